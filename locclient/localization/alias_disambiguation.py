@@ -4,8 +4,9 @@ Fix totals cannot do this: a sign at an aisle's end has ten landmarks among hund
 of each aisle. So every hypothesis keeps a history: how often each landmark was expected, and how often it was observed. To compare
 two hypotheses, their landmarks are superimposed in the odometry frame:
 
-* Landmarks that look the same at the same position of any two competing hypotheses are excluded. A third hypothesis counts as well: if
-  the robot's own aisle is not mapped, its aliases would otherwise be distinguished by features that they share with it.
+* Landmarks that look the same at the same position of both are excluded. Those of a third hypothesis do not support theirs: if the robot's
+  own aisle is not mapped, its aliases would otherwise be distinguished by features that they share with it. If they are absent, they count
+  against theirs: an object of one aisle alone mostly stands where all the others have the same one.
 * The others are compared cell by cell. In most cells both places contain the same object, mapped by different corners, or the
   object was removed. If the landmarks of one place are observed and those of the other never are, one of the two is wrong.
 * A cell with landmarks of one place only is ignored: the budget may have dropped the other's, or a box may have been moved.
@@ -147,17 +148,26 @@ def log_odds(one: ObservationHistory, other: ObservationHistory, one_shared: Fla
     """Return the log Bayes factor of the first hypothesis against the second, given the observations; 0 without evidence.
 
     Only views with a fix at both count: a fix at a single hypothesis may be wrong. one_shared, other_shared: landmarks that look
-    the same at the same position of any hypothesis, and so do not discriminate. Source: Kass and Raftery 1995 (Bayes factors).
+    the same at the same position of any hypothesis, and so do not support theirs. Source: Kass and Raftery 1995 (Bayes factors).
     """
     common = one.views & other.views
     if not common or not len(one.ids) or not len(other.ids):
         return 0.0
+    one_alike, other_alike = np.zeros(len(one.ids), bool), np.zeros(len(other.ids), bool)
+    mark_shared(one, other, one_alike, other_alike)
+    return _support(common, (one, one_shared), (other, other_alike)) - _support(
+        common, (other, other_shared), (one, one_alike)
+    )
+
+
+def _support(views: int, one: tuple[ObservationHistory, Flags], other: tuple[ObservationHistory, Flags]) -> float:
+    """Return the log odds of the blocks that support the first hypothesis in these views; each with its excluded landmarks."""
     sides = []
-    for history, shared in ((one, one_shared), (other, other_shared)):
-        expected, found = history.counts(common)
-        sides.append((history.points_odom, _LOG_LIKELIHOODS[expected, found], shared | (expected == 0)))
+    for history, excluded in (one, other):
+        expected, found = history.counts(views)
+        sides.append((history.points_odom, _LOG_LIKELIHOODS[expected, found], excluded | (expected == 0)))
     strongest = core.block_log_odds(sides[0], sides[1], _LATTICES, _MODEL, _BLOCK_M, _MAX_BLOCKS)
-    return float(np.clip(strongest, -_MAX_BLOCK_LOG_ODDS, _MAX_BLOCK_LOG_ODDS).sum())
+    return float(np.clip(strongest, 0.0, _MAX_BLOCK_LOG_ODDS).sum())
 
 
 def log_beta_binomial(expected: int, found: int, a: float, b: float) -> float:

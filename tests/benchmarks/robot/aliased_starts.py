@@ -82,15 +82,15 @@ class Site:
     lookalikes: LookAlikes | None = None
 
 
-def surveyed_site(scenario: str, seed: int, survey_run: str = "survey-both-ways") -> Site:
-    """The site of that seed, on the day of its survey, which went through every aisle both ways by default."""
-    session = prepare(Order(scenario, seed=seed, robot=survey_run))
+def surveyed_site(scenario: str, seed: int, survey_run: str = "survey-both-ways", day: int = 0) -> Site:
+    """The site of that seed, surveyed through every aisle both ways by default; the robot drives a day later, on day 0 the same day."""
+    session = prepare(Order(scenario, seed=seed, robot=survey_run, day=day))
     session.renderer.close()
     field = LandmarkField(session.world)
     survey = EstimatorSession(session, field=field)
-    drive = prepare(Order(scenario, seed=seed, robot="runner-1"))
+    drive = prepare(Order(scenario, seed=seed, robot="runner-1", day=day + 1 if day else 0))
     drive.renderer.close()
-    robot = RememberingSession(drive, field)
+    robot = RememberingSession(drive, LandmarkField(drive.world) if day else field)
     (whole_tile,), vocabulary = estimator_loop.survey_map(survey, np.random.default_rng(seed), every_m=_EVERY_M)
     tile = within_budget(whole_tile, survey.camera, survey.body_from_cam)
     view = estimator_loop.map_view(robot, [tile], vocabulary)
@@ -112,7 +112,7 @@ class Start:
 
     wrong_frames: TRACKING and more than WRONG_M off. ambiguous_frames, and of those with the right place among the hypotheses.
     tracking_s: until the first TRACKING at the right place, None without. late_m: the way by then since the robot left the racks,
-    negative before; None where it never tracked rightly.
+    negative before; None where it never tracked rightly. frames: all of the start's.
     """
 
     frame: int
@@ -121,6 +121,7 @@ class Start:
     ambiguous_right_frames: int
     tracking_s: float | None
     late_m: float | None
+    frames: int
 
 
 def prior_at(session: EstimatorSession, sigma_m: float, rng: np.random.Generator) -> PositionPrior:
@@ -162,9 +163,9 @@ def judged(frame: int, session: EstimatorSession, estimates: list[Estimate]) -> 
             off_m = [np.linalg.norm(h.map_from_body[:3, 3] - truth[:3, 3]) for h in estimate.hypotheses]
             with_right += bool(min(off_m) < RIGHT_M)
     if first is None:
-        return Start(frame, wrong, ambiguous, with_right, None, None)
+        return Start(frame, wrong, ambiguous, with_right, None, None, len(estimates))
     took_s = (estimates[first].stamp_ns - session.stamps_ns[0]) * 1e-9
-    return Start(frame, wrong, ambiguous, with_right, took_s, float(ways_m(session)[first]))
+    return Start(frame, wrong, ambiguous, with_right, took_s, float(ways_m(session)[first]), len(estimates))
 
 
 def start_at(
@@ -199,6 +200,13 @@ def resolving_start_at(site: Site, number: int, beyond_m: float, settings: Local
         session, site.view, None, count, settings=settings, until=lambda estimate: estimate.status is Status.TRACKING
     )
     return judged(number, session, known)
+
+
+def drive_from(site: Site, number: int, way_m: float, settings: LocalizerSettings) -> Start:
+    """The outcome of waking at a frame without a prior and driving so far."""
+    session = LateSession(site.robot, number)
+    count = int(np.searchsorted(ways_m(session) - ways_m(session)[0], way_m))
+    return judged(number, session, estimator_loop.run_localizer(session, site.view, None, count, settings=settings))
 
 
 def among_racks(session: EstimatorSession) -> NDArray[np.int64]:

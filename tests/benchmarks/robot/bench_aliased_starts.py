@@ -3,9 +3,10 @@
 `PYTHONPATH=tests python tests/benchmarks/robot/bench_aliased_starts.py [--starts N] [--seeds N...] [--only NAME...] [--out FILE.json]`.
 Six aisles 5 m apart that were surveyed both ways, so that each has five twins; N starts (200) of each kind, shared among the sites
 of the seeds. With signs at the aisles' ends the starts are followed out of the racks. "surveyed one way": every aisle in one direction,
-with look-alikes measured as a build does it. "whole site": the robot may take it that its own aisle is in the map. Where it may not, it
-must not be misled by signs out of an aisle that is not in the map, nor where two of five twins are not; from the only twin of an aisle
-that is not in the map nothing protects.
+with look-alikes measured as a build does it. "along the aisle": N/10 drives of 22 m on the day after a survey of day 2, when stock was
+moved in every aisle, so that each has some slots of its own. "whole site": the robot may take it that its own aisle is in the map. Where
+it may not, it must not be misled by signs out of an aisle that is not in the map, nor where two of five twins are not; from the only twin
+of an aisle that is not in the map nothing protects.
 """
 
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
@@ -24,6 +25,7 @@ from benchmarks.robot.aliased_starts import (
     Site,
     Start,
     among_racks,
+    drive_from,
     resolving_start_at,
     standing_start_at,
     start_at,
@@ -38,9 +40,21 @@ _FOLLOWED_S = 3.2
 _WHOLE = "no prior, whole site"
 _OUT, _OUT_M, _SPEED_MPS, _RATE_HZ = "out of the aisle, whole site", 8.0, 2.0, 15.0
 _FOREIGN, _FOREIGN_MAPPED = "out of an aisle that is not in the map", (0, 1, 3, 4, 5)
+_ALONG, _ALONG_M = "along the aisle, stock moved, whole site", 22.0
 _MAPPED = {"own aisle and all twins but one unmapped": (5,), "own aisle and two of five twins unmapped": (3, 4, 5)}
 _ONE_WAY, _ONE_WAY_STANDING = "no prior, surveyed one way", "no prior, surveyed one way, standing"
-KINDS = ("no prior", _ONE_WAY, _ONE_WAY_STANDING, _WHOLE, "prior of 0.5 m", "prior of 2 m", _OUT, _FOREIGN, *_MAPPED)
+KINDS = (
+    "no prior",
+    _ONE_WAY,
+    _ONE_WAY_STANDING,
+    _WHOLE,
+    "prior of 0.5 m",
+    "prior of 2 m",
+    _OUT,
+    _ALONG,
+    _FOREIGN,
+    *_MAPPED,
+)
 _PRIORS_M = {"no prior": None, _WHOLE: None, _ONE_WAY: None, "prior of 0.5 m": 0.5, "prior of 2 m": 2.0}
 
 
@@ -54,6 +68,8 @@ def starts_of(name: str, site: Site, count: int, seed: int) -> list[Start]:
         numbers = _spread(30, len(robot) - 60, count)
         return [start_at(site, n, _FOLLOWED_S, _PRIORS_M[name], rng, settings) for n in numbers]
     frames = among_racks(robot)
+    if name == _ALONG:
+        return [drive_from(site, n, _ALONG_M, WHOLE_SITE) for n in _spread(frames[0], frames[-1] - 60, -(-count // 10))]
     if name in (_OUT, _FOREIGN):
         late = frames[-int(_OUT_M / _SPEED_MPS * _RATE_HZ) :]
         part = site if name == _OUT else with_aisles(site, _FOREIGN_MAPPED)
@@ -63,10 +79,14 @@ def starts_of(name: str, site: Site, count: int, seed: int) -> list[Start]:
     return [start_at(part, n, _FOLLOWED_S, None, rng) for n in _spread(frames[0], frames[-1] - 46, count)]
 
 
-def _site_of(name: str) -> tuple[str, str]:
-    """Scenario and survey."""
+def _site_of(name: str) -> tuple[str, str, int]:
+    """Scenario, survey, and its day."""
     scenario = "marked-ends" if name in (_OUT, _FOREIGN) else "identical-aisles"
-    return scenario, "survey" if name in (_ONE_WAY, _ONE_WAY_STANDING) else "survey-both-ways"
+    return (
+        scenario,
+        "survey" if name in (_ONE_WAY, _ONE_WAY_STANDING) else "survey-both-ways",
+        2 if name == _ALONG else 0,
+    )
 
 
 def _spread(first: int, last: int, count: int) -> list[int]:
@@ -81,6 +101,8 @@ def judged(name: str, found: list[Start]) -> dict[str, float]:
         figures["resolved_share"] = len([m for m in late_m if m <= WITHIN_M]) / len(found)
         figures["resolved_median_m"] = float(np.median(late_m)) if late_m else np.nan
         figures["resolved_last_m"] = float(np.max(late_m)) if late_m else np.nan
+    if name == _ALONG:
+        figures["ambiguous_share"] = sum(s.ambiguous_frames for s in found) / sum(s.frames for s in found)
     return figures
 
 
@@ -95,7 +117,7 @@ def main() -> None:
     found: dict[str, list[Start]] = {name: [] for name in arguments.only or KINDS}
     for seed in arguments.seeds:
         begun_s = time.process_time()
-        sites = {of: surveyed_site(of[0], seed, of[1]) for of in {_site_of(name) for name in found}}
+        sites = {of: surveyed_site(of[0], seed, *of[1:]) for of in {_site_of(name) for name in found}}
         print(f"seed {seed}: sites in {time.process_time() - begun_s:.0f} s", flush=True)
         for of, site in sites.items():
             print(f"  {of}: look-alikes {site.lookalikes}", flush=True)
