@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
 from fleetmap.mapformat import Tile, decode_tile, encode_tile
@@ -41,7 +42,7 @@ class TileChooser(NamedTuple):
 
     survey_map: SurveyMap
     settings: BudgetSettings
-    published: np.typing.NDArray[np.uint32] | None
+    published: NDArray[np.uint32] | None
     vocabulary: Vocabulary
 
     def choose(self, views: Sequence[AskedView]) -> tuple[list[Tile], SurveyedViews]:
