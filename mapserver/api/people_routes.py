@@ -94,10 +94,10 @@ def _install_operator_routes(app: FastAPI, store: MapStore, operators: Operators
         response.headers.update(_ONCE)
         return views.Secret(act.name, operators.make_token(act.name, act.scopes, act.days, actor))
 
-    @app.post("/v1/tokens/{number}/revoke")
-    def revoke_token(request: Request, number: p.TokenNumber, act: views.Act) -> views.ServiceState:
+    @app.post("/v1/tokens/{token}/revoke")
+    def revoke_token(request: Request, token: p.TokenNumber, act: views.Act) -> views.ServiceState:
         """End one token at once; the other tokens of its owner stay."""
-        store.operators.revoke_token(number, actor_of(request, act.actor, act.reason))
+        store.operators.revoke_token(token, actor_of(request, act.actor, act.reason))
         return views.ServiceState("ok")
 
 

@@ -37,7 +37,8 @@ from mapserver.trust import init_here
 from mapserver.trust.enrolment import RobotRegister
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.fleet.quick_passwords import use_quick_passwords
-from support.storage.map_samples import save_grid_draft, save_sample_draft, wall
+from support.storage.map_samples import save_grid_draft, save_picture_draft, save_sample_draft, wall
+from support.storage.room_sessions import session_at
 
 EXAMPLES = int(os.environ.get("FLEETMAP_API_EXAMPLES", "8"))  # of each operation
 CHECKS = (not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance)
@@ -60,7 +61,7 @@ LOOKED = msgspec.structs.replace(
 )  # fmt: skip
 
 
-def ask_operation(operation: schemathesis.APIOperation, request: str, headers: dict[str, str]) -> list[int]:
+def ask_operation(operation: schemathesis.APIOperation, known: dict[str, str], headers: dict[str, str]) -> list[int]:
     """The statuses of the answers to questions made up after the document, some of them about what is there."""
     statuses: list[int] = []
 
@@ -72,7 +73,7 @@ def ask_operation(operation: schemathesis.APIOperation, request: str, headers: d
             path["site"] = "hall"
             path |= {name: 1 + number % 3 for name in ("version", "before", "after") if name in path}
         path |= {name: 1 for name in ("job", "number") if number % 2 and name in path}
-        path |= {"asked": request} if number % 2 and "asked" in path else {}
+        path |= {name: value for name, value in known.items() if number % 2 and name in path}
         path |= {"robot": "r1"} if number % 2 and "robot" in path else {}
         path |= {"operator": "olga"} if number % 2 and "operator" in path else {}
         path |= {"place": 0} if number % 2 and "place" in path else {}
@@ -82,6 +83,10 @@ def ask_operation(operation: schemathesis.APIOperation, request: str, headers: d
             number % 2 and "/changes." in operation.label
         ):  # the version that has surfels; few such questions are answered
             path |= {"before": 3, "after": 3}
+        if number % 2 and operation.label.endswith("/pictures"):
+            path |= {"version": 4}
+        if number % 2 and operation.label.endswith("/estimate"):
+            case.query = {"pin": PINS}
         if number % 4 == 3 and isinstance(case.query, dict):  # made-up moments are hardly ever ones
             case.query = {name: value for name, value in case.query.items() if name not in ("since", "until")}
         if number % 2 and isinstance(case.body, dict):
@@ -114,6 +119,7 @@ def test_no_question_breaks_the_server(tmp_path: Path, monkeypatch: pytest.Monke
             save_sample_draft(store, site="hall", seed=seed)
             releases.publish(store, "hall")
         save_grid_draft(store, site="hall", surfels=wall())
+        save_picture_draft(store, [session_at([np.eye(4)], has_depth=True)], site="hall")
         store.update_job(store.begin_job("hall", "nightly"), "done", "version 2 is published", {})
         fleet = Fleet(store, clock_ns=lambda: now_ns)  # a robot that was heard stays so
         for failure in (LOOKED, FAILURE):
@@ -131,19 +137,23 @@ def test_no_question_breaks_the_server(tmp_path: Path, monkeypatch: pytest.Monke
         operators = Operators(store)
         operators.add("olga", "viewer", None, Actor("ada"))
         headers = {"Authorization": f"Bearer {operators.make_token('root', Scope, 1, Actor('ada'))}"}
-        asked_for = ask_for_survey(store, "hall", POLYGON, Actor("ada"))
+        operators.make_token("ci", ["read"], 1, Actor("ada"))
+        known = {
+            "asked": ask_for_survey(store, "hall", POLYGON, Actor("ada")).id,
+            "token": store.operators.tokens(now_ns)[0].sha256[:12],
+        }
         receiver = Mock(**{"test.return_value": (True, "alerts.example accepted it")})
         for number in range(1, 2 * EXAMPLES, 2):
             make_folder(tmp_path / "inbox/hall/held")
             (tmp_path / f"inbox/hall/held/held-{number}.mcap").touch()
         log_path(tmp_path, 1).write_text("reading monday\n")
         nights = NightRuns(store, tmp_path / "inbox")
-        monkeypatch.setattr(nights, "start", lambda site: store.job(1))
+        monkeypatch.setattr(nights, "start", lambda site, log: store.job(1))
         settings = ApiSettings(GuardSettings(names=frozenset({"testserver"})), webhook=receiver, nights=nights)
         app = create_app(store, fleet, Metrics(store, fleet), bus, None, settings)
         schema = schemathesis.openapi.from_asgi("/openapi.json", app, headers=headers)
         asked = {
-            operation.ok().label: ask_operation(operation.ok(), asked_for.id, headers)
+            operation.ok().label: ask_operation(operation.ok(), known, headers)
             for operation in schema.get_all_operations()
         }
         assert sum(len(statuses) for statuses in asked.values()) >= 100
