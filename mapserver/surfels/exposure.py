@@ -59,10 +59,10 @@ def estimate_exposure(samples: Sequence[Sample], views: int) -> Exposure:
     _, shown = np.unique(every.points, return_inverse=True)
     # Columns of the lens and of the views; the points' own are eliminated by the Schur complement.
     first = FALLOFF + views
-    rows = np.repeat(np.arange(count), FALLOFF + 1)
-    columns = np.column_stack([np.tile(np.arange(FALLOFF), (count, 1)), FALLOFF + every.views.astype(np.int64)])
+    columns = np.column_stack([np.tile(np.arange(FALLOFF), (count, 1)), FALLOFF + every.views]).astype(np.int32)
     values = np.column_stack([_powers(every.squared), np.ones(count)])
-    design = scipy.sparse.csr_array((values.ravel(), (rows, columns.ravel())), (count, first))
+    starts = np.arange(0, values.size + 1, FALLOFF + 1)
+    design = scipy.sparse.csr_array((values.ravel(), columns.ravel(), starts), (count, first))
     points = scipy.sparse.csr_array((np.ones(count), (np.arange(count), shown)))
     # Gauge: brighter views with darker points are equivalent. Unobserved values stay 0.
     prior = _PRIOR**2 * scipy.sparse.eye_array(first)

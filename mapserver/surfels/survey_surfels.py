@@ -1,5 +1,6 @@
 """Update of the previous version's surfels by a build's recordings: their keyframes are matched densely at their final poses."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -36,7 +37,11 @@ _BLOCK_M = 4.0  # surfels are judged by the views near their block
 _HALO_M = 0.32  # around a tile, where finer surfels may replace its coarse ones: two of the coarsest voxels
 _OWN_LIGHT_M = 2.0
 _DARK, _MIN_ALIKE = 5, 50  # grey levels; common voxels needed to compare the exposure of two drives
-_SATURATED, _SAMPLE_STEP = 250, 24  # grey level; every so many kept disparities a point is used for exposure
+_SATURATED, _SAMPLE_STEP, _MOST_SAMPLED = (
+    250,
+    24,
+    10_000,
+)  # grey level; every so many kept disparities a point is used for exposure
 _LOGS_STEP = 16  # one common voxel of this many is used to compare drives
 _MIN_FINER = 2  # voxels of the next finer level that replace a coarse one
 _Place = tuple[int, int]
@@ -93,7 +98,7 @@ class SurfelGrower:
         exposure = self._exposure(views)
         grown = {place: self._grown(place, views, exposure) for place in sorted(self._seen)}
         old = {place: self._left(place, views) for place in before.tiles if views.near(place)}
-        shift = _brightness_shift([(old[place], grown[place]) for place in sorted(old.keys() & grown.keys())])
+        shift = self._brightness_shift([(old[place], grown[place]) for place in sorted(old.keys() & grown.keys())])
         tiles = dict(before.tiles)
         for place in sorted({*old, *grown}):
             new = grown.get(place, Surfels.joined([]))
@@ -108,24 +113,25 @@ class SurfelGrower:
         self.surfels = SurfelTiles(tiles, *self._light(before, exposure, shift))
 
     def _exposure(self, views: "_Views") -> Exposure:
-        """Estimate the brightness of the views, by a raster of points of each that others see."""
-        points_map = np.concatenate([_points(look, self._camera, _SAMPLE_STEP) for look in self._looks]).astype(
-            np.float32
-        )
+        """Estimate the brightness of the views, by a raster of points of each that others see, of a long drive by fewer of each."""
+        raster = [_points(look, self._camera, _SAMPLE_STEP).astype(np.float32) for look in self._looks]
+        points_map = np.concatenate(raster)
+        points_map = points_map[:: max(1, math.ceil(len(points_map) / _MOST_SAMPLED))]
         order, blocks = _blocks(points_map)
         points_map, levels, samples = points_map[order], np.zeros(len(order), np.uint8), []
+        last = np.array([self._camera.width_px, self._camera.height_px]) - 1
         for rows in blocks:
             for number in views.seeing(points_map[rows]):
                 marks, pixels = core.look_at(points_map[rows], levels[rows], *views.depths(number))
                 seen = np.flatnonzero(marks == _SEEN)
-                column, row = pixels[seen].round().astype(np.int64).T
-                greys = self._looks[number].picture[row, column]
+                column, row = np.clip(pixels[seen].round().astype(np.int64), 0, last).T
+                greys = self._looks[number].picture[row, column].astype(np.float64)
                 fit = (greys < _SATURATED) & (greys >= 1)
                 tangents = squared_tangent(pixels[seen[fit]], self._camera)
                 samples.append(
                     Sample(rows.start + seen[fit], np.full(int(fit.sum()), number), tangents, np.log(greys[fit]))
                 )
-        self._images.release()
+            self._images.release()
         return estimate_exposure(samples, len(self._looks))
 
     def _grown(self, place: _Place, views: "_Views", exposure: Exposure) -> Surfels:
@@ -169,6 +175,22 @@ class SurfelGrower:
                 light = self._looks[number].picture, exposure.falloff, float(exposure.logs[number])
                 core.weigh(points_map, levels, *(*views.depths(number), *light, sums[rows]))
         return sums
+
+    def _brightness_shift(self, tiles: Sequence[tuple[Surfels, Surfels]]) -> float:
+        """Return the logarithm by which the new surfels of tiles are darker than the old ones, as the median over common voxels.
+
+        Each drive has its own mean brightness; 0 if too few voxels are common.
+        """
+        shifts = [np.zeros(0)]
+        for old, new in tiles:
+            (keys, first), (others, second) = (_of_voxels(surfels) for surfels in (old, new))
+            _, mine, theirs = np.intersect1d(keys, others, assume_unique=True, return_indices=True)
+            before, after = old.greys[first[mine]].astype(np.float64), new.greys[second[theirs]].astype(np.float64)
+            sure = (before > _DARK) & (after > _DARK) & (before < _SATURATED) & (after < _SATURATED)
+            shifts.append(np.log(before[sure] / after[sure])[::_LOGS_STEP])
+            self._images.release()
+        every = np.concatenate(shifts)
+        return float(np.median(every)) if len(every) * _LOGS_STEP >= _MIN_ALIKE else 0.0
 
     def _light(self, before: SurfelTiles, exposure: Exposure, shift: float) -> tuple[tuple[float, ...], Array]:
         """Return lens and exposures: where both drives overlap, the last one defines the brightness."""
@@ -228,22 +250,6 @@ def _blocks(points_map: NDArray[np.float32]) -> tuple[NDArray[np.int64], list[sl
     order = np.argsort(keys, kind="stable")
     ends = [*(np.flatnonzero(np.diff(keys[order])) + 1).tolist(), len(order)]
     return order, [slice(first, last) for first, last in zip([0, *ends], ends, strict=False) if last > first]
-
-
-def _brightness_shift(tiles: Sequence[tuple[Surfels, Surfels]]) -> float:
-    """Return the logarithm by which the new surfels of tiles are darker than the old ones, as the median over common voxels.
-
-    Each drive has its own mean brightness; 0 if too few voxels are common.
-    """
-    shifts = [np.zeros(0)]
-    for old, new in tiles:
-        (keys, first), (others, second) = (_of_voxels(surfels) for surfels in (old, new))
-        _, mine, theirs = np.intersect1d(keys, others, assume_unique=True, return_indices=True)
-        before, after = old.greys[first[mine]].astype(np.float64), new.greys[second[theirs]].astype(np.float64)
-        sure = (before > _DARK) & (after > _DARK) & (before < _SATURATED) & (after < _SATURATED)
-        shifts.append(np.log(before[sure] / after[sure])[::_LOGS_STEP])
-    every = np.concatenate(shifts)
-    return float(np.median(every)) if len(every) * _LOGS_STEP >= _MIN_ALIKE else 0.0
 
 
 def _of_voxels(surfels: Surfels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
