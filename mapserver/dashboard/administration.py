@@ -3,7 +3,7 @@
 import time
 from typing import NamedTuple
 
-from mapserver.dashboard.console import Console, Services
+from mapserver.dashboard.console import PageContext, Services
 from mapserver.dashboard.rendering import size
 from mapserver.fleet.alerts import active_alerts
 from mapserver.serving.server_health import Ending, ServerHealth, server_health
@@ -32,13 +32,8 @@ class Row(NamedTuple):
     remark: str
 
 
-def install(console: Console) -> None:
-    """Adds the page."""
-    services = console.services
-    console.page("administration", "administration.html", lambda _: _page(services), of_site=False)
-
-
-def _page(services: Services) -> dict[str, object]:
+def page(services: Services, _: PageContext) -> dict[str, object]:
+    """What the template needs."""
     store, settings, now_ns = services.maps.store, services.settings, time.time_ns()
     found = server_health(store, services.robots.fleet, settings.ingest, settings.certificate)
     kept = found.retention

@@ -125,7 +125,7 @@ class Console:
     def nothing_else(self) -> None:
         """Adds the page for addresses that no page has."""
 
-        def no_page(context: PageContext) -> dict[str, object]:
+        def no_page(*_: object) -> dict[str, object]:
             raise UsageError("There is no such page here.")
 
         @self.app.exception_handler(404)
@@ -143,7 +143,7 @@ class Console:
         under_way: Callable[[], list[str]] = list,
         of_site: bool = True,
     ) -> None:
-        """Adds a page. fill: what its template needs beside `context`, of that and the parts of `path` in braces; it may block.
+        """Adds a page. fill: what its template needs beside `context`, of the services, it and the parts of `path` in braces; may block.
 
         A FleetmapError becomes a notice within the frame. knows: query parameters beside the site. under_way: sites that the page
         knows though the store has no version of them. of_site: False for a page that shows the same whatever site its address names.
@@ -180,7 +180,7 @@ class Console:
                 is_signed_in = getattr(request.state, "operator", None) is not None
                 if is_signed_in and guard.identify(request.scope, uses=False) is None:
                     return ended
-                return b"data: %s\n\n" % to_json(one(context, **request.path_params))
+                return b"data: %s\n\n" % to_json(one(self.services, context, **request.path_params))
 
             async def events() -> AsyncIterator[bytes]:
                 told = b""
@@ -217,7 +217,7 @@ class Console:
             check_query(request, knows)
             zone = zone_of(request.cookies.get(_ZONE_COOKIE))
             context = PageContext(root, site, zone, request.query_params)
-            found = {"context": context} | await load(lambda: fill(context, **request.path_params))
+            found = {"context": context} | await load(lambda: fill(self.services, context, **request.path_params))
         except FleetmapError as error:
             template, found, status = "problem.html", {"words": str(error)}, 404
             site = site if site in sites else None  # links lead somewhere
@@ -279,7 +279,7 @@ def scene_of(
     """A version's map with layers over it, for `site_map` of templates. places_m: what is in sight first, everything without them."""
     plan = services.maps.plan(context.site, version)
     below = services.maps.underlays(context.site, version, context.root)
-    picture, areas = context.plan_picture(version), services.maps.areas(context.site)
+    picture, areas = context.plan_picture(version), services.maps.store.areas(context.site)
     layers = [*ground(plan, picture, areas, below, shows_coverage=shows_coverage), *over]
     box = box_around(places_m, box_of(plan))
     return {"label": f"Map of {context.site}, version {version}", "box": box, "layers": layers, "follows": False}

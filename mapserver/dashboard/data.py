@@ -19,20 +19,19 @@ from mapserver.dashboard.space.loops import Loop, loops_of_version
 from mapserver.dashboard.space.points import space_bytes, surfel_bytes
 from mapserver.dashboard.underlays import floor_picture, grid_picture
 from mapserver.floor_plan.alignment import PLAN
-from mapserver.floor_plan.areas import Areas
 from mapserver.nightly.inbox import InboxContents, contents, sites_of
 from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
 from mapserver.serving.expected_views import failure_camera
 from mapserver.serving.night_runs import SETTLE_S
-from mapserver.store import JobInfo, MapStore, VerdictRow, VersionInfo
+from mapserver.store import MapStore, VerdictRow, VersionInfo
 from mapserver.surfels.surfel_map import index_address, surfels_of
 from mapserver.surfels.survey_pictures import pictures_of
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
 _GRID_HEIGHT_M = 1.1  # as the API's grid without a height
-_JOBS_SHOWN = 100
+JOBS_SHOWN = 100
 
 
 Span = tuple[int | None, int | None]
@@ -137,7 +136,7 @@ class MapData:
 
     def loops(self, site: str, version: int) -> list[Loop]:
         """Loops of the build that made a version, as far as a job that is kept tells them."""
-        return loops_of_version((job.report for job in self.store.jobs(site, limit=_JOBS_SHOWN)), version)
+        return loops_of_version((job.report for job in self.store.jobs(site, limit=JOBS_SHOWN)), version)
 
     def underlays(self, site: str, version: int, root: str) -> list[Layer]:
         """The floor plan and the occupancy grid under a version's map, where there are any; root: prefix of their addresses."""
@@ -175,10 +174,6 @@ class MapData:
         tiles = known_grid(self.store.manifest(site, version), self.store.blob)
         return grid_picture(occupancy(tiles, _GRID_HEIGHT_M)) if tiles else None
 
-    def areas(self, site: str) -> Areas:
-        """The named areas of a site."""
-        return self.store.areas(site)
-
     def lacks_view(self, report: FailureReport) -> str | None:
         """Why it cannot be drawn what a robot should have seen when its failure began; None where it can."""
         return _fault(lambda: index_address(self.store.manifest(report.site, failure_camera(report)[0])))
@@ -205,10 +200,3 @@ class MapData:
         changed = {cell: "changed" for cell in old.keys() & new.keys() if old[cell] != new[cell]}
         added, removed = new.keys() - old.keys(), old.keys() - new.keys()
         return changed | dict.fromkeys(added, "added") | dict.fromkeys(removed, "removed")
-
-    def jobs(self, site: str, span_ns: Span = EVER) -> list[JobInfo]:
-        """The last jobs of a site that began in a time, newest first."""
-        return self.store.jobs(site, span_ns, limit=_JOBS_SHOWN)
-
-    def job(self, number: int) -> JobInfo:
-        return self.store.job(number)

@@ -8,7 +8,7 @@ from math import hypot
 
 from fleetmap.messages import FailureReport
 from mapserver.dashboard import failure_story as story
-from mapserver.dashboard.console import Console, PageContext, Services, number, scene_of
+from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.failures import ADVICE, failure_marks, tone_of
 from mapserver.dashboard.fleet_health import MANY_FAILURES
 from mapserver.dashboard.map_layers import Layer, Line, Mark
@@ -18,19 +18,9 @@ _NEAR_M = 5.0
 _LISTED = 6
 
 
-def install(console: Console) -> None:
-    """Adds the page."""
-    services = console.services
-    console.page(
-        "failures/{failure}",
-        "failure.html",
-        lambda context, failure: _page(services, context, failure),
-        of_site=False,
-    )
-
-
-def _page(services: Services, context: PageContext, failure: str) -> dict[str, object]:
-    detail = services.health.failure(number(failure, "failure") or 0)
+def page(services: Services, context: PageContext, failure: str) -> dict[str, object]:
+    """What the template needs."""
+    detail = services.maps.store.fleet.failure(number(failure, "failure") or 0)
     row, report, began_ns = detail.failure, detail.report, detail.report.stamp_ns
     context = replace(context, site=row.site)  # whatever site the address names, or none
     moments = story.moments_near(services.health.replay(row.number), began_ns)
@@ -55,7 +45,7 @@ def _page(services: Services, context: PageContext, failure: str) -> dict[str, o
         "scene": _scene(services, context, row, report, story.path(moments, clock)),
         "nearby": near[:_LISTED],
         "nearby_words": words,
-        "nearby_pictures": services.health.first_pictures(other.number for other in near[:_LISTED]),
+        "nearby_pictures": services.maps.store.fleet.first_pictures(other.number for other in near[:_LISTED]),
         "facts": _facts(context, row, report),
         "status_words": story.status_words,
         "matches": [picture.place for picture in detail.pictures if picture.kind == "matches"],
@@ -82,7 +72,7 @@ def _scene(
 
 def _nearby(services: Services, row: FailureRow) -> tuple[list[FailureRow], str]:
     """Others that began within _NEAR_M, the last first; and whether it is this robot or this place, as far as counts can tell."""
-    kept = services.health.failures(FailureFilter(site=row.site), None, MANY_FAILURES)
+    kept = services.maps.store.fleet.failures(FailureFilter(site=row.site), limit=MANY_FAILURES)
     others = [other for other in kept if other.number != row.number]
     near = [other for other in others if _is_near(row, other)]
     elsewhere = sum(other.robot == row.robot for other in others) - sum(other.robot == row.robot for other in near)

@@ -11,12 +11,12 @@ from typing import NamedTuple
 from fleetmap.errors import UsageError
 from fleetmap.messages import Cause, FailureKind
 from mapserver.api.moments import steps
-from mapserver.dashboard.console import Console, PageContext, Services, number, scene_of
+from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN, MANY_FAILURES
 from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
 from mapserver.store import FailureFilter, FailureRow
 
-_AXES = {"cause": "Cause", "area": "Area", "tile": "Tile", "version": "Map version", "robot": "Robot"}
+AXES = {"cause": "Cause", "area": "Area", "tile": "Tile", "version": "Map version", "robot": "Robot"}
 _SHADES = 6  # of causes; the last is that of all others
 _HOUR_NS = 3_600_000_000_000
 _STEPS_NS = {
@@ -62,36 +62,31 @@ ADVICE: dict[str, str] = {
 """What a cause means and what to do, where there is more to say than its name."""
 
 
-def install(console: Console) -> None:
-    """Adds the page."""
-    knows = (*_AXES, "since", "until", "before", "sort")
-    console.page("failures", "failures.html", lambda context: _page(console.services, context), knows=knows)
-
-
-def _page(services: Services, context: PageContext) -> dict[str, object]:
+def page(services: Services, context: PageContext) -> dict[str, object]:
+    """What the template needs."""
     kept = {name: value for name, value in context.query.items() if name not in {"site", "before"}}
     if kept.get("sort") not in (None, "happened"):
         raise UsageError(
             f"sort={kept['sort'][:40]!r} is unknown; write sort=happened, or leave it out for the last to arrive first"
         )
     version = number(kept.get("version"), "version")
-    chosen = {axis: kept[axis] for axis in _AXES if kept.get(axis)}
+    chosen = {axis: kept[axis] for axis in AXES if kept.get(axis)}
     if version is not None:
         chosen["version"] = str(version)  # 07 is 7
     since_ns, until_ns = context.time_range()
     in_time = FailureFilter(site=context.site, since_ns=since_ns, until_ns=until_ns)
     named = {axis: value for axis, value in chosen.items() if axis != "version"}
     wanted = replace(in_time, version=version, **named)  # type: ignore[arg-type]  # texts, all of them
-    before = number(context.query.get("before"), "failure")
-    rows = services.health.failures(in_time, None, MANY_FAILURES)
+    before, kept_failures = number(context.query.get("before"), "failure"), services.maps.store.fleet
+    rows = kept_failures.failures(in_time, limit=MANY_FAILURES)
     matching = [row for row in rows if _fits(row, chosen)]
     if kept.get("sort") == "happened":
         found = sorted(matching, key=lambda row: (-row.happened_ns, -row.number))
         found = found[next((n + 1 for n, row in enumerate(found) if row.number == before), 0) :]
     else:
-        found = services.health.failures(wanted, before)
+        found = kept_failures.failures(wanted, before=before, limit=FAILURES_SHOWN + 1)
     shown = found[:FAILURES_SHOWN]
-    facets = _facets(context, rows, chosen, kept, services.maps.areas(context.site).names)
+    facets = _facets(context, rows, chosen, kept, services.maps.store.areas(context.site).names)
     causes = next((facet.choices for facet in facets if facet.axis == "cause"), [])
     shades = {cause.value: min(n, _SHADES - 1) for n, cause in enumerate(causes)}
     return {
@@ -109,7 +104,7 @@ def _page(services: Services, context: PageContext) -> dict[str, object]:
         "chart": _chart(context, matching, shades, chosen) if matching else None,
         "scene": _scene(services, context, shown, matching, version),
         "rows": shown,
-        "pictures": services.health.first_pictures(row.number for row in shown),
+        "pictures": kept_failures.first_pictures(row.number for row in shown),
         "older": context.to("failures", **kept, before=shown[-1].number) if len(found) > len(shown) else None,
     }
 
@@ -147,7 +142,7 @@ def _facets(
 ) -> list[Facet]:
     """For each axis its values, those with most failures first. kept: query parameters."""
     found = []
-    for axis, title in _AXES.items():
+    for axis, title in AXES.items():
         own = chosen.get(axis)
         counts = Counter(dict.fromkeys(areas if axis == "area" else (), 0))
         counts.update([] if own is None else {own: 0})

@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import scipy
@@ -17,7 +17,7 @@ from mapserver.fleet_statistics.area_trend import AreaTrend, area_trends
 from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, Kpis, Rate, hour_of, kpis, rate
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings, TileConcern
-from mapserver.store import FailureDetail, FailureFilter, FailureRow, MapStore, TraceRow
+from mapserver.store import FailureFilter, MapStore, TraceRow
 
 _log = logging.getLogger(__name__)
 DAY_H, WEEK_H = 24, 7 * 24
@@ -69,14 +69,6 @@ class HealthData:
             self._cached[site] = (self._clock_ns(), found)
         return found
 
-    def failures(self, wanted: FailureFilter, before: int | None, limit: int = FAILURES_SHOWN + 1) -> list[FailureRow]:
-        """Failures, latest arrival first; without a limit one more than is shown if there are more."""
-        return self._store.fleet.failures(wanted, before=before, limit=limit)
-
-    def first_pictures(self, numbers: Iterable[int]) -> dict[int, int]:
-        """For each failure with a picture of its camera the place of the first one."""
-        return self._store.fleet.first_pictures(numbers)
-
     def trace(self, site: str, robot: str, since_ns: int, until_ns: int) -> list[TraceRow]:
         """Where a robot was and what it said of itself, thinned, oldest first."""
         hours = {"since_hour": hour_of(since_ns), "until_hour": hour_of(until_ns - 1) + 1}
@@ -96,9 +88,6 @@ class HealthData:
         wanted = FailureFilter(site=site, since_ns=since_ns, until_ns=until_ns)
         found = self._store.fleet.failures(wanted, limit=MANY_FAILURES)
         return [(row.x_map_m, row.y_map_m) for row in found if row.x_map_m is not None and row.y_map_m is not None]
-
-    def failure(self, number: int) -> FailureDetail:
-        return self._store.fleet.failure(number)
 
     def cameras(self, site: str) -> dict[str, CameraNote]:
         """The robots' cameras as the newest failure report of each tells it; robots without one are left out."""

@@ -47,20 +47,7 @@ def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: Api
     pages.add_middleware(GZipMiddleware, compresslevel=5)
     console = Console(pages, services)
     console.files()
-    for module in (
-        overview,
-        robots,
-        robot,
-        map_page,
-        failures,
-        failure,
-        space_page,
-        live_page,
-        survey_jobs,
-        administration,
-        people,
-    ):
-        module.install(console)
+    _install_pages(console)
     console.nothing_else()
     _install_files(pages, services)
     app.mount(PATH, pages)
@@ -70,6 +57,26 @@ def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: Api
     def to_dashboard(request: Request) -> RedirectResponse:
         """Redirects the bare address to the dashboard."""
         return RedirectResponse(f"{request.scope.get('root_path', '')}{PATH}/")
+
+
+def _install_pages(console: Console) -> None:
+    """What a page is asked with beside its site, and what it follows."""
+    span, growing = ("since", "until"), console.services.surveys.sites
+    console.page("", "overview.html", overview.page, knows=("find",))
+    console.stream("now", overview.now)
+    console.page("trends", "trends.html", overview.trends, knows=span)
+    console.page("robots", "robots.html", robots.page, knows=("find", "state", "without"))
+    console.page("robots/{robot}", "robot.html", robot.page, knows=span)
+    console.stream("robots/{robot}/now", robot.now)
+    console.page("map", "map.html", map_page.page, knows=("version", "before", "after", *span))
+    console.page("space", "space.html", space_page.page, knows=("version", "x", "y"))
+    console.page("failures", "failures.html", failures.page, knows=(*failures.AXES, *span, "before", "sort"))
+    console.page("failures/{failure}", "failure.html", failure.page, of_site=False)
+    console.page("surveys", "surveys.html", survey_jobs.page, knows=("job", *span))
+    console.page("live", "live.html", live_page.page, under_way=growing)
+    console.stream("live/now", live_page.heard, under_way=growing)
+    console.page("administration", "administration.html", administration.page, of_site=False)
+    console.page("administration/people", "people.html", people.page, of_site=False)
 
 
 def _install_files(pages: FastAPI, services: Services) -> None:

@@ -6,11 +6,10 @@ import numpy as np
 
 from fleetmap.geometry import Array
 from fleetmap.live_survey import COVERAGE_CELL_M, LiveSurveyState
-from mapserver.dashboard.console import Console, PageContext
+from mapserver.dashboard.console import PageContext, Services
 from mapserver.dashboard.live import STATUSES
 from mapserver.dashboard.map_layers import Dots, Layer, Line, Mark, Square, trail
 from mapserver.dashboard.space.loops import VERDICTS
-from mapserver.serving.live_surveys import LiveSurvey, LiveSurveys
 
 _MARGIN_M = 4.0
 _SHOWN_LANDMARKS = 4000
@@ -23,21 +22,17 @@ _PHASES = {
 }
 
 
-def install(console: Console) -> None:
-    """Adds the page and what it follows."""
-    surveys = console.services.surveys
-    console.page("live", "live.html", lambda context: _page(surveys, context), under_way=surveys.sites)
-    console.stream("live/now", lambda context: _heard(surveys.of(context.site)), under_way=surveys.sites)
-
-
-def _heard(survey: LiveSurvey | None) -> dict[str, object]:
+def heard(services: Services, context: PageContext) -> dict[str, object]:
     """Changes when the page does."""
+    survey = services.surveys.of(context.site)
     if survey is None:
         return {"heard": None}
     return {"heard": survey.number, "silent": survey.is_silent}
 
 
-def _page(surveys: LiveSurveys, context: PageContext) -> dict[str, object]:
+def page(services: Services, context: PageContext) -> dict[str, object]:
+    """What the template needs."""
+    surveys = services.surveys
     survey = surveys.of(context.site)
     if survey is None:
         return {"state": None}

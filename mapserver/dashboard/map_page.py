@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
-from mapserver.dashboard.console import Console, PageContext, Services, number, scene_of
+from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.data import EVER, MapData
 from mapserver.dashboard.map_layers import Layer, Outline, Picture, box_of, heat, squares
 from mapserver.dashboard.plan import Plan
@@ -58,14 +58,8 @@ _UNKNOWN = {
 _FRAMES = {"held_out_frames": "held_out", "yesterdays_recordings": "replayed", "last_versions_places": "last_version"}
 
 
-def install(console: Console) -> None:
-    """Adds the page."""
-    services = console.services
-    knows = ("version", "before", "after", "since", "until")
-    console.page("map", "map.html", lambda context: _page(services, context), knows=knows)
-
-
-def _page(services: Services, context: PageContext) -> dict[str, object]:
+def page(services: Services, context: PageContext) -> dict[str, object]:
+    """What the template needs."""
     maps, site, span_ns = services.maps, context.site, context.time_range()
     if not maps.is_mapped(site):
         return {"shown": None}
@@ -96,10 +90,10 @@ def _page(services: Services, context: PageContext) -> dict[str, object]:
         "scene": scene_of(services, context, shown, over, shows_coverage=not compares),
         "gate": _gate(maps, info, verdicts.get(shown)),
         "version_facts": _facts(maps, info, plan),
-        "one_way": one_way(plan, maps.areas(site)),
+        "one_way": one_way(plan, maps.store.areas(site)),
         "changes": changes,
         "alignment": _aligned(maps.store.alignment(site)),
-        "areas": sorted(maps.areas(site).areas, key=lambda area: area.name),
+        "areas": sorted(maps.store.areas(site).areas, key=lambda area: area.name),
         "requests": requests,
         "kept": {"version": asked},
         "events": events if span_ns == EVER else maps.store.events(site, span_ns)[::-1][:_EVENTS_SHOWN],

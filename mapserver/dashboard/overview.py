@@ -5,7 +5,7 @@ pages; the Overview is kept up to date by a stream of server-sent events.
 import time
 
 from mapserver.dashboard import fleet_parts
-from mapserver.dashboard.console import Console, PageContext, Services, scene_of
+from mapserver.dashboard.console import PageContext, Services, scene_of
 from mapserver.dashboard.data import EVER
 from mapserver.dashboard.fleet_health import SiteHealth
 from mapserver.dashboard.fleet_parts import Bars, Figure
@@ -20,17 +20,10 @@ from mapserver.floor_plan.areas import OUTSIDE, Areas
 _MANY = 20  # robots, whose places say better than the map's tiles what to show first
 
 
-def install(console: Console) -> None:
-    """Adds the pages and the stream."""
-    services = console.services
-
-    def overview(context: PageContext) -> dict[str, object]:
-        data = {"scene": _scene(services, context), "now": _now(services, context)}
-        return {"data": data, "find": context.query.get("find", "")}
-
-    console.page("", "overview.html", overview, knows=("find",))
-    console.page("trends", "trends.html", lambda context: _trends(services, context), knows=("since", "until"))
-    console.stream("now", lambda context: _now(services, context))
+def page(services: Services, context: PageContext) -> dict[str, object]:
+    """What the template needs."""
+    data = {"scene": _scene(services, context), "now": now(services, context)}
+    return {"data": data, "find": context.query.get("find", "")}
 
 
 def _scene(services: Services, context: PageContext) -> dict[str, object] | None:
@@ -47,10 +40,10 @@ def _scene(services: Services, context: PageContext) -> dict[str, object] | None
     return scene_of(services, context, version, layers, places_m=places if len(places) > _MANY else ())
 
 
-def _now(services: Services, context: PageContext) -> dict[str, object]:
+def now(services: Services, context: PageContext) -> dict[str, object]:
     """What changes from second to second."""
     live, health = services.robots.look(context.site), services.health.site(context.site)
-    areas = services.maps.areas(context.site)
+    areas = services.maps.store.areas(context.site)
     robots = sorted(live.robots, key=lambda robot: robot.tone in {"good", "quiet"} and not _is_troubled(robot))
     return {
         "line": site_line(live),
@@ -168,7 +161,7 @@ def _notices(context: PageContext, health: SiteHealth) -> list[dict[str, str]]:
     return found
 
 
-def _trends(services: Services, context: PageContext) -> dict[str, object]:
+def trends(services: Services, context: PageContext) -> dict[str, object]:
     """The figures of a day, or of the range in the address, and what they were before."""
     live, health = services.robots.look(context.site), services.health.site(context.site)
     span_ns = context.time_range()

@@ -6,7 +6,7 @@ from typing import NamedTuple
 from fleetmap.errors import StateError
 from mapserver.api.people_routes import enrolled_of, operators_of
 from mapserver.api.views import EnrolledRobot
-from mapserver.dashboard.console import Console, PageContext, Services
+from mapserver.dashboard.console import PageContext, Services
 from mapserver.dashboard.live import ORDER, LiveRobot
 from mapserver.operators.operators import MAX_TOKEN_DAYS
 from mapserver.operators.roles import OPERATOR_PATTERN, SCOPES, Role, Scope
@@ -44,14 +44,8 @@ class _Robot(NamedTuple):
         return "good" if self.enrolled.is_used and self.enrolled.days_left > _SOON_DAYS else "warn"
 
 
-def install(console: Console) -> None:
-    """Adds the page."""
-    console.page(
-        "administration/people", "people.html", lambda context: _page(console.services, context), of_site=False
-    )
-
-
-def _page(services: Services, context: PageContext) -> dict[str, object]:
+def page(services: Services, context: PageContext) -> dict[str, object]:
+    """What the template needs."""
     store, now_ns = services.maps.store, time.time_ns()
     enrolled = {row.robot: row for row in enrolled_of(store, context.site)}
     heard = {robot.name: robot for robot in services.robots.look(context.site).robots}

@@ -3,7 +3,7 @@
 import time
 
 from fleetmap.errors import UsageError
-from mapserver.dashboard.console import Console, PageContext, Services, scene_of
+from mapserver.dashboard.console import PageContext, Services, scene_of
 from mapserver.dashboard.failures import failure_marks, tone_of
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN
 from mapserver.dashboard.live import LiveRobot
@@ -31,24 +31,20 @@ _CURVES = (
 )
 
 
-def install(console: Console) -> None:
-    """Adds the page and its stream."""
-    services = console.services
+def page(services: Services, context: PageContext, robot: str) -> dict[str, object]:
+    """What the template needs. UsageError for an unknown robot."""
+    found = services.robots.look(context.site).robot(robot)
+    if found is None:
+        raise UsageError(f"site {context.site} never heard of a robot {robot[:40]!r}; the page Robots lists them")
+    return _page(services, context, found)
 
-    def page(context: PageContext, robot: str) -> dict[str, object]:
-        found = services.robots.look(context.site).robot(robot)
-        if found is None:
-            raise UsageError(f"site {context.site} never heard of a robot {robot[:40]!r}; the page Robots lists them")
-        return _page(services, context, found)
 
-    def now(context: PageContext, robot: str) -> dict[str, object]:
-        found = services.robots.look(context.site).robot(robot)
-        if found is not None:
-            return _now(services, context, found)
-        return {"line": {"tone": "quiet", "words": "It is not known any more.", "exact": ""}, "facts": [], "marks": []}
-
-    console.page("robots/{robot}", "robot.html", page, knows=("since", "until"))
-    console.stream("robots/{robot}/now", now)
+def now(services: Services, context: PageContext, robot: str) -> dict[str, object]:
+    """What changes from second to second."""
+    found = services.robots.look(context.site).robot(robot)
+    if found is not None:
+        return _now(services, context, found)
+    return {"line": {"tone": "quiet", "words": "It is not known any more.", "exact": ""}, "facts": [], "marks": []}
 
 
 def _page(services: Services, context: PageContext, robot: LiveRobot) -> dict[str, object]:
@@ -60,7 +56,7 @@ def _page(services: Services, context: PageContext, robot: LiveRobot) -> dict[st
     parts = stretches(rows, until_ns)
     shown = band(parts, span_ns // _BAND_PARTS)
     wanted = FailureFilter(site=context.site, robot=robot.name, until_ns=end_ns)
-    failures = services.health.failures(wanted, None)[:FAILURES_SHOWN]
+    failures = services.maps.store.fleet.failures(wanted, limit=FAILURES_SHOWN)
     within = [row for row in failures if row.happened_ns >= since_ns]
     curves = [(words, form, curve(rows, name, (since_ns, until_ns))) for words, name, form in _CURVES]
     version = robot.version or services.maps.current_version(context.site)
@@ -86,15 +82,14 @@ def _page(services: Services, context: PageContext, robot: LiveRobot) -> dict[st
         "band": shown,
         "curves": [(words, form, *found) for words, form, found in curves if found],
         "failures": failures,
-        "pictures": services.health.first_pictures(row.number for row in failures),
+        "pictures": services.maps.store.fleet.first_pictures(row.number for row in failures),
         "within": within,
         "tone_of": tone_of,
     }
 
 
 def _now(services: Services, context: PageContext, robot: LiveRobot) -> dict[str, object]:
-    """What changes from second to second."""
-    where = robot.where(services.maps.areas(context.site))
+    where = robot.where(services.maps.store.areas(context.site))
     state, exact = robot.words.capitalize(), ""
     if robot.tone == "quiet":
         state += f", last heard {age(robot.seconds_since)} ago"

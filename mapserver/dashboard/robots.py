@@ -4,7 +4,7 @@ from collections import Counter
 from typing import NamedTuple
 
 from fleetmap.errors import UsageError
-from mapserver.dashboard.console import Console, PageContext, Services
+from mapserver.dashboard.console import PageContext, Services
 from mapserver.dashboard.fleet_health import SiteHealth
 from mapserver.dashboard.live import ORDER, LiveRobot
 from mapserver.dashboard.overview import remarks, since_words, site_line
@@ -40,15 +40,10 @@ class _Choice(NamedTuple):
     to: str
 
 
-def install(console: Console) -> None:
-    """Adds the page."""
-    services, knows = console.services, ("find", "state", "without")
-    console.page("robots", "robots.html", lambda context: _page(services, context), knows=knows)
-
-
-def _page(services: Services, context: PageContext) -> dict[str, object]:
+def page(services: Services, context: PageContext) -> dict[str, object]:
+    """What the template needs."""
     live, health = services.robots.look(context.site), services.health.site(context.site)
-    areas = services.maps.areas(context.site)
+    areas = services.maps.store.areas(context.site)
     find, state, hidden = (context.query.get(name, "") for name in ("find", "state", "without"))
     without = dict.fromkeys(filter(None, hidden.split(",")))
     for name in without:

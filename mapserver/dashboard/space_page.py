@@ -3,18 +3,14 @@
 import math
 
 from fleetmap.errors import StateError, UsageError
-from mapserver.dashboard.console import Console, PageContext, Services, number, scene_of
+from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.map_layers import Layer
 from mapserver.dashboard.space.points import COARSEST_M, FINEST_M
 from mapserver.dashboard.space.robot_views import robot_views
 
 
-def install(console: Console) -> None:
-    """Adds the page."""
-    console.page("space", "space.html", lambda context: _space(console.services, context), knows=("version", "x", "y"))
-
-
-def _space(services: Services, context: PageContext) -> dict[str, object]:
+def page(services: Services, context: PageContext) -> dict[str, object]:
+    """What the template needs."""
     maps, site = services.maps, context.site
     version = number(context.query.get("version"), "version")
     if version is None:

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 from fleetmap.recordings import FILE_SUFFIXES
 from mapserver.api.inbox_routes import NO_INBOX
-from mapserver.dashboard.console import Console, PageContext, Services, number, scene_of
+from mapserver.dashboard.console import PageContext, Services, number, scene_of
+from mapserver.dashboard.data import JOBS_SHOWN
 from mapserver.dashboard.map_layers import Item, Layer, Line, Mark
 from mapserver.dashboard.space.loops import VERDICTS, Loop, builds_of, dicts, loops_of
 from mapserver.store import JobInfo
@@ -32,18 +33,13 @@ class _Recording(NamedTuple):
     unjudged: Mapping[str, Sequence[str]] = {}
 
 
-def install(console: Console) -> None:
-    """Adds the page."""
-    services, knows = console.services, ("job", "since", "until")
-    console.page("surveys", "surveys.html", lambda context: _page(services, context), knows=knows)
-
-
-def _page(services: Services, context: PageContext) -> dict[str, object]:
+def page(services: Services, context: PageContext) -> dict[str, object]:
+    """What the template needs."""
     wanted = number(context.query.get("job"), "job")
-    chosen = None if wanted is None else services.maps.job(wanted)
+    chosen = None if wanted is None else services.maps.store.job(wanted)
     if chosen is not None:
         context = replace(context, site=chosen.site)  # whatever site the address names, or none
-    jobs = services.maps.jobs(context.site, context.time_range())
+    jobs = services.maps.store.jobs(context.site, context.time_range(), limit=JOBS_SHOWN)
     chosen = chosen or next((job for job in jobs if job.report and job.state != "running"), None)
     shown: dict[str, object] = {
         "context": context,

@@ -321,7 +321,7 @@ def test_health_of_a_site(store: MapStore) -> None:
     assert (found.day.failures.events, found.day.silent_estimated.events) == (1, 1)
     assert len(found.days) == 14
     assert found.days[-1].events == 1
-    assert health.first_pictures([1, 2, 99]) == {1: 0, 2: 0}
+    assert store.fleet.first_pictures([1, 2, 99]) == {1: 0, 2: 0}
     assert health.site(SITE) is found
     now_ns = time.time_ns()
     assert health.span(SITE, None, None).failures.events == 1
