@@ -186,6 +186,8 @@ class _Walk:
             is_number = isinstance(member, int | float) and name != "seed"
             if is_number and not (isfinite(member) and abs(member) <= _MAX_SETTING):
                 raise _refused(at, f"{member}")
+            if name.endswith("_share") and not 0 < member < 1:  # all of them are by default
+                raise _refused(at, f"{member}")
             self.check(member, at)
 
     def _number(self, value: Any, where: str) -> None:
