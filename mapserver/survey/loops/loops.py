@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.bow import BowVector, PlaceIndex
-from fleetmap.geometry import Array, se3_inverse, se3_log
+from fleetmap.geometry import Array, se3_inverse, se3_log, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.loops.keyframe_groups import KeyframeGroups, Revisit, WaitingRevisits
@@ -333,7 +333,12 @@ class LoopCloser:
             points_old = self._posed.keyframes[match.i].points_cam[match.features[:, 0]]
             points_new = self._posed.keyframes[match.j].points_cam[match.features[:, 1]]
             self.scales[match.j, match.i] = measured_log_scale(points_old, points_new, match.j_from_i)
-        return body_edge(match, self._posed.body_from_cam)
+        edge, old = body_edge(match, self._posed.body_from_cam), self._posed.keyframes[match.i]
+        if old.from_views:
+            return edge
+        per_px = by_disparity(old.points_cam[match.features[:, 0]], match.j_from_i, self._posed.camera)
+        shared = self._config.settings.noise.disparity_sigma_px * adjoint(self._posed.body_from_cam) @ per_px
+        return replace(edge, cov_rot_trans=edge.cov_rot_trans + np.outer(shared, shared))
 
     def _neighbours_agree(self, match: PairMatch) -> bool | None:
         """True if a covisible neighbour of the old keyframe, located by this match, matches too; None if none is visible."""
@@ -403,6 +408,25 @@ def body_edge(match: PairMatch, body_from_cam: Array) -> PoseEdge:
     carry = adjoint(body_from_cam)
     covariance = _CORRELATION**2 * carry @ match.cov_rot_trans @ carry.T + np.diag([1e-6] * 3 + [1e-5] * 3)
     return PoseEdge(match.j, match.i, body_from_body, covariance, is_loop=True)
+
+
+def by_disparity(points_cam: Array, new_from_old: Array, camera: StereoCamera) -> Array:
+    """Return (6,) how an error of all disparities by one pixel moves a match, new_from_old (4, 4), of points (N, 3) in the old camera.
+
+    At depth edges disparities are too large and never too small: errors that a view's points share do not average out. In long
+    aisles, 12 m and more away, they are 0.2 px (rms of 222 loops of rendered drives). First order, for equal weights.
+    """
+    seen = points_cam[np.isfinite(points_cam).all(axis=1)]
+    nearer = -seen * seen[:, 2:] / (camera.focal_px * camera.baseline_m)
+    x, y, z = np.moveaxis(transform_points(new_from_old, seen), 1, 0)
+    rows = np.zeros((len(seen), 3, 3))
+    rows[:, 0, 0] = rows[:, 1, 1] = camera.focal_px / z
+    rows[:, 0, 2], rows[:, 1, 2] = -camera.focal_px * x / z**2, -camera.focal_px * y / z**2
+    rows[:, 2, 2] = -camera.focal_px * camera.baseline_m / z**2
+    shift = np.einsum("nab,nb->na", rows, nearer @ new_from_old[:3, :3].T) - [0.0, 0.0, 1.0]
+    turns = np.cross(np.eye(3), np.stack([x, y, z], axis=1)[:, None]).transpose(0, 2, 1)
+    jacobian = np.concatenate([rows @ turns, rows], axis=2).reshape(-1, 6)
+    return np.asarray(-np.linalg.lstsq(jacobian, shift.ravel(), rcond=None)[0])
 
 
 def _around(distance_m: float) -> Array:

@@ -12,10 +12,11 @@ import pytest
 from msgspec import structs
 
 from fleetmap.bow import Vocabulary
-from fleetmap.geometry import Array, se3_exp, se3_inverse
-from fleetmap.sensors.rectification import Rectifier
+from fleetmap.geometry import Array, se3_exp, se3_inverse, se3_log, transform_points
+from fleetmap.pnp.pnp import Correspondences, refine_pnp
+from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from mapserver.survey.keyframes.keyframes import make_keyframe
-from mapserver.survey.loops.loops import LoopCloser, LoopRecord, Loops, LoopVerdict
+from mapserver.survey.loops.loops import LoopCloser, LoopRecord, Loops, LoopVerdict, by_disparity
 from mapserver.survey.loops.zones import Zones
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
@@ -263,3 +264,19 @@ def test_what_the_pose_graph_disbelieves_is_rejected_after_all() -> None:
     assert "contradicts" in loops.records[0].reason
     assert loops.records[0].inliers == 40
     assert loops.counts()["accepted"] == len(loops.edges) == 1
+
+
+@pytest.mark.parametrize("depth_m", [4.0, 17.0])
+def test_an_error_that_all_disparities_share_moves_a_loop_as_its_covariance_says(depth_m: float) -> None:
+    """All disparities of two views are a hundredth of a pixel too large: solved again, the loop is off by as much as predicted."""
+    rng, camera, error_px = np.random.default_rng(3), StereoCamera(420.0, 320.0, 240.0, 0.12, 640, 480), 0.01
+    points = np.column_stack([rng.uniform(-0.4, 0.4, (60, 2)), np.ones(60)]) * rng.uniform(0.8, 1.2, (60, 1)) * depth_m
+    new_from_old = se3_exp(np.array([0.02, 0.05, -0.01, 0.3, -0.1, -0.8]))
+    old, new = (camera.pixel_from_point(each) for each in (points, transform_points(new_from_old, points)))
+    old[:, 2] -= error_px
+    new[:, 2] -= error_px
+    nearer = camera.point_from_pixel(old[:, :2], old[:, 0] - old[:, 2])
+    found = refine_pnp(Correspondences(camera, nearer, new, np.ones((60, 2))), new_from_old)
+    assert found is not None
+    moved = se3_log(found.cam_from_source @ se3_inverse(new_from_old))
+    np.testing.assert_allclose(moved, error_px * by_disparity(points, new_from_old, camera), rtol=0.05, atol=2e-5)
