@@ -1,6 +1,7 @@
-"""Tiles for robots, checked by frames of the surveys: a view without a fix gets more landmarks."""
+"""Tiles for robots, checked by frames of the surveys: a view without a fix, or with a weak one, gets more landmarks."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,8 @@ from fleetmap.bow import Vocabulary
 from fleetmap.mapformat import Tile, decode_tile, encode_tile
 from fleetmap.relocalization.landmark_visibility import places_around
 from fleetmap.relocalization.map_view import MapView
+from fleetmap.relocalization.relocalizer import Fix, is_reliable
+from fleetmap.relocalization.settings import FixSettings
 from mapserver.drafting.draft_evidence import JudgedSession
 from mapserver.quality.figures import BlindView, SurveyedViews
 from mapserver.quality.probes import PRIOR_RADIUS_M, SAME_WAY_COSINE, Probe, relocalized
@@ -52,11 +55,13 @@ class TileChooser(NamedTuple):
         landmarks: those that it matches among all landmarks then count as its observations, and the budget is chosen again.
         """
         tiles = self._tiles(())
-        missed = self._without_fix(tiles, views)
-        sightings = [found for view in missed if (found := self._sighting(view.probe)) is not None]
+        fixes = self._fixes(tiles, views)
+        weak = [view for view, fix in zip(views, fixes, strict=True) if fix is None or not _is_sure(fix)]
+        sightings = [found for view in weak if (found := self._sighting(view.probe)) is not None]
         if sightings:
             tiles = self._tiles(sightings)
-            missed = self._without_fix(tiles, views)
+            fixes = self._fixes(tiles, views)
+        missed = [view for view, fix in zip(views, fixes, strict=True) if fix is None]
         places = [BlindView(_xy(view), round(view.path_m, 1)) for view in missed]
         return tiles, SurveyedViews(len(views), len(sightings), places)
 
@@ -68,9 +73,9 @@ class TileChooser(NamedTuple):
         stored = [decode_tile(encode_tile(tile)) for tile in tiles]
         return MapView(stored, self.vocabulary, self.survey_map.camera.focal_px)
 
-    def _without_fix(self, tiles: Sequence[Tile], views: Sequence[AskedView]) -> list[AskedView]:
+    def _fixes(self, tiles: Sequence[Tile], views: Sequence[AskedView]) -> list[Fix | None]:
         view = self._view(tiles)
-        return [each for each in views if relocalized(view, each.probe, each.probe.map_from_cam) is None]
+        return [relocalized(view, each.probe, each.probe.map_from_cam) for each in views]
 
     def _sighting(self, probe: Probe) -> Sighting | None:
         """Return the matches of a probe among all landmarks that were observed around it; None without a fix."""
@@ -87,6 +92,13 @@ class TileChooser(NamedTuple):
         order = np.argsort(survey.landmark_ids, kind="stable")
         landmarks = order[np.searchsorted(survey.landmark_ids, view.landmark_ids[rows], sorter=order)]
         return Sighting(fix.map_from_cam, landmarks, probe.features.pixels[features])
+
+
+def _is_sure(fix: Fix) -> bool:
+    """True if 95 % of other looks from there are reliable, too: the numbers that they find are distributed as Poisson's."""
+    inliers, seen = (count - 1.645 * np.sqrt(count) for count in (fix.inliers, fix.seen))
+    recall = seen / fix.expected if fix.expected else fix.landmark_recall
+    return is_reliable(replace(fix, inliers=int(inliers), landmark_recall=recall), FixSettings())
 
 
 def _xy(view: AskedView) -> tuple[float, float]:

@@ -87,7 +87,8 @@ class BlindView(msgspec.Struct, frozen=True):
 class SurveyedViews(msgspec.Struct, frozen=True):
     """Held-out frames and both ends of every recording, localized in the tiles from a prior at their own place.
 
-    frames: their number. given_more: number of those for which the budget was chosen again. without_fix: those that have none yet.
+    frames: their number. given_more: number of those for which the budget was chosen again, since their fix was none or weak.
+    without_fix: those that have none yet.
     """
 
     frames: int
