@@ -2,13 +2,15 @@
 
 They hold what pictures and the IMU leave weak, such as the yaw of a block of aisles, each with its own covariance. A prior that contradicts
 the survey beyond both covariances has no influence and is reported: before loops are searched by the chain of odometry, after the
-adjustment by the prior's own covariance.
+adjustment by the prior's own covariance. A device publishes many samples while a robot stands at it or passes it, and they share its
+error: each visit is one term with the covariance of one sample.
 """
 
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.sensors.samples import PositionPrior
@@ -19,6 +21,8 @@ from mapserver.survey.state import OdometryPass, PriorTerm
 
 _MAX_GAP_NS = 500_000_000  # between a prior and the frame used for it
 _HEADING_KNOWN_RAD = 0.2
+# A robot that was not away for so long, and not further, is still at the same device: tags are read from up to 3 m.
+_AWAY_NS, _AWAY_M = 10_000_000_000, 3.0
 _UNKNOWN_VARIANCE = np.array([1.0] * 3 + [1e4] * 3)  # rad^2, m^2
 # Errors of a prior by the floor's unevenness and a robot's tilt: roll, pitch, yaw in rad; x, y, z in m.
 _UNEVEN = np.diag(np.square([0.05, 0.05, 0.0, 0.01, 0.01, 0.25]))
@@ -33,16 +37,19 @@ def placed_by_priors(
     base_from_body: Array,
     odometry: OdometryPass,
 ) -> tuple[Array, list[PriorTerm]]:
-    """Return keyframes (K, 4, 4) in `map`, and the terms of the priors, the reference first; no terms without a usable prior.
+    """Return keyframes (K, 4, 4) in `map`, and a term for each visit of a device, the reference first; no terms without a usable prior.
 
-    The reference is the prior with a heading with which most others agree within the covariances of `marginals`; among equals the first.
-    Positions alone suffice if there are two. A prior without heading takes that of the survey.
+    priors: in order of time. The reference is the visit with a heading with which most others agree within the covariances of
+    `marginals`; among equals the first. Positions alone suffice if there are two. A prior without heading takes that of the survey.
     """
-    terms = _terms(priors, base_from_body, odometry, survey_from_body)
+    usable = _usable(priors, odometry)
+    terms = _terms(usable, base_from_body, odometry, survey_from_body)
+    chosen = _one_a_visit(usable, terms, marginals)
+    usable, terms = [usable[n] for n in chosen], [terms[n] for n in chosen]
     headed = [n for n, term in enumerate(terms) if _has_heading(term)]
     order = list(range(len(terms)))
     if headed:
-        agreeing = [sum(_innovation(marginals, terms[n], terms[m]) <= CHI2_6_0999 for m in headed) for n in headed]
+        agreeing = [sum(_agree(marginals, terms[n], terms[m]) for m in headed) for n in headed]
         order.insert(0, order.pop(headed[int(np.argmax(agreeing))]))
         reference = terms[order[0]]
         map_from_survey = level(
@@ -56,7 +63,7 @@ def placed_by_priors(
     else:
         return survey_from_body, []
     map_from_body = map_from_survey @ survey_from_body
-    terms = _terms(priors, base_from_body, odometry, map_from_body)
+    terms = _terms(usable, base_from_body, odometry, map_from_body)
     return map_from_body, [terms[n] for n in order]
 
 
@@ -69,7 +76,7 @@ def learn_priors(marginals: GraphMarginals, priors: Sequence[PriorTerm]) -> list
         return list(priors)
     reference, judged = priors[0], [priors[0]]
     for term in priors[1:]:
-        is_believed = term.k == reference.k or _innovation(marginals, reference, term) <= CHI2_6_0999
+        is_believed = _agree(marginals, reference, term)
         if is_believed and term.k != reference.k:
             marginals.add(_edge(reference, term))
         judged.append(replace(term, is_believed=is_believed))
@@ -124,18 +131,27 @@ def judged_priors(priors: Sequence[PriorTerm], map_from_body: Array) -> tuple[li
     return judged, all(a.is_believed == b.is_believed for a, b in zip(judged, priors, strict=True))
 
 
+def _usable(priors: Sequence[PositionPrior], odometry: OdometryPass) -> list[PositionPrior]:
+    """Return the priors of devices with known position in the plane and a frame near in time."""
+    stamps_ns = _stamps_ns(odometry)
+    return [
+        prior
+        for prior in priors
+        if not prior.is_revisable
+        and np.isfinite(np.diag(prior.cov_rot_trans)[3:5]).all()
+        and np.abs(stamps_ns - prior.stamp_ns).min() <= _MAX_GAP_NS
+    ]
+
+
 def _terms(
     priors: Sequence[PositionPrior], base_from_body: Array, odometry: OdometryPass, map_from_body: Array
 ) -> list[PriorTerm]:
-    """Return terms of devices with known position in the plane, each at the keyframe nearest in time; map_from_body (K, 4, 4)."""
-    stamps_ns = np.array([e.stamp_ns for e in odometry.estimates], np.int64)
+    """Return a term for each usable prior, at the keyframe nearest in time; map_from_body (K, 4, 4)."""
+    stamps_ns = _stamps_ns(odometry)
     frames = np.array([keyframe.frame_index for keyframe in odometry.keyframes])
     found = []
     for prior in priors:
         frame = int(np.argmin(np.abs(stamps_ns - prior.stamp_ns)))
-        is_near = abs(int(stamps_ns[frame]) - prior.stamp_ns) <= _MAX_GAP_NS
-        if prior.is_revisable or not is_near or not np.isfinite(np.diag(prior.cov_rot_trans)[3:5]).all():
-            continue
         k = int(np.argmin(np.abs(frames - frame)))
         # By odometry from the frame to its keyframe: both are standing at a dock, and near each other elsewhere.
         body_from_k = se3_inverse(odometry.odom_from_body[frame]) @ odometry.odom_from_body[frames[k]]
@@ -152,6 +168,36 @@ def _terms(
     return found
 
 
+def _stamps_ns(odometry: OdometryPass) -> NDArray[np.int64]:
+    return np.array([estimate.stamp_ns for estimate in odometry.estimates], np.int64)
+
+
+def _one_a_visit(priors: Sequence[PositionPrior], terms: Sequence[PriorTerm], marginals: GraphMarginals) -> list[int]:
+    """Return the number of the most certain sample of each visit of a device.
+
+    A sample continues a visit if it agrees with its first one, and the robot stood or hardly moved since. Contradicting samples are
+    visits of their own, and judged.
+    """
+    positions_m = marginals.map_from_body[:, :3, 3]
+    visits, present = list[list[int]](), list[list[int]]()
+    for n, (prior, term) in enumerate(zip(priors, terms, strict=True)):
+        present = [
+            visit
+            for visit in present
+            if term.k == terms[visit[-1]].k or prior.stamp_ns - priors[visit[-1]].stamp_ns <= _AWAY_NS
+        ]
+        for visit in present:
+            first = terms[visit[0]]
+            is_near = np.linalg.norm(positions_m[term.k] - positions_m[first.k]) <= _AWAY_M
+            if is_near and _agree(marginals, first, term):
+                visit.append(n)
+                break
+        else:
+            present.append([n])
+            visits.append(present[-1])
+    return [max(visit, key=lambda n: float(np.linalg.slogdet(terms[n].information)[1])) for visit in visits]
+
+
 def _has_heading(term: PriorTerm) -> bool:
     return float(_covariance(term)[2, 2]) <= _HEADING_KNOWN_RAD**2
 
@@ -160,9 +206,9 @@ def _covariance(term: PriorTerm) -> Array:
     return np.asarray(np.linalg.inv(term.information), np.float64)
 
 
-def _innovation(marginals: GraphMarginals, reference: PriorTerm, term: PriorTerm) -> float:
-    """Return the squared distance in sigmas, 6 degrees of freedom, between two priors and the graph."""
-    return 0.0 if reference.k == term.k else marginals.innovation_squared(_edge(reference, term))
+def _agree(marginals: GraphMarginals, reference: PriorTerm, term: PriorTerm) -> bool:
+    """Return True if the graph allows two priors within its covariance and theirs."""
+    return marginals.innovation_squared(_edge(reference, term)) <= CHI2_6_0999
 
 
 def _edge(reference: PriorTerm, term: PriorTerm) -> PoseEdge:

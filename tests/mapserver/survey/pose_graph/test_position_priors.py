@@ -55,9 +55,16 @@ def _graph(rng: np.random.Generator, bend_rad: float = 0.0) -> tuple[list[PoseEd
 
 
 def _priors(
-    rng: np.random.Generator, moved_m: float = 0.0, docks: tuple[int, ...] = (0,), wrong: int | None = None
+    rng: np.random.Generator,
+    moved_m: float = 0.0,
+    docks: tuple[int, ...] = (0,),
+    wrong: int | None = None,
+    repeated: tuple[int, ...] = (),
 ) -> list[PositionPrior]:
-    """Docks, and a zone of a metre every ten metres; from the middle on zones are so far aside, the wrong dock by twelve metres."""
+    """Docks, and a zone of a metre every ten metres; from the middle on zones are so far aside, the wrong dock by twelve metres.
+
+    Robots at `repeated` docks read them twenty times.
+    """
     truth, found = _truth(), []
     for k in sorted({*range(0, len(truth), 10), *docks}):
         is_dock = k in docks
@@ -67,7 +74,8 @@ def _priors(
         place = truth[k] @ se3_inverse(BASE_FROM_BODY)
         place[:2, 3] += rng.normal(0.0, np.sqrt(variances[3:5]))
         place[1, 3] += 12.0 if k == wrong else moved_m if k > 60 and not is_dock else 0.0
-        found.append(PositionPrior(k * _PERIOD_NS, place, np.diag(variances)))
+        samples = 20 if k in repeated else 1
+        found += [PositionPrior(k * _PERIOD_NS + 10_000_000 * n, place, np.diag(variances)) for n in range(samples)]
     return found
 
 
@@ -159,6 +167,27 @@ def test_a_wrong_dock_is_not_obeyed_even_if_it_comes_first() -> None:
     survey = Survey(7, docks=(0, 50, 120), wrong=0)
     assert [term.k for term in survey.priors if not term.is_believed] == [0]
     assert np.linalg.norm((survey.solved()[0] - _truth())[[50, 120], :2, 3], axis=1).max() < 3 * 0.05
+
+
+def test_samples_of_one_visit_have_one_vote() -> None:
+    survey = Survey(7, docks=(0, 50, 120), wrong=0, repeated=(0,))
+    assert [term.k for term in survey.priors if not term.is_believed] == [0]
+
+
+def test_samples_of_one_visit_weigh_as_one() -> None:
+    once, often = Survey(8, docks=(0, 120)), Survey(8, docks=(0, 120), repeated=(0, 120))
+    np.testing.assert_array_equal(often.solved()[0], once.solved()[0])
+    passing = Survey(8, docks=(0, 50, 51, 52))
+    assert [term.k for term in passing.priors if 50 <= term.k < 60] == [50]
+
+
+def test_of_two_priors_that_contradict_at_one_keyframe_one_is_not_believed() -> None:
+    survey = Survey(9)
+    reference = survey.priors[0]
+    aside = reference.map_from_body.copy()
+    aside[1, 3] += 5.0
+    twice = [reference, PriorTerm(reference.k, aside, reference.information)]
+    assert [term.is_believed for term in learn_priors(survey.graph, twice)] == [True, False]
 
 
 def test_a_prior_beyond_its_own_covariance_is_no_longer_believed() -> None:
