@@ -40,6 +40,7 @@ from mapserver.survey.stages import Survey
 from mapserver.survey.survey_map import SurveyMap, history_of
 
 PROBES = 40  # of each kind: one wrong or missing frame counts 2.5 %
+_HELD_OUT = 2 * PROBES  # every second one has a say in the landmarks for robots, and only the others can judge these
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,13 +68,17 @@ class JudgedSession(NamedTuple):
     probed: Sequence[ProbedFrame]
     survey: Survey
 
-    def held_out(self, recordings: int) -> list[ProbedFrame]:
-        """Return the share of held-out frames of one of so many recordings."""
-        return [frame for frame in self.probed if frame.is_held_out][::recordings]
-
     def asked(self, recordings: int) -> list[ProbedFrame]:
-        """Return these and both ends."""
-        return [*self.held_out(recordings), *self.probed[:1], *self.probed[-1:]]
+        """Return the frames whose views get landmarks: every second held-out one of one of so many recordings, and both ends."""
+        return [*self._held_out(recordings)[1::2], *self.probed[:1], *self.probed[-1:]]
+
+    def judging(self, recordings: int) -> list[ProbedFrame]:
+        """Return the other held-out frames: the tiles do not depend on them."""
+        asked = {frame.number for frame in self.asked(recordings)}
+        return [frame for frame in self._held_out(recordings)[::2] if frame.number not in asked]
+
+    def _held_out(self, recordings: int) -> list[ProbedFrame]:
+        return [frame for frame in self.probed if frame.is_held_out][::recordings]
 
 
 def probed_frames(
@@ -85,7 +90,7 @@ def probed_frames(
 ) -> list[ProbedFrame]:
     """Return frames of a surveyed recording that did not become keyframes, and both ends, read again. Damaged ones are left out."""
     keyframes = [k.frame_index for k in survey.odometry.keyframes]
-    numbers = held_out_frames(keyframes, survey.map.trajectory_estimated, PROBES)
+    numbers = held_out_frames(keyframes, survey.map.trajectory_estimated, _HELD_OUT)
     ends = spread(np.flatnonzero(survey.map.trajectory_estimated), 2)
     found = _read(recording, selected, sorted({*numbers, *ends}), rectifier, orb)
     return [replace(frame, is_held_out=frame.number not in keyframes) for frame in found]
@@ -205,7 +210,7 @@ def examine_draft(
     held_out = [
         frame.probe(session.trajectory.frame_from_body)
         for session in sessions
-        for frame in session.held_out(len(sessions))
+        for frame in session.judging(len(sessions))
     ]
     last = [] if before is None else probes_of_map(before.survey, PROBES)
     stored = [decode_tile(encode_tile(tile)) for tile in drafted.tiles]

@@ -30,7 +30,7 @@ class AskedView(NamedTuple):
 
 
 def asked_views(sessions: Sequence[JudgedSession]) -> list[AskedView]:
-    """Return held-out frames of all recordings, as many as the evidence has, and both ends of every recording."""
+    """Return held-out frames of all recordings that judge no draft, and both ends of every recording."""
     found = []
     for session in sessions:
         map_from_body, positions_m = session.trajectory.frame_from_body, session.trajectory.positions_m

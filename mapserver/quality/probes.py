@@ -74,7 +74,7 @@ def most_similar_beyond(view: MapView, probe: Probe, radius_m: float) -> Array |
 
 
 def held_out_frames(keyframes: Sequence[int], measured: NDArray[np.bool_], count: int) -> list[int]:
-    """Return up to `count` numbers, evenly spread, of measured frames (F,) that are not keyframes: none of their data is in the map.
+    """Return up to `count` numbers, evenly spread, of measured frames (F,) that are not keyframes: the survey used none of their images.
 
     Odometry tracked them, so their position between two keyframes is known to millimetres; excluding whole stretches would
     leave gaps in the map. Empty if every frame is a keyframe.

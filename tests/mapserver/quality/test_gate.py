@@ -183,12 +183,20 @@ def beside_itself(archive: SurveyMap, tiles: list[Tile]) -> Evidence:
     return examine_draft(DraftMap(tiles, done.vocabulary, done.map.camera), before, [session], [])
 
 
+def test_frames_that_choose_landmarks_do_not_judge_the_draft() -> None:
+    done, own = sound()
+    session = JudgedSession(done.map.trajectory, own, done)
+    _, evidence = verdict(done.map)
+    assert evidence.held_out is not None
+    assert evidence.held_out.draft.frames + len(asked_views([session])) == len(own)
+    assert {f.number for f in session.asked(1)}.isdisjoint(f.number for f in session.judging(1))
+
+
 def test_a_view_without_a_fix_gets_the_landmarks_that_it_matches_and_is_named_if_there_are_none() -> None:
     """Robots have the first wall already and the budget is full: seen at the ends of drives, whose last view got too little."""
     done, own = sound()
     session, survey_map = JudgedSession(done.map.trajectory, own, done), done.map
     views = asked_views([session])
-    assert len(views) == len(own)
     is_old = at_first_wall(survey_map.points_map)
     full = BudgetSettings(landmarks_per_m=0.0, min_landmarks=int(is_old.sum()))
     chooser = TileChooser(survey_map, full, survey_map.landmark_ids[is_old], WORDS)
