@@ -14,7 +14,7 @@ from fleetmap.geometry import Array
 from fleetmap.relocalization.frame_features import FrameFeatures, with_depth
 from fleetmap.relocalization.landmark_visibility import places_around
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, MapView
-from fleetmap.relocalization.relocalizer import Fix, Relocalizer, is_reliable
+from fleetmap.relocalization.relocalizer import SAME_PLACE_M, Fix, Relocalizer, is_reliable
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.time_sliced import finished
@@ -111,8 +111,6 @@ def probes_of_map(survey_map: SurveyMap, count: int) -> list[Probe]:
 
 
 _NAMED = 3
-_FIX_M = 0.5  # errors of fixes, and duplicates of one
-_ENOUGH_FRAMES = 19  # another place with an alias that none of so many shows has a probability of at most 5 % (see `starts_without_prior`)
 
 
 def starts_without_prior(view: MapView, probes: Sequence[Probe]) -> Starts | None:
@@ -141,27 +139,29 @@ def starts_without_prior(view: MapView, probes: Sequence[Probe]) -> Starts | Non
 def repetition(view: MapView, probes: Sequence[Probe]) -> Repetition | None:
     """Measure the smallest distance at which a map looks like itself, as a robot without a prior would see it; None without probes.
 
-    Every place that robots accept for a probe's image, beyond the errors of fixes, is an alias of its place; the search finds those at
-    least 1.2 m away. Source: Ballard 1981 (the generalised Hough transform of `find_aliases`), each alias verified by its fix.
+    Every place that robots accept for a probe's image, further away than the search takes for the same place, is an alias of its place;
+    nearer ones are errors of fixes.
+    Source: Ballard 1981 (the generalised Hough transform of `find_aliases`), each alias verified by its fix.
     """
     steps_m = []
     for probe in probes:
         for fix in finished(Relocalizer(view, probe.camera, _ROBOTS).anywhere(probe.features)):
             step_m = float(np.linalg.norm(fix.map_from_cam[:3, 3] - probe.map_from_cam[:3, 3]))
-            if step_m > _FIX_M and is_reliable(fix, _ROBOTS.fix):
+            if step_m > SAME_PLACE_M and is_reliable(fix, _ROBOTS.fix):
                 steps_m.append(round(step_m, 3))
     return Repetition(len(probes), min(steps_m, default=None)) if probes else None
 
 
 def alias_step_m(found: Repetition | None, known_m: float | None) -> float | None:
-    """Return the step for robots: the smaller one of a measured and a known one; None if it is unknown, or there is none.
+    """Return the step for robots: the smaller one of a measured and a known one; None if there is neither.
 
-    Too few frames prove a small step, and never that there is no smaller one than ALIAS_STEP_M.
+    At least SAME_PLACE_M: nearer ones are not aliases. At most ALIAS_STEP_M: frames prove a step, and never that there is no smaller
+    one at the places that none of them shows.
     """
     steps_m = [] if known_m is None else [known_m]
     if found is not None and found.step_m is not None:
-        steps_m.append(found.step_m if found.frames >= _ENOUGH_FRAMES else min(found.step_m, ALIAS_STEP_M))
-    return min(steps_m, default=None)
+        steps_m.append(found.step_m)
+    return max(SAME_PLACE_M, min(ALIAS_STEP_M, *steps_m)) if steps_m else None
 
 
 def lookalike_words(starts: Starts | None) -> str:

@@ -21,7 +21,7 @@ from fleetmap.time_sliced import TimeSliced
 
 _RANKED = 8  # ratio of ranked to tried places
 _TRIALS_AT_A_PLACE = 2
-_SAME_PLACE_M, _SAME_PLACE_COSINE = 1.2, 0.8  # less than half a bay: no look-alike place is so near
+SAME_PLACE_M, _SAME_PLACE_COSINE = 1.2, 0.8  # less than half a bay: no look-alike place is so near
 _MIN_RANSAC_SHARE = 0.15
 
 
@@ -195,7 +195,7 @@ class Relocalizer:
         if not failed:
             return self.view.similar_places(query.features.descriptors, allowed, top)
         map_from_cam = self.view.map_from_cam
-        around = [places_around(map_from_cam, place, _SAME_PLACE_M, _SAME_PLACE_COSINE) for place in failed]
+        around = [places_around(map_from_cam, place, SAME_PLACE_M, _SAME_PLACE_COSINE) for place in failed]
         is_tried = np.any([(map_from_cam == place).all(axis=(1, 2)) for place in failed], axis=0)
         is_open = ~is_tried & (np.sum(around, axis=0) < _TRIALS_AT_A_PLACE)
         places = self.view.similar_places(
@@ -319,7 +319,7 @@ def _count_at(places: Sequence[Array], map_from_cam: Array) -> int:
     """Number of places with mostly the same neighbourhood as a camera."""
     if not places:
         return 0
-    return int(places_around(np.stack(places), map_from_cam, _SAME_PLACE_M, _SAME_PLACE_COSINE).sum())
+    return int(places_around(np.stack(places), map_from_cam, SAME_PLACE_M, _SAME_PLACE_COSINE).sum())
 
 
 def _is_new(fix: Fix, others: Sequence[Fix]) -> bool:

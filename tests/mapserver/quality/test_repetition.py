@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from fleetmap.relocalization.map_view import ALIAS_STEP_M
+from fleetmap.relocalization.relocalizer import SAME_PLACE_M
 from mapserver.quality.figures import Repetition
 from mapserver.quality.probes import Probe, alias_step_m, repetition
 from support.worlds.aisle_world import BODY_FROM_CAM, CAMERA, Aisle, aisle, drive, frame, relocalizer
@@ -39,6 +40,14 @@ def test_racks_repeat_at_their_bays(bay_m: float) -> None:
     assert found.step_m == pytest.approx(bay_m, rel=0.1)
 
 
+def test_a_fix_that_is_off_by_less_than_an_alias_is_no_alias() -> None:
+    rng, places, seen = np.random.default_rng(3), drive(50), aisle(1)
+    view = relocalizer(seen, places)[0].view
+    aside = places[20] @ BODY_FROM_CAM
+    aside[0, 3] += 0.6
+    assert repetition(view, [Probe(CAMERA, frame(seen, places[20], rng), aside)]) == Repetition(1, None)
+
+
 def test_an_aisle_whose_places_differ_repeats_nothing() -> None:
     assert measured(aisle(1)) == Repetition(20, None)
 
@@ -46,12 +55,12 @@ def test_an_aisle_whose_places_differ_repeats_nothing() -> None:
 @pytest.mark.parametrize(
     ("found", "known_m", "step_m"),
     [
-        (Repetition(40, 5.0), None, 5.0),
-        (Repetition(40, 5.0), 2.7, 2.7),  # of the version before, by drives through other aisles
-        (Repetition(40, None), 2.7, 2.7),
+        (Repetition(40, 1.8), None, 1.8),
+        (Repetition(40, 5.0), None, ALIAS_STEP_M),  # others may be nearer, where no frame looks
+        (Repetition(40, 5.0), 1.8, 1.8),  # of the version before, by drives through other aisles
+        (Repetition(40, None), 1.8, 1.8),
         (Repetition(40, None), None, None),
-        (Repetition(18, 5.0), None, ALIAS_STEP_M),  # others may be nearer
-        (Repetition(18, 1.8), None, 1.8),
+        (Repetition(40, None), 0.55, SAME_PLACE_M),  # no alias, but an error of a fix
         (None, None, None),
     ],
 )
