@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
+from fleetmap.errors import FleetmapError
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.data import EVER, MapData
 from mapserver.dashboard.map_layers import Layer, Outline, Picture, box_of, heat, squares
@@ -133,6 +134,8 @@ def _card(
     by = f" by {event.actor or 'the server'}" if event else ""
     runs = robots.count(version)
     is_old = rows.current is not None and version < rows.current.version and not on_trial
+    # A difference decodes the tiles of both versions: not for every draft of the list.
+    gets = _gets(maps, rows, version) if version in (shown, max(rows.versions)) else ""
     return {
         "version": version,
         "tone": tone,
@@ -142,14 +145,17 @@ def _card(
         "stamp_ns": stamp_ns,
         "why": event.reason if event else "",
         "robots": f"{runs} of {len(robots)} robots" if runs else "",
-        "acts": [] if is_old and version != shown else list(_acts(maps, rows, info, verdict, len(robots))),
+        "acts": [] if is_old and version != shown else list(_acts(maps, rows, info, verdict, len(robots), gets)),
     }
 
 
 def _acts(
-    maps: MapData, rows: SiteReleases, info: VersionInfo, verdict: VerdictRow | None, robots: int
+    maps: MapData, rows: SiteReleases, info: VersionInfo, verdict: VerdictRow | None, robots: int, gets: str
 ) -> Iterator[tuple[object, ...]]:
-    """What can be done to a version, as the macro `act` takes it: give it to all robots, to some of them first, or take it back."""
+    """What can be done to a version, as the macro `act` takes it: give it to all robots, to some of them first, or take it back.
+
+    gets: what it changes for them.
+    """
     site, version, trial, before = info.site, info.version, rows.canary, rows.rollback_target
     current = None if rows.current is None else rows.current.version
     to, back = f"sites/{site}/versions/{version}", f"sites/{site}/rollback"
@@ -164,9 +170,6 @@ def _acts(
             yield f"Roll back to version {before}", back, told, {"to": before}, "back", True
         return
     through = f"Draft {version} goes through the gate. If the gate accepts it, " if info.state == "draft" else ""
-    gets = ""
-    if current is not None:
-        gets = f" {_gets(maps.difference(site, current, version), maps.store.manifest(site, version).tile_size_m)}"
     if info.state == "draft":
         told = f"{_begun(f'{through}{everybody}')} get it.{gets}"
         yield f"Publish draft {version}", f"{to}/publish", told, {}, "forward", False
@@ -204,16 +207,23 @@ def _aligned(found: Alignment | None) -> str:
     return f"The map is aligned {plan}by {len(found.off_m)} points{left}."
 
 
-def _gets(found: Difference, tile_size_m: float) -> str:
-    """What a version changes for robots that have another one, in a sentence."""
+def _gets(maps: MapData, rows: SiteReleases, version: int) -> str:
+    """What a version changes for robots that have the current one, in a sentence that follows another; empty if it changes none."""
+    if rows.current is None or rows.current.version == version:
+        return ""
+    try:
+        found = maps.difference(rows.site, rows.current.version, version)
+        tile_size_m = maps.store.manifest(rows.site, version).tile_size_m
+    except FleetmapError as error:  # a lost tile must not take the other versions' acts with it
+        return f" What it changes is not known: {error}."
     tiles = found.tiles_added + found.tiles_changed + found.tiles_removed
     if not tiles:
-        return "The map is the same."
+        return " The map is the same."
     of_tiles = f"{tiles} tiles of {tiles + found.tiles_kept}, {tiles * tile_size_m**2:.0f} m²"
     landmarks = (
         f"{found.landmarks_added} new and {found.landmarks_removed} removed landmarks, {found.landmarks_moved} moved"
     )
-    return f"It changes {of_tiles}: {landmarks}. Each robot downloads {size(found.fetch_bytes)}."
+    return f" It changes {of_tiles}: {landmarks}. Each robot downloads {size(found.fetch_bytes)}."
 
 
 def verdict_words(verdict: VerdictRow | None, is_draft: bool) -> tuple[str, str]:
@@ -300,10 +310,14 @@ def _changes(maps: MapData, context: PageContext, rows: SiteReleases, before: in
     if before is None:
         earlier = max((version for version in rows.versions if version < after), default=after)
         before = current.version if current and current.version != after else rows.rollback_target or earlier
-    found, tiles = maps.difference(site, before, after), maps.changed_tiles(site, before, after)
+    tiles, swipe = maps.changed_tiles(site, before, after), None
     lacks = filter(None, (maps.lacks_surfels(site, version) for version in (before, after)))
-    swipe = None if before == after else _swipe(maps, context, before, after)
-    facts, lack = _changed(found), next(lacks, "")
+    lack = next(lacks, "")
+    try:
+        facts = _changed(maps.difference(site, before, after))
+        swipe = None if before == after else _swipe(maps, context, before, after)
+    except FleetmapError as error:
+        facts = [("Not known", str(error))]
     return {"before": before, "after": after, "tiles": tiles, "lack": lack, "facts": facts, "swipe": swipe}
 
 

@@ -2,6 +2,7 @@
 
 import re
 from datetime import datetime, timedelta
+from pathlib import Path
 from urllib.parse import urlsplit
 from zoneinfo import ZoneInfo
 
@@ -10,6 +11,7 @@ import pytest
 from playwright.sync_api import Locator, Page, expect
 
 from fleetmap.bus import Bus
+from fleetmap.mapformat import blob_path
 from fleetmap.messages import FailureAck, decode_message, encode_message, robot_key
 from mapserver.store import MapStore
 from support.fleet.dashboard_scene import (
@@ -17,10 +19,12 @@ from support.fleet.dashboard_scene import (
     SITE,
     Served,
     failure,
+    fill_store,
     marks,
     opened,
     overlapping,
     place_of,
+    serving,
     talking,
     wait_until,
 )
@@ -290,6 +294,18 @@ def test_wrong_addresses_are_answered_in_words(served: Served) -> None:
         assert 'href="/dashboard/?site=nowhere"' not in text, "a way back"
     for path in ("plans/hall/99.png", "underlays/hall/2/floor.png", "underlays/hall/99/grid.png"):
         assert httpx.get(f"{served.http}/dashboard/{path}").status_code == 404
+
+
+@pytest.mark.parametrize("version", [1, 3])
+def test_a_lost_tile_of_another_version_leaves_the_page_with_its_roll_back(tmp_path: Path, version: int) -> None:
+    fill_store(tmp_path)
+    with MapStore.open(tmp_path) as store:
+        (store.folder / blob_path(store.manifest(SITE, version).tiles[-1].sha256)).unlink()
+    with serving(tmp_path) as served:
+        answer = httpx.get(f"{served.http}/dashboard/map", timeout=60)
+    assert answer.status_code == 200
+    assert "Roll back to version 1" in answer.text
+    assert "Publish draft 3" in answer.text
 
 
 def test_another_site_is_chosen_on_pages_that_are_of_one(served: Served) -> None:
