@@ -8,6 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.bow import Vocabulary
+from fleetmap.failure_definition import is_wrong
+from fleetmap.geometry import rotation_angle_rad, se3_inverse
 from fleetmap.mapformat import Tile, decode_tile, encode_tile
 from fleetmap.relocalization.landmark_visibility import places_around
 from fleetmap.relocalization.map_view import MapView
@@ -52,18 +54,22 @@ class TileChooser(NamedTuple):
         """Return the tiles, and which views give no fix in them.
 
         The budget is chosen for what keyframes observed. A view between them or beyond the last one may match few of those
-        landmarks: those that it matches among all landmarks then count as its observations, and the budget is chosen again.
+        landmarks: those that it matches among all landmarks then count as its observations, and the budget is chosen again. What one view
+        gets others lose: the second choice is taken if fewer views are without a fix in it, or as many and fewer are weak.
         """
         tiles = self._tiles(())
         fixes = self._fixes(tiles, views)
         weak = [view for view, fix in zip(views, fixes, strict=True) if fix is None or not _is_sure(fix)]
         sightings = [found for view in weak if (found := self._sighting(view.probe)) is not None]
+        given_more = 0
         if sightings:
-            tiles = self._tiles(sightings)
-            fixes = self._fixes(tiles, views)
+            again = self._tiles(sightings)
+            fixes_again = self._fixes(again, views)
+            if _lacking(fixes_again) < _lacking(fixes):
+                tiles, fixes, given_more = again, fixes_again, len(sightings)
         missed = [view for view, fix in zip(views, fixes, strict=True) if fix is None]
         places = [BlindView(_xy(view), round(view.path_m, 1)) for view in missed]
-        return tiles, SurveyedViews(len(views), len(sightings), places)
+        return tiles, SurveyedViews(len(views), given_more, places)
 
     def _tiles(self, sightings: Sequence[Sighting]) -> list[Tile]:
         chosen = choose_landmarks(self.survey_map, self.settings, TILE_SIZE_M, self.published, sightings)
@@ -78,7 +84,7 @@ class TileChooser(NamedTuple):
         return [relocalized(view, each.probe, each.probe.map_from_cam) for each in views]
 
     def _sighting(self, probe: Probe) -> Sighting | None:
-        """Return the matches of a probe among all landmarks that were observed around it; None without a fix."""
+        """Return the matches of a probe among all landmarks that were observed around it; None without a fix at its place."""
         survey = self.survey_map
         map_from_cam = survey.map_from_body @ survey.body_from_cam
         near = places_around(map_from_cam, probe.map_from_cam, PRIOR_RADIUS_M, SAME_WAY_COSINE)
@@ -88,10 +94,18 @@ class TileChooser(NamedTuple):
         fix = relocalized(view, probe, probe.map_from_cam)
         if fix is None or fix.matches is None:
             return None
+        off = se3_inverse(probe.map_from_cam) @ fix.map_from_cam
+        if is_wrong(float(np.linalg.norm(off[:3, 3])), rotation_angle_rad(off[:3, :3])):
+            return None
         features, rows = fix.matches.T
         order = np.argsort(survey.landmark_ids, kind="stable")
         landmarks = order[np.searchsorted(survey.landmark_ids, view.landmark_ids[rows], sorter=order)]
         return Sighting(fix.map_from_cam, landmarks, probe.features.pixels[features])
+
+
+def _lacking(fixes: Sequence[Fix | None]) -> tuple[int, int]:
+    """Return the numbers of views without a fix, and of those without a sure one."""
+    return fixes.count(None), sum(fix is None or not _is_sure(fix) for fix in fixes)
 
 
 def _is_sure(fix: Fix) -> bool:

@@ -217,6 +217,31 @@ def test_a_view_without_a_fix_gets_the_landmarks_that_it_matches_and_is_named_if
     assert "m into its recording" in said.report["warnings"][0]
 
 
+def test_a_second_choice_that_loses_more_views_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    done, own = sound()
+    views = asked_views([JudgedSession(done.map.trajectory, own, done)])
+    chooser = TileChooser(done.map, BudgetSettings(), None, WORDS)
+    fixes = chooser._fixes(chooser._tiles(()), views)
+    assert None not in fixes
+    one, two = [None, *fixes[1:]], [*fixes[:-2], None, None]
+    for before, after, takes in ((one, two, False), (two, one, True)):
+        answers = iter((before, after))
+        monkeypatch.setattr(TileChooser, "_fixes", lambda *_, answers=answers: next(answers))
+        found = chooser.choose(views)[1]
+        assert (found.given_more > 0, len(found.without_fix)) == (takes, 1)
+
+
+def test_a_view_that_is_found_elsewhere_gets_no_landmarks() -> None:
+    """A metre aside, within the radius of the prior."""
+    done, own = sound()
+    view = asked_views([JudgedSession(done.map.trajectory, own, done)])[0]
+    elsewhere = view.probe.map_from_cam.copy()
+    elsewhere[:3, 3] += np.cross(facing(), [0, 0, 1.0])
+    chooser = TileChooser(done.map, BudgetSettings(), None, WORDS)
+    assert chooser._sighting(view.probe) is not None
+    assert chooser._sighting(replace(view.probe, map_from_cam=elsewhere)) is None
+
+
 def test_nights_that_changed_little_do_not_hold_the_next_one() -> None:
     """Seen: after eight nights most keyframes of a version had observed a handful of new landmarks, and no night passed any more."""
     evidence = beside_itself(nights_after(sound()[0].map, 8), tiles_from_survey(sound()[0].map))
