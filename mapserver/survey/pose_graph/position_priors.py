@@ -40,7 +40,8 @@ def placed_by_priors(
     """Return keyframes (K, 4, 4) in `map`, and a term for each visit of a device, the reference first; no terms without a usable prior.
 
     priors: in order of time. The reference is the visit with a heading with which most others agree within the covariances of
-    `marginals`; among equals the first. Positions alone suffice if there are two. A prior without heading takes that of the survey.
+    `marginals`; among equals the first. Positions alone suffice if they are far enough apart for a heading. A prior without heading
+    takes that of the survey.
     """
     usable = _usable(priors, odometry)
     terms = _terms(usable, base_from_body, odometry, survey_from_body)
@@ -56,10 +57,11 @@ def placed_by_priors(
             reference.map_from_body @ se3_inverse(survey_from_body[reference.k]), reference.map_from_body
         )
     elif len(terms) > 1:
-        there, here = np.array([(t.map_from_body[:3, 3], survey_from_body[t.k, :3, 3]) for t in terms]).transpose(
-            1, 0, 2
-        )
+        there = np.array([term.map_from_body[:3, 3] for term in terms])
+        here = survey_from_body[[term.k for term in terms], :3, 3]
         map_from_survey = level_fit(there, here)
+        if not _gives_heading(terms, here @ map_from_survey[:3, :3].T):
+            return survey_from_body, []
     else:
         return survey_from_body, []
     map_from_body = map_from_survey @ survey_from_body
@@ -200,6 +202,19 @@ def _one_a_visit(priors: Sequence[PositionPrior], terms: Sequence[PriorTerm], ma
 
 def _has_heading(term: PriorTerm) -> bool:
     return float(_covariance(term)[2, 2]) <= _HEADING_KNOWN_RAD**2
+
+
+def _gives_heading(terms: Sequence[PriorTerm], places: Array) -> bool:
+    """Return True if the positions' own covariances give the yaw of `level_fit` as well as a prior with a heading.
+
+    places (N, 3) by the fit. To first order the error of the yaw is the mean of the positions' errors across their arms, weighted by
+    the arms.
+    """
+    arms = (places - places.mean(axis=0))[:, :2]
+    across = np.column_stack([-arms[:, 1], arms[:, 0]])
+    covariances = np.array([_covariance(term)[3:5, 3:5] for term in terms])
+    variance = float(np.einsum("ni,nij,nj->", across, covariances, across))
+    return variance < (_HEADING_KNOWN_RAD * float((arms**2).sum())) ** 2
 
 
 def _covariance(term: PriorTerm) -> Array:

@@ -151,6 +151,20 @@ def test_positions_without_any_heading_give_the_frame_and_no_gate() -> None:
     assert np.linalg.norm((survey.placed - _truth())[:, :2, 3], axis=1).mean() < 3.0
 
 
+def test_positions_too_near_each_other_give_no_heading() -> None:
+    edges, odom_from_body, odometry = _graph(np.random.default_rng(6))
+    alone = GraphMarginals(odom_from_body, edges)
+    variances = np.square([0.0, 0.0, np.inf, 1.0, 1.0, 0.02])
+    for last, count in ((4, 0), (40, 2)):  # metres apart: sigmas of the yaw of 0.35 and 0.035 rad
+        zones = [
+            PositionPrior(k * _PERIOD_NS, _truth()[k] @ se3_inverse(BASE_FROM_BODY), np.diag(variances))
+            for k in (0, last)
+        ]
+        placed, terms = placed_by_priors(odom_from_body, alone, zones, BASE_FROM_BODY, odometry)
+        assert len(terms) == count
+        assert (placed is odom_from_body) is (count == 0)
+
+
 def test_a_block_whose_yaw_drifts_is_held_by_two_docks() -> None:
     """Three degrees at the turn are 3.1 m at the end of the next aisle: odometry's covariance allows it, the docks do not."""
     bent_m = []
