@@ -1,5 +1,6 @@
 """The surfels of a version: as arrays, and as bytes (an index, and one blob for each tile; docs/map_format.md)."""
 
+import logging
 import struct
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -18,6 +19,7 @@ from fleetmap.mapformat.container import pack, unpack
 from fleetmap.mapformat.manifest import Positive, Sha256, TileEntry
 from mapserver.surfels.exposure import FALLOFF
 
+_log = logging.getLogger(__name__)
 EDGE_M, LEVELS = core.SURFEL_EDGE_M, core.SURFEL_LEVELS
 MIN_RANGE_M, MAX_RANGE_M = core.SURFEL_RANGE_M
 TILE_SIZE_M = 16.0  # the size of the map's own tiles
@@ -223,12 +225,21 @@ def _read_index(data: bytes) -> SurfelIndex:
 
 
 def encode_tile(place: tuple[int, int], surfels: Surfels) -> SurfelTile:
-    """Return the bytes of the surfels of a tile; they do not depend on the order of the surfels."""
+    """Return the bytes of the surfels of a tile; they do not depend on the order of the surfels.
+
+    Two bytes of height span 65.5 m, from the lowest surfel or from 32.8 m under the median, whichever is higher. Surfels outside, whose
+    depths are wrong, are left out.
+    """
+    height = np.round(surfels.points_map[:, 2].astype(np.float64) / _HEIGHT_M).astype(np.int64)
+    lowest = max(int(height.min()), int(np.median(height)) - 32768)
+    is_within = (height >= lowest) & (height <= lowest + 65535)
+    if not is_within.all():
+        count = int((~is_within).sum())
+        _log.warning("surfel tile %d, %d: %d surfels outside 65.5 m of height are left out", *place, count)
+        surfels, height = surfels[is_within], height[is_within]
     corner = np.array(place) * TILE_SIZE_M
     flat = np.clip((surfels.points_map[:, :2] - corner) / _FLAT_M, 0, 65535)
-    height = np.round(surfels.points_map[:, 2].astype(np.float64) / _HEIGHT_M).astype(np.int64)
-    lowest = int(height.min())
-    position = np.column_stack([flat, np.minimum(height - lowest, 65535)]).astype(np.uint16)
+    position = np.column_stack([flat, height - lowest]).astype(np.uint16)
     columns: list[AnyArray] = [position, _octahedron(surfels.normals), surfels.levels[:, None], surfels.greys[:, None]]
     # Sorted by place in centimetres and then all values: the bytes do not depend on the order.
     near = [position[:, axis] // step for axis, step in ((0, 256), (1, 256), (2, 64), (0, 32), (1, 32), (2, 8))]

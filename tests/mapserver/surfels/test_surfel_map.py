@@ -53,6 +53,18 @@ def test_a_version_keeps_them_and_gives_those_that_are_near(tmp_path: Path) -> N
     assert (np.abs(near.points_map[:, :2] - 1.0) <= TILE_SIZE_M + 2.0).all()
 
 
+def test_surfels_far_above_or_below_their_tile_are_left_out(tmp_path: Path) -> None:
+    surfels = scattered()
+    stray = surfels[np.array([0, 1])]
+    stray.points_map[:, 2] += [70.0, -70.0]
+    with MapStore.open(tmp_path, create=True) as store:
+        manifest = store.manifest("lab", save_surfel_draft(store, Surfels.joined([surfels, stray])))
+        found = surfels_of(manifest, store.blob)
+    assert len(found) == len(surfels)
+    assert found.points_map[:, 2].min() == pytest.approx(surfels.points_map[:, 2].min(), abs=1e-3)
+    assert found.points_map[:, 2].max() == pytest.approx(surfels.points_map[:, 2].max(), abs=1e-3)
+
+
 def test_they_travel_with_the_archive_and_go_with_their_version(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "a", create=True) as store, MapStore.open(tmp_path / "b", create=True) as other:
         for level in range(4):
