@@ -112,6 +112,7 @@ def paths_of(client: TestClient) -> list[tuple[str, str]]:
         "job": "1",
         "robot": "r1",
         "operator": "olga",
+        "token": "00000000",
         "asked": "00000000",
         "box": "held",
         "name": "monday.mcap",
