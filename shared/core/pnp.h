@@ -37,9 +37,7 @@ struct ChosenSightings {
     cameras_from_first = from.cameras_from_first;
   }
   void clear() { points.clear(), pixels.clear(), weights.clear(), cameras.clear(); }
-  Sightings all() const {
-    return {points.data(), pixels.data(), weights.data(), points.size() / 3, cameras.data(), cameras_from_first};
-  }
+  Sightings all() const { return {points.data(), pixels.data(), weights.data(), points.size() / 3, cameras.data(), cameras_from_first}; }
 };
 
 // The redescending weight of Geman and McClure has this width, in sigmas: gross outliers have no weight. Inliers are those whose squared

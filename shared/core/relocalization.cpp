@@ -50,8 +50,8 @@ void measure(const QueryFrame::Unmeasured& unmeasured, const Matched& matched, s
   }
 }
 
-// Sigmas of a pixel and of its disparity, by its octave, by the motion between frames and by the landmark's own uncertainty. That lies along
-// the direction from which the landmark was mapped: seen from there it hardly shows, from aside it does.
+// Sigmas of a pixel and of its disparity, by its octave, by the motion between frames and by the landmark's own uncertainty. That lies
+// along the direction from which the landmark was mapped: seen from there it hardly shows, from aside it does.
 void add_sigmas(const MapLandmarks& map, size_t row, int8_t octave, const StereoLens& lens, const FixLimits& limits, Vec3 place,
                 const QueryFrame& frame, double doubt, std::vector<double>& sigmas) {
   const double base = limits.feature_sigma_px * std::pow(limits.octave_scale, std::min(double(octave), kCoarsestOctave));

@@ -127,7 +127,8 @@ class FixFinder {
     return frame;
   }
 
-  static std::tuple<Reals2, Reals2, int, size_t, Rows, Rows, Flags, std::tuple<Reals2, Reals2, Reals2>, Rows, Flags, bool> as_python(MapFix&& fix) {
+  static std::tuple<Reals2, Reals2, int, size_t, Rows, Rows, Flags, std::tuple<Reals2, Reals2, Reals2>, Rows, Flags, bool> as_python(
+      MapFix&& fix) {
     std::vector<double> place(16);
     store(fix.map_from_cam, place.data());
     const size_t matched = fix.rows.size();
