@@ -79,9 +79,11 @@ class ListRepository:
         if not all(keyid in roles[name].keyids for name in ("root", "targets")):
             raise StateError(f"key {keyid[:8]} is not the root key of {self.lists.folder}; name its file by --key")
 
-    def replace_online(self, root_key: Signer) -> None:
-        """Replace the key of snapshot and timestamp; robots then discard the numbers of the old one."""
-        self._change_root(_ONLINE, self.keys.replace("online").public_key, [root_key])
+    def replace_online(self, root_key: Signer, roots: int = 1) -> None:
+        """Replace the key of snapshot and timestamp; robots then discard the numbers of the old one. roots: how many to write for it."""
+        key = self.keys.replace("online").public_key
+        for _ in range(roots):
+            self._change_root(_ONLINE, key, [root_key])
 
     def replace_root(self, root_key: Signer, new: Signer) -> None:
         """Write the next root and targets, signed by `new` in place of `root_key`, or extended with the same key."""

@@ -67,12 +67,12 @@ def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
         raise faults[0]
 
 
-def sign_ahead(store: MapStore, ahead: int) -> Literal["new", "ahead", "old"]:
+def sign_ahead(store: MapStore, ahead: int, roots: int) -> Literal["new", "ahead", "old"]:
     """Sign the lists of a restored store under numbers this far ahead, beyond those that robots may know from the lost one.
 
-    With the root key at hand there are new online keys as well, after which robots forget what they knew of sites and keys: "new". There
-    are two, as the lost store may have made one after the backup, whose root has the number of the first. "ahead" without the root key;
-    "old": nothing is signed, as another key is elsewhere. Errors as of `update_lists`.
+    With the root key at hand there is a new online key as well, after which robots forget what they knew of sites and keys: "new". It comes
+    with so many roots, as the lost store may have made some after the backup. "ahead" without the root key; "old": nothing is signed, as
+    another key is elsewhere. Errors as of `update_lists`.
     """
     with _held(store) as repository:
         keys, root_key = repository.keys, repository.keys.signer("root")
@@ -81,8 +81,7 @@ def sign_ahead(store: MapStore, ahead: int) -> Literal["new", "ahead", "old"]:
         repository.ahead = ahead
         if root_key is not None:
             repository.check_root_key(root_key)
-            repository.replace_online(root_key)
-            repository.replace_online(root_key)
+            repository.replace_online(root_key, roots)
             repository.renew_targets(root_key)
         for info in store.sites():
             if site_role(info.site) in repository.lists.site_roles():
