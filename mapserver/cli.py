@@ -9,7 +9,7 @@ from fleetmap.cli_exit import require_extra, run_cli
 from fleetmap.cli_options import Commands, ConfigFile, Options, Version, make_app
 from mapserver.commands.align import align
 from mapserver.commands.areas import AREAS_GROUP
-from mapserver.commands.backup import backup, backups, restore
+from mapserver.commands.backup import attach, backup, backups, restore
 from mapserver.commands.build import build
 from mapserver.commands.calibrate import calibrate
 from mapserver.commands.convert import convert
@@ -43,6 +43,7 @@ COMMANDS: Commands = {
     "serve": serve,
     "verify": verify,
     "gc": gc,
+    "attach": attach,
     "backup": backup,
     "backups": backups,
     "restore": restore,

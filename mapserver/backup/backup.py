@@ -116,14 +116,13 @@ class _Upload:
         found, missing = dict[str, int](), set[str]()
         for number, address in enumerate(sorted(addresses), start=1):
             progress(number, len(addresses))
-            path = store.blob_file(address)
-            size = None if path is None else path.stat().st_size
+            size = store.blob_size(address)
             if address in self.sizes and size in (None, self.sizes[address]):
                 found[address] = self.sizes[address]
-            elif path is None or size is None or not store.is_whole(address):
+            elif size is None or not store.is_whole(address):
                 missing.add(address)
             else:
-                self._target.put(path, address)
+                self._target.put(store.blob_chunks(address), address)
                 self.count, self.bytes = self.count + 1, self.bytes + size
                 found[address] = self.sizes[address] = size
         return found, missing

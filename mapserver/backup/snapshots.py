@@ -11,20 +11,20 @@ credentials and the endpoint of the environment (AWS_ACCESS_KEY_ID, AWS_ENDPOINT
 import hashlib
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Literal
 
 import msgspec
 import obstore
-from obstore.exceptions import BaseError
-from obstore.store import LocalStore, ObjectStore, from_url
+from obstore.store import LocalStore, ObjectStore
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, MapFormatError, NewerFormatError, StoreError, UsageError
 from fleetmap.files import sync_path
 from fleetmap.mapformat import check_sha256, sha256_hex
+from mapserver.store.object_store import object_errors, open_objects
 
 FORMAT = 1
 PIECE_BYTES = 4 << 20
@@ -70,15 +70,15 @@ class BackupTarget:
                     raise UsageError(f"{where} holds no backups; `mapserver backup {where} --store DIR` makes one")
                 self._store: ObjectStore = LocalStore(self._folder, mkdir=True)
             else:
-                self._store = from_url(where, client_options={"allow_http": True})
+                self._store = open_objects(where)
 
     def objects(self) -> dict[str, int]:
         """Return the sizes of all objects by address."""
         with self._errors():
             return {name: size for name, size, _ in self._listed(_OBJECTS)}
 
-    def put(self, content: bytes | Path, address: str | None = None) -> None:
-        """Upload bytes, or a file in pieces, to their address."""
+    def put(self, content: bytes | Iterator[bytes], address: str | None = None) -> None:
+        """Upload bytes, at once or in pieces, to their address."""
         name = sha256_hex(content) if isinstance(content, bytes) else address
         assert name is not None
         self._put(_path(name), content)
@@ -167,7 +167,9 @@ class BackupTarget:
             for meta in batch:
                 yield meta["path"].rpartition("/")[2].removesuffix(".json"), meta["size"], meta["last_modified"]
 
-    def _put(self, path: str, content: bytes | Path, *, mode: Literal["create", "overwrite"] = "overwrite") -> None:
+    def _put(
+        self, path: str, content: bytes | Iterator[bytes], *, mode: Literal["create", "overwrite"] = "overwrite"
+    ) -> None:
         """Write an object durably: an object store answers once it is, files and their folders are synced."""
         with self._errors():
             obstore.put(self._store, path, content, mode=mode)
@@ -176,13 +178,8 @@ class BackupTarget:
                 for synced in (file, file.parent, file.parent.parent):
                     sync_path(synced)
 
-    @contextmanager
-    def _errors(self) -> Iterator[None]:
-        try:
-            yield
-        except (BaseError, OSError, ValueError) as error:
-            reason = str(error).split("\n\nDebug source", 1)[0].replace("\n", " ")
-            raise StoreError(f"{self.where}: {reason}; check the URL, its rights, and the credentials") from error
+    def _errors(self) -> AbstractContextManager[None]:
+        return object_errors(self.where)
 
 
 def _path(address: str) -> str:

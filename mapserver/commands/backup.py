@@ -1,4 +1,4 @@
-"""`mapserver backup`, `restore` and `backups`: copies of a store in a folder or an object store."""
+"""`mapserver backup`, `restore` and `backups`: copies of a store in a folder or an object store; `attach`: its content there."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -119,6 +119,20 @@ def backups(
         typer.echo(f"{len(found.faults)} faults" if found.faults else "clean")
     if found.faults:
         raise typer.Exit(EXIT_STATUS_FAULTS)
+
+
+@expand_options
+def attach(
+    *,
+    store: StoreFolder,
+    content: Annotated[str, typer.Option(metavar="URL", help="Object store for tiles, archives and pictures.")],
+) -> None:
+    """Copy the content of a store into an object store, and use it from there; stop the server and the nights first."""
+    with open_store(store) as maps, _progress("blobs") as progress:
+        copied = maps.move_content(content, progress)
+    typer.echo(
+        f"the content of {store} is at {content}, {copied} bytes were copied; its folder blobs is not used any more"
+    )
 
 
 @contextmanager

@@ -1,11 +1,13 @@
-"""The folder of content-addressed files."""
+"""Content-addressed bytes: in files of the store's folder, or in an object store."""
 
 import errno
 import hashlib
 import os
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
+from typing import ClassVar
 
 from fleetmap.errors import MapFormatError, StoreError, disk_errors
 from fleetmap.files import TEMPORARY_SUFFIX, sync_path, write_atomically
@@ -15,75 +17,130 @@ from mapserver.store.files import check_no_link, is_plain_file, make_folder, rea
 _FOLDER = "blobs"
 
 
-class BlobFolder:
-    """Bytes by their SHA-256, in files below the store's folder. Symbolic links there are not followed."""
+class Blobs(ABC):
+    """Bytes by their SHA-256. is_folder: True if robots may read them as files beside the store's database."""
 
-    def __init__(self, root: Path) -> None:
-        self._root = root
+    is_folder: ClassVar[bool]
 
     def put(self, data: bytes) -> str:
-        """Store `data` and return its address; it is on the disk when this returns. Raises StoreError on a disk error."""
+        """Store `data` and return its address; it is durable when this returns. Raises StoreError if disk or object store refuse."""
         sha256 = sha256_hex(data)
         self._keep(sha256, len(data), [data])
         return sha256
 
     def put_chunks(self, chunks: Iterable[bytes], sha256: str, size_bytes: int) -> None:
-        """As `put`, for bytes in pieces that must be `size_bytes` with this address.
-
-        Raises MapFormatError for other bytes, StoreError on a disk error.
-        """
+        """As `put`, for bytes in pieces that must be `size_bytes` with this address. Raises MapFormatError for other bytes."""
         self._keep(sha256, size_bytes, _checked(chunks, sha256, size_bytes))
 
     def get(self, sha256: str) -> bytes:
         """Return the bytes of an address; raises StoreError for missing ones, MapFormatError for damaged ones."""
         return verified(b"".join(self.chunks(sha256)), sha256)
 
-    def chunks(self, sha256: str) -> Iterator[bytes]:
-        """Yield the bytes of an address in pieces, unverified; raises StoreError for missing ones."""
-        path = self.path(sha256)
-        with disk_errors(f"{path} cannot be read", "the store is incomplete, restore it"):
-            self._check_plain(path)
-            yield from read_chunks(path)
+    def total_bytes(self) -> int:
+        return sum(self.sizes().values()) + sum(self.leftovers().values())
 
+    @abstractmethod
     def is_whole(self, sha256: str) -> bool:
         """True if the bytes of an address exist and match it; reads them in pieces."""
+
+    @abstractmethod
+    def where(self, sha256: str) -> str:
+        """Return the place of an address, for messages."""
+
+    @abstractmethod
+    def chunks(self, sha256: str) -> Iterator[bytes]:
+        """Yield the bytes of an address in pieces, unverified; raises StoreError for missing ones."""
+
+    @abstractmethod
+    def size(self, sha256: str) -> int | None:
+        """Return the size in bytes of an address, None if missing; raises StoreError behind a symbolic link."""
+
+    @abstractmethod
+    def sizes(self) -> dict[str, int]:
+        """Return the sizes in bytes of all addresses."""
+
+    @abstractmethod
+    def remove(self, sha256: str) -> None:
+        """Remove the bytes of an address; raises StoreError if disk or object store refuse."""
+
+    @abstractmethod
+    def leftovers(self) -> dict[str, int]:
+        """Return names and sizes in bytes of what is not a blob, such as remains of a killed process."""
+
+    @abstractmethod
+    def remove_leftover(self, name: str) -> None: ...
+
+    @abstractmethod
+    def links(self) -> list[str]:
+        """Return symbolic links, which are not followed."""
+
+    def _matches(self, sha256: str) -> bool:
         digest = hashlib.sha256()
-        try:
-            self._check_plain(self.path(sha256))
-            for chunk in read_chunks(self.path(sha256)):
-                digest.update(chunk)
-        except (OSError, StoreError):
-            return False
+        for chunk in self.chunks(sha256):
+            digest.update(chunk)
         return digest.hexdigest() == sha256
 
-    def path(self, sha256: str) -> Path:
+    @abstractmethod
+    def _keep(self, sha256: str, size_bytes: int, chunks: Iterable[bytes]) -> None: ...
+
+
+class BlobFolder(Blobs):
+    """Files below the store's folder. Symbolic links there are not followed."""
+
+    is_folder = True
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+
+    def where(self, sha256: str) -> str:
+        return str(self._path(sha256))
+
+    def chunks(self, sha256: str) -> Iterator[bytes]:
+        path = self._path(sha256)
+        with disk_errors(f"{path} cannot be read", "the store is incomplete, restore it"):
+            check_no_link(self._root, path)
+            if not is_plain_file(path):
+                raise FileNotFoundError(errno.ENOENT, "not a plain file", str(path))
+            yield from read_chunks(path)
+
+    def size(self, sha256: str) -> int | None:
+        path = self._path(sha256)
+        check_no_link(self._root, path)
+        return path.stat().st_size if path.is_file() else None
+
+    def is_whole(self, sha256: str) -> bool:
+        try:
+            return self._matches(sha256)
+        except StoreError:  # a link, or a disk that cannot read it
+            return False
+
+    def sizes(self) -> dict[str, int]:
+        return {path.name: size for path, size in self._files() if _is_address(path)}
+
+    def remove(self, sha256: str) -> None:
+        self._remove(self._path(sha256))
+
+    def leftovers(self) -> dict[str, int]:
+        return dict(sorted((str(path), size) for path, size in self._files() if not _is_address(path)))
+
+    def remove_leftover(self, name: str) -> None:
+        self._remove(Path(name))
+
+    def links(self) -> list[str]:
+        folder = self._root / _FOLDER
+        candidates = [folder] if folder.is_symlink() else [*folder.glob("*"), *self._inner(os.DirEntry.is_symlink)]
+        return sorted(str(path) for path in candidates if path.is_symlink())
+
+    def _path(self, sha256: str) -> Path:
         return self._root / blob_path(sha256)
 
-    def addresses(self) -> set[str]:
-        return {path.name for path in self._files() if _is_address(path)}
-
-    def unreferenced(self) -> list[Path]:
-        """Return files that are not blobs, such as remains of a killed process."""
-        return sorted(path for path in self._files() if not _is_address(path))
-
-    def total_bytes(self) -> int:
-        """Return the size of all files; one that is removed meanwhile counts nothing."""
-        found = 0
-        for path in self._files():
-            with suppress(FileNotFoundError):
-                found += path.stat().st_size
-        return found
-
-    def remove_file(self, path: Path) -> int:
-        """Remove a file and return its size; raises StoreError on a disk error."""
+    def _remove(self, path: Path) -> None:
         with disk_errors(f"{path} cannot be removed", "check the folder's rights"):
             check_no_link(self._root, path.parent)
-            size = path.stat().st_size
             os.unlink(path)  # noqa: PTH108
-        return size
 
     def _keep(self, sha256: str, size_bytes: int, chunks: Iterable[bytes]) -> None:
-        path = self.path(sha256)
+        path = self._path(sha256)
         with disk_errors(f"{path} cannot be written", "check the disk's space and rights"):
             check_no_link(self._root, path.parent)
             # A file of that name may be damaged; reading it costs less than writing it.
@@ -96,13 +153,11 @@ class BlobFolder:
             if chunks:
                 write_atomically(path, chunks)
 
-    def links(self) -> list[Path]:
-        folder = self._root / _FOLDER
-        candidates = [folder] if folder.is_symlink() else [*folder.glob("*"), *self._inner(os.DirEntry.is_symlink)]
-        return sorted(path for path in candidates if path.is_symlink())
-
-    def _files(self) -> Iterator[Path]:
-        return self._inner(lambda entry: entry.is_file(follow_symlinks=False))
+    def _files(self) -> Iterator[tuple[Path, int]]:
+        """Yield files with their sizes; one that is removed meanwhile is left out."""
+        for path in self._inner(lambda entry: entry.is_file(follow_symlinks=False)):
+            with suppress(FileNotFoundError):
+                yield path, path.stat().st_size
 
     def _inner(self, wanted: "Callable[[os.DirEntry[str]], bool]") -> Iterator[Path]:
         """Yield the entries of the folder's subfolders, without links."""
@@ -112,11 +167,6 @@ class BlobFolder:
         for folder in os.scandir(top):
             if folder.is_dir(follow_symlinks=False):
                 yield from (Path(entry.path) for entry in os.scandir(folder.path) if wanted(entry))
-
-    def _check_plain(self, path: Path) -> None:
-        check_no_link(self._root, path)
-        if not is_plain_file(path):
-            raise FileNotFoundError(errno.ENOENT, "not a plain file", str(path))
 
 
 def _is_address(path: Path) -> bool:

@@ -3,7 +3,7 @@
 import sqlite3
 from dataclasses import dataclass, field
 
-from mapserver.store.blobs import BlobFolder
+from mapserver.store.blobs import Blobs
 from mapserver.store.database import Transactions
 from mapserver.store.rows import Actor, LogEntry, SiteReleases
 from mapserver.store.version_rows import EXTRA_TABLES, mentioned, set_state, site_releases
@@ -35,9 +35,7 @@ class Garbage:
     freed_bytes: int = 0
 
 
-def collect(
-    transactions: Transactions, blobs: BlobFolder, retention: Retention, *, dry_run: bool, actor: Actor
-) -> Garbage:
+def collect(transactions: Transactions, blobs: Blobs, retention: Retention, *, dry_run: bool, actor: Actor) -> Garbage:
     """Remove versions first; this must be on the disk before the first file is deleted. The caller holds the exclusive lock.
 
     Never removed: current versions, canaries, rollback targets, versions in use by robots.
@@ -50,10 +48,13 @@ def collect(
             _plan(transactions, retention, garbage)
             _write_down(transactions, connection, garbage, actor)
     kept = mentioned(transactions, set(garbage.removed) if dry_run else set())
-    unmentioned = [blobs.path(sha256) for sha256 in sorted(blobs.addresses() - kept)]
-    for path in [*unmentioned, *blobs.unreferenced()]:
-        garbage.freed_bytes += path.stat().st_size if dry_run else blobs.remove_file(path)
-        garbage.files += 1
+    unmentioned = {sha256: size for sha256, size in sorted(blobs.sizes().items()) if sha256 not in kept}
+    for found, remove in ((unmentioned, blobs.remove), (blobs.leftovers(), blobs.remove_leftover)):
+        for name, size_bytes in found.items():
+            if not dry_run:
+                remove(name)
+            garbage.freed_bytes += size_bytes
+            garbage.files += 1
     return garbage
 
 

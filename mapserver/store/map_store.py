@@ -2,7 +2,7 @@
 
     DIR/store.sqlite3            sites, versions and their states, robots, jobs, events
         DIR/lock                     exclusive during garbage collection, shared while new, still unreferenced bytes arrive
-    DIR/blobs/ab/<sha256>        tiles, manifests, vocabularies, archives, by content
+    DIR/blobs/ab/<sha256>        tiles, manifests, vocabularies, archives, by content; or in an object store that DIR/places.json names
         DIR/reserve                  space freed by `gc` to work on a full disk
     DIR/sites/<site>/current     the current manifest's address as text, for robots that read the folder; derived
 
@@ -35,7 +35,7 @@ from fleetmap.mapformat import (
 from fleetmap.mapformat.building import BUILDING_KEY
 from fleetmap.mapformat.version_file import BlobKind, ExportBlob, ExportHead, open_export
 from mapserver.quality.figures import carried_evidence, trusted_calibrations
-from mapserver.store.blobs import BlobFolder
+from mapserver.store.blobs import Blobs
 from mapserver.store.database import is_older
 from mapserver.store.files import (
     check_no_link,
@@ -48,6 +48,7 @@ from mapserver.store.files import (
 )
 from mapserver.store.fleet_queries import name_failures
 from mapserver.store.garbage_collection import Garbage, Retention, collect
+from mapserver.store.places import Places, open_blobs, write_places
 from mapserver.store.queries import StoreQueries
 from mapserver.store.rows import (
     NOBODY,
@@ -66,6 +67,7 @@ from mapserver.store.version_rows import (
     extras,
     insert_draft,
     insert_extras,
+    mentioned,
     site_releases,
 )
 
@@ -202,7 +204,7 @@ class MapStore(StoreQueries):
         with self._transactions.write() as connection:
             changes = decide(site_releases(self._transactions, site))
             apply_changes(self._transactions, connection, site, changes)
-        if any(state == "current" for _, state in changes.states):
+        if self._blobs.is_folder and any(state == "current" for _, state in changes.states):
             self._write_current_file(site)
         return changes
 
@@ -269,6 +271,28 @@ class MapStore(StoreQueries):
             self._transactions.shrink(1 << 30)
             keep_reserve(self._root)
             return garbage
+
+    def move_content(self, url: str, progress: Callable[[int, int], None] = lambda done, total: None) -> int:
+        """Copy the content into the object store under a URL, where who opens the store next finds it; return the number of bytes.
+
+        Files in the folder stay. Raises StoreError if either side fails; the store is then unchanged.
+        """
+        places = Places(content=url)
+        target, copied = open_blobs(self._root, places), 0
+        with self._locked(shared=False):
+            known, named = target.sizes(), sorted(mentioned(self._transactions))
+            for number, sha256 in enumerate(named, start=1):
+                progress(number, len(named))
+                size = self._blobs.size(sha256)
+                if size is None:
+                    raise StoreError(
+                        f"{self._blobs.where(sha256)} is missing; run `mapserver verify`, the content stays"
+                    )
+                if known.get(sha256) != size:
+                    target.put_chunks(self._blobs.chunks(sha256), sha256, size)
+                    copied += size
+            write_places(self._root, places)
+        return copied
 
     def export_version(self, site: str, version: int, path: Path, *, archive: bool = True) -> int:
         """Write a version into one file and return its size; errors as of `manifest`, StoreError for the disk."""
@@ -370,6 +394,8 @@ class MapStore(StoreQueries):
         return known
 
     def _repair_current_files(self) -> None:
+        if not self._blobs.is_folder:
+            return
         for row in self._transactions.query("SELECT site, manifest_sha256 FROM versions WHERE state = 'current'"):
             path = self._root / current_path(row["site"])
             if not is_plain_file(path) or read_file(path) != f"{row['manifest_sha256']}\n".encode():
@@ -404,7 +430,7 @@ class MapStore(StoreQueries):
             raise StoreError(f"{error.filename or self._root}: {error.strerror}; check the store's disk") from error
 
 
-def _export_chunks(head: ExportHead, blobs: BlobFolder) -> Iterator[bytes]:
+def _export_chunks(head: ExportHead, blobs: Blobs) -> Iterator[bytes]:
     """Yield the bytes of the file; raises MapFormatError, before its end, for damaged bytes in the store."""
     start = head.start()
     whole = hashlib.sha256(start)

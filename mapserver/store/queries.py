@@ -1,7 +1,7 @@
 """Queries of a store, and writes that change no version: robots' reports, jobs, events."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,10 +18,9 @@ from mapserver.floor_plan.survey_requests import KIND, SurveyRequest, read_reque
 from mapserver.quality.figures import Evidence, TrustedCalibration, carried_evidence, trusted_calibrations
 from mapserver.store.access.chain import AuditLine
 from mapserver.store.access.operators import OperatorQueries
-from mapserver.store.blobs import BlobFolder
 from mapserver.store.database import Transactions
-from mapserver.store.files import check_no_link
 from mapserver.store.fleet_queries import FleetQueries, keep_last_reports
+from mapserver.store.places import open_blobs, read_places
 from mapserver.store.rows import (
     NOBODY,
     Actor,
@@ -57,7 +56,7 @@ class StoreQueries:
     def __init__(self, root: Path, clock_ns: Callable[[], int], *, read_only: bool = False) -> None:
         self._root = root
         self._clock_ns = clock_ns
-        self._blobs = BlobFolder(root)
+        self._blobs = open_blobs(root, read_places(root))
         self._transactions = Transactions(root / "store.sqlite3", clock_ns, read_only=read_only)
         self.fleet = FleetQueries(self._transactions)
         self._areas: dict[str, tuple[tuple[str, ...], Areas]] = {}  # by the addresses of their source files
@@ -101,11 +100,13 @@ class StoreQueries:
         """Return the addresses of all blobs that the database names."""
         return mentioned(self._transactions)
 
-    def blob_file(self, sha256: str) -> Path | None:
-        """Return the file of a blob, None if it is missing; StoreError behind a symbolic link."""
-        path = self._blobs.path(sha256)
-        check_no_link(self._root, path)
-        return path if path.is_file() else None
+    def blob_size(self, sha256: str) -> int | None:
+        """Return the size of a blob in bytes, None if it is missing; StoreError behind a symbolic link."""
+        return self._blobs.size(sha256)
+
+    def blob_chunks(self, sha256: str) -> Iterator[bytes]:
+        """Yield the bytes of a blob in pieces, unverified; raises StoreError for a missing one."""
+        return self._blobs.chunks(sha256)
 
     def is_whole(self, sha256: str) -> bool:
         """True if a blob exists and matches its address; reads it in pieces."""

@@ -11,7 +11,7 @@ from pathlib import Path
 from statistics import median
 
 from fleetmap.errors import FleetmapError, disk_errors
-from mapserver.store.blobs import BlobFolder
+from mapserver.store.blobs import Blobs
 from mapserver.store.database import Transactions
 
 _EVERY_S, _DAY_S = 600.0, 86_400.0
@@ -33,7 +33,7 @@ class StoreUsage:
 class UsageMeter:
     """Measures a store when asked, at most every ten minutes. Thread-safe."""
 
-    def __init__(self, root: Path, transactions: Transactions, blobs: BlobFolder) -> None:
+    def __init__(self, root: Path, transactions: Transactions, blobs: Blobs) -> None:
         self._root, self._transactions, self._blobs = root, transactions, blobs
         self._lock = threading.Lock()
         self._thread: threading.Thread | None = None

@@ -6,7 +6,7 @@ from typing import Any
 
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import current_path, decode_manifest
-from mapserver.store.blobs import BlobFolder
+from mapserver.store.blobs import Blobs
 from mapserver.store.database import Transactions
 from mapserver.store.files import is_plain_file
 from mapserver.store.rows import SiteReleases, VersionInfo
@@ -31,7 +31,7 @@ class StoreFindings:
     faults: list[str] = field(default_factory=list)
 
 
-def verify(root: Path, transactions: Transactions, blobs: BlobFolder) -> StoreFindings:
+def verify(root: Path, transactions: Transactions, blobs: Blobs) -> StoreFindings:
     """Read everything in the store. Raises StoreError only if the database cannot be read at all."""
     found = StoreFindings()
     integrity = [row["integrity_check"] for row in transactions.query("PRAGMA integrity_check")]
@@ -43,16 +43,17 @@ def verify(root: Path, transactions: Transactions, blobs: BlobFolder) -> StoreFi
         for path in (*blobs.links(), *_links(root / "trust"))
     ]
     found.open_to_others = sum(bool(path.stat().st_mode & 0o077) for path in (root, *root.glob("store.sqlite3*")))
-    sound = _check_blobs(transactions, blobs, found)
+    sizes = blobs.sizes()
+    sound = _check_blobs(transactions, blobs, sizes, found)
     sites = transactions.query("SELECT * FROM sites ORDER BY site")
     releases = [site_releases(transactions, row["site"]) for row in sites]
     for info in (info for rows in releases for info in rows.versions.values()):
         found.versions += 1
-        found.faults += _version_faults(transactions, blobs, info, sound)
+        found.faults += _version_faults(transactions, blobs, info, {sha256: sizes[sha256] for sha256 in sound})
     for row, rows in zip(sites, releases, strict=True):
         found.sites += 1
         found.faults += _site_faults(transactions, row, rows)
-        found.faults += _file_faults(root, rows)
+        found.faults += _file_faults(root, rows) if blobs.is_folder else []
         if any(info.state != "draft" and info.manifest_sha256 not in sound for info in rows.versions.values()):
             found.faults.append(f"site {rows.site}: a published version has no whole manifest")
     return found
@@ -62,19 +63,20 @@ def _links(folder: Path) -> list[Path]:
     return sorted(path for path in (folder, *folder.rglob("*")) if path.is_symlink())
 
 
-def _check_blobs(transactions: Transactions, blobs: BlobFolder, found: StoreFindings) -> set[str]:
-    named, present = mentioned(transactions), blobs.addresses()
+def _check_blobs(transactions: Transactions, blobs: Blobs, sizes: dict[str, int], found: StoreFindings) -> set[str]:
+    named, present = mentioned(transactions), sizes.keys()
     found.orphans = len(present - named)
-    found.leftovers = len(blobs.unreferenced())
+    found.leftovers = len(blobs.leftovers())
     found.blobs = len(present)
-    found.blob_bytes = sum(blobs.path(sha256).stat().st_size for sha256 in present)
-    found.faults += [f"{blobs.path(sha256)} is missing" for sha256 in sorted(named - present)]
+    found.blob_bytes = sum(sizes.values())
+    found.faults += [f"{blobs.where(sha256)} is missing" for sha256 in sorted(named - present)]
     damaged = {sha256 for sha256 in named & present if not blobs.is_whole(sha256)}
-    found.faults += [f"{blobs.path(sha256)} is damaged" for sha256 in sorted(damaged)]
+    found.faults += [f"{blobs.where(sha256)} is damaged" for sha256 in sorted(damaged)]
     return (named & present) - damaged
 
 
-def _version_faults(transactions: Transactions, blobs: BlobFolder, info: VersionInfo, sound: set[str]) -> list[str]:
+def _version_faults(transactions: Transactions, blobs: Blobs, info: VersionInfo, sound: dict[str, int]) -> list[str]:
+    """Return the faults of a version. sound: sizes of all undamaged blobs."""
     name = f"version {info.version} of {info.site}"
     if info.manifest_sha256 not in sound:
         return []  # reported with the blobs, unless it is unreferenced
@@ -92,9 +94,7 @@ def _version_faults(transactions: Transactions, blobs: BlobFolder, info: Version
     made = (*(getattr(manifest, name) for name in names), len(manifest.tiles), manifest.vocabulary.sha256)
     if stored != made:
         faults.append(f"{name}: the database says {stored}, its manifest {made}")
-    wrong = [
-        tile for tile in manifest.tiles if tile.sha256 in sound and blobs.path(tile.sha256).stat().st_size != tile.bytes
-    ]
+    wrong = [tile for tile in manifest.tiles if sound.get(tile.sha256, tile.bytes) != tile.bytes]
     return faults + [f"{name}: tile {tile.x},{tile.y} has another size than in its manifest" for tile in wrong]
 
 

@@ -11,7 +11,7 @@ from datetime import datetime, timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from fleetmap.errors import StoreError, UntrustedError
+from fleetmap.errors import StoreError, UntrustedError, disk_errors
 from fleetmap.messages import WantedVersion
 from fleetmap.trust import SiteList, read_site_list, site_role
 from mapserver.store.files import is_plain_file
@@ -43,7 +43,9 @@ class SignedLists:
 
     @property
     def are_there(self) -> bool:
-        return (self.folder / "1.root.json").is_file()
+        """True for signed maps; StoreError if the disk does not answer."""
+        with disk_errors(f"{self.folder} cannot be looked at", "check the disk"):
+            return (self.folder / "1.root.json").is_file()
 
     def file(self, site: str, name: str) -> bytes:
         """Return a file for the robots of a site; empty if absent."""

@@ -48,6 +48,16 @@ def test_a_life_of_versions(run, tmp_path: Path) -> None:
     assert "clean" in run("verify", *in_store)
 
 
+def test_content_goes_where_attach_says(run, tmp_path: Path, s3: str) -> None:
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        save_sample_draft(store)
+    assert s3 in run("attach", "--store", tmp_path / "store", "--content", s3)
+    (tmp_path / "store" / "blobs").rename(tmp_path / "not used any more")
+    assert "clean" in run("verify", "--store", tmp_path / "store")
+    (tmp_path / "store" / "places.json").write_text('{"contents": "s3://typing-error"}')
+    assert "places.json" in run("verify", "--store", tmp_path / "store", status=2)
+
+
 def test_verify_ends_with_a_status_of_its_own(run, tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         save_sample_draft(store)

@@ -8,17 +8,18 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import UnreachableError
-from fleetmap.mapformat import Tile, blob_path
+from fleetmap.mapformat import Tile
 from fleetmap.messages import PART_BYTES
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from support.fleet.served_world import World, served_world
 from support.storage.map_samples import random_tile
+from support.storage.s3_server import Content
 
 
 @pytest.fixture
-def world(tmp_path: Path) -> Iterator[World]:
-    with served_world(tmp_path) as made:
+def world(store_folder: Path) -> Iterator[World]:
+    with served_world(store_folder.parent) as made:
         yield made
 
 
@@ -60,8 +61,7 @@ def test_a_damaged_version_never_becomes_active(world: World) -> None:
     world.hall.ready()
     world.publish(large_site(world))
     bad = world.store.manifest("hall", 2).tiles[1]
-    path = world.folder / blob_path(bad.sha256)
-    path.write_bytes(path.read_bytes()[:-1] + b"x")
+    Content(world.store).write(bad.sha256, world.store.blob(bad.sha256)[:-1] + b"x")
     ready = world.hall.ready()
     assert ready.wanted.version == 1
     assert "version 1 stays active" in ready.note

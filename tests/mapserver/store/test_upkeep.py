@@ -5,18 +5,25 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from fleetmap.errors import FleetmapError, MapFormatError, StateError, StoreError
-from fleetmap.mapformat import blob_path, current_path
+from fleetmap.mapformat import current_path
 from mapserver import releases
-from mapserver.store import Actor, MapStore, Retention
+from mapserver.backup.backup import back_up
+from mapserver.backup.restore import restore
+from mapserver.backup.snapshots import BackupTarget
+from mapserver.store import Actor, MapStore, Retention, object_store
 from mapserver.store.files import locked
+from mapserver.store.object_store import BlobBucket
+from mapserver.store.places import read_places
 from support.storage.clock import Clock
 from support.storage.map_samples import publish_samples, save_sample_draft
+from support.storage.s3_server import Content
 
 ADA = Actor("ada", "a test")
 DAY_NS = 86_400_000_000_000
@@ -28,8 +35,8 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def store(tmp_path: Path, clock: Clock):
-    with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as opened:
+def store(store_folder: Path, clock: Clock):
+    with MapStore.open(store_folder, create=True, clock_ns=clock) as opened:
         yield opened
 
 
@@ -51,10 +58,12 @@ def test_verify_names_what_is_wrong(store: MapStore, tmp_path: Path) -> None:
     assert store.verify().faults == []
     root = tmp_path / "store"
     first, second = (tile.sha256 for tile in store.manifest("lab", 2).tiles)
-    (root / blob_path(first)).write_bytes(b"other")
-    (root / blob_path(second)).unlink()
-    (root / current_path("lab")).write_text("wrong")
-    (root / "blobs" / first[:2] / ".leftover.tmp").write_bytes(b"x")
+    Content(store).write(first, b"other")
+    Content(store).remove(second)
+    is_folder = read_places(root).content is None
+    if is_folder:
+        (root / current_path("lab")).write_text("wrong")
+        (root / "blobs" / first[:2] / ".leftover.tmp").write_bytes(b"x")
     connection = sqlite3.connect(root / "store.sqlite3")
     connection.execute("UPDATE versions SET landmarks = 7 WHERE version = 1")
     connection.execute("DELETE FROM version_blobs WHERE version = 1 AND kind = 'tile'")
@@ -62,10 +71,10 @@ def test_verify_names_what_is_wrong(store: MapStore, tmp_path: Path) -> None:
     connection.close()
     found = store.verify()
     text = "\n".join(found.faults)
-    for words in (f"{first} is damaged", f"{second} is missing", "does not name the current", "the database says"):
+    for words in (f"{first} is damaged", f"{second} is missing", "the database says", "reference different"):
         assert words in text
-    assert "reference different" in text
-    assert (found.leftovers, found.orphans) == (1, 2)
+    assert ("does not name the current" in text) is is_folder
+    assert (found.leftovers, found.orphans) == (int(is_folder), 2)
 
 
 def test_garbage_goes_in_steps_and_nothing_that_is_used(store: MapStore, tmp_path: Path, clock: Clock) -> None:
@@ -95,15 +104,18 @@ def test_garbage_goes_in_steps_and_nothing_that_is_used(store: MapStore, tmp_pat
     assert store.verify().faults == []
 
 
-def test_leftovers_are_removed(store: MapStore, tmp_path: Path) -> None:
+def test_leftovers_are_removed(store: MapStore) -> None:
     publish_samples(store, 1)
-    folder = next((tmp_path / "store" / "blobs").iterdir())
-    (folder / f".{'ab' * 8}.0011.tmp").write_bytes(b"half")
+    is_folder = read_places(store.folder).content is None
+    if is_folder:
+        folder = next((store.folder / "blobs").iterdir())
+        (folder / f".{'ab' * 8}.0011.tmp").write_bytes(b"half")
     store._blobs.put(b"nobody mentions this")
     found = store.verify()
-    assert (found.faults, found.orphans, found.leftovers) == ([], 1, 1)
+    assert (found.faults, found.orphans, found.leftovers) == ([], 1, int(is_folder))
     garbage = store.collect_garbage()
-    assert (garbage.files, garbage.freed_bytes) == (2, 24)
+    assert (garbage.files, garbage.freed_bytes) == ((2, 24) if is_folder else (1, 20))
+    assert store.verify().orphans == 0
 
 
 def test_garbage_waits_for_those_who_bring_bytes(store: MapStore, tmp_path: Path, monkeypatch) -> None:
@@ -166,8 +178,8 @@ def test_exports_that_are_not_whole_are_refused(store: MapStore, tmp_path: Path)
 
 def test_a_damaged_version_is_not_exported(store: MapStore, tmp_path: Path) -> None:
     publish_samples(store, 1)
-    path = tmp_path / "store" / blob_path(store.manifest("lab", 1).tiles[0].sha256)
-    path.write_bytes(path.read_bytes()[:-1] + b"?")
+    tile = store.manifest("lab", 1).tiles[0].sha256
+    Content(store).write(tile, store.blob(tile)[:-1] + b"?")
     with pytest.raises(FleetmapError, match="verify"):
         store.export_version("lab", 1, tmp_path / "lab.fmex")
     assert list(tmp_path.glob("*lab*")) == []
@@ -193,3 +205,53 @@ def test_days_until_the_disk_is_full_are_known_after_a_day(
     assert (found.grows_bytes_per_day, found.days_left) == (0.0, None)
     clock.now_ns -= 3600 * 10**9
     assert store.disk_space().grows_bytes_per_day is None, "the clock was set back"
+
+
+def test_content_moves_into_an_object_store(tmp_path: Path, s3: str) -> None:
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        publish_samples(store, 2)
+        tile = store.manifest("lab", 2).tiles[0].sha256
+        with pytest.raises(StoreError, match="credentials"):
+            store.move_content("s3://no-bucket-of-this-name")
+        assert read_places(store.folder).content is None
+        assert store.move_content(s3) > 0
+        assert store.move_content(s3) == 0, "what is there is not copied again"
+    shutil.rmtree(tmp_path / "store" / "blobs")
+    with MapStore.open(tmp_path / "store") as store:
+        assert store.move_content(f"{s3}-elsewhere") > 0
+        back_up(store, target := BackupTarget(f"{s3}-backup", create=True))
+    restore(target, tmp_path / "restored", ADA)
+    with MapStore.open(tmp_path / "restored") as restored:
+        assert restored.verify().faults == []
+    with MapStore.open(tmp_path / "store") as store:
+        assert store.blob(tile)
+        publish_samples(store, 1)
+        assert store.verify().faults == []
+        data = store.blob(tile)
+        Content(store).write(tile, data[:-1] + b"?")
+        with pytest.raises(MapFormatError, match=tile):
+            store.move_content(f"{s3}-other")
+        Content(store).remove(tile)
+        with pytest.raises(StoreError, match=f"{tile} is missing"):
+            store.move_content(f"{s3}-other")
+        with pytest.raises(StoreError, match=f"{tile} is missing"):
+            store.blob(tile)
+        assert tile not in BlobBucket(f"{s3}-other").sizes(), "damaged bytes do not appear there"
+
+
+def test_an_object_store_that_does_not_answer_is_no_damage(
+    tmp_path: Path, s3: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        publish_samples(store, 1)
+        store.move_content(s3)
+    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
+    monkeypatch.setattr(object_store, "from_url", partial(object_store.from_url, retry_config={"max_retries": 0}))
+    with MapStore.open(tmp_path / "store") as store:
+        with pytest.raises(StoreError, match="credentials"):
+            store.verify()
+        with pytest.raises(StoreError, match="credentials"):
+            back_up(store, BackupTarget(str(tmp_path / "backups"), create=True))
+        with pytest.raises(StoreError, match="credentials"):
+            save_sample_draft(store)
+        assert store.current("lab").version == 1

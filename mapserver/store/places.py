@@ -1,0 +1,46 @@
+"""Places of a store's parts outside of its folder, by URL; the file DIR/places.json names them, absent if all is in the folder."""
+
+from pathlib import Path
+
+import msgspec
+
+from fleetmap.encoding import to_json
+from fleetmap.errors import UsageError, disk_errors
+from fleetmap.files import write_atomically
+from mapserver.store.blobs import BlobFolder, Blobs
+
+_FILE = "places.json"
+
+
+class Places(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """content: URL of the object store with tiles, archives and pictures; None: in the folder."""
+
+    content: str | None = None
+
+
+def read_places(root: Path) -> Places:
+    """Return the places of the store in a folder; UsageError for an unreadable file."""
+    path = root / _FILE
+    with disk_errors(f"{path} cannot be read", "check its rights"):
+        if not path.is_file():
+            return Places()
+        data = path.read_bytes()
+    try:
+        return msgspec.json.decode(data, type=Places)
+    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: {error}; `mapserver attach --store DIR --content URL` writes it") from error
+
+
+def write_places(root: Path, places: Places) -> None:
+    """Replace the places; it is private, because a URL may hold a password. Raises StoreError on a disk error."""
+    with disk_errors(f"{root / _FILE} cannot be written", "check the folder's space and rights"):
+        write_atomically(root / _FILE, [to_json(places, indent=2)])
+
+
+def open_blobs(root: Path, places: Places) -> Blobs:
+    """Return the content of a store. Raises StoreError for a URL that cannot be opened."""
+    if places.content is None:
+        return BlobFolder(root)
+    from mapserver.store.object_store import BlobBucket  # late: a store in a folder does not need obstore
+
+    return BlobBucket(places.content)

@@ -1,0 +1,34 @@
+"""Places of a store's content: its folder, or an object store."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from mapserver.store.places import Places, write_places
+from support.storage.s3_server import KEYS, s3_server
+
+
+@pytest.fixture(scope="session")
+def s3_bucket(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The URL of a bucket in an S3 server, whose address and credentials are in the environment."""
+    with s3_server(tmp_path_factory.mktemp("s3")) as address, pytest.MonkeyPatch.context() as patch:
+        for name, value in (KEYS | {"AWS_ENDPOINT_URL": address}).items():
+            patch.setenv(name, value)
+        yield "s3://fleet"
+
+
+@pytest.fixture
+def s3(s3_bucket: str, tmp_path: Path) -> str:
+    """The URL of an empty place in that bucket."""
+    return f"{s3_bucket}/{tmp_path.name}"
+
+
+@pytest.fixture(params=["folder", "s3"])
+def store_folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """The folder of a new store, whose content is there or in S3."""
+    folder = tmp_path / "store"
+    if request.param == "s3":
+        folder.mkdir()
+        write_places(folder, Places(content=request.getfixturevalue("s3")))
+    return folder
