@@ -15,8 +15,8 @@ from fleetmap.encoding import to_plain
 from fleetmap.errors import StateError, UsageError
 from mapserver.api import parameters as p
 from mapserver.api import views
-from mapserver.api.guard import By
-from mapserver.fleet.building import align, estimate_alignment, forget_alignment, keep_areas, replace_areas
+from mapserver.api.guard import By, actor_of
+from mapserver.fleet.building import align, estimate_alignment, forget_alignment, keep_areas, replace_areas, undo_areas
 from mapserver.floor_plan.pins import MAX_PINS, parse_pin
 from mapserver.floor_plan.plan_file import decode_plan
 from mapserver.store import MapStore
@@ -80,6 +80,11 @@ def install_building_routes(app: FastAPI, store: MapStore) -> None:
         """Remove the areas of a site; their past counts stay."""
         keep_areas(store, site, None, "no areas", by, tag=_given(if_match))
         return views.ServiceState("ok")
+
+    @app.post("/v1/sites/{site}/areas/undo")
+    def undo(request: Request, site: p.Site, act: views.Act) -> dict[str, Any]:
+        """Bring back the areas and corrections of a site as before their last change; once more, and they are as now."""
+        return undo_areas(store, site, actor_of(request, act.actor, act.reason)).geojson(site)
 
     @app.get("/v1/sites/{site}/alignment")
     def alignment(site: p.Site) -> dict[str, Any]:

@@ -47,10 +47,11 @@ class Square:
 
 @dataclass(frozen=True, slots=True)
 class Outline:
-    """A named area."""
+    """A named area. tone: of one that corrects the map."""
 
     rings: list[list[tuple[float, float]]]
     words: str
+    tone: str = ""
     kind: Literal["area"] = "area"
 
 
@@ -138,10 +139,12 @@ def ground(
 
 def outlines(areas: Areas) -> list[Outline]:
     """Named areas, the smallest last, so that it is on top."""
-    return [
-        Outline([[(round(x, 3), round(y, 3)) for x, y in ring.tolist()] for ring in area.rings], area.name)
-        for area in reversed(areas.areas)
-    ]
+    drawn = []
+    for area in reversed(areas.areas):
+        words, tone = (area.name, "") if area.correction is None else (f"{area.name} ({area.correction.kind})", "warn")
+        rings = [[(round(x, 3), round(y, 3)) for x, y in ring.tolist()] for ring in area.rings]
+        drawn.append(Outline(rings, words, tone))
+    return drawn
 
 
 def coverage(plan: Plan) -> list[Square]:

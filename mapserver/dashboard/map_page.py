@@ -10,6 +10,7 @@ from mapserver.dashboard.data import EVER, MapData
 from mapserver.dashboard.map_layers import Layer, Outline, Picture, box_of, heat, squares
 from mapserver.dashboard.plan import Plan
 from mapserver.dashboard.rendering import share, size
+from mapserver.drafting.area_corrections import waiting
 from mapserver.floor_plan.alignment import Alignment
 from mapserver.floor_plan.areas import Areas
 from mapserver.quality.directions import missing_words
@@ -56,6 +57,7 @@ _UNKNOWN = {
     "motion": "nothing to compare it with",
     "size_against_last_version": "there was none",
 }
+_CORRECTED = {"forget": "forgotten and learned anew", "never-use": "never used", "freeze": "frozen"}
 _FRAMES = {"held_out_frames": "held_out", "yesterdays_recordings": "replayed", "last_versions_places": "last_version"}
 
 
@@ -94,12 +96,22 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         "one_way": one_way(plan, maps.store.areas(site)),
         "changes": changes,
         "alignment": _aligned(maps.store.alignment(site)),
+        "corrected": _CORRECTED,
+        "waiting": _waiting(maps, site),
         "areas": sorted(maps.store.areas(site).areas, key=lambda area: area.name),
         "requests": requests,
         "kept": {"version": asked},
         "events": events if span_ns == EVER else maps.store.events(site, span_ns)[::-1][:_EVENTS_SHOWN],
         "no_events": "No events yet." if span_ns == EVER else "Nothing happened in this time.",
     }
+
+
+def _waiting(maps: MapData, site: str) -> list[str]:
+    """Names of the areas to be learned anew that the current version has not forgotten yet."""
+    current = maps.current_version(site)
+    if current is None:
+        return []
+    return [area.name for area in waiting(maps.store.areas(site), maps.store.manifest(site, current))]
 
 
 def _used(services: Services, rows: SiteReleases) -> str:

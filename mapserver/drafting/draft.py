@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-import numpy as np
 from rich.console import Console
 
 from fleetmap.bow.shipped_vocabulary import default_vocabulary, default_vocabulary_bytes
@@ -23,6 +22,7 @@ from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import SensorSet
 from fleetmap.version_grid import encode_grid, grid_report
+from mapserver.drafting.area_corrections import AreaCorrections, driven_since, waiting
 from mapserver.drafting.draft_evidence import Before, DraftMap, JudgedSession, examine_draft, replayed_probes
 from mapserver.drafting.job_lock import Job, JobProgress, recorded_job
 from mapserver.drafting.mapped_images import MappedImageStore
@@ -56,6 +56,7 @@ from mapserver.drafting.trajectory import OtherTrajectory
 from mapserver.drafting.view_check import TileChooser, asked_views
 from mapserver.drafting.worker import open_executor, single_threaded_libraries
 from mapserver.evaluation.trajectory_error import truth_from_estimate
+from mapserver.floor_plan.areas import Areas
 from mapserver.grid.survey_grid import GridGrower, GridSession, Grower, grow
 from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged
 from mapserver.quality.probes import alias_step_m
@@ -68,10 +69,9 @@ from mapserver.survey.executor import Executor
 from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.loops.zones import Zones
-from mapserver.survey.merge.multi_session import MapMerger, MergedMap, Session
+from mapserver.survey.merge.multi_session import MergedMap
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
-from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.tiling import TILE_SIZE_M
 from mapserver.trust.signing import check_base
 
@@ -153,11 +153,12 @@ class _Run:
 
 @dataclass(frozen=True)
 class Built:
-    """The surveys and their outcomes: the map in its final frame, its accuracy, and whether it is the site's first."""
+    """The surveys and their outcomes: the map in its final frame, its accuracy, its corrections, and whether it is the site's first."""
 
     surveyed: list[Surveyed]
     joined: MergedMap
     accuracy: Accuracy
+    corrections: AreaCorrections
     is_first: bool
 
     @property
@@ -203,7 +204,9 @@ def build_draft(
         ):
             parent = _parent(request, maps)
             told = JobProgress(maps, job.number)
-            built = _survey(run, admitted, None if parent is None else parent.survey, told)
+            built = _survey(run, admitted, parent, maps.areas(request.site) if parent is not None else Areas(), told)
+            if parent is not None:
+                parent = built.corrections.applied(parent)
             draft = _keep(run, built, parent, maps)
             draft = replace(draft, report=draft.report | {"loop_places": loop_places(built.taken, built.joined)})
             job.message, job.report = draft.sentence, draft.report | {"version": draft.version}
@@ -245,9 +248,14 @@ def _parent(request: BuildRequest, maps: MapStore) -> Before | None:
     return Before.of(maps, maps.manifest(site, current.version), decode_archive(archive))
 
 
-def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, told: JobProgress) -> Built:
-    """Survey all recordings and join them to the current map."""
+def _survey(
+    run: _Run, admitted: dict[Path, Admission], parent: Before | None, areas: Areas, told: JobProgress
+) -> Built:
+    """Survey all recordings and join them to the current map, with the corrections of the site's areas."""
     options, settings = run.request.options, run.settings
+    base, corrections = None if parent is None else parent.survey, AreaCorrections()
+    if parent is not None:
+        corrections = AreaCorrections(areas.corrections, waiting(areas, parent.manifest))
     with (
         ProgressView(run.console) as view,
         open_executor(options.threads, options.scheduler) as executor,
@@ -263,10 +271,7 @@ def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, 
         surveyed = survey_all(paths, survey_one, None if base is None else base.camera, run.unusable)
         options.look_at(paths)
         tools.progress("joining", 0, 1)
-        joining = MapMerger(base, settings)
-        for done in surveyed:
-            joining.add(Session(done.survey, done.map_from_survey))
-        joined = joining.finish()
+        joined, corrections = corrections.joined(base, surveyed, settings)
     run.times.begin("storing")
     say_left_out(run.console, run.request.site, surveyed, joined)
     truth = joined_truth(surveyed, joined)
@@ -280,7 +285,7 @@ def _survey(run: _Run, admitted: dict[Path, Admission], base: SurveyMap | None, 
         joined = replace(
             joined, map=transform_map(joined.map, truth_from_estimate(estimated_trajectory(joined.map), truth))
         )
-    return Built(surveyed, joined, found, is_first=base is None)
+    return Built(surveyed, joined, found, corrections, is_first=base is None)
 
 
 def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Draft:
@@ -292,25 +297,29 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         for trajectory, s in zip(map_trajectories(built.joined), built.taken, strict=True)
     ]
     run.times.begin("choosing")
-    chooser = TileChooser(survey_map, run.settings.budget, wanted, default_vocabulary())
+    corrections = built.corrections
+    frozen = corrections.frozen(survey_map.points_map)
+    chooser = TileChooser(survey_map, run.settings.budget, wanted, default_vocabulary(), frozen)
     tiles, views = chooser.choose(asked_views(judged))
     run.times.begin("grid and surfels")
     sessions = [
         GridSession(s.entry.name, s.survey, session.trajectory.frame_from_body)
         for s, session in zip(built.taken, judged, strict=True)
     ]
-    grid_grower = GridGrower({} if parent is None else parent.grid, run.settings.stereo)
+    grid_before = {} if parent is None else parent.grid
+    grid_grower = GridGrower(corrections.grid_before(grid_before), run.settings.stereo)
     growers: dict[str, Grower] = {"grid": grid_grower} if run.settings.occupancy_grid else {}
     if run.settings.surfel_map:
         known = SurfelTiles() if parent is None else known_surfels(parent.manifest, maps.blob)
-        growers["surfels"] = surfel_grower = SurfelGrower(known)
+        growers["surfels"] = surfel_grower = SurfelGrower(corrections.surfels_before(known))
     without = grow(growers, sessions, run.settings.stereo)
-    grid, surfels = encode_grid(grid_grower.tiles), list[bytes]()
+    grid, surfels = encode_grid(corrections.grid(grid_grower.tiles, grid_before)), list[bytes]()
     grid_said = grid_report(grid, without.get("grid", {})) if grid or without.get("grid") else None
     surfels_said = None
     if run.settings.surfel_map:
-        surfels = surfel_grower.surfels.blobs()
-        surfels_said = surfel_report(surfels, len(surfel_grower.surfels), without["surfels"])
+        grown = corrections.surfels(surfel_grower.surfels, known)
+        surfels = grown.blobs()
+        surfels_said = surfel_report(surfels, len(grown), without["surfels"])
     pictures, pictures_said = list[bytes](), None
     if run.settings.survey_pictures:
         before = (
@@ -318,7 +327,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
             if parent is None or PICTURES_KEY not in parent.manifest.report
             else pictures_of(parent.manifest, maps.blob)
         )
-        pictures, pictures_said = kept_pictures(sessions, before, maps.blob)
+        pictures, pictures_said = kept_pictures(sessions, corrections.pictures_before(before), maps.blob)
     run.times.begin("examining")
     evidence = msgspec.structs.replace(_evidence(run, built, judged, tiles, parent), views=views)
     run.times.begin("storing")
@@ -340,6 +349,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         surfels=surfels_said,
         pictures=pictures_said,
         surveyed_requests=asked,
+        removed_landmarks={} if parent is None else parent.removed(),
         alias_step_m=step_m,
     )
     details = DraftDetails(
@@ -347,7 +357,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         tile_size_m=TILE_SIZE_M,
         camera=CameraEntry(**{name: getattr(camera, name) for name in CameraEntry.__struct_fields__}),
         recordings=tuple(s.entry for s in built.taken),
-        configuration=_configuration(run, parent),
+        configuration=_configuration(run, parent) | corrections.configuration(site),
         libraries=library_versions(),
         # A robot downloads the manifest: its part about the build is short.
         report={key: value for key, value in to_plain(report).items() if key not in _NOT_FOR_ROBOTS}
@@ -372,21 +382,13 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     return draft
 
 
-_CLOCKS_BEGIN_NS = 946_684_800_000_000_000  # the year 2000: earlier stamps count from a start, not from 1970
-
-
 def covered_requests(maps: MapStore, site: str, joined: MergedMap) -> dict[str, float]:
     """Return by id of each open request the covered share of its places; recordings older than the request do not count."""
     places = joined.map.map_from_body[:, :2, 3]
-    drives = map_trajectories(joined)
-    found = {}
-    for request in maps.survey_requests(site):
-        later = [
-            drive.positions_m[:, :2]
-            for drive in drives
-            if len(drive) and not _CLOCKS_BEGIN_NS < int(drive.stamps_ns[-1]) < request.asked_ns
-        ]
-        found[request.id] = round(request.covered_share(places, np.concatenate([np.zeros((0, 2)), *later])), 3)
+    found = {
+        request.id: round(request.covered_share(places, driven_since(joined, request.asked_ns)), 3)
+        for request in maps.survey_requests(site)
+    }
     return {name: share for name, share in found.items() if share > 0}
 
 

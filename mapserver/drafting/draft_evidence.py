@@ -116,13 +116,17 @@ def _read(
 
 @dataclass(frozen=True, slots=True)
 class Before:
-    """The parent version of a draft: its manifest, survey, tiles and grid, and the calibrations judged up to it."""
+    """The parent version of a draft: its manifest, survey, tiles and grid, and the calibrations judged up to it.
+
+    removed_ids: landmarks that corrections of the site's areas take from the draft, None for none.
+    """
 
     manifest: Manifest
     survey: SurveyMap
     tiles: list[Tile]
     calibrations: list[RigEvidence]
     grid: Grid = field(default_factory=dict)
+    removed_ids: NDArray[np.uint32] | None = None
 
     @classmethod
     def of(cls, maps: MapStore, manifest: Manifest, survey: SurveyMap) -> "Before":
@@ -140,6 +144,12 @@ class Before:
         """
         new = survey_map.landmark_ids[survey_map.landmark_ids >= history_of(self.survey).next_landmark_id]
         return np.unique(np.concatenate([new, *(tile.landmark_ids for tile in self.tiles)])).astype(np.uint32)
+
+    def removed(self) -> dict[str, int]:
+        """Return by tile, as "x,y", how many of its landmarks corrections take from the draft."""
+        ids = np.zeros(0, np.uint32) if self.removed_ids is None else self.removed_ids
+        counts = {f"{tile.tile_x},{tile.tile_y}": int(np.isin(tile.landmark_ids, ids).sum()) for tile in self.tiles}
+        return {name: count for name, count in counts.items() if count}
 
     def trajectory_of(self, entry: RecordingEntry) -> tuple[Array, NDArray[np.bool_]] | None:
         """Return (F, 4, 4) map_from_body of a recording's frames from the build of this version, and a mask (F,) of usable ones.
@@ -221,7 +231,7 @@ def examine_draft(
     tasks: list[Callable[[], Any]] = [
         lambda: starts_without_prior(draft, probes.frames),
         lambda: repetition(draft, probes.frames),
-        lambda: examine(draft, current, probes, _breaks(sessions)),
+        lambda: examine(draft, current, probes, _breaks(sessions), None if before is None else before.removed_ids),
     ]
     starts, repeated, evidence = executor.map(lambda _, task: task(), None, tasks)
     found: Evidence = msgspec.structs.replace(

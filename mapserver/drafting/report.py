@@ -67,6 +67,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     surfels: SurfelReport | None = None
     pictures: PicturesReport | None = None
     surveyed_requests: dict[str, float] = {}
+    removed_landmarks: dict[str, int] = {}
 
 
 class Accuracy(msgspec.Struct, frozen=True):

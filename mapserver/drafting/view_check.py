@@ -43,12 +43,16 @@ def asked_views(sessions: Sequence[JudgedSession]) -> list[AskedView]:
 
 
 class TileChooser(NamedTuple):
-    """A map, its budget for robots, and what their tiles need. published: landmarks with priority, None in a first version."""
+    """A map, its budget for robots, and what their tiles need.
+
+    published: landmarks with priority, None in a first version. frozen (N,): those that are chosen only if published.
+    """
 
     survey_map: SurveyMap
     settings: BudgetSettings
     published: NDArray[np.uint32] | None
     vocabulary: Vocabulary
+    frozen: NDArray[np.bool_] | None = None
 
     def choose(self, views: Sequence[AskedView]) -> tuple[list[Tile], SurveyedViews]:
         """Return the tiles, and which views give no fix in them.
@@ -73,6 +77,8 @@ class TileChooser(NamedTuple):
 
     def _tiles(self, sightings: Sequence[Sighting]) -> list[Tile]:
         chosen = choose_landmarks(self.survey_map, self.settings, TILE_SIZE_M, self.published, sightings)
+        if self.frozen is not None and self.published is not None:
+            chosen = np.where(self.frozen, np.isin(self.survey_map.landmark_ids, self.published), chosen)
         return tiles_from_survey(self.survey_map, chosen=chosen)
 
     def _view(self, tiles: Sequence[Tile]) -> MapView:

@@ -1,18 +1,23 @@
 """Operators' knowledge of a site's building: its named areas, and the pose of the map in its floor plan. Both are kept with the site."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from math import degrees
 
+import msgspec
+import numpy as np
+
 from fleetmap.encoding import to_json
-from fleetmap.errors import StateError
+from fleetmap.errors import StateError, UsageError
 from fleetmap.geometry import Array
 from fleetmap.mapformat.building import ALIGNMENT, AREAS
 from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment, map_corners_m
-from mapserver.floor_plan.areas import Areas, read_areas
+from mapserver.floor_plan.areas import Area, Areas, Correction, CorrectionKind, read_areas
 from mapserver.floor_plan.pins import Fit, Pin, fit_pins
 from mapserver.floor_plan.plan_file import PlanFile, upwards
 from mapserver.grid.masks import check_masks_on_map
 from mapserver.store import Actor, MapStore
+from mapserver.store.map_store import AREAS_BEFORE
 
 
 def keep_areas(
@@ -20,24 +25,82 @@ def keep_areas(
 ) -> Areas:
     """Replace the areas of a site by those of a GeoJSON file, or remove them (None); return them. detail: for the log.
 
-    tag: `areas_tag` of the areas that were looked at, None for any. UsageError for an unknown site, for invalid areas and for a mask
-    outside of the map, ChangedError if somebody changed them since.
+    tag: `areas_tag` of the areas that were looked at, None for any. UsageError for an unknown site, for invalid areas, for a mask
+    outside of the map and a correction without a reason, ChangedError if somebody changed them since.
     """
-    current, alignment = store.current(site), store.alignment(site)
-    if data is not None and current is not None:
-        areas = read_areas(data, None if alignment is None else alignment.frame)
-        check_masks_on_map(areas, store.manifest(site, current.version))
+    current, before = store.current(site), store.areas(site)
+    if data is not None:
+        areas = _read(store, site, data)
+        if current is not None:
+            check_masks_on_map(areas, store.manifest(site, current.version))
+        data = _dated(data, areas, before, actor, store.now_ns())
     store.keep_site_files(site, {AREAS: data}, detail, actor=actor, areas_tag=tag)
     return store.areas(site)
 
 
+def correct_area(store: MapStore, site: str, name: str, kind: CorrectionKind | None, actor: Actor) -> Areas:
+    """Let an area of a site correct the map, or no longer (None), and return all areas. UsageError for an unknown one; as `keep_areas`."""
+    areas = store.areas(site)
+    if name not in areas.names:
+        raise UsageError(
+            f"site {site} has no area {name[:80]!r}; see `mapserver areas list`, or draw it on the Maps page"
+        )
+    correction = None if kind is None else Correction(kind, actor.reason)
+    changed = [replace(area, correction=correction) if area.name == name else area for area in areas.areas]
+    data = to_json(Areas.of(changed).geojson(site))
+    return replace_areas(store, site, data, actor, tag=store.areas_tag(site))
+
+
+def undo_areas(store: MapStore, site: str, actor: Actor) -> Areas:
+    """Bring back the areas as they were before their last change, with the moments of their corrections, and return them; undone once more
+    they are as now. Errors as of `keep_areas`.
+    """
+    store.current(site)  # raises for an unknown site
+    store.keep_site_files(site, {AREAS: store.site_file(site, AREAS_BEFORE)}, "last change undone", actor=actor)
+    return store.areas(site)
+
+
+def _read(store: MapStore, site: str, data: bytes) -> Areas:
+    alignment = store.alignment(site)
+    return read_areas(data, None if alignment is None else alignment.frame)
+
+
+def _dated(data: bytes, areas: Areas, before: Areas, actor: Actor, now_ns: int) -> bytes:
+    """Give every correction its reason and the moment since when it holds: that of the same one before, else now.
+
+    A new one without a reason gets the actor's; UsageError if there is none.
+    """
+    if not areas.corrections:
+        return data
+    collection, new = msgspec.json.decode(data), {area.name: area for area in areas.corrections}
+    for number, feature in enumerate(collection["features"]):
+        area = new.get(feature["properties"]["name"].strip())
+        if area is None or area.correction is None:
+            continue
+        known = next((old.correction for old in before.corrections if _is_same(old, area)), None)
+        reason = area.correction.reason.strip() or (known.reason if known else actor.reason)
+        if not reason:
+            raise UsageError(f"area {area.name!r}: a correction of the map needs a reason; add it, or --reason")
+        since_ns = known.since_ns if known else now_ns + number  # each has another one, by which versions know it
+        feature["properties"]["correction"] = {"kind": area.correction.kind, "reason": reason, "since_ns": since_ns}
+    return to_json(collection)
+
+
+def _is_same(before: Area, after: Area) -> bool:
+    """True if two areas correct the map alike, whatever their names: to a millimetre, for areas that were sent in another frame."""
+    if before.correction is None or after.correction is None or before.correction.kind is not after.correction.kind:
+        return False
+    rings = list(zip(before.rings, after.rings, strict=False))
+    return len(before.rings) == len(after.rings) and all(
+        len(a) == len(b) and bool(np.allclose(a, b, rtol=0, atol=1e-3)) for a, b in rings
+    )
+
+
 def replace_areas(store: MapStore, site: str, data: bytes, actor: Actor, *, tag: str | None) -> Areas:
     """As `keep_areas`, with the names in the log. Areas that were drawn in the building stay in its frame: they move with the alignment."""
-    alignment, before = store.alignment(site), store.areas(site)
-    frame = None if alignment is None else alignment.frame
-    after = read_areas(data, frame)
-    if before.frame == "building" and after.frame == "map":
-        data = to_json(after.geojson(site, frame))
+    alignment, before, after = store.alignment(site), store.areas(site), _read(store, site, data)
+    if alignment is not None and before.frame == "building" and after.frame == "map":
+        data = to_json(after.geojson(site, alignment.frame))
     added, removed = (sorted({*these.names} - {*others.names}) for these, others in ((after, before), (before, after)))
     words = [f"{done} {', '.join(names)}" for done, names in (("added", added), ("removed", removed)) if names]
     return keep_areas(store, site, data, "; ".join(words)[:2000] or "changed", actor, tag=tag)

@@ -13,6 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.encoding import to_plain
 from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, inside_rings, se3_inverse, transform_points
 from fleetmap.mapformat.building import BuildingFrame
@@ -47,10 +48,27 @@ class MaskKind(StrEnum):
     SPEED = "speed"
 
 
+class CorrectionKind(StrEnum):
+    """Effect of an area on maps: learned anew once, never used, or not changed by surveys."""
+
+    FORGET = "forget"
+    NEVER_USE = "never-use"
+    FREEZE = "freeze"
+
+
+class Correction(msgspec.Struct, frozen=True):
+    """Why an area corrects the map, and since when, in nanoseconds since 1970. since_ns: None until the site keeps it."""
+
+    kind: CorrectionKind
+    reason: Annotated[str, msgspec.Meta(max_length=500)] = ""
+    since_ns: Annotated[int, msgspec.Meta(ge=0)] | None = None
+
+
 class _Properties(msgspec.Struct):
     name: str
     mask: MaskKind | None = None
     percent: Annotated[int, msgspec.Meta(ge=1, le=99)] | None = None
+    correction: Correction | None = None
 
 
 class _Feature(msgspec.Struct):
@@ -70,12 +88,23 @@ class Area:
     """rings: (V, 2) corners in `map`, metres, not repeated at the end; inside by the even-odd rule over all rings.
 
     mask: effect on planners, None if absent. percent: of the robot's largest speed, in an area of the kind SPEED.
+    correction: effect on maps, None if absent.
     """
 
     name: str
     rings: tuple[Array, ...]
     mask: MaskKind | None = None
     percent: int | None = None
+    correction: Correction | None = None
+
+    @property
+    def effects(self) -> str:
+        """Effects on planners and maps as text, each after a comma; empty without any."""
+        speed = "" if self.percent is None else f" {self.percent} %"
+        masked = "" if self.mask is None else f", {self.mask.value}{speed}"
+        return (
+            masked if self.correction is None else f"{masked}, {self.correction.kind.value}: {self.correction.reason}"
+        )
 
     @property
     def size_m2(self) -> float:
@@ -85,6 +114,17 @@ class Area:
     def holds(self, points_m: Array) -> NDArray[np.bool_]:
         """Return a mask (N,) of the points (N, 2) inside."""
         return inside_rings(points_m, self.rings)
+
+    def feature(self, target_from_map: Array) -> dict[str, Any]:
+        """Return it as a feature of GeoJSON in another frame; its rings are one polygon, holes included."""
+        effects = {"mask": self.mask, "percent": self.percent} if self.mask else {}
+        corrects = {"correction": to_plain(self.correction)} if self.correction else {}
+        coordinates = [_closed(_moved(ring, target_from_map)) for ring in self.rings]
+        return {
+            "type": "Feature",
+            "geometry": {"type": "Polygon", "coordinates": coordinates},
+            "properties": {"name": self.name} | effects | corrects,
+        }
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,6 +145,11 @@ class Areas:
 
     def __bool__(self) -> bool:
         return bool(self.areas)
+
+    @property
+    def corrections(self) -> list[Area]:
+        """Areas that correct the map."""
+        return [area for area in self.areas if area.correction is not None]
 
     @property
     def names(self) -> list[str]:
@@ -144,22 +189,11 @@ class Areas:
         return _TILE.sub(lambda found: self.tile_words((int(found[1]), int(found[2])), size_m), text)
 
     def geojson(self, site: str, building: BuildingFrame | None = None) -> dict[str, Any]:
-        """Return all areas, in `map` or in the building; each one's rings are one polygon, holes included."""
+        """Return all areas, in `map` or in the building."""
         frame, target_from_map = "map", np.eye(4)
         if building is not None:
             frame, target_from_map = "building", building.building_from_map
-        features = [
-            {
-                "type": "Feature",
-                "geometry": {
-                    "type": "Polygon",
-                    "coordinates": [_closed(_moved(ring, target_from_map)) for ring in area.rings],
-                },
-                "properties": {"name": area.name}
-                | ({} if area.mask is None else {"mask": area.mask, "percent": area.percent}),
-            }
-            for area in self.areas
-        ]
+        features = [area.feature(target_from_map) for area in self.areas]
         return {"type": "FeatureCollection", "site": site, "frame": frame, "units": "metres", "features": features}
 
     def _near(self, box_m: tuple[float, ...]) -> list[Area]:
@@ -227,7 +261,7 @@ def _area(feature: _Feature, map_from_building: Array | None) -> Area:
         raise UsageError(f"area {name!r} has no corners; draw it as a polygon")
     if map_from_building is not None:
         rings = [_moved(ring, map_from_building) for ring in rings]
-    return Area(name, tuple(rings), mask, percent)
+    return Area(name, tuple(rings), mask, percent, feature.properties.correction)
 
 
 def _ring(positions: list[list[float]], where: str) -> Array:

@@ -6,6 +6,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, inside_rings
 
@@ -45,9 +46,14 @@ class SurveyRequest:
     def covered_share(self, places_map_m: Array, driven_map_m: Array) -> float:
         """Return the share of places (K, 2) in the polygon within 2 m of a driven position (F, 2); 0 without places in it."""
         inside = places_map_m[inside_rings(places_map_m, [np.array(self.corners_map_m)])]
-        if not len(inside) or not len(driven_map_m):
-            return 0.0
-        return float(np.mean(scipy.spatial.cKDTree(driven_map_m).query(inside)[0] <= _NEAR_M))
+        return float(np.mean(near_drives(inside, driven_map_m))) if len(inside) else 0.0
+
+
+def near_drives(places_map_m: Array, driven_map_m: Array) -> NDArray[np.bool_]:
+    """Return (K,) which places (K, 2) are within 2 m of a driven position (F, 2)."""
+    if not len(driven_map_m):
+        return np.zeros(len(places_map_m), bool)
+    return np.asarray(scipy.spatial.cKDTree(driven_map_m).query(places_map_m)[0] <= _NEAR_M)
 
 
 def read_request(kind: str, data: bytes) -> SurveyRequest:

@@ -33,13 +33,22 @@ class Probes:
         return [*self.held_out, *self.replayed] or self.last_version
 
 
-def examine(draft: MapView, before: MapView | None, probes: Probes, motion: TrajectoryBreaks | None) -> Evidence:
-    """Return the results of the probes in the draft, and in the current version's tiles if present; starts are left to the caller."""
+def examine(
+    draft: MapView,
+    before: MapView | None,
+    probes: Probes,
+    motion: TrajectoryBreaks | None,
+    removed_ids: NDArray[np.uint32] | None = None,
+) -> Evidence:
+    """Return the results of the probes in the draft, and in the current version's tiles if present; starts are left to the caller.
+
+    removed_ids: landmarks of the current version that operators' corrections removed from the draft; None for none.
+    """
     frames = probes.frames
     return Evidence(
-        held_out=compare(draft, before, probes.held_out),
-        replayed=compare(draft, before, probes.replayed),
-        last_version=compare(draft, before, _placed_by_either(draft, before, probes.last_version)),
+        held_out=compare(draft, before, probes.held_out, removed_ids),
+        replayed=compare(draft, before, probes.replayed, removed_ids),
+        last_version=compare(draft, before, _placed_by_either(draft, before, probes.last_version), removed_ids),
         aliasing=aliasing(draft, frames),
         aliasing_before=None if before is None else aliasing(before, frames),
         starts=None,
@@ -56,17 +65,29 @@ def _placed_by_either(draft: MapView, before: MapView | None, probes: Sequence[P
     return [p for p in probes if any(relocalized(view, p, p.map_from_cam) is not None for view in views)]
 
 
-def compare(draft: MapView, before: MapView | None, probes: Sequence[Probe]) -> Compared | None:
-    """Relocalize each probe in both maps from a prior at its own position; None without probes."""
+def compare(
+    draft: MapView, before: MapView | None, probes: Sequence[Probe], removed_ids: NDArray[np.uint32] | None = None
+) -> Compared | None:
+    """Relocalize each probe in both maps from a prior at its own position; None without probes.
+
+    Matches of removed landmarks do not count in inliers_share: their loss is wanted, a lost fix is not.
+    """
     if not probes:
         return None
     now = [relocalized(draft, probe, probe.map_from_cam) for probe in probes]
     if before is None:
         return Compared(_figures(draft, probes, now))
     then = [relocalized(before, probe, probe.map_from_cam) for probe in probes]
-    shares = [a.inliers / b.inliers for a, b in zip(now, then, strict=True) if a is not None and b is not None]
+    left = [0 if fix is None else _inliers_left(before, fix, removed_ids) for fix in then]
+    shares = [a.inliers / inliers for a, inliers in zip(now, left, strict=True) if a is not None and inliers]
     inliers_share = round(float(np.median(shares)), 4) if shares else None
     return Compared(_figures(draft, probes, now), _figures(before, probes, then), inliers_share)
+
+
+def _inliers_left(view: MapView, fix: Fix, removed_ids: NDArray[np.uint32] | None) -> int:
+    if removed_ids is None or fix.matches is None:
+        return fix.inliers
+    return fix.inliers - int(np.isin(view.landmark_ids[fix.matches[:, 1]], removed_ids).sum())
 
 
 def _figures(view: MapView, probes: Sequence[Probe], fixes: Sequence[Fix | None]) -> ProbeFigures:

@@ -182,12 +182,17 @@ def _calibration_reasons(
 
 
 def _shares(draft: Manifest, current: Manifest) -> dict[str, float]:
-    """Return by tile its landmarks against before: a tile is covered with at least half as many."""
-    before = {(tile.x, tile.y): tile.landmarks for tile in current.tiles if tile.landmarks}
+    """Return by tile its landmarks against before: a tile is covered with at least half as many.
+
+    Those that corrections took from the draft, as its report says, do not count.
+    """
+    found = draft.report.get("removed_landmarks") if draft.parent == current.version else None
+    removed = found if isinstance(found, dict) else {}
+    before = {(tile.x, tile.y): tile.landmarks - removed.get(f"{tile.x},{tile.y}", 0) for tile in current.tiles}
     after = {(tile.x, tile.y): tile.landmarks for tile in draft.tiles}
     covered = sum(count for cell, count in before.items() if 2 * after.get(cell, 0) >= count)
     return {
-        "landmarks_share": round(draft.landmarks / max(1, current.landmarks), 4),
+        "landmarks_share": round(draft.landmarks / max(1, sum(before.values())), 4),
         "coverage_share": round(covered / max(1, sum(before.values())), 4),
         "bytes_share": round(draft.tile_bytes / max(1, current.tile_bytes), 4),
     }

@@ -32,7 +32,7 @@ from fleetmap.mapformat import (
     encode_manifest,
     encode_tile,
 )
-from fleetmap.mapformat.building import BUILDING_KEY
+from fleetmap.mapformat.building import AREAS, BUILDING_KEY
 from fleetmap.mapformat.version_file import BlobKind, ExportBlob, ExportHead, open_export
 from mapserver.quality.figures import carried_evidence, trusted_calibrations
 from mapserver.store.blobs import Blobs
@@ -72,6 +72,8 @@ from mapserver.store.version_rows import (
 )
 
 _USUAL_RETENTION = Retention()
+AREAS_BEFORE = "areas before"
+"""Kind of a site's file with its areas before their last change."""
 
 
 class MapStore(StoreQueries):
@@ -178,9 +180,9 @@ class MapStore(StoreQueries):
     ) -> None:
         """Store files of a site beside its versions, by kind, in one transaction; None deletes a kind. detail: for the log.
 
-        Failures get the area names valid then. Raises UsageError for an unknown site, for invalid areas and for areas
-        without the alignment that they need, ChangedError if the areas have another tag than areas_tag (None: any), StoreError
-        on a disk error.
+        Failures get the area names valid then; the replaced areas are kept as AREAS_BEFORE. Raises UsageError for an unknown site,
+        for invalid areas and for areas without the alignment that they need, ChangedError if the areas have another tag than
+        areas_tag (None: any), StoreError on a disk error.
         """
         self._check_site(site)
         with self._locked(shared=True):
@@ -190,6 +192,10 @@ class MapStore(StoreQueries):
                     raise ChangedError(
                         f"the areas of site {site} were changed meanwhile; load them anew, and make the change again"
                     )
+                if AREAS in files:
+                    connection.execute("DELETE FROM site_files WHERE site = ? AND kind = ?", (site, AREAS_BEFORE))
+                    rename = "UPDATE site_files SET kind = ? WHERE site = ? AND kind = ?"
+                    connection.execute(rename, (AREAS_BEFORE, site, AREAS))
                 connection.executemany("DELETE FROM site_files WHERE site = ? AND kind = ?", [(site, k) for k in files])
                 rows = [(site, kind, sha256) for kind, sha256 in addresses.items()]
                 connection.executemany("INSERT INTO site_files (site, kind, sha256) VALUES (?, ?, ?)", rows)

@@ -2,12 +2,9 @@
 
 import json
 import shutil
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 
@@ -27,31 +24,11 @@ from mapserver.survey.stages import survey
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs
 from support.recordings.recording_samples import Sample, make_sample, write_euroc
 from support.room_site import KNOWN_RIG, invoke, run
-from support.worlds import box_room
-from support.worlds.box_room import out_and_back, ride_sample
+from support.worlds.box_room import out_and_back, poster, ride_sample
 
 FRAME_S = 0.1
-WALL = 3  # the face at y = 3 that all rides look at
 POSTER_M = np.array([[-0.8, -0.7], [0.8, 0.7]])  # x and z of its corners
 FIELDS = ("points_map", "descriptors", "view_directions_map", "view_half_angle_rad", "max_distance_m", "sigma_m")
-
-
-@contextmanager
-def poster(seed: int) -> Iterator[None]:
-    """Another picture on part of the wall for as long as this lasts."""
-    texture = box_room._texture(WALL)
-    before = texture.copy()
-    (left, low), (right, high) = np.rint((POSTER_M - box_room.ROOM_M[0, [0, 2]]) / 0.01).astype(int)
-    rng = np.random.default_rng(seed)
-    patch = np.full((high - low, right - left), 120.0)
-    for _ in range(120):
-        x, y, w, h = (int(v) for v in (*rng.integers(0, 150, 2), *rng.integers(6, 30, 2)))
-        patch[y : y + h, x : x + w] = rng.uniform(20, 235)
-    texture[low:high, left:right] = cv2.GaussianBlur(patch, (0, 0), 1.2)
-    try:
-        yield
-    finally:
-        texture[:] = before
 
 
 def second_ride(seed: int) -> Sample:
@@ -66,7 +43,7 @@ class Nights:
         self.folder, self.store = folder, folder / "store"
         write_euroc(folder / "night1", ride_sample(out_and_back(5.0), 50, FRAME_S))
         self.samples = {2: second_ride(2)}
-        with poster(7):
+        with poster(7, POSTER_M):
             self.samples |= {3: second_ride(3), 4: second_ride(4)}
         for night, sample in self.samples.items():
             write_euroc(folder / f"night{night}", sample)

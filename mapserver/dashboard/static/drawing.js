@@ -51,7 +51,9 @@ function drawn() {
 }
 
 // The areas are sent as a whole: as they were when the dialog opened, with one change. The server refuses it if others changed them since.
-const described = ({ name, mask, percent }) => ({ name, ...(mask && { mask }), ...(mask === "speed" && { percent: Number(percent) }) });
+const described = ({ name, mask, percent, correction, reason }) => ({
+  name, ...(mask && { mask }), ...(mask === "speed" && { percent: Number(percent) }), ...(correction && { correction: { kind: correction, reason } }),
+});
 const isCalled = (name) => ({ properties }) => properties.name === name;
 const outlined = () => ({ type: "Polygon", coordinates: [[...corners, corners[0]]] });
 const CHANGES = {
@@ -65,12 +67,12 @@ async function read(address) {
   return { answer, areas: answer.ok && (await answer.json()) };
 }
 
-async function send(before, { dataset }, { name, mask, percent, ...by }) {
+async function send(before, { dataset }, { name, mask, percent, correction, ...by }) {
   const { answer, areas } = await before;
   if (!answer.ok) return answer;
   if (dataset.name && !areas.features.some(isCalled(dataset.name)))
     return new Response(JSON.stringify({ detail: `There is no area ${dataset.name} any more: somebody else changed it.` }), { status: 412 });
-  const features = CHANGES[dataset.area](areas.features, dataset.name, { name: name?.trim(), mask, percent });
+  const features = CHANGES[dataset.area](areas.features, dataset.name, { name: name?.trim(), mask, percent, correction, reason: by.reason });
   const headers = { "If-Match": answer.headers.get("ETag"), "Content-Type": "application/geo+json" };
   const request = features.length ? { method: "PUT", headers, body: JSON.stringify({ ...areas, features }) } : { method: "DELETE", headers };
   return fetch(`${dataset.act}?${new URLSearchParams(by)}`, request);
@@ -81,10 +83,13 @@ document.addEventListener("asked", ({ target }) => {
   const before = read(target.dataset.act);
   before.catch(() => {}); // it is told when it is sent
   target.send = (act, told) => send(before, act, told);
-  const { mask, percent } = document.querySelector("dialog form").elements;
+  const { mask, percent, correction, reason } = document.querySelector("dialog form").elements;
   if (!mask) return;
-  const follow = () => (percent.required = !(percent.parentElement.hidden = mask.value !== "speed"));
-  mask.addEventListener("change", follow);
+  const follow = () => {
+    percent.required = !(percent.parentElement.hidden = mask.value !== "speed");
+    reason.required = Boolean(correction.value) && correction.value !== target.dataset.correction;
+  };
+  for (const field of [mask, correction]) field.addEventListener("change", follow);
   follow();
 });
 if (drawing) drawn();

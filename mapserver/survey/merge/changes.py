@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.relocalization.landmark_visibility import COLUMNS, ROWS, Rows, image_cells
 from mapserver.survey.finish.culling import parallax_rad
+from mapserver.survey.merge.area_corrections import SurveyLimits
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.merge.joint_adjustment import JointSolution, free_observations
@@ -26,23 +27,34 @@ Mask = NDArray[np.bool_]
 
 
 def what_changes(
-    base: BaseMap, survey: Survey, joint: JointSolution, gone: Mask, settings: SurveySettings, *, anchored: bool
+    base: BaseMap,
+    survey: Survey,
+    joint: JointSolution,
+    gone: Mask,
+    settings: SurveySettings,
+    *,
+    anchored: bool,
+    limits: SurveyLimits,
 ) -> tuple[Change, int, int]:
     """Return the change, and how many keyframes and landmarks of the map moved. gone (N,): faded landmarks."""
     marks, body_from_cam = survey.state.landmarks, survey.state.body_from_cam
     map_from_cam = joint.map_from_body @ body_from_cam
     moved_keyframes = np.zeros(len(base.map_from_cam), bool)
     moved_keyframes[joint.base_keyframes] = _keyframes_moved(base, joint, settings.sessions) if anchored else True
+    moved_keyframes &= ~limits.freezes(base.map_from_cam[:, :3, 3])
     cameras = base.map_from_cam.copy()
     cameras[joint.base_keyframes] = joint.base_from_body @ body_from_cam
     judged = shifts(base, map_from_cam, joint.sightings, settings)
     points, moved = _moved_points(base, joint, judged, moved_keyframes, cameras, anchored=anchored)
-    alone = judged.significant & ~moved[judged.rows] & ~gone[judged.rows]
+    frozen = limits.freezes(base.points_map)
+    points[frozen], moved[frozen] = base.points_map[frozen], False
+    alone = judged.significant & ~moved[judged.rows] & ~gone[judged.rows] & ~frozen[judged.rows]
     keep = ~gone
     keep[judged.rows[alone]] = False
     free = free_observations(marks, joint.sightings)
     fresh = _new_landmarks(base, survey.odometry.keyframes, marks, joint, free, settings.sessions)
     fresh &= known_well(survey, joint, settings)
+    fresh &= ~limits.closes(joint.own_points_map, int(survey.map.trajectory.stamps_ns[-1]))
     again = _resighted(base, judged.rows[alone], judged.points_map[alone], joint.sightings)
     own = free & fresh[marks.obs_landmark]
     number = len(again.points_map) + np.cumsum(fresh) - 1

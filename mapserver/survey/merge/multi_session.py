@@ -10,6 +10,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.finish.frame_adjustment import frame_trajectory
 from mapserver.survey.finish.map_transform import transform_map, transform_state
+from mapserver.survey.merge.area_corrections import SurveyLimits
 from mapserver.survey.merge.joint_adjustment import Measured, begun
 from mapserver.survey.merge.membership import Membership, MembershipEvidence, MembershipVerdict
 from mapserver.survey.merge.pipeline import Counts, Extension, extend
@@ -18,6 +19,7 @@ from mapserver.survey.stages import Survey
 from mapserver.survey.survey_map import SurveyMap
 
 Mask = NDArray[np.bool_]
+_NO_LIMITS = SurveyLimits()
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,8 +67,8 @@ class MapMerger:
     once, are tried after all others. The map depends on the order of the sessions, not on the time of adding them.
     """
 
-    def __init__(self, base: SurveyMap | None, settings: SurveySettings) -> None:
-        self._settings, self._current = settings, base
+    def __init__(self, base: SurveyMap | None, settings: SurveySettings, limits: SurveyLimits = _NO_LIMITS) -> None:
+        self._settings, self._current, self._limits = settings, base, limits
         self._measured: Measured | None = None  # constraints of an unpublished map
         self._sessions: list[Session] = []
         self._waiting: list[int] = []
@@ -106,7 +108,9 @@ class MapMerger:
             outcome = Outcome(number, MembershipVerdict.JOINED, "begins the map")
         else:
             known, place = self._measured, session.map_from_survey
-            result = extend(self._current, session.survey, self._settings, known=known, map_from_survey=place)
+            result = extend(
+                self._current, session.survey, self._settings, known=known, map_from_survey=place, limits=self._limits
+            )
             if isinstance(result, Membership):
                 self._outcomes[number] = Outcome(number, result.verdict, result.reason, evidence=result.evidence)
                 return

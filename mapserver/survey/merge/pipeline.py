@@ -8,6 +8,7 @@ from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.bundle.odometry_factors import chain_edges
 from mapserver.survey.finish.frame_adjustment import frame_trajectory
+from mapserver.survey.merge.area_corrections import SurveyLimits
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import what_changes
 from mapserver.survey.merge.confirmation import firm_landmarks
@@ -25,6 +26,8 @@ from mapserver.survey.merge.merge import merged
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import Survey
 from mapserver.survey.survey_map import SurveyMap
+
+_NO_LIMITS = SurveyLimits()
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,12 +66,13 @@ def extend(
     *,
     known: Measured | None = None,
     map_from_survey: Array | None = None,
+    limits: SurveyLimits = _NO_LIMITS,
 ) -> Extension | Membership:
     """Return the map joined with a survey that passes the test of `membership`: at the pose by fixes, and after joint adjustment.
 
     known: constraints of base_map, which is adjusted as a whole; None for a published one, whose landmarks without
     significant motion are bit-identical.
-    map_from_survey: pose by position priors, if any.
+    map_from_survey: pose by position priors, if any. limits: what operators do not let surveys change.
     """
     state, guess = survey.state, survey.odometry
     if not (guess.scale_known and base_map.scale_known):
@@ -109,12 +113,16 @@ def extend(
     found = count_landmarks(base, guess.keyframes, map_from_body @ state.body_from_cam, joint.sightings)
     anchored = known is None
     gone = faded(base, found, settings) if anchored else np.zeros(len(base.points_map), bool)
-    change, moved_keyframes, moved_landmarks = what_changes(base, survey, joint, gone, settings, anchored=anchored)
+    gone &= ~limits.freezes(base.points_map)
+    change, moved_keyframes, moved_landmarks = what_changes(
+        base, survey, joint, gone, settings, anchored=anchored, limits=limits
+    )
+    cameras = change.map_from_cam[:, :3, 3]
     # Frames between keyframes were located within the survey; they follow their moved keyframes.
     stamps_ns, survey_from_body = survey.map.trajectory.stamps_ns, survey.map.trajectory.frame_from_body
     placed = frame_trajectory(stamps_ns, survey_from_body, guess.keyframe_frames, map_from_body)
     result = replace(
-        merged(base, change, found, guess.keyframes, settings.sessions.new_place_landmarks),
+        merged(base, change, found, guess.keyframes, settings.sessions.new_place_landmarks, limits.freezes(cameras)),
         trajectory=Trajectory(stamps_ns, placed),
         trajectory_estimated=survey.map.trajectory_estimated,
     )

@@ -71,6 +71,39 @@ def test_a_change_of_what_somebody_else_changed_is_refused(server: Server) -> No
     check_problem(server.client.put(f"{AREAS}?if-match=*", content=drawn("gate")), 422, "knows actor, reason")
 
 
+def test_a_correction_keeps_its_moment_and_reason_until_it_is_another(server: Server) -> None:
+    def kept() -> list[tuple[str, str, int]]:
+        found = [(area.name, area.correction) for area in server.store.areas("lab").corrections]
+        return [(name, one.reason, one.since_ns or 0) for name, one in found if one is not None]
+
+    put(server, drawn("glass", correction={"kind": "never-use"}))
+    ((_, reason, since_ns),) = kept()
+    assert reason == ADA["reason"]
+    assert since_ns > 10**18
+    answer = server.client.get(AREAS).json()
+    answer["features"][0]["properties"] |= {"name": "front", "correction": {"kind": "never-use", "since_ns": 5}}
+    put(server, json.dumps(answer).encode())
+    assert kept() == [("front", reason, since_ns)], "another name is the same correction; its moment is the server's"
+    put(server, drawn("front", correction={"kind": "forget", "reason": "new racks"}))
+    ((_, reason, later_ns),) = kept()
+    assert (reason, later_ns > since_ns) == ("new racks", True)
+    undone = server.client.post(f"{AREAS}/undo", json=ADA)
+    assert undone.status_code == 200
+    assert kept() == [("front", ADA["reason"], since_ns)]
+    assert listed(server) == "front: 12.0 m2, never-use: racks were moved\n1 areas\n"
+    server.client.post(f"{AREAS}/undo", json=ADA)
+    assert kept() == [("front", "new racks", later_ns)]
+    put(server, drawn("a"))
+    site = ["--site", "lab", "--store", str(server.folder), "--reason", "why"]
+    for words, said in (
+        (["correct", "a", "freeze"], "a: 12.0 m2, freeze: why\n"),
+        (["correct", "a", "nothing"], "a: 12.0 m2\n"),
+    ):
+        assert CliRunner().invoke(app, ["areas", *words, *site]).output == said
+    assert "1 areas, as before" in CliRunner().invoke(app, ["areas", "undo", *site]).output
+    assert [name for name, *_ in kept()] == ["a"]
+
+
 @pytest.mark.parametrize(
     ("content", "status", "words"),
     [
@@ -80,6 +113,7 @@ def test_a_change_of_what_somebody_else_changed_is_refused(server: Server) -> No
         (drawn("a", frame="wgs84"), 422, "frame"),
         (drawn("a", frame="building"), 422, "need the map's pose"),
         (drawn("a", mask="speed"), 422, "percent"),
+        (drawn("a", correction={"kind": "burn", "reason": "x"}), 422, "burn"),
         (drawn("a").replace(b"[4, 3]", b"[0, 3.5]").replace(b"[0, 3]", b"[4, 4]"), 422, "crosses itself"),
         (drawn("a", mask="keep-out").replace(b"4", b"904").replace(b"[0", b"[900"), 422, "outside of version 1"),
         (b" " * (8 << 20) + b"x", 413, "more than 8388608 bytes"),

@@ -204,6 +204,20 @@ def test_an_area_is_drawn_named_changed_and_removed(page: Page, tmp_path: Path) 
         dialog.get_by_role("button", name=re.compile("^Yes")).click()
         expect(areas).to_contain_text("aisle 5: 128 m²")
         assert listed() == "aisle 5: 128.0 m2\ngate: 6.0 m2\n2 areas\n"
+
+        page.get_by_role("button", name="Change aisle 5").click()
+        dialog.get_by_label("Correct the map").select_option("forget what is here, learn it anew")
+        dialog.get_by_label("Your name").fill("ada")
+        dialog.get_by_role("button", name=re.compile("^Yes")).click()
+        assert dialog.get_by_label("Reason").evaluate("field => field.matches(':invalid')"), "a correction has a reason"
+        dialog.get_by_label("Reason").fill("new racks")
+        dialog.get_by_role("button", name=re.compile("^Yes")).click()
+        expect(areas).to_contain_text("to be forgotten once a recording shows it anew, since")
+        expect(areas).to_contain_text("new racks")
+        assert listed().startswith("aisle 5: 128.0 m2, forget: new racks\n")
+        expect(page.locator(".site-map path.area.warn")).to_have_count(1)
+        change(page, "Undo the last change of areas")
+        expect(areas).not_to_contain_text("new racks")
         for name in ("aisle 5", "gate"):
             change(page, f"Remove {name}")
             expect(areas).not_to_contain_text(name)

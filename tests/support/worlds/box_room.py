@@ -3,7 +3,8 @@
 A ride is a function from seconds to map_from_body; it stands still before 0 and after its end.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 
 import cv2
@@ -17,6 +18,7 @@ from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOC
 ROOM_M = np.array([[-4.0, -3.0, -1.5], [4.0, 3.0, 1.5]])
 GRAVITY_MPS2 = 9.81
 _TEXEL_M = 0.01
+_WALL = 3  # the face at y = 3
 Ride = Callable[[float], Array]
 
 
@@ -103,6 +105,28 @@ def _texture(face: int) -> NDArray[np.uint8]:
         x, y, w, h = (int(v) for v in (*rng.integers(0, 800, 2), *rng.integers(6, 45, 2)))
         canvas[y : y + h, x : x + w] = rng.uniform(20, 235)
     return np.asarray(np.clip(cv2.GaussianBlur(canvas, (0, 0), 1.2), 0, 255), np.uint8)
+
+
+@contextmanager
+def poster(seed: int, corners_m: Array, shift_m: float = 0.0) -> Iterator[None]:
+    """Another picture on part of the wall at y = 3 for as long as this lasts, shifted sideways in its frame as on a screen.
+
+    corners_m: x and z of the lower left and the upper right one.
+    """
+    texture = _texture(_WALL)
+    before = texture.copy()
+    (left, low), (right, high) = np.rint((corners_m - ROOM_M[0, [0, 2]]) / _TEXEL_M).astype(int)
+    rng = np.random.default_rng(seed)
+    patch = np.full((high - low, right - left), 120.0)
+    for _ in range(patch.size * 120 // (160 * 140)):
+        at, (w, h) = rng.integers(0, np.array(patch.shape[::-1]) - 10), rng.integers(6, 30, 2)
+        patch[at[1] : at[1] + h, at[0] : at[0] + w] = rng.uniform(20, 235)
+    shifted = np.roll(cv2.GaussianBlur(patch, (0, 0), 1.2), round(shift_m / _TEXEL_M), axis=1)
+    texture[low:high, left:right] = shifted
+    try:
+        yield
+    finally:
+        texture[:] = before
 
 
 def points_seen(map_from_cam: Array, pixels: Array) -> Array:

@@ -10,7 +10,7 @@ const DRAWN = {
   picture: (item) => L.imageOverlay(item.url, corners(item.box), { className: `picture ${item.tone}` }),
   square: (item) =>
     L.rectangle(corners(item.box), { className: `cell ${item.tone}`, fillOpacity: 0.06 + 0.3 * item.full, weight: 1 }),
-  area: (item) => L.polygon(item.rings.map(places), { className: "area", fill: true, fillOpacity: 0.001, weight: 1.2 }),
+  area: (item) => L.polygon(item.rings.map(places), { className: `area ${item.tone}`, fill: true, fillOpacity: 0.001, weight: 1.2 }),
   line(item) {
     const drawn = L.polyline(places(item.points), { className: `line ${item.tone}`, weight: item.width, smoothFactor: 0 });
     if (item.hue !== null) drawn.on("add", () => drawn.getElement().style.setProperty("stroke", `hsl(${item.hue} 75% 55% / .55)`));
