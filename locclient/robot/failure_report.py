@@ -37,7 +37,7 @@ def expected_matches(
     max_angle_rad = np.radians(settings.fix.max_view_angle_deg)
     expected = visible_landmarks(cones_of_tiles(tiles), map_from_cam, camera, 0.0, max_angle_rad)
     pixels = expected.pixels
-    features = extract(left, settings.orb)
+    features = extract(left, settings.orb, camera.clearance_px)
     hit = np.full(len(pixels), -1, np.int64)
     if len(pixels) and len(features):
         descriptors = np.concatenate([tile.descriptors for tile in tiles])[expected.rows]

@@ -63,7 +63,8 @@ def motion_between(before: RectifiedFrame, after: RectifiedFrame, camera: Stereo
     With a second camera or depth by perspective-n-point from the first frame's points, which is exact in pure rotation
     too, else the rotation of the essential matrix, and a translation of NaN.
     """
-    corners = cv2.goodFeaturesToTrack(before.left, _CORNERS, 0.01, 12)
+    is_clear = None if camera.clearance_px is None else (camera.clearance_px > _WINDOW_PX // 2).astype(np.uint8)
+    corners = cv2.goodFeaturesToTrack(before.left, _CORNERS, 0.01, 12, mask=is_clear)
     if corners is None or len(corners) < _MIN_POINTS:
         return None
     pixels = corners.reshape(-1, 2).astype(np.float64)

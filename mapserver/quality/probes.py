@@ -40,7 +40,7 @@ class Probe:
 def probe_features(frame: RectifiedFrame, camera: StereoCamera, survey_orb: OrbSettings) -> FrameFeatures:
     """Return the features that a robot with the survey's extractor would extract from a frame, as many as on robots, all with depth."""
     orb = msgspec.structs.replace(survey_orb, count=_ROBOTS.orb.count)
-    return with_depth(frame, extract(frame.left, orb), camera, _ROBOTS.stereo)
+    return with_depth(frame, extract(frame.left, orb, camera.clearance_px), camera, _ROBOTS.stereo)
 
 
 def relocalized(view: MapView, probe: Probe, prior_map_from_cam: Array) -> Fix | None:

@@ -3,6 +3,7 @@
 
 #include <cstddef>
 
+#include "image.h"
 #include "lie.h"
 
 namespace fleetmap {
@@ -22,6 +23,7 @@ struct RigCamera {
 struct StereoImage {
   StereoLens lens;
   double width, height;
+  Clearance clearance = {};
 };
 
 // Radial-tangential distortion k1 k2 p1 p2 k3 k4 k5 k6. Sources: Brown 1966; OpenCV's order and its rational model.

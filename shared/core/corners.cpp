@@ -134,8 +134,10 @@ void clear_discs(Grey<uint8_t> free, const Pixel* taken, size_t count, double ra
 }  // namespace
 
 // Row by row; none where free, of the image's size, is 0 (no pointer: all is free).
-void CornerFinder::fast(GreyImage image, int threshold, ptrdiff_t border, const uint8_t* free, std::vector<Pixel>& found) {
+void CornerFinder::fast(GreyImage image, const CornerLimits& limits, const uint8_t* free, std::vector<Pixel>& found) {
   found.clear();
+  const int threshold = limits.threshold;
+  const ptrdiff_t border = limits.border;
   const ptrdiff_t width = image.width, height = image.height;
   if (std::min(width, height) <= 2 * border) return;
   // Scores of three rows: that which is looked through, the one above and the one below.
@@ -155,6 +157,7 @@ void CornerFinder::fast(GreyImage image, int threshold, ptrdiff_t border, const 
     for_each_set(here, border, width - border, [&](ptrdiff_t x) {
       const uint8_t s = here[x];
       if (free != nullptr && free[y * width + x] == 0) return;
+      if (!limits.clearance.holds(limits.scale * double(x), limits.scale * double(y), limits.scale * limits.clear)) return;
       if (s > here[x - 1] && s > here[x + 1] && s > above[x - 1] && s > above[x] && s > above[x + 1] && s > below[x - 1] && s > below[x] &&
           s > below[x + 1])
         found.push_back({float(x), float(y)});
@@ -219,10 +222,13 @@ void CornerFinder::find(GreyImage image, size_t count, const CornerLimits& limit
     free = free_.data();
   }
   const size_t enough = 2 * count;
-  fast(image, limits.threshold, limits.border, free, candidates_);
+  fast(image, limits, free, candidates_);
   if (candidates_.size() < enough) {
-    fast(image, limits.threshold, kCircleRadius, nullptr, whole_);
-    if (whole_.size() < enough) fast(image, std::max(limits.threshold / 2, 4), limits.border, free, candidates_);
+    CornerLimits other = limits;
+    other.border = kCircleRadius;
+    fast(image, other, nullptr, whole_);
+    other = limits, other.threshold = std::max(limits.threshold / 2, 4);
+    if (whole_.size() < enough) fast(image, other, free, candidates_);
   }
   eigenvalues_.resize(candidates_.size());
   min_eigenvalues(image, candidates_.data(), candidates_.size(), eigenvalues_.data());

@@ -36,6 +36,9 @@ struct CornerLimits {
   int threshold;
   ptrdiff_t border;  // from the image's edges, at least 3
   double distance;   // of corners from each other
+  // Of the robot's own body in the image, of which this one is a copy reduced by `scale`: in pixels of this one.
+  Clearance clearance = {};
+  double scale = 1.0, clear = 0.0;
 };
 
 // Finds corners and keeps its memory.
@@ -49,7 +52,7 @@ class CornerFinder {
   std::vector<double> scores;  // the eigenvalues
 
  private:
-  void fast(GreyImage image, int threshold, ptrdiff_t border, const uint8_t* free, std::vector<Pixel>& found);
+  void fast(GreyImage image, const CornerLimits& limits, const uint8_t* free, std::vector<Pixel>& found);
   void put_in_order(size_t most);
 
   std::vector<Pixel> candidates_, whole_;

@@ -1,6 +1,7 @@
 // Grey images, and wide registers for their loops.
 #pragma once
 
+#include <algorithm>
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
@@ -15,6 +16,18 @@ struct Grey {
   Byte* row(ptrdiff_t y) const { return at + y * width; }
 };
 using GreyImage = Grey<const uint8_t>;
+
+// Distance of a camera's pixels from those that show the robot itself, in whole pixels, 255 at most; empty where it shows nothing of it.
+struct Clearance {
+  GreyImage px = {};
+  // True if nothing of the robot is within `radius` of (u, v), a place in the image.
+  bool holds(double u, double v, double radius) const {
+    if (px.at == nullptr) return true;
+    const ptrdiff_t x = std::min(std::max(ptrdiff_t(u + 0.5), ptrdiff_t(0)), px.width - 1);
+    const ptrdiff_t y = std::min(std::max(ptrdiff_t(v + 0.5), ptrdiff_t(0)), px.height - 1);
+    return double(px.row(y)[x]) > radius;
+  }
+};
 
 // The whole pixel towards zero; far outside for what is not finite.
 inline ptrdiff_t whole(double coordinate) { return std::abs(coordinate) < 1e9 ? ptrdiff_t(coordinate) : -1'000'000'000; }

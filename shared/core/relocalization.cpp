@@ -22,6 +22,7 @@ constexpr double kMostAcrossPx = 10.0;                        // that a landmark
 constexpr double kNearlyPx = 50.0;                            // beside the image
 constexpr double kPassedM = 1.0, kPassedCosine = 0.8;         // limits of the survey's cameras that define covisible landmarks
 constexpr double kColumns = 8.0, kRows = 6.0;                 // the parts of an image
+constexpr double kPatchRadius = 15.0;                         // of a descriptor, at the finest octave
 
 // Landmarks of the map that features of some frames show, frame by frame.
 struct Matched {
@@ -151,7 +152,7 @@ int image_cell(const double* pixel, const StereoImage& camera) {
 }
 
 // Landmarks in a camera's image that the survey saw from nearby in the same direction, so without those hidden by racks. All that
-// may be visible where the survey did not pass.
+// may be visible where the survey did not pass. None that the robot's own body hides: there are no features.
 void add_covisible(const MapLandmarks& map, const StereoImage& camera, const FixLimits& limits, const Matched& matched, MapFix& fix) {
   const SE3& here = fix.map_from_cam;
   std::vector<uint8_t> seen(map.cones.count), found(map.cones.count);
@@ -168,8 +169,11 @@ void add_covisible(const MapLandmarks& map, const StereoImage& camera, const Fix
     if (fix.inliers[n]) found[size_t(matched.rows[n])] = true;
   const VisibleLandmarks visible =
       visible_landmarks(map.cones, here, camera, float(limits.distance_scale), 0.0, std::numbers::pi, limits.octave_scale);
-  for (const int64_t row : visible.rows) {
+  for (size_t n = 0; n < visible.rows.size(); ++n) {
+    const int64_t row = visible.rows[n];
+    const double radius = kPatchRadius * std::pow(limits.octave_scale, std::max(visible.octaves[n], 0.0));
     if (fix.is_passed && !seen[size_t(row)]) continue;
+    if (!camera.clearance.holds(visible.pixels[3 * n], visible.pixels[3 * n + 1], radius)) continue;
     fix.covisible.push_back(row), fix.is_found.push_back(found[size_t(row)]);
   }
 }

@@ -176,7 +176,19 @@ void Tracker::measure(const TrackerFrame& frame, const double* prior_px, size_t 
     if (!(disparities_px_[2 * n] > model_.min_disparity_px)) disparities_px_[2 * n] = kNaN;
 }
 
+void Tracker::end_hidden(const Clearance& clearance) {
+  size_t stay = 0;
+  for (size_t n = 0; n < ids_.size(); ++n) {
+    const double* pixel = pixels_.data() + 3 * n;
+    if (!clearance.holds(pixel[0], pixel[1], model_.half)) continue;
+    ids_[stay] = ids_[n];
+    store(vec3(pixel), pixels_.data() + 3 * stay++);
+  }
+  ids_.resize(stay), pixels_.resize(3 * stay);
+}
+
 void Tracker::renew(const TrackerFrame& frame) {
+  if (frame.clearance.px.at != nullptr) end_hidden(frame.clearance);
   const size_t count = ids_.size(), missing = model_.max_points - std::min(model_.max_points, count);
   left_px_.resize(2 * count), prior_px_.resize(count), taken_.resize(count);
   for (size_t n = 0; n < count; ++n) {
@@ -187,7 +199,9 @@ void Tracker::renew(const TrackerFrame& frame) {
   measure(frame, prior_px_.data(), count);
   for (size_t n = 0; n < count; ++n) pixels_[3 * n + 2] = pixels_[3 * n] - disparities_px_[2 * n];
   if (double(missing) < kFewPoints * double(model_.max_points)) return;
-  corners_.find(frame.whole.left, missing, model_.corners, taken_.data(), count);
+  CornerLimits limits = model_.corners;
+  limits.clearance = frame.clearance, limits.clear = model_.half;
+  corners_.find(frame.whole.left, missing, limits, taken_.data(), count);
   const size_t fresh = corners_.corners.size();
   left_px_.resize(2 * fresh), prior_px_.assign(fresh, kNaN);
   for (size_t n = 0; n < fresh; ++n) left_px_[2 * n] = corners_.corners[n].x, left_px_[2 * n + 1] = corners_.corners[n].y;

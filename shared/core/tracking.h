@@ -34,6 +34,7 @@ struct TrackerModel {
 struct TrackerFrame {
   StereoPair whole, halved;
   Grey<const float> disparity_px;
+  Clearance clearance;
 };
 
 // Motion between two frames, by the points in both.
@@ -61,7 +62,8 @@ class Tracker {
   int64_t add(const double* pixels, size_t count);  // returns the first id
   bool has_begun() const { return !now_.is_empty(); }
 
-  // Measures the disparities of the points in the newest frame, and adds corners where they have become few.
+  // Measures the disparities of the points in the newest frame, and adds corners where they have become few. Points whose window
+  // touches the robot's own body end.
   void renew(const TrackerFrame& frame);
 
   const TrackerModel& model() const { return model_; }
@@ -73,6 +75,7 @@ class Tracker {
   bool find_motion(TrackedMotion& found);
   bool search_motion(size_t agree, TrackedMotion& found);
   void keep_agreeing(const TrackedMotion& motion);
+  void end_hidden(const Clearance& clearance);
   void measure(const TrackerFrame& frame, const double* prior_px, size_t count);
 
   TrackerModel model_;

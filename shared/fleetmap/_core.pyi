@@ -149,6 +149,7 @@ class FixFinder:
         stereo: object,
         min_inlier_share: float,
         refinement: tuple[float, float, tuple[int, int]],
+        clearance_px: _Grey | None = None,
     ) -> None: ...
     def median_distance_m(self, map_from_cam: _Reals) -> float:
         """Median distance of the landmarks expected in a camera's view; NaN without any."""
@@ -334,11 +335,20 @@ def twins(
     """(N,) True for landmarks at points_map (N, 3), by ascending z, with a look-alike at equal height farther away than own_m."""
 
 def spread_corners(
-    image: _Grey, count: int, distance_px: float, threshold: int, border_px: int, taken: _Pixels
+    image: _Grey,
+    count: int,
+    distance_px: float,
+    threshold: int,
+    border_px: int,
+    taken: _Pixels,
+    clearance_px: _Grey | None = None,
+    scale: float = 1.0,
+    clear_px: float = 0.0,
 ) -> tuple[_Pixels, _Reals]:
     """Up to `count` whole-pixel corners (N, 2), best first, none within distance_px of another or of `taken` (M, 2); their scores (N,).
 
-    The threshold is halved if the image has too little texture for them.
+    The threshold is halved if the image has too little texture for them. clearance_px: distances from the robot's own body, in the
+    image of which this one is a copy reduced by `scale`; corners keep clear_px away from it, in pixels of this one.
     """
 
 def select_spread(
@@ -561,10 +571,12 @@ class Tracker:
         cam_from_previous: _Reals | None,
         is_predicted: bool,
         points_cam: _Reals | None,
+        clearance_px: _Grey | None = None,
     ) -> tuple[tuple[_Reals, _Reals] | None, float]:
         """Track the points into a frame, predicted by a motion (None: they belong to the frame), measure disparities, add corners.
 
-        pair: right, and both at half size. points_cam (N, 3): the points, by disparities if None. Returns the motion
+        pair: right, and both at half size. points_cam (N, 3): the points, by disparities if None. clearance_px: distances from the
+        robot's own body; points whose window touches it end. Returns the motion
         (4, 4) and its information (6, 6), None if too few points agree, and the share of the tracked points that follow it.
         """
     ids: _Indices

@@ -60,7 +60,7 @@ def _extract(
     camera, settings = shared
     found = []
     for frame in frames:
-        features = extract(frame.left, settings.orb)
+        features = extract(frame.left, settings.orb, camera.clearance_px)
         found.append((features, stereo.disparities(frame, camera, features.pixels, settings.stereo)))
     return found
 

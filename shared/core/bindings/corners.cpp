@@ -11,13 +11,16 @@ using Pixels = Array<float, -1, 2>;
 
 const Pixel* first(const Pixels& pixels) { return reinterpret_cast<const Pixel*>(pixels.data()); }
 
-auto spread_corners_of(const Image& image, int count, double distance_px, int threshold, int border_px, const Pixels& taken) {
+auto spread_corners_of(const Image& image, int count, double distance_px, int threshold, int border_px, const Pixels& taken,
+                       const std::optional<Image>& clearance_px, double scale, double clear_px) {
   if (count < 0) throw nb::value_error("count: not negative");
   if (threshold < 0 || threshold > 255) throw nb::value_error("threshold: a difference of grey values, 0 to 255");
   if (border_px < 3) throw nb::value_error("border_px: at least the circle's radius, 3");
   check_corners(distance_px, double(image.shape(1)), double(image.shape(0)));
+  if (!(scale >= 1.0)) throw nb::value_error("scale: at least 1");
+  const CornerLimits limits{threshold, border_px, distance_px, clearance(clearance_px), scale, clear_px};
   CornerFinder found;
-  unlocked([&] { found.find(grey(image), size_t(count), {threshold, border_px, distance_px}, first(taken), taken.shape(0)); });
+  unlocked([&] { found.find(grey(image), size_t(count), limits, first(taken), taken.shape(0)); });
   const size_t size = found.corners.size();
   return std::make_tuple(as_numpy<float, 2>(std::move(found.corners), {size, 2}), as_numpy<double>(std::move(found.scores)));
 }
@@ -52,7 +55,8 @@ auto centroid_angles_deg_of(const Image& image, const Pixels& pixels, int radius
 
 void bind_corners(nb::module_& module) {
   const auto image = "image"_a.noconvert(), pixels = "pixels"_a.noconvert();
-  module.def("spread_corners", &spread_corners_of, image, "count"_a, "distance_px"_a, "threshold"_a, "border_px"_a, "taken"_a.noconvert());
+  module.def("spread_corners", &spread_corners_of, image, "count"_a, "distance_px"_a, "threshold"_a, "border_px"_a, "taken"_a.noconvert(),
+             "clearance_px"_a.noconvert().none() = nb::none(), "scale"_a = 1.0, "clear_px"_a = 0.0);
   module.def("select_spread", &select_spread_of, pixels, "order"_a.noconvert(), "taken"_a.noconvert(), "distance_px"_a, "count"_a,
              "width"_a, "height"_a);
   module.def("centroid_angles_deg", &centroid_angles_deg_of, image, pixels, "radius"_a);

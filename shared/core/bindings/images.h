@@ -12,6 +12,11 @@ template <typename Number>
 fleetmap::Grey<const Number> grey(const Array<Number, -1, -1>& image) {
   return {image.data(), ptrdiff_t(image.shape(0)), ptrdiff_t(image.shape(1))};
 }
+inline fleetmap::Clearance clearance(const std::optional<Image>& px) {
+  if (!px) return {};
+  if (px->size() == 0) throw nb::value_error("clearance_px: not empty");
+  return {grey(*px)};
+}
 template <typename A, typename B>
 bool same_size(const A& a, const B& b) {
   return a.shape(0) == b.shape(0) && a.shape(1) == b.shape(1);

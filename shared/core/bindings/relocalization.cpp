@@ -53,12 +53,13 @@ class FixFinder {
  public:
   FixFinder(const Cones& cones, const Floats& sigmas_m, const Packed& descriptors, const Poses& map_from_cam, const Indices& shown,
             const Indices& shown_from, const Array<double, 6>& pinhole, double distance_scale, double octave_scale, nb::object fix,
-            nb::object stereo, double min_inlier_share, const Limits& refinement)
+            nb::object stereo, double min_inlier_share, const Limits& refinement, const std::optional<Image>& clearance_px)
       : cones_(cones),
         sigmas_m_(sigmas_m),
         descriptors_(descriptors),
         map_from_cam_(map_from_cam),
-        camera_{{pinhole(0), pinhole(1), pinhole(2), pinhole(3)}, pinhole(4), pinhole(5)} {
+        clearance_(clearance_px),
+        camera_{{pinhole(0), pinhole(1), pinhole(2), pinhole(3)}, pinhole(4), pinhole(5), clearance(clearance_px)} {
     const size_t count = landmarks().count, places = map_from_cam.shape(0);
     if (sigmas_m.shape(0) != count || descriptors.shape(0) != count)
       throw nb::value_error("sigmas_m, descriptors: a row for each landmark");
@@ -157,6 +158,7 @@ class FixFinder {
   Packed descriptors_;
   Poses map_from_cam_;
   std::vector<int64_t> shown_, shown_from_;
+  std::optional<Image> clearance_;
   StereoImage camera_;
   FixLimits limits_;
 };
@@ -192,10 +194,10 @@ auto near_descriptors_of(const Packed& descriptors, const Packed& centres, int c
 void bind_relocalization(nb::module_& module) {
   nb::class_<FixFinder>(module, "FixFinder")
       .def(nb::init<const Cones&, const Floats&, const Packed&, const Poses&, const Indices&, const Indices&, const Array<double, 6>&,
-                    double, double, nb::object, nb::object, double, const Limits&>(),
+                    double, double, nb::object, nb::object, double, const Limits&, const std::optional<Image>&>(),
            "cones"_a.noconvert(), "sigmas_m"_a.noconvert(), "descriptors"_a.noconvert(), "map_from_cam"_a.noconvert(),
            "shown"_a.noconvert(), "shown_from"_a.noconvert(), "pinhole"_a.noconvert(), "distance_scale"_a, "octave_scale"_a, "fix"_a,
-           "stereo"_a, "min_inlier_share"_a, "refinement"_a)
+           "stereo"_a, "min_inlier_share"_a, "refinement"_a, "clearance_px"_a.noconvert().none() = nb::none())
       .def("median_distance_m", &FixFinder::median_distance_m, "map_from_cam"_a.noconvert())
       .def("by_projection", &FixFinder::by_projection, "features"_a.noconvert(), "unmeasured"_a.noconvert().none(),
            "map_from_cam"_a.noconvert(), "radius_px"_a, "earlier"_a = std::vector<EarlierFrame>());

@@ -92,9 +92,10 @@ void make_tracker(SharedTracker* tracker, const Lens& lens, const nb::object& se
 
 auto track_of(SharedTracker& tracker, const Image& left, const std::optional<std::tuple<Image, Image, Image>>& pair,
               const std::optional<Array<float, -1, -1>>& disparity_px, const std::optional<Motion>& cam_from_previous, bool is_predicted,
-              const std::optional<Points>& points_cam) {
+              const std::optional<Points>& points_cam, const std::optional<Image>& clearance_px) {
   const GreyImage image = pictured(left);
-  TrackerFrame frame{{image, {}}, {}, {}};
+  if (clearance_px && !same_size(left, *clearance_px)) throw nb::value_error("clearance_px: of the image's size");
+  TrackerFrame frame{{image, {}}, {}, {}, clearance(clearance_px)};
   if (pair) {
     const auto& [right, left_half, right_half] = *pair;
     if (!same_size(left, right) || !same_size(left_half, right_half)) throw nb::value_error("pair: right images of the left ones' size");
@@ -137,7 +138,8 @@ void bind_tracking(nb::module_& module) {
            "left"_a.noconvert())
       .def("add", in_turn(+[](SharedTracker& tracker, const Points& of) { return tracker.add(of.data(), of.shape(0)); }), pixels)
       .def("track", in_turn(&track_of), "left"_a.noconvert(), "pair"_a.noconvert().none(), "disparity_px"_a.noconvert().none(),
-           "cam_from_previous"_a.noconvert().none(), "is_predicted"_a, "points_cam"_a.noconvert().none())
+           "cam_from_previous"_a.noconvert().none(), "is_predicted"_a, "points_cam"_a.noconvert().none(),
+           "clearance_px"_a.noconvert().none() = nb::none())
       .def_prop_ro("ids", in_turn(+[](SharedTracker& tracker) { return as_numpy<int64_t>(std::vector<int64_t>(tracker.ids())); }),
                    nb::rv_policy::automatic)
       .def_prop_ro("pixels", in_turn(+[](SharedTracker& tracker) { return copied<2>(tracker.pixels().data(), {tracker.ids().size(), 3}); }),

@@ -8,19 +8,22 @@ from fleetmap.features.settings import OrbSettings
 from fleetmap.sensors.samples import Image
 from fleetmap.time_sliced import TimeSliced, finished
 
-Extractor = Callable[[Image, OrbSettings], TimeSliced[orb.Features]]
-"""Features of a rectified grey image (H, W); the same image and settings give the same features."""
+Extractor = Callable[[Image, OrbSettings, Image | None], TimeSliced[orb.Features]]
+"""Features of a rectified grey image (H, W); the same image and settings give the same features, none that touches the robot's own body
+(`clearance_px` of StereoCamera)."""
 
 EXTRACTORS: dict[str, Extractor] = {"grid-orb": orb.detect_in_slices}
 
 
-def extract(image: Image, settings: OrbSettings) -> orb.Features:
+def extract(image: Image, settings: OrbSettings, clearance_px: Image | None = None) -> orb.Features:
     """Extract the features of an image with the extractor of the settings; UsageError for an unknown one."""
-    return finished(extract_in_slices(image, settings))
+    return finished(extract_in_slices(image, settings, clearance_px))
 
 
-def extract_in_slices(image: Image, settings: OrbSettings) -> TimeSliced[orb.Features]:
+def extract_in_slices(
+    image: Image, settings: OrbSettings, clearance_px: Image | None = None
+) -> TimeSliced[orb.Features]:
     """As `extract`, in slices."""
     if settings.extractor not in EXTRACTORS:
         raise UsageError(f"unknown feature extractor {settings.extractor!r}; choose one of {', '.join(EXTRACTORS)}")
-    return EXTRACTORS[settings.extractor](image, settings)
+    return EXTRACTORS[settings.extractor](image, settings, clearance_px)

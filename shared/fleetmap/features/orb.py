@@ -47,15 +47,15 @@ class Features:
         return cls(np.zeros((0, 2)), np.zeros(0, np.int8), np.zeros(0, np.float32), np.zeros((0, 32), np.uint8))
 
 
-def detect(image: Image, settings: OrbSettings) -> Features:
-    """Features of a rectified grey image, spread by suppression per level.
+def detect(image: Image, settings: OrbSettings, clearance_px: Image | None = None) -> Features:
+    """Features of a rectified grey image, spread by suppression per level, whose patches show nothing of the robot itself.
 
     Source: Rublee et al. 2011 (ORB), Mur-Artal 2015 (levels).
     """
-    return finished(detect_in_slices(image, settings))
+    return finished(detect_in_slices(image, settings, clearance_px))
 
 
-def detect_in_slices(image: Image, settings: OrbSettings) -> TimeSliced[Features]:
+def detect_in_slices(image: Image, settings: OrbSettings, clearance_px: Image | None = None) -> TimeSliced[Features]:
     """As `detect`, in slices of about equal work: corners, descriptors, and the caller's use of them.
 
     An image whose noise makes corners of its own is smoothed first (3x3 binomial).
@@ -63,7 +63,9 @@ def detect_in_slices(image: Image, settings: OrbSettings) -> TimeSliced[Features
     image = np.ascontiguousarray(image)
     if noise_grey(image) > _NOISE_SHARE * settings.fast_threshold:
         image = np.asarray(cv2.GaussianBlur(image, (3, 3), 0), np.uint8)
-    levels = [_detect_level(image, level, quota, settings) for level, quota in enumerate(_quotas(settings))]
+    levels = [
+        _detect_level(image, level, quota, settings, clearance_px) for level, quota in enumerate(_quotas(settings))
+    ]
     yield
     octaves = np.repeat(np.arange(len(levels), dtype=np.int8), [len(pixels) for pixels, _ in levels])
     pixels, angles = (np.concatenate(parts) for parts in zip(*levels, strict=True))
@@ -108,7 +110,7 @@ def _quotas(settings: OrbSettings) -> list[int]:
 
 
 def _detect_level(
-    image: Image, level: int, quota: int, settings: OrbSettings
+    image: Image, level: int, quota: int, settings: OrbSettings, clearance_px: Image | None
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Pixels (N, 2) of the image and angles (N,) of the corners of a level."""
     scale = SCALE_FACTOR**level
@@ -119,7 +121,9 @@ def _detect_level(
         else np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
     )
     limits = settings.min_distance_px, settings.fast_threshold, _BORDER_PX
-    chosen, _ = core.spread_corners(scaled, quota, *limits, np.zeros((0, 2), np.float32))
+    chosen, _ = core.spread_corners(
+        scaled, quota, *limits, np.zeros((0, 2), np.float32), clearance_px, scale, _PATCH_RADIUS
+    )
     return (scale * chosen.astype(np.float64)).astype(np.float32), core.centroid_angles_deg(
         scaled, chosen, _PATCH_RADIUS
     )

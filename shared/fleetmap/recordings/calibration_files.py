@@ -10,6 +10,11 @@ distortion_coeffs, resolution, T_cam_imu or T_cn_cnm1, timeshift_cam_imu), with 
       accelerometer_random_walk: 3.0e-3    m/s^3/sqrt(Hz)
     base_from_body: [[...], [...], [...], [...]]   4x4 rows, where the IMU sits on the robot
 
+and in each camera
+
+    mask: [[[0, 380], [639, 380], [639, 479], [0, 479]]]   polygons of pixels (u, v) that show the robot itself; one in another is a hole
+    mask: robot.png                                        or an image of the camera's size beside the file, not 0 there
+
 and `has_imu: false` for a rig described by its cameras alone, and inside a camera `body_from_cam` (4x4 rows), which
 takes precedence over T_cam_imu: this project writes it, because inverting a matrix twice changes the
 last bits.
@@ -23,14 +28,16 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import yaml
 
-from fleetmap.errors import CalibrationError
+from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.recordings.files import read_text
-from fleetmap.recordings.limits import MAX_CALIBRATION_BYTES
-from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
+from fleetmap.recordings.images import StoredImage, decode_grey
+from fleetmap.recordings.limits import MAX_CALIBRATION_BYTES, MAX_IMAGE_BYTES
+from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, Polygon, RigCalibration, check_camera
 from fleetmap.sensors.cameras import lens_of
 
 _SAFE_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -55,6 +62,7 @@ _IMU_INTRINSICS: dict[str, Any] = {
     "time_offset": 0.0,
 }
 _LARGEST_PX = 32_768
+_MOST_CORNERS = 4000  # of a mask's polygons
 Values = Mapping[str, Any]
 
 
@@ -87,7 +95,7 @@ def load_calibration(path: Path) -> CalibrationFile:
     Kalibr's `imu*.yaml` or OpenVINS' `kalibr_imu_chain.yaml` beside a camchain that has no noise values is read too.
     CalibrationError for missing files and invalid values.
     """
-    found = parse_calibration(_read(path), str(path))
+    found = parse_calibration(_read(path), str(path), path.parent)
     if found.calibration.imu is not None and not found.topics.get("noise"):
         for candidate in sorted([*path.parent.glob("imu*.yaml"), *path.parent.glob("kalibr_imu_chain.yaml")]):
             noise = _imu_noise(read_yaml(candidate), str(candidate))
@@ -102,8 +110,8 @@ def read_calibration(path: Path) -> RigCalibration:
     return load_calibration(path).calibration
 
 
-def parse_calibration(text: str, where: str) -> CalibrationFile:
-    """Parse the text of a camchain; `where` names it in error messages."""
+def parse_calibration(text: str, where: str, folder: Path | None = None) -> CalibrationFile:
+    """Parse the text of a camchain; `where` names it in error messages. folder: of images of masks, None for a text without files."""
     values = _parse_yaml(text, where)
     if "camera_matrix" in values:
         return CalibrationFile(RigCalibration((_ros_camera(values, where),), assumed=("base_from_body",)), {})
@@ -133,7 +141,7 @@ def parse_calibration(text: str, where: str) -> CalibrationFile:
     for name in names:
         camera = _section(values, name, where)
         previous = cameras[-1] if cameras else None
-        cameras.append(_kalibr_camera(camera, previous, f"{where}: {name}"))
+        cameras.append(_kalibr_camera(camera, previous, f"{where}: {name}", folder))
         topics[name] = str(camera.get("rostopic", ""))
     imu = (noise or ImuNoise()) if has_imu else None
     base = matrix_4x4(values["base_from_body"], f"{where}: base_from_body") if "base_from_body" in values else np.eye(4)
@@ -161,6 +169,9 @@ def format_calibration(calibration: RigCalibration) -> str:
         out.write(f"  timeshift_cam_imu: {float(camera.imu_minus_cam_s)!r}\n")
         if camera.line_delay_s:
             out.write(f"  line_delay: {camera.line_delay_s!r}\n")
+        if camera.mask:
+            polygons = [[[float(u), float(v)] for u, v in polygon] for polygon in camera.mask]
+            out.write(f"  mask: {polygons}\n")
         out.write(f"  T_cam_imu:\n{_rows(se3_inverse(camera.body_from_cam), '  ')}")
         out.write(f"  body_from_cam:\n{_rows(camera.body_from_cam, '  ')}")
     if calibration.imu is None:
@@ -177,7 +188,7 @@ def format_calibration(calibration: RigCalibration) -> str:
 def read_euroc_camera(path: Path) -> CameraCalibration:
     """Read the camera of a EuRoC `sensor.yaml`, mounted on the frame that the file calls body (`T_BS`)."""
     where, values = str(path), read_yaml(path)
-    camera = _camera(values, "distortion_coefficients", where)
+    camera = _camera(values, "distortion_coefficients", where, path.parent)
     return check_camera(
         replace(camera, body_from_cam=matrix_4x4(_need(values, "T_BS", where), f"{where}: T_BS")), where
     )
@@ -238,8 +249,10 @@ def _fault_of(matrix: Array) -> str:
     return "the rows of its rotation are not of unit length and at right angles"
 
 
-def _kalibr_camera(values: Values, previous: CameraCalibration | None, where: str) -> CameraCalibration:
-    camera = _camera(values, "distortion_coeffs", where)
+def _kalibr_camera(
+    values: Values, previous: CameraCalibration | None, where: str, folder: Path | None
+) -> CameraCalibration:
+    camera = _camera(values, "distortion_coeffs", where, folder)
     shift = values.get("timeshift_cam_imu", previous.imu_minus_cam_s if previous else 0.0)
     body_from_cam = _body_from_cam(values, previous, where)
     return check_camera(
@@ -282,7 +295,7 @@ def _body_from_cam(values: Values, previous: CameraCalibration | None, where: st
     return previous.body_from_cam @ se3_inverse(matrix_4x4(values["T_cn_cnm1"], f"{where}: T_cn_cnm1"))
 
 
-def _camera(values: Values, distortion_key: str, where: str) -> CameraCalibration:
+def _camera(values: Values, distortion_key: str, where: str, folder: Path | None = None) -> CameraCalibration:
     camera_model, name = str(_need(values, "camera_model", where))[:80], str(values.get("distortion_model"))[:80]
     if camera_model.lower() != "pinhole":
         raise CalibrationError(
@@ -304,9 +317,52 @@ def _camera(values: Values, distortion_key: str, where: str) -> CameraCalibratio
         raise CalibrationError(
             f"{where}: line_delay is {line_delay_s:g} s, {line_delay_s * height:g} s for {height:g} rows; write the seconds from row to row"
         )
+    mask = _mask(values.get("mask", []), (int(width), int(height)), f"{where}: mask", folder)
     return CameraCalibration(
-        model, int(width), int(height), intrinsics, distortion, np.eye(4), line_delay_s=line_delay_s
+        model, int(width), int(height), intrinsics, distortion, np.eye(4), line_delay_s=line_delay_s, mask=mask
     )
+
+
+def _mask(value: object, size_px: tuple[int, int], where: str, folder: Path | None) -> tuple[Polygon, ...]:
+    if isinstance(value, str):
+        polygons = _outlines(value, size_px, where, folder)
+    else:
+        try:
+            polygons = tuple(tuple((float(u), float(v)) for u, v in polygon) for polygon in value)  # type: ignore[attr-defined]
+        except (TypeError, ValueError):
+            raise CalibrationError(
+                f"{where} is {_brief(value)}; write polygons [[[u, v], [u, v], [u, v]]] in pixels, or the name of a PNG"
+            ) from None
+    corners = np.array([corner for polygon in polygons for corner in polygon]).reshape(-1, 2)
+    if len(corners) > _MOST_CORNERS:
+        raise CalibrationError(
+            f"{where} has {len(corners)} corners; the limit is {_MOST_CORNERS}, simplify its outline"
+        )
+    if any(len(polygon) < 3 for polygon in polygons) or not (np.abs(corners) <= _LARGEST_PX).all():
+        raise CalibrationError(f"{where} is {_brief(value)}; a polygon has three corners or more, near the image")
+    return polygons
+
+
+def _outlines(name: str, size_px: tuple[int, int], where: str, folder: Path | None) -> tuple[Polygon, ...]:
+    """The polygons around the pixels of an image that are not 0, to one pixel."""
+    if folder is None or Path(name).is_absolute() or ".." in Path(name).parts:
+        raise CalibrationError(
+            f"{where}: {name[:80]!r} is not a file beside the calibration; write its polygons instead"
+        )
+    try:
+        if (folder / name).stat().st_size > MAX_IMAGE_BYTES:
+            raise CalibrationError(f"{where}: {name} is too large for an image")
+        image = decode_grey(StoredImage("file", (folder / name).read_bytes(), str(folder / name)))
+    except (OSError, RecordingError) as error:
+        raise CalibrationError(f"{where}: {name} cannot be read: {error}") from error
+    if image.shape[::-1] != size_px:
+        width, height = size_px
+        raise CalibrationError(
+            f"{where}: {name} is {image.shape[1]}x{image.shape[0]}, the camera's images are {width}x{height}"
+        )
+    contours, _ = cv2.findContours((image > 0).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    outlines = [cv2.approxPolyDP(contour, 1.0, closed=True).reshape(-1, 2) for contour in contours]
+    return tuple(tuple((float(u), float(v)) for u, v in outline) for outline in outlines if len(outline) > 2)
 
 
 def _imu_noise(values: Values, where: str) -> ImuNoise | None:

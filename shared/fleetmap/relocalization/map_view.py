@@ -132,6 +132,7 @@ class MapView:
             settings.stereo,
             _MIN_INLIER_SHARE,
             REFINEMENT,
+            camera.clearance_px,
         )
 
     def neighbourhood(self, place: int) -> Rows:

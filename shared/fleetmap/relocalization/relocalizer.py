@@ -80,7 +80,7 @@ class Relocalizer:
 
     def extract(self, frame: RectifiedFrame) -> TimeSliced[FrameFeatures]:
         """Extract the features of one frame, in slices (see `finished`); the depth of a pair is not measured yet."""
-        features = yield from extract_in_slices(frame.left, self._settings.orb)
+        features = yield from extract_in_slices(frame.left, self._settings.orb, self._camera.clearance_px)
         return FrameFeatures.of(frame, features, self._camera, self._settings.stereo)
 
     def near(

@@ -2,11 +2,16 @@
 
 from dataclasses import dataclass, field
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.cameras import CAMERA_MODELS
+
+_SUB_PX = 4  # bits of a pixel's fraction
+Polygon = tuple[tuple[float, float], ...]  # corners (u, v) in pixels as recorded
 
 
 @dataclass(frozen=True, slots=True)
@@ -15,7 +20,8 @@ class CameraCalibration:
 
     model: a key of CAMERA_MODELS. intrinsics_px: fx fy cx cy. body_from_cam (4, 4).
     imu_minus_cam_s: stamp of the IMU clock minus stamp of the camera clock at one moment (Kalibr's timeshift_cam_imu). line_delay_s: from
-    one row to the next of a rolling shutter, 0 for a global one; reported, not corrected.
+    one row to the next of a rolling shutter, 0 for a global one; reported, not corrected. mask: parts of the image that show the robot
+    itself, inside an odd number of polygons.
     """
 
     model: str
@@ -26,6 +32,7 @@ class CameraCalibration:
     body_from_cam: Array
     imu_minus_cam_s: float = 0.0
     line_delay_s: float = 0.0
+    mask: tuple[Polygon, ...] = ()
 
     def __post_init__(self) -> None:
         # Values from files are numpy scalars, which encoders do not support.
@@ -76,6 +83,13 @@ class RigCalibration:
     def wheels_fault(self) -> str:
         """Reason why wheels cannot be used, with advice; empty if they can."""
         return NO_BASE if "base_from_body" in self.assumed else ""
+
+
+def hidden_pixels(mask: tuple[Polygon, ...], size_px: tuple[int, int]) -> NDArray[np.bool_]:
+    """(H, W) True inside a mask's polygons or on their edges, for an image of a width and a height."""
+    hidden = np.zeros(size_px[::-1], np.uint8)
+    outlines = [np.rint(np.array(polygon) * 2**_SUB_PX).astype(np.int32) for polygon in mask]
+    return np.asarray(cv2.fillPoly(hidden, outlines, (1,), shift=_SUB_PX), bool)
 
 
 def _set_numbers(record: object, kind: type[int] | type[float], *names: str) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
+from fleetmap.sensors.calibration import CameraCalibration, Polygon, RigCalibration, hidden_pixels
 from fleetmap.sensors.samples import CameraFrame, Image, Stamps
 
 _CORNERS, _LEAST_POINTS, _LEAST_ALL, _LEAST_MOTION_PX = 300, 20, 150, 1.0
@@ -72,14 +72,18 @@ def lens_of_frames(rig: RigCalibration, stamps_ns: Stamps, read: Callable[[int],
         if later >= len(stamps_ns) or stamps_ns[later] - stamps_ns[index] > _TOO_FAR_S * 1e9:
             continue
         before, after = read(int(index)), read(later)
-        if before is not None and after is not None and (points := follow_points(before, after)) is not None:
+        if before is None or after is None:
+            continue
+        points = follow_points(before, after, rig.cameras[0].mask)
+        if points is not None:
             pairs.append(points)
     return fit_lens(rig, pairs)
 
 
-def follow_points(frame: CameraFrame, later: CameraFrame) -> FollowedPoints | None:
-    """Track corners of the left image to the later one and, for a pair, to the right one; None if there are too few."""
-    best = cv2.goodFeaturesToTrack(frame.left, _CORNERS, 0.01, 10)
+def follow_points(frame: CameraFrame, later: CameraFrame, mask: tuple[Polygon, ...] = ()) -> FollowedPoints | None:
+    """Track corners of the left image, outside its mask, to the later one and, for a pair, to the right one; None if there are too few."""
+    seen = (~hidden_pixels(mask, frame.left.shape[::-1])).astype(np.uint8)
+    best = cv2.goodFeaturesToTrack(frame.left, _CORNERS, 0.01, 10, mask=seen)
     if best is None or (frame.right is None and frame.depth_m is None):
         return None
     corners = np.asarray(best, np.float32)

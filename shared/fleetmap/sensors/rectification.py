@@ -5,7 +5,7 @@ left and at u - f b/z on the right, same row. An RGB-D frame becomes such a pair
 single camera has baseline 0.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 
 import cv2
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
-from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
+from fleetmap.sensors.calibration import CameraCalibration, Polygon, RigCalibration, hidden_pixels
 from fleetmap.sensors.cameras import CAMERA_MODELS
 from fleetmap.sensors.samples import CameraFrame, Image
 
@@ -24,7 +24,11 @@ RGBD_BASELINE_M = 0.08  # a depth sensor's triangulation base: turns depth noise
 
 @dataclass(frozen=True, slots=True)
 class StereoCamera:
-    """The rectified pinhole pair. baseline_m is 0 for a single camera."""
+    """The rectified pinhole pair. baseline_m is 0 for a single camera.
+
+    clearance_px (H, W): distance of the left image's pixels from those that show the robot itself, in whole pixels, 255 at most; None if
+    it shows nothing of it.
+    """
 
     focal_px: float
     cx_px: float
@@ -32,6 +36,7 @@ class StereoCamera:
     baseline_m: float
     width_px: int
     height_px: int
+    clearance_px: Image | None = field(default=None, repr=False, compare=False)
 
     @property
     def lens(self) -> Array:
@@ -87,7 +92,7 @@ def _halved(image: Image) -> Image:
 
 
 class Rectifier:
-    """Rectifies recorded frames of one rig; holds the look-up tables.
+    """Rectifies recorded frames of one rig; holds the look-up tables. What shows the robot itself becomes black, without depth.
 
     pinhole: the target camera without its baseline, common to the rigs of a site; one that suits the rig
     if omitted. Raises CalibrationError if its focal length is too far from the rig's.
@@ -113,15 +118,18 @@ class Rectifier:
             self.camera = _as_pinhole(pinhole, self.camera)
         self.body_from_cam = cameras[0].body_from_cam @ se3(cam0_from_rect, np.zeros(3))
         self.imu_minus_cam_s = cameras[0].imu_minus_cam_s
-        self._maps = []
+        self._maps, hidden = [], []
         for camera in used:
             body_from_rect = self.body_from_cam[:3, :3]
             cam_from_rect = camera.body_from_cam[:3, :3].T @ body_from_rect
             numbers = camera.intrinsics_px, camera.distortion, cam_from_rect.ravel()
             size = camera.width_px, camera.height_px
-            self._maps.append(
-                _remap_tables(self.camera, camera.model, size, *(tuple(each.tolist()) for each in numbers))
+            tables, shows_robot = _remap_tables(
+                self.camera, camera.model, size, *(tuple(each.tolist()) for each in numbers), camera.mask
             )
+            self._maps.append(tables)
+            hidden.append(shows_robot)
+        self.camera = replace(self.camera, clearance_px=_clearance_px(hidden[0]))
 
     def rectify(self, frame: CameraFrame) -> RectifiedFrame:
         """Rectify a frame; raises RecordingError if an image's size differs from the calibration's."""
@@ -196,8 +204,9 @@ def _remap_tables(
     intrinsics_px: tuple[float, ...],
     distortion: tuple[float, ...],
     cam_from_rect: tuple[float, ...],
-) -> tuple[NDArray[np.int16], NDArray[np.uint16]] | None:
-    """Fixed-point look-up tables for cv2.remap, or None if the image is already rectified (as KITTI's are)."""
+    mask: tuple[Polygon, ...],
+) -> tuple[tuple[NDArray[np.int16], NDArray[np.uint16]] | None, NDArray[np.bool_] | None]:
+    """Fixed-point look-up tables for cv2.remap, or None if the image is already rectified (as KITTI's are); and the rectified mask."""
     u, v = np.meshgrid(
         np.arange(rectified.width_px, dtype=np.float64), np.arange(rectified.height_px, dtype=np.float64)
     )
@@ -207,9 +216,23 @@ def _remap_tables(
     rays = rays.reshape(-1, 3) @ np.array(cam_from_rect).reshape(3, 3).T
     lens = np.array(intrinsics_px), np.array(distortion)
     pixels = CAMERA_MODELS[model].pixel_from_ray(*lens, rays).reshape(*u.shape, 2)
+    hidden = None
+    if mask:
+        at = np.rint(np.nan_to_num(pixels, nan=-1.0)).astype(np.int64)
+        inside = np.asarray(((at >= 0) & (at < size_px)).all(axis=2))
+        columns, rows = np.moveaxis(np.where(inside[..., None], at, 0), 2, 0)
+        hidden = np.logical_and(inside, hidden_pixels(mask, size_px)[rows, columns])
+        pixels = np.where(hidden[..., None], np.nan, pixels)
     same_size = (rectified.width_px, rectified.height_px) == size_px
     if same_size and np.nanmax(np.hypot(pixels[..., 0] - u, pixels[..., 1] - v)) < 0.02 and np.isfinite(pixels).all():
-        return None
+        return None, hidden
     pixels = np.nan_to_num(pixels, nan=-1e4).astype(np.float32)
     first, second = cv2.convertMaps(pixels[..., 0], pixels[..., 1], cv2.CV_16SC2)
-    return np.asarray(first, np.int16), np.asarray(second, np.uint16)
+    return (np.asarray(first, np.int16), np.asarray(second, np.uint16)), hidden
+
+
+def _clearance_px(hidden: NDArray[np.bool_] | None) -> Image | None:
+    if hidden is None or not hidden.any():
+        return None
+    distances = cv2.distanceTransform((~hidden).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    return np.minimum(distances, 255).astype(np.uint8)

@@ -119,7 +119,8 @@ class Tracker:
     ) -> tuple[tuple[Array, Array] | None, float]:
         pair = None if frame.right is None else (frame.right, frame.half_left, frame.half_right)
         guess = None if cam_from_previous is None else np.ascontiguousarray(cam_from_previous)
-        return self._points.track(frame.left, pair, frame.disparity_px, guess, is_predicted, points_cam)
+        images = frame.left, pair, frame.disparity_px
+        return self._points.track(*images, guess, is_predicted, points_cam, self._camera.clearance_px)
 
     def _points_cam(self) -> Array | None:
         """(N, 3) the points in the camera of the frame before; None if their disparities give the depth."""
@@ -153,7 +154,7 @@ class Tracker:
         return tuple(sorted(found, key=lambda e: -len(e.ids))), share
 
     def _remember(self, frame: RectifiedFrame, frame_index: int) -> _Remembered:
-        features = extract(frame.left, self._orb)
+        features = extract(frame.left, self._orb, self._camera.clearance_px)
         depth = stereo.disparities(frame, self._camera, features.pixels, self._stereo)[:, 0]
         points = self._camera.point_from_pixel(features.pixels, depth)
         return _Remembered(frame_index, patch_align.half_pyramid(frame.left), features, depth, points)

@@ -1,0 +1,206 @@
+"""Parts of a camera's image that show the robot itself: nothing is found, tracked or expected there."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from fleetmap import core
+from fleetmap.errors import CalibrationError
+from fleetmap.features.extraction import extract
+from fleetmap.features.orb import SCALE_FACTOR
+from fleetmap.features.settings import OrbSettings, StereoSettings
+from fleetmap.odometry import make_odometry
+from fleetmap.odometry.settings import OdometrySettings
+from fleetmap.pnp.pnp import REFINEMENT
+from fleetmap.recordings.calibration_files import format_calibration, parse_calibration, read_calibration
+from fleetmap.relocalization.settings import FixSettings
+from fleetmap.sensors.calibration import Polygon, RigCalibration, hidden_pixels
+from fleetmap.sensors.lens_fit import follow_points
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.samples import CameraFrame
+from mapserver.doctor.camera_motion import motion_between
+from support.worlds.inertial_motion import analytic_motion
+from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, rig, stereo_frame
+
+FRAME_NS = 50_000_000
+SIZE_PX = CAMERA.width_px, CAMERA.height_px
+BODY: Polygon = ((0.0, 110.0), (210.0, 110.0), (319.0, 150.0), (319.0, 199.0), (0.0, 199.0))
+
+
+def masked(mask: tuple[Polygon, ...] = (BODY,)) -> RigCalibration:
+    return replace(rig(None), cameras=tuple(replace(camera, mask=mask) for camera in rig(None).cameras))
+
+
+def frame_with_body(stamp_ns: int) -> CameraFrame:
+    """The room as a robot sees it whose own body, with screws and stickers, fills the same pixels of every image."""
+    paint = np.random.default_rng(7).integers(0, 255, (CAMERA.height_px, CAMERA.width_px)).astype(np.uint8)
+    paint = cv2.normalize(cv2.GaussianBlur(paint, (0, 0), 1.5), None, 0, 255, cv2.NORM_MINMAX)  # type: ignore[call-overload]
+    seen, shown = stereo_frame(stamp_ns), hidden_pixels((BODY,), SIZE_PX)
+    assert seen.right is not None
+    left, right = (np.where(shown, paint, image).astype(np.uint8) for image in (seen.left, seen.right))
+    return CameraFrame(stamp_ns, left, right)
+
+
+def drift_m(calibration: RigCalibration) -> float:
+    """Error of the distance covered in two seconds."""
+    rectifier = Rectifier(calibration)
+    odometry = make_odometry(calibration, rectifier.camera, rectifier.body_from_cam, 0.0, OdometrySettings(), None)
+    placed = [
+        odometry.handle_stereo(rectifier.rectify(frame_with_body(k * FRAME_NS))).odom_from_body for k in range(1, 40)
+    ]
+    truth = [analytic_motion(k * FRAME_NS * 1e-9).map_from_body for k in (1, 39)]
+    moved, true = (np.linalg.inv(first) @ last for first, last in ((placed[0], placed[-1]), truth))
+    return float(np.linalg.norm((moved - true)[:3, 3]))
+
+
+def test_odometry_does_not_follow_the_robots_own_body() -> None:
+    assert drift_m(masked()) < 0.05 < 5 * 0.05 < drift_m(rig(None))
+
+
+def test_no_descriptor_and_no_corner_touches_the_body() -> None:
+    rectifier = Rectifier(masked())
+    frame, clearance_px = rectifier.rectify(frame_with_body(FRAME_NS)), rectifier.camera.clearance_px
+    assert clearance_px is not None
+    features, everywhere = (extract(frame.left, OrbSettings(count=300), each) for each in (clearance_px, None))
+    room_px = clearance_px[tuple(np.rint(features.pixels).astype(int).T[::-1])]
+    assert (room_px > 14.0 * SCALE_FACTOR**features.octaves).all()
+    assert len(features) > 0.5 * len(everywhere)
+    tracker = core_tracker_pixels(frame.left, clearance_px)
+    assert (clearance_px[tuple(np.rint(tracker).astype(int).T[::-1])] > 5).all() and len(tracker) > 20
+
+
+def core_tracker_pixels(left: NDArray[np.uint8], clearance_px: NDArray[np.uint8]) -> NDArray[np.float64]:
+    pixels, _ = core.spread_corners(left, 100, 8.0, 12, 8, np.zeros((0, 2), np.float32), clearance_px, 1.0, 5.0)
+    return pixels.astype(np.float64)
+
+
+def test_points_end_at_the_body() -> None:
+    """A point that the flow carries into the window around the body ends; the same point goes on without a mask."""
+    rectifier = Rectifier(masked())
+    odometry = make_odometry(masked(), rectifier.camera, rectifier.body_from_cam, 0.0, OdometrySettings(), None)
+    clearance_px = rectifier.camera.clearance_px
+    assert clearance_px is not None
+    for k in range(1, 20):
+        estimate = odometry.handle_stereo(rectifier.rectify(frame_with_body(k * FRAME_NS)))
+        assert estimate.track_pixels is not None
+        at = np.rint(estimate.track_pixels[:, :2]).astype(int).T[::-1]
+        assert (clearance_px[tuple(at)] > 5).all()
+
+
+def test_checks_of_a_recording_look_beside_the_body() -> None:
+    frames = [frame_with_body(k * FRAME_NS) for k in (1, 4)]
+    points = follow_points(*frames, masked().cameras[0].mask)
+    assert points is not None
+    assert not hidden_pixels((BODY,), SIZE_PX)[tuple(np.rint(points.left).astype(int).T[::-1])].any()
+    rectifier = Rectifier(masked())
+    found = motion_between(*(rectifier.rectify(frame) for frame in frames), rectifier.camera)  # type: ignore[misc]
+    before, after = (analytic_motion(k * FRAME_NS * 1e-9).map_from_body @ BODY_FROM_CAM for k in (1, 4))
+    assert found is not None
+    assert np.linalg.norm((found - np.linalg.inv(before) @ after)[:3, 3]) < 0.02
+
+
+def test_a_masked_pixel_becomes_black_and_nothing_else_changes() -> None:
+    rectifier, plain = Rectifier(masked()), Rectifier(rig(None))
+    frame = frame_with_body(FRAME_NS)
+    hidden = hidden_pixels((BODY,), SIZE_PX)
+    ours, other = rectifier.rectify(frame), plain.rectify(frame)
+    assert ours.right is not None and other.right is not None
+    for one, same in ((ours.left, other.left), (ours.right, other.right)):
+        assert not one[hidden].any()
+        beside = np.abs(one[~hidden].astype(int) - same[~hidden])
+        assert np.quantile(beside, 0.98) <= 1
+    assert plain.camera.clearance_px is None and rectifier.camera == plain.camera
+    depth = np.full(hidden.shape, 2.0, np.float32)
+    single = Rectifier(RigCalibration(masked().cameras[:1]), has_depth=True)
+    disparity = single.rectify(CameraFrame(FRAME_NS, frame.left, depth_m=depth)).disparity_px
+    assert disparity is not None and np.array_equal(np.isnan(disparity), hidden)
+
+
+def test_landmarks_behind_the_body_are_not_missed() -> None:
+    """Half of the landmarks lie behind the robot's own body: the fix expects the other half alone."""
+
+    rng, camera = np.random.default_rng(3), Rectifier(masked()).camera
+    count = 200
+    at = np.column_stack([rng.uniform(20, 300, count), rng.uniform(20, 180, count)])
+    points = camera.point_from_pixel(at, rng.uniform(4, 10, count))
+    distances = np.linalg.norm(points, axis=1)
+    away = (-points / distances[:, None]).astype(np.float32)
+    reach, words = distances.astype(np.float32), rng.integers(0, 2**63, (count, 4)).astype(np.uint64)
+    pixels = camera.pixel_from_point(points)
+    assert camera.clearance_px is not None
+    shown = camera.clearance_px[tuple(np.rint(at).astype(int).T[::-1])] > 15
+    seen = pixels[shown], pixels[shown, :2].copy(), np.zeros(shown.sum(), np.int8), words[shown]
+
+    def expected(clearance_px: NDArray[np.uint8] | None) -> tuple[int, int]:
+        finder = core.FixFinder(
+            *((points, away, np.full(count, 0.3, np.float32), reach), np.full(count, 0.01, np.float32), words),
+            *(np.eye(4)[None], np.arange(count), np.array([0, count]), np.array([*camera.lens, *SIZE_PX], np.float64)),
+            *(1.0, SCALE_FACTOR, FixSettings(), StereoSettings(), 0.35, REFINEMENT, clearance_px),
+        )
+        found = finder.by_projection(seen, None, np.eye(4), 12.0)
+        assert found is not None
+        return len(found[8]), int(found[9].sum())
+
+    (all_of_them, found), (beside, same) = expected(None), expected(camera.clearance_px)
+    assert found == same and all_of_them == count
+    assert shown.sum() * 0.3 < beside <= shown.sum()
+
+
+# --------------------------------------------------------------------------------------------------------------- files
+
+
+def test_masks_are_written_and_read_back_bit_for_bit() -> None:
+    hole: Polygon = ((20.5, 130.25), (40.0, 130.0), (40.0, 150.0))
+    ours = masked((BODY, hole))
+    back = parse_calibration(format_calibration(ours), "text").calibration
+    assert [camera.mask for camera in back.cameras] == [(BODY, hole)] * 2
+    assert "mask" not in format_calibration(rig(None))
+    shown = hidden_pixels((BODY, hole), SIZE_PX)
+    assert shown[180, 10] and not shown[140, 36] and not shown[20, 20]
+
+
+def test_a_mask_of_an_image_has_its_holes(tmp_path: Path) -> None:
+    v, u = np.mgrid[: CAMERA.height_px, : CAMERA.width_px]
+    picture = np.where(np.hypot(u - 160, v - 100) > 90, 255, 0).astype(np.uint8)  # the rim of a fisheye
+    picture[150:, 100:180] = 1
+    cv2.imwrite(str(tmp_path / "robot.png"), picture)
+    (tmp_path / "camchain.yaml").write_text(with_mask("robot.png"))
+    read = read_calibration(tmp_path / "camchain.yaml").cameras[0]
+    differs = hidden_pixels(read.mask, SIZE_PX) != (picture > 0)
+    edges = cv2.morphologyEx((picture > 0).astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) > 0
+    assert not differs[~edges].any() and differs.mean() < 0.01
+
+
+def with_mask(value: str) -> str:
+    text = format_calibration(rig(None))
+    return text.replace("  timeshift_cam_imu", f"  mask: {value}\n  timeshift_cam_imu", 1)
+
+
+@pytest.mark.parametrize(
+    ("value", "words"),
+    [
+        ("small.png", "is 10x10, the camera's images are 320x200"),
+        ("missing.png", "cannot be read"),
+        ("../robot.png", "beside the calibration"),
+        ("/etc/hostname", "beside the calibration"),
+        ("[[[0, 0], [1, 1]]]", "three corners"),
+        ("[[[0, 0], [1, 1], [.inf, 2]]]", "near the image"),
+        ("[[0, 0], [1, 1]]", "write polygons"),
+        ("7", "write polygons"),
+        (str([[[0, k] for k in range(4001)]]), "simplify"),
+    ],
+)
+def test_an_invalid_mask_is_refused(tmp_path: Path, value: str, words: str) -> None:
+    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((10, 10), np.uint8))
+    (tmp_path / "camchain.yaml").write_text(with_mask(value))
+    with pytest.raises(CalibrationError, match=words):
+        read_calibration(tmp_path / "camchain.yaml")
+
+
+def test_a_recordings_own_calibration_names_no_file() -> None:
+    with pytest.raises(CalibrationError, match="polygons instead"):
+        parse_calibration(with_mask("robot.png"), "text")
