@@ -51,6 +51,7 @@ class ActionBook:
 
     def __init__(self) -> None:
         self._states: dict[str, ActionState] = {}
+        self._told: set[str] = set()  # actions whose end was in a state
         self._errors: dict[str, list[Error]] = {}
 
     def __contains__(self, action_id: str) -> bool:
@@ -69,8 +70,14 @@ class ActionBook:
         for key in over[: max(0, len(self._states) - _MOST_STATES)]:
             del self._states[key]
 
+    def tell(self) -> list[ActionState]:
+        """Return all states, for a message that reports them."""
+        self._told = {key for key, state in self._states.items() if state.action_status in OVER}
+        return list(self._states.values())
+
     def clear(self) -> None:
-        self._states = {key: state for key, state in self._states.items() if state.action_status not in OVER}
+        """Forget actions whose end was reported."""
+        self._states = {key: state for key, state in self._states.items() if key not in self._told}
 
     def fail(self, action: Action, error_type: str, words: str, level: str = "WARNING") -> None:
         """Mark the action as failed, with an error until another action of its kind is accepted."""
@@ -104,10 +111,6 @@ class ActionBook:
 
     def end(self, until: str) -> None:
         self._errors.pop(until, None)
-
-    @property
-    def states(self) -> list[ActionState]:
-        return list(self._states.values())
 
     @property
     def errors(self) -> list[Error]:

@@ -76,6 +76,7 @@ class FleetAdapter:
         # Last part of the state by the robot's program, and its time; the node by initializePosition, and the program's node then.
         self._part: RobotPart | None = None
         self._part_s = 0.0
+        self._order_id = ""  # the last order that the robot's program accepted
         self._last_node: tuple[str, str] | None = None
         self._localization = Localization()
         self._untold: Localization | None = None  # a loss not yet reported in a state, even if already over
@@ -126,6 +127,12 @@ class FleetAdapter:
                 self._book.add_error("robot", "ROBOT_PART_INVALID", str(error), {"topic": "robotState"}, "CRITICAL")
             else:
                 self._part, self._part_s = part, self._clock_s()
+                if part.order_id not in ("", self._order_id):
+                    self._order_id = part.order_id
+                    if (
+                        self._section.version != "3.0.0"
+                    ):  # 2.x keeps action states until a new order; 3.0 until clearInstantActions
+                        self._book.clear()
             self.changed.set()
 
     def _begin(self, action: Action) -> None:
@@ -335,7 +342,7 @@ class FleetAdapter:
             if place is not None:
                 found["mobileRobotPosition"] = place
             found["errors"] = to_plain(errors) + found.get("errors", [])
-            found["instantActionStates"] = to_plain(self._book.states) + found.get("instantActionStates", [])
+            found["instantActionStates"] = to_plain(self._book.tell()) + found.get("instantActionStates", [])
             return found
 
     def position(self) -> dict[str, Any] | None:

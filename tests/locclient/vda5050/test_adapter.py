@@ -267,6 +267,25 @@ def test_others_actions_repeated_actions_and_floods() -> None:
     assert [state["actionId"] for state in adapter.said()["instantActionStates"]] == ["c"]
 
 
+@pytest.mark.parametrize(("version", "left"), [("2.0.0", "bc"), ("2.1.0", "bc"), ("3.0.0", "abc")])
+def test_a_new_order_ends_the_states_of_finished_actions_in_2_x(version: str, left: str) -> None:
+    """Source: actionStates in the schemas of 2.0.0 and 2.1.0, kept until a new order is received."""
+    adapter = Adapter(version=version)
+
+    def ids(**order: object) -> str:
+        adapter.robot_part(json.dumps({**PART, **order}).encode())
+        return "".join(state["actionId"] for state in adapter.said()["instantActionStates"])
+
+    assert ids(orderId="o-1") == ""
+    adapter.ask("stateRequest", "a")
+    adapter.ask("enableMap", "b", mapId="hall", mapVersion="2")
+    assert ids() == ids(orderId="o-1") == ids(orderId="o-1", orderUpdateId=1) == "ab", "an update is no new order"
+    untold = {"actionId": "c", "actionType": "stateRequest", "blockingType": "NONE"}
+    adapter.instant_actions(json.dumps({**HEADER, "actions": [untold]}).encode())
+    assert ids(orderId="o-2") == left, "b is running, and the end of c was in no state yet"
+    assert ids(orderId="o-3") == left.replace("c", "" if left == "bc" else "c")
+
+
 def test_a_version_on_trial_is_running_until_the_localizer_decides() -> None:
     from locclient.robot.version_trial import Change, VersionChange
 
