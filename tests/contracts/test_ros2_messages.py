@@ -35,6 +35,7 @@ from locclient.daemon.ros2_localizer import (
     encode_transitions,
 )
 from support.fleet.nav2_client import message_name, typestore
+from support.recordings.realdata import real_data
 from support.recordings.recording_samples import calibration
 
 STAMP_NS = 1_700_000_000_123_456_789
@@ -175,6 +176,28 @@ def test_hashes_of_services_are_those_that_ros_announces(monkeypatch: pytest.Mon
     assert type_hash("test_msgs/srv/BasicTypes_Event").startswith(
         "5b9988a4805a06ae22dff12903a774ccda710e9514926b826ffc8"
     )
+
+
+def test_hashes_of_the_localizers_services_are_those_of_ros() -> None:
+    """As ROS 2 Jazzy's own packages state them: share/lifecycle_msgs/srv/GetState.json and the others."""
+    for name, stated in {
+        "lifecycle_msgs/srv/GetState": "800a0a5aae599782b02932de0caf563f6dc4e7e94b794eadde075ba2cbef9795",
+        "lifecycle_msgs/srv/ChangeState": "356fe34f0475a43acf54542013af4167b0e729f77ea22ffb045c6ad8e20668e5",
+        "lifecycle_msgs/srv/GetAvailableStates": "00a07d79d2207d71e81a8cbc1880e5d924cc16d4688ea8e8e06e443dc8f8aa1d",
+        "lifecycle_msgs/srv/GetAvailableTransitions": "59b7ecefce0982a8a844b9f2c4f14764c1c4543cc55e72924e2aa4adad83e9bc",
+        "std_srvs/srv/Empty": "5888399dedec5ccc85ea6451949fd2c9f97bfdf963f9a588821639fcd31b5d19",
+        "service_msgs/ServiceEventInfo": "41bcbbe07a75c9b52bc96bfd5c24d7f0fc0a08c0cb7921b3373c5732345a6f45",
+    }.items():
+        assert type_hash(name) == stated, name
+
+
+def test_nav2s_service_is_defined_as_nav2_defines_it() -> None:
+    """No list of hashes has it: the definition is nav2's, and the way from there to a hash is tested above."""
+    official = (real_data("conformance/nav2") / "nav2_msgs/srv/SetInitialPose.srv").read_text("utf-8")
+    request, response = (part.strip() for part in official.split("---"))
+    nothing = DEFINITIONS["std_srvs/srv/Empty_Request"]
+    name = "nav2_msgs/srv/SetInitialPose"
+    assert (DEFINITIONS[f"{name}_Request"], DEFINITIONS[f"{name}_Response"]) == (request, response or nothing)
 
 
 def test_tokens_are_those_of_rmw_zenoh_and_of_the_bridge() -> None:
