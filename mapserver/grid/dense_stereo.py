@@ -11,8 +11,11 @@ from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 
 DENSE_SIGMA_PX = 0.3  # of a disparity of the matcher on textured surfaces
-BLOCK_PX = 5
+_ROW_STEP, _BLOCK = 2, 3
+BLOCK_PX = _ROW_STEP * (_BLOCK - 1) + 3  # rows that a disparity depends on: of a block, each smoothed over three
 _NEAREST_M, _FRACTIONS = 0.6, 16
+_ROWS = np.array([[1.0], [2.0], [1.0]], np.float32) / 4
+_SMOOTH, _SMALLER = 16 * _BLOCK * _BLOCK, 4
 _MIN_TEXTURE, _TEXTURE_PX = 1.5, 9  # mean horizontal gradient in grey levels, of a square around the pixel
 _FLOOR_REACH_M, _FLOOR_BIN_M, _MIN_FLOOR_POINTS = 4.0, 0.02, 400
 _FLOOR_APART_M, _FLOOR_SHARE = 0.05, 0.6
@@ -28,25 +31,51 @@ def dense_disparity(
     if frame.disparity_px is not None:
         return frame.disparity_px, settings.depth_sigma_px
     assert frame.right is not None
-    nearest_px = min(camera.focal_px * camera.baseline_m / _NEAREST_M, 0.4 * camera.width_px)
-    smooth = BLOCK_PX * BLOCK_PX
+    farther_px = min(camera.focal_px * camera.baseline_m / _NEAREST_M, 0.4 * camera.width_px)
+    nearest_px = min(farther_px, _largest_disparity_px(frame.left, frame.right, farther_px))
+    # Rows weigh little in a disparity, and the time goes by them: every second one is matched, smoothed as far as it stands for.
+    left, right = (cv2.filter2D(picture, -1, _ROWS)[::_ROW_STEP].copy() for picture in (frame.left, frame.right))
+    rows = _between(_matched(left, right, nearest_px), len(frame.left))
+    gradient = np.abs(cv2.Sobel(frame.left, cv2.CV_32F, 1, 0, ksize=3)) / np.float32(8.0)
+    is_textured = cv2.blur(gradient, (_TEXTURE_PX, _TEXTURE_PX)) >= _MIN_TEXTURE
+    return np.where(is_textured, rows, np.float32(np.nan)), DENSE_SIGMA_PX
+
+
+def _matched(left: NDArray[np.uint8], right: NDArray[np.uint8], nearest_px: float) -> NDArray[np.float32]:
+    """Return the disparities of a pair up to `nearest_px`, NaN if unknown."""
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=16 * int(np.ceil(nearest_px / 16)),
-        blockSize=BLOCK_PX,
-        P1=8 * smooth,
-        P2=32 * smooth,
+        blockSize=_BLOCK,
+        P1=_SMOOTH,
+        P2=4 * _SMOOTH,
         disp12MaxDiff=1,
         preFilterCap=31,
         uniquenessRatio=10,
-        speckleWindowSize=100,
+        speckleWindowSize=50,
         speckleRange=2,
         mode=cv2.StereoSGBM_MODE_SGBM_3WAY,
     )
-    disparity = matcher.compute(frame.left, frame.right).astype(np.float32) / np.float32(_FRACTIONS)
-    gradient = np.abs(cv2.Sobel(frame.left, cv2.CV_32F, 1, 0, ksize=3)) / np.float32(8.0)
-    is_known = (disparity > 0.5) & (cv2.blur(gradient, (_TEXTURE_PX, _TEXTURE_PX)) >= _MIN_TEXTURE)
-    return np.where(is_known, disparity, np.float32(np.nan)), DENSE_SIGMA_PX
+    disparity = matcher.compute(left, right).astype(np.float32) / np.float32(_FRACTIONS)
+    return np.where(disparity > 0.5, disparity, np.float32(np.nan))
+
+
+def _largest_disparity_px(left: NDArray[np.uint8], right: NDArray[np.uint8], farther_px: float) -> float:
+    """Return the largest disparity of a pair, found in small pictures: a matcher's time and its blind left edge go by its range."""
+    small = [
+        cv2.resize(each, None, fx=1 / _SMALLER, fy=1 / _SMALLER, interpolation=cv2.INTER_AREA) for each in (left, right)
+    ]
+    disparity = _matched(small[0], small[1], farther_px / _SMALLER)
+    return _SMALLER * (float(np.nanmax(disparity, initial=0.0)) + 1.0)
+
+
+def _between(rows: NDArray[np.float32], height: int) -> NDArray[np.float32]:
+    """Return (height, W) disparities from those of every second row: means of like neighbours between them, NaN elsewhere."""
+    every = np.full((height, rows.shape[1]), np.float32(np.nan))
+    every[::2] = rows
+    above, below = rows[: (height - 1) // 2], rows[1 : 1 + (height - 1) // 2]
+    every[1 : height - 1 : 2] = np.where(np.abs(above - below) <= 1.0, (above + below) / 2, np.float32(np.nan))
+    return every
 
 
 def nearest_around(disparity_px: NDArray[np.float32], reach_px: int) -> NDArray[np.float32]:
