@@ -1,4 +1,4 @@
-"""`mapserver backup`, `restore` and `backups`: copies of a store in a folder or an object store; `attach`: its content there."""
+"""`mapserver backup`, `restore` and `backups`: copies of a store in a folder or an object store; `attach`: a store there."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -9,7 +9,8 @@ import typer
 
 from fleetmap.cli_options import expand_options
 from fleetmap.console import plain_console
-from mapserver.commands.options import ActorOptions, Json, StoreFolder, open_store, print_json
+from fleetmap.errors import UsageError
+from mapserver.commands.options import ActorOptions, Json, NewStoreFolder, StoreFolder, open_store, print_json
 from mapserver.commands.store import EXIT_STATUS_FAULTS
 
 Where = Annotated[str, typer.Argument(metavar="TARGET", help="Folder, or s3://BUCKET/PREFIX; for one store alone.")]
@@ -121,17 +122,25 @@ def backups(
         raise typer.Exit(EXIT_STATUS_FAULTS)
 
 
-@expand_options
 def attach(
-    *,
-    store: StoreFolder,
-    content: Annotated[str, typer.Option(metavar="URL", help="Object store for tiles, archives and pictures.")],
+    store: NewStoreFolder,
+    content: Annotated[
+        str | None, typer.Option(metavar="URL", help="Object store for tiles, archives and pictures.")
+    ] = None,
+    database: Annotated[
+        str | None, typer.Option(metavar="URL", help="PostgreSQL database for everything else.")
+    ] = None,
 ) -> None:
-    """Copy the content of a store into an object store, and use it from there; stop the server and the nights first."""
-    with open_store(store) as maps, _progress("blobs") as progress:
-        copied = maps.move_content(content, progress)
+    """Move a store out of its folder, or let a new folder share one that was moved; stop the server and the nights first."""
+    from mapserver.store import MapStore
+    from mapserver.store.places import Places
+
+    if content is None and database is None:
+        raise UsageError("name --content, --database or both")
+    with _progress("blobs") as progress:
+        copied = MapStore.attach(store, Places(content, database), progress)
     typer.echo(
-        f"the content of {store} is at {content}, {copied} bytes were copied; its folder blobs is not used any more"
+        f"{store} uses {content or 'its content'} and {database or 'its database'}; {copied} bytes of content were copied"
     )
 
 

@@ -1,32 +1,30 @@
-"""The SQLite file of an open store: its migrations, reading, write transactions, the log. All settings of SQLite are here."""
+"""The SQLite file of an open store: its migrations, reading, write transactions. All settings of SQLite are here."""
 
 import os
 import sqlite3
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 from urllib.parse import quote
 
 from sqlite_utils import Database
 
 from fleetmap.errors import NewerFormatError, StoreError
 from fleetmap.files import sync_path
-from mapserver.store.access.chain import COLUMNS, AuditLine, chain_head, line_sha256
-from mapserver.store.rows import LogEntry
-from mapserver.store.schema import FORMAT, LAST_UNNAMED, MIGRATIONS
+from mapserver.store.files import locked
+from mapserver.store.schema import FORMAT, LAST_UNNAMED, MIGRATIONS, TABLES
+from mapserver.store.transactions import Transactions
 
 APPLICATION_ID = 0x464D4150  # "FMAP": identifies the file as a map store
 _BUSY_TIMEOUT_MS = 30_000
 _INCREMENTAL = 2
 _HEAD_BYTES, _FORMAT_AT, _APPLICATION_AT = 100, 60, 68  # SQLite header; its user_version and application_id
+_ROWS_AT_ONCE = 100
 
 
-Row = TypeVar("Row")
-
-
-class Transactions:
+class SqliteTransactions(Transactions):
     """The database at a path, created or migrated as needed. Methods may be called from any thread.
 
     One connection writes and another one reads, each under its own lock: reading does not wait while a write is forced to the
@@ -35,7 +33,7 @@ class Transactions:
     """
 
     def __init__(self, path: Path, clock_ns: Callable[[], int], *, read_only: bool = False) -> None:
-        self.now_ns = clock_ns
+        super().__init__(clock_ns)
         self._path = path
         self._lock, self._reading = threading.RLock(), threading.Lock()
         self._writing_thread: int | None = None
@@ -56,7 +54,6 @@ class Transactions:
 
     @contextmanager
     def write(self, *, durable: bool = True) -> Iterator[sqlite3.Connection]:
-        """Run the block as one transaction. Raises StoreError on a disk error."""
         with self._lock:
             self._writing_thread = threading.get_ident()
             try:
@@ -68,7 +65,6 @@ class Transactions:
                 self._writing_thread = None
 
     def query(self, sql: str, values: tuple[object, ...] = ()) -> list[dict[str, Any]]:
-        """Return the rows by column. Raises StoreError on a disk error."""
         try:
             if self._writing_thread == threading.get_ident():
                 return list(self._database.query(sql, values))
@@ -78,7 +74,6 @@ class Transactions:
             raise StoreError(f"the store {self._path} cannot be read ({error}); check its disk") from error
 
     def copy_to(self, path: Path) -> None:
-        """Copy the database, as of one moment, page by page into a new file. Raises StoreError on a disk error."""
         try:
             with self._reading, closing(sqlite3.connect(path)) as target:
                 self._reader.conn.backup(target)
@@ -86,38 +81,34 @@ class Transactions:
             raise StoreError(f"{self._path} cannot be copied to {path} ({error}); check its disk and space") from error
 
     def shrink(self, pages: int) -> None:
-        """Return up to `pages` unused pages of the file to the disk."""
         with self._lock, suppress(sqlite3.Error):  # a busy file is shrunk the next time
             # One step of `execute` frees one page
             self._database.conn.executescript(f"PRAGMA incremental_vacuum({pages:d})")
 
-    def rows(self, kind: Callable[..., Row], sql: str, values: tuple[object, ...] = ()) -> list[Row]:
-        """Return the rows, each as a `kind` with a field for every column. Raises StoreError on a disk error."""
-        return [kind(**row) for row in self.query(sql, values)]
+    def tables(self) -> Iterator[tuple[str, list[str], list[Any]]]:
+        with self._reading:
+            self._reader.execute("BEGIN")
+            try:
+                for table in TABLES:
+                    found = self._reader.execute(f"SELECT * FROM {table}")
+                    columns = [column[0] for column in found.description]
+                    while rows := found.fetchmany(_ROWS_AT_ONCE):
+                        yield table, columns, rows
+            finally:
+                self._reader.execute("COMMIT")
 
-    def first(self, kind: Callable[..., Row], sql: str, values: tuple[object, ...] = ()) -> Row | None:
-        """As `rows`: the first of them, None if absent."""
-        return next(iter(self.rows(kind, sql, values)), None)
+    def faults(self) -> list[str]:
+        found = [row["integrity_check"] for row in self.query("PRAGMA integrity_check")]
+        foreign = self.query("PRAGMA foreign_key_check")
+        return [text for text in found if text != "ok"] + [
+            f"a row of {row['table']} refers to nothing" for row in foreign
+        ]
 
-    def log(self, connection: sqlite3.Connection, site: str, entry: LogEntry) -> None:
-        """Write a line of the log, chained to the previous one, within a transaction; site: empty if not about one."""
-        actor = entry.actor
-        last = connection.execute("SELECT id, sha256 FROM events ORDER BY id DESC LIMIT 1").fetchone()
-        number, before = last or (0, "")
-        if number and not before:  # all lines are from before the chain: the first chained one covers them
-            before = chain_head(self.audit_lines())
-        values: tuple[object, ...] = (number + 1, self.now_ns(), site, entry.kind, entry.detail, entry.version)
-        values += (actor.name, actor.reason, actor.operator, actor.address)
-        connection.execute(
-            f"INSERT INTO events ({COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            (*values, line_sha256(before, values)),
-        )
+    def total_bytes(self) -> int:
+        return sum(path.stat().st_size for path in self._path.parent.glob("store*.sqlite3*"))
 
-    def audit_lines(self, last: int | None = None) -> list[AuditLine]:
-        rows = self.rows(
-            AuditLine, f"SELECT {COLUMNS} FROM events ORDER BY id DESC LIMIT ?", (-1 if last is None else last,)
-        )
-        return rows[::-1]
+    def locked(self, name: str, *, shared: bool = False, waits: bool = True) -> AbstractContextManager[None]:
+        return locked(self._path.with_name(name), shared=shared, waits=waits)
 
 
 def _opened(path: Path, prepare: Callable[[Database, Path], object], options: str = "mode=rwc") -> Database:

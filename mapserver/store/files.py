@@ -4,11 +4,11 @@ import fcntl
 import os
 import stat
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from fleetmap.errors import StoreError, disk_errors
+from fleetmap.errors import BusyError, StoreError, disk_errors
 from fleetmap.files import OWN_FILE, sync_path
 
 _CHUNK_BYTES = 1 << 20
@@ -91,14 +91,15 @@ def release_reserve(root: Path) -> bool:
 
 
 @contextmanager
-def locked(path: Path, *, shared: bool) -> Iterator[None]:
+def locked(path: Path, *, shared: bool = False, waits: bool = True) -> Iterator[None]:
     """Hold the lock file at `path` during the block: shared or exclusive. The lock of a dead process is released.
 
-    Raises StoreError if the lock is not free within a minute, OSError if the file cannot be created.
+    Raises StoreError if the lock is not free within a minute, BusyError at once without `waits`, OSError if the file cannot be created.
     """
     descriptor = _open_own(path, os.O_RDWR | os.O_NOFOLLOW)
     try:
-        _take_lock(descriptor, fcntl.LOCK_SH if shared else fcntl.LOCK_EX, path)
+        kind = fcntl.LOCK_NB | (fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
+        take_lock(lambda: fcntl.flock(descriptor, kind), str(path), waits=waits)
         yield
     finally:
         os.close(descriptor)
@@ -108,14 +109,17 @@ def _open_own(path: Path, flags: int) -> int:
     return os.open(path, flags | os.O_CREAT | os.O_CLOEXEC, OWN_FILE)
 
 
-def _take_lock(descriptor: int, kind: int, path: Path) -> None:
+def take_lock(take: Callable[[], None], name: str, *, waits: bool) -> None:
+    """Call `take` until it raises no BlockingIOError. Raises StoreError after a minute, BusyError at once without `waits`."""
     give_up_s = time.monotonic() + _LOCK_WITHIN_S
     while True:
         try:
-            fcntl.flock(descriptor, kind | fcntl.LOCK_NB)
+            take()
         except BlockingIOError as error:
+            if not waits:
+                raise BusyError(f"{name} is held by another process; it ends by itself; try later") from error
             if time.monotonic() > give_up_s:
-                raise StoreError(f"{path} is held by another process for {_LOCK_WITHIN_S:.0f} s; try later") from error
+                raise StoreError(f"{name} is held by another process for {_LOCK_WITHIN_S:.0f} s; try later") from error
             time.sleep(0.05)
         else:
             return

@@ -1,7 +1,6 @@
 """The fleet's health in the store: sums by the hour, thinned traces, failures with their pictures."""
 
-import sqlite3
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, dataclass, field
 from itertools import accumulate
 from typing import Any
@@ -13,9 +12,9 @@ from fleetmap.errors import UsageError
 from fleetmap.messages import FailureReport
 from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters, hour_of
 from mapserver.floor_plan.areas import Areas
-from mapserver.store.database import Transactions
 from mapserver.store.rows import (
     AXES,
+    UNLIMITED,
     FailureDetail,
     FailureFilter,
     FailureReplay,
@@ -24,6 +23,7 @@ from mapserver.store.rows import (
     PictureRow,
     TraceRow,
 )
+from mapserver.store.transactions import Connection, Transactions
 
 CounterKey = tuple[str, str, str, int]
 """Site, axis, key, hour."""
@@ -41,7 +41,8 @@ _COUNTED = """FROM tally_keys k JOIN tallies t ON t.key_id = k.id
     WHERE k.axis = ?1 AND (?2 IS NULL OR k.site = ?2) AND (?3 IS NULL OR k.key = ?3) AND t.hour >= ?4 AND t.hour < ?5"""
 _ADD = f"""INSERT INTO tallies (key_id, hour, {", ".join(COUNTER_COLUMNS)})
     VALUES (?, ?, {", ".join("?" * len(COUNTER_COLUMNS))})
-    ON CONFLICT DO UPDATE SET {", ".join(f"{name} = {name} + excluded.{name}" for name in COUNTER_COLUMNS)}"""
+    ON CONFLICT (key_id, hour)
+    DO UPDATE SET {", ".join(f"{name} = tallies.{name} + excluded.{name}" for name in COUNTER_COLUMNS)}"""
 _REPORT_COLUMNS = ("site", "robot", "duration_s", "kind", "cause", "status", "version")
 _TRACED = tuple(TraceRow.__dataclass_fields__)[2:]
 _TRACE_COLUMNS = ", ".join(_TRACED)
@@ -76,7 +77,8 @@ class FleetQueries:
             _add_counters(connection, ids, batch.counters)
             where = [(ids[row.site, "robot", row.robot], row) for row in batch.traces]
             connection.executemany(
-                f"INSERT OR IGNORE INTO traces (key_id, {_TRACE_COLUMNS}) VALUES ({', '.join('?' * (1 + len(_TRACED)))})",
+                f"""INSERT INTO traces (key_id, {_TRACE_COLUMNS}) VALUES ({", ".join("?" * (1 + len(_TRACED)))})
+                    ON CONFLICT DO NOTHING""",
                 [(key_id, *astuple(row)[2:]) for key_id, row in where],
             )
             keep_last_reports(connection, batch.last_reports)
@@ -104,15 +106,16 @@ class FleetQueries:
             "report": to_msgpack(msgspec.structs.replace(report, thumbnails=())),
         }
         with self._transactions.write() as connection:
-            done = connection.execute(
-                f"INSERT OR IGNORE INTO failures ({', '.join(row)}) VALUES ({', '.join(f':{name}' for name in row)})",
+            added = connection.execute(
+                f"""INSERT INTO failures ({", ".join(row)}) VALUES ({", ".join(f":{name}" for name in row)})
+                    ON CONFLICT DO NOTHING RETURNING number""",
                 row,
-            )
-            if done.rowcount != 1:
+            ).fetchone()
+            if added is None:
                 return False
             connection.executemany(
                 "INSERT INTO failure_pictures VALUES (?, ?, ?, ?, ?)",
-                [(done.lastrowid, n, t.kind, t.stamp_ns, t.jpeg) for n, t in enumerate(report.thumbnails)],
+                [(added[0], n, t.kind, t.stamp_ns, t.jpeg) for n, t in enumerate(report.thumbnails)],
             )
             _prune_failures(connection, (report.site, report.robot), retention.failures_per_robot)
             self._picture_bytes += sum(len(thumbnail.jpeg) for thumbnail in report.thumbnails)
@@ -139,7 +142,7 @@ class FleetQueries:
         rows = self._transactions.query(f"SELECT t.hour, {_SUMS} {_COUNTED} GROUP BY t.hour ORDER BY t.hour", values)
         return {row.pop("hour"): Counters(**row) for row in rows}
 
-    def failures(self, wanted: FailureFilter, *, before: int | None = None, limit: int = -1) -> list[FailureRow]:
+    def failures(self, wanted: FailureFilter, *, before: int | None = None, limit: int = UNLIMITED) -> list[FailureRow]:
         return self._transactions.rows(
             FailureRow,
             f"""SELECT {_FAILURE_COLUMNS} FROM failures
@@ -170,10 +173,10 @@ class FleetQueries:
 
     def first_pictures(self, numbers: Iterable[int]) -> dict[int, int]:
         """Return by failure the place of its first camera picture, for failures that have one."""
-        wanted = to_json(list(numbers)).decode()
-        query = """SELECT number, min(place) place FROM failure_pictures WHERE kind != 'matches'
-                   AND number IN (SELECT value FROM json_each(?)) GROUP BY number"""
-        return {row["number"]: row["place"] for row in self._transactions.query(query, (wanted,))}
+        wanted = tuple(numbers)
+        query = f"""SELECT number, min(place) place FROM failure_pictures WHERE kind != 'matches'
+                    AND number IN ({", ".join("?" * len(wanted))}) GROUP BY number"""
+        return {row["number"]: row["place"] for row in self._transactions.query(query, wanted)} if wanted else {}
 
     def failure_number(self, site: str, robot: str, failure_id: str) -> int | None:
         """Return the number of a robot's report, None if not stored."""
@@ -185,7 +188,8 @@ class FleetQueries:
         """Store a failure's recording, and its pictures with those of the failure; the oldest recordings are deleted, never this one."""
         with self._transactions.write() as connection:
             values = (number, replay.summary, replay.mcap)
-            if not connection.execute("INSERT OR IGNORE INTO failure_replays VALUES (?, ?, ?)", values).rowcount:
+            query = "INSERT INTO failure_replays VALUES (?, ?, ?) ON CONFLICT DO NOTHING"
+            if not connection.execute(query, values).rowcount:
                 return
             query = "SELECT coalesce(max(place) + 1, 0) FROM failure_pictures WHERE number = ?"
             (place,) = connection.execute(query, (number,)).fetchone()
@@ -212,15 +216,17 @@ class FleetQueries:
 
     def trace(self, site: str, robot: str, *, since_hour: int = 0, until_hour: int = 1 << 60) -> list[TraceRow]:
         """Return a robot's trace, oldest first, hour by hour: in the table, an hour's rows of other robots lie in between."""
+        (ends,) = self._transactions.query("SELECT min(hour) first, max(hour) last FROM traces")
+        if ends["first"] is None:
+            return []
         return self._transactions.rows(
             TraceRow,
-            f"""WITH RECURSIVE asked(at, last) AS (
-                    SELECT max(?1, (SELECT min(hour) FROM traces)), min(?2 - 1, (SELECT max(hour) FROM traces))
-                    UNION ALL SELECT at + 1, last FROM asked WHERE at < last)
+            f"""WITH RECURSIVE asked(at) AS (
+                    SELECT CAST(? AS BIGINT) UNION ALL SELECT at + 1 FROM asked WHERE at < ?)
                SELECT k.site, k.key robot, {_TRACE_COLUMNS}
-               FROM tally_keys k CROSS JOIN asked CROSS JOIN traces t ON t.hour = at AND t.key_id = k.id
-               WHERE at <= last AND k.site = ?3 AND k.axis = 'robot' AND k.key = ?4 ORDER BY t.hour, t.stamp_ns""",
-            (since_hour, until_hour, site, robot),
+               FROM tally_keys k CROSS JOIN asked CROSS JOIN traces t WHERE t.hour = at AND t.key_id = k.id
+               AND at < ? AND k.site = ? AND k.axis = 'robot' AND k.key = ? ORDER BY t.hour, t.stamp_ns""",
+            (max(since_hour, ends["first"]), min(until_hour - 1, ends["last"]), until_hour, site, robot),
         )
 
     def prune(self, retention: FleetRetention) -> int:
@@ -240,19 +246,17 @@ class FleetQueries:
         self._transactions.shrink(_SHRINK_PAGES)
         return gone
 
-    def _ids(
-        self, connection: sqlite3.Connection, keys: Iterable[tuple[str, str, str]]
-    ) -> dict[tuple[str, str, str], int]:
+    def _ids(self, connection: Connection, keys: Iterable[tuple[str, str, str]]) -> dict[tuple[str, str, str], int]:
         """Return the numbers of keys, which are never removed: cached ones stay valid."""
         found = {key: self._key_ids.get(key, 0) for key in keys}
         for key in (key for key, number in found.items() if number == 0):
-            connection.execute("INSERT OR IGNORE INTO tally_keys (site, axis, key) VALUES (?, ?, ?)", key)
+            connection.execute("INSERT INTO tally_keys (site, axis, key) VALUES (?, ?, ?) ON CONFLICT DO NOTHING", key)
             row = connection.execute("SELECT id FROM tally_keys WHERE site = ? AND axis = ? AND key = ?", key)
             found[key] = int(row.fetchone()[0])
         return found
 
 
-def name_failures(connection: sqlite3.Connection, site: str, areas: Areas) -> None:
+def name_failures(connection: Connection, site: str, areas: Areas) -> None:
     """Set the present areas of a site's failures, within a transaction."""
     query = (
         "SELECT number, x_map_m, y_map_m FROM failures WHERE site = ? AND x_map_m IS NOT NULL AND y_map_m IS NOT NULL"
@@ -261,11 +265,11 @@ def name_failures(connection: sqlite3.Connection, site: str, areas: Areas) -> No
     connection.executemany("UPDATE failures SET area = ? WHERE number = ?", [(areas.at(x, y), n) for n, x, y in placed])
 
 
-def keep_last_reports(connection: sqlite3.Connection, reports: LastReports) -> None:
+def keep_last_reports(connection: Connection, reports: LastReports) -> None:
     """Store the robots' last reports, within a transaction."""
     connection.executemany(
         """INSERT INTO robots (site, robot, version, last_seen_ns, last_report) VALUES (?, ?, ?, ?, ?)
-           ON CONFLICT DO UPDATE SET version = coalesce(excluded.version, version),
+           ON CONFLICT (site, robot) DO UPDATE SET version = coalesce(excluded.version, robots.version),
            last_seen_ns = excluded.last_seen_ns, last_report = excluded.last_report""",
         [
             (site, robot, version, seen_ns, to_json(report).decode())
@@ -286,26 +290,26 @@ def _axis(axis: str) -> str:
 
 
 def _add_counters(
-    connection: sqlite3.Connection, ids: Mapping[tuple[str, str, str], int], counters: Mapping[CounterKey, Counters]
+    connection: Connection, ids: Mapping[tuple[str, str, str], int], counters: Mapping[CounterKey, Counters]
 ) -> None:
     ordered = sorted(counters.items(), key=lambda item: item[0])
     connection.executemany(_ADD, [(ids[key[:3]], key[3], *counts.values()) for key, counts in ordered])
 
 
-def _newest_beyond(rows: list[tuple[int, int]], keep: float) -> int | None:
+def _newest_beyond(rows: Sequence[tuple[int, int]], keep: float) -> int | None:
     """Return the newest number at which the sizes summed from the newest exceed `keep`. rows: number and size, the newest first."""
     sums = accumulate(size for _, size in rows)
     return next((number for (number, _), kept in zip(rows, sums, strict=True) if kept > keep), None)
 
 
-def _prune_traces(connection: sqlite3.Connection, keep: int) -> int:
+def _prune_traces(connection: Connection, keep: int) -> int:
     """Delete whole hours, the oldest first, until at most `keep` rows remain (the running hour always stays)."""
     hours = connection.execute("SELECT hour, count(*) FROM traces GROUP BY hour ORDER BY hour DESC").fetchall()
     last = _newest_beyond(hours[1:], keep - hours[0][1]) if hours else None
     return connection.execute("DELETE FROM traces WHERE hour <= ?", (last,)).rowcount
 
 
-def _prune_failures(connection: sqlite3.Connection, robot: tuple[str, str], keep: int) -> None:
+def _prune_failures(connection: Connection, robot: tuple[str, str], keep: int) -> None:
     """Delete the oldest failures of a robot until `keep` remain; their pictures are deleted with them."""
     (count,) = connection.execute("SELECT count(*) FROM failures WHERE site = ? AND robot = ?", robot).fetchone()
     if count <= keep:
@@ -314,18 +318,18 @@ def _prune_failures(connection: sqlite3.Connection, robot: tuple[str, str], keep
     connection.execute(f"DELETE FROM failures WHERE number IN ({oldest})", (*robot, count - keep))
 
 
-def _sum_of_pictures(connection: sqlite3.Connection) -> int:
+def _sum_of_pictures(connection: Connection) -> int:
     return int(connection.execute("SELECT coalesce(sum(length(jpeg)), 0) FROM failure_pictures").fetchone()[0])
 
 
-def _prune_replays(connection: sqlite3.Connection, keep_bytes: int, newest: int) -> None:
+def _prune_replays(connection: Connection, keep_bytes: int, newest: int) -> None:
     """Delete the oldest recordings until at most keep_bytes remain."""
     sizes = connection.execute("SELECT number, length(mcap) FROM failure_replays ORDER BY number DESC").fetchall()
     last = _newest_beyond(sizes, keep_bytes)
     connection.execute("DELETE FROM failure_replays WHERE number <= ? AND number <> ?", (last, newest))
 
 
-def _prune_pictures(connection: sqlite3.Connection, keep_bytes: float) -> int:
+def _prune_pictures(connection: Connection, keep_bytes: float) -> int:
     sizes = connection.execute(
         "SELECT number, sum(length(jpeg)) FROM failure_pictures GROUP BY number ORDER BY number DESC"
     ).fetchall()

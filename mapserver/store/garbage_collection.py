@@ -1,11 +1,10 @@
 """Garbage collection: versions beyond retention, unreferenced bytes, files left by killed processes."""
 
-import sqlite3
 from dataclasses import dataclass, field
 
 from mapserver.store.blobs import Blobs
-from mapserver.store.database import Transactions
 from mapserver.store.rows import Actor, LogEntry, SiteReleases
+from mapserver.store.transactions import Connection, Transactions
 from mapserver.store.version_rows import EXTRA_TABLES, mentioned, set_state, site_releases
 
 _DAY_NS = 86_400_000_000_000
@@ -90,7 +89,7 @@ def _protected(transactions: Transactions, releases: SiteReleases, seen_since_ns
     return {current, tried, releases.rollback_target, *(row["version"] for row in robots)}
 
 
-def _write_down(transactions: Transactions, connection: sqlite3.Connection, garbage: Garbage, actor: Actor) -> None:
+def _write_down(transactions: Transactions, connection: Connection, garbage: Garbage, actor: Actor) -> None:
     for site, version in garbage.retired:
         set_state(connection, (site, version), "retired", transactions.now_ns())
         transactions.log(connection, site, LogEntry("retired", f"version {version}", version, actor))

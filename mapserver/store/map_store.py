@@ -1,6 +1,6 @@
 """The store of maps: versions of sites in one folder.
 
-    DIR/store.sqlite3            sites, versions and their states, robots, jobs, events
+    DIR/store.sqlite3            sites, versions and their states, robots, jobs, events; or in PostgreSQL, as DIR/places.json says
         DIR/lock                     exclusive during garbage collection, shared while new, still unreferenced bytes arrive
     DIR/blobs/ab/<sha256>        tiles, manifests, vocabularies, archives, by content; or in an object store that DIR/places.json names
         DIR/reserve                  space freed by `gc` to work on a full disk
@@ -13,13 +13,21 @@ import hashlib
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self, cast
 
 from fleetmap.encoding import to_json, to_plain
-from fleetmap.errors import ChangedError, MapFormatError, NewerFormatError, StateError, StoreError, disk_errors
+from fleetmap.errors import (
+    ChangedError,
+    MapFormatError,
+    NewerFormatError,
+    StateError,
+    StoreError,
+    UsageError,
+    disk_errors,
+)
 from fleetmap.files import sync_path, write_atomically
 from fleetmap.mapformat import (
     BlobEntry,
@@ -41,14 +49,13 @@ from mapserver.store.files import (
     check_no_link,
     is_plain_file,
     keep_reserve,
-    locked,
     make_folder,
     make_own_file,
     read_file,
 )
 from mapserver.store.fleet_queries import name_failures
 from mapserver.store.garbage_collection import Garbage, Retention, collect
-from mapserver.store.places import Places, open_blobs, write_places
+from mapserver.store.places import DATABASE, Places, open_blobs, open_database, read_places, write_places
 from mapserver.store.queries import StoreQueries
 from mapserver.store.rows import (
     NOBODY,
@@ -79,8 +86,10 @@ AREAS_BEFORE = "areas before"
 class MapStore(StoreQueries):
     """One open store. Methods may be called from any thread; every process opens its own."""
 
-    def __init__(self, root: Path, clock_ns: Callable[[], int], *, read_only: bool = False) -> None:
-        super().__init__(root, clock_ns, read_only=read_only)
+    def __init__(
+        self, root: Path, clock_ns: Callable[[], int], *, create: bool = False, read_only: bool = False
+    ) -> None:
+        super().__init__(root, clock_ns, create=create, read_only=read_only)
         try:
             if not read_only:
                 sync_path(root)
@@ -100,6 +109,8 @@ class MapStore(StoreQueries):
         Raises StoreError if it does not exist, cannot be opened or is from an earlier fleetmap, NewerFormatError for one of
         a newer fleetmap.
         """
+        if read_places(path).database is not None:
+            return cls(path, clock_ns, create=create)
         is_new = not (path / "store.sqlite3").is_file()
         if is_new and not create:
             raise StoreError(
@@ -122,6 +133,54 @@ class MapStore(StoreQueries):
                 raise
             reason = f"the store {path} cannot be opened ({error}); check the path, its rights and space"
             raise StoreError(reason) from error
+
+    @classmethod
+    def attach(
+        cls,
+        path: Path,
+        places: Places,
+        progress: Callable[[int, int], None] = lambda done, total: None,
+        clock_ns: Callable[[], int] = time.time_ns,
+    ) -> int:
+        """Copy what is in the folder to these places, where all who open the store then find it; return the copied bytes of content.
+
+        A folder without a store is attached to the one that is there already. Files in the folder stay; the database is renamed.
+        Raises StoreError if either side fails, or if there is a store on both; nothing is changed then.
+        """
+        before = read_places(path)
+        places = Places(places.content or before.content, places.database or before.database)
+        file = path / DATABASE
+        if not file.is_file() and before.database is None:
+            if None in (places.content, places.database):
+                raise UsageError(
+                    f"{path} holds no map store; name the content and the database of the one that it shall share"
+                )
+            open_database(path, places, clock_ns, create=False, read_only=True).close()
+            make_folder(path)
+            write_places(path, places)
+            return 0
+        with cls.open(path, clock_ns=clock_ns) as store, store._locked(shared=False):
+            copied = store._copy_content(open_blobs(path, places), progress) if places.content != before.content else 0
+            if places.database != before.database:
+                with closing(open_database(path, places, clock_ns, create=True, read_only=False)) as target:
+                    target.copy_from(store._transactions)
+            write_places(path, places)
+        if file.is_file() and places.database is not None:
+            with disk_errors(f"{file} cannot be renamed", "rename it: nobody may use it any more"):
+                file.replace(path / "store-moved.sqlite3")
+        return copied
+
+    def _copy_content(self, target: Blobs, progress: Callable[[int, int], None]) -> int:
+        known, named, copied = target.sizes(), sorted(mentioned(self._transactions)), 0
+        for number, sha256 in enumerate(named, start=1):
+            progress(number, len(named))
+            size = self._blobs.size(sha256)
+            if size is None:
+                raise StoreError(f"{self._blobs.where(sha256)} is missing; run `mapserver verify`, the content stays")
+            if known.get(sha256) != size:
+                target.put_chunks(self._blobs.chunks(sha256), sha256, size)
+                copied += size
+        return copied
 
     def close(self) -> None:
         self._transactions.close()
@@ -146,7 +205,7 @@ class MapStore(StoreQueries):
             every = {"grid": content.grid, "surfel": [*content.surfels, *content.pictures]}
             kept = {kind: [self._blobs.put(data) for data in blobs] for kind, blobs in every.items()}
             with self._transactions.write() as connection:
-                connection.execute("INSERT OR IGNORE INTO sites (site) VALUES (?)", (site,))
+                connection.execute("INSERT INTO sites (site) VALUES (?) ON CONFLICT DO NOTHING", (site,))
                 last = connection.execute("SELECT last_version FROM sites WHERE site = ?", (site,)).fetchone()[0]
                 current = self._current_row(site)
                 manifest = Manifest(
@@ -278,28 +337,6 @@ class MapStore(StoreQueries):
             keep_reserve(self._root)
             return garbage
 
-    def move_content(self, url: str, progress: Callable[[int, int], None] = lambda done, total: None) -> int:
-        """Copy the content into the object store under a URL, where who opens the store next finds it; return the number of bytes.
-
-        Files in the folder stay. Raises StoreError if either side fails; the store is then unchanged.
-        """
-        places = Places(content=url)
-        target, copied = open_blobs(self._root, places), 0
-        with self._locked(shared=False):
-            known, named = target.sizes(), sorted(mentioned(self._transactions))
-            for number, sha256 in enumerate(named, start=1):
-                progress(number, len(named))
-                size = self._blobs.size(sha256)
-                if size is None:
-                    raise StoreError(
-                        f"{self._blobs.where(sha256)} is missing; run `mapserver verify`, the content stays"
-                    )
-                if known.get(sha256) != size:
-                    target.put_chunks(self._blobs.chunks(sha256), sha256, size)
-                    copied += size
-            write_places(self._root, places)
-        return copied
-
     def export_version(self, site: str, version: int, path: Path, *, archive: bool = True) -> int:
         """Write a version into one file and return its size; errors as of `manifest`, StoreError for the disk."""
         head = self._export_head(site, version, archive=archive)
@@ -348,7 +385,7 @@ class MapStore(StoreQueries):
                 self._blobs.put_chunks(reader.chunks(number), blob.sha256, blob.bytes)
             archive = reader.head.archive()
             with self._transactions.write() as connection:
-                connection.execute("INSERT OR IGNORE INTO sites (site) VALUES (?)", (manifest.site,))
+                connection.execute("INSERT INTO sites (site) VALUES (?) ON CONFLICT DO NOTHING", (manifest.site,))
                 self._known_import(manifest, sha256)
                 draft = self._draft_row(manifest, None if archive is None else archive.sha256, None)
                 log = LogEntry("saved", f"import as draft {manifest.version}", manifest.version, actor)
@@ -425,7 +462,7 @@ class MapStore(StoreQueries):
 
     @contextmanager
     def _locked(self, *, shared: bool) -> Iterator[None]:
-        with self._disk_errors(), locked(self._root / "lock", shared=shared):
+        with self._disk_errors(), self._transactions.locked("lock", shared=shared):
             yield
 
     @contextmanager

@@ -1,5 +1,6 @@
 """Places of a store's parts outside of its folder, by URL; the file DIR/places.json names them, absent if all is in the folder."""
 
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -8,14 +9,17 @@ from fleetmap.encoding import to_json
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.files import write_atomically
 from mapserver.store.blobs import BlobFolder, Blobs
+from mapserver.store.database import SqliteTransactions
+from mapserver.store.transactions import Transactions
 
-_FILE = "places.json"
+_FILE, DATABASE = "places.json", "store.sqlite3"
 
 
 class Places(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """content: URL of the object store with tiles, archives and pictures; None: in the folder."""
+    """content: URL of the object store with tiles, archives and pictures; database: of the PostgreSQL database; None: in the folder."""
 
     content: str | None = None
+    database: str | None = None
 
 
 def read_places(root: Path) -> Places:
@@ -44,3 +48,16 @@ def open_blobs(root: Path, places: Places) -> Blobs:
     from mapserver.store.object_store import BlobBucket  # late: a store in a folder does not need obstore
 
     return BlobBucket(places.content)
+
+
+def open_database(
+    root: Path, places: Places, clock_ns: Callable[[], int], *, create: bool, read_only: bool
+) -> Transactions:
+    """Return the database of a store, in its folder or in PostgreSQL; errors as of SqliteTransactions and PostgresTransactions."""
+    if places.database is None:
+        return SqliteTransactions(root / DATABASE, clock_ns, read_only=read_only)
+    try:
+        from mapserver.store.postgres import PostgresTransactions
+    except ImportError as error:
+        raise UsageError(f"a database in PostgreSQL needs {error.name}; install fleetmap[server,postgres]") from error
+    return PostgresTransactions(places.database, clock_ns, create=create)

@@ -18,11 +18,12 @@ from mapserver.floor_plan.survey_requests import KIND, SurveyRequest, read_reque
 from mapserver.quality.figures import Evidence, TrustedCalibration, carried_evidence, trusted_calibrations
 from mapserver.store.access.chain import AuditLine
 from mapserver.store.access.operators import OperatorQueries
-from mapserver.store.database import Transactions
+from mapserver.store.database import SqliteTransactions
 from mapserver.store.fleet_queries import FleetQueries, keep_last_reports
-from mapserver.store.places import open_blobs, read_places
+from mapserver.store.places import open_blobs, open_database, read_places
 from mapserver.store.rows import (
     NOBODY,
+    UNLIMITED,
     Actor,
     CanaryRow,
     Event,
@@ -53,11 +54,14 @@ class DatabaseCopy(NamedTuple):
 class StoreQueries:
     """Methods of an open store that change no version."""
 
-    def __init__(self, root: Path, clock_ns: Callable[[], int], *, read_only: bool = False) -> None:
+    def __init__(
+        self, root: Path, clock_ns: Callable[[], int], *, create: bool = False, read_only: bool = False
+    ) -> None:
         self._root = root
         self._clock_ns = clock_ns
-        self._blobs = open_blobs(root, read_places(root))
-        self._transactions = Transactions(root / "store.sqlite3", clock_ns, read_only=read_only)
+        places = read_places(root)
+        self._blobs = open_blobs(root, places)
+        self._transactions = open_database(root, places, clock_ns, create=create, read_only=read_only)
         self.fleet = FleetQueries(self._transactions)
         self._areas: dict[str, tuple[tuple[str, ...], Areas]] = {}  # by the addresses of their source files
         self.operators = OperatorQueries(self._transactions)
@@ -115,7 +119,7 @@ class StoreQueries:
     def copy_database(self, path: Path) -> DatabaseCopy:
         """Copy the database into a new file, as of one moment, and return what the copy names. Raises StoreError on a disk error."""
         self._transactions.copy_to(path)
-        copy = Transactions(path, self._clock_ns, read_only=True)
+        copy = SqliteTransactions(path, self._clock_ns, read_only=True)
         try:
             versions = copy.query("SELECT count(*) n FROM versions")[0]["n"]
             return DatabaseCopy(mentioned(copy), versions)
@@ -136,7 +140,7 @@ class StoreQueries:
                FROM sites s ORDER BY s.site""",
         )
 
-    def versions(self, site: str, *, after: int = 0, limit: int = -1) -> list[VersionInfo]:
+    def versions(self, site: str, *, after: int = 0, limit: int = UNLIMITED) -> list[VersionInfo]:
         """Return versions of a site, oldest first, after number `after`; raises UsageError for an unknown site."""
         self._check_site(site)
         return self._transactions.rows(
@@ -199,8 +203,8 @@ class StoreQueries:
 
     def survey_requests(self, site: str) -> list[SurveyRequest]:
         """Return the open survey requests, oldest first; empty for an unknown site."""
-        query = "SELECT kind, sha256 FROM site_files WHERE site = ? AND kind GLOB ?"
-        rows = self._transactions.query(query, (site, f"{KIND}*"))
+        query = "SELECT kind, sha256 FROM site_files WHERE site = ? AND substr(kind, 1, ?) = ?"
+        rows = self._transactions.query(query, (site, len(KIND), KIND))
         found = [read_request(row["kind"], self._blobs.get(row["sha256"])) for row in rows]
         return sorted(found, key=lambda request: (request.asked_ns, request.id))
 
@@ -269,7 +273,12 @@ class StoreQueries:
             return []
 
     def events(
-        self, site: str, span_ns: tuple[int | None, int | None] = (None, None), *, after: int = 0, limit: int = -1
+        self,
+        site: str,
+        span_ns: tuple[int | None, int | None] = (None, None),
+        *,
+        after: int = 0,
+        limit: int = UNLIMITED,
     ) -> list[Event]:
         """Return a site's history, oldest first, after event `after`; span_ns: start and end, None for open."""
         return self._transactions.rows(
@@ -305,7 +314,7 @@ class StoreQueries:
     def robots(self, site: str | None = None) -> list[RobotInfo]:
         """Return the last report of every robot (of a site)."""
         rows = self._transactions.query(
-            "SELECT * FROM robots WHERE ?1 IS NULL OR site = ?1 ORDER BY site, robot", (site,)
+            "SELECT * FROM robots WHERE (?1 IS NULL OR site = ?1) ORDER BY site, robot", (site,)
         )
         return [RobotInfo(**row | {"last_report": json.loads(row["last_report"])}) for row in rows]
 
@@ -315,7 +324,7 @@ class StoreQueries:
         span_ns: tuple[int | None, int | None] = (None, None),
         *,
         before: int | None = None,
-        limit: int = -1,
+        limit: int = UNLIMITED,
     ) -> list[JobInfo]:
         """Return jobs (of a site), newest first, older than job `before`; span_ns: range of their start, by the second."""
         since, until = (None if ns is None else _iso(ns + 999_999_999) for ns in span_ns)
@@ -333,10 +342,10 @@ class StoreQueries:
     def tell_progress(self, job: int, progress: object, key: str = "progress") -> None:
         """Store the progress of a running job under a key of its report; ignored for an ended one. A power cut may lose it."""
         with self._transactions.write(durable=False) as connection:
-            connection.execute(
-                "UPDATE jobs SET report = json_set(report, '$.' || ?, json(?)) WHERE id = ? AND state = 'running'",
-                (key, to_json(progress).decode(), job),
-            )
+            found = connection.execute("SELECT report FROM jobs WHERE id = ? AND state = 'running'", (job,)).fetchone()
+            if found is not None:
+                report = to_json(json.loads(found[0]) | {key: progress}).decode()
+                connection.execute("UPDATE jobs SET report = ? WHERE id = ?", (report, job))
 
     def running_jobs(self) -> list[JobInfo]:
         return self._jobs("WHERE state = 'running' ORDER BY id", ())
@@ -369,10 +378,11 @@ class StoreQueries:
     def begin_job(self, site: str, kind: str) -> int:
         with self._transactions.write() as connection:
             done = connection.execute(
-                "INSERT INTO jobs (site, kind, state, started, message, report) VALUES (?, ?, 'running', ?, '', '{}')",
+                """INSERT INTO jobs (site, kind, state, started, message, report) VALUES (?, ?, 'running', ?, '', '{}')
+                   RETURNING id""",
                 (check_name(site, "site"), kind, _iso(self._clock_ns())),
             )
-            return int(done.lastrowid or 0)
+            return int(done.fetchone()[0])
 
     def update_job(self, job: int, state: str, message: str, report: dict[str, Any]) -> None:
         """Store the state of a job: running, or ended (done or failed)."""

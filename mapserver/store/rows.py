@@ -145,6 +145,9 @@ class DraftContent:
     job: int | None = None
 
 
+UNLIMITED = 1 << 62
+"""As limit of a number of rows: all."""
+
 AXES = ("site", "robot", "version", "tile", "area", "cause", "arm")
 """Keys of the sums, each separate: never robot and tile together, so that they stay few."""
 

@@ -1,5 +1,7 @@
 """The tables of the database. A change is a further named migration; a released one is never changed."""
 
+import re
+
 from sqlite_utils import Database, Migrations
 
 MIGRATIONS = Migrations("fleetmap")
@@ -264,6 +266,10 @@ CREATE TABLE failure_replays (
     mcap BLOB NOT NULL)
 """
 
+STATEMENTS = _TABLES.strip().split("\n\n")
+TABLES = re.findall(r"CREATE TABLE (\w+)", _TABLES)
+"""Their names, each after those that it refers to."""
+
 
 @MIGRATIONS()
 def tables(database: Database) -> None:
@@ -272,7 +278,7 @@ def tables(database: Database) -> None:
         database.execute("ALTER TABLE sites DROP COLUMN vocabulary_sha256")
         database.execute("DELETE FROM traces WHERE heard_ns IS NULL")  # without a time; pages do not show them
         return
-    for statement in _TABLES.strip().split("\n\n"):
+    for statement in STATEMENTS:
         database.execute(statement)
 
 

@@ -12,7 +12,7 @@ from statistics import median
 
 from fleetmap.errors import FleetmapError, disk_errors
 from mapserver.store.blobs import Blobs
-from mapserver.store.database import Transactions
+from mapserver.store.transactions import Transactions
 
 _EVERY_S, _DAY_S = 600.0, 86_400.0
 _WAIT_S = 0.5  # for a measurement under way: that of a small store is done by then
@@ -66,8 +66,7 @@ class UsageMeter:
             """SELECT (SELECT coalesce(sum(length(jpeg)), 0) FROM failure_pictures) pictures,
                       (SELECT coalesce(sum(length(mcap)), 0) FROM failure_replays) recordings"""
         )
-        files_bytes = sum(path.stat().st_size for path in self._root.glob("store*.sqlite3*"))
-        database_bytes = max(0, files_bytes - kept["pictures"] - kept["recordings"])
+        database_bytes = max(0, self._transactions.total_bytes() - kept["pictures"] - kept["recordings"])
         now_ns, maps_bytes = self._transactions.now_ns(), self._blobs.total_bytes()
         return StoreUsage(now_ns, maps_bytes, kept["pictures"], kept["recordings"], database_bytes)
 

@@ -7,9 +7,9 @@ from typing import Any
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import current_path, decode_manifest
 from mapserver.store.blobs import Blobs
-from mapserver.store.database import Transactions
 from mapserver.store.files import is_plain_file
 from mapserver.store.rows import SiteReleases, VersionInfo
+from mapserver.store.transactions import Transactions
 from mapserver.store.version_rows import mentioned, references, site_releases
 
 
@@ -34,10 +34,7 @@ class StoreFindings:
 def verify(root: Path, transactions: Transactions, blobs: Blobs) -> StoreFindings:
     """Read everything in the store. Raises StoreError only if the database cannot be read at all."""
     found = StoreFindings()
-    integrity = [row["integrity_check"] for row in transactions.query("PRAGMA integrity_check")]
-    found.faults += [f"database: {text}" for text in integrity if text != "ok"]
-    foreign = transactions.query("PRAGMA foreign_key_check")
-    found.faults += [f"database: a row of {row['table']} refers to nothing" for row in foreign]
+    found.faults += [f"database: {text}" for text in transactions.faults()]
     found.faults += [
         f"{path} is a symbolic link, which a store does not follow"
         for path in (*blobs.links(), *_links(root / "trust"))

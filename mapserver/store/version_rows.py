@@ -1,12 +1,11 @@
 """SQL on versions, canaries and the history of current versions. `releases` decides the changes."""
 
-import sqlite3
 from collections.abc import Iterable, Mapping, Set
 
 from fleetmap.mapformat import Manifest
 from fleetmap.mapformat.building import FOR_ROBOTS
-from mapserver.store.database import Transactions
 from mapserver.store.rows import CanaryRow, LogEntry, ReleaseChanges, SiteReleases, VersionInfo
+from mapserver.store.transactions import Connection, Transactions
 
 EXTRA_TABLES = {"grid": "grid_blobs", "surfel": "surfel_blobs"}
 """By kind: table of the bytes of a version not needed by its robots; pictures of surveys are among the surfels."""
@@ -40,9 +39,7 @@ def canaries(transactions: Transactions, site: str | None, *, running: bool) -> 
     return transactions.rows(CanaryRow, query, (site, int(running)))
 
 
-def apply_changes(
-    transactions: Transactions, connection: sqlite3.Connection, site: str, changes: ReleaseChanges
-) -> None:
+def apply_changes(transactions: Transactions, connection: Connection, site: str, changes: ReleaseChanges) -> None:
     """Write the changes of a release, within its transaction."""
     now_ns = transactions.now_ns()
     for version, state in changes.states:
@@ -65,23 +62,23 @@ def apply_changes(
         transactions.log(connection, site, entry)
 
 
-def set_state(connection: sqlite3.Connection, version: tuple[str, int], state: str, now_ns: int) -> None:
+def set_state(connection: Connection, version: tuple[str, int], state: str, now_ns: int) -> None:
     """Set the state of (site, number), published, current or retired, with the time of the first and of the last."""
     connection.execute(
-        """UPDATE versions SET state = ?1, published_ns = coalesce(published_ns, ?2),
-           retired_ns = CASE WHEN ?1 = 'retired' THEN ?2 END WHERE site = ?3 AND version = ?4""",
-        (state, now_ns, *version),
+        """UPDATE versions SET state = ?, published_ns = coalesce(published_ns, ?), retired_ns = ?
+           WHERE site = ? AND version = ?""",
+        (state, now_ns, now_ns if state == "retired" else None, *version),
     )
 
 
 def insert_draft(
-    transactions: Transactions, connection: sqlite3.Connection, manifest: Manifest, draft: VersionInfo, log: LogEntry
+    transactions: Transactions, connection: Connection, manifest: Manifest, draft: VersionInfo, log: LogEntry
 ) -> None:
     """Insert the rows of a new draft, within a transaction; its bytes are already on the disk."""
     row = {name: getattr(draft, name) for name in VersionInfo.__dataclass_fields__}
     connection.execute(f"INSERT INTO versions ({', '.join(row)}) VALUES ({', '.join(f':{name}' for name in row)})", row)
-    query = "UPDATE sites SET last_version = max(last_version, ?) WHERE site = ?"
-    connection.execute(query, (draft.version, draft.site))
+    query = "UPDATE sites SET last_version = ? WHERE site = ? AND last_version < ?"
+    connection.execute(query, (draft.version, draft.site, draft.version))
     connection.executemany(
         "INSERT INTO version_blobs (site, version, kind, sha256) VALUES (?, ?, ?, ?)",
         [(draft.site, draft.version, kind, sha256) for kind, sha256 in sorted(references(draft, manifest))],
@@ -89,7 +86,7 @@ def insert_draft(
     transactions.log(connection, draft.site, log)
 
 
-def insert_extras(connection: sqlite3.Connection, draft: VersionInfo, extras: Mapping[str, Iterable[str]]) -> None:
+def insert_extras(connection: Connection, draft: VersionInfo, extras: Mapping[str, Iterable[str]]) -> None:
     """Insert the bytes of a draft's grid and surfels, by their kind in EXTRA_TABLES, within a transaction."""
     for kind, addresses in extras.items():
         rows = [(draft.site, draft.version, sha256) for sha256 in sorted(set(addresses))]

@@ -26,7 +26,7 @@ PROJECT = tomllib.loads(text("pyproject.toml"))["project"]
 # Extras whose libraries are imported where a recording, a message or a setting asks for them.
 ON_DEMAND = sorted(set(PROJECT["optional-dependencies"]) - {"client", "server", "dev"})
 # Imported by a library that we import, which does not ask for them itself.
-BEHIND = {"httpx", "securesystemslib"}
+BEHIND = {"pg8000", "httpx", "securesystemslib"}
 
 
 def declared(extra: str | None) -> set[str]:

@@ -1,4 +1,4 @@
-"""Places of a store's content: its folder, or an object store."""
+"""Places of a store's content and metadata: its folder, an object store, PostgreSQL."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from mapserver.store.places import Places, write_places
+from support.storage.postgres_server import PostgresServer, postgres_server
 from support.storage.s3_server import KEYS, s3_server
 
 
@@ -24,11 +25,27 @@ def s3(s3_bucket: str, tmp_path: Path) -> str:
     return f"{s3_bucket}/{tmp_path.name}"
 
 
-@pytest.fixture(params=["folder", "s3"])
+@pytest.fixture(scope="session")
+def postgres() -> Iterator[PostgresServer]:
+    with postgres_server() as server:
+        yield server
+
+
+@pytest.fixture(params=["folder", "s3", "postgres"])
 def store_folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """The folder of a new store, whose content is there or in S3."""
+    """The folder of a new store, whose content is there or in S3, and its metadata there or in PostgreSQL."""
     folder = tmp_path / "store"
-    if request.param == "s3":
+    if request.param != "folder":
         folder.mkdir()
-        write_places(folder, Places(content=request.getfixturevalue("s3")))
+        content = request.getfixturevalue("s3") if request.param == "s3" else None
+        database = None if content else request.getfixturevalue("postgres").database()
+        write_places(folder, Places(content, database))
     return folder
+
+
+@pytest.fixture(params=["sqlite", "postgres"])
+def metadata_folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    """The folder of a new store, whose metadata is there or in PostgreSQL."""
+    if request.param == "postgres":
+        write_places(tmp_path, Places(database=request.getfixturevalue("postgres").database()))
+    return tmp_path

@@ -1,13 +1,12 @@
 """Operators, their sessions and tokens. Secrets are stored as hashes only; every change is logged."""
 
-import sqlite3
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
 from fleetmap.errors import StateError, UsageError
-from mapserver.store.database import Transactions
 from mapserver.store.rows import Actor, LogEntry
+from mapserver.store.transactions import Connection, Transactions
 
 _TOKENS_KEPT_NS = 400 * 86_400_000_000_000
 
@@ -90,7 +89,9 @@ class OperatorQueries:
         with self._transactions.write() as connection:
             values = (name, role, password)
             done = connection.execute(
-                "INSERT OR IGNORE INTO operators (name, role, password, is_disabled) VALUES (?, ?, ?, 0)", values
+                """INSERT INTO operators (name, role, password, is_disabled) VALUES (?, ?, ?, 0)
+                   ON CONFLICT DO NOTHING""",
+                values,
             )
             if not done.rowcount:
                 raise StateError(
@@ -169,7 +170,9 @@ class OperatorQueries:
         """Add a token; an unknown name becomes that of a program."""
         with self._transactions.write() as connection:
             connection.execute(
-                "INSERT OR IGNORE INTO operators (name, role, is_disabled) VALUES (?, 'program', 0)", (token.name,)
+                """INSERT INTO operators (name, role, is_disabled) VALUES (?, 'program', 0)
+                   ON CONFLICT DO NOTHING""",
+                (token.name,),
             )
             values = (sha256, token.name, token.scopes, token.ends_ns)
             connection.execute("INSERT INTO tokens (sha256, name, scopes, ends_ns) VALUES (?, ?, ?, ?)", values)
@@ -195,6 +198,6 @@ class OperatorQueries:
         )
 
 
-def _change(connection: sqlite3.Connection, sql: str, *values: str) -> None:
+def _change(connection: Connection, sql: str, *values: str) -> None:
     if not connection.execute(sql, values).rowcount:
         raise UsageError(f"unknown operator {values[-1]}; `mapserver operators list` names all operators")

@@ -52,9 +52,9 @@ class Site:
 
 
 @pytest.fixture
-def site(tmp_path: Path) -> Iterator[Site]:
+def site(metadata_folder: Path) -> Iterator[Site]:
     clock = {"ns": START_NS}
-    with MapStore.open(tmp_path, create=True, clock_ns=lambda: clock["ns"]) as store:
+    with MapStore.open(metadata_folder, create=True, clock_ns=lambda: clock["ns"]) as store:
         save_sample_draft(store)
         releases.publish(store, "lab")
         fleet = Fleet(store, clock_ns=lambda: clock["ns"])

@@ -1,6 +1,5 @@
 """Sign-in, sessions and tokens; guessing of passwords (row 36 of docs/security.md)."""
 
-import sqlite3
 import threading
 import time
 from collections.abc import Iterator
@@ -39,8 +38,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.fixture
-def operators(tmp_path: Path, clock: Clock) -> Iterator[Operators]:
-    with MapStore.open(tmp_path, create=True, clock_ns=clock) as store:
+def operators(metadata_folder: Path, clock: Clock) -> Iterator[Operators]:
+    with MapStore.open(metadata_folder, create=True, clock_ns=clock) as store:
         made = Operators(store)
         made.add("ada", "operator", PASSWORD, ADMIN)
         yield made
@@ -209,8 +208,8 @@ def test_sign_in_is_on_from_the_first_name_to_the_end_of_days(tmp_path: Path, cl
         assert Operators(store).is_sign_in_on
 
 
-def test_a_damaged_hash_lets_nobody_in(operators: Operators, tmp_path: Path) -> None:
-    with sqlite3.connect(tmp_path / "store.sqlite3") as connection:
+def test_a_damaged_hash_lets_nobody_in(operators: Operators) -> None:
+    with operators._store._transactions.write() as connection:
         connection.execute("UPDATE operators SET password = 'nonsense'")
     assert operators.sign_in("ada", PASSWORD, "").refusal
     assert operators.sign_in("ada", "nonsense", "").refusal

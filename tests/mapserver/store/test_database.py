@@ -17,7 +17,7 @@ from mapserver import releases
 from mapserver.store import FailureFilter, MapStore, schema
 from mapserver.store import database as database_module
 from mapserver.store.access.chain import chain_faults
-from mapserver.store.database import APPLICATION_ID, Transactions
+from mapserver.store.database import APPLICATION_ID, SqliteTransactions
 from mapserver.store.schema import FORMAT, LAST_UNNAMED
 from support.storage.map_samples import save_sample_draft
 
@@ -26,13 +26,13 @@ _LINE = "INSERT INTO events (stamp_ns, site, kind, detail) VALUES (1, 'hall', 'n
 
 
 @pytest.fixture
-def ledger(tmp_path: Path) -> Iterator[Transactions]:
-    opened = Transactions(tmp_path / "store.sqlite3", lambda: 1)
+def ledger(tmp_path: Path) -> Iterator[SqliteTransactions]:
+    opened = SqliteTransactions(tmp_path / "store.sqlite3", lambda: 1)
     yield opened
     opened.close()
 
 
-def _read_elsewhere(ledger: Transactions) -> int:
+def _read_elsewhere(ledger: SqliteTransactions) -> int:
     found: list[int] = []
     thread = threading.Thread(target=lambda: found.append(ledger.query(COUNT)[0]["n"]), daemon=True)
     thread.start()
@@ -41,7 +41,7 @@ def _read_elsewhere(ledger: Transactions) -> int:
     return found[0]
 
 
-def test_others_read_on_while_a_transaction_is_open(ledger: Transactions) -> None:
+def test_others_read_on_while_a_transaction_is_open(ledger: SqliteTransactions) -> None:
     with ledger.write() as connection:
         connection.execute(_LINE)
         assert ledger.query(COUNT)[0]["n"] == 1, "its own thread sees what it wrote"
@@ -49,21 +49,21 @@ def test_others_read_on_while_a_transaction_is_open(ledger: Transactions) -> Non
     assert _read_elsewhere(ledger) == ledger.query(COUNT)[0]["n"] == 1
 
 
-def test_what_is_taken_back_was_never_there(ledger: Transactions) -> None:
+def test_what_is_taken_back_was_never_there(ledger: SqliteTransactions) -> None:
     with pytest.raises(RuntimeError), ledger.write() as connection:
         connection.execute(_LINE)
         raise RuntimeError
     assert ledger.query(COUNT)[0]["n"] == 0
 
 
-def test_reading_cannot_write(ledger: Transactions) -> None:
+def test_reading_cannot_write(ledger: SqliteTransactions) -> None:
     with pytest.raises(StoreError, match="cannot be read"):
         ledger.query(_LINE)
 
 
 def test_closing_leaves_one_file(tmp_path: Path) -> None:
     """The write-ahead log is folded in by the last connection; a copy of the file is then the whole database."""
-    opened = Transactions(tmp_path / "store.sqlite3", lambda: 1)
+    opened = SqliteTransactions(tmp_path / "store.sqlite3", lambda: 1)
     with opened.write() as connection:
         connection.execute(_LINE)
     opened.query(COUNT)

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import sqlite3
 import subprocess
 import sys
 from functools import partial
@@ -17,12 +16,12 @@ from mapserver import releases
 from mapserver.backup.backup import back_up
 from mapserver.backup.restore import restore
 from mapserver.backup.snapshots import BackupTarget
-from mapserver.store import Actor, MapStore, Retention, object_store
-from mapserver.store.files import locked
+from mapserver.store import Actor, MapStore, Retention, chain_faults, object_store
 from mapserver.store.object_store import BlobBucket
-from mapserver.store.places import read_places
+from mapserver.store.places import Places, read_places
 from support.storage.clock import Clock
 from support.storage.map_samples import publish_samples, save_sample_draft
+from support.storage.postgres_server import PostgresServer
 from support.storage.s3_server import Content
 
 ADA = Actor("ada", "a test")
@@ -44,13 +43,13 @@ def states(store: MapStore) -> dict[int, str]:
     return {info.version: info.state for info in store.versions("lab")}
 
 
-def test_the_log_is_never_changed(store: MapStore, tmp_path: Path) -> None:
+def test_the_log_is_never_changed(store: MapStore) -> None:
     publish_samples(store, 1)
-    connection = sqlite3.connect(tmp_path / "store" / "store.sqlite3")
     for statement in ("DELETE FROM events", "UPDATE events SET actor = 'nobody'"):
-        with pytest.raises(sqlite3.IntegrityError, match="never"):
+        with pytest.raises(StoreError, match="never"), store._transactions.write() as connection:
             connection.execute(statement)
-    connection.close()
+    assert len(store.audit_lines()) == 2
+    assert chain_faults(store.audit_lines()) == []
 
 
 def test_verify_names_what_is_wrong(store: MapStore, tmp_path: Path) -> None:
@@ -64,11 +63,9 @@ def test_verify_names_what_is_wrong(store: MapStore, tmp_path: Path) -> None:
     if is_folder:
         (root / current_path("lab")).write_text("wrong")
         (root / "blobs" / first[:2] / ".leftover.tmp").write_bytes(b"x")
-    connection = sqlite3.connect(root / "store.sqlite3")
-    connection.execute("UPDATE versions SET landmarks = 7 WHERE version = 1")
-    connection.execute("DELETE FROM version_blobs WHERE version = 1 AND kind = 'tile'")
-    connection.commit()
-    connection.close()
+    with store._transactions.write() as connection:
+        connection.execute("UPDATE versions SET landmarks = 7 WHERE version = 1")
+        connection.execute("DELETE FROM version_blobs WHERE version = 1 AND kind = 'tile'")
     found = store.verify()
     text = "\n".join(found.faults)
     for words in (f"{first} is damaged", f"{second} is missing", "the database says", "reference different"):
@@ -121,18 +118,18 @@ def test_leftovers_are_removed(store: MapStore) -> None:
 def test_garbage_waits_for_those_who_bring_bytes(store: MapStore, tmp_path: Path, monkeypatch) -> None:
     publish_samples(store, 1)
     monkeypatch.setattr("mapserver.store.files._LOCK_WITHIN_S", 0.1)
-    with locked(tmp_path / "store" / "lock", shared=True):
+    with MapStore.open(tmp_path / "store") as other, other._transactions.locked("lock", shared=True):
         save_sample_draft(store, seed=7)
         with pytest.raises(StoreError, match="held by another process"):
             store.collect_garbage()
     # A process that was killed holds nothing.
     program = (
-        "import os, sys\nfrom pathlib import Path\nfrom mapserver.store.files import locked\n"
-        "with locked(Path(sys.argv[1]), shared=False): os._exit(9)\n"
+        "import os, sys\nfrom pathlib import Path\nfrom mapserver.store import MapStore\n"
+        "with MapStore.open(Path(sys.argv[1]))._transactions.locked('lock'): os._exit(9)\n"
     )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    lock = str(tmp_path / "store" / "lock")
-    done = subprocess.run([sys.executable, "-c", program, lock], env=environment, check=False, timeout=60)
+    folder = str(tmp_path / "store")
+    done = subprocess.run([sys.executable, "-c", program, folder], env=environment, check=False, timeout=60)
     assert done.returncode == 9
     store.collect_garbage()
 
@@ -207,36 +204,50 @@ def test_days_until_the_disk_is_full_are_known_after_a_day(
     assert store.disk_space().grows_bytes_per_day is None, "the clock was set back"
 
 
-def test_content_moves_into_an_object_store(tmp_path: Path, s3: str) -> None:
-    with MapStore.open(tmp_path / "store", create=True) as store:
+def test_a_store_moves_out_of_its_folder_and_back(tmp_path: Path, s3: str, postgres: PostgresServer) -> None:
+    folder, database = tmp_path / "store", postgres.database()
+    with MapStore.open(folder, create=True) as store:
         publish_samples(store, 2)
-        tile = store.manifest("lab", 2).tiles[0].sha256
-        with pytest.raises(StoreError, match="credentials"):
-            store.move_content("s3://no-bucket-of-this-name")
-        assert read_places(store.folder).content is None
-        assert store.move_content(s3) > 0
-        assert store.move_content(s3) == 0, "what is there is not copied again"
-    shutil.rmtree(tmp_path / "store" / "blobs")
-    with MapStore.open(tmp_path / "store") as store:
-        assert store.move_content(f"{s3}-elsewhere") > 0
+        store.record_robot_report("lab", "r1", {"note": "caf\u00e9"}, 2)
+        tile, log = store.manifest("lab", 2).tiles[0].sha256, store.audit_lines()
+        data = store.blob(tile)
+    with pytest.raises(StoreError, match="credentials"):
+        MapStore.attach(folder, Places("s3://no-bucket-of-this-name"))
+    assert read_places(folder) == Places()
+    assert MapStore.attach(folder, Places(s3)) > 0
+    assert MapStore.attach(folder, Places(f"{s3}-2", database)) > 0
+    shutil.rmtree(folder / "blobs")
+    with pytest.raises(StoreError, match="holds no map store"):
+        MapStore.attach(tmp_path / "second", Places(s3, postgres.database()))
+    MapStore.attach(tmp_path / "second", Places(f"{s3}-2", database))
+    with MapStore.open(folder) as store, MapStore.open(tmp_path / "second") as second:
+        assert (store.audit_lines(), store.robots("lab")[0].last_report) == (log, {"note": "caf\u00e9"})
+        publish_samples(second, 1)
+        job = second.begin_job("lab", "build")
+        second.tell_progress(job, {"stage": "bundle"})
+        assert [info.state for info in store.versions("lab")] == ["published", "published", "current"]
+        assert store.verify().faults == chain_faults(store.audit_lines()) == []
         back_up(store, target := BackupTarget(f"{s3}-backup", create=True))
     restore(target, tmp_path / "restored", ADA)
     with MapStore.open(tmp_path / "restored") as restored:
         assert restored.verify().faults == []
-    with MapStore.open(tmp_path / "store") as store:
-        assert store.blob(tile)
-        publish_samples(store, 1)
-        assert store.verify().faults == []
-        data = store.blob(tile)
-        Content(store).write(tile, data[:-1] + b"?")
-        with pytest.raises(MapFormatError, match=tile):
-            store.move_content(f"{s3}-other")
-        Content(store).remove(tile)
-        with pytest.raises(StoreError, match=f"{tile} is missing"):
-            store.move_content(f"{s3}-other")
-        with pytest.raises(StoreError, match=f"{tile} is missing"):
-            store.blob(tile)
-        assert tile not in BlobBucket(f"{s3}-other").sizes(), "damaged bytes do not appear there"
+        assert chain_faults(restored.audit_lines()) == []
+        assert (restored.blob(tile), restored.jobs()[0].report) == (data, {"progress": {"stage": "bundle"}})
+    with pytest.raises(StoreError, match="holds a store already"):
+        MapStore.attach(tmp_path / "restored", Places(None, database))
+
+
+def test_damaged_content_is_not_moved(store: MapStore, s3: str) -> None:
+    publish_samples(store, 1)
+    tile, folder, other = store.manifest("lab", 1).tiles[0].sha256, store.folder, f"{s3}-other"
+    Content(store).write(tile, store.blob(tile)[:-1] + b"?")
+    with pytest.raises(MapFormatError, match=tile):
+        MapStore.attach(folder, Places(other))
+    Content(store).remove(tile)
+    with pytest.raises(StoreError, match=f"{tile} is missing"):
+        MapStore.attach(folder, Places(other))
+    assert tile not in BlobBucket(other).sizes()
+    assert read_places(folder).content != other
 
 
 def test_an_object_store_that_does_not_answer_is_no_damage(
@@ -244,7 +255,7 @@ def test_an_object_store_that_does_not_answer_is_no_damage(
 ) -> None:
     with MapStore.open(tmp_path / "store", create=True) as store:
         publish_samples(store, 1)
-        store.move_content(s3)
+    MapStore.attach(tmp_path / "store", Places(s3))
     monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
     monkeypatch.setattr(object_store, "from_url", partial(object_store.from_url, retry_config={"max_retries": 0}))
     with MapStore.open(tmp_path / "store") as store:

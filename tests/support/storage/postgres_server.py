@@ -1,0 +1,71 @@
+"""A PostgreSQL server of Debian's package on this machine, with a new database for who asks."""
+
+import os
+import shutil
+import socket
+import subprocess
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+_BINARIES = sorted(Path("/usr/lib/postgresql").glob("*/bin"))
+
+
+class PostgresServer:
+    """url: of the server, without a database."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder, self._count = folder, 0
+        # It refuses to run as root.
+        self._account = {"user": "postgres", "group": "postgres"} if os.geteuid() == 0 else {}
+        if self._account:
+            shutil.chown(folder, "postgres", "postgres")
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            self._port = free.getsockname()[1]
+        self._run("initdb", "-D", str(folder / "data"), "-A", "trust", "-U", "fleet", "--no-sync", "-E", "UTF8")
+        self.start()
+
+    def start(self) -> None:
+        options = f"-p {self._port} -c listen_addresses=127.0.0.1 -c unix_socket_directories= -c fsync=off"
+        log = str(self._folder / "log")
+        self._run("pg_ctl", "-D", str(self._folder / "data"), "-l", log, "-o", options, "-w", "-t", "60", "start")
+
+    def stop(self, how: str = "immediate") -> None:
+        """Stop it at once, as a crash does; what was committed stays."""
+        self._run("pg_ctl", "-D", str(self._folder / "data"), "-m", how, "-w", "-t", "60", "stop")
+
+    def database(self) -> str:
+        """The URL of a new database."""
+        self._count += 1
+        self._run("createdb", "-h", "127.0.0.1", "-p", str(self._port), "-U", "fleet", f"d{self._count}")
+        return f"postgresql://fleet@127.0.0.1:{self._port}/d{self._count}"
+
+    def _run(self, program: str, *words: str) -> None:
+        command = [str(_BINARIES[-1] / program), *words]
+        subprocess.run(
+            command,
+            check=True,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            cwd="/",
+            timeout=120,
+            **self._account,
+        )
+
+
+@contextmanager
+def postgres_server() -> Iterator[PostgresServer]:
+    """Skips where the package is missing."""
+    if not _BINARIES:
+        pytest.skip("NO POSTGRESQL: a database on a server is not tested; apt-get install postgresql to do it")
+    folder = Path(tempfile.mkdtemp(prefix="postgres-"))
+    server = PostgresServer(folder)
+    try:
+        yield server
+    finally:
+        server.stop()
+        shutil.rmtree(folder)
