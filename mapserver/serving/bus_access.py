@@ -39,6 +39,8 @@ def prepare_bus(store: MapStore, endpoint: str, *, insecure: bool) -> "tuple[Bus
         if is_open:
             _log.warning("--insecure: at %s anyone can act as any robot or as the server", endpoint)
         return Bus(endpoint, is_server=True), None
+    if endpoint.startswith("quic/") and not is_loopback(endpoint):
+        _log.warning("at %s one packet of a stranger keeps robots from connecting for 30 s; use tls/", endpoint)
     register = RobotRegister(store)
     tls = register.tls
     register.authorities.check()

@@ -258,6 +258,20 @@ def test_rules_fire_when_they_should(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
+def test_the_kernel_takes_the_rules_of_the_firewall(tmp_path: Path) -> None:
+    """Twice, in a network of its own."""
+    nft, unshare = shutil.which("nft"), shutil.which("unshare")
+    alone = [str(unshare), "--map-root-user", "--net"]
+    if nft is None or unshare is None or subprocess.run([*alone, "true"], check=False, capture_output=True).returncode:
+        pytest.skip(
+            "NO NFT: the firewall's rules are not tried; install Debian's nftables, where namespaces are allowed"
+        )
+    words = f"{nft} -f {DEPLOY}/fleetmap.nft && {nft} -f {DEPLOY}/fleetmap.nft && {nft} list table inet fleetmap"
+    done = subprocess.run([*alone, "sh", "-c", words], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("tcp dport 7447 ct state new add @addresses") == 2
+
+
 def test_nothing_says_to_install_the_project_by_its_bare_name() -> None:
     """Any index may give that name to somebody else."""
     assert BY_NAME.search('/opt/fleetmap/bin/pip install "fleetmap[server]"')

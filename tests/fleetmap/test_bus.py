@@ -1,8 +1,10 @@
 """Both buses keep the same promises; zenoh's own pitfalls are covered on loopback."""
 
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 
 import pytest
 import zenoh
@@ -171,6 +173,17 @@ def test_a_robot_survives_the_absence_of_its_server() -> None:
             with Bus.listen(endpoint) as back:
                 back.queryable("x", lambda *_: b"back")
                 assert robot.get("x", timeout_s=20) == b"back"
+
+
+def test_silent_connections_do_not_shut_out_robots() -> None:
+    """More than zenoh lets wait for their sessions by default."""
+    with Bus.listen("tcp/127.0.0.1:0") as server, ExitStack() as stack:
+        server.queryable("key", lambda *_: b"answer")
+        port = int(server.endpoint.rpartition(":")[2])
+        for _ in range(150):
+            stack.enter_context(socket.create_connection(("127.0.0.1", port)))
+        with Bus.connect(server.endpoint) as robot:
+            assert robot.get("key") == b"answer"
 
 
 def test_the_server_stays_on_its_own_endpoint() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import logging
+import resource
 import threading
 import time
 from collections.abc import Callable
@@ -32,6 +33,8 @@ _REOPEN_WITHIN_S = 10.0
 _MAX_ALIVE = 1 << 17
 _HEARTBEAT_S = 0.5  # period after which a subscriber detects that the last message was lost; same as in rmw_zenoh
 _MAX_SESSIONS = 20_000  # zenoh's default is 1000: further robots would get no response
+# Connections without a session yet, each for at most 10 s. At zenoh's default, 100, so many silent ones would shut out all robots.
+_MAX_PENDING = 4096
 _MAX_RECEIVED_BYTES = 2 * MAX_MESSAGE_BYTES
 _BUSY = b"later: too much of this sender is waiting already"
 _log = logging.getLogger(__name__)
@@ -330,7 +333,8 @@ class Bus:
         if self._tls is not None:
             entries["transport/link/tls"] = self._tls.listening() if self._is_server else self._tls.connecting()
         if self._is_server:
-            entries |= _SERVER
+            files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+            entries |= _SERVER | {"transport/unicast/accept_pending": min(_MAX_PENDING, files // 4)}
             if self.access is not None:
                 entries |= {"transport/link/rx/max_message_size": _MAX_RECEIVED_BYTES, **self.access.zenoh_config()}
         if self._is_ros:

@@ -64,13 +64,18 @@ def register(tmp_path: Path) -> Iterator[RobotRegister]:
         yield RobotRegister(store)
 
 
-def test_tls_needs_certificates_and_loopback_nothing(tmp_path: Path, register: RobotRegister) -> None:
+def test_tls_needs_certificates_and_loopback_nothing(
+    tmp_path: Path, register: RobotRegister, caplog: pytest.LogCaptureFixture
+) -> None:
     store = register._store
     bus, guard = prepare_bus(store, "tcp/127.0.0.1:0", insecure=False)
     assert (bus.access, guard) == (None, None)
     bus, guard = prepare_bus(store, "tls/0.0.0.0:0", insecure=False)
     assert guard is not None
     assert bus.access == register.access()
+    assert "use tls/" not in caplog.text
+    prepare_bus(store, "quic/0.0.0.0:0", insecure=False)
+    assert "one packet of a stranger keeps robots from connecting" in caplog.text
     with MapStore.open(tmp_path / "other", create=True) as other, pytest.raises(StateError, match="trust init"):
         prepare_bus(other, "tls/0.0.0.0:0", insecure=False)
 
