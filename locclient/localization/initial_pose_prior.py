@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse, so3_log
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.map_view import LookAlikes
@@ -125,6 +126,11 @@ class InitialPosePrior:
         """Return True if the prior is told and so tight that one fix within it confirms a pose; an operator's, only at its own place."""
         is_named = not self.is_revisable or hypothesis.told_log_odds > 0.0
         return self.is_told and is_named and self.is_tight(self._settings.tight_prior_sigma_m)
+
+    def known_pose(self, radius_m: float) -> PoseHypothesis | None:
+        """Return the pose by an exact source and the motion since, while its 95 % radius is at most `radius_m`; else None."""
+        known = self.hypothesis if self.is_told and not self.is_revisable else None
+        return known if known is not None and radius_95_m(known.now_cov) <= radius_m else None
 
     def is_tight(self, sigma_m: float) -> bool:
         """Return True if the present horizontal sigma is at most `sigma_m`."""

@@ -218,7 +218,7 @@ class MapQuery:
         prior = tracker.prior
         near = None if prior is None else prior.is_near(relocalizer.view.map_from_cam[:, :3, 3])
         fixes = yield from relocalizer.anywhere(features, near, rotation, fixes, self._failed_places)
-        fixes = [fix for fix in fixes if tracker.is_reliable(fix)]
+        fixes = tracker.believed(fixes)
         prior = tracker.prior
         if prior is None:
             return fixes, False

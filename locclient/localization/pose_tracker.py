@@ -238,6 +238,20 @@ class PoseTracker:
     def is_reliable(self, fix: Fix) -> bool:
         return is_reliable(fix, self._settings.fix, self._track.strong_inliers)
 
+    def believed(self, fixes: Sequence[Fix]) -> list[Fix]:
+        """Return the fixes that are reliable, or within the gate of a prior that names one place, such as a dock's.
+
+        As near a confirmed pose, other places are excluded there, and few matches decide only about the last decimetres.
+        """
+        known = None if self.prior is None else self.prior.known_pose(0.5 * self.alias_step_m)
+        return [fix for fix, at in self.observations(fixes) if self.is_reliable(fix) or self._is_at(known, fix, at)]
+
+    def _is_at(self, known: PoseHypothesis | None, fix: Fix, at: PoseHypothesis) -> bool:
+        if known is None or fix.inliers < self._settings.fix.min_inliers:
+            return False
+        poses = at.now_map_from_body, at.now_cov, known.now_map_from_body, known.now_cov
+        return innovation_of(*poses)[1] <= self._track.innovation_limit
+
     def _at_body(self, fix: Fix) -> tuple[Array, Array]:
         """Return a fix as map_from_body with its covariance (map axes, about the body)."""
         map_from_body = fix.map_from_cam @ self._cam_from_body

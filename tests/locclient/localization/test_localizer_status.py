@@ -74,6 +74,22 @@ def test_a_tight_prior_confirms_the_first_fix(robot: Robot) -> None:
     assert robot.knows(estimate)
 
 
+@pytest.mark.parametrize(
+    ("sigma_m", "is_revisable", "off_m", "is_found"),
+    [(0.05, False, 0.1, True), (0.05, False, 0.4, False), (0.05, True, 0.1, False), (0.6, False, 0.1, False)],
+)
+def test_at_a_dock_a_fix_needs_no_recall(
+    robot: Robot, sigma_m: float, is_revisable: bool, off_m: float, is_found: bool
+) -> None:
+    """Most of what is expected is hidden from a low camera: a dock names the place, the fix must lie within its gate. Neither the
+    word of an operator nor a zone as wide as the next aisle is near does as much."""
+    robot.inliers, robot.landmark_recall = 35, 0.1
+    robot.told(sigma_m, off(off_m), is_whole=True, is_revisable=is_revisable)
+    said = robot.ride(8, 0.0)
+    assert [e.status is Status.TRACKING for e in said] == [is_found] * 8
+    assert is_found == robot.knows(said[-1])
+
+
 def test_a_wide_prior_only_narrows_the_search(robot: Robot) -> None:
     """Aliased places 12 m apart: the one outside the prior is never believed, the other must still be confirmed."""
     robot.told(2.0)
