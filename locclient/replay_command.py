@@ -76,6 +76,9 @@ class PlaybackOptions:
     realtime: Annotated[
         bool, typer.Option("--realtime", help="Play at the recorded speed; default: as fast as possible.")
     ] = False
+    starts: Annotated[
+        int, typer.Option(min=0, metavar="N", help="Also start N times along the recording without any guess.")
+    ] = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -179,8 +182,9 @@ def _run(
     from fleetmap.sources.replay_source import ReplaySource
     from locclient.maps.connection import connected
     from locclient.prior_option import parse_prior
-    from locclient.replay.replay import ReplayOptions
+    from locclient.replay.replay import ReplayOptions, load_map
     from locclient.replay.replay import replay as play
+    from locclient.replay.starts import spread_starts, start_frames, starts
 
     if files.mcap is not None:
         require_foxglove("--mcap")
@@ -203,9 +207,16 @@ def _run(
             task = bar.add_task("replay", total=len(source))
             options = ReplayOptions(settings.localizer, playback.realtime, lambda _: bar.advance(task), export)
             result = play(source, connection, options, prior)
-    report = result.report
+        report, anew = result.report, []
+        if playback.starts:
+            numbers = spread_starts(source, playback.starts)
+            anew = [
+                start_frames(found)
+                for found in starts(source, numbers, load_map(connection.source)[0], settings.localizer)
+            ]
     if files.report is not None:
-        files.report.write_bytes(to_json(report, indent=2) + b"\n")
+        given = report | ({"starts": anew} if playback.starts else {})
+        files.report.write_bytes(to_json(given, indent=2) + b"\n")
     if files.trajectory is not None:
         write_tum(files.trajectory, result.trajectory)
     if files.picture is not None:

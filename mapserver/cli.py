@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from fleetmap.cli_exit import require_extra, run_cli
 from fleetmap.cli_options import Commands, ConfigFile, Options, Version, make_app
+from mapserver.commands.accept import accept
 from mapserver.commands.align import align
 from mapserver.commands.areas import AREAS_GROUP
 from mapserver.commands.backup import attach, backup, backups, restore
@@ -53,6 +54,7 @@ COMMANDS: Commands = {
     "doctor": doctor,
     "calibrate": calibrate,
     "evaluate": evaluate,
+    "accept": accept,
     "align": align,
     "areas": AREAS_GROUP,
     "fleet": FLEET,

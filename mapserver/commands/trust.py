@@ -177,6 +177,21 @@ def status(store: StoreFolder, json: Json = False) -> None:
         raise typer.Exit(1)
 
 
+def verify(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `mapserver accept` wrote.")],
+    store: StoreFolder,
+) -> None:
+    """Check that an acceptance report was signed by this store and is unchanged; status 3 otherwise."""
+    from fleetmap.errors import disk_errors
+    from mapserver.trust.documents import verify as verified
+
+    with disk_errors(f"{folder} cannot be read", "name the folder of a report", UsageError):
+        signature = (folder / "acceptance.sig").read_bytes()
+        files = {path.name: path.read_bytes() for path in folder.glob("acceptance.*") if path.suffix != ".sig"}
+    with open_store(store, read_only=True) as maps:
+        typer.echo(f"signed on {verified(maps, signature, files)} by this store, and unchanged")
+
+
 def _root_key(maps: "MapStore", path: Path | None) -> "Signer":
     from mapserver.trust.keys import KeyFolder, load_key
 
@@ -205,5 +220,5 @@ def _show(path: Path, passphrase: str) -> None:
 
 TRUST = Group(
     "Signing keys of maps, and the signed lists.",
-    {"init": init, "admit": admit, "rotate": rotate, "revoke": revoke, "status": status},
+    {"init": init, "admit": admit, "rotate": rotate, "revoke": revoke, "status": status, "verify": verify},
 )

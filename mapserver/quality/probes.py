@@ -143,13 +143,23 @@ def repetition(view: MapView, probes: Sequence[Probe]) -> Repetition | None:
     nearer ones are errors of fixes.
     Source: Ballard 1981 (the generalised Hough transform of `find_aliases`), each alias verified by its fix.
     """
-    steps_m = []
-    for probe in probes:
-        for fix in finished(Relocalizer(view, probe.camera, _ROBOTS).anywhere(probe.features)):
-            step_m = float(np.linalg.norm(fix.map_from_cam[:3, 3] - probe.map_from_cam[:3, 3]))
-            if step_m > SAME_PLACE_M and is_reliable(fix, _ROBOTS.fix):
-                steps_m.append(round(step_m, 3))
+    steps_m = [
+        round(float(np.linalg.norm(fix.map_from_cam[:3, 3] - probe.map_from_cam[:3, 3])), 3)
+        for probe in probes
+        for fix in aliases(view, probe)
+    ]
     return Repetition(len(probes), min(steps_m, default=None)) if probes else None
+
+
+def aliases(view: MapView, probe: Probe) -> list[Fix]:
+    """Return the fixes that robots without a prior accept for a probe at other places than its own."""
+    found = finished(Relocalizer(view, probe.camera, _ROBOTS).anywhere(probe.features))
+    place_m = probe.map_from_cam[:3, 3]
+    return [
+        fix
+        for fix in found
+        if np.linalg.norm(fix.map_from_cam[:3, 3] - place_m) > SAME_PLACE_M and is_reliable(fix, _ROBOTS.fix)
+    ]
 
 
 def alias_step_m(found: Repetition | None, known_m: float | None) -> float | None:

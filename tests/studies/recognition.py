@@ -8,10 +8,11 @@ from typing import NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from benchmarks.common.looks import EVERY_S, LOOK_S, Answer, as_row, curve, looks, map_of, right_at
+from benchmarks.common.looks import EVERY_S, Answer, as_row, curve, looks, map_of, right_at
 from benchmarks.common.recorded_runs import kept_folder, recorded, surveyed
 from benchmarks.robot.bench_real_robots import MAPPED, UNSEEN, mapped
 from locclient.maps.loaded_map import LoadedMap
+from locclient.replay.starts import LOOK_S
 from studies.study import Column, Row, publish, results, table
 from support.recordings.realdata import DATA
 

@@ -1,7 +1,7 @@
 """A robot that is switched on somewhere in a drive and looks around for some seconds, knowing nothing: is what it answers right?"""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -12,19 +12,16 @@ from fleetmap.geometry import Array, rotation_angle_rad
 from fleetmap.messages import Status
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sensors.samples import CameraFrame
 from fleetmap.sources.replay_source import ReplaySource
-from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.identity import MapAddress
+from locclient.localization.estimate import Estimate
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.connection import connected
 from locclient.maps.loaded_map import LoadedMap
 from locclient.replay.replay import load_map
-from locclient.robot.robot import Robot
-from locclient.robot.version_trial import TrialSettings
+from locclient.replay.starts import starts
 
-RIGHT_M, RIGHT_DEG, LOOK_S, EVERY_S = 0.5, 5.0, 3.0, 0.5
-_IMU_LEAD_NS = 100_000_000  # of a robot's own samples before its first frame
+RIGHT_M, RIGHT_DEG, EVERY_S = 0.5, 5.0, 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,44 +72,28 @@ def looks(
     """Looks of LOOK_S from every EVERY_S of a recording on, of those of its frames that are selected. The map is in the frame of the
     recording's truth."""
     with open_recording(path) as recording:
-        whole = ReplaySource.of(recording, FrameSelection.parse(frames), reverse=False)
-        stamps_s = recording.frame_stamps_ns[whole.indices] * 1e-9
-        shown: dict[int, CameraFrame] = {}
-        last_s = -np.inf
-        for start, begin_s in enumerate(stamps_s.tolist()):
-            if begin_s - last_s < EVERY_S - 1e-6:
-                continue
-            last_s = begin_s
-            end = int(np.searchsorted(stamps_s, begin_s + LOOK_S + 1e-6))
-            shown = {k: frame for k, frame in shown.items() if k >= start}
-            shown |= {k: whole.frame(k) for k in range(start, end) if k not in shown}
-            part = replace(whole, indices=whole.indices[start:end])
-            yield replace(_look(part, [shown[k] for k in range(start, end)], loaded, settings), start=start)
+        source = ReplaySource.of(recording, FrameSelection.parse(frames), reverse=False)
+        numbers, last_s = list[int](), -np.inf
+        for number, begin_s in enumerate((recording.frame_stamps_ns[source.indices] * 1e-9).tolist()):
+            if begin_s - last_s >= EVERY_S - 1e-6:
+                numbers.append(number)
+                last_s = begin_s
+        body_from_cam = Rectifier(source.calibration).body_from_cam
+        for start, found in zip(numbers, starts(source, numbers, loaded, settings or LocalizerSettings()), strict=True):
+            truths = [source.truth_map_from_body(start + k) for k in range(len(found))]
+            yield _look(start, found, truths, _off_m(loaded, truths[0] @ body_from_cam))
 
 
-def _look(
-    source: ReplaySource, frames: Sequence[CameraFrame], loaded: LoadedMap, settings: LocalizerSettings | None
-) -> Look:
-    rectifier = Rectifier(source.calibration)
-    robot = Robot(source.calibration, rectifier, settings or LocalizerSettings(), TrialSettings())
-    robot.use(loaded)
-    answers, score, tracking_s, is_silent, off_m = list[Answer](), 0.0, None, False, np.inf
-    for number, before in enumerate(source.imu_before_each()):
-        imu = before if number else before.between(frames[0].stamp_ns - _IMU_LEAD_NS, 1 << 62)
-        outcome = robot.handle(
-            SensorBundle(frames[number], imu, list(source.wheel_before(number) if number else []), [])
-        )
-        assert outcome is not None
-        estimate, truth = outcome.estimate, source.truth_map_from_body(number)
+def _look(start: int, found: Sequence[Estimate], truths: Sequence[Array | None], off_m: float) -> Look:
+    answers, score, tracking_s, is_silent = list[Answer](), 0.0, None, False
+    for estimate, truth in zip(found, truths, strict=True):
         assert truth is not None
-        if not number:
-            off_m = _off_m(loaded, truth @ rectifier.body_from_cam)
         score += estimate.fix.inliers if estimate.fix else 0.0
         answers.append(_answer(estimate.status, score, estimate.map_from_body, truth))
         if estimate.status is Status.TRACKING:
-            tracking_s = (frames[number].stamp_ns - frames[0].stamp_ns) * 1e-9 if tracking_s is None else tracking_s
+            tracking_s = (estimate.stamp_ns - found[0].stamp_ns) * 1e-9 if tracking_s is None else tracking_s
             is_silent |= answers[-1].is_wrong
-    return Look(0, answers[0], answers[-1], tracking_s, is_silent, off_m)
+    return Look(start, answers[0], answers[-1], tracking_s, is_silent, off_m)
 
 
 def _answer(status: Status, score: float, map_from_body: Array | None, truth: Array) -> Answer:

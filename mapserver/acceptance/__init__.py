@@ -1,0 +1,1 @@
+"""The acceptance report of a site: from a version and drives through it, how well robots will be localised, and where not."""

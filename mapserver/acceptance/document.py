@@ -1,0 +1,187 @@
+"""The report as text and tables, for the page and the PDF."""
+
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from fleetmap.geometry import Array
+from mapserver.acceptance.figures import ALL, UNKNOWN_PLACE, AreaFigures, Count, Report, percentile
+from mapserver.fleet_statistics.kpis import figure
+
+
+@dataclass(frozen=True, slots=True)
+class Section:
+    """A heading, paragraphs, items of a list, and a table with its header."""
+
+    title: str
+    words: Sequence[str] = ()
+    items: Sequence[str] = ()
+    header: Sequence[str] = ()
+    rows: Sequence[Sequence[str]] = ()
+
+
+_COLORS = {"found": "#14924b", "ambiguous": "#c77700", "lost": "#d1342f", "silent": "#7c1fa3"}
+
+
+def sections(report: Report) -> list[Section]:
+    """Return the sections of a report after its verdict, the most important first."""
+    areas = [*report.areas, report.whole] if len(report.areas) > 1 else report.areas
+    found = [Section("Reasons against it", items=report.reasons)] if report.reasons else []
+    if report.compared_with is not None:
+        words = f"Against {report.compared_with}, beyond chance (5 % for all comparisons together)."
+        found.append(
+            Section(
+                "Better and worse",
+                [words],
+                [*(f"worse: {w}" for w in report.worse), *(f"better: {b}" for b in report.better)],
+            )
+        )
+    found.append(Section("Survey again", [] if report.survey_again else ["Nothing."], report.survey_again))
+    return [
+        *found,
+        _coverage(areas),
+        _errors(report, areas),
+        _starts(areas),
+        _ladder("Less light", "stops", _DARK, [(area, area.darkness) for area in areas]),
+        _ladder("Blur", "px", _BLUR, [(area, area.blur) for area in areas]),
+        _similar(report),
+        _calibrations(report),
+        _incidents(report),
+        Section("Not judged", [] if report.not_judged else ["Nothing is left out."], report.not_judged),
+    ]
+
+
+_DARK = (
+    "Frames still localized, from a prior at their own place, with the light divided by 2 at each stop beyond what exposure and gain "
+    "of the camera make up for; the pictures' noise stays as strong."
+)
+_BLUR = "Frames still localized with pictures smeared along their rows, as a turn on the spot does during the exposure."
+
+
+def drawn(places_m: Array, starts: Sequence[tuple[Array, str]]) -> bytes:
+    """Return a PNG of the site from above: the places of the map (K, 2), and the starts without a guess by outcome."""
+    width_m, height_m = np.maximum(np.ptp(places_m, axis=0), 5.0) if len(places_m) else (5.0, 5.0)
+    sheet = Figure(figsize=(7.0, min(7.0, 1.2 + 6.5 * height_m / width_m)), layout="constrained")
+    axes = sheet.subplots()
+    axes.plot(*places_m.T, ".", color="#9ca3af", markersize=3, label="place of the map")
+    for outcome, color in _COLORS.items():
+        at = np.array([place for place, found in starts if found == outcome]).reshape(-1, 2)
+        if len(at):
+            axes.plot(*at.T, "o", color=color, markersize=7, label=f"start: {outcome}")
+    axes.set_aspect("equal", "datalim")
+    axes.set(xlabel="x, m", ylabel="y, m")
+    axes.legend(fontsize=8, loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False)
+    data = io.BytesIO()
+    sheet.savefig(data, format="png", dpi=150)
+    return data.getvalue()
+
+
+def _coverage(areas: Sequence[AreaFigures]) -> Section:
+    rows = [
+        (a.name, str(a.places), _directions(a.seen), ", ".join(a.missing) or ("none" if a.places else "–"))
+        for a in areas
+        if a.name not in (UNKNOWN_PLACE, ALL)
+    ]
+    words = ["Places of the map by the direction in which the camera looked (E along x of the map, N along y)."]
+    return Section("Coverage", words, header=("area", "places", "seen facing", "nobody drove"), rows=rows)
+
+
+def _directions(seen: Mapping[str, int]) -> str:
+    return ", ".join(f"{heading} {count}" for heading, count in seen.items()) or "–"
+
+
+def _errors(report: Report, areas: Sequence[AreaFigures]) -> Section:
+    rows = [
+        (a.name, a.frames.text, str(a.wrong), _mm(percentile(a.errors_mm, 50)), _mm(percentile(a.errors_mm, 99)))
+        for a in areas
+        if a.frames.tries
+    ]
+    for drive in report.drives:
+        errors = drive.errors_mm or {}
+        share = f"{100 * drive.localised_share:.1f} % of {drive.frames}"
+        rows.append(
+            (f"drive {drive.name}", share, str(drive.silent), _mm(errors.get("median")), _mm(errors.get("p99")))
+        )
+        if drive.docks_mm:
+            rows.append(
+                (
+                    f"docks of {drive.name}",
+                    str(len(drive.docks_mm)),
+                    "",
+                    _mm(percentile(drive.docks_mm, 50)),
+                    _mm(percentile(drive.docks_mm, 99)),
+                )
+            )
+    references = [f"{drive.name}: against {drive.reference}." for drive in report.drives]
+    words = [
+        "Held-out frames one at a time in the tiles, from a prior at their own place; drives as a robot localises them, with odometry; "
+        "docks: the estimate there against the dock's recorded place.",
+        *references,
+    ]
+    return Section("Error", words, header=("frames of", "localized", "wrong", "median", "p99"), rows=rows)
+
+
+def _starts(areas: Sequence[AreaFigures]) -> Section:
+    rows = [
+        (
+            a.name,
+            str(a.starts.found_of_all.tries),
+            *(str(n) for n in (a.starts.found, a.starts.ambiguous, a.starts.lost, a.starts.silent)),
+        )
+        for a in areas
+        if a.starts.found_of_all.tries
+    ]
+    words = ["A robot is switched on along the drives, knows nothing, and looks around for 3 s while it drives on."]
+    return Section(
+        "Starts without a guess", words, header=("area", "starts", "found", "AMBIGUOUS", "lost", "silent"), rows=rows
+    )
+
+
+def _ladder(title: str, unit: str, words: str, ladders: Sequence[tuple[AreaFigures, Mapping[str, Count]]]) -> Section:
+    levels = sorted({level for _, ladder in ladders for level in ladder}, key=int)
+    rows = [
+        (area.name, area.frames.text, *(ladder.get(level, Count()).text for level in levels))
+        for area, ladder in ladders
+        if area.frames.tries
+    ]
+    return Section(title, [words], header=("area", "as it is", *(f"{level} {unit}" for level in levels)), rows=rows)
+
+
+def _similar(report: Report) -> Section:
+    if not report.similar:
+        return Section("Similar places", [f"None of {report.similar_of} frames fits another place of the map."])
+    rows = [(s.area, s.other, f"{s.frames} of {report.similar_of}", f"{100 * s.recall:.0f} %") for s in report.similar]
+    words = [
+        "Frames that robots would accept at another place, too: a robot without a coarse position stays AMBIGUOUS there."
+    ]
+    return Section(
+        "Similar places", words, header=("area", "looks like", "frames", "of its landmarks, at most"), rows=rows
+    )
+
+
+def _calibrations(report: Report) -> Section:
+    rows = []
+    for rig in report.calibrations:
+        rows += [(rig.rig, subject, "right") for subject in rig.judged if subject not in rig.doubted]
+        rows += [(rig.rig, subject, f"in doubt: {words}") for subject, words in rig.doubted.items()]
+        rows += [(rig.rig, subject, f"not judged: {words}") for subject, words in rig.unknown().items()]
+    remarks = [f"{drive.name}: {words}" for drive in report.drives for words in drive.remarks]
+    return Section("Calibration", [], remarks, ("camera rig", "property", "verdict"), rows)
+
+
+def _incidents(report: Report) -> Section:
+    found = report.incidents
+    words = [
+        f"{figure(found.per_day)} a robot-day ({figure(found.low)} to {figure(found.high)} with 95 %); silent ones at most "
+        f"{figure(found.silent_high)}."
+    ]
+    if found.fleet is not None:
+        words.append(f"The fleet itself reported {found.fleet} failures a robot-day in this version.")
+    return Section("Expected incidents", [*words, "Assumed:"], found.assumptions)
+
+
+def _mm(value: float | None) -> str:
+    return "–" if value is None else f"{value:.1f} mm"

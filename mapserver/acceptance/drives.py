@@ -1,0 +1,302 @@
+"""A drive through a site: replayed by the robots' program, and its pictures localized in the version's tiles."""
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.bow import decode_vocabulary
+from fleetmap.errors import FleetmapError, RecordingError, StateError
+from fleetmap.failure_definition import SILENT_S, is_wrong
+from fleetmap.features.settings import OrbSettings
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.mapformat import Manifest, RecordingEntry, Tile, decode_tile
+from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
+from fleetmap.recordings.tum import read_tum
+from fleetmap.relocalization.map_view import MapView
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.samples import CameraFrame, SensorSet, Trajectory
+from mapserver.acceptance.figures import DriveFigures, percentile
+from mapserver.acceptance.ladders import ladders
+from mapserver.doctor import Finding, Verdict, run_checks
+from mapserver.drafting.admission import fingerprint, rig_evidence
+from mapserver.drafting.draft_evidence import Before
+from mapserver.quality.probes import Probe, probe_features, relocalized, spread
+from mapserver.store import MapStore
+from mapserver.store.archive import decode_archive
+
+_NEVER_LOCALISED = 6  # exit status of `locclient replay` that comes with a report
+_TRACKING, _AMBIGUOUS = "TRACKING", "AMBIGUOUS"  # fleetmap.messages.Status, as the report writes them
+_DOCK_SIGMA_M = (
+    0.1  # of a place that can judge an estimate of centimetres: a dock or tag, not a zone or an operator's click
+)
+
+
+class StartFrame(msgspec.Struct, frozen=True):
+    """A frame of a start, as `locclient replay --starts` reports it."""
+
+    stamp_ns: int
+    status: str
+    map_from_body: list[list[float]] | None
+
+
+class ReplayReport(msgspec.Struct, frozen=True):
+    """Keys of the report of `locclient replay`."""
+
+    frames: int
+    localised_share_of_all: float | None
+    position_failures: int
+    starts: list[list[StartFrame]] = []
+
+
+@dataclass(frozen=True)
+class MapUnderTest:
+    """A version of a site. built: what its archive knows, None for a version without one. truth_in_map: True if its frame is that of the
+    recordings' ground truth."""
+
+    store: Path
+    manifest: Manifest
+    tiles: list[Tile]
+    view: MapView
+    built: Before | None
+    truth_in_map: bool
+
+    @classmethod
+    def of(cls, maps: MapStore, site: str, version: int) -> "MapUnderTest":
+        """Read a version; errors as of the store."""
+        manifest, archive = maps.manifest(site, version), maps.archive(site, version)
+        tiles = [decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles]
+        view = MapView(tiles, decode_vocabulary(maps.blob(manifest.vocabulary.sha256)), manifest.camera.focal_px)
+        built = None if archive is None else Before.of(maps, manifest, decode_archive(archive))
+        return cls(
+            maps.folder, manifest, tiles, view, built, bool(manifest.configuration.get("frame_from_ground_truth"))
+        )
+
+
+@dataclass(frozen=True)
+class DriveRequest:
+    """A recording, its selected frames, and how many starts and pictures of it are wanted."""
+
+    path: Path
+    frames: str
+    opening: OpenOptions
+    starts: int
+    pictures: int
+
+
+class Start(NamedTuple):
+    """A start without a guess: its place (2,) in `map`, NaN if unknown, and its outcome, a field of StartCounts."""
+
+    place_m: Array
+    outcome: str
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A picture at its place. error_m: of its fix, None without one; is_wrong: its fix is at another place. rungs: by kind of ladder, the
+    grey level and outcome at each rung that was tried."""
+
+    probe: Probe
+    grey: float
+    error_m: float | None
+    is_wrong: bool
+    rungs: dict[str, dict[int, tuple[float, bool]]] = field(default_factory=dict)
+
+    @property
+    def is_fixed(self) -> bool:
+        return self.error_m is not None and not self.is_wrong
+
+
+@dataclass(frozen=True)
+class Drive:
+    """An examined drive; unplaced: number of its frames without a known place."""
+
+    figures: DriveFigures
+    starts: list[Start]
+    pictures: list[Picture]
+    places_m: Array
+    unplaced: int
+
+
+class Reference(NamedTuple):
+    """Poses of a drive with the name of their source, and the mask (F,) of selected frames that did not make the map."""
+
+    source: str
+    trajectory: Trajectory
+    free: NDArray[np.bool_]
+
+
+def replayed(request: DriveRequest, version: MapUnderTest) -> tuple[ReplayReport, Trajectory]:
+    """Replay a drive, and its starts, by `locclient replay` in a process of its own; return its report and the localized frames."""
+    if find_spec("locclient") is None:
+        raise StateError("the robots' client is not installed; install the distribution `fleetmap` as a whole")
+    with TemporaryDirectory() as folder:
+        report, trajectory = Path(folder) / "report.json", Path(folder) / "trajectory.tum"
+        named = {
+            "--store": version.store, "--site": version.manifest.site, "--version": version.manifest.version, "--frames": request.frames,
+            "--cache": folder, "--report": report, "--trajectory": trajectory, "--starts": request.starts,
+        }  # fmt: skip
+        if request.opening.calibration_file is not None:
+            named["--calibration"] = request.opening.calibration_file
+        words = [word for name, value in named.items() for word in (name, str(value))]
+        command = [sys.executable, "-m", "locclient.cli", "replay", str(request.path), *words]
+        done = subprocess.run(command, stdin=subprocess.DEVNULL, capture_output=True, text=True, check=False)
+        if done.returncode not in (0, _NEVER_LOCALISED):
+            raise FleetmapError((done.stderr.strip().splitlines() or [f"replay of {request.path} failed"])[-1])
+        return msgspec.json.decode(report.read_bytes(), type=ReplayReport), read_tum(trajectory)
+
+
+def checked(request: DriveRequest) -> list[Finding]:
+    """Return the doctor's findings; errors as of the recording."""
+    with open_recording(request.path, request.opening) as recording:
+        return run_checks(recording).findings
+
+
+def examined(
+    request: DriveRequest, version: MapUnderTest, replay: tuple[ReplayReport, Trajectory], findings: list[Finding]
+) -> Drive:
+    """Return the figures of a drive from its replay and its findings; errors as of the recording."""
+    report, localised = replay
+    with open_recording(request.path, request.opening) as opened:
+        recording, selected = opened.readable(FrameSelection.parse(request.frames).apply(opened))
+        reference, is_surveyed = _reference(recording, selected, version, localised)
+        truths = [reference.trajectory.at(int(stamp)) for stamp in recording.frame_stamps_ns[selected]]
+        known = np.array([truth is not None for truth in truths], bool)
+        numbers = spread(np.flatnonzero(known & reference.free), request.pictures)
+        pictures = list(_pictures(recording, [(int(selected[n]), truths[n]) for n in numbers], version.view))
+        starts = [_start(frames, reference.trajectory) for frames in report.starts]
+        errors_m = [] if reference.trajectory is localised else _errors_m(localised, reference.trajectory)
+        docks_mm = [
+            1e3 * float(np.linalg.norm((there @ se3_inverse(recording.calibration.base_from_body) - prior.map_from_base)[:2, 3]))
+            for prior in recording.priors
+            if prior.cov_rot_trans[3, 3] <= _DOCK_SIGMA_M**2 and not prior.is_revisable
+            and (there := localised.at(prior.stamp_ns)) is not None
+        ]  # fmt: skip
+        stamps_ns = recording.frame_stamps_ns[selected]
+        figures = DriveFigures(
+            name=recording.name,
+            sha256=recording.content_hash(),
+            frames=report.frames,
+            hours=round(float(stamps_ns[-1] - stamps_ns[0]) / 3.6e12, 6),
+            reference=reference.source,
+            is_surveyed=is_surveyed,
+            localised_share=round(report.localised_share_of_all or 0.0, 4),
+            failures=report.position_failures,
+            silent=_silent(localised, reference.trajectory),
+            errors_mm={
+                name: round(1e3 * (percentile(errors_m, at) or 0.0), 2)
+                for name, at in (("median", 50), ("p95", 95), ("p99", 99), ("max", 100))
+            }
+            if errors_m
+            else None,
+            docks_mm=[round(off, 1) for off in docks_mm],
+            calibration=rig_evidence(fingerprint(recording.calibration), findings),
+            remarks=[f"{f.name}: {f.sentence}" for f in findings if f.verdict in (Verdict.WARN, Verdict.FAIL)],
+        )
+    places = np.array([truth[:2, 3] for truth in truths if truth is not None]).reshape(-1, 2)
+    return Drive(figures, starts, pictures, places, int((~known).sum()))
+
+
+def _reference(
+    recording: Recording, selected: NDArray[np.int64], version: MapUnderTest, localised: Trajectory
+) -> tuple[Reference, bool]:
+    """Return the best known poses: ground truth in the map's frame, the version's own survey, or the localized frames themselves."""
+    entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(selected))
+    known = None if version.built is None else version.built.trajectory_of(entry)
+    free = np.ones(len(selected), bool) if known is None else known[1]
+    stamps_ns = recording.frame_stamps_ns[selected]
+    is_surveyed = any(entry.sha256 == each.sha256 for each in version.manifest.recordings)
+    if version.truth_in_map and recording.ground_truth is not None:
+        return Reference("ground truth", recording.ground_truth, free), is_surveyed
+    if known is not None:
+        return Reference(
+            f"the survey of version {version.manifest.version}", Trajectory(stamps_ns, known[0]), free
+        ), is_surveyed
+    return Reference("its own replay", localised, free), is_surveyed
+
+
+def _off(map_from_body: Array, truth: Array) -> tuple[float, float]:
+    off = se3_inverse(truth) @ map_from_body
+    return float(np.linalg.norm(off[:3, 3])), rotation_angle_rad(off[:3, :3])
+
+
+def _errors_m(localised: Trajectory, reference: Trajectory) -> list[float]:
+    pairs = zip(localised.stamps_ns.tolist(), localised.frame_from_body, strict=True)
+    return [_off(pose, truth)[0] for stamp, pose in pairs if (truth := reference.at(stamp)) is not None]
+
+
+def _silent(localised: Trajectory, reference: Trajectory) -> int:
+    """Return the number of silent failures among localized frames."""
+    pairs = zip(localised.stamps_ns.tolist(), localised.frame_from_body, strict=True)
+    return _silent_runs(
+        (stamp, is_wrong(*_off(pose, truth))) for stamp, pose in pairs if (truth := reference.at(stamp)) is not None
+    )
+
+
+def _silent_runs(frames: Iterable[tuple[int, bool]]) -> int:
+    """Return the number of runs of wrong frames (stamp, is wrong) longer than SILENT_S, or up to the end: those may have become as long."""
+    runs, begun_ns, is_counted = 0, None, False
+    for stamp_ns, is_off in frames:
+        begun_ns = (stamp_ns if begun_ns is None else begun_ns) if is_off else None
+        is_long = begun_ns is not None and stamp_ns - begun_ns > SILENT_S * 1e9
+        runs += is_long and not is_counted
+        is_counted = is_long
+    return runs + (begun_ns is not None and not is_counted)
+
+
+def _start(frames: list[StartFrame], reference: Trajectory) -> Start:
+    """Return the place and outcome of a start."""
+    there = reference.at(frames[0].stamp_ns)
+    place_m = np.full(2, np.nan) if there is None else there[:2, 3]
+    wrong = [
+        (frame.stamp_ns, frame.status == _TRACKING and is_wrong(*_off(np.array(frame.map_from_body), truth)))
+        for frame in frames
+        if frame.map_from_body is not None and (truth := reference.at(frame.stamp_ns)) is not None
+    ]
+    if _silent_runs(wrong):
+        return Start(place_m, "silent")
+    outcomes = {_TRACKING: "found", _AMBIGUOUS: "ambiguous"}
+    return Start(place_m, outcomes.get(frames[-1].status, "lost"))
+
+
+def _pictures(recording: Recording, wanted: list[tuple[int, Array | None]], view: MapView) -> Iterator[Picture]:
+    """Yield frames, localized from a prior at their own place, as they are and on the rungs of all ladders, up to the first miss."""
+    rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
+    for index, truth in wanted:
+        assert truth is not None
+        try:
+            frame = recording.read_frame(index)
+        except RecordingError:
+            continue
+        map_from_cam = truth @ rectifier.body_from_cam
+
+        def look(frame: CameraFrame, map_from_cam: Array = map_from_cam) -> Picture:
+            features = probe_features(rectifier.rectify(frame), rectifier.camera, OrbSettings())
+            probe = Probe(rectifier.camera, features, map_from_cam)
+            fix = relocalized(view, probe, map_from_cam)
+            error = None if fix is None else _off(fix.map_from_cam, map_from_cam)
+            is_off = error is not None and is_wrong(*error)
+            return Picture(probe, float(np.median(frame.left)), None if error is None else error[0], is_off)
+
+        found = look(frame)
+        found.rungs.update({kind: _climbed(rungs, look, found) for kind, rungs in ladders(frame, index).items()})
+        yield found
+
+
+def _climbed(
+    rungs: Iterator[tuple[int, CameraFrame]], look: Callable[[CameraFrame], Picture], start: Picture
+) -> dict[int, tuple[float, bool]]:
+    found, is_fixed = {}, start.is_fixed
+    for level, frame in rungs:
+        seen = look(frame) if is_fixed else None  # a rung above a missed one counts as missed
+        is_fixed = seen is not None and seen.is_fixed
+        found[level] = (float(np.median(frame.left)), is_fixed)
+    return found

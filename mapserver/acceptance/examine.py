@@ -1,0 +1,168 @@
+"""Examination of a site: a version and drives through it become the figures of a report."""
+
+import os
+from collections import defaultdict
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from fleetmap.geometry import Array
+from mapserver.acceptance.document import drawn
+from mapserver.acceptance.drives import Drive, DriveRequest, MapUnderTest, checked, examined, replayed
+from mapserver.acceptance.figures import UNKNOWN_PLACE, AreaFigures, Count, Incidents, Report, Similar
+from mapserver.acceptance.ladders import darkest_grey
+from mapserver.drafting.draft_evidence import PROBES
+from mapserver.drafting.worker import single_threaded_libraries
+from mapserver.fleet_statistics.day_rate import Stratum, day_rate
+from mapserver.fleet_statistics.kpis import ROBOT_DAY_S, Counters, format_rate, is_telling, rate
+from mapserver.floor_plan.areas import Areas
+from mapserver.quality.directions import tile_directions
+from mapserver.quality.figures import merged
+from mapserver.quality.probes import Probe, aliases, spread
+from mapserver.store import MapStore
+
+STARTS, PICTURES = 40, 80  # of all drives: with 40 starts and none lost, fewer than 8 % of starts are lost
+_DAY_H = ROBOT_DAY_S / 3600
+_RESTARTS_PER_DAY = 0.2
+_ASSUMPTIONS = [
+    f"a robot-day is {_DAY_H:g} h of driving with as much in its way, and as much light, as in these drives",
+    f"{_RESTARTS_PER_DAY:g} restarts a day at a place of these drives, about which the robot is told nothing; each one that is not "
+    "TRACKING after 3 s counts as an incident, although a robot that drives on may find itself",
+    "blackouts, collisions, robots that are carried and works on the site are not in it",
+]
+
+
+@dataclass(frozen=True)
+class _Square:
+    """The places of an area, for `tile_directions`."""
+
+    tile_x: int
+    tile_y: int
+    map_from_cam: Array
+
+
+def examine(
+    maps: MapStore, site: str, version: int, drives: Sequence[DriveRequest], promises: Sequence[str]
+) -> tuple[Report, bytes]:
+    """Return the figures of a version, without verdict, and a picture. promises: the operator's statements about the robots."""
+    under_test, named = MapUnderTest.of(maps, site, version), maps.areas(site)
+    with single_threaded_libraries(), ThreadPoolExecutor(os.cpu_count()) as pool:
+        begun = [
+            (request, pool.submit(replayed, request, under_test), pool.submit(checked, request)) for request in drives
+        ]
+        found = [
+            examined(request, under_test, replay.result(), findings.result()) for request, replay, findings in begun
+        ]
+        probes = [picture.probe for drive in found for picture in drive.pictures]
+        probes = [probes[n] for n in spread(np.arange(len(probes)), PROBES)]
+        alike = similar(under_test, named, probes)
+    known = [] if under_test.built is None else under_test.built.calibrations
+    judged = maps.evidence(site, version)
+    built = [] if judged is None else judged.calibrations or []
+    pictures = [picture for drive in found for picture in drive.pictures]
+    rungs = [rung for picture in pictures for rung in picture.rungs["darkness"].values()]
+    levels = [*((picture.grey, picture.is_fixed) for picture in pictures), *rungs]
+    report = Report(
+        site=site,
+        version=version,
+        manifest_sha256=maps.version(site, version).manifest_sha256,
+        created=under_test.manifest.created,
+        promises=list(promises),
+        areas=areas_of(under_test, named, found),
+        drives=[drive.figures for drive in found],
+        similar=alike,
+        similar_of=len(probes),
+        darkest_grey=darkest_grey(np.array([g for g, _ in levels]), np.array([hit for _, hit in levels]))
+        if levels
+        else None,
+        calibrations=merged([*known, *built, *(drive.figures.calibration for drive in found)]),
+        incidents=incidents(maps, site, version, found),
+    )
+    starts = [(start.place_m, start.outcome) for drive in found for start in drive.starts]
+    return report, drawn(under_test.view.map_from_cam[:, :2, 3], starts)
+
+
+def _area_name(named: Areas, size_m: float, place_m: Array) -> str:
+    """Return the area of a place (2,) in `map`, NaN if unknown; its tile outside of all areas."""
+    if not np.isfinite(place_m).all():
+        return UNKNOWN_PLACE
+    x, y = (int(n) for n in np.floor(place_m / size_m))
+    return named.at(float(place_m[0]), float(place_m[1])) or f"tile {x},{y}"
+
+
+def similar(under_test: MapUnderTest, named: Areas, probes: Sequence[Probe]) -> list[Similar]:
+    """Return the areas of which frames fit other places, too, the most alike first."""
+    where = partial(_area_name, named, under_test.manifest.tile_size_m)
+    recalls: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
+    for probe in probes:
+        pair: dict[tuple[str, str], float] = {}
+        for fix in aliases(under_test.view, probe):
+            names = where(probe.map_from_cam[:2, 3]), where(fix.map_from_cam[:2, 3])
+            pair[names] = max(pair.get(names, 0.0), fix.landmark_recall)
+        for names, recall in pair.items():
+            recalls[names].append(recall)
+    found = [Similar(area, other, len(of), round(max(of), 4)) for (area, other), of in recalls.items()]
+    return sorted(found, key=lambda alike: (-alike.frames, alike.area, alike.other))
+
+
+def areas_of(under_test: MapUnderTest, named: Areas, drives: Sequence[Drive]) -> list[AreaFigures]:
+    """Return the figures of each area with places of the map or of a drive, by name."""
+    where = partial(_area_name, named, under_test.manifest.tile_size_m)
+    places: defaultdict[str, list[Array]] = defaultdict(list)
+    figures: dict[str, AreaFigures] = {}
+    for place in under_test.view.map_from_cam:
+        places[where(place[:2, 3])].append(place)
+    squares = [_Square(n, 0, np.array(of_area)) for n, of_area in enumerate(places.values())]
+    seen = {found.tile[0]: found for found in tile_directions(squares)}
+    for n, (name, of_area) in enumerate(places.items()):
+        directions = seen.get(n)
+        figures[name] = AreaFigures(name, len(of_area))
+        if directions is not None:
+            figures[name].seen, figures[name].missing = directions.seen, directions.missing
+
+    def area(place_m: Array) -> AreaFigures:
+        return figures.setdefault(where(place_m), AreaFigures(where(place_m)))
+
+    greys: defaultdict[str, list[float]] = defaultdict(list)
+    for drive in drives:
+        for place_m in drive.places_m:
+            area(place_m)
+        for start in drive.starts:
+            starts = area(start.place_m).starts
+            setattr(starts, start.outcome, getattr(starts, start.outcome) + 1)
+        for picture in drive.pictures:
+            found = area(picture.probe.map_from_cam[:2, 3])
+            found.frames.add(picture.is_fixed)
+            found.wrong += picture.is_wrong
+            greys[found.name].append(picture.grey)
+            if picture.error_m is not None and not picture.is_wrong:
+                found.errors_mm.append(round(1e3 * picture.error_m, 2))
+            for kind, ladder in (("darkness", found.darkness), ("blur", found.blur)):
+                for level, (_, is_fixed) in picture.rungs[kind].items():
+                    ladder.setdefault(str(level), Count()).add(is_fixed)
+    for name, levels in greys.items():
+        figures[name].grey = float(np.median(levels))
+    return [figures[name] for name in sorted(figures)]
+
+
+def incidents(maps: MapStore, site: str, version: int, drives: Sequence[Drive]) -> Incidents:
+    """Return the expected incidents of a robot-day: position failures of the drives, and restarts without a guess that fail."""
+    outcomes = [start.outcome for drive in drives for start in drive.starts]
+    hours = sum(drive.figures.hours for drive in drives)
+
+    def of(failures: Sequence[int], bad: Sequence[str]) -> list[Stratum]:
+        strata = [Stratum(_DAY_H, max(hours, 1e-6), tuple(failures))]
+        if outcomes:
+            strata.append(Stratum(_RESTARTS_PER_DAY, len(outcomes), tuple(int(each in bad) for each in outcomes)))
+        return strata
+
+    every = day_rate(of([max(d.figures.failures, d.figures.silent) for d in drives], ("ambiguous", "lost", "silent")))
+    silent = day_rate(of([d.figures.silent for d in drives], ("silent",)))
+    counts = maps.fleet.counters(site, "version", key=str(version)).get((site, str(version)), Counters())
+    reported = rate(counts.position_failures, counts.robot_days)
+    per_day, low, high, silent_high = (round(value, 5) for value in (every.rate, every.low, every.high, silent.high))
+    fleet = format_rate(reported) if is_telling(reported) else None
+    return Incidents(per_day, low, high, silent_high, fleet, _ASSUMPTIONS)

@@ -1,0 +1,161 @@
+"""Figures of an acceptance report; docs/acceptance.md lists them. Pure."""
+
+import msgspec
+import numpy as np
+
+from mapserver.fleet_statistics.kpis import Share, share
+from mapserver.quality.figures import RigEvidence
+
+FORMAT = 1
+UNKNOWN_PLACE, ALL = "unknown place", "all areas"
+
+
+class Count(msgspec.Struct):
+    """`hits` of `tries`."""
+
+    hits: int = 0
+    tries: int = 0
+
+    def add(self, hit: bool) -> None:
+        self.hits += hit
+        self.tries += 1
+
+    @property
+    def share(self) -> Share:
+        """With its exact 95 % interval."""
+        return share(self.hits, self.tries)
+
+    @property
+    def text(self) -> str:
+        return f"{self.hits} of {self.tries}" if self.tries else "–"
+
+
+class StartCounts(msgspec.Struct):
+    """Starts without a guess by their outcome; silent: silent failures by
+    `fleetmap.failure_definition`, and what may have become one at the end."""
+
+    found: int = 0
+    ambiguous: int = 0
+    lost: int = 0
+    silent: int = 0
+
+    @property
+    def found_of_all(self) -> Count:
+        return Count(self.found, self.found + self.ambiguous + self.lost + self.silent)
+
+
+class AreaFigures(msgspec.Struct):
+    """An area of the site, or a tile outside of all areas.
+
+    places: of the map in it; seen and missing: headings as in TileDirections. frames: held-out ones localized from a prior at their own
+    place; wrong: those of them at a wrong place; errors_mm: of the others. grey: median level of its pictures. darkness: frames still
+    localized by stops (powers of two) of lost light; blur: by the length of the blur in pixels.
+    """
+
+    name: str
+    places: int = 0
+    seen: dict[str, int] = {}
+    missing: dict[str, int] = {}
+    frames: Count = msgspec.field(default_factory=Count)
+    wrong: int = 0
+    errors_mm: list[float] = []
+    starts: StartCounts = msgspec.field(default_factory=StartCounts)
+    grey: float | None = None
+    darkness: dict[str, Count] = {}
+    blur: dict[str, Count] = {}
+
+
+class Similar(msgspec.Struct, frozen=True):
+    """Frames of an area that robots accept at another place, too; recall: the largest landmark recall there."""
+
+    area: str
+    other: str
+    frames: int
+    recall: float
+
+
+class DriveFigures(msgspec.Struct, frozen=True):
+    """A drive through the site, played by the robots' localizer.
+
+    reference: source of its poses. is_surveyed: True if the version was made of it. failures and silent: position failures by
+    `fleetmap.failure_definition`. errors_mm: median, p95, p99 and max of localised frames. docks_mm: distance of the estimate at each dock
+    from the dock's place. calibration: evidence of this drive on its rig; remarks: the doctor's findings that are not good.
+    """
+
+    name: str
+    sha256: str
+    frames: int
+    hours: float
+    reference: str
+    is_surveyed: bool
+    localised_share: float
+    failures: int
+    silent: int
+    errors_mm: dict[str, float] | None
+    docks_mm: list[float]
+    calibration: RigEvidence
+    remarks: list[str]
+
+
+class Incidents(msgspec.Struct, frozen=True):
+    """Expected incidents per robot-day with their 95 % interval; silent_high: upper end of the silent ones alone. fleet: failures that the
+    robots reported, as text, None if they drove too little."""
+
+    per_day: float
+    low: float
+    high: float
+    silent_high: float
+    fleet: str | None
+    assumptions: list[str]
+
+
+class Report(msgspec.Struct, kw_only=True):
+    """The report.
+
+    promises: the operator's statements. reasons: against the site. similar: places that look alike, of similar_of frames. darkest_grey:
+    grey level at which pictures of this site give no fix any more. better and worse: against an earlier report.
+    """
+
+    format: int = FORMAT
+    verdict: str = ""
+    is_accepted: bool = False
+    site: str
+    version: int
+    manifest_sha256: str
+    created: str
+    promises: list[str]
+    reasons: list[str] = []
+    survey_again: list[str] = []
+    not_judged: list[str] = []
+    areas: list[AreaFigures]
+    drives: list[DriveFigures]
+    similar: list[Similar]
+    similar_of: int
+    darkest_grey: float | None
+    calibrations: list[RigEvidence]
+    incidents: Incidents
+    compared_with: str | None = None
+    better: list[str] = []
+    worse: list[str] = []
+
+    @property
+    def whole(self) -> AreaFigures:
+        """All areas together."""
+        sums = AreaFigures(ALL)
+        for area in self.areas:
+            sums.places += area.places
+            sums.wrong += area.wrong
+            sums.frames = Count(sums.frames.hits + area.frames.hits, sums.frames.tries + area.frames.tries)
+            sums.errors_mm = [*sums.errors_mm, *area.errors_mm]
+            for name in StartCounts.__struct_fields__:
+                setattr(sums.starts, name, getattr(sums.starts, name) + getattr(area.starts, name))
+            for mine, other in ((sums.darkness, area.darkness), (sums.blur, area.blur)):
+                for level, count in other.items():
+                    known = mine.get(level, Count())
+                    mine[level] = Count(known.hits + count.hits, known.tries + count.tries)
+        return sums
+
+
+def percentile(values: list[float], share_: float) -> float | None:
+    """Return a percentile, None without values."""
+    return float(np.percentile(values, share_)) if values else None

@@ -1,0 +1,148 @@
+"""`mapserver accept`: the acceptance report of a site."""
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleetmap.cli_options import ConfigFile, TopicNames, expand_options, settings_of
+from fleetmap.errors import RecordingError, UsageError
+from mapserver.commands.options import Calibration, SiteOptions, open_store, topics_of, version_named, write_output
+
+if TYPE_CHECKING:
+    from mapserver.acceptance.figures import Report
+    from mapserver.config import MapserverConfig
+    from mapserver.store import MapStore
+
+EXIT_STATUS_NOT_ACCEPTED = 1
+
+
+@dataclass(frozen=True, kw_only=True)
+class AcceptOptions(SiteOptions):
+    """The drives, and the operator's statements about the robots."""
+
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for acceptance.html, .pdf, .json and .sig.")]
+    version: Annotated[int | None, typer.Option(min=1, help="Version to judge; default: the current one.")] = None
+    before: Annotated[
+        str | None, typer.Option(metavar="N|FILE.json", help="Compare with version N, or with an earlier report.")
+    ] = None
+    frames: Annotated[str, typer.Option(metavar="A:B:C", help="Slice of the frames of each drive.")] = ":"
+    calibration: Calibration = None
+    topic: TopicNames = None
+    one_way: Annotated[
+        bool,
+        typer.Option("--one-way", help="Robots drive every aisle as it was surveyed; other directions are no fault."),
+    ] = False
+    known_starts: Annotated[
+        bool,
+        typer.Option("--known-starts", help="Robots always start at a told place; a start without one is no fault."),
+    ] = False
+
+
+@expand_options
+def accept(
+    context: typer.Context,
+    recordings: Annotated[list[Path], typer.Argument(metavar="RECORDING...", help="Drives through the site.")],
+    options: AcceptOptions,
+    config: ConfigFile = None,
+) -> None:
+    """Report where and how well robots will be localised at a site, from a version and drives through it.
+
+    The first line is the verdict. Status 1 if the site is not accepted.
+    """
+    from fleetmap.encoding import to_json
+    from mapserver.acceptance.document import sections
+    from mapserver.acceptance.pdf import pdf
+    from mapserver.acceptance.verdict import compared
+    from mapserver.dashboard.acceptance_page import html_page
+    from mapserver.trust.documents import sign
+
+    if not options.out.is_dir():
+        raise UsageError(f"--out {options.out}: the folder does not exist; make it first")
+    settings = settings_of(context)
+    with open_store(options.store, read_only=True) as maps:
+        before = None if options.before is None else _before(context, maps, recordings, options, settings)
+        report, picture = _report(
+            context, maps, version_named(maps, options.site, options.version), recordings, options, settings
+        )
+        if before is not None:
+            report = compared(report, before)
+        shown = sections(report)
+        files = {
+            "acceptance.json": to_json(report, indent=2) + b"\n",
+            "acceptance.html": html_page(report, shown, picture).encode(),
+            "acceptance.pdf": pdf(report, shown, picture),
+        }
+        signature = sign(maps, files)
+    for name, data in files.items():
+        write_output(options.out / name, data)
+    if signature is not None:
+        write_output(options.out / "acceptance.sig", signature)
+    typer.echo(report.verdict)
+    for words in (*report.worse, *report.better):
+        typer.echo(f"{'worse' if words in report.worse else 'better'}: {words}")
+    typer.echo(str(options.out / "acceptance.html"))
+    if signature is None:
+        typer.echo(
+            "not signed: the store has no lists, or the online key is elsewhere; see `mapserver trust init`", err=True
+        )
+    if not report.is_accepted:
+        raise typer.Exit(EXIT_STATUS_NOT_ACCEPTED)
+
+
+def _report(
+    context: typer.Context,
+    maps: "MapStore",
+    version: int,
+    recordings: list[Path],
+    options: AcceptOptions,
+    settings: "MapserverConfig",
+) -> "tuple[Report, bytes]":
+    from fleetmap.recordings import OpenOptions
+    from mapserver.acceptance.drives import DriveRequest
+    from mapserver.acceptance.examine import PICTURES, STARTS, examine
+    from mapserver.acceptance.verdict import KNOWN_STARTS, ONE_WAY, judged
+    from mapserver.fleet.resurvey_list import resurvey_list
+
+    opening = OpenOptions(options.calibration, topics_of(context, options.topic))
+    counts = (-(-number // len(recordings)) for number in (STARTS, PICTURES))
+    starts, pictures = counts
+    drives = [DriveRequest(path, options.frames, opening, starts, pictures) for path in recordings]
+    promises = [words for words, given in ((ONE_WAY, options.one_way), (KNOWN_STARTS, options.known_starts)) if given]
+    report, picture = examine(maps, options.site, version, drives, promises)
+    fleet = [
+        f"{c.name}: {'; '.join(c.reasons)}"
+        for c in resurvey_list(maps, options.site, settings.resurvey, time.time_ns()).tiles
+    ]
+    return judged(report, settings.gate, maps.evidence(options.site, version), fleet), picture
+
+
+def _before(
+    context: typer.Context,
+    maps: "MapStore",
+    recordings: list[Path],
+    options: AcceptOptions,
+    settings: "MapserverConfig",
+) -> "Report":
+    """Return the earlier report: that of a file, or of the same drives in an earlier version."""
+    import msgspec
+
+    from fleetmap.errors import disk_errors
+    from mapserver.acceptance.figures import FORMAT, Report
+
+    assert options.before is not None
+    if options.before.isdecimal():
+        return _report(context, maps, int(options.before), recordings, options, settings)[0]
+    with disk_errors(f"{options.before} cannot be read", "name a version or a report", UsageError):
+        data = Path(options.before).read_bytes()
+    try:
+        found = msgspec.json.decode(data, type=Report)
+    except msgspec.MsgspecError as error:
+        raise RecordingError(f"{options.before} is no acceptance report ({error}); name its acceptance.json") from error
+    if found.format != FORMAT:
+        raise UsageError(
+            f"{options.before} has format {found.format}, this program writes {FORMAT}; compare by the version's number"
+        )
+    return found
