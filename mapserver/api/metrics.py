@@ -63,7 +63,7 @@ _ROBOTS = {
     "robots_seen": "Robots that reported in the last minute.",
     "robots_current": "Robots on the wanted version.",
     "robots_present": "Robots on the bus now.",
-    "robots_copied": "Robots connected twice.",
+    "robots_copied": "Robots of which two were there at once within the last hour.",
     "robots_lost": "Robots that have not known their position for longer than [alerts] lost_s.",
     "clock_skew_max_seconds": "Largest clock error of a robot.",
     "map_word_hours_max": "Age of the oldest map approval on a robot seen in the last minute.",

@@ -83,7 +83,7 @@ def _is_troubled(robot: LiveRobot) -> bool:
 def _troubles(robot: LiveRobot) -> list[str]:
     """What is wrong beside the state."""
     found = [f"refuses a version: {robot.refused}"] if robot.refused else []
-    found += ["was connected twice: was its certificate copied?"] if robot.is_copied else []
+    found += ["is there twice: has another robot its name, or was its certificate copied?"] if robot.is_copied else []
     if robot.is_behind and robot.wanted_version is not None:
         found.append(f"runs version {robot.version or 'none'}, should run {robot.wanted_version}")
     if robot.clock_ahead_s is not None and abs(robot.clock_ahead_s) >= 1:

@@ -86,7 +86,7 @@ def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site: str, 
         yield from _lost(robot, settings, now_ns)
         if robot.is_copied:
             ends = f"`mapserver robots revoke {robot.robot} --site {site}` stops the copy"
-            words = f"{robot.robot} of {site} was connected twice; was its certificate copied? {ends}"
+            words = f"{robot.robot} of {site} is there twice; has another robot its name, or was its certificate copied? {ends}"
             yield Alert("FleetmapRobotCopied", site, robot.robot, now_ns, words)
     night = store.last_night(site)
     if night is not None and night.state == "failed":

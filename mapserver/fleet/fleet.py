@@ -1,5 +1,6 @@
 """State of the robots: wanted version, running version, last messages."""
 
+import logging
 import math
 import threading
 import time
@@ -39,7 +40,10 @@ FAILURE_BURST, FAILURES_PER_S = 60, 1 / 60
 _FORGET_AFTER_NS = 600_000_000_000
 _GAP_NS = 60_000_000_000  # a longer silence starts a new sequence
 _COPIED_NS = 3_600_000_000_000  # time for which a detected copy is reported
+# A robot reports once a second; of two programs under one name every other report follows the last one within half a second, or before it.
+_SOONEST_NS, _TWO_REPORT = 700_000_000, 20
 _USUAL = IngestSettings()
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,9 +51,10 @@ class RobotStatus:
     """One robot. version: running version, None before the first report; seconds_since: since its last message.
 
     is_canary: True if it runs a version before the others. is_present: its liveliness token, None before the first check. is_copied: True
-    if its certificate was on two connections at once within the last hour. state_since_ns: start of its present state (localised, DEGRADED
-    or not localised) by the server's clock; None before its first report. clock_ahead_s: offset of its wall clock against the server's,
-    None before its first report. last_ack, last_health and last_pose: its last messages as plain values, None if absent.
+    if two programs were connected with its certificate, or reported under its name, at once within the last hour. state_since_ns: start
+    of its present state (localised, DEGRADED or not localised) by the server's clock; None before its first report. clock_ahead_s: offset
+    of its wall clock against the server's, None before its first report. last_ack, last_health and last_pose: its last messages as plain
+    values, None if absent.
     """
 
     site: str
@@ -77,6 +82,18 @@ class _Robot:
     is_present: bool | None = None
     is_stored: bool = False
     copied_ns: int | None = None
+    wall_ns: int = -(2**62)
+    haste: int = 0  # 2 more for each report that came too soon by its own clock, 1 less for each other one
+
+    def note_report(self, wall_ns: int, now_ns: int) -> bool:
+        """Take the time of a health report; True if two programs report under this name, and did not in the last hour."""
+        is_soon = wall_ns - self.wall_ns < _SOONEST_NS
+        self.wall_ns, self.haste = wall_ns, min(_TWO_REPORT, max(0, self.haste + (2 if is_soon else -1)))
+        if self.haste < _TWO_REPORT:
+            return False
+        is_new = self.copied_ns is None or abs(now_ns - self.copied_ns) >= _COPIED_NS
+        self.copied_ns = now_ns
+        return is_new
 
 
 @dataclass(frozen=True, slots=True)
@@ -176,6 +193,10 @@ class Fleet:
             if health.wall_ns is not None:
                 entry.skew.take(health.wall_ns, now_ns)
                 entry.report["clock_ahead_s"] = entry.skew.ahead_s
+                if entry.note_report(health.wall_ns, now_ns):
+                    _log.warning(
+                        "two programs report as robot %s of site %s: give each robot its own name", robot, site
+                    )
             entry.report["health"] = finite(report_dict(health))
             self._ingest.take_health(health, entry.last_estimate, now_ns, dict(entry.report), entry.version)
 

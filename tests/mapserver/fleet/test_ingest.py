@@ -88,6 +88,27 @@ def test_a_clock_that_is_set_back_freezes_no_robot(site: Site) -> None:
     assert site.store.fleet.trace("lab", "r1", since_hour=START_NS // HOUR_NS)
 
 
+@pytest.mark.parametrize("ahead_s", [0.0, 0.02, 0.5, 0.97, -3600.0, 0.3 * 86400])
+def test_two_robots_of_one_name_are_told(site: Site, caplog: pytest.LogCaptureFixture, ahead_s: float) -> None:
+    """Whatever the other one's clock says; one alone is not, with a late network, restarts and a clock that is set."""
+
+    def hear(at_s: float, wall_s: float) -> bool:
+        site.set_ns(START_NS + round(at_s * NS))
+        wall_ns = START_NS + round(wall_s * NS)
+        health = RobotHealth(site="lab", robot="r1", stamp_ns=wall_ns, wall_ns=wall_ns, version=1, status="TRACKING")
+        site.fleet.take_health("lab", "r1", health)
+        return site.fleet.robots("lab")[0].is_copied
+
+    for second in range(300):
+        late_s = 10 - second % 10 if second > 200 else 0  # ten come at once
+        assert not hear(second + late_s, second * 1.001 - (40 if second > 100 else 0)), second
+    told = [hear(300 + half / 2, 300 + half // 2 + half % 2 * (0.5 + ahead_s)) for half in range(120)]
+    assert told.index(True) <= 80
+    assert caplog.text.count("two programs report as robot r1") == 1
+    assert hear(400, 400), "for an hour"
+    assert not any(hear(4100 + second, 4100 + second) for second in range(60))
+
+
 def test_the_store_counts_what_the_robots_know(site: Site) -> None:
     robots = made(site, 5, rate_per_robot_day=300.0, bad_tile=1, suspected_share=0.3, ahead_s=-7.0)
     site.run(robots, 600)
