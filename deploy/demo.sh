@@ -87,7 +87,7 @@ pictures() { deploy/dashboard_pictures.sh "$http" "$OUT" demo "$@"; }
 # Runs a robot's daemon on a recording instead of sensors; speed: 1 in real time, 0 as fast as possible.
 drive() {
   local robot=$1 recording=$2 speed=$3
-  printf '[run]\nserver = "%s"\nsite = "demo"\nrobot = "%s"\ncache = "%s"\noutbox = "%s"\n[source]\nkind = "recording"\n' \
+  printf '[run]\nserver = "%s"\nsite = "demo"\nrobot = "%s"\ncache = "%s"\noutbox = "%s"\nreplays = "full"\n[source]\nkind = "recording"\n' \
     "$zenoh" "$robot" "$OUT/cache-$robot" "$OUT/spool-$robot.sqlite3" >"$OUT/$robot.toml"
   printf 'recording = "%s"\nspeed = %s.0\n' "$recording" "$speed" >>"$OUT/$robot.toml"
   "$BIN/locclient" run --config "$OUT/$robot.toml" --verbose >"$OUT/$robot-run.log" 2>&1 &

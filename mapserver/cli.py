@@ -24,7 +24,7 @@ from mapserver.commands.operators import OPERATORS
 from mapserver.commands.releases import diff, inspect, promote, publish, rollback, versions
 from mapserver.commands.robots import ROBOTS
 from mapserver.commands.serve import serve
-from mapserver.commands.store import audit, export, gc, import_, verify
+from mapserver.commands.store import audit, export, gc, import_, retention, verify
 from mapserver.commands.surfels import MAP
 from mapserver.commands.trust import TRUST
 
@@ -45,6 +45,7 @@ COMMANDS: Commands = {
     "verify": verify,
     "gc": gc,
     "attach": attach,
+    "retention": retention,
     "backup": backup,
     "backups": backups,
     "restore": restore,

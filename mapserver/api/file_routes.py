@@ -26,7 +26,7 @@ from mapserver.serving.expected_views import ExpectedViews, SurfelChanges, failu
 from mapserver.store import MapStore
 from mapserver.surfels.changes import Changes, changes_geojson, changes_png
 from mapserver.surfels.expected_view import ExpectedView
-from mapserver.surfels.survey_pictures import SurveyPicture, nearest_pictures, pictures_of
+from mapserver.surfels.survey_pictures import SurveyPicture, nearest_pictures
 
 _DIGESTS_KEPT = 256
 _VIEWS_AT_ONCE, _VIEWS_PER_S = 5, 1.0  # of one address: each costs a tenth of a second of CPU
@@ -106,15 +106,13 @@ def install_file_routes(app: FastAPI, store: MapStore) -> None:
     def pictures(site: Site, version: Version, near: Annotated[NearPlace, Query()]) -> PictureList:
         """Pictures of the surveys, nearest to a place first; 409 for a version that keeps none."""
         looks = None if near.yaw_deg is None else looking((0, 0, 0), near.yaw_deg, 0)[:3, 2]
-        found = nearest_pictures(
-            pictures_of(store.manifest(site, version), store.blob), np.array([near.x_m, near.y_m, near.z_m]), looks
-        )
+        found = nearest_pictures(store.survey_pictures(site, version), np.array([near.x_m, near.y_m, near.z_m]), looks)
         return PictureList([_picture_view(*one) for one in found[: near.limit]])
 
     @app.get("/v1/sites/{site}/versions/{version}/pictures/{sha256}", response_class=Response)
     def picture(request: Request, site: Site, version: Version, sha256: Sha256) -> Response:
         """One of these pictures, a grey JPEG of at most 320 pixels."""
-        if not any(one.sha256 == sha256 for one in pictures_of(store.manifest(site, version), store.blob)):
+        if not any(one.sha256 == sha256 for one in store.survey_pictures(site, version)):
             raise HTTPException(404, f"version {version} of site {site} has no picture {sha256}")
         return bytes_response(request, store.blob(sha256), sha256, "image/jpeg", immutable=True)
 

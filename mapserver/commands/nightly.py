@@ -35,10 +35,13 @@ def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile 
     from mapserver.nightly.night import NightRequest, run_night
 
     FrameSelection.parse(options.frames)
-    build = options.build_options(context, report=None)
-    request = NightRequest(options.site, options.inbox, options.store, time.time_ns(), options.settle_s, build)
+    settings, build = settings_of(context), options.build_options(context, report=None)
+    retention = settings.ingest.retention()
+    request = NightRequest(
+        options.site, options.inbox, options.store, time.time_ns(), options.settle_s, build, retention
+    )
     try:
-        sentence = run_night(request, settings_of(context).gate, plain_console(stderr=True))
+        sentence = run_night(request, settings.gate, plain_console(stderr=True))
     except BusyError:
         raise
     except FleetmapError:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import expand_options
+from fleetmap.cli_options import ConfigFile, expand_options, settings_of
 from fleetmap.errors import StoreError
 from mapserver.commands.options import (
     ActorOptions,
@@ -97,6 +97,35 @@ def gc(
         for site, version in versions:
             typer.echo(f"site {site}: version {version} {would}{word}")
     typer.echo(f"{garbage.files} files {would}removed, {garbage.freed_bytes} bytes {would}freed")
+
+
+@expand_options
+def retention(
+    context: typer.Context,
+    *,
+    store: StoreFolder,
+    inbox: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="An inbox, or the folder with an inbox for each site.")
+    ] = None,
+    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what would be removed; remove nothing.")] = False,
+    config: ConfigFile = None,
+    json: Json = False,
+) -> None:
+    """Remove reports, pictures and recordings that are older than the periods of [ingest], as the nightly job does.
+
+    Versions of maps are removed by `gc`.
+    """
+    from mapserver.nightly.inbox import sites_of
+    from mapserver.nightly.retention import apply_retention
+
+    inboxes = [] if inbox is None else [inbox, *(inbox / site for site in sites_of(inbox))]
+    with open_store(store) as maps:
+        removed = apply_retention(maps, settings_of(context).ingest.retention(), inboxes, dry_run=dry_run)
+    if json:
+        print_json(removed)
+        return
+    for name, count in removed.items():
+        typer.echo(f"{name}: {count} {'would be ' if dry_run else ''}removed")
 
 
 def export(

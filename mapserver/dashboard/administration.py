@@ -48,9 +48,11 @@ def page(services: Services, _: PageContext) -> dict[str, object]:
         "retention": [
             ("Figures by the hour", f"{kept.tally_days:g} days"),
             ("Failures", f"{kept.failure_days:g} days, {kept.failures_per_robot} of a robot"),
-            ("Their pictures", f"the newest {size(kept.picture_bytes)}"),
-            ("Their recordings", f"the newest {size(found.replay_bytes)}"),
+            ("Their pictures", f"{kept.picture_days:g} days, the newest {size(kept.picture_bytes)}"),
+            ("Their recordings", f"{kept.replay_days:g} days, the newest {size(found.replay_bytes)}"),
             ("Ways of robots", f"{kept.trace_days:g} days"),
+            ("Pictures of surveys", f"{kept.survey_picture_days:g} days since they were taken"),
+            ("Recordings of surveys", f"{kept.recording_days:g} days since a night took or refused them"),
             ("Versions of maps", "until somebody runs mapserver gc"),
         ],
     }

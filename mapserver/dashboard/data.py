@@ -26,7 +26,6 @@ from mapserver.serving.expected_views import failure_camera
 from mapserver.serving.night_runs import SETTLE_S
 from mapserver.store import MapStore, VerdictRow, VersionInfo
 from mapserver.surfels.surfel_map import index_address, surfels_of
-from mapserver.surfels.survey_pictures import pictures_of
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -184,7 +183,7 @@ class MapData:
 
     def lacks_pictures(self, site: str, version: int) -> str | None:
         """Why a version keeps no pictures of its surveys; None where it does."""
-        return _fault(lambda: pictures_of(self.store.manifest(site, version), self.store.blob))
+        return _fault(lambda: self.store.survey_pictures(site, version))
 
     def difference(self, site: str, before: int, after: int) -> Difference:
         """The difference between two versions."""

@@ -3,7 +3,7 @@
 import resource
 import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,7 +15,7 @@ from rich.console import Console
 from fleetmap.bow.shipped_vocabulary import default_vocabulary, default_vocabulary_bytes
 from fleetmap.console import plain_console
 from fleetmap.encoding import to_json, to_plain
-from fleetmap.errors import RecordingError, StoreError, UsageError
+from fleetmap.errors import RecordingError, StateError, StoreError, UsageError
 from fleetmap.mapformat import CameraEntry, Tile
 from fleetmap.recordings import OpenOptions, Topics
 from fleetmap.recordings.tum import write_tum
@@ -63,7 +63,7 @@ from mapserver.quality.probes import alias_step_m
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
 from mapserver.surfels.surfel_map import SurfelTiles, known_surfels, surfel_report
-from mapserver.surfels.survey_pictures import PICTURES_KEY, kept_pictures, pictures_of
+from mapserver.surfels.survey_pictures import PICTURES_KEY, SurveyPicture, kept_pictures
 from mapserver.surfels.survey_surfels import SurfelGrower
 from mapserver.survey.executor import Executor
 from mapserver.survey.finish.map_transform import transform_map
@@ -322,11 +322,10 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         surfels_said = surfel_report(surfels, len(grown), without["surfels"])
     pictures, pictures_said = list[bytes](), None
     if run.settings.survey_pictures:
-        before = (
-            ()
-            if parent is None or PICTURES_KEY not in parent.manifest.report
-            else pictures_of(parent.manifest, maps.blob)
-        )
+        before: tuple[SurveyPicture, ...] = ()
+        if parent is not None and PICTURES_KEY in parent.manifest.report:
+            with suppress(StateError):  # all of them were removed after their period
+                before = maps.survey_pictures(site, parent.manifest.version)
         pictures, pictures_said = kept_pictures(sessions, corrections.pictures_before(before), maps.blob)
     run.times.begin("examining")
     evidence = msgspec.structs.replace(_evidence(run, built, judged, tiles, parent), views=views)

@@ -25,10 +25,14 @@ _TRACE_STEP_M = 0.5
 _MAX_CAUSES = 64
 _MAX_KEPT_TRACES = 200_000
 _DAY_NS = 86_400_000_000_000
+_PERIODS = (
+    *("trace_days", "tally_days", "failure_days", "picture_days", "replay_days", "survey_picture_days"),
+    *("recording_days", "picture_bytes"),
+)
 
 
 class IngestSettings(Section, frozen=True):
-    """Rate of the robots' stored traces, and retention of their reports.
+    """Rate of the robots' stored traces, and retention of what robots and surveys send: reports, pictures, recordings.
 
     trace_every_s: of a robot that stands. One that drives gets a row each half metre, with a longer step as it uses up as many rows a
     day as standing gives.
@@ -38,11 +42,15 @@ class IngestSettings(Section, frozen=True):
     trace_days: Positive = 2.0
     tally_days: Positive = 400.0
     failure_days: Positive = 400.0
+    picture_days: Positive = 30.0
+    replay_days: Positive = 30.0
+    survey_picture_days: Positive = 400.0
+    recording_days: Positive = 400.0
     picture_bytes: PositiveInt = 1_000_000_000  # above, the oldest pictures are deleted
     replay_bytes: PositiveInt = 2_000_000_000  # above, the oldest recordings are deleted
 
     def retention(self) -> FleetRetention:
-        return FleetRetention(self.tally_days, self.failure_days, self.picture_bytes, self.trace_days)
+        return FleetRetention(**{name: getattr(self, name) for name in _PERIODS})
 
 
 @dataclass(slots=True)

@@ -1,4 +1,4 @@
-"""The folder for incoming recordings, and the folders to which each is moved. Nothing is ever deleted.
+"""The folder for incoming recordings, and the folders to which each is moved. Only `remove_old` deletes.
 
     INBOX/NAME             a recording: a folder, or a file with a suffix such as .mcap
     INBOX/done/HASH-NAME   it is in a version
@@ -13,6 +13,7 @@ import fcntl
 import hashlib
 import os
 import resource
+import shutil
 import signal
 import stat
 import threading
@@ -383,6 +384,25 @@ def is_safe_name(name: str) -> bool:
 def _safe_name(path: Path) -> str:
     suffix = path.suffix if path.suffix in FILE_SUFFIXES else ""
     return f"unnamed-{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:_HASH_SIGNS]}{suffix}"
+
+
+def remove_old(inbox: Path, days: float, now_ns: int, *, dry_run: bool = False) -> int:
+    """Remove recordings that were put away longer ago, with their reasons, and return their number. StoreError if the disk refuses.
+
+    Those that wait for a night stay. Their age counts from the last change of their entry, which no tool sets back.
+    """
+    found = 0
+    for folder in (inbox / where for where in (DONE, HELD, BAD)):
+        with disk_errors(f"old recordings of {folder} cannot be removed", "check the rights of the inbox"):
+            paths = sorted(folder.iterdir()) if folder.is_dir() and not folder.is_symlink() else []
+            for path in paths:
+                if path.name.endswith(_REASON) or path.lstat().st_ctime_ns >= now_ns - days * _DAY_S * 1e9:
+                    continue
+                found += 1
+                if not dry_run:
+                    path.unlink() if not path.is_dir() or path.is_symlink() else shutil.rmtree(path)
+                    Path(f"{path}{_REASON}").unlink(missing_ok=True)
+    return found
 
 
 def _free(folder: Path, name: str) -> Path:

@@ -23,8 +23,9 @@ from mapserver.drafting.job_lock import INTERRUPTED, end_interrupted, held, logg
 from mapserver.library import settings_for
 from mapserver.nightly import inbox as boxes
 from mapserver.nightly.inbox import Recorded
+from mapserver.nightly.retention import apply_retention
 from mapserver.quality.gate import GateSettings
-from mapserver.store import Actor, MapStore, VersionInfo
+from mapserver.store import Actor, FleetRetention, MapStore, VersionInfo
 
 JOB = "nightly"
 _MOST_A_NIGHT = 1000  # recordings, and lines on entries left in place
@@ -37,7 +38,7 @@ _ENDED = (
 
 @dataclass(frozen=True, slots=True)
 class NightRequest:
-    """Options of `mapserver nightly`. now_ns: the time against which `settle_s` is checked."""
+    """Options of `mapserver nightly`. now_ns: the time against which `settle_s` is checked; retention: applied before the work."""
 
     site: str
     inbox: Path
@@ -45,13 +46,15 @@ class NightRequest:
     now_ns: int
     settle_s: float = 300.0
     options: BuildOptions = field(default_factory=BuildOptions)
+    retention: FleetRetention = field(default_factory=FleetRetention)
 
 
 @dataclass
 class NightReport:
     """The report of a night, with the keys of docs/reports.md. version: the current one at the end.
 
-    looking_at: names of the recordings being read or built. ended: by name, number of nights that ended during its processing.
+    expired: by kind, how much was removed after its period. looking_at: names of the recordings being read or built.
+    ended: by name, number of nights that ended during its processing.
     """
 
     job: int
@@ -60,6 +63,7 @@ class NightReport:
     published: list[int] = field(default_factory=list)
     recordings: list[dict[str, Any]] = field(default_factory=list)
     waiting: list[dict[str, str]] = field(default_factory=list)
+    expired: dict[str, int] = field(default_factory=dict)
     builds: list[dict[str, Any]] = field(default_factory=list)
     looking_at: list[str] = field(default_factory=list)
     ended: dict[str, int] = field(default_factory=dict)
@@ -78,6 +82,8 @@ def run_night(request: NightRequest, gate: GateSettings, console: Console) -> st
         end_interrupted(maps, time.time_ns())
         try:
             with held(request.store, report.job), logged(request.store, report.job):
+                removed = apply_retention(maps, request.retention, [request.inbox])
+                report.expired = {name: count for name, count in removed.items() if count}
                 sentence = _Night(request, gate, console, maps, report).run()
         except KeyboardInterrupt:  # ended by a user, not by a recording
             maps.tell_progress(report.job, [], "looking_at")

@@ -231,20 +231,37 @@ class FleetQueries:
 
     def prune(self, retention: FleetRetention) -> int:
         """Remove old or excess data; return the number of removed rows."""
-        now_ns = self._transactions.now_ns()
-        tallies_ns, traces_ns, failures_ns = (
-            now_ns - int(days * _DAY_NS)
-            for days in (retention.tally_days, retention.trace_days, retention.failure_days)
-        )
         with self._transactions.write(durable=False) as connection:
-            gone = connection.execute("DELETE FROM tallies WHERE hour < ?", (hour_of(tallies_ns),)).rowcount
-            gone += connection.execute("DELETE FROM traces WHERE hour < ?", (hour_of(traces_ns),)).rowcount
+            gone = 0
+            for rows, before in self._expired(retention).values():
+                gone += connection.execute(f"DELETE FROM {rows}", (before,)).rowcount
             gone += _prune_traces(connection, retention.trace_rows)
-            gone += connection.execute("DELETE FROM failures WHERE happened_ns < ?", (failures_ns,)).rowcount
             gone += _prune_pictures(connection, retention.picture_bytes)
             self._picture_bytes = _sum_of_pictures(connection)
         self._transactions.shrink(_SHRINK_PAGES)
         return gone
+
+    def expired(self, retention: FleetRetention) -> dict[str, int]:
+        """Return by name how many rows are older than their period."""
+        return {
+            name: int(self._transactions.query(f"SELECT count(*) n FROM {rows}", (before,))[0]["n"])
+            for name, (rows, before) in self._expired(retention).items()
+        }
+
+    def _expired(self, retention: FleetRetention) -> dict[str, tuple[str, int]]:
+        """Return by name the rows older than their period, as a table with a condition, and the condition's parameter."""
+        of_failures = "WHERE number IN (SELECT number FROM failures WHERE happened_ns < ?)"
+
+        def before(days: float) -> int:
+            return self._transactions.now_ns() - int(days * _DAY_NS)
+
+        return {
+            "figures by the hour": ("tallies WHERE hour < ?", hour_of(before(retention.tally_days))),
+            "ways of robots": ("traces WHERE hour < ?", hour_of(before(retention.trace_days))),
+            "pictures of failures": (f"failure_pictures {of_failures}", before(retention.picture_days)),
+            "recordings of failures": (f"failure_replays {of_failures}", before(retention.replay_days)),
+            "failures": ("failures WHERE happened_ns < ?", before(retention.failure_days)),
+        }
 
     def _ids(self, connection: Connection, keys: Iterable[tuple[str, str, str]]) -> dict[tuple[str, str, str], int]:
         """Return the numbers of keys, which are never removed: cached ones stay valid."""

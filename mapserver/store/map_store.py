@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import TYPE_CHECKING, Any, Self, cast
 
 from fleetmap.encoding import to_json, to_plain
 from fleetmap.errors import (
@@ -77,6 +77,10 @@ from mapserver.store.version_rows import (
     mentioned,
     site_releases,
 )
+from mapserver.survey.merge.area_corrections import CLOCKS_BEGIN_NS
+
+if TYPE_CHECKING:
+    from mapserver.surfels.survey_pictures import SurveyPicture
 
 _USUAL_RETENTION = Retention()
 AREAS_BEFORE = "areas before"
@@ -337,6 +341,27 @@ class MapStore(StoreQueries):
             keep_reserve(self._root)
             return garbage
 
+    def remove_survey_pictures(self, days: float, *, dry_run: bool = False) -> int:
+        """Remove the surveys' pictures taken longer ago from all versions, and return their number; StoreError on a disk error.
+
+        One of a recording whose clock does not count from 1970 is as old as the oldest version that has it. Indexes of versions, which
+        are signed, still name them.
+        """
+        before_ns, taken_ns = self.now_ns() - int(days * 86_400e9), dict[str, int]()
+        with self._locked(shared=dry_run):
+            for site in self.sites():
+                for info in self.versions(site.site):
+                    for one in _pictures_of(self, info):
+                        since_ns = one.stamp_ns if one.stamp_ns > CLOCKS_BEGIN_NS else info.saved_ns
+                        taken_ns[one.sha256] = min(since_ns, taken_ns.get(one.sha256, since_ns))
+            old = [sha256 for sha256, since_ns in taken_ns.items() if since_ns < before_ns]
+            if not dry_run and old:
+                with self._transactions.write() as connection:
+                    connection.executemany("DELETE FROM surfel_blobs WHERE sha256 = ?", [(sha256,) for sha256 in old])
+                for sha256 in set(old) - self.named_blobs():
+                    self._blobs.remove(sha256)
+        return len(old)
+
     def export_version(self, site: str, version: int, path: Path, *, archive: bool = True) -> int:
         """Write a version into one file and return its size; errors as of `manifest`, StoreError for the disk."""
         head = self._export_head(site, version, archive=archive)
@@ -471,6 +496,14 @@ class MapStore(StoreQueries):
             yield
         except OSError as error:
             raise StoreError(f"{error.filename or self._root}: {error.strerror}; check the store's disk") from error
+
+
+def _pictures_of(store: MapStore, info: VersionInfo) -> "tuple[SurveyPicture, ...]":
+    """Return the surveys' pictures that a version still has; none for one without."""
+    try:
+        return store.survey_pictures(info.site, info.version)
+    except (StateError, MapFormatError):
+        return ()
 
 
 def _export_chunks(head: ExportHead, blobs: Blobs) -> Iterator[bytes]:

@@ -4,12 +4,12 @@ import json
 from collections.abc import Callable, Iterator, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import msgspec
 
 from fleetmap.encoding import to_json
-from fleetmap.errors import MapFormatError, StoreError, UsageError
+from fleetmap.errors import MapFormatError, StateError, StoreError, UsageError
 from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manifest, sha256_hex
 from fleetmap.mapformat.building import ALIGNMENT, AREAS, FOR_ROBOTS
 from mapserver.floor_plan.alignment import Alignment, decode_alignment
@@ -37,6 +37,9 @@ from mapserver.store.rows import (
 )
 from mapserver.store.usage import DiskMeter, DiskSpace, StoreUsage, UsageMeter
 from mapserver.store.version_rows import canaries, mentioned, site_releases
+
+if TYPE_CHECKING:
+    from mapserver.surfels.survey_pictures import SurveyPicture
 
 _EVENT = "id, stamp_ns, site, kind, detail, version, actor, reason"
 _OF_VERSIONS = ("manifest", "tile", "vocabulary")
@@ -195,6 +198,20 @@ class StoreQueries:
         """Return the archive of a version, if it has one; errors as of `version` and `blob`."""
         sha256 = self.version(site, version).archive_sha256
         return None if sha256 is None else self._blobs.get(sha256)
+
+    def survey_pictures(self, site: str, version: int) -> "tuple[SurveyPicture, ...]":
+        """Return the surveys' pictures of a version that are still kept; errors as of `manifest` and `pictures_of`."""
+        from mapserver.surfels.survey_pictures import pictures_of  # loads OpenCV, which few commands need
+
+        query = "SELECT sha256 FROM surfel_blobs WHERE site = ? AND version = ?"
+        known = {row["sha256"] for row in self._transactions.query(query, (site, version))}
+        pictures = pictures_of(self.manifest(site, version), self._blobs.get)
+        found = tuple(one for one in pictures if one.sha256 in known)
+        if not found:
+            raise StateError(
+                f"the surveys' pictures of version {version} of site {site} were removed after their period"
+            )
+        return found
 
     def site_file(self, site: str, kind: str) -> bytes | None:
         """Return a site's file of this kind, such as `plan`; None if absent. Errors as of `blob`."""

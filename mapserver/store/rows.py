@@ -334,8 +334,10 @@ class ReleaseChanges:
 
 @dataclass(frozen=True, slots=True)
 class FleetRetention:
-    """Retention of the fleet's reports: sums and failures by age, failures also by number per robot, pictures by size, traces by age
-    and number.
+    """Periods after which data is removed. Of the fleet's reports: sums and failures by age, failures also by number per robot, their
+    pictures by age and size, their recordings by age (and size, by `replay_bytes`), traces by age and number.
+
+    survey_picture_days: of the small pictures in versions of maps; recording_days: of recordings in an inbox since it was put away.
     """
 
     tally_days: float = 400.0
@@ -344,3 +346,7 @@ class FleetRetention:
     trace_days: float = 2.0
     trace_rows: int = 3_000_000  # whole hours are deleted, the oldest first
     failures_per_robot: int = 5000  # twelve a day for 400 days
+    picture_days: float = 30.0
+    replay_days: float = 30.0
+    survey_picture_days: float = 400.0
+    recording_days: float = 400.0

@@ -13,7 +13,7 @@ Rings = tuple[Array, ...]
 """An area: (V, 2) corners of its outlines in `map`, inside by the even-odd rule over all of them."""
 
 _MOST_AT_ONCE = 1 << 22  # points times corners
-_CLOCKS_BEGIN_NS = 946_684_800_000_000_000  # the year 2000: earlier stamps count from a start, not from 1970
+CLOCKS_BEGIN_NS = 946_684_800_000_000_000  # the year 2000: earlier stamps count from a start, not from 1970
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,7 +40,7 @@ class SurveyLimits:
 
 def is_before(end_ns: int, since_ns: int) -> bool:
     """True if a recording's last stamp precedes a time; a clock that does not count from 1970 cannot tell."""
-    return _CLOCKS_BEGIN_NS < end_ns < since_ns
+    return CLOCKS_BEGIN_NS < end_ns < since_ns
 
 
 def inside_any(points_map: AnyArray, areas: Sequence[Rings]) -> Mask:

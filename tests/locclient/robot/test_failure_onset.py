@@ -141,6 +141,7 @@ def reported(bundles: Iterable[SensorBundle], store: MapStore) -> list[FailureRe
         if outcome is not None and outcome.failure is not None:
             contexts.append(outcome.failure)
     profile = RobotProfile("room", "r1", np.eye(4), rig.body_from_cam, rig.camera, robot_world.SETTINGS)
+    profile = replace(profile, pictures="full")
     return [failure_report(context, profile, report_id="ab" * 16, wall_ns=7) for context in contexts]
 
 

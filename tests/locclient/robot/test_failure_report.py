@@ -11,6 +11,7 @@ from fleetmap.geometry import se3, so3_exp
 from fleetmap.messages import MAX_MESSAGE_BYTES, MAX_THUMBNAIL_BYTES, encode_message
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import CameraFrame
+from locclient.config import LocclientConfig
 from locclient.delivery.report_delivery import write_failure
 from locclient.robot.failure_report import expected_matches, match_view, small_jpeg, without_detail
 from mapserver.store import MapStore
@@ -109,6 +110,7 @@ def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
     assert edges[1] < 0.1 * edges[0]
     assert is_like(sharp[3].jpeg, left, without_detail(left))
     assert is_like(blurred[3].jpeg, without_detail(left), left)
+    assert LocclientConfig().run.replays == profile.pictures == "blurred", "unless somebody asks for more"
     unseen = failure_report(bright, replace(profile, pictures="off"), report_id="ab" * 16, wall_ns=7)
     assert b"\xff\xd8\xff" not in encode_message(unseen), "the beginning of a JPEG"
     assert (unseen.thumbnails, unseen.landmarks_expected) == ((), report.landmarks_expected)

@@ -294,6 +294,14 @@ def test_old_and_many_things_go(site: Site) -> None:
     fleet.prune(replace(usual, picture_bytes=size // 2))
     kept = [fleet.failure(row.number).pictures for row in fleet.failures(FailureFilter())]
     assert kept[0] and not kept[-1]  # the newest keep theirs
+    site.set_ns(START_NS + 31 * 24 * HOUR_NS)
+    pictured = fleet.expired(usual)
+    assert pictured["pictures of failures"] == sum(map(len, kept))
+    assert (pictured["failures"], pictured["figures by the hour"]) == (0, 0)
+    fleet.prune(usual)
+    assert not any(fleet.expired(usual).values())
+    assert not any(fleet.failure(row.number).pictures for row in fleet.failures(FailureFilter())), "failures stay"
+    site.set_ns(START_NS)
     site.run(made(site, 1), 20, START_NS + 10 * HOUR_NS)
     fleet.prune(replace(usual, trace_rows=3))
     assert {row.hour for row in fleet.trace("lab", "r0")} == {490_010}

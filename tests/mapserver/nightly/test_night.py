@@ -44,7 +44,7 @@ from mapserver.nightly import night
 from mapserver.nightly.inbox import arrivals
 from mapserver.nightly.night import NightRequest, last_report, run_night
 from mapserver.quality.gate import GateSettings
-from mapserver.store import DraftContent, MapStore
+from mapserver.store import DraftContent, FleetRetention, MapStore
 from mapserver.survey.settings import SurveySettings
 from support.recordings.recording_samples import make_sample, write_euroc
 from support.storage.faulty_disk import Disk, install
@@ -127,6 +127,17 @@ def test_a_night_surveys_with_the_preset_of_the_sensors_as_a_build_does(
     assert used == [survey_settings(config, SensorSet.MONO)]
     assert used[0] != survey_settings(config, SensorSet.STEREO_INERTIAL)
     assert used[0].seed == 5
+
+
+def test_a_night_removes_what_is_older_than_its_period(hall: Path) -> None:
+    spend(hall)
+    now_ns, periods = time.time_ns() + LATER_NS, FleetRetention(recording_days=1e-9)
+    order = NightRequest("hall", hall / "inbox", hall / "store", now_ns, retention=periods)
+    assert run_night(order, GateSettings(), Console(file=io.StringIO())) == "site hall: nothing new"
+    assert names(hall / "inbox/done") == []
+    last = last_report(hall / "store", "hall")
+    assert last is not None
+    assert last["expired"] == {"recordings of surveys": 2}
 
 
 def states(folder: Path) -> list[tuple[str, list[str]]]:

@@ -1,0 +1,105 @@
+"""What is older than its period goes: pictures and recordings of surveys, by the command and by every night."""
+
+import json
+import os
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from fleetmap.errors import StateError
+from fleetmap.geometry import se3
+from mapserver import releases
+from mapserver.cli import app
+from mapserver.nightly.inbox import BAD, DONE, HELD, put_away, remove_old
+from mapserver.store import FleetRetention, MapStore
+from mapserver.survey.merge.area_corrections import CLOCKS_BEGIN_NS
+from support.storage.clock import Clock
+from support.storage.map_samples import save_picture_draft
+from support.storage.room_sessions import Seen, session_at
+
+DAY_S, HASH = 86_400, "ab" * 32
+
+
+def pictured(*x_m: float, since_ns: int = 0):
+    session = session_at([se3([[1, 0, 0], [0, 1, 0], [0, 0, 1]], [x, 0.0, 0.5]) for x in x_m], has_depth=True)
+    keyframes = session.survey.odometry.keyframes
+    for number, each in enumerate(keyframes):
+        keyframes[number] = Seen(replace(each.frame, stamp_ns=since_ns + each.frame.stamp_ns), each.frame_index)
+    return session
+
+
+def test_pictures_of_surveys_go_from_every_version_that_has_them(tmp_path: Path) -> None:
+    clock = Clock()
+    with MapStore.open(tmp_path, create=True, clock_ns=clock) as store:
+        young_ns = store.now_ns() - 2 * DAY_S * 10**9
+        assert young_ns > CLOCKS_BEGIN_NS
+        first = save_picture_draft(store, [pictured(0.0, 3.0, since_ns=young_ns - 9 * DAY_S * 10**9)])
+        releases.publish(store, "lab", first)
+        sessions = [pictured(0.0, 3.0, since_ns=young_ns - 9 * DAY_S * 10**9), pictured(-3.0, since_ns=young_ns)]
+        both, counting = save_picture_draft(store, sessions), save_picture_draft(store, [pictured(6.0)])
+        assert [len(store.survey_pictures("lab", version)) for version in (first, both, counting)] == [2, 3, 1]
+        blobs = len(list(tmp_path.glob("blobs/*/*")))
+        assert store.remove_survey_pictures(5.0, dry_run=True) == 2
+        assert len(list(tmp_path.glob("blobs/*/*"))) == blobs
+        assert store.remove_survey_pictures(5.0) == 2
+        assert len(list(tmp_path.glob("blobs/*/*"))) == blobs - 2
+        assert [one.stamp_ns for one in store.survey_pictures("lab", both)] == [young_ns]
+        with pytest.raises(StateError, match="removed after their period"):
+            store.survey_pictures("lab", first)
+        assert store.verify().faults == []
+        assert store.remove_survey_pictures(5.0) == 0
+        clock.now_ns += 6 * DAY_S * 10**9  # a picture whose clock counts from a start is as old as its oldest version
+        assert store.remove_survey_pictures(5.0) == 2
+        store.export_version("lab", both, tmp_path / "lab.fmex")
+    with MapStore.open(tmp_path / "other", create=True) as other:
+        other.import_version(tmp_path / "lab.fmex")
+        assert other.verify().faults == []
+
+
+@pytest.fixture
+def inbox(tmp_path: Path) -> Path:
+    """Recordings in each folder, and one that waits."""
+    for number, where in enumerate((DONE, HELD, BAD)):
+        recording = tmp_path / "inbox/lab" / f"drive{number}"
+        (recording / "mav0").mkdir(parents=True)
+        put_away(recording, where, HASH, "it is far away")
+    (tmp_path / "inbox/lab/done" / "single.mcap").write_bytes(b"x")
+    (tmp_path / "inbox/lab/bad" / "link").symlink_to("/etc")
+    (tmp_path / "inbox/lab" / "tonight.mcap").write_bytes(b"x")
+    return tmp_path / "inbox/lab"
+
+
+def test_recordings_that_were_put_away_go_and_others_stay(inbox: Path) -> None:
+    now_ns = time.time_ns()
+    os.utime(inbox / "done/single.mcap", (0, 0))  # copied with an old time: it came today all the same
+    assert remove_old(inbox, 1.0, now_ns) == 0
+    later_ns = now_ns + 2 * DAY_S * 10**9
+    assert remove_old(inbox, 1.0, later_ns, dry_run=True) == 5
+    assert remove_old(inbox, 3.0, later_ns) == 0
+    assert remove_old(inbox, 1.0, later_ns) == 5
+    left = sorted(str(path.relative_to(inbox)) for path in inbox.rglob("*"))
+    assert left == ["bad", "done", "held", "tonight.mcap"]
+    assert Path("/etc/passwd").exists()
+
+
+def test_the_command_takes_its_periods_from_the_file(inbox: Path, tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        save_picture_draft(store, [pictured(0.0, 3.0)])
+    config = tmp_path / "site.toml"
+    config.write_text("[ingest]\nrecording_days = 1e-9\nsurvey_picture_days = 1e-9\n")
+    command = ["retention", "--store", tmp_path / "store", "--inbox", inbox.parent]
+
+    def run(*more: object) -> str:
+        done = CliRunner().invoke(app, [str(word) for word in (*command, *more)])
+        assert done.exit_code == 0, done.output
+        return done.output
+
+    assert "recordings of surveys: 0 removed\n" in run()
+    assert "recordings of surveys: 5 would be removed\n" in run("--config", config, "--dry-run")
+    removed = json.loads(run("--config", config, "--json"))
+    assert (removed["recordings of surveys"], removed["pictures of surveys"]) == (5, 2)
+    assert set(removed) >= {"failures", "pictures of failures", "recordings of failures", "ways of robots"}
+    assert FleetRetention() == replace(FleetRetention(), recording_days=400.0, picture_days=30.0)
