@@ -19,7 +19,7 @@ from locclient.vda5050.settings import Vda5050Section
 TIERS = {
     "user": {
         "": "site store server",
-        "run": "server store site robot prior cache cache_bytes root identity insecure outbox failures replays",
+        "run": "server store site robot prior cache cache_bytes root identity insecure outbox failures replays surveys",
         "source": "kind sensors calibration endpoint recording device",
         "output": "format endpoint robot_height_m autostart",
         "topics": "*",
@@ -64,6 +64,7 @@ class RunSection(Section, frozen=True):
     failures: str | None = None
     replays: str = "blurred"
     replays_bytes: int = 50_000_000
+    surveys: bool = False
     frame_queue: int = 2
     imu_wait_s: float = 0.05
     window: TileSelectionSettings = TileSelectionSettings()

@@ -25,6 +25,7 @@ from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.failure_file import PICTURES
 from locclient.delivery.outbox import Outbox
 from locclient.delivery.report_delivery import ReplayQueue
+from locclient.delivery.survey_drives import SurveyDrives
 from locclient.identity import GivenAddress, MapAddress, check_reach
 from locclient.maps.connection import cache_folder, open_bus, outbox_path, replay_outbox, trusted_map
 from locclient.maps.map_client import MapClient
@@ -160,6 +161,8 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         if server is not None and keeps_replay:
             server.replays = Outbox(replay_outbox(outbox_file), max_bytes=run.replays_bytes, is_needed=False)
             replays = ReplayQueue(server.replays, profile, run.replays)
+        if server is not None and run.surveys:
+            server.drives = SurveyDrives(outbox_file.with_name(f"{outbox_file.stem}.drives"), calibration)
         yield RuntimeParts(
             profile=profile,
             source=source,
@@ -174,6 +177,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             failures_folder=None if run.failures is None else Path(run.failures),
             caches=caches,
             fleet_manager=fleet_manager,
+            drives=None if server is None else server.drives,
         )
 
 

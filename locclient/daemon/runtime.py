@@ -23,6 +23,7 @@ from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.service_manager import ServiceManager
 from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.delivery.report_delivery import ReplayQueue, write_failure
+from locclient.delivery.survey_drives import SurveyDrives
 from locclient.maps.loaded_map import Cell, LoadedMap, PositionBound, PositionBoundTracker
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
@@ -57,6 +58,7 @@ class RuntimeParts:
     server: ServerSync | None
     first: WantedVersion | None
     failures_folder: Path | None = None
+    drives: SurveyDrives | None = None
     caches: tuple[TileCache, ...] = ()
     fleet_manager: MqttLink | None = None
 
@@ -124,6 +126,8 @@ class Runtime:
         if self._parts.replays is not None and self._robot.ring is not None:
             self._robot.ring.finish()
             self._parts.replays.work()
+        if self._parts.drives is not None:
+            self._parts.drives.finish()
         _log.info("stopped: %s", self._health())
         if words := self._figures.search.words:
             _log.warning("stopped: %s", words)
@@ -143,6 +147,8 @@ class Runtime:
         outcome = None
         try:
             outcome = robot.handle(bundle)
+            if self._parts.drives is not None:
+                self._parts.drives.handle(bundle, None if outcome is None else outcome.estimate)
         except RecordingError as error:
             intake.count_unreadable(str(error))
             _log.warning("a frame is skipped: %s", error)
@@ -237,6 +243,8 @@ class Runtime:
             self._queue_failures()
             if self._parts.replays is not None:
                 self._parts.replays.work()
+            if self._parts.drives is not None:
+                self._parts.drives.work()
 
     def _load_maps(self) -> None:
         loader, server, bound = self._parts.tile_loader, self._server, self._bound

@@ -12,6 +12,7 @@ from fleetmap.messages import RobotHealth, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient.delivery.outbox import Outbox
 from locclient.delivery.report_delivery import deliver, deliver_replay_part
+from locclient.delivery.survey_drives import SurveyDrives
 from locclient.maps.map_client import MapClient
 from locclient.prior_option import told_prior
 from locclient.robot.version_trial import Change, VersionChange
@@ -42,6 +43,7 @@ class ServerSync:
     ) -> None:
         """retry_s: delay before a postponed version is offered again. upkeep: called once an hour; its errors are logged."""
         self.replays: Outbox | None = None  # recordings of failures, which may be large
+        self.drives: SurveyDrives | None = None  # through areas that operators want to be surveyed
         self._replayed_bytes: dict[str, int] = {}
         self._replay_at_s = self._deliver_at_s = 0.0
         self.follows = True  # the server selects the version; False: the fleet manager does
@@ -88,7 +90,7 @@ class ServerSync:
             self._fetch_again()
             if self._announced or now_s >= self._ask_at_s:
                 self._ask(now_s)
-            self._send_replay(now_s)
+            self._send_recordings(now_s)
         except UnreachableError as error:
             _log.info("the map server is away: %s", error)
             self._silent_until_s = self._clock_s() + self._backoff_s
@@ -110,6 +112,8 @@ class ServerSync:
         wanted = self.client.wanted()
         self._ask_at_s = now_s + _ASK_EVERY_S
         self._send_again()
+        if self.drives is not None:
+            self.drives.requests = self.client.surveys
         self._learn_frame()
         sha256 = wanted.manifest_sha256
         if sha256 is None:
@@ -232,17 +236,20 @@ class ServerSync:
                     "the map server was restored from a backup: %d reports or recordings are sent again", count
                 )
 
-    def _send_replay(self, now_s: float) -> None:
-        """Send a part of a recording, at most one per second, while no report waits and no version is fetched."""
-        if self.replays is None or now_s < self._replay_at_s:
+    def _send_recordings(self, now_s: float) -> None:
+        """Send a part of a recording, at most one per second, while no report waits and no version is fetched; failures first."""
+        if now_s < self._replay_at_s:
             return
         goes_on = False
         try:
             if self._outbox.waiting():
                 return
-            goes_on = deliver_replay_part(self.client, self.replays, self._replayed_bytes)
+            if self.replays is not None:
+                goes_on = deliver_replay_part(self.client, self.replays, self._replayed_bytes)
+            if not goes_on and self.drives is not None:
+                goes_on = self.drives.deliver_part(self.client)
         except StoreError as error:
-            _log.warning("recordings of failures wait: %s", error)
+            _log.warning("recordings wait: %s", error)
         self._replay_at_s = now_s + (_REPLAY_PART_EVERY_S if goes_on else _MAX_BACKOFF_S)
 
     def _publish_health(self) -> None:

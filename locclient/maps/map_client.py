@@ -29,6 +29,7 @@ from fleetmap.messages import (
     PoseMessage,
     RobotAck,
     RobotHealth,
+    SurveyArea,
     WantedVersion,
     decode_message,
     encode_message,
@@ -135,6 +136,7 @@ class MapClient(MapSource):
         self._chunks = ChunkReader(bus, timeout_s=timeout_s, patience_s=patience_s)
         self._trust: TrustedMap | None = None
         self.takes_grids = False  # for planners, if versions have them; localization does not need them
+        self.surveys: tuple[SurveyArea, ...] = ()  # that robots may make, by its last answer
         self.restored_ns = 0  # when the server's store was restored from a backup, by its last answer
         self._away: UnreachableError | None = None  # while tiles are read
         self._begun = ""  # the manifest's address of the version that was admitted last
@@ -173,8 +175,8 @@ class MapClient(MapSource):
             raise LinkError(f"requested site {self._site}, the server answered for {wanted.site[:80]!r}")
         if self._trust is not None:
             self._trust.refresh()
-        self.restored_ns = wanted.restored_ns
-        return msgspec.structs.replace(wanted, restored_ns=0)
+        self.restored_ns, self.surveys = wanted.restored_ns, wanted.surveys
+        return msgspec.structs.replace(wanted, restored_ns=0, surveys=())
 
     def on_wanted(self, listener: Callable[[WantedVersion], None]) -> Handle:
         """Call `listener`, on a thread of the bus, whenever the server wants another version."""

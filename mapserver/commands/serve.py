@@ -40,6 +40,7 @@ _END_WITHIN_S = 5.0  # additional limit for threads
 _SWITCH_INTERVAL_S = 0.001
 _RENEW_EVERY_S = 10.0
 _WARN_EVERY_S = 86_400.0
+_BUILD_EVERY_S = 60.0
 _LOOPBACK = frozenset({"127.0.0.1", "::1"})
 _INSECURE = "This server was started with --insecure. Anyone who can connect may read everything and change the maps of the robots."
 _OPEN_BUS = "This server was started with --insecure. Anyone who can connect to its bus may act as any robot."
@@ -218,6 +219,7 @@ def _run(
     from mapserver.api.version_routes import ApiSettings
     from mapserver.dashboard.install import install_dashboard
     from mapserver.fleet.fleet import Fleet
+    from mapserver.nightly.robot_drives import RobotDrives
     from mapserver.serving.background_tasks import (
         BackgroundTask,
         admission_tasks,
@@ -237,8 +239,11 @@ def _run(
     fleet = Fleet(maps, settings=settings.ingest)
     metrics = Metrics(maps, fleet, settings.alerts, certificate)
     webhook = None if settings.alerts.webhook is None else Webhook(settings.alerts)
-    bus_service = BusService(maps, fleet, bus, metrics.count_bus, robots)
+    drives = None if nights is None else RobotDrives(maps, nights)
+    bus_service = BusService(maps, fleet, bus, metrics.count_bus, robots, None if drives is None else drives.take)
     tasks = server_tasks(maps, fleet, bus_service, settings.canary)
+    if drives is not None:
+        tasks.append(BackgroundTask("building robots' drives", _BUILD_EVERY_S, drives.build))
 
     @asynccontextmanager
     async def lifespan(_: "FastAPI") -> AsyncIterator[None]:

@@ -111,7 +111,7 @@ def retention(
     config: ConfigFile = None,
     json: Json = False,
 ) -> None:
-    """Remove reports, pictures and recordings that are older than the periods of [ingest], as the nightly job does.
+    """Remove reports, pictures and recordings that are older than their periods, as the nightly job does.
 
     Versions of maps are removed by `gc`.
     """

@@ -1,5 +1,6 @@
 """The page of maps: what runs where (versions with state, the gate's word and robots), and what another version would change."""
 
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,6 +14,7 @@ from mapserver.dashboard.rendering import share, size
 from mapserver.drafting.area_corrections import waiting
 from mapserver.floor_plan.alignment import Alignment
 from mapserver.floor_plan.areas import Areas
+from mapserver.floor_plan.survey_requests import courses
 from mapserver.quality.directions import missing_words
 from mapserver.quality.figures import trusted_calibrations
 from mapserver.quality.gate import CHECKS
@@ -21,6 +23,7 @@ from mapserver.store import Event, VerdictRow, VersionInfo
 from mapserver.store.rows import SiteReleases
 
 _EVENTS_SHOWN = 50
+_COURSES_NS = 14 * 86_400_000_000_000
 _STATES = {
     "current": ("good", "current"),
     "draft": ("warn", "draft"),
@@ -100,10 +103,16 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         "waiting": _waiting(maps, site),
         "areas": sorted(maps.store.areas(site).areas, key=lambda area: area.name),
         "requests": requests,
+        "courses": courses((e.stamp_ns, e.kind, e.detail) for e in maps.store.events(site, _lately())),
         "kept": {"version": asked},
         "events": events if span_ns == EVER else maps.store.events(site, span_ns)[::-1][:_EVENTS_SHOWN],
         "no_events": "No events yet." if span_ns == EVER else "Nothing happened in this time.",
     }
+
+
+def _lately() -> tuple[int, int]:
+    now_ns = time.time_ns()
+    return now_ns - _COURSES_NS, now_ns
 
 
 def _waiting(maps: MapData, site: str) -> list[str]:

@@ -1,6 +1,7 @@
 """Operators' knowledge of a site's building: its named areas, and the pose of the map in its floor plan. Both are kept with the site."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from math import degrees
 
@@ -11,6 +12,7 @@ from fleetmap.encoding import to_json
 from fleetmap.errors import StateError, UsageError
 from fleetmap.geometry import Array
 from fleetmap.mapformat.building import ALIGNMENT, AREAS
+from mapserver.fleet.survey_requests import ask_for_survey
 from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment, map_corners_m
 from mapserver.floor_plan.areas import Area, Areas, Correction, CorrectionKind, read_areas
 from mapserver.floor_plan.pins import Fit, Pin, fit_pins
@@ -23,7 +25,8 @@ from mapserver.store.map_store import AREAS_BEFORE
 def keep_areas(
     store: MapStore, site: str, data: bytes | None, detail: str, actor: Actor, *, tag: str | None = None
 ) -> Areas:
-    """Replace the areas of a site by those of a GeoJSON file, or remove them (None); return them. detail: for the log.
+    """Replace the areas of a site by those of a GeoJSON file, or remove them (None); return them. detail: for the log. A survey
+    of new areas to forget is requested.
 
     tag: `areas_tag` of the areas that were looked at, None for any. UsageError for an unknown site, for invalid areas, for a mask
     outside of the map and a correction without a reason, ChangedError if somebody changed them since.
@@ -35,7 +38,12 @@ def keep_areas(
             check_masks_on_map(areas, store.manifest(site, current.version))
         data = _dated(data, areas, before, actor, store.now_ns())
     store.keep_site_files(site, {AREAS: data}, detail, actor=actor, areas_tag=tag)
-    return store.areas(site)
+    after, known = store.areas(site), {area.correction for area in before.corrections}
+    for area in after.corrections if current is not None else ():
+        if area.correction not in known and area.correction and area.correction.kind is CorrectionKind.FORGET:
+            with suppress(UsageError, StateError):  # too large or too many for requests: somebody surveys it
+                ask_for_survey(store, site, [(x, y) for x, y in area.rings[0].tolist()], actor)
+    return after
 
 
 def correct_area(store: MapStore, site: str, name: str, kind: CorrectionKind | None, actor: Actor) -> Areas:

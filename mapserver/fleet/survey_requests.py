@@ -8,7 +8,7 @@ import numpy as np
 from fleetmap.encoding import to_json
 from fleetmap.errors import StateError, UsageError
 from mapserver.floor_plan.areas import read_areas
-from mapserver.floor_plan.survey_requests import KIND, SurveyRequest
+from mapserver.floor_plan.survey_requests import ASKED, KIND, SurveyRequest
 from mapserver.store import Actor, MapStore
 
 MOST_REQUESTS, MOST_CORNERS = 100, 200
@@ -39,7 +39,8 @@ def ask_for_survey(store: MapStore, site: str, corners_map_m: Corners, actor: Ac
         raise UsageError(f"{sides_m[0]:.0f} x {sides_m[1]:.0f} m; draw several of at most {MOST_SIDE_M:g} m each way")
     made = SurveyRequest(hashlib.sha256(data).hexdigest()[:8], asked_ns, actor.name, actor.reason, ring)
     middle = np.array(ring).mean(axis=0)
-    words = f"asked for {area.size_m2:.0f} m2 around {middle[0]:.1f}, {middle[1]:.1f} m"
+    named = store.areas(site).at(*middle.tolist())
+    words = f"{ASKED}{f'{named}, ' if named else ''}{area.size_m2:.0f} m2 around {middle[0]:.1f}, {middle[1]:.1f} m"
     store.keep_site_files(site, {KIND + made.id: data}, words, actor=actor)
     return made
 

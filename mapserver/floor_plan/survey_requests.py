@@ -1,6 +1,7 @@
 """Polygons requested for a new survey, as stored for a site, and the covered share of one. Pure."""
 
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, field
 from typing import Any
 
 import msgspec
@@ -12,6 +13,9 @@ from fleetmap.geometry import Array, inside_rings
 
 KIND = "survey request "
 """Prefix of a request's kind among the files of a site; its id follows."""
+
+ASKED, DRIVEN, IN_USE = "asked for ", "driven by ", "done: version "
+"""How the entries of a request in the site's log begin."""
 
 COVERED_SHARE = 0.9
 """Covered share of a request's places above which it counts as surveyed."""
@@ -47,6 +51,35 @@ class SurveyRequest:
         """Return the share of places (K, 2) in the polygon within 2 m of a driven position (F, 2); 0 without places in it."""
         inside = places_map_m[inside_rings(places_map_m, [np.array(self.corners_map_m)])]
         return float(np.mean(near_drives(inside, driven_map_m))) if len(inside) else 0.0
+
+
+@dataclass(slots=True)
+class SurveyCourse:
+    """What became of a request: when it was made, driven by robots, and in use by a version; 0 if it was not yet."""
+
+    id: str
+    place: str = ""
+    asked_ns: int = 0
+    driven_ns: int = 0
+    robots: list[str] = field(default_factory=list)
+    used_ns: int = 0
+
+
+def courses(events: Iterable[tuple[int, str, str]]) -> list[SurveyCourse]:
+    """Return the courses of requests by a site's log, the latest first. events: time, kind and text, the oldest first."""
+    found: dict[str, SurveyCourse] = {}
+    for stamp_ns, kind, words in events:
+        if not kind.startswith(KIND):
+            continue
+        name = kind.removeprefix(KIND)
+        if words.startswith(ASKED):
+            found[name] = SurveyCourse(name, words.removeprefix(ASKED), stamp_ns)
+        elif (course := found.get(name)) is not None and words.startswith(DRIVEN):
+            course.driven_ns = course.driven_ns or stamp_ns
+            course.robots = sorted({*course.robots, words.removeprefix(DRIVEN)})
+        elif course is not None and words.startswith(IN_USE):
+            course.used_ns = stamp_ns
+    return list(found.values())[::-1]
 
 
 def near_drives(places_map_m: Array, driven_map_m: Array) -> NDArray[np.bool_]:

@@ -9,7 +9,7 @@ from fleetmap.encoding import to_plain
 from fleetmap.errors import StateError, UsageError
 from fleetmap.mapformat import decode_manifest, decode_tile
 from mapserver.fleet_statistics.canary_decision import threshold_for
-from mapserver.floor_plan.survey_requests import COVERED_SHARE, KIND
+from mapserver.floor_plan.survey_requests import COVERED_SHARE, IN_USE, KIND
 from mapserver.quality.figures import TRUSTED_KEY, TrustedCalibration, trusted_calibrations
 from mapserver.quality.gate import GateSettings, GateVerdict, judge
 from mapserver.releases import rules
@@ -180,7 +180,7 @@ def _end_surveyed(store: MapStore, site: str) -> None:
         shares = said if isinstance(said, dict) else {}
         for name in sorted(waiting & shares.keys()):
             if isinstance(shares[name], int | float) and shares[name] >= COVERED_SHARE:
-                words = f"done: version {version} surveyed {shares[name]:.0%} of its places"
+                words = f"{IN_USE}{version} surveyed {shares[name]:.0%} of its places"
                 store.keep_site_files(site, {KIND + name: None}, words)
                 waiting.discard(name)
         version = manifest.parent

@@ -8,13 +8,16 @@ import msgspec
 
 from fleetmap.bus import Bus, Handle
 from fleetmap.errors import FleetmapError, LinkError
+from fleetmap.failure_summary import ReplayPart
 from fleetmap.live_survey import LiveSurveyState, live_key
 from fleetmap.log_lines import LogLimit
 from fleetmap.mapformat import check_name
 from fleetmap.messages import (
+    FailureAck,
     PoseMessage,
     RobotAck,
     RobotHealth,
+    SurveyArea,
     decode_message,
     encode_message,
     part_of,
@@ -28,6 +31,7 @@ from mapserver.serving.live_surveys import LiveSurveys
 from mapserver.store import MapStore
 from mapserver.trust import SignedLists
 
+TakeDrive = Callable[[str, str, ReplayPart], FailureAck]
 Count = Callable[[str, str, int], None]
 """Counts for metrics: (what, "ok", "refused" or "dropped", bytes sent)."""
 
@@ -36,6 +40,7 @@ MAX_REPORT_BYTES = 16 << 10  # a complete health report has 3 kB, a pose 0.5 kB
 # A robot's limit of messages, at once and per second: health once a second, poses with every frame, an ack per version.
 RENEWAL_RATE = (5, 1 / 60)  # per robot: each costs a signature and a line in the log
 REPORT_RATES = {"ack": (20, 1.0), "health": (20, 4.0), "pose": (80, 60.0)}
+_MOST_AREAS = 20  # told to a robot, the oldest requests first
 _CACHED_BYTES = 64_000_000
 _ENTRY_BYTES = 200  # overhead of a cache entry, so that empty ones are limited too
 
@@ -46,8 +51,19 @@ class BusService:
     Bytes are sent in parts; the latest ones are cached in memory, because robots query the same ones at the same time.
     """
 
-    def __init__(self, store: MapStore, fleet: Fleet, bus: Bus, count: Count, guard: BusGuard | None = None) -> None:
-        """guard: of the enrolled robots, if only those may connect; None: no restriction."""
+    def __init__(
+        self,
+        store: MapStore,
+        fleet: Fleet,
+        bus: Bus,
+        count: Count,
+        guard: BusGuard | None = None,
+        take_drive: TakeDrive | None = None,
+    ) -> None:
+        """guard: of the enrolled robots, if only those may connect; None: no restriction. take_drive: receives a part of a robot's drive
+        through a requested area; None: this server has no inbox for them, and asks robots for none.
+        """
+        self._take_drive = take_drive
         self._guard = guard
         self._store = store
         self._fleet = fleet
@@ -140,7 +156,9 @@ class BusService:
     def _wanted(self, key: str, _: bytes) -> bytes:
         wanted = self._fleet.take_question(*self._sender(key))
         answer = self._lists.admitted_or_current(wanted)
-        return encode_message(msgspec.structs.replace(answer, restored_ns=self._restored_ns))
+        asked = () if self._take_drive is None else self._store.survey_requests(wanted.site)[:_MOST_AREAS]
+        surveys = tuple(SurveyArea(id=r.id, corners_map_m=[(x, y) for x, y in r.corners_map_m]) for r in asked)
+        return encode_message(msgspec.structs.replace(answer, restored_ns=self._restored_ns, surveys=surveys))
 
     def _failure(self, key: str, payload: bytes) -> bytes:
         site, robot = self._sender(key)
@@ -150,7 +168,13 @@ class BusService:
         return encode_message(ack)
 
     def _replay(self, key: str, payload: bytes) -> bytes:
-        return encode_message(self._fleet.replays.take(*self._sender(key), payload))
+        site, robot = self._sender(key)
+        part = decode_message(payload, ReplayPart)
+        if part.survey is None:
+            return encode_message(self._fleet.replays.take(site, robot, payload))
+        if self._take_drive is None:
+            return encode_message(FailureAck(id=part.id, refused="this server has no inbox for drives"))
+        return encode_message(self._take_drive(site, robot, part))
 
     def _manifest(self, key: str) -> bytes:
         site, _what, number = split_key(key)

@@ -129,6 +129,11 @@ class StoreQueries:
         finally:
             copy.close()
 
+    def log_event(self, site: str, kind: str, detail: str, *, actor: Actor = NOBODY) -> None:
+        """Write a line into a site's log."""
+        with self._transactions.write() as connection:
+            self._transactions.log(connection, site, LogEntry(kind, detail, None, actor))
+
     def note_restored(self, detail: str, ahead: int, actor: Actor) -> None:
         """Log the restoration of this store, and let its sites' versions go on `ahead` numbers later: the lost store gave the next ones."""
         with self._transactions.write() as connection:

@@ -13,6 +13,8 @@ from fleetmap.errors import RecordingError
 from fleetmap.mapformat.manifest import Name
 
 MAX_FILE_BYTES = 8 << 20
+MAX_DRIVE_BYTES = 48 << 20
+"""Largest size of the recording of a failure, and of a drive through a requested area."""
 _MAX_SUMMARY_BYTES, _MAX_MOMENTS = 512 << 10, 2000
 
 Text = Annotated[str, msgspec.Meta(max_length=64)]
@@ -20,12 +22,16 @@ Stamp = Annotated[int, msgspec.Meta(ge=-(1 << 62), le=1 << 62)]
 
 
 class ReplayPart(msgspec.Struct, frozen=True, kw_only=True):
-    """Part of a failure's recording in transfer, from offset on; total_bytes: of the whole recording; id: of its report."""
+    """Part of a recording in transfer, from offset on; total_bytes: of the whole recording.
+
+    id: of the failure's report, or a drive's own; survey: the request that the drive is for, None for a failure's.
+    """
 
     id: Text
     total_bytes: Annotated[int, msgspec.Meta(ge=1, le=1 << 40)]
     offset: Annotated[int, msgspec.Meta(ge=0, le=1 << 40)]
     data: bytes
+    survey: Text | None = None
 
 
 class Moment(msgspec.Struct, frozen=True, array_like=True):

@@ -113,16 +113,25 @@ class Part(msgspec.Struct, frozen=True, kw_only=True):
     data: bytes
 
 
+class SurveyArea(msgspec.Struct, frozen=True, kw_only=True):
+    """An area of which operators want a new survey: a polygon in `map`, metres, its first corner not repeated at the end."""
+
+    id: Name
+    corners_map_m: Annotated[list[tuple[float, float]], msgspec.Meta(min_length=3, max_length=200)]
+
+
 class WantedVersion(msgspec.Struct, frozen=True, kw_only=True):
     """Version that a robot should run; None while the site has none.
 
-    restored_ns, in the answer to a question: when the server's store was last restored from a backup, 0 if never.
+    In the answer to a question, restored_ns: when the server's store was last restored from a backup, 0 if never; surveys: the areas that
+    robots may survey, the oldest requests.
     """
 
     site: Name
     version: Version | None
     manifest_sha256: str | None
     restored_ns: int = 0
+    surveys: Annotated[tuple[SurveyArea, ...], msgspec.Meta(max_length=20)] = ()
 
 
 class InitialPoseMessage(msgspec.Struct, frozen=True, kw_only=True):

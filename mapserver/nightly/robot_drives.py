@@ -1,0 +1,102 @@
+"""Drives of robots through requested areas: received in parts, into the inbox of their site, where they are surveys like any other."""
+
+import logging
+import re
+import threading
+from dataclasses import dataclass
+
+from fleetmap.errors import FleetmapError, LinkError, StateError, UsageError
+from fleetmap.failure_summary import MAX_DRIVE_BYTES, ReplayPart
+from fleetmap.messages import FailureAck
+from mapserver.fleet.rate_limit import RateLimit
+from mapserver.floor_plan.survey_requests import DRIVEN, KIND
+from mapserver.nightly.inbox import arrivals
+from mapserver.nightly.upload import Upload
+from mapserver.serving.night_runs import SETTLE_S, NightRuns
+from mapserver.store import Actor, MapStore
+
+# A robot hands in two drives for each request; one that always begins anew fills no disk.
+DRIVE_BURST, DRIVES_PER_S = 6, 1 / 1200
+_MOST_AT_ONCE = 4
+_IDLE_NS = 120_000_000_000
+_ID = re.compile(r"[0-9a-f]{8,32}")
+_DRIVE = re.compile(r"survey-[0-9a-f]{8}-[a-z0-9_-]+-[0-9a-f]{8,32}\.mcap")
+_log = logging.getLogger(__name__)
+
+
+@dataclass(slots=True)
+class _Drive:
+    id: str
+    total_bytes: int
+    upload: Upload
+    heard_ns: int
+
+
+class RobotDrives:
+    """Receives parts in order, and starts a night once a drive is in. Methods may be called from any thread."""
+
+    def __init__(self, store: MapStore, nights: NightRuns) -> None:
+        self._store, self._nights, self._lock = store, nights, threading.Lock()
+        self._drives: dict[tuple[str, str], _Drive] = {}
+        self._rates = RateLimit(DRIVE_BURST, DRIVES_PER_S, store.now_ns)
+
+    def take(self, site: str, robot: str, part: ReplayPart) -> FailureAck:
+        """Return the received length of a drive; a permanent refusal is in the answer. LinkError if the robot must retry later."""
+        if not _ID.fullmatch(part.id) or part.total_bytes > MAX_DRIVE_BYTES:
+            return FailureAck(id=part.id, refused=f"not a drive of at most {MAX_DRIVE_BYTES} bytes")
+        if part.survey not in {request.id for request in self._store.survey_requests(site)}:
+            return FailureAck(id=part.id, refused="its survey is not requested any more")
+        with self._lock:
+            drive = self._drive(site, robot, part)
+            if drive is None:
+                return FailureAck(id=part.id)  # begin again
+            try:
+                if part.offset == drive.upload.size_bytes:
+                    drive.upload.write(part.data[: part.total_bytes - part.offset])
+                drive.heard_ns = self._store.now_ns()
+                if drive.upload.size_bytes < drive.total_bytes:
+                    return FailureAck(id=part.id, received_bytes=drive.upload.size_bytes)
+                drive.upload.end()
+                self._drop((site, robot))  # closes the file, which has its name now
+            except (StateError, UsageError) as error:
+                self._drop((site, robot))
+                return FailureAck(id=part.id, refused=str(error)[:2000])
+        who = Actor(robot, f"{drive.total_bytes / 1e6:.1f} MB")
+        self._store.log_event(site, f"{KIND}{part.survey}", f"{DRIVEN}{robot}", actor=who)
+        return FailureAck(id=part.id, received_bytes=part.total_bytes)
+
+    def build(self) -> None:
+        """Start a night of a site whose inbox has a complete drive, unless one runs. The night judges and publishes as always."""
+        for inbox in sorted(self._nights.inbox.glob("*")):
+            if any(_DRIVE.fullmatch(path.name) for path in arrivals(inbox, SETTLE_S, self._store.now_ns()).complete):
+                try:
+                    self._nights.start(inbox.name)
+                except StateError as error:
+                    _log.info("robots' drives at %s wait: %s", inbox.name, error)
+
+    def _drive(self, site: str, robot: str, part: ReplayPart) -> _Drive | None:
+        """Return the drive that a part belongs to, None to begin it again. The caller holds the lock."""
+        now_ns, key = self._store.now_ns(), (site, robot)
+        drive = self._drives.get(key)
+        if drive is not None and (drive.id, drive.total_bytes) == (part.id, part.total_bytes):
+            return drive
+        for other in [k for k, each in self._drives.items() if k == key or abs(now_ns - each.heard_ns) > _IDLE_NS]:
+            self._drop(other)
+        if part.offset:
+            return None
+        if len(self._drives) >= _MOST_AT_ONCE:
+            raise LinkError(f"later: {_MOST_AT_ONCE} robots are already handing in drives")
+        if not self._rates.admits(key):
+            raise LinkError(
+                f"later: robot {robot[:80]!r} handed in {DRIVE_BURST} drives; now one in twenty minutes is accepted"
+            )
+        inbox, name = self._nights.inbox / site, f"survey-{part.survey}-{robot}-{part.id}.mcap"
+        try:
+            self._drives[key] = _Drive(part.id, part.total_bytes, Upload(inbox, name, part.total_bytes), now_ns)
+        except FleetmapError as error:
+            raise LinkError(f"later: {error}") from error
+        return self._drives[key]
+
+    def _drop(self, key: tuple[str, str]) -> None:
+        if (drive := self._drives.pop(key, None)) is not None:
+            drive.upload.discard()

@@ -1,0 +1,100 @@
+"""Drives that robots hand in: bounded, wanted, and in the inbox as a whole."""
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from fleetmap.errors import LinkError, StateError
+from fleetmap.failure_summary import MAX_DRIVE_BYTES, ReplayPart
+from mapserver.fleet.survey_requests import ask_for_survey, end_request
+from mapserver.floor_plan.survey_requests import courses
+from mapserver.nightly import robot_drives
+from mapserver.nightly.robot_drives import RobotDrives
+from mapserver.store import Actor, MapStore
+from support.fleet.dashboard_scene import SITE, fill_store
+
+ADA = Actor("ada", "new racks")
+AISLE = [(14.0, 2.0), (20.0, 2.0), (20.0, 10.0), (14.0, 10.0)]
+DATA = bytes(range(256)) * 40
+
+
+class Scene:
+    def __init__(self, folder: Path) -> None:
+        fill_store(folder / "store")
+        self.store, self.inbox, self.started = MapStore.open(folder / "store"), folder / "inbox", list[str]()
+        self.request = ask_for_survey(self.store, SITE, AISLE, ADA).id
+        nights: Any = SimpleNamespace(inbox=self.inbox, start=self._start)
+        self.drives = RobotDrives(self.store, nights)
+
+    def _start(self, site: str) -> None:
+        self.started.append(site)
+        raise StateError("a build runs already")
+
+    def send(
+        self, robot: str = "r1", name: str = "ab12ab12", *, data: bytes = DATA, until: int = 1 << 30, **other: object
+    ):
+        """Parts of 4 kB, the answers' lengths or the refusal."""
+        lengths: list[int | str] = []
+        for offset in range(0, min(len(data), until), 4096):
+            fields = {"survey": self.request, "total_bytes": len(data)} | other
+            part = ReplayPart(id=name, offset=offset, data=data[offset : offset + 4096], **fields)  # type: ignore[arg-type]
+            ack = self.drives.take(SITE, robot, part)
+            lengths.append(ack.refused or ack.received_bytes)
+        return lengths
+
+    def arrived(self) -> list[str]:
+        return sorted(path.name for path in self.inbox.rglob("*") if path.is_file())
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Scene:
+    return Scene(tmp_path)
+
+
+def test_a_drive_lands_whole_and_is_built(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert scene.send(until=4096) == [4096]
+    scene.drives.build()
+    assert (scene.arrived(), scene.started) == ([f".survey-{scene.request}-r1-ab12ab12.mcap.upload.part"], [])
+    assert scene.send() == [4096, 8192, len(DATA)], "a part that comes twice changes nothing"
+    assert scene.arrived() == [f"survey-{scene.request}-r1-ab12ab12.mcap"]
+    assert (scene.inbox / SITE / scene.arrived()[0]).read_bytes() == DATA
+    monkeypatch.setattr(robot_drives, "SETTLE_S", 0.0)
+    (scene.inbox / SITE / "drive.mcap").write_bytes(b"of an operator: waits for the night")
+    scene.drives.build()
+    assert scene.started == [SITE]
+    (course,) = courses((e.stamp_ns, e.kind, e.detail) for e in scene.store.events(SITE))
+    assert (course.robots, course.driven_ns > course.asked_ns, course.used_ns) == (["r1"], True, 0)
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"survey": "00000000"}, "not requested"),
+        ({"name": "../../x"}, "not a drive"),
+        ({"total_bytes": MAX_DRIVE_BYTES + 1}, "not a drive"),
+    ],
+)
+def test_what_nobody_asked_for_is_refused(scene: Scene, fields: dict[str, Any], words: str) -> None:
+    assert words in str(scene.send(**fields)[0])
+    assert scene.arrived() == []
+
+
+def test_a_closed_request_takes_no_more(scene: Scene) -> None:
+    scene.send(until=4096)
+    end_request(scene.store, SITE, scene.request, ADA)
+    assert "not requested any more" in str(scene.send()[0])
+
+
+def test_robots_are_bounded(scene: Scene) -> None:
+    for number in range(robot_drives.DRIVE_BURST):
+        scene.send(name=f"{number:08x}")
+    with pytest.raises(LinkError, match="one in twenty minutes"):
+        scene.send(name="ffffffff")
+    for number in range(4):
+        scene.send(f"s{number}", until=4096)
+    with pytest.raises(LinkError, match="4 robots"):
+        scene.send("s4", until=4096)
+    begun_again = ReplayPart(id="cdcdcdcd", total_bytes=9999, offset=4096, data=b"x", survey=scene.request)
+    assert scene.drives.take(SITE, "s9", begun_again).received_bytes == 0
