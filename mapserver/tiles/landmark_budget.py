@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.features.matching import packed
 from fleetmap.geometry import Array, se3_inverse
+from mapserver.survey.merge.landmark_persistence import PRIOR_COUNT
 from mapserver.survey.settings import BudgetSettings
-from mapserver.survey.survey_map import SurveyMap
+from mapserver.survey.survey_map import SurveyMap, history_of
 
 # An object differs from its identical copy by about 30 bits, two objects by 128; copies have the same height on the same floor.
 _ALIKE_BITS, _HEIGHT_M = 60, 0.15
@@ -144,8 +145,8 @@ def _views(survey: SurveyMap, sightings: Sequence[Sighting]) -> tuple[NDArray[np
 def _weights(survey: SurveyMap, map_from_cam: Array) -> Array:
     """Return (N,) weights: probability that a landmark is seen again, times its information.
 
-    Laplace's rule for n - 1 repeated observations; up to twice that for views 20 degrees apart; less the more pixels its own
-    uncertainty spans.
+    The share of looks in which later surveys saw it, with some looks at the rate of all by Laplace's rule for n - 1 repeated
+    observations; up to twice that for views 20 degrees apart; less the more pixels its own uncertainty spans.
     """
     landmark, count = survey.obs_landmark, len(survey.landmark_ids)
     seen = np.bincount(landmark, minlength=count)
@@ -159,7 +160,10 @@ def _weights(survey: SurveyMap, map_from_cam: Array) -> Array:
     nearest_m = np.full(count, np.inf)
     np.minimum.at(nearest_m, landmark, distances_m)
     sigma_px = survey.camera.focal_px * survey.point_sigma_m / nearest_m
-    found = seen / (seen + 1.0)
+    history = history_of(survey)
+    rate = history.landmark_seen.sum() / max(history.landmark_expected.sum(), 1) or 1.0
+    again = history.landmark_seen + PRIOR_COUNT * rate * seen / (seen + 1.0)
+    found = again / (history.landmark_expected + PRIOR_COUNT)
     return np.asarray(found * (1.0 + np.minimum(2 * spread / _WIDE_RAD, 1.0)) / (1.0 + sigma_px**2))
 
 

@@ -16,7 +16,7 @@ from mapserver.survey.merge.guided_matching import Sighting, keyframe_features
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Keyframe
 
-_PRIOR_COUNT = 4.0  # weight of the survey's overall rate, in observations, for a landmark without history
+PRIOR_COUNT = 4.0  # weight of the survey's overall rate, in observations, for a landmark without history
 _AGAINST = 7.815  # 0.95 of chi-square with 3 degrees of freedom: an observation that contradicts a position
 _DOUBTED, _SETTLED = 0.5, 0.8  # shares of sightings: against the old position, for the new one
 _MIN_SIGHTINGS = 3  # below, a landmark's position is not judged
@@ -67,7 +67,7 @@ def faded(base: BaseMap, counts: LandmarkCounts, settings: SurveySettings) -> ND
     """
     history, missed = base.history, missed_since(base, counts)
     before = history.landmark_expected.astype(np.float64) - history.landmark_missed
-    chance = (history.landmark_seen + _PRIOR_COUNT * counts.rate) / (before + _PRIOR_COUNT)
+    chance = (history.landmark_seen + PRIOR_COUNT * counts.rate) / (before + PRIOR_COUNT)
     chance = np.clip(chance, 0.0, 0.95)
     gone = missed * np.log1p(-settings.sessions.look_weight * chance) < np.log(settings.sessions.fade_probability)
     return np.asarray(gone & (missed > 1))

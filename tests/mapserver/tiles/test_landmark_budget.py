@@ -10,7 +10,7 @@ from fleetmap import core
 from fleetmap.geometry import se3_exp
 from fleetmap.mapformat import encode_tile
 from mapserver.survey.settings import BudgetSettings
-from mapserver.survey.survey_map import SurveyMap
+from mapserver.survey.survey_map import SurveyMap, history_of
 from mapserver.tiles.landmark_budget import choose_landmarks, covered_path_m, distinctive_landmarks
 from mapserver.tiles.tiling import tiles_from_survey
 from support.storage.map_samples import random_survey
@@ -149,6 +149,22 @@ def test_the_same_way_again_adds_no_budget_and_the_way_back_does() -> None:
     tilt = se3_exp(np.array([0.0, np.pi / 2, 0.0, 0.0, 0.0, 0.0]))  # the camera looks along x, and back
     there_and_back = np.concatenate([survey.map_from_body, turned]) @ tilt
     assert covered_path_m(replace(survey, map_from_body=there_and_back, body_from_cam=np.eye(4))) > 1.8 * once_m
+
+
+def test_what_later_surveys_found_again_comes_before_what_they_missed() -> None:
+    """The nights looked twenty times for every landmark, and found every second one seldom."""
+    survey = random_survey(np.random.default_rng(8), keyframes=20, landmarks=600)
+    first = choose_landmarks(survey, exactly(150), 16.0)
+    is_often = np.arange(600) % 2 == 0
+    looks = np.full(600, 20, np.uint32)
+    seen = np.where(is_often, 16, 1).astype(np.uint32)
+    known = replace(history_of(survey), landmark_expected=looks, landmark_seen=seen)
+    later = choose_landmarks(replace(survey, history=known), exactly(150), 16.0)
+    assert first.sum() == later.sum() == 150
+    assert (first & is_often).sum() < 90
+    assert (later & is_often).sum() > 110
+    alike = replace(known, landmark_seen=looks // 2)  # says nothing of one against another
+    assert (choose_landmarks(replace(survey, history=alike), exactly(150), 16.0) & first).sum() > 100
 
 
 def test_what_is_published_is_kept_first() -> None:
