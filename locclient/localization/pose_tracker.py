@@ -249,8 +249,8 @@ class PoseTracker:
     def _is_at(self, known: PoseHypothesis | None, fix: Fix, at: PoseHypothesis) -> bool:
         if known is None or fix.inliers < self._settings.fix.min_inliers:
             return False
-        poses = at.now_map_from_body, at.now_cov, known.now_map_from_body, known.now_cov
-        return innovation_of(*poses)[1] <= self._track.innovation_limit
+        _, innovation = innovation_of(at.now_map_from_body, at.now_cov, known.now_map_from_body, known.now_cov)
+        return innovation <= self._track.innovation_limit
 
     def _at_body(self, fix: Fix) -> tuple[Array, Array]:
         """Return a fix as map_from_body with its covariance (map axes, about the body)."""
