@@ -1,7 +1,7 @@
 """The report as text and tables, for the page and the PDF."""
 
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,8 +45,8 @@ def sections(report: Report) -> list[Section]:
         _coverage(areas),
         _errors(report, areas),
         _starts(areas),
-        _ladder("Less light", "stops", _DARK, [(area, area.darkness) for area in areas]),
-        _ladder("Blur", "px", _BLUR, [(area, area.blur) for area in areas]),
+        _ladder("Less light", lambda stops: f"light / {2**stops}", _DARK, [(area, area.darkness) for area in areas]),
+        _ladder("Blur", lambda length: f"{length} px", _BLUR, [(area, area.blur) for area in areas]),
         _similar(report),
         _calibrations(report),
         _incidents(report),
@@ -140,14 +140,16 @@ def _starts(areas: Sequence[AreaFigures]) -> Section:
     )
 
 
-def _ladder(title: str, unit: str, words: str, ladders: Sequence[tuple[AreaFigures, Mapping[str, Count]]]) -> Section:
+def _ladder(
+    title: str, named: Callable[[int], str], words: str, ladders: Sequence[tuple[AreaFigures, Mapping[str, Count]]]
+) -> Section:
     levels = sorted({level for _, ladder in ladders for level in ladder}, key=int)
     rows = [
         (area.name, area.frames.text, *(ladder.get(level, Count()).text for level in levels))
         for area, ladder in ladders
         if area.frames.tries
     ]
-    return Section(title, [words], header=("area", "as it is", *(f"{level} {unit}" for level in levels)), rows=rows)
+    return Section(title, [words], header=("area", "as it is", *(named(int(level)) for level in levels)), rows=rows)
 
 
 def _similar(report: Report) -> Section:

@@ -2,7 +2,7 @@
 
 import os
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -10,6 +10,7 @@ from functools import partial
 import numpy as np
 
 from fleetmap.geometry import Array
+from fleetmap.relocalization.map_view import MapView
 from mapserver.acceptance.document import drawn
 from mapserver.acceptance.drives import Drive, DriveRequest, MapUnderTest, checked, examined, replayed
 from mapserver.acceptance.figures import UNKNOWN_PLACE, AreaFigures, Count, Incidents, Report, Similar
@@ -35,6 +36,10 @@ _ASSUMPTIONS = [
 ]
 
 
+Where = Callable[[Array], str]
+"""Names the area of a place (2,) in `map`."""
+
+
 @dataclass(frozen=True)
 class _Square:
     """The places of an area, for `tile_directions`."""
@@ -48,7 +53,8 @@ def examine(
     maps: MapStore, site: str, version: int, drives: Sequence[DriveRequest], promises: Sequence[str]
 ) -> tuple[Report, bytes]:
     """Return the figures of a version, without verdict, and a picture. promises: the operator's statements about the robots."""
-    under_test, named = MapUnderTest.of(maps, site, version), maps.areas(site)
+    under_test = MapUnderTest.of(maps, site, version)
+    where = partial(area_name, maps.areas(site), under_test.manifest.tile_size_m)
     with single_threaded_libraries(), ThreadPoolExecutor(os.cpu_count()) as pool:
         begun = [
             (request, pool.submit(replayed, request, under_test), pool.submit(checked, request)) for request in drives
@@ -58,7 +64,7 @@ def examine(
         ]
         probes = [picture.probe for drive in found for picture in drive.pictures]
         probes = [probes[n] for n in spread(np.arange(len(probes)), PROBES)]
-        alike = similar(under_test, named, probes)
+        alike = similar(under_test.view, where, probes)
     known = [] if under_test.built is None else under_test.built.calibrations
     judged = maps.evidence(site, version)
     built = [] if judged is None else judged.calibrations or []
@@ -71,7 +77,7 @@ def examine(
         manifest_sha256=maps.version(site, version).manifest_sha256,
         created=under_test.manifest.created,
         promises=list(promises),
-        areas=areas_of(under_test, named, found),
+        areas=areas_of(under_test.view, where, found),
         drives=[drive.figures for drive in found],
         similar=alike,
         similar_of=len(probes),
@@ -85,7 +91,7 @@ def examine(
     return report, drawn(under_test.view.map_from_cam[:, :2, 3], starts)
 
 
-def _area_name(named: Areas, size_m: float, place_m: Array) -> str:
+def area_name(named: Areas, size_m: float, place_m: Array) -> str:
     """Return the area of a place (2,) in `map`, NaN if unknown; its tile outside of all areas."""
     if not np.isfinite(place_m).all():
         return UNKNOWN_PLACE
@@ -93,13 +99,12 @@ def _area_name(named: Areas, size_m: float, place_m: Array) -> str:
     return named.at(float(place_m[0]), float(place_m[1])) or f"tile {x},{y}"
 
 
-def similar(under_test: MapUnderTest, named: Areas, probes: Sequence[Probe]) -> list[Similar]:
+def similar(view: MapView, where: Where, probes: Sequence[Probe]) -> list[Similar]:
     """Return the areas of which frames fit other places, too, the most alike first."""
-    where = partial(_area_name, named, under_test.manifest.tile_size_m)
     recalls: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
     for probe in probes:
         pair: dict[tuple[str, str], float] = {}
-        for fix in aliases(under_test.view, probe):
+        for fix in aliases(view, probe):
             names = where(probe.map_from_cam[:2, 3]), where(fix.map_from_cam[:2, 3])
             pair[names] = max(pair.get(names, 0.0), fix.landmark_recall)
         for names, recall in pair.items():
@@ -108,12 +113,11 @@ def similar(under_test: MapUnderTest, named: Areas, probes: Sequence[Probe]) -> 
     return sorted(found, key=lambda alike: (-alike.frames, alike.area, alike.other))
 
 
-def areas_of(under_test: MapUnderTest, named: Areas, drives: Sequence[Drive]) -> list[AreaFigures]:
+def areas_of(view: MapView, where: Where, drives: Sequence[Drive]) -> list[AreaFigures]:
     """Return the figures of each area with places of the map or of a drive, by name."""
-    where = partial(_area_name, named, under_test.manifest.tile_size_m)
     places: defaultdict[str, list[Array]] = defaultdict(list)
     figures: dict[str, AreaFigures] = {}
-    for place in under_test.view.map_from_cam:
+    for place in view.map_from_cam:
         places[where(place[:2, 3])].append(place)
     squares = [_Square(n, 0, np.array(of_area)) for n, of_area in enumerate(places.values())]
     seen = {found.tile[0]: found for found in tile_directions(squares)}

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from fleetmap.sensors.samples import CameraFrame, Image
@@ -59,11 +60,13 @@ def ladders(frame: CameraFrame, seed: int) -> dict[str, Iterator[tuple[int, Came
     return {"darkness": dark(), "blur": blur()}
 
 
-def darkest_grey(levels: Array, is_fixed: Array) -> float | None:
-    """Return the highest grey level up to which less than half of pictures gave a fix; None if those of every level did.
+def darkest_grey(levels: Array, is_fixed: NDArray[np.bool_]) -> float | None:
+    """Return the grey level that best divides pictures without a fix, up to it, from those with one; None if no level does.
 
     levels (N,): median grey level of each picture, darkened ones included; is_fixed (N,).
     """
     order = np.argsort(levels, kind="stable")
-    below = np.cumsum(is_fixed[order]) < 0.5 * np.arange(1, len(order) + 1)
-    return float(levels[order][np.flatnonzero(below)[-1]]) if below.any() else None
+    fixed_below = np.concatenate([[0], np.cumsum(is_fixed[order])])
+    missed_above = (~is_fixed).sum() - np.concatenate([[0], np.cumsum(~is_fixed[order])])
+    cut = int(np.argmin(fixed_below + missed_above))
+    return float(levels[order][cut - 1]) if cut else None

@@ -2,13 +2,17 @@
 
 import io
 from collections.abc import Sequence
+from pathlib import Path
 from xml.sax.saxutils import escape
 
+import matplotlib as mpl
 from reportlab.lib import colors
 from reportlab.lib.pagesizes import A4
 from reportlab.lib.styles import getSampleStyleSheet
 from reportlab.lib.units import mm
 from reportlab.lib.utils import ImageReader
+from reportlab.pdfbase import pdfmetrics
+from reportlab.pdfbase.ttfonts import TTFont
 from reportlab.platypus import Flowable, Image, ListFlowable, Paragraph, SimpleDocTemplate, Spacer, Table, TableStyle
 
 from mapserver.acceptance.document import Section
@@ -18,6 +22,12 @@ _MARGIN = 18 * mm
 _WIDTH = A4[0] - 2 * _MARGIN
 _INK = {True: colors.HexColor("#14924b"), False: colors.HexColor("#d1342f")}
 _STYLES = getSampleStyleSheet()
+_TTF = Path(mpl.get_data_path()) / "fonts" / "ttf"  # the standard fonts of a PDF have Western letters only
+for _name, _file in (("DejaVu", "DejaVuSans.ttf"), ("DejaVu-Bold", "DejaVuSans-Bold.ttf")):
+    pdfmetrics.registerFont(TTFont(_name, _TTF / _file))
+for _style, _font in (("BodyText", "DejaVu"), ("Heading2", "DejaVu-Bold"), ("Heading3", "DejaVu-Bold")):
+    _STYLES[_style].fontName, _STYLES[_style].keepWithNext = _font, int(_style != "BodyText")
+_STYLES["BodyText"].fontSize = 8.5
 _LOOK = TableStyle(
     [
         ("LINEBELOW", (0, 0), (-1, -1), 0.25, colors.HexColor("#d1d5db")),
@@ -30,12 +40,13 @@ _LOOK = TableStyle(
 def pdf(report: Report, shown: Sequence[Section], picture: bytes) -> bytes:
     """Return the report as a PDF; equal reports give equal bytes."""
     width, height = ImageReader(io.BytesIO(picture)).getSize()
+    scale = min(1.0, 0.6 * width / height)
     story: list[Flowable] = [
         _text(report.verdict, "Heading2", _INK[report.is_accepted]),
         _text(
             f"Acceptance report of {report.site}, version {report.version} of {report.created} (manifest {report.manifest_sha256[:12]})."
         ),
-        Image(io.BytesIO(picture), _WIDTH, _WIDTH * height / width),
+        Image(io.BytesIO(picture), _WIDTH * scale, _WIDTH * scale * height / width),
     ]
     for section in shown:
         story.append(_text(section.title, "Heading3"))
@@ -56,7 +67,7 @@ def pdf(report: Report, shown: Sequence[Section], picture: bytes) -> bytes:
 
 
 def _text(words: str, style: str = "BodyText", color: colors.Color | None = None, *, bold: bool = False) -> Paragraph:
-    inner = f"<b>{escape(words)}</b>" if bold else escape(words)
+    inner = f'<font name="DejaVu-Bold">{escape(words)}</font>' if bold else escape(words)
     return Paragraph(inner if color is None else f'<font color="{color.hexval()}">{inner}</font>', _STYLES[style])
 
 

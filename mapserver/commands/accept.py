@@ -26,7 +26,10 @@ class AcceptOptions(SiteOptions):
     out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for acceptance.html, .pdf, .json and .sig.")]
     version: Annotated[int | None, typer.Option(min=1, help="Version to judge; default: the current one.")] = None
     before: Annotated[
-        str | None, typer.Option(metavar="N|FILE.json", help="Compare with version N, or with an earlier report.")
+        str | None,
+        typer.Option(
+            metavar="EARLIER", help="Compare with an earlier version (its number) or report (its acceptance.json)."
+        ),
     ] = None
     frames: Annotated[str, typer.Option(metavar="A:B:C", help="Slice of the frames of each drive.")] = ":"
     calibration: Calibration = None

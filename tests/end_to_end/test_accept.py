@@ -1,0 +1,53 @@
+"""The acceptance report by its command: of the rendered room, with its signature and a comparison with itself."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from mapserver.cli import app as mapserver_app
+from mapserver.store import MapStore
+from mapserver.trust import init_here
+from support.room_site import RoomSite, invoke, run
+
+
+def test_a_room_is_accepted_signed_and_equal_to_itself(site: RoomSite, tmp_path: Path) -> None:
+    with MapStore.open(site.store) as store:
+        init_here(store)
+    outs = [tmp_path / name for name in ("one", "two")]
+    for out, more in zip(outs, ([], ["--before", outs[0] / "acceptance.json"]), strict=True):
+        out.mkdir()
+        told = invoke(mapserver_app, "accept", site.robot, "--site", "lab", "--store", site.store, "--out", out, *more)
+        assert told.exit_code in (0, 1), told.output
+        first = told.output.splitlines()[0]
+        report = json.loads((out / "acceptance.json").read_text())
+        assert first == report["verdict"]
+        assert first.startswith("ACCEPTED" if told.exit_code == 0 else "NOT ACCEPTED")
+        assert first in (out / "acceptance.html").read_text()
+        assert (out / "acceptance.pdf").read_bytes().startswith(b"%PDF")
+        assert "unchanged" in run(mapserver_app, "trust", "verify", out, "--store", site.store)
+    replay = site.replay(tmp_path)
+    (drive,) = report["drives"]
+    for name in ("median", "p95", "p99", "max"):
+        assert drive["errors_mm"][name] == pytest.approx(1e3 * replay["error_m"][name], abs=0.02)
+    assert (drive["failures"], drive["silent"]) == (replay["position_failures"], replay["silent_failures"])
+    assert sum(area["starts"]["found"] for area in report["areas"]) >= 0.9 * sum(
+        sum(area["starts"].values()) for area in report["areas"]
+    )
+    assert sum(area["starts"]["silent"] for area in report["areas"]) == 0
+    assert sum(area["frames"]["hits"] for area in report["areas"]) >= 0.9 * sum(
+        area["frames"]["tries"] for area in report["areas"]
+    )
+    assert report["better"] == report["worse"] == []
+    assert report["areas"] == json.loads((outs[0] / "acceptance.json").read_text())["areas"]  # the same bytes
+    (out / "acceptance.json").write_text("{}")
+    assert invoke(mapserver_app, "trust", "verify", out, "--store", site.store).exit_code != 0
+
+
+def test_an_earlier_report_that_is_none_and_a_folder_that_is_missing_are_named(site: RoomSite, tmp_path: Path) -> None:
+    (tmp_path / "x.json").write_text("{}")
+    given = ["accept", site.robot, "--site", "lab", "--store", site.store]
+    assert "is no acceptance report" in str(
+        invoke(mapserver_app, *given, "--out", tmp_path, "--before", tmp_path / "x.json").exception
+    )
+    assert "does not exist" in str(invoke(mapserver_app, *given, "--out", tmp_path / "none").exception)

@@ -1,0 +1,199 @@
+"""Sites that must fail are told so in the first line, by the figures of maps and frames without pictures; and what a change made better."""
+
+import copy
+
+import msgspec
+import numpy as np
+import pytest
+
+from fleetmap.geometry import Array, se3, so3_exp
+from mapserver.acceptance.document import drawn, sections
+from mapserver.acceptance.drives import Drive, Picture, Start
+from mapserver.acceptance.examine import area_name, areas_of, similar
+from mapserver.acceptance.figures import Count, DriveFigures, Incidents, Report
+from mapserver.acceptance.ladders import BLUR_PX, STOPS
+from mapserver.acceptance.pdf import pdf
+from mapserver.acceptance.verdict import KNOWN_STARTS, ONE_WAY, compared, judged
+from mapserver.dashboard.acceptance_page import html_page
+from mapserver.floor_plan.areas import Area, Areas
+from mapserver.quality.figures import Evidence, RigEvidence, SurveyedViews
+from mapserver.quality.gate import GateSettings
+from mapserver.quality.probes import Probe, aliases, relocalized
+from support.worlds.aisle_world import BODY_FROM_CAM, CAMERA, Aisle, aisle, drive, frame, relocalizer
+
+LANE_M = 12.0
+BACK = se3(so3_exp(np.array([0.0, 0.0, np.pi])), np.zeros(3))
+DARK = 12.0
+CALIBRATION = RigEvidence("rig", ["metric scale"])
+HALVES = Areas.of([Area(name, (box,)) for name, box in (
+    ("aisle 1", np.array([[-9.0, -2.0], [40.0, -2.0], [40.0, 6.0], [-9.0, 6.0]])),
+    ("aisle 2", np.array([[-9.0, 6.0], [40.0, 6.0], [40.0, 18.0], [-9.0, 18.0]])),
+)])  # fmt: skip
+
+
+def both(first: Aisle, second: Aisle) -> Aisle:
+    return Aisle(
+        *(
+            np.concatenate(pair)
+            for pair in zip(*((a.points_map, a.descriptors, a.reaches_m) for a in (first, second)), strict=True)
+        )
+    )
+
+
+def report(seen: Aisle, surveyed: Array, driven: Array, *, dark: str = "") -> Report:
+    """Of a site with two aisles: frames along `driven`, in the map of a survey along `surveyed`. dark: an aisle in which frames show nothing."""
+    rng, view = np.random.default_rng(3), relocalizer(seen, surveyed)[0].view
+
+    def where(place_m: Array) -> str:
+        return area_name(HALVES, 20.0, place_m)
+
+    pictures, starts = [], []
+    for place in driven:
+        map_from_cam = place @ BODY_FROM_CAM
+        is_dark = where(place[:2, 3]) == dark
+        shown = frame(aisle(99, count=1200) if is_dark else seen, place, rng)
+        probe = Probe(CAMERA, shown, map_from_cam)
+        fix = relocalized(view, probe, map_from_cam)
+        error_m = None if fix is None else float(np.linalg.norm(fix.map_from_cam[:3, 3] - map_from_cam[:3, 3]))
+        grey = 5.0 if is_dark else 100.0
+        # Of a camera that needs a grey level of 12.
+        rungs = {"darkness": {n: (grey / 2**n, fix is not None and grey / 2**n > DARK) for n in STOPS}}
+        rungs |= {"blur": {n: (grey, fix is not None) for n in BLUR_PX}}
+        pictures.append(Picture(probe, grey, error_m, False, rungs))
+        outcome = "lost" if fix is None else "ambiguous" if aliases(view, probe) else "found"
+        starts.append(Start(place[:2, 3], outcome))
+    figures = DriveFigures(
+        "drive", "00", len(driven), 0.01, "ground truth", False, 1.0, 0, 0, None, [20.0], CALIBRATION, []
+    )
+    ride = Drive(figures, starts, pictures, driven[:, :2, 3], 0)
+    return Report(
+        site="hall", version=3, manifest_sha256="ab" * 32, created="2026-11-28", promises=[], areas=areas_of(view, where, [ride]),
+        drives=[figures], similar=similar(view, where, [picture.probe for picture in pictures]), similar_of=len(pictures),
+        darkest_grey=DARK, calibrations=[CALIBRATION], incidents=Incidents(0.0, 0.0, 300.0, 300.0, None, ["a"]),
+    )  # fmt: skip
+
+
+def verdict(found: Report, *promises: str) -> Report:
+    return judged(msgspec.structs.replace(found, promises=list(promises)), GateSettings(), None, [])
+
+
+ONE, TWO = drive(30), drive(30, y_m=LANE_M)
+BOTH_WAYS = np.concatenate([ONE, TWO, ONE[::-1] @ BACK, TWO[::-1] @ BACK])
+DRIVEN = np.concatenate([ONE[3:27:3], TWO[3:27:3]]) @ se3(np.eye(3), np.array([0.15, 0.0, 0.0]))
+DIFFERENT = both(aisle(1, count=1200), aisle(2, y_m=LANE_M, count=1200))
+IDENTICAL = both(aisle(1, count=1200), aisle(1, y_m=LANE_M, count=1200))
+
+
+@pytest.fixture(scope="module")
+def good() -> Report:
+    return report(DIFFERENT, BOTH_WAYS, DRIVEN)
+
+
+def test_a_good_site_is_accepted_with_its_figures(good: Report) -> None:
+    found = verdict(good)
+    assert found.is_accepted
+    assert found.verdict.startswith("ACCEPTED: hall, version 3: 16 of 16 starts without a guess found their place")
+    assert found.reasons == found.survey_again == []
+    assert any("48 h" in words for words in found.not_judged)
+    assert [area.name for area in found.areas] == ["aisle 1", "aisle 2"]
+    assert found.areas[0].darkness["3"] == Count(8, 8)
+    assert found.areas[0].darkness["4"] == Count(0, 8)
+
+
+def test_a_site_surveyed_in_one_direction_is_told_so(good: Report) -> None:
+    one_way = report(DIFFERENT, np.concatenate([ONE, TWO, TWO[::-1] @ BACK]), DRIVEN)
+    found = verdict(one_way)
+    assert not found.is_accepted
+    assert found.verdict == "NOT ACCEPTED: hall, version 3: aisle 1 was surveyed in one direction only, nobody drove W."
+    assert found.survey_again[0].startswith("aisle 1: drive it facing W")
+    assert verdict(one_way, ONE_WAY).is_accepted
+    assert "if robots drive every aisle as it was surveyed" in verdict(one_way, ONE_WAY).verdict
+    change = compared(verdict(good), found)
+    assert change.compared_with == "version 3 of hall"
+    assert "aisle 1: surveyed facing W" in change.better
+    assert change.worse == []
+
+
+def test_two_identical_aisles_are_told_so() -> None:
+    twins = report(IDENTICAL, BOTH_WAYS, DRIVEN)
+    found = verdict(twins)
+    assert "aisle 1 looks like aisle 2: 8 of 8 starts stay AMBIGUOUS" in found.verdict
+    assert {(alike.area, alike.other) for alike in found.similar} >= {("aisle 1", "aisle 2"), ("aisle 2", "aisle 1")}
+    assert verdict(twins, KNOWN_STARTS).is_accepted
+
+
+def test_a_dark_aisle_is_told_so(good: Report) -> None:
+    found = verdict(report(DIFFERENT, BOTH_WAYS, DRIVEN, dark="aisle 2"))
+    assert found.verdict.startswith(
+        "NOT ACCEPTED: hall, version 3: aisle 2 is too dark (grey level 5 of 255): 0 of 8 frames get a fix"
+    )
+    assert "aisle 2: survey it with more light" in found.survey_again
+    change = compared(found, verdict(good))
+    assert "aisle 2: 0 of 8 frames localized, 8 of 8 before" in change.worse
+    assert not any(words.startswith("aisle 1") for words in (*change.better, *change.worse))
+
+
+def test_what_a_site_with_half_its_light_needs_is_said(good: Report) -> None:
+    dim = copy.deepcopy(good)
+    dim.areas[1].darkness["1"] = Count(0, 8)
+    assert "aisle 2 is nearly too dark: with half its light 0 of 8 frames get a fix" in verdict(dim).verdict
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"silent": 1}, "1 silent failures while driving"),
+        ({"localised_share": 0.3}, "30 % of drive drive is localized"),
+    ],
+)
+def test_a_drive_that_fails_is_a_reason(good: Report, change: dict[str, float], words: str) -> None:
+    worse = msgspec.structs.replace(good, drives=[msgspec.structs.replace(good.drives[0], **change)])
+    assert words in verdict(worse).verdict
+
+
+def test_a_silent_start_a_doubted_calibration_and_too_few_frames_are_reasons(good: Report) -> None:
+    bad = copy.deepcopy(good)
+    bad.areas[0].starts.silent += 1
+    assert "aisle 1: 1 starts without a guess are silently wrong" in verdict(bad).verdict
+    doubted = msgspec.structs.replace(
+        good, calibrations=[RigEvidence("rig", [], {}, {"pair geometry": "0.3 degrees off"})]
+    )
+    assert "the calibration rig is in doubt: pair geometry: 0.3 degrees off" in verdict(doubted).verdict
+    few = msgspec.structs.replace(good, areas=[area for area in copy.deepcopy(good.areas) if area.name == "aisle 1"])
+    assert "only 8 frames at a known place judge it, 12 are needed" in verdict(few).verdict
+
+
+def test_a_few_misses_are_chance_and_no_reason(good: Report) -> None:
+    few = copy.deepcopy(good)
+    few.areas[0].frames = Count(1, 4)
+    assert verdict(few).is_accepted  # the share may well be a half
+
+
+def test_equal_reports_differ_in_nothing(good: Report) -> None:
+    found = compared(verdict(good), verdict(good))
+    assert (found.better, found.worse) == ([], [])
+
+
+def test_a_larger_error_is_worse_and_chance_is_not(good: Report) -> None:
+    blunt, shuffled = copy.deepcopy(good), copy.deepcopy(good)
+    for area in blunt.areas:
+        area.errors_mm = [3.0 * error + 5.0 for error in area.errors_mm]
+    for area in shuffled.areas:
+        area.errors_mm = [1.05 * error for error in area.errors_mm]
+    assert any(words.startswith("all areas: median error") for words in compared(verdict(blunt), verdict(good)).worse)
+    assert compared(verdict(shuffled), verdict(good)).worse == []
+
+
+def test_documents_begin_with_the_verdict_and_are_the_same_each_time(good: Report) -> None:
+    views = Evidence(views=SurveyedViews(40, 0, []))
+    found = judged(good, GateSettings(), views, ["tile 1,2: three failures a day"])
+    assert found.survey_again == ["tile 1,2: three failures a day"]
+    shown = sections(compared(found, found))
+    picture = drawn(np.zeros((3, 2)), [(np.zeros(2), "found")])
+    page = html_page(found, shown, picture)
+    assert page.index("ACCEPTED: hall") < page.index("<h1>")
+    assert "tile 1,2: three failures a day" in page
+    one = pdf(found, shown, picture)
+    assert one.startswith(b"%PDF")
+    assert one == pdf(found, shown, picture)
+    assert msgspec.json.decode(msgspec.json.encode(found), type=Report) == found
