@@ -21,7 +21,7 @@ from fleetmap.mapformat import sha256_hex
 from mapserver.backup.snapshots import PIECE_BYTES, BackupTarget, Snapshot
 from mapserver.store import MapStore
 from mapserver.store.database import format_of
-from mapserver.store.files import is_plain_file, locked
+from mapserver.store.files import is_plain_file
 
 _TRIES = 3  # copies of the database, each after another garbage collection
 _LEFT_OVER = ".backup-"
@@ -68,12 +68,12 @@ def back_up(
     folder = store.folder
     with (
         disk_errors(f"{folder} cannot be read", "check its rights and space"),
-        locked(folder / "backup.lock", shared=False),
+        store.locked("backup.lock"),
     ):
         for path in folder.glob(f"{_LEFT_OVER}*"):  # of a killed backup
             shutil.rmtree(path)
         upload = _Upload(target)
-        files, keys = _trusted(folder, upload, recipient)
+        files, keys = _trusted(store, upload, recipient)
         for _ in range(_TRIES):
             with tempfile.TemporaryDirectory(prefix=_LEFT_OVER, dir=folder) as temporary:
                 copy = Path(temporary) / "store.sqlite3"
@@ -129,11 +129,11 @@ class _Upload:
 
 
 def _trusted(
-    folder: Path, upload: _Upload, recipient: "pyrage.x25519.Recipient | None"
+    store: MapStore, upload: _Upload, recipient: "pyrage.x25519.Recipient | None"
 ) -> tuple[dict[str, list[str]], str]:
     """Upload signed lists and, for a recipient, keys. They are older than the database then: the restored store signs what is missing."""
-    lists = folder / "trust"
-    with locked(lists / "lock", shared=False) if lists.is_dir() else nullcontext():  # keys and lists change under it
+    folder, lists = store.folder, store.folder / "trust"
+    with store.locked("trust/lock") if lists.is_dir() else nullcontext():  # keys and lists change under it
         keys = "" if recipient is None else upload.put(pyrage.encrypt(_packed(folder / "keys"), [recipient]))
         return {f"trust/{path.name}": [upload.put(path.read_bytes())] for path in _plain_files(lists, ".json")}, keys
 

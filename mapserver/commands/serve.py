@@ -158,7 +158,7 @@ def serve(
     certificate, proxy, settings = at.load_certificate(), at.load_proxy(), settings_of(context)
     # The sockets are opened before the store is read, so an invalid address is reported at once.
     proxies = (_LOOPBACK if at.http_name else frozenset()) | (proxy.addresses if proxy else frozenset())
-    with _listening(host, port, proxies) as listener, open_store(store, create=create) as maps:
+    with _listening(host, port, proxies) as listener, open_store(store, create=create) as maps, maps.served():
         guard = at.guard(maps, certificate, proxy, _OPEN_BUS if is_open else "")
         prepare_lists(maps, zenoh)
         bus, robots = prepare_bus(maps, zenoh, insecure=at.insecure)

@@ -1,13 +1,11 @@
-"""Running jobs and nights: their locks, which the operating system releases when a process dies, and their records in the store."""
+"""Running jobs and nights: their locks, which end with the process that holds them, and their records in the store."""
 
-import fcntl
 import io
-import os
 import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, redirect_stderr, suppress
+from contextlib import ExitStack, contextmanager, redirect_stderr, suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
@@ -26,27 +24,25 @@ _YOUNG_S = 60.0  # a job is recorded before it holds its lock
 
 
 @contextmanager
-def held(store: Path, job: int) -> Iterator[None]:
+def held(maps: MapStore, job: int) -> Iterator[None]:
     """Mark a job as running, for the block. Raises StoreError if the lock cannot be written."""
-    path = _path(store, job)
-    with _opened(path) as descriptor:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
+    with _opened(maps, job, waits=True):
         try:
             yield
         finally:
             with suppress(OSError):
-                path.unlink()
+                _path(maps.folder, job).unlink()
 
 
 @contextmanager
-def only_one(store: Path, site: str) -> Iterator[None]:
+def only_one(maps: MapStore, site: str) -> Iterator[None]:
     """Hold the site's nightly lock for the block; raises BusyError if another process holds it, StoreError on a disk error."""
-    path = store / f"nightly-{site}.lock"
-    with _opened(path) as descriptor:
+    with ExitStack() as stack:
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise BusyError(f"another nightly run of site {site} holds {path}; it ends by itself; try later") from error
+            with disk_errors(f"{maps.folder} cannot be written", "check the store's rights and space"):
+                stack.enter_context(maps.locked(name := f"nightly-{site}.lock", waits=False))
+        except BusyError as error:
+            raise BusyError(f"another nightly run of site {site} holds {name}; it ends by itself; try later") from error
         yield
 
 
@@ -54,7 +50,7 @@ def end_interrupted(maps: MapStore, now_ns: int) -> list[int]:
     """Mark jobs as failed that are recorded as running without a process; return their numbers."""
     ended, store = [], maps.folder
     for job in maps.running_jobs():
-        if _is_young(job, now_ns) or _is_held(store, job.id):
+        if _is_young(job, now_ns) or _is_held(maps, job.id):
             continue
         message = "was interrupted: its process has ended; run it again, a nightly run resumes at the next start"
         maps.update_job(job.id, "failed", message, job.report | {INTERRUPTED: True})
@@ -68,21 +64,13 @@ def _is_young(job: JobInfo, now_ns: int) -> bool:
     return 0 <= now_ns / 1e9 - datetime.fromisoformat(job.started).astimezone(UTC).timestamp() < _YOUNG_S
 
 
-def _is_held(store: Path, job: int) -> bool:
+def _is_held(maps: MapStore, job: int) -> bool:
     """True if a living process holds the job's lock, or if that is unknown."""
     try:
-        descriptor = os.open(_path(store, job), os.O_RDONLY | os.O_CLOEXEC)
-    except FileNotFoundError:
-        return False
-    except OSError:
+        with _opened(maps, job, waits=False):
+            return False
+    except FleetmapError:
         return True
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    finally:
-        os.close(descriptor)
-    return False
 
 
 def _path(store: Path, job: int) -> Path:
@@ -152,13 +140,11 @@ class _Copied(io.TextIOBase):
 
 
 @contextmanager
-def _opened(path: Path) -> Iterator[int]:
-    with disk_errors(f"{path} cannot be made", "check the store's rights and space"):
-        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o600)
-    try:
-        yield descriptor
-    finally:
-        os.close(descriptor)
+def _opened(maps: MapStore, job: int, *, waits: bool) -> Iterator[None]:
+    with ExitStack() as stack:
+        with disk_errors(f"{_path(maps.folder, job)} cannot be made", "check the store's rights and space"):
+            stack.enter_context(maps.locked(_path(maps.folder, job).name, waits=waits))
+        yield
 
 
 @dataclass(slots=True)
@@ -201,7 +187,7 @@ def recorded_job(maps: MapStore, site: str, kind: str) -> Iterator[Job]:
     number = maps.begin_job(site, kind)
     job = Job(number=number)
     try:
-        with held(maps.folder, number), logged(maps.folder, number):
+        with held(maps, number), logged(maps.folder, number):
             yield job
     except BaseException as error:
         maps.update_job(number, "failed", str(error) or type(error).__name__, job.report)

@@ -31,6 +31,7 @@ from mapserver.fleet.replay_intake import ReplayIntake
 from mapserver.fleet_statistics.canary_decision import number_of
 from mapserver.fleet_statistics.clock_skew import ClockSkew
 from mapserver.store import CanaryRow, MapStore
+from mapserver.store.rows import RobotInfo
 
 MAX_ROBOTS = 10_000
 MAX_STAMP_NS = 1 << 62  # limit of the store
@@ -142,9 +143,7 @@ class Fleet:
         self._robots: dict[tuple[str, str], _Robot] = {}
         self.storage_fault = ""
         for info in store.robots():
-            skew = ClockSkew(info.last_report.get("clock_ahead_s"))
-            robot = _Robot(info.version, info.last_seen_ns, dict(info.last_report), skew=skew, is_stored=True)
-            self._robots[info.site, info.robot] = robot
+            self._robots[info.site, info.robot] = _stored(info)
 
     def wanted_version(self, site: str, robot: str) -> WantedVersion:
         """Return the version that a robot should run: its site's current one, or the canary version.
@@ -249,8 +248,14 @@ class Fleet:
         """Record which robots (site, name) have a liveliness token now; robots never seen stay unknown."""
         there = set(present)
         stored = self._store.robot_names()
+        others = self._store.robots() if self._store.is_shared else []
         now_ns = self._clock_ns()
         with self._lock:
+            for info in others:
+                known = self._robots.get((info.site, info.robot))
+                if known is None or info.last_seen_ns > known.seen_ns:  # by another server
+                    self._robots[info.site, info.robot] = _stored(info)
+                    there.add((info.site, info.robot))
             for key, robot in list(self._robots.items()):
                 robot.is_present = key in there
                 # Removed by a command, or a name that only sent queries.
@@ -313,6 +318,11 @@ class Fleet:
         entry.version = version if version is not None else entry.version
         entry.seen_ns = now_ns
         return entry
+
+
+def _stored(info: RobotInfo) -> _Robot:
+    skew = ClockSkew(info.last_report.get("clock_ahead_s"))
+    return _Robot(info.version, info.last_seen_ns, dict(info.last_report), skew=skew, is_stored=True)
 
 
 def _status(key: tuple[str, str], robot: _Robot, assignment: _Assignment, now_ns: int) -> RobotStatus:

@@ -76,12 +76,12 @@ def run_night(request: NightRequest, gate: GateSettings, console: Console) -> st
     in the store holds the same message. The current version is the last good one in any case.
     """
     site = request.site
-    with MapStore.open(request.store, create=True) as maps, only_one(request.store, site):
+    with MapStore.open(request.store, create=True) as maps, only_one(maps, site):
         report = NightReport(maps.begin_job(site, JOB))
         _resume_killed(maps, site, report)
         end_interrupted(maps, time.time_ns())
         try:
-            with held(request.store, report.job), logged(request.store, report.job):
+            with held(maps, report.job), logged(request.store, report.job):
                 removed = apply_retention(maps, request.retention, [request.inbox])
                 report.expired = {name: count for name, count in removed.items() if count}
                 sentence = _Night(request, gate, console, maps, report).run()

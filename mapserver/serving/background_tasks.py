@@ -4,9 +4,10 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
-from fleetmap.errors import FleetmapError
+from fleetmap.errors import BusyError, FleetmapError
 from fleetmap.log_lines import LogLimit
 from mapserver.drafting.job_lock import end_interrupted
 from mapserver.fleet.alerts import AlertSettings, active_alerts
@@ -46,16 +47,31 @@ def server_tasks(
     store: MapStore, fleet: Fleet, bus_service: BusService, canary: CanarySettings
 ) -> list[BackgroundTask]:
     """Return all background tasks of a server."""
+
+    def alone(act: Callable[[], object], name: str) -> Callable[[], object]:
+        """Return the act, left out while another server does the same."""
+
+        def acts() -> None:
+            with suppress(BusyError), store.locked(f"{name}.lock", waits=False):
+                act()
+
+        return acts if store.is_shared else act
+
     return [
+        BackgroundTask("following other servers", _ANNOUNCE_EVERY_S, store.files.follow),
         # Before the announcement: robots accept only versions on the lists.
         BackgroundTask("signing the lists of versions", _ANNOUNCE_EVERY_S, lambda: update_lists(store)),
         BackgroundTask("announcing versions", _ANNOUNCE_EVERY_S, bus_service.announce_changes),
         BackgroundTask("keeping reports", _FLUSH_EVERY_S, fleet.flush),
         BackgroundTask("looking for robots", _PRESENCE_EVERY_S, bus_service.look_for_robots),
-        BackgroundTask("removing old reports", _PRUNE_EVERY_S, fleet.prune),
+        BackgroundTask("removing old reports", _PRUNE_EVERY_S, alone(fleet.prune, "prune")),
         BackgroundTask("measuring the disk", _PRUNE_EVERY_S, store.disk_space),
-        BackgroundTask("searching for killed jobs", _JOBS_EVERY_S, lambda: end_interrupted(store, time.time_ns())),
-        BackgroundTask("looking at canaries", _CANARIES_EVERY_S, lambda: review(store, canary, time.time_ns())),
+        BackgroundTask(
+            "searching for killed jobs", _JOBS_EVERY_S, alone(lambda: end_interrupted(store, time.time_ns()), "jobs")
+        ),
+        BackgroundTask(
+            "looking at canaries", _CANARIES_EVERY_S, alone(lambda: review(store, canary, time.time_ns()), "canaries")
+        ),
     ]
 
 
@@ -66,7 +82,12 @@ def alert_tasks(
     if webhook is None:
         return []
     watch = AlertWatch(lambda: active_alerts(store, fleet, settings, time.time_ns()), webhook.put, time.time_ns)
-    return [BackgroundTask("looking for alerts", _ALERTS_EVERY_S, watch.look)]
+
+    def look() -> None:
+        if store.leads():
+            watch.look()
+
+    return [BackgroundTask("looking for alerts", _ALERTS_EVERY_S, look)]
 
 
 def admission_tasks(guard: BusGuard | None, fleet: Fleet) -> list[BackgroundTask]:

@@ -32,6 +32,8 @@ class SqliteTransactions(Transactions):
     Raises NewerFormatError for a database of a newer fleetmap, StoreError for one that cannot be opened or belongs to another program.
     """
 
+    is_shared = False
+
     def __init__(self, path: Path, clock_ns: Callable[[], int], *, read_only: bool = False) -> None:
         super().__init__(clock_ns)
         self._path = path
@@ -108,7 +110,7 @@ class SqliteTransactions(Transactions):
         return sum(path.stat().st_size for path in self._path.parent.glob("store*.sqlite3*"))
 
     def locked(self, name: str, *, shared: bool = False, waits: bool = True) -> AbstractContextManager[None]:
-        return locked(self._path.with_name(name), shared=shared, waits=waits)
+        return locked(self._path.parent / name, shared=shared, waits=waits)
 
 
 def _opened(path: Path, prepare: Callable[[Database, Path], object], options: str = "mode=rwc") -> Database:

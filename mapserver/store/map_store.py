@@ -13,13 +13,14 @@ import hashlib
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, cast
 
 from fleetmap.encoding import to_json, to_plain
 from fleetmap.errors import (
+    BusyError,
     ChangedError,
     MapFormatError,
     NewerFormatError,
@@ -67,6 +68,7 @@ from mapserver.store.rows import (
     VerdictRow,
     VersionInfo,
 )
+from mapserver.store.shared_files import SHARED
 from mapserver.store.verification import StoreFindings, verify
 from mapserver.store.version_rows import (
     EXTRA_TABLES,
@@ -95,6 +97,7 @@ class MapStore(StoreQueries):
     ) -> None:
         super().__init__(root, clock_ns, create=create, read_only=read_only)
         try:
+            self.files.follow()
             if not read_only:
                 sync_path(root)
                 self._repair_current_files()
@@ -163,16 +166,28 @@ class MapStore(StoreQueries):
             make_folder(path)
             write_places(path, places)
             return 0
-        with cls.open(path, clock_ns=clock_ns) as store, store._locked(shared=False):
+        with cls.open(path, clock_ns=clock_ns) as store, store._locked(shared=False), store.served(shared=False):
+            if running := store.running_jobs():
+                raise BusyError(f"job {running[0].id} of site {running[0].site} runs; wait for its end")
             copied = store._copy_content(open_blobs(path, places), progress) if places.content != before.content else 0
             if places.database != before.database:
                 with closing(open_database(path, places, clock_ns, create=True, read_only=False)) as target:
                     target.copy_from(store._transactions)
             write_places(path, places)
+        if places.database is not None:
+            with cls.open(path, clock_ns=clock_ns) as store:
+                for folder in SHARED:
+                    if (path / folder).is_dir():
+                        with store.files.changing(folder):
+                            pass
         if file.is_file() and places.database is not None:
             with disk_errors(f"{file} cannot be renamed", "rename it: nobody may use it any more"):
                 file.replace(path / "store-moved.sqlite3")
         return copied
+
+    def served(self, *, shared: bool = True) -> AbstractContextManager[None]:
+        """Note for the block that a server has the store in this folder open; BusyError for its exclusive use while one has."""
+        return nullcontext() if self.is_shared else self.locked("served.lock", shared=shared, waits=False)
 
     def _copy_content(self, target: Blobs, progress: Callable[[int, int], None]) -> int:
         known, named, copied = target.sizes(), sorted(mentioned(self._transactions)), 0

@@ -5,6 +5,7 @@ lock cannot write under it any more. A failed commit is asked for in a new sessi
 """
 
 import hashlib
+import logging
 import os
 import re
 import ssl
@@ -48,7 +49,10 @@ _MORE = (
        $$BEGIN RAISE EXCEPTION 'the log of events is never shortened or changed'; END$$""",
     "CREATE TRIGGER events_are_kept BEFORE DELETE OR UPDATE OR TRUNCATE ON events EXECUTE FUNCTION keep_events()",
     "CREATE TABLE store_format (number BIGINT NOT NULL)",
+    "CREATE TABLE shared_files (name TEXT PRIMARY KEY, sha256 TEXT NOT NULL, data BYTEA NOT NULL)",
 )
+# It writes a traceback for every connection that it cannot end politely.
+logging.getLogger("sqlalchemy.pool").setLevel(logging.CRITICAL)
 
 
 class PostgresTransactions(Transactions):
@@ -56,6 +60,8 @@ class PostgresTransactions(Transactions):
 
     Raises StoreError if it does not answer or holds no store, NewerFormatError for one of a newer fleetmap, UsageError for an invalid URL.
     """
+
+    is_shared = True
 
     def __init__(self, url: str, clock_ns: Callable[[], int], *, create: bool = False) -> None:
         super().__init__(clock_ns)
@@ -86,6 +92,7 @@ class PostgresTransactions(Transactions):
         self._lock = threading.RLock()
         self._session: Session | None = None
         self._writing_thread: int | None = None
+        self._leading: Session | None = None
         self._held = Counter[tuple[str, bool]]()  # locks by name and whether they are shared
         try:
             self._prepare(create=create)
@@ -95,19 +102,21 @@ class PostgresTransactions(Transactions):
 
     def close(self) -> None:
         with self._lock:
-            if self._session is not None:
-                with suppress(SQLAlchemyError):
-                    self._session.close()
+            for session in (self._session, self._leading):
+                if session is not None:
+                    with suppress(SQLAlchemyError):
+                        session.detach()
+                        session.close()
             self._engine.dispose()
 
     @contextmanager
     def write(self, *, durable: bool = True) -> Iterator[Connection]:
         with self._lock, self._errors("written"):
+            self._first("BEGIN")
             session = self._connected()
             self._writing_thread = threading.get_ident()
             number = None
             try:
-                session.exec_driver_sql("BEGIN")
                 commit = "on" if durable else "off"
                 ((number, *_),) = session.exec_driver_sql(
                     f"""SELECT pg_current_xact_id()::text, pg_advisory_xact_lock({_key("write")}),
@@ -187,7 +196,7 @@ class PostgresTransactions(Transactions):
             with self._lock, self._errors("locked"):
                 others = self._held[name, False] or (not shared and self._held[name, True])
                 taken = f"SELECT pg_try_advisory_lock{suffix}({_key(name)})"
-                if others or not self._connected().exec_driver_sql(taken).scalar():
+                if others or not self._first(taken).scalar():
                     raise BlockingIOError
                 self._held[name, shared] += 1
 
@@ -200,6 +209,21 @@ class PostgresTransactions(Transactions):
                 if self._session is not None and not self._session.invalidated:
                     with suppress(SQLAlchemyError):
                         self._session.exec_driver_sql(f"SELECT pg_advisory_unlock{suffix}({_key(name)})")
+
+    def leads(self) -> bool:
+        with self._lock, self._errors("read"):
+            try:
+                if self._leading is not None:
+                    self._leading.exec_driver_sql("SELECT 1")
+                    return True
+            except DBAPIError:
+                self._leading = None  # its connection is lost, and with it the lock
+            session = self._engine.connect()
+            if session.exec_driver_sql(f"SELECT pg_try_advisory_lock({_key('leader')})").scalar():
+                self._leading = session
+            else:
+                session.close()
+            return self._leading is not None
 
     def _prepare(self, *, create: bool) -> None:
         if not self._has_tables():
@@ -236,6 +260,15 @@ class PostgresTransactions(Transactions):
         if self._session is None:
             self._session = self._engine.connect()
         return self._session
+
+    def _first(self, sql: str) -> CursorResult[Any]:
+        """Execute what begins a transaction or takes a lock, in a new session if the last one was lost since."""
+        try:
+            return self._connected().exec_driver_sql(sql)
+        except DBAPIError as error:
+            if not error.connection_invalidated:
+                raise
+        return self._connected().exec_driver_sql(sql)
 
     def _is_committed(self, number: str | None) -> bool:
         with self._engine.connect() as session:

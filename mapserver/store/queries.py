@@ -35,6 +35,7 @@ from mapserver.store.rows import (
     VerdictRow,
     VersionInfo,
 )
+from mapserver.store.shared_files import SharedFiles
 from mapserver.store.usage import DiskMeter, DiskSpace, StoreUsage, UsageMeter
 from mapserver.store.version_rows import canaries, mentioned, site_releases
 
@@ -68,6 +69,9 @@ class StoreQueries:
         self.fleet = FleetQueries(self._transactions)
         self._areas: dict[str, tuple[tuple[str, ...], Areas]] = {}  # by the addresses of their source files
         self.operators = OperatorQueries(self._transactions)
+        self.files = SharedFiles(root, self._transactions)
+        self.locked, self.leads = self._transactions.locked, self._transactions.leads
+        self.is_shared = self._transactions.is_shared
         self._disk = DiskMeter(root, self._transactions.now_ns)
         self._usage = UsageMeter(root, self._transactions, self._blobs)
 

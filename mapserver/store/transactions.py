@@ -4,7 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, ClassVar, Protocol, TypeVar
 
 from fleetmap.errors import StoreError
 from mapserver.store.access.chain import COLUMNS, AuditLine, chain_head, line_sha256
@@ -36,6 +36,9 @@ class Transactions(ABC):
 
     One transaction writes at a time, in all processes.
     """
+
+    is_shared: ClassVar[bool]
+    """True if servers on several machines may use it."""
 
     def __init__(self, clock_ns: Callable[[], int]) -> None:
         self.now_ns = clock_ns
@@ -76,6 +79,10 @@ class Transactions(ABC):
 
         Raises StoreError if it is not free within a minute, BusyError at once without `waits`.
         """
+
+    def leads(self) -> bool:
+        """True if this process is the one of all servers that does what one alone may do, until it ends or loses the database."""
+        return True
 
     def copy_from(self, source: "Transactions") -> None:
         """Fill the database, which is empty, with the rows of another one. StoreError if it holds something."""

@@ -22,7 +22,7 @@ from fleetmap.mapformat import check_name
 from fleetmap.messages import encode_message
 from fleetmap.trust.enrolment import Bundle, RenewalAnswer, certificate_info, check_request, key_fingerprint
 from mapserver.store import NOBODY, Actor, MapStore
-from mapserver.store.files import locked, make_folder
+from mapserver.store.files import make_folder
 from mapserver.trust.authorities import DAYS, Authorities
 from mapserver.trust.lists import SignedLists
 
@@ -273,13 +273,13 @@ class RobotRegister:
         """Yield the robots, to be changed by one process at a time; written at the end unless an error was raised."""
         with disk_errors(f"{self._path} cannot be written", "free some space, and check the account"):
             make_folder(self._keys)
-            with locked(self._keys / "lock", shared=False):
+            with self._store.files.changing("keys") as root:
                 before = {(entry.site, entry.robot): entry for entry in self.robots()}
                 entries = dict(before)
                 yield entries
                 if entries != before:
                     ordered = [entries[key] for key in sorted(entries)]
-                    write_atomically(self._path, [to_json(ordered)])
+                    write_atomically(root / "keys" / self._path.name, [to_json(ordered)])
 
 
 def _stamp(path: Path) -> tuple[int, int, int] | None:

@@ -39,11 +39,12 @@ _COMPACT = JSONSerializer(compact=True)
 class ListRepository:
     """The signed lists of one store, for writing, and its keys. now: reference time of expiry.
 
+    draft: folder with a copy of the lists to be changed; default: the store's own.
     ahead: numbers that the server's keys skip, after a restoration from a backup.
     """
 
-    def __init__(self, store: Path, now: datetime) -> None:
-        self.lists, self.keys = SignedLists(store), KeyFolder(store / "keys")
+    def __init__(self, store: Path, now: datetime, *, draft: Path | None = None) -> None:
+        self.lists, self.keys = SignedLists(draft or store), KeyFolder(store / "keys")
         self.now, self.ahead = now.astimezone(UTC).replace(microsecond=0), 0
 
     def root(self) -> Root:

@@ -15,7 +15,7 @@ from fleetmap.errors import FleetmapError, StateError, UsageError, disk_errors
 from fleetmap.trust import AdmittedVersion, SiteList, site_role
 from fleetmap.trust.site_list import VersionState
 from mapserver.store import MapStore, VersionInfo
-from mapserver.store.files import locked, make_folder
+from mapserver.store.files import make_folder
 from mapserver.store.rows import SiteReleases
 from mapserver.trust.keys import KeyFolder, make_key, make_passphrase
 from mapserver.trust.lists import TIMESTAMP, SignedLists, is_fresh
@@ -52,8 +52,8 @@ def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
     now, keys = _now(store), KeyFolder(store.folder / "keys")
     if not all_anew and not _due(store, lists, keys, now):
         return
-    with locked(lists.folder / "lock", shared=False):
-        repository, faults = _repository(store), []
+    with store.files.changing("trust") as root:
+        repository, faults = _repository(store, root), []
         for info in store.sites():
             try:
                 if number := _update_site(repository, store.releases(info.site)):
@@ -61,7 +61,7 @@ def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
             except FleetmapError as error:  # of one site: it must not block the other sites and the timestamp
                 faults.append(error)
         online = keys.signer("online")
-        if online is not None and (all_anew or _online_is_due(lists, now)):
+        if online is not None and (all_anew or _online_is_due(repository.lists, now)):
             repository.sign_online(online)
     if faults:
         raise faults[0]
@@ -208,11 +208,11 @@ def _changing(store: MapStore, root_key: "Signer", words: str) -> Iterator["List
 @contextmanager
 def _held(store: MapStore) -> Iterator["ListRepository"]:
     """Yield the lists under a lock: of two processes that create a key, one would overwrite the other's."""
-    repository = _repository(store)
-    with disk_errors(f"{repository.lists.folder} cannot be changed", "check its rights"):
-        make_folder(repository.lists.folder)
-        with locked(repository.lists.folder / "lock", shared=False):
-            yield repository
+    folder = store.folder / "trust"
+    with disk_errors(f"{folder} cannot be changed", "check its rights"):
+        make_folder(folder)
+        with store.files.changing("trust") as root:
+            yield _repository(store, root)
 
 
 def _offline_key(folder: Path, number: int) -> "tuple[Signer, tuple[Path, str]]":
@@ -221,10 +221,11 @@ def _offline_key(folder: Path, number: int) -> "tuple[Signer, tuple[Path, str]]"
     return make_key(path, passphrase), (path, passphrase)
 
 
-def _repository(store: MapStore) -> "ListRepository":
+def _repository(store: MapStore, root: Path) -> "ListRepository":
+    """Return the lists below `root`, to be signed with the keys of the store."""
     from mapserver.trust.repository import ListRepository  # late: tuf comes with it
 
-    return ListRepository(store.folder, _now(store))
+    return ListRepository(store.folder, _now(store), draft=root)
 
 
 def _now(store: MapStore) -> datetime:

@@ -30,7 +30,8 @@ def begun_elsewhere(folder: Path) -> int:
     return child
 
 
-def test_a_killed_job_is_ended_and_a_running_one_is_not(tmp_path: Path) -> None:
+def test_a_killed_job_is_ended_and_a_running_one_is_not(metadata_folder: Path) -> None:
+    tmp_path = metadata_folder
     with MapStore.open(tmp_path, create=True) as maps:
         save_sample_draft(maps)
     child = begun_elsewhere(tmp_path)

@@ -1,0 +1,196 @@
+"""What PostgreSQL alone brings: a database that goes away and comes back, locks of several machines, files that servers share."""
+
+import os
+import subprocess
+import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+from sqlalchemy.exc import OperationalError
+
+from fleetmap.errors import BusyError, NewerFormatError, StoreError, UsageError
+from fleetmap.messages import RobotHealth
+from mapserver.fleet.fleet import Fleet
+from mapserver.store import MapStore, chain_faults
+from mapserver.store.places import Places, read_places, write_places
+from mapserver.store.postgres import PostgresTransactions
+from mapserver.store.schema import FORMAT
+from mapserver.trust import SignedLists, init_here
+from mapserver.trust.signing import update_lists
+from support.storage.map_samples import publish_samples, save_sample_draft
+from support.storage.postgres_server import PostgresServer
+
+
+@pytest.fixture
+def folders(tmp_path: Path, postgres: PostgresServer, s3: str) -> tuple[Path, Path]:
+    """Folders of two machines that share a store."""
+    here, there = tmp_path / "here", tmp_path / "there"
+    with MapStore.open(here, create=True) as store:
+        publish_samples(store, 1)
+        init_here(store)
+    MapStore.attach(here, Places(s3, postgres.database()))
+    (there / "keys").mkdir(parents=True)
+    for path in (here / "keys").iterdir():
+        (there / "keys" / path.name).write_bytes(path.read_bytes())
+    MapStore.attach(there, read_places(here))
+    return here, there
+
+
+def test_a_database_that_was_restarted_is_found_again(folders: tuple[Path, Path], postgres: PostgresServer) -> None:
+    with MapStore.open(folders[0]) as store:
+        postgres.stop()
+        with pytest.raises(StoreError, match="check the database"):
+            store.sites()
+        with pytest.raises(StoreError, match="check the database"):
+            store.record_robot_report("lab", "r1", {}, 1)
+        postgres.start()
+        assert save_sample_draft(store, seed=5) == 2
+        assert [info.site for info in store.sites()] == ["lab"]
+        assert chain_faults(store.audit_lines()) == []
+
+
+def test_who_lost_a_lock_writes_nothing_under_it(folders: tuple[Path, Path], postgres: PostgresServer) -> None:
+    with MapStore.open(folders[0]) as store, MapStore.open(folders[1]) as other:
+        with store.locked("nightly-lab.lock"):
+            with pytest.raises(BusyError), other.locked("nightly-lab.lock", waits=False):
+                pass
+            with pytest.raises(BusyError), store.locked("nightly-lab.lock", waits=False):
+                pass  # not even the same process
+            postgres.stop()
+            postgres.start()
+            with pytest.raises(StoreError):
+                save_sample_draft(store, seed=5)
+            with other.locked("nightly-lab.lock", waits=False), pytest.raises(StoreError, match="with it the lock"):
+                save_sample_draft(store, seed=5)
+        assert save_sample_draft(store, seed=5) == 2, "afterwards it is as before"
+
+
+def test_one_leads_until_it_is_gone(folders: tuple[Path, Path], postgres: PostgresServer) -> None:
+    with MapStore.open(folders[1]) as other:
+        with MapStore.open(folders[0]) as store:
+            assert [each.leads() for each in (store, other, store, other)] == [True, False, True, False]
+        until_s = time.monotonic() + 30  # the database ends a closed session by itself
+        while not other.leads():
+            assert time.monotonic() < until_s
+        postgres.stop()
+        postgres.start()
+        assert other.leads(), "in a new session"
+
+
+@pytest.mark.parametrize("is_done", [True, False])
+def test_a_commit_without_an_answer_counts_once(
+    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, is_done: bool
+) -> None:
+    with MapStore.open(folders[0]) as store:
+        session = store._transactions._connected()
+        real = type(session).exec_driver_sql
+
+        def cut(self: object, sql: str, *more: object) -> object:
+            if sql != "COMMIT":
+                return real(self, sql, *more)
+            real(self, "COMMIT" if is_done else "ROLLBACK")
+            self.invalidate()
+            raise OperationalError(sql, (), OSError("network error"), connection_invalidated=True)
+
+        with monkeypatch.context() as patch:
+            patch.setattr(type(session), "exec_driver_sql", cut)
+            if is_done:
+                store.audit("note", "x")
+            else:
+                with pytest.raises(StoreError, match="network error"):
+                    store.audit("note", "x")
+        assert [line.kind for line in store.audit_lines()].count("note") == int(is_done)
+        assert chain_faults(store.audit_lines()) == []
+
+
+def test_lists_and_enrolled_robots_are_those_of_all_servers(folders: tuple[Path, Path]) -> None:
+    with MapStore.open(folders[0]) as store, MapStore.open(folders[1]) as other:
+        assert SignedLists(folders[1]).served("lab").state("current").about.version == 1
+        publish_samples(other, 1)
+        update_lists(other)
+        store.files.follow()
+        for folder in folders:
+            assert SignedLists(folder).served("lab").state("current").about.version == 2
+        names = [sorted(path.name for path in (folder / "trust").glob("*.json")) for folder in folders]
+        assert names[0] == names[1]
+        with store.files.changing("keys") as root:
+            (root / "keys" / "robots.json").write_text("[]\n")
+        other.files.follow()
+        assert (folders[1] / "keys" / "robots.json").read_text() == "[]\n"
+        with pytest.raises(ZeroDivisionError), store.files.changing("trust") as root:
+            (root / "trust" / "9.targets.json").write_text("half of a change")
+            raise ZeroDivisionError
+        other.files.follow()
+        names += [sorted(path.name for path in (folder / "trust").glob("*.json")) for folder in folders]
+        assert names == [names[0]] * 4
+
+
+def test_robots_of_another_server_are_known(folders: tuple[Path, Path]) -> None:
+    with MapStore.open(folders[0]) as store, MapStore.open(folders[1]) as other:
+        here, there = Fleet(store), Fleet(other)
+        here.take_health("lab", "r1", RobotHealth(site="lab", robot="r1", stamp_ns=1, status="TRACKING", version=1))
+        here.flush()
+        there.take_presence([])
+        assert [(robot.robot, robot.version, robot.is_present) for robot in there.robots()] == [("r1", 1, True)]
+        there.take_presence([])
+        assert [robot.is_present for robot in there.robots()] == [False], "it reports to nobody any more"
+
+
+def test_all_writers_get_their_turn(folders: tuple[Path, Path]) -> None:
+    with MapStore.open(folders[0]) as store, MapStore.open(folders[1]) as other, ThreadPoolExecutor(4) as pool:
+        for done in [pool.submit(each.audit, "note", str(n)) for n in range(40) for each in (store, other)]:
+            done.result()
+        lines = store.audit_lines()
+        assert [line.kind for line in lines].count("note") == 80
+        assert chain_faults(lines) == []
+
+
+def test_wrong_words_get_a_next_step(tmp_path: Path, postgres: PostgresServer) -> None:
+    url = postgres.database()
+    for wrong, words in (
+        ("nonsense", "invalid"),
+        ("mysql://a/b", "PostgreSQL alone"),
+        (f"{url}?sslmode=maybe", "verify-full"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            PostgresTransactions(wrong, lambda: 1)
+    with pytest.raises(StoreError, match="mapserver attach"):
+        PostgresTransactions(url, lambda: 1)
+    with pytest.raises(StoreError, match="check the database") as error:
+        PostgresTransactions("postgresql://fleet:secret@127.0.0.1:9/none", lambda: 1)
+    assert "secret" not in str(error.value)
+    write_places(tmp_path, Places(database=url))
+    with MapStore.open(tmp_path, create=True) as store, store._transactions.write() as connection:
+        connection.execute("UPDATE store_format SET number = ?", (FORMAT + 1,))
+    with pytest.raises(NewerFormatError, match=f"format {FORMAT + 1}"):
+        MapStore.open(tmp_path)
+
+
+def test_a_served_store_is_not_moved(tmp_path: Path, s3: str) -> None:
+    with (
+        MapStore.open(tmp_path / "store", create=True) as store,
+        store.served(),
+        pytest.raises(BusyError, match="served"),
+    ):
+        MapStore.attach(tmp_path / "store", Places(s3))
+    with MapStore.open(tmp_path / "store") as store:
+        store.begin_job("lab", "build")
+        with pytest.raises(BusyError, match="job 1"):
+            MapStore.attach(tmp_path / "store", Places(s3))
+
+
+def test_a_killed_writer_holds_nothing(folders: tuple[Path, Path]) -> None:
+    program = (
+        "import os, sys\nfrom pathlib import Path\nfrom mapserver.store import MapStore\n"
+        "store = MapStore.open(Path(sys.argv[1]))\n"
+        "with store.locked('lock'), store._transactions.write() as connection:\n"
+        '    connection.execute("UPDATE sites SET last_version = 99")\n    os._exit(9)\n'
+    )
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run([sys.executable, "-c", program, str(folders[1])], env=environment, check=False, timeout=60)
+    assert done.returncode == 9
+    with MapStore.open(folders[0]) as store:
+        assert save_sample_draft(store, seed=5) == 2
+        store.collect_garbage()
