@@ -36,7 +36,7 @@ class Estimate:
     distance between fix and prediction; innovation_m: metres, for fixes that were accepted or found at the predicted place. moved_m: for
     a pose confirmed with this frame, its distance from the pose that was claimed until fixes contradicted it, if beyond its
     covariance: one of the two was wrong. hypotheses: the competing poses while AMBIGUOUS. stage_s: seconds by stage, by the given
-    clock. calibration: its state by the map.
+    clock. calibration: its state by the map. views: faults of the images of each of the rig's views, NONE for those in use.
     """
 
     stamp_ns: int
@@ -56,6 +56,7 @@ class Estimate:
     innovation_m: float | None = None
     moved_m: float | None = None
     calibration: CalibrationState = NOT_JUDGED
+    views: tuple[Cause, ...] = (Cause.NONE,)
 
 
 class QueryResult(NamedTuple):

@@ -1,7 +1,7 @@
 """Image quality of a frame: exposure, sharpness, and faults. Pure."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import sqrt
 from statistics import median
 
@@ -11,10 +11,11 @@ from fleetmap import core
 from fleetmap.config import Section
 from fleetmap.messages import Cause
 from fleetmap.sensors.rectification import RectifiedFrame
-from fleetmap.sensors.samples import Image
+from fleetmap.sensors.samples import CameraFrame, Image
 
 _EVERY_PX = 8  # step of the rows and columns that are sampled
 _BRIGHT = 250
+UNUSABLE = frozenset({Cause.DARK, Cause.GLARE, Cause.FROZEN, Cause.NO_FRAMES})  # images in which nothing can be found
 
 
 class ImageQualitySettings(Section, frozen=True):
@@ -53,7 +54,7 @@ class ImageQualityMonitor:
         self._sharpness: deque[float] = deque(maxlen=settings.typical_frames)
         self._depths_m: deque[float] = deque(maxlen=settings.typical_frames)
 
-    def judge(self, frame: RectifiedFrame) -> ImageQuality:
+    def judge(self, frame: RectifiedFrame | CameraFrame) -> ImageQuality:
         """Return the quality of `frame`; faults are darkness, glare, a repeated image of either camera, and blur."""
         thinned = [_ThinnedImage.of(image) for image in (frame.left, frame.right) if image is not None]
         self._frozen = [self._is_frozen(side, image) for side, image in enumerate(thinned)]
@@ -71,7 +72,7 @@ class ImageQualityMonitor:
     def without_frozen(self, frame: RectifiedFrame) -> RectifiedFrame:
         """Return `frame`, just judged, without images of a stuck camera: no right image, or an empty left one."""
         left = np.zeros_like(frame.left) if self._frozen[0] else frame.left
-        return RectifiedFrame(frame.stamp_ns, left, None, None)
+        return replace(frame, left=left, right=None, disparity_px=None)
 
     def judge_depth(self, scene_depth_m: float) -> Cause:
         """Return OCCLUDED if the scene is much nearer than usual: an object is in front of the cameras."""

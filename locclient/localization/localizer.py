@@ -11,12 +11,12 @@ from fleetmap.odometry import Odometry, is_away
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from locclient.localization.calibration.monitor import CalibrationMonitor, with_calibration
 from locclient.localization.calibration.watch import Mounting
 from locclient.localization.estimate import Estimate, assemble
-from locclient.localization.image_quality import ImageQualityMonitor
+from locclient.localization.image_quality import UNUSABLE, ImageQuality, ImageQualityMonitor
 from locclient.localization.map_query import MapQuery
 from locclient.localization.percept import Percept
 from locclient.localization.pose_hypothesis import Motion
@@ -39,16 +39,20 @@ class Localizer:
         imu_minus_cam_s: float,
         settings: LocalizerSettings,
         clock: Callable[[], float] = lambda: 0.0,
+        others: Sequence[MountedCamera] = (),
     ) -> None:
-        """clock: seconds, measures the stages; the default measures nothing."""
-        self._clock, self._settings, self._camera = clock, settings, camera
+        """clock: seconds, measures the stages; the default measures nothing. others: cameras of the rig's other views."""
+        self._clock, self._settings = clock, settings
+        self._mounted = (MountedCamera(camera, body_from_cam), *others)
         rig = (calibration, camera, body_from_cam, imu_minus_cam_s)
-        self.odometry = Odometry(*rig, settings.odometry, settings.stereo)
+        self.odometry = Odometry(*rig, settings.odometry, settings.stereo, others)
         self.percept: Percept | None = None  # of the last frame
-        self._images = ImageQualityMonitor(settings.image_quality)
+        self._images = [ImageQualityMonitor(settings.image_quality) for _ in self._mounted]
+        self._followed = 0  # view of the odometry
+        self._last_frame: RectifiedFrame | None = None  # of a rig with several views
         self._mounting = Mounting(se3_inverse(body_from_cam), calibration.base_from_body)
         self._calibration = CalibrationMonitor(self._mounting, settings.relocalizer, imu_minus_cam_s)
-        self._tracker = PoseTracker(settings, body_from_cam, calibration.base_from_body)
+        self._tracker = PoseTracker(settings, self._mounted, calibration.base_from_body)
         self._query = MapQuery(self._tracker, settings)
         self._map_version: int | None = None
         self._last_ns: int | None = None
@@ -93,7 +97,7 @@ class Localizer:
         self._tracker.lookalikes, self._tracker.alias_step_m = lookalikes, alias_step_m
         self._map_version = version
         view = MapView(tiles, vocabulary, survey_focal_px)
-        self._query.use(Relocalizer(view, self._camera, self._settings.relocalizer))
+        self._query.use(*(Relocalizer(view, camera, self._settings.relocalizer) for camera, _ in self._mounted))
         self._calibration.give_up()
 
     def start(self) -> Start | None:
@@ -109,20 +113,46 @@ class Localizer:
     def handle_stereo(self, frame: RectifiedFrame) -> Estimate:
         """Return the estimate at `frame`, which must be newer than all before."""
         begun_s = self._clock()
-        image = self._images.judge(frame)
-        if image.cause is Cause.FROZEN:
-            frame = self._images.without_frozen(frame)
+        images = [self._judged(frame, number) for number in range(len(self._mounted))]
+        self._choose_view([image.cause for image in images])
+        number = self._followed
+        image, followed = images[number], frame.view(number)
+        if image.cause is Cause.FROZEN and followed is not None:
+            followed = self._images[number].without_frozen(followed)
+        frame = followed if number == 0 and followed is not None else frame
         judged_s = self._clock()
-        odometry = self.odometry.handle_stereo(frame)
+        odometry = self.odometry.handle_stereo(frame if followed is None else followed)
         if image.cause is Cause.NONE:
-            image = replace(image, cause=self._images.judge_depth(odometry.scene_depth_m))
+            image = replace(image, cause=self._images[number].judge_depth(odometry.scene_depth_m))
         tracked_s = self._clock()
-        self.percept = Percept(odometry, image, self._motions())
+        causes = [image.cause if k == number else each.cause for k, each in enumerate(images)]
+        self.percept = Percept(odometry, image, self._motions(), views=tuple(causes))
+        self._last_frame = frame if frame.others else None
         estimate = self.localize(self.percept, frame)
         estimate.stage_s.update(
             {"image_quality": judged_s - begun_s, "odometry": tracked_s - judged_s, "map": self._clock() - tracked_s}
         )
         return estimate
+
+    def _judged(self, frame: RectifiedFrame, number: int) -> ImageQuality:
+        """Return the quality of a view's images: of the first as rectified, of others as recorded, since few of them are rectified."""
+        if number == 0:
+            return self._images[0].judge(frame)
+        other = frame.others[number - 1] if number <= len(frame.others) else None
+        return ImageQuality(Cause.NO_FRAMES) if other is None else self._images[number].judge(other.recorded)
+
+    def _choose_view(self, causes: Sequence[Cause]) -> None:
+        """Let the odometry follow another view that measures depth, if the images of the present one are unusable."""
+        present, last = self._followed, self.percept
+        is_occluded = last is not None and last.image.cause is Cause.OCCLUDED
+        if not (causes[present] in UNUSABLE or is_occluded):
+            return
+        for number, cause in enumerate(causes):
+            if number != present and cause not in UNUSABLE and self._mounted[number].camera.baseline_m > 0:
+                before = None if self._last_frame is None else self._last_frame.view(number)
+                self.odometry.follow(number, before)
+                self._followed = number
+                return
 
     def _motions(self) -> dict[int, Motion]:
         motions = {}
@@ -143,10 +173,12 @@ class Localizer:
         tracker.propagate(odometry, percept.motions, has_broken=percept.has_broken)
         if frame is not None:
             self._calibration.work()
-            percept.is_reversed = self._calibration.is_reversed(frame, is_localized=tracker.confirmed is not None)
+            percept.is_reversed = self._followed == 0 and self._calibration.is_reversed(
+                frame, is_localized=tracker.confirmed is not None
+            )
         result = self._query.step(percept, frame)
         if frame is not None:
-            if self._query.finished is not None:
+            if self._query.finished is not None and self._query.view == 0:
                 self._calibration.add(self._query.finished)
             percept.calibration = self._calibration.state
         estimate = Estimate(
@@ -160,6 +192,7 @@ class Localizer:
             stage_s={},
             cause=percept.image.cause or (Cause.CARRIED if tracker.is_carried else Cause.NONE),
             image=percept.image,
+            views=percept.views,
             **result._asdict(),
         )
         estimate = assemble(

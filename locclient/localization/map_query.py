@@ -3,8 +3,10 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, interpolate_se3
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, Relocalizer
@@ -13,6 +15,7 @@ from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import ViewpointGate
 from locclient.localization.calibration.pair_order import REVERSED_TEXT
 from locclient.localization.estimate import QueryResult
+from locclient.localization.image_quality import UNUSABLE
 from locclient.localization.percept import Percept, QueryInput
 from locclient.localization.pose_covariance import transport_cov
 from locclient.localization.pose_hypothesis import PoseHypothesis
@@ -55,7 +58,8 @@ class MapQuery:
 
     def __init__(self, tracker: PoseTracker, settings: LocalizerSettings) -> None:
         self._tracker, self._settings, self._track = tracker, settings, settings.track
-        self.relocalizer: Relocalizer | None = None
+        self._relocalizers: tuple[Relocalizer, ...] = ()  # of each view
+        self.view = 0  # whose frame is queried
         self.failed = 0
         self.finished: FinishedQuery | None = None  # finished with the last frame
         self._job: TimeSliced[QueryResult] | None = None
@@ -63,24 +67,26 @@ class MapQuery:
         self._begun_ns: int | None = None
         self._slices, self._is_urgent = 1, False  # of that job: slices per frame; started by lost tracks
         self._last_ns: int | None = None  # of the last frame
-        self._gate = ViewpointGate()
-        self._failed_places: list[Array] = []  # searched without success from the viewpoint of the gate
+        self._gates = [ViewpointGate()]  # of each view
+        self._failed_places: list[list[Array]] = [[]]  # searched without success from the viewpoint of the gate
 
     @property
     def is_under_way(self) -> bool:
         return self._job is not None
 
-    def use(self, relocalizer: Relocalizer) -> None:
-        """Use another map; cancel a running query."""
-        self.relocalizer = relocalizer
+    def use(self, *relocalizers: Relocalizer) -> None:
+        """Use another map, by a relocalizer for each of the rig's views; cancel a running query."""
+        if len(relocalizers) != len(self._gates):
+            self._gates = [ViewpointGate() for _ in relocalizers]
+        self._relocalizers = relocalizers
         self._cancel()
-        self._failed_places.clear()
+        self._failed_places = [[] for _ in relocalizers]
 
     def forget(self) -> None:
         """Forget the pose; cancel a running query."""
         self._cancel()
         self.failed = 0
-        self._failed_places.clear()
+        self._failed_places = [[] for _ in self._gates]
 
     def _cancel(self) -> None:
         self._job = None
@@ -94,7 +100,8 @@ class MapQuery:
         """
         self.finished = None
         if percept.odometry.new_odom_from_old_odom is not None:
-            self._gate.redefine_odom(percept.odometry.new_odom_from_old_odom)
+            for gate in self._gates:
+                gate.redefine_odom(percept.odometry.new_odom_from_old_odom)
         result = QueryResult(refused=REVERSED_TEXT) if percept.is_reversed else self._step(percept, frame)
         self._last_ns = percept.odometry.stamp_ns
         return result
@@ -104,12 +111,12 @@ class MapQuery:
         is_urgent = percept.has_broken and not self.failed
         if (is_urgent and not self._is_urgent) or odometry.after_gap:
             self._cancel()  # a frame before the break, or before the gap, says little of the robot's present pose
-        if self._job is None and self.relocalizer is not None:
+        if self._job is None and self._relocalizers:
             is_due = is_urgent or self._is_due(odometry)
             begins = percept.query is not None if frame is None else is_due
             if begins:
                 is_at_once = self._is_sparse(odometry.stamp_ns) or odometry.after_gap
-                self._begin(percept, frame, self.relocalizer, is_urgent=is_urgent)
+                self._begin(percept, frame, is_urgent=is_urgent)
         return self._advance(is_at_once=is_at_once)
 
     def _is_due(self, odometry: OdometryEstimate) -> bool:
@@ -124,21 +131,37 @@ class MapQuery:
             return True
         return (stamp_ns - self._last_ns) * 1e-9 > _SPREAD_SHARE * self._track.fix_interval_s
 
-    def _begin(
-        self, percept: Percept, frame: RectifiedFrame | None, relocalizer: Relocalizer, *, is_urgent: bool
-    ) -> None:
+    def _next_view(self, percept: Percept, frame: RectifiedFrame) -> int:
+        """Return the view to query: the last one as long as it gives fixes, else the next one with good images."""
+        count, first = len(self._relocalizers), self.view + bool(self.failed)
+        order = [(first + k) % count for k in range(count)]
+        return next((k for k in order if percept.views[k] not in UNUSABLE), self.view)
+
+    def _motion_until(self, odometry: OdometryEstimate, stamp_ns: int) -> Array | None:
+        """Return the body's motion (4, 4) now_from_then from a moment to the present frame, at its speed; None if they are the same."""
+        later_ns, before, last_ns = stamp_ns - odometry.stamp_ns, odometry.previous_from_body, self._last_ns
+        if later_ns == 0 or before is None or last_ns is None:
+            return None
+        return interpolate_se3(np.eye(4), before, later_ns / (odometry.stamp_ns - last_ns))
+
+    def _begin(self, percept: Percept, frame: RectifiedFrame | None, *, is_urgent: bool) -> None:
         odometry, tracker = percept.odometry, self._tracker
-        percept.query = percept.query or QueryInput()
+        if percept.query is None:
+            assert frame is not None
+            percept.query = QueryInput(view=self._next_view(percept, frame))
+        self.view = view = percept.query.view
+        frame = None if frame is None else frame.view(view) or frame
         self._begun = percept, frame
+        tracker.begin_query(odometry, view, None if frame is None else self._motion_until(odometry, frame.stamp_ns))
         self._begun_ns = odometry.stamp_ns
-        tracker.begin_query(odometry)
-        is_at_rest = tracker.confirmed is None and not self._gate.is_new(odometry.odom_from_body)
+        is_at_rest = tracker.confirmed is None and not self._gates[view].is_new(odometry.odom_from_body)
         is_unknown = tracker.confirmed is None and tracker.prior is None
         is_eager = is_at_rest or is_urgent or (is_unknown and self.failed < _FIRST_SEARCHES)
         self._is_urgent, self._slices = is_urgent, _MORE_SLICES if is_eager else 1
         if not is_at_rest:
-            self._failed_places.clear()
-        self._job = self._run(percept.query, frame, relocalizer, is_sparse=self._is_sparse(odometry.stamp_ns))
+            self._failed_places[view].clear()
+        is_sparse = self._is_sparse(odometry.stamp_ns)
+        self._job = self._run(percept.query, frame, self._relocalizers[view], is_sparse=is_sparse)
 
     def _advance(self, *, is_at_once: bool) -> QueryResult:
         if self._job is None:
@@ -154,11 +177,11 @@ class MapQuery:
             self._is_urgent = False
             self.failed = 0 if result.fix is not None else self.failed + 1
             assert self._begun is not None
-            assert self.relocalizer is not None
             percept, frame = self._begun
             if frame is not None and percept.query is not None and percept.query.features is not None:
                 is_confirmed = self._tracker.confirmed is not None
-                looked = percept.odometry, percept.query.features, result.fix, self.relocalizer, is_confirmed
+                relocalizer = self._relocalizers[self.view]
+                looked = percept.odometry, percept.query.features, result.fix, relocalizer, is_confirmed
                 self.finished = FinishedQuery(frame, *looked)
             return result
         return QueryResult()
@@ -217,7 +240,7 @@ class MapQuery:
         rotation = self._rotation(candidates[0]) if len(candidates) == 1 else None
         prior = tracker.prior
         near = None if prior is None else prior.is_near(relocalizer.view.map_from_cam[:, :3, 3])
-        fixes = yield from relocalizer.anywhere(features, near, rotation, fixes, self._failed_places)
+        fixes = yield from relocalizer.anywhere(features, near, rotation, fixes, self._failed_places[self.view])
         fixes = tracker.believed(fixes)
         prior = tracker.prior
         if prior is None:

@@ -12,10 +12,14 @@ from locclient.localization.pose_hypothesis import Motion
 
 @dataclass(slots=True)
 class QueryInput:
-    """Features of the frame of a map query, and the number of slices of their extraction; None until they are complete."""
+    """Features of the frame of a map query, and the number of slices of their extraction; None until they are complete.
+
+    view: number of the rig's view that they are of.
+    """
 
     slices: int = 0
     features: FrameFeatures | None = None
+    view: int = 0
 
 
 @dataclass(slots=True)
@@ -23,7 +27,8 @@ class Percept:
     """Percept of one frame.
 
     motions: of the odometry, from start frames of hypotheses. is_reversed: left and right image are exchanged or mirrored.
-    calibration: its state by the map before this frame. query: of a map query that begins with this frame.
+    calibration: its state by the map before this frame. query: of a map query that begins with this frame. image: of the view that the
+    odometry follows; views: faults of the images of each view.
     """
 
     odometry: OdometryEstimate
@@ -32,6 +37,7 @@ class Percept:
     is_reversed: bool = False
     calibration: CalibrationState = NOT_JUDGED
     query: QueryInput | None = None
+    views: tuple[Cause, ...] = (Cause.NONE,)
 
     @property
     def has_broken(self) -> bool:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,6 +12,7 @@ from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes
 from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, is_reliable
+from fleetmap.sensors.rectification import MountedCamera
 from fleetmap.sensors.samples import PositionPrior
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import is_other_viewpoint
@@ -52,6 +54,15 @@ class Start:
     failed_queries: int = 0
 
 
+class _Unmatched(NamedTuple):
+    """The frame of a query without a fix, as the identity; features of one of its views, body_from_cam (4, 4)."""
+
+    frame: PoseHypothesis
+    features: FrameFeatures
+    view: int
+    body_from_cam: Array
+
+
 class PoseTracker:
     """Propagates hypotheses from frame to frame, confirms one of them, and gives it up.
 
@@ -69,10 +80,11 @@ class PoseTracker:
     CONFIRMED   --its radius includes the next similar place-->  SEARCHING, with the pose as a prior
     """
 
-    def __init__(self, settings: LocalizerSettings, body_from_cam: Array, base_from_body: Array) -> None:
+    def __init__(self, settings: LocalizerSettings, mounted: Sequence[MountedCamera], base_from_body: Array) -> None:
+        """mounted: the cameras of the rig's views."""
         self._settings, self._track = settings, settings.track
-        self.body_from_cam, self._base_from_body = body_from_cam, base_from_body
-        self._cam_from_body = se3_inverse(body_from_cam)
+        self._mounted, self._base_from_body = mounted, base_from_body
+        self._view, self.body_from_cam = 0, mounted[0].body_from_cam  # of the last query
         self.prior: InitialPosePrior | None = None
         self.candidates = HypothesisSet(settings.track)
         self.confirmed: PoseHypothesis | None = None
@@ -84,7 +96,7 @@ class PoseTracker:
         self._query_frame: PoseHypothesis | None = None  # of the running map query, as the identity
         self._query_index: int | None = None  # of the last map query's frame
         # Frames of queries since the last fix, each as the identity.
-        self._unmatched: list[tuple[PoseHypothesis, FrameFeatures]] = []
+        self._unmatched: list[_Unmatched] = []
 
     # --- priors and starts --------------------------------------------------------------------------------------------
 
@@ -179,13 +191,18 @@ class PoseTracker:
         found = [*self.candidates.tracked(), *([] if self.prior is None else self.prior.tracked())]
         if self.confirmed is not None:
             found.append(self.confirmed)
-        found.extend(frame for frame, _ in self._unmatched)
+        found.extend(each.frame for each in self._unmatched)
         return found if self._query_frame is None else [*found, self._query_frame]
 
     # --- fixes of a map query -----------------------------------------------------------------------------------------
 
-    def begin_query(self, odometry: OdometryEstimate) -> None:
-        """Begin a map query with the present frame; its fixes may follow some frames later."""
+    def begin_query(self, odometry: OdometryEstimate, view: int = 0, now_from_then: Array | None = None) -> None:
+        """Begin a map query with the present frame of a view; its fixes may follow some frames later.
+
+        now_from_then (4, 4): the body's motion from the moment of that view's images to that of `odometry`; None if they are the same.
+        """
+        self._view, body_from_cam = view, self._mounted[view].body_from_cam
+        self.body_from_cam = body_from_cam if now_from_then is None else now_from_then @ body_from_cam
         self._doubt_confirmed(odometry)
         for hypothesis in self._tracked():
             hypothesis.mark_query()
@@ -212,22 +229,26 @@ class PoseTracker:
         """Keep the frame of the running query, which found no fix near the confirmed pose, for later ones; not the same view again, whose
         wrong matches would be the same."""
         assert self._query_frame is not None
-        if len(self.earlier_frames()) == len(self._unmatched):
-            self._unmatched = [*self._unmatched, (self._query_frame, features)][-_EARLIER:]
+        if all(self._is_aside(each) for each in self._unmatched):
+            kept = _Unmatched(self._query_frame, features, self._view, self.body_from_cam)
+            self._unmatched = [*self._unmatched, kept][-_EARLIER:]
 
     def forget_frames(self) -> None:
         """Drop all kept frames: each counts for one fix."""
         self._unmatched.clear()
 
     def earlier_frames(self) -> list[EarlierFrame]:
-        """Return the kept frames from other viewpoints than that of the running query."""
-        found = []
-        for frame, features in self._unmatched:
-            earlier_from_query = frame.query_map_from_body
-            if is_other_viewpoint(earlier_from_query):
-                cam_from_query = self._cam_from_body @ earlier_from_query @ self.body_from_cam
-                found.append(EarlierFrame(features, cam_from_query, frame.query_cov))
+        """Return the kept frames of other viewpoints or cameras than those of the running query, if their lenses are alike."""
+        found, lens = [], self._mounted[self._view].camera
+        for each in self._unmatched:
+            if self._is_aside(each) and self._mounted[each.view].camera == lens:
+                earlier_from_query = each.frame.query_map_from_body
+                cam_from_query = se3_inverse(each.body_from_cam) @ earlier_from_query @ self.body_from_cam
+                found.append(EarlierFrame(each.features, cam_from_query, each.frame.query_cov))
         return found
+
+    def _is_aside(self, earlier: _Unmatched) -> bool:
+        return earlier.view != self._view or is_other_viewpoint(earlier.frame.query_map_from_body)
 
     def observations(self, fixes: Sequence[Fix]) -> Observations:
         """Return the fixes of the running query with their poses at present."""
@@ -254,7 +275,7 @@ class PoseTracker:
 
     def _at_body(self, fix: Fix) -> tuple[Array, Array]:
         """Return a fix as map_from_body with its covariance (map axes, about the body)."""
-        map_from_body = fix.map_from_cam @ self._cam_from_body
+        map_from_body = fix.map_from_cam @ se3_inverse(self.body_from_cam)
         return map_from_body, transport_cov(fix.cov_rot_trans, map_from_body[:3, 3] - fix.map_from_cam[:3, 3])
 
     def within_prior(self, fixes: Sequence[Fix]) -> list[Fix]:

@@ -93,7 +93,7 @@ class Robot:
         self._rectifier, self._clock_s = rectifier, clock_s
         self.base_from_body = calibration.base_from_body
         mounting = (rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s)
-        self.localizer = Localizer(calibration, *mounting, settings, clock_s)
+        self.localizer = Localizer(calibration, *mounting, settings, clock_s, rectifier.mounted[1:])
         self.ring = FailureRing() if keeps_replay else None
         self._versions = VersionTrials(trial, self._show)
         self._odom = ContinuousOdom(calibration.base_from_body)

@@ -970,7 +970,7 @@ class Filter:
     def motion_since(self, clone_id: int) -> tuple[_Reals, _Reals]:
         """As body_since, and its covariance (6, 6), of a left perturbation in axes of the earlier body."""
 
-    def cam_from_earlier(self, clone_id: int, cam_from_body: _Reals) -> _Reals:
+    def cam_from_earlier(self, clone_id: int, cam_from_body: _Reals, camera: int = 0) -> _Reals:
         """(4, 4) from a clone's first camera to that of the state."""
 
     def odom_from_clone(self, clone_id: int) -> _Reals:

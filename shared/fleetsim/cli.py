@@ -41,6 +41,7 @@ def record(
         str | None,
         Option(help="pinhole, radial-tangential, plumb-bob, rational or equidistant instead of the robot's own."),
     ] = None,
+    rig: Annotated[str, Option(help="pair, front-rear (a second pair) or front-sides (two single cameras).")] = "pair",
     size: Annotated[str | None, Option(metavar="WxH", help="Picture size in pixels, 640x480 unless given.")] = None,
     frames: Annotated[int | None, Option(min=1, help="Maximum number of frames.")] = None,
     fault: Annotated[list[str] | None, Option(metavar="NAME@START+SECONDS", help="A fault; repeatable.")] = None,
@@ -67,7 +68,7 @@ def record(
 
     order = Order(
         scenario, seed, day, light, robot, lens, frames, tuple(parse_fault(text) for text in fault or []), _size_px(size),
-        HiddenErrors(camera_delay_ms * 1e-3, math.radians(camera_turn_deg), camera_shift_mm * 1e-3), camera_pipeline,
+        HiddenErrors(camera_delay_ms * 1e-3, math.radians(camera_turn_deg), camera_shift_mm * 1e-3), camera_pipeline, rig,
     )  # fmt: skip
     from fleetsim.commands import record_order
 

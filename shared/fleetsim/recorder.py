@@ -33,7 +33,7 @@ class Order:
     """A run to record. robot: a run of the scenario, its first one for None. frames: maximum number, all for None.
 
     hidden: errors of mounting and clock missing in the recording's calibration. camera_pipeline: a key of
-    IMAGE_PIPELINES.
+    IMAGE_PIPELINES. rig: a key of RIGS.
     """
 
     scenario: str
@@ -47,6 +47,7 @@ class Order:
     size_px: tuple[int, int] | None = None
     hidden: HiddenErrors = field(default_factory=HiddenErrors)
     camera_pipeline: str = "clean"
+    rig: str = "pair"
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,7 +72,8 @@ class Session:
 
         def made(time_s: float, stamp_ns: int) -> CameraFrame:
             shot = self.renderer.shoot(time_s)
-            return process_frame(CameraFrame(stamp_ns, shot.left, shot.right), pipeline, self.order.seed)
+            others = tuple(CameraFrame(stamp_ns, each[0], each[1] if each[1:] else None) for each in shot.others)
+            return process_frame(CameraFrame(stamp_ns, shot.left, shot.right, others=others), pipeline, self.order.seed)
 
         moments = iter(zip(self.frame_times_s, self.frame_stamps_ns(), strict=True))
         with ThreadPoolExecutor(1, thread_name_prefix="shutter") as shutter:
@@ -111,7 +113,7 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
     if order.day < 0 or order.seed < 0:
         raise UsageError(f"seed {order.seed} and day {order.day} must not be negative")
     name, run = scenario.run(order.robot)
-    kind = replace(run.kind.with_lens(order.lens or run.kind.lens), hidden=order.hidden)
+    kind = replace(run.kind.with_lens(order.lens or run.kind.lens).with_rig(order.rig), hidden=order.hidden)
     if order.size_px is not None:
         kind = replace(kind, width_px=order.size_px[0], height_px=order.size_px[1])
     nominal, true = nominal_calibration(kind), true_calibration(kind, _generator(order, name, "mounting"))

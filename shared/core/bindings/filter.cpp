@@ -132,9 +132,10 @@ auto motion_since(SharedFilter& filter, int64_t clone_id) {
   return std::make_tuple(transform(filter.motion_between(index, newest(filter))), copied<2>(covariance, {6, 6}));
 }
 
-auto cam_from_earlier(SharedFilter& filter, int64_t clone_id, const Transform& cam_from_body) {
+auto cam_from_earlier(SharedFilter& filter, int64_t clone_id, const Transform& cam_from_body, size_t camera) {
+  if (camera >= filter.cameras().size()) throw nb::value_error("camera: its number");
   const SE3 body_from_earlier = inverse(filter.state.body()) * filter.clone(index_of(filter, clone_id));
-  return transform(se3(cam_from_body.data()) * body_from_earlier * filter.cameras().front().body_from_cam);
+  return transform(se3(cam_from_body.data()) * body_from_earlier * filter.cameras()[camera].body_from_cam);
 }
 
 auto body_covariance(SharedFilter& filter) {
@@ -249,7 +250,7 @@ void bind_filter(nb::module_& module) {
            }),
            clone_id)
       .def("motion_since", in_turn(&motion_since), clone_id)
-      .def("cam_from_earlier", in_turn(&cam_from_earlier), clone_id, "cam_from_body"_a.noconvert())
+      .def("cam_from_earlier", in_turn(&cam_from_earlier), clone_id, "cam_from_body"_a.noconvert(), "camera"_a = 0)
       .def("odom_from_clone", in_turn(+[](SharedFilter& filter, int64_t id) { return transform(filter.clone(index_of(filter, id))); }),
            clone_id)
       .def("odom_from_body", in_turn(+[](SharedFilter& filter) { return transform(filter.state.body()); }))

@@ -94,6 +94,10 @@ class Mode(ABC):
         """Return the mode for the first frame, at stamp_ns."""
         return self
 
+    def follow(self, rig: OdometryRig) -> None:
+        """Follow another camera of the rig from the next frame on."""
+        raise NotImplementedError(f"{type(self).__name__} follows one camera")
+
     @abstractmethod
     def predict(self, stamp_ns: int) -> None:
         """Move the state to a frame."""
@@ -127,6 +131,9 @@ class WindowMode(Mode):
     def __init__(self, window: SlidingWindow) -> None:
         self.window = window
         self._rig = window.rig
+
+    def follow(self, rig: OdometryRig) -> None:
+        self._rig = self.window.rig = rig
 
     @property
     def stamp_ns(self) -> int:
@@ -199,6 +206,12 @@ class VisualMode(WindowMode):
         self._step_ns = 0  # duration of that motion, 0 if unknown
         # Of the last frame whose motion was known from images: stamp, duration (0 without one) and variance of the motion.
         self._seen_ns, self._seen_step_ns, self._seen_var_m2 = window.stamp_ns, 0, 0.0
+
+    def follow(self, rig: OdometryRig) -> None:
+        """See Mode; the last motion becomes that of the other camera."""
+        body_from_next = self._rig.body_from_cam @ se3_inverse(self._cam_from_previous) @ self._rig.cam_from_body
+        self._cam_from_previous = rig.cam_from_body @ se3_inverse(body_from_next) @ rig.body_from_cam
+        super().follow(rig)
 
     def predict(self, stamp_ns: int) -> None:
         """See Mode; the state is known only after tracking of the frame."""
@@ -437,6 +450,10 @@ class InertialMode(WindowMode):
     def started(cls, old: SlidingWindow, imu: ImuInputs, start: InitialState) -> "InertialMode":
         """Replace another mode, with an empty window."""
         return cls(old.restarted(start.state, start.covariance, start.stamp_ns), imu)
+
+    def follow(self, rig: OdometryRig) -> None:
+        super().follow(rig)
+        self._seen = None  # of the other camera
 
     def predict(self, stamp_ns: int) -> None:
         window, imu = self.window, self._imu

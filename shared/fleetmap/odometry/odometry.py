@@ -20,7 +20,7 @@ from fleetmap.odometry.sensor_buffer import SensorBuffer
 from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.odometry.tracking.tracker import Tracker
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import ImuSamples, WheelSample
 
 _IMU_MEMORY_S = 25.0
@@ -38,15 +38,20 @@ class Odometry:
         imu_minus_cam_s: float,
         settings: OdometrySettings,
         stereo_settings: StereoSettings | None = None,
+        others: Sequence[MountedCamera] = (),
     ) -> None:
+        """others: cameras of further views, see `follow`."""
         cam_from_body, base_from_body = se3_inverse(body_from_cam), calibration.base_from_body
+        mounted = (MountedCamera(camera, body_from_cam), *others)
         self._rig = OdometryRig(
-            camera, body_from_cam, cam_from_body, base_from_body, imu_minus_cam_s, calibration.imu, settings
+            camera, body_from_cam, cam_from_body, base_from_body, imu_minus_cam_s, calibration.imu, settings, mounted
         )
+        self._stereo_settings = stereo_settings
         self._samples = SensorBuffer()
         self._accelerometer = AccelerometerCheck(base_from_body)
         self._clock = GyroClock(MAX_OFFSET_SIGMAS * settings.filter.time_offset_sigma_s)
-        self._tracker = Tracker(camera, settings.tracker, stereo_settings)
+        self._tracker = self._new_tracker(0, 0)
+        self._before: RectifiedFrame | None = None  # of a camera that is followed from the next frame on
         self._mode = self._first_mode()
         self._frame_index = 0
 
@@ -59,8 +64,21 @@ class Odometry:
         if self._rig.settings.filter.use_wheels:
             self._samples.add_wheel(samples)
 
+    def follow(self, number: int, before: RectifiedFrame | None) -> None:
+        """Take the frames of another view from now on; before: its frame at the last moment, in which its tracks begin."""
+        self._rig = self._rig.following(number)
+        self._mode.follow(self._rig)
+        self._before = before if self._frame_index else None
+        first_frame = self._frame_index - (self._before is not None)
+        self._tracker = self._new_tracker(first_frame, self._tracker.next_id)
+
+    def _new_tracker(self, first_frame: int, first_id: int) -> Tracker:
+        settings = self._rig.settings.tracker
+        numbers = {"first_frame": first_frame, "first_id": first_id}
+        return Tracker(self._rig.camera, settings, self._stereo_settings, **numbers)
+
     def handle_stereo(self, frame: RectifiedFrame) -> OdometryEstimate:
-        """Return the estimate at `frame`, which must be newer than any before.
+        """Return the estimate at `frame`, of the followed view, which must be newer than any before.
 
         IMU samples up to its stamp should have been added.
         """
@@ -69,7 +87,10 @@ class Odometry:
         stamp_ns, frame_index = frame.stamp_ns + int(self._rig.imu_minus_cam_s * 1e9), self._frame_index
         mode = self._mode if frame_index else self._mode.begin(stamp_ns)
         mode.predict(stamp_ns)
+        before = None if self._before is None else self._tracker.track(self._before, mode.cam_from_earlier)
         tracked = self._tracker.track(frame, mode.cam_from_earlier, mode.rotation_sigma_rad)
+        if before is not None:
+            tracked, self._before = tracked.begun_in(frame_index - 1, before), None
         step = mode.process(frame_index, tracked)
         self._mode, self._frame_index = step.mode, frame_index + 1
         return self._mode.estimate(frame.stamp_ns, frame_index, tracked, step)

@@ -11,6 +11,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.cameras import CAMERA_MODELS
 
 _SUB_PX = 4  # bits of a pixel's fraction
+_SAME_WAY_COSINE = 0.7  # of 45 degrees: half of a usual lens's image is common to both cameras
 Polygon = tuple[tuple[float, float], ...]  # corners (u, v) in pixels as recorded
 
 
@@ -69,7 +70,7 @@ NO_BASE = (
 
 @dataclass(frozen=True, slots=True)
 class RigCalibration:
-    """All sensors of one robot. Cameras left first; `imu` is None for a rig without one.
+    """All sensors of one robot. Cameras view by view (see `views`), of a pair the left one first; `imu` is None for a rig without one.
 
     assumed: names of values without a source, of `imu` and `base_from_body`.
     """
@@ -78,6 +79,17 @@ class RigCalibration:
     imu: ImuNoise | None = None
     base_from_body: Array = field(default_factory=lambda: np.eye(4))
     assumed: tuple[str, ...] = ()
+
+    @property
+    def views(self) -> tuple[tuple[int, ...], ...]:
+        """Numbers of the cameras of each view, a single camera or a stereo pair: two successive cameras that look the same way."""
+        views, numbers = list[tuple[int, ...]](), list(range(len(self.cameras)))
+        while numbers:
+            axes = [self.cameras[number].body_from_cam[:3, 2] for number in numbers[:2]]
+            size = 2 if len(axes) == 2 and axes[0] @ axes[1] > _SAME_WAY_COSINE else 1
+            views.append(tuple(numbers[:size]))
+            del numbers[:size]
+        return tuple(views)
 
     @property
     def wheels_fault(self) -> str:

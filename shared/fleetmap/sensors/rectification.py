@@ -7,6 +7,7 @@ single camera has baseline 0.
 
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -65,14 +66,32 @@ class StereoCamera:
             )
 
 
+class MountedCamera(NamedTuple):
+    """The rectified camera of a view on its body: body_from_cam (4, 4)."""
+
+    camera: StereoCamera
+    body_from_cam: Array
+
+
 @dataclass(frozen=True)
 class RectifiedFrame:
-    """A CameraFrame rectified to the StereoCamera. disparity_px (H, W) float32 (NaN unknown) only with a depth sensor."""
+    """A CameraFrame rectified to the StereoCamera. disparity_px (H, W) float32 (NaN unknown) only with a depth sensor.
+
+    others: the rig's other views, None without images at this moment.
+    """
 
     stamp_ns: int
     left: Image
     right: Image | None
     disparity_px: NDArray[np.float32] | None
+    others: "tuple[OtherView | None, ...]" = ()
+
+    def view(self, number: int) -> "RectifiedFrame | None":
+        """The frame of a view of the rig, 0 for this one; None without images."""
+        if number == 0:
+            return self
+        other = self.others[number - 1] if number <= len(self.others) else None
+        return None if other is None else other.rectified
 
     @cached_property
     def half_left(self) -> Image:
@@ -91,6 +110,18 @@ def _halved(image: Image) -> Image:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
+@dataclass(frozen=True)
+class OtherView:
+    """A further view of a rig at one moment, rectified when it is needed; stamped on the first view's clock."""
+
+    recorded: CameraFrame
+    rectifier: "Rectifier"
+
+    @cached_property
+    def rectified(self) -> RectifiedFrame:
+        return self.rectifier.rectify(self.recorded)
+
+
 class Rectifier:
     """Rectifies recorded frames of one rig; holds the look-up tables. What shows the robot itself becomes black, without depth.
 
@@ -101,23 +132,25 @@ class Rectifier:
     def __init__(
         self, calibration: RigCalibration, *, has_depth: bool = False, pinhole: StereoCamera | None = None
     ) -> None:
-        cameras = calibration.cameras
-        if not cameras:
+        if not calibration.cameras:
             raise CalibrationError("the calibration holds no camera; pass one with --calibration FILE")
-        self._sizes = [(c.height_px, c.width_px) for c in cameras[:2]]
+        self._numbers, *others = calibration.views
+        cameras = tuple(calibration.cameras[number] for number in self._numbers)
+        self._sizes = [(c.height_px, c.width_px) for c in cameras]
         self.has_depth = has_depth
         if has_depth or len(cameras) == 1:
             cam0_from_rect = np.eye(3)
             baseline = RGBD_BASELINE_M if has_depth else 0.0
             used = cameras[:1]
         else:
-            cam0_from_rect, baseline = _rectifying_rotation(cameras[0], cameras[1])
-            used = cameras[:2]
+            cam0_from_rect, baseline = _rectifying_rotation(cameras[0], cameras[1], self._numbers)
+            used = cameras
         self.camera = _common_pinhole(used, baseline)
         if pinhole is not None:
             self.camera = _as_pinhole(pinhole, self.camera)
         self.body_from_cam = cameras[0].body_from_cam @ se3(cam0_from_rect, np.zeros(3))
         self.imu_minus_cam_s = cameras[0].imu_minus_cam_s
+        self.others = tuple(self._of_view(calibration, numbers) for numbers in others)
         self._maps, hidden = [], []
         for camera in used:
             body_from_rect = self.body_from_cam[:3, :3]
@@ -131,8 +164,22 @@ class Rectifier:
             hidden.append(shows_robot)
         self.camera = replace(self.camera, clearance_px=_clearance_px(hidden[0]))
 
+    def _of_view(self, calibration: RigCalibration, numbers: tuple[int, ...]) -> "Rectifier":
+        """The rectifier of another view: to the same pinhole, if its focal length allows."""
+        view = replace(calibration, cameras=tuple(calibration.cameras[number] for number in numbers))
+        focal_px = float(np.mean([camera.intrinsics_px[:2].mean() for camera in view.cameras]))
+        is_alike = 1 / _MAX_ZOOM < focal_px / self.camera.focal_px < _MAX_ZOOM
+        other = Rectifier(view, pinhole=self.camera if is_alike else None)
+        other._numbers = numbers
+        return other
+
+    @property
+    def mounted(self) -> tuple[MountedCamera, ...]:
+        """The cameras of all views."""
+        return tuple(MountedCamera(each.camera, each.body_from_cam) for each in (self, *self.others))
+
     def rectify(self, frame: CameraFrame) -> RectifiedFrame:
-        """Rectify a frame; raises RecordingError if an image's size differs from the calibration's."""
+        """Rectify a frame, its other views once they are needed; RecordingError for an image of another size than the calibration's."""
         left = self._remap(frame.left, 0, frame.stamp_ns)
         right = self._remap(frame.right, 1, frame.stamp_ns) if frame.right is not None and len(self._maps) > 1 else None
         disparity = None
@@ -142,13 +189,20 @@ class Rectifier:
             if self._maps[0] is not None:
                 nearest = cv2.remap(disparity, *self._maps[0], cv2.INTER_NEAREST, borderValue=float("nan"))
                 disparity = np.asarray(nearest, np.float32)
-        return RectifiedFrame(frame.stamp_ns, left, right, disparity)
+        others = (self._other(*each) for each in zip(frame.others, self.others, strict=False))
+        return RectifiedFrame(frame.stamp_ns, left, right, disparity, tuple(others))
+
+    def _other(self, frame: CameraFrame | None, rectifier: "Rectifier") -> OtherView | None:
+        if frame is None:
+            return None
+        later_ns = round((rectifier.imu_minus_cam_s - self.imu_minus_cam_s) * 1e9)
+        return OtherView(replace(frame, stamp_ns=frame.stamp_ns + later_ns), rectifier)
 
     def _remap(self, image: Image, index: int, stamp_ns: int) -> Image:
         if image.shape != self._sizes[index]:
             height, width = self._sizes[index]
             raise RecordingError(
-                f"cam{index} image at {stamp_ns} is {image.shape[1]}x{image.shape[0]}, "
+                f"cam{self._numbers[index]} image at {stamp_ns} is {image.shape[1]}x{image.shape[0]}, "
                 f"the calibration says {width}x{height}; pass the matching one with --calibration FILE"
             )
         tables = self._maps[index]
@@ -157,18 +211,20 @@ class Rectifier:
         return np.asarray(cv2.remap(image, tables[0], tables[1], cv2.INTER_LINEAR), np.uint8)
 
 
-def _rectifying_rotation(left: CameraCalibration, right: CameraCalibration) -> tuple[Array, float]:
+def _rectifying_rotation(
+    left: CameraCalibration, right: CameraCalibration, numbers: tuple[int, ...]
+) -> tuple[Array, float]:
     """cam0_from_rect (3, 3) and the baseline: x along the baseline, z as near to both optical axes as possible."""
     cam0_from_cam1 = se3_inverse(left.body_from_cam) @ right.body_from_cam
     baseline_cam0 = cam0_from_cam1[:3, 3]
     baseline_m = float(np.linalg.norm(baseline_cam0))
     if baseline_m < 1e-3:
         raise CalibrationError(
-            f"the two cameras are {baseline_m * 1000:.3f} mm apart; stereo needs a baseline, check body_from_cam"
+            f"cam{numbers[0]} and cam{numbers[1]} are {baseline_m * 1000:.3f} mm apart; stereo needs a baseline, check body_from_cam"
         )
     if baseline_cam0[0] < 0.7 * baseline_m:
         raise CalibrationError(
-            f"cam1 lies at {np.round(baseline_cam0, 4).tolist()} m in cam0's axes, not to its right; "
+            f"cam{numbers[1]} lies at {np.round(baseline_cam0, 4).tolist()} m in cam{numbers[0]}'s axes, not to its right; "
             "are left and right swapped?"
         )
     half = so3_exp(0.5 * so3_log(cam0_from_cam1[:3, :3]))

@@ -58,13 +58,15 @@ class CameraFrame:
     """One moment of the camera rig, as recorded (not rectified).
 
     left: (H, W) uint8 grey. right: the same for the second camera, None without one. depth_m: (H, W) float32 registered to
-    `left`, 0 or NaN where unknown, None without a depth sensor.
+    `left`, 0 or NaN where unknown, None without a depth sensor. others: the same of the rig's other views (`RigCalibration.views`),
+    None for one without images.
     """
 
     stamp_ns: int
     left: Image
     right: Image | None = None
     depth_m: NDArray[np.float32] | None = None
+    others: "tuple[CameraFrame | None, ...]" = ()
 
 
 @dataclass(frozen=True, slots=True)

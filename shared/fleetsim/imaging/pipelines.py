@@ -141,7 +141,7 @@ def find_pipeline(name: str) -> ImagePipeline:
     return IMAGE_PIPELINES[name]
 
 
-def process_frame(frame: CameraFrame, pipeline: ImagePipeline, seed: int) -> CameraFrame:
+def process_frame(frame: CameraFrame, pipeline: ImagePipeline, seed: int, first_camera: int = 0) -> CameraFrame:
     """Apply a pipeline to a frame; noise depends on seed, stamp and camera alone."""
     if pipeline == ImagePipeline():
         return frame
@@ -149,10 +149,14 @@ def process_frame(frame: CameraFrame, pipeline: ImagePipeline, seed: int) -> Cam
         None
         if picture is None
         else _process(picture, pipeline, frame.stamp_ns, np.random.default_rng([seed, frame.stamp_ns, n]))
-        for n, picture in enumerate((frame.left, frame.right))
+        for n, picture in enumerate((frame.left, frame.right), first_camera)
     ]
     assert pictures[0] is not None
-    return CameraFrame(frame.stamp_ns, pictures[0], pictures[1], frame.depth_m)
+    others = (
+        None if other is None else process_frame(other, pipeline, seed, first_camera + 2 * n)
+        for n, other in enumerate(frame.others, 1)
+    )
+    return CameraFrame(frame.stamp_ns, pictures[0], pictures[1], frame.depth_m, tuple(others))
 
 
 def _process(picture: Image, pipeline: ImagePipeline, stamp_ns: int, rng: np.random.Generator) -> Image:

@@ -24,7 +24,7 @@ _PERSON_AHEAD_M = 0.8
 
 @dataclass(frozen=True, slots=True)
 class StereoShot:
-    """A recorded pair, and the ground truth of the left image."""
+    """A recorded pair, and the ground truth of the left image. others: images of the rig's other views, of a pair or a single camera."""
 
     left: Image
     right: Image
@@ -32,6 +32,7 @@ class StereoShot:
     faces: NDArray[np.int32]
     exposure: Exposure
     subframes: int
+    others: tuple[tuple[Image, ...], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +47,7 @@ class RenderOptions:
 
 
 class StereoRenderer:
-    """Renders the images of a rig moving through a world. Its two threads end with `close`."""
+    """Renders the images of a rig moving through a world. Its threads, one a camera, end with `close`."""
 
     def __init__(self, world: World, rig: RigCalibration, motion: Motion, options: RenderOptions) -> None:
         self._world, self._rig, self._motion = world, rig, motion
@@ -96,12 +97,14 @@ class StereoRenderer:
         def shoot_one(camera: int) -> Shot:
             return self._painters[camera].shoot(scene, groups, self.path(camera), t_s, exposure, noise_key)
 
-        left, right = self._workers.map(shoot_one, (0, 1))
+        left, right, *beside = self._workers.map(shoot_one, range(len(self._painters)))
         right_image = right.image
         if self.faults.has("camera-frozen", t_s) and self._last_right is not None:
             right_image = self._last_right
         self._last_right = right_image
-        return StereoShot(left.image, right_image, left.depth_m, left.faces, exposure, left.subframes)
+        views = (numbers for numbers in self._rig.views[1:])
+        others = tuple(tuple(beside[number - 2].image for number in numbers) for numbers in views)
+        return StereoShot(left.image, right_image, left.depth_m, left.faces, exposure, left.subframes, others)
 
     def _person_in_front(self, t_s: float) -> tuple[float, float, float] | None:
         if not self.faults.has("person-in-front", t_s):

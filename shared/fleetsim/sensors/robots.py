@@ -1,5 +1,6 @@
 """The robots: drive, mounting, cameras, sensor errors. To add one: a line in ROBOTS."""
 
+import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -55,12 +56,29 @@ class HiddenErrors:
 
 
 @dataclass(frozen=True, slots=True)
+class ViewMount:
+    """A further view of a robot: turned left by yaw_rad, its middle at forward_m and left_m; of a pair unless baseline_m is 0."""
+
+    yaw_rad: float
+    forward_m: float
+    left_m: float = 0.0
+    baseline_m: float = 0.12
+
+
+RIGS: dict[str, tuple[ViewMount, ...]] = {  # beside the pair in front
+    "pair": (),
+    "front-rear": (ViewMount(math.pi, -0.3),),
+    "front-sides": (ViewMount(math.pi / 2, 0.0, 0.25, 0.0), ViewMount(-math.pi / 2, 0.0, -0.25, 0.0)),
+}
+
+
+@dataclass(frozen=True, slots=True)
 class RobotKind:
     """One model of robot.
 
     The IMU is the body, straight above the base; cameras sit baseline_m apart around their mount.
 
-    pitch_rad: cameras look down by this.
+    pitch_rad: cameras look down by this. rig: a key of RIGS.
     hidden: differences between the true mounting and clock and the calibration.
     """
 
@@ -74,6 +92,7 @@ class RobotKind:
     width_px: int = 640
     height_px: int = 480
     lens: str = "pinhole"
+    rig: str = "pair"
     clearance_m: float = 0.3
     imu: ImuErrors = field(default_factory=ImuErrors)
     wheels: WheelErrors = field(default_factory=WheelErrors)
@@ -84,6 +103,12 @@ class RobotKind:
         if lens not in LENSES:
             raise UsageError(f"unknown lens {lens!r}; known are {', '.join(LENSES)}")
         return replace(self, lens=lens)
+
+    def with_rig(self, rig: str) -> "RobotKind":
+        """A copy with another rig; UsageError naming the known ones."""
+        if rig not in RIGS:
+            raise UsageError(f"unknown rig {rig!r}; known are {', '.join(RIGS)}")
+        return replace(self, rig=rig)
 
 
 ROBOTS = {
@@ -103,13 +128,18 @@ def nominal_calibration(kind: RobotKind) -> RigCalibration:
     intrinsics = np.array([focal, focal, (kind.width_px - 1) / 2, (kind.height_px - 1) / 2])
     cosine, sine = np.cos(kind.pitch_rad), np.sin(kind.pitch_rad)
     rotation = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]) @ _BODY_FROM_OPTICAL
-    cameras = []
-    for number, side in enumerate((0.5, -0.5)):
-        place = np.array([kind.camera_forward_m, side * kind.baseline_m, kind.camera_height_m - kind.body_height_m])
-        camera = CameraCalibration(
-            model, kind.width_px, kind.height_px, intrinsics, np.array(distortion), se3(rotation, place)
-        )
-        cameras.append(check_camera(camera, f"cam{number}"))
+    cameras = list[CameraCalibration]()
+    height_m = kind.camera_height_m - kind.body_height_m
+    front = ViewMount(0.0, kind.camera_forward_m, 0.0, kind.baseline_m)
+    for view in (front, *RIGS[kind.rig]):
+        middle = np.array([view.forward_m, view.left_m, height_m])
+        turn = so3_exp(np.array([0.0, 0.0, view.yaw_rad])) if view.yaw_rad else np.eye(3)
+        for side in (0.5, -0.5) if view.baseline_m else (0.0,):
+            place = middle + turn @ np.array([0.0, side * view.baseline_m, 0.0])
+            camera = CameraCalibration(
+                model, kind.width_px, kind.height_px, intrinsics, np.array(distortion), se3(turn @ rotation, place)
+            )
+            cameras.append(check_camera(camera, f"cam{len(cameras)}"))
     base_from_body = se3(np.eye(3), np.array([0.0, 0.0, kind.body_height_m]))
     return RigCalibration(tuple(cameras), kind.imu.noise, base_from_body)
 

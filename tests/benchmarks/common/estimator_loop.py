@@ -3,7 +3,7 @@
 The loop is closed here because the simulator and the estimators may not know each other.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -21,8 +21,8 @@ from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
-from fleetmap.sensors.samples import PositionPrior, wheel_between
+from fleetmap.sensors.rectification import MountedCamera, OtherView, RectifiedFrame, StereoCamera
+from fleetmap.sensors.samples import CameraFrame, PositionPrior, wheel_between
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
@@ -43,8 +43,10 @@ class EstimatorTracker(Tracker):
     Track ids are the landmarks'. After a gap the flow simply goes on.
     """
 
-    def __init__(self, session: EstimatorSession, camera: StereoCamera, settings: TrackerSettings) -> None:
-        super().__init__(camera, settings)
+    def __init__(
+        self, session: EstimatorSession, camera: StereoCamera, settings: TrackerSettings, first_frame: int = 0
+    ) -> None:
+        super().__init__(camera, settings, first_frame=first_frame)
         self._session = session
         self._ids, self._pixels = np.zeros(0, np.int64), np.zeros((0, 3))
         self._begun_px: dict[int, Array] = {}
@@ -121,11 +123,27 @@ def seen(session: EstimatorSession, frame: int) -> FrameFeatures:
     )
 
 
-def blank(session: EstimatorSession, frame: int) -> RectifiedFrame:
+def blank(session: EstimatorSession, frame: int, others: Sequence[EstimatorSession] = ()) -> RectifiedFrame:
     """A frame that carries its stamp alone: noise for the judge of pictures, nothing at all where nothing is to be seen."""
     is_dark = not len(session.sighting(frame).ids)
     left = np.zeros_like(_NOISE[0]) if is_dark else _NOISE[frame % len(_NOISE)]
-    return RectifiedFrame(session.stamps_ns[frame], left, None, None)
+    views = tuple(_Blank.of(blank(other, frame)) for other in others)
+    return RectifiedFrame(session.stamps_ns[frame], left, None, None, views)
+
+
+@dataclass(frozen=True)
+class _Blank(OtherView):
+    """A view of which nothing is rectified."""
+
+    frame: RectifiedFrame
+
+    @classmethod
+    def of(cls, frame: RectifiedFrame) -> "_Blank":
+        return cls(CameraFrame(frame.stamp_ns, frame.left), None, frame)  # type: ignore[arg-type]
+
+    @property
+    def rectified(self) -> RectifiedFrame:  # type: ignore[override]
+        return self.frame
 
 
 def run_odometry(
@@ -170,17 +188,28 @@ def is_new_place(last_map_from_cam: Array, map_from_cam: Array, every_m: float =
 
 
 def survey_map(
-    session: EstimatorSession, rng: np.random.Generator, *, every_m: float = _EVERY_M, sigma_m: float = 0.01
-) -> tuple[list[Tile], Vocabulary]:
+    session: EstimatorSession, rng: np.random.Generator, *, every_m: float = _EVERY_M, sigma_m: float = 0.01,
+    others: Sequence[EstimatorSession] = (),
+) -> tuple[list[Tile], Vocabulary]:  # fmt: skip
     """A map as a survey would have left it: landmarks found at least twice, with an error of sigma_m, a place each every_m.
 
-    The vocabulary is trained on its descriptors.
+    The vocabulary is trained on its descriptors. others: the rig's other views.
     """
     observed: dict[int, Observed] = {}
     places: list[tuple[Array, list[int]]] = []
+    for view in (session, *others):
+        _add_places(view, every_m, observed, places)
+    return tile_of(observed, places, rng, sigma_m)
+
+
+def _add_places(
+    session: EstimatorSession, every_m: float, observed: dict[int, Observed], places: list[tuple[Array, list[int]]]
+) -> None:
+    """Add what a view shows along the session's drive."""
+    first = len(places)
     for frame in range(len(session)):
         map_from_cam = session.map_from_body[frame] @ session.body_from_cam
-        if places and not is_new_place(places[-1][0], map_from_cam, every_m):
+        if len(places) > first and not is_new_place(places[-1][0], map_from_cam, every_m):
             continue
         sighting, found = session.sighting(frame), session.features(frame)
         members = []
@@ -194,7 +223,6 @@ def survey_map(
             entry.add(away / np.linalg.norm(away), reach, found.descriptors[feature])
             members.append(landmark)
         places.append((map_from_cam, members))
-    return tile_of(observed, places, rng, sigma_m)
 
 
 def _features_map(session: EstimatorSession, frame: int, found: Found) -> Array:
@@ -248,13 +276,21 @@ class SessionRelocalizer(Relocalizer):
 def run_localizer(
     session: EstimatorSession, view: MapView, prior: PositionPrior | None = None, frames: int | None = None, *,
     has_wheels: bool = False, settings: LocalizerSettings = SETTINGS, until: Callable[[Estimate], bool] = lambda _: False,
-    lookalikes: LookAlikes | None = None,
+    lookalikes: LookAlikes | None = None, others: Sequence[EstimatorSession] = (),
 ) -> list[Estimate]:  # fmt: skip
-    """The localizer's estimates over a session in a map; the last one is that for which `until` holds."""
-    nominal = session.session.nominal
-    localizer = Localizer(nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s, settings)
-    localizer.odometry._tracker = EstimatorTracker(session, session.camera, settings.odometry.tracker)
-    localizer._query.use(SessionRelocalizer(view, session, settings))
+    """The localizer's estimates over a session in a map; the last one is that for which `until` holds. others: the rig's other views."""
+    nominal, views = session.session.nominal, (session, *others)
+    rig = nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s
+    mounted = [MountedCamera(other.camera, other.body_from_cam) for other in others]
+    localizer = Localizer(*rig, settings, others=mounted)
+
+    def new_tracker(first_frame: int, first_id: int) -> Tracker:
+        followed = views[localizer.odometry._rig.followed]
+        return EstimatorTracker(followed, followed.camera, settings.odometry.tracker, first_frame)
+
+    localizer.odometry._new_tracker = new_tracker  # type: ignore[method-assign]
+    localizer.odometry._tracker = new_tracker(0, 0)
+    localizer._query.use(*(SessionRelocalizer(view, each, settings) for each in views))
     localizer._map_version, localizer._tracker.lookalikes = 1, lookalikes
     if prior is not None:
         localizer.handle_prior(prior)
@@ -265,7 +301,7 @@ def run_localizer(
         if has_wheels:
             localizer.handle_wheel(wheel_between(session.session.wheel, last_ns, stamp_ns + 1))
         last_ns = stamp_ns + 1
-        estimates.append(localizer.handle_stereo(blank(session, frame)))
+        estimates.append(localizer.handle_stereo(blank(session, frame, others)))
         if until(estimates[-1]):
             break
     return estimates

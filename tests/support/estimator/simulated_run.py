@@ -85,23 +85,32 @@ class EstimatorSession:
         features: FeatureStatistics | None = None,
         field: LandmarkField | None = None,
         smudge: Smudge | None = None,
+        view: int = 0,
+        covered_s: tuple[float, float] = (0.0, 0.0),
     ) -> None:
+        """view: of the rig, whose measurements these are. covered_s: from when to when something lies on its lenses."""
         self.session = session
+        self._covered_s = covered_s
         self._movers, self._smudge = MoverLandmarks(session.renderer.movers), smudge
         self._flow, self._features = flow or FlowStatistics(), features or FeatureStatistics()
         self._field = field or LandmarkField(session.world)
         rectifier = Rectifier(session.nominal)
+        numbers = session.nominal.views[view]
+        if view:
+            rectifier = rectifier.others[view - 1]
         self.camera: StereoCamera = rectifier.camera
         self.body_from_cam: Array = rectifier.body_from_cam
         self.stamps_ns = session.frame_stamps_ns()
         self.map_from_body = session.motion.map_from_body(np.array(session.frame_times_s))
         self._size_px = float(self.camera.width_px), float(self.camera.height_px)
         self._rect_from_body = [
-            _rectified_from_body(nominal.body_from_cam, true.body_from_cam, self.body_from_cam)
-            for nominal, true in zip(session.nominal.cameras, session.true.cameras, strict=True)
+            _rectified_from_body(
+                session.nominal.cameras[k].body_from_cam, session.true.cameras[k].body_from_cam, self.body_from_cam
+            )
+            for k in (numbers[0], numbers[-1])
         ]
         self._stations = _stations(self.map_from_body)
-        self._seed = session.order.seed * 4096 + session.order.day
+        self._seed = session.order.seed * 4096 + session.order.day + (view << 40)
         self._table = np.random.default_rng(98).standard_normal(_TABLE)
         self._held: tuple[int, Landmarks] | None = None
         self._sighting: tuple[int, Sighting] | None = None
@@ -165,7 +174,10 @@ class EstimatorSession:
     def _look(self, frame: int) -> Sighting:
         landmarks, camera, time_s = self._landmarks(frame), self.camera, self.session.frame_times_s[frame]
         landmarks = self._movers.around(time_s, (self.map_from_body[frame] @ self.body_from_cam)[:3, 3], landmarks)
-        if any(self.session.renderer.faults.has(fault, time_s) for fault in ("camera-dark", "over-exposure")):
+        is_covered = self._covered_s[0] <= time_s < self._covered_s[1]
+        if is_covered or any(
+            self.session.renderer.faults.has(fault, time_s) for fault in ("camera-dark", "over-exposure")
+        ):
             landmarks = landmarks.take(np.zeros(0, np.int64))
         body_from_map = se3_inverse(self.map_from_body[frame])
         rect_from_map = np.stack([(rect @ body_from_map)[:3] for rect in self._rect_from_body])

@@ -1,7 +1,7 @@
 """Sliding window of the odometry: the filter, its clones, and the observations that link them."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,20 +13,20 @@ from fleetmap.odometry.odometry_checks import middle
 from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.odometry.tracking.tracker import Tracked
 from fleetmap.sensors.calibration import ImuNoise
-from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.sensors.rectification import MountedCamera, StereoCamera
 
 _UNKNOWN_DEPTH_M = 5.0
 _FAR_DEPTH_M = 20.0
-_CAMERA = 0  # the only one of a rig yet
 # The filter contradicts the images if it accepts less than this share of at least as many tracks over as many updates.
 _LEAST_TAKEN, _JUDGED_TRACKS, _JUDGED_UPDATES = 0.2, 10, 3
 
 
 @dataclass(frozen=True, slots=True)
 class OdometryRig:
-    """The rectified camera on its body, and the calibration of the other sensors.
+    """The rectified camera on its body that the odometry follows, and the calibration of the other sensors.
 
-    body_from_cam, cam_from_body and base_from_body are (4, 4); imu is None for a rig without noise figures.
+    body_from_cam, cam_from_body and base_from_body are (4, 4); imu is None for a rig without noise figures. mounted: the cameras of all
+    views, of which this one has the number `followed`.
     """
 
     camera: StereoCamera
@@ -36,6 +36,14 @@ class OdometryRig:
     imu_minus_cam_s: float
     imu: ImuNoise | None
     settings: OdometrySettings
+    mounted: tuple[MountedCamera, ...]
+    followed: int = 0
+
+    def following(self, number: int) -> "OdometryRig":
+        """The same rig, of which another camera is followed."""
+        camera, body_from_cam = self.mounted[number]
+        mounting = {"camera": camera, "body_from_cam": body_from_cam, "cam_from_body": se3_inverse(body_from_cam)}
+        return replace(self, followed=number, **mounting)  # type: ignore[arg-type]
 
 
 class SlidingWindow:
@@ -54,7 +62,7 @@ class SlidingWindow:
         if rig.imu is not None:  # the mean of a steady gyro is far more accurate than its weight
             true_error_cov[9:12, :], true_error_cov[:, 9:12] = 0.0, 0.0
             true_error_cov[range(9, 12), range(9, 12)] = settings.real_gyro_bias_sigma_radps**2
-        self.filter = InvariantFilter(state, covariance, settings, [(rig.camera, rig.body_from_cam)], true_error_cov)
+        self.filter = InvariantFilter(state, covariance, settings, rig.mounted, true_error_cov)
         self._stamps_ns: dict[int, int] = {}
         # Frames dropped with the newest: a frame that is kept, and kept_from_dropped.
         self._merged: dict[int, tuple[int, Array]] = {}
@@ -98,12 +106,12 @@ class SlidingWindow:
         """(4, 4) from a frame's camera to the current one; None if the frame is not kept."""
         if frame_index not in self.filter.clone_ids:
             return None
-        return self.filter.cam_from_earlier(frame_index, self.rig.cam_from_body)
+        return self.filter.cam_from_earlier(frame_index, self.rig.cam_from_body, self.rig.followed)
 
     def matched_body(self, tracked: Tracked) -> tuple[int, Array] | None:
         """After a gap: the best matched clone and odom_from_body (4, 4) by vision since then."""
         best = next((e for e in tracked.earlier if e.frame_index in self.filter.clone_ids), None)
-        if best is None:
+        if best is None or not tracked.by_descriptors:
             return None
         odom_from_earlier = self.filter.odom_from_clone(best.frame_index)
         odom_from_cam = odom_from_earlier @ self.rig.body_from_cam @ se3_inverse(best.cam_from_earlier)
@@ -122,7 +130,7 @@ class SlidingWindow:
     def seed(self, frame_index: int, tracked: Tracked) -> None:
         """Start an empty window with one frame; the tracks continue from it."""
         self._add_clone(frame_index)
-        self.filter.observe(frame_index, _CAMERA, tracked.ids, tracked.pixels)
+        self.filter.observe(frame_index, self.rig.followed, tracked.ids, tracked.pixels)
 
     def update(self, frame_index: int, tracked: Tracked, chunk_frames: int, iterations: int) -> NDArray[np.int8]:
         """Add a frame at the state and use the tracks that ended, those that are due, or (after a gap) all.
@@ -163,8 +171,8 @@ class SlidingWindow:
 
     def _observe(self, frame_index: int, tracked: Tracked) -> None:
         for earlier in tracked.earlier:
-            self.filter.observe(earlier.frame_index, _CAMERA, earlier.ids, earlier.pixels)
-        self.filter.observe(frame_index, _CAMERA, tracked.ids, tracked.pixels)
+            self.filter.observe(earlier.frame_index, self.rig.followed, earlier.ids, earlier.pixels)
+        self.filter.observe(frame_index, self.rig.followed, tracked.ids, tracked.pixels)
         self.scene_depth_m = self._depth_of(tracked.pixels)
 
     def _depth_of(self, pixels: Array) -> float:

@@ -1,7 +1,7 @@
 """Point tracking: optical flow between close frames, descriptors after gaps."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,15 @@ class Tracked:
     by_descriptors: bool
     information: Array | None = None
 
+    def begun_in(self, frame_index: int, before: "Tracked") -> "Tracked":
+        """Return the tracks of the second frame of a camera that was not followed before, with their observations in the first."""
+        if self.cam_from_previous is None:
+            return self
+        kept = np.isin(before.ids, self.ids)
+        return replace(
+            self, earlier=(Earlier(frame_index, before.ids[kept], before.pixels[kept], self.cam_from_previous),)
+        )
+
     @property
     def lost(self) -> bool:
         """True if this frame has no link to any earlier one."""
@@ -69,8 +78,15 @@ class Tracker:
     """Tracks points through rectified frames in order; ids never repeat. `core.Tracker` handles close frames."""
 
     def __init__(
-        self, camera: StereoCamera, settings: TrackerSettings, stereo_settings: StereoSettings | None = None
+        self,
+        camera: StereoCamera,
+        settings: TrackerSettings,
+        stereo_settings: StereoSettings | None = None,
+        *,
+        first_frame: int = 0,
+        first_id: int = 0,
     ) -> None:
+        """first_frame: number of the frame that comes first; first_id: of its first point."""
         self._camera = camera
         self._settings = settings
         self._stereo = stereo_settings or StereoSettings()
@@ -78,7 +94,7 @@ class Tracker:
         most_px = stereo.max_disparity_px(camera, self._stereo)
         self._points = core.Tracker(camera.lens, settings, self._stereo, most_px, REFINEMENT)
         self._previous: RectifiedFrame | None = None
-        self._frame_index = -1
+        self._first_id, self._frame_index = first_id, first_frame - 1
         self._memory: list[_Remembered] = []
 
     def track(
@@ -98,17 +114,25 @@ class Tracker:
             earlier, share = self._rematch(previous, frame, motion_since, rotation_sigma_rad)
             motion = next((e.cam_from_earlier for e in earlier if e.frame_index == self._frame_index - 1), None)
             self._step(frame)
-            return Tracked(self._points.ids, self._points.pixels, earlier, motion, share, by_descriptors=True)
+            return Tracked(self._ids(), self._points.pixels, earlier, motion, share, by_descriptors=True)
         self._memory.clear()
         if previous is None:
             self._step(frame)
-            return Tracked(self._points.ids, self._points.pixels, (), None, 1.0, by_descriptors=False)
+            return Tracked(self._ids(), self._points.pixels, (), None, 1.0, by_descriptors=False)
         guess = motion_since(self._frame_index - 1)
         is_predicted = guess is not None and rotation_sigma_rad is not None
         found, share = self._step(frame, np.eye(4) if guess is None else guess, is_predicted, self._points_cam())
         motion, information = found or (None, None)
         pixels = self._points.pixels
-        return Tracked(self._points.ids, pixels, (), motion, share, by_descriptors=False, information=information)
+        return Tracked(self._ids(), pixels, (), motion, share, by_descriptors=False, information=information)
+
+    @property
+    def next_id(self) -> int:
+        """Number of the next new point."""
+        return self._first_id + self._points.add(np.zeros((0, 3)))
+
+    def _ids(self) -> Ids:
+        return self._points.ids + self._first_id
 
     def _step(
         self,
@@ -190,7 +214,7 @@ class Tracker:
         depth = transform_points(found.cam_from_source, old.points_cam[a])[:, 2]
         disparity = self._camera.focal_px * self._camera.baseline_m / depth
         fresh = np.column_stack([refined[sure, :2], refined[sure, 0] - disparity])
-        ids = self._points.add(fresh) + np.arange(len(fresh))
+        ids = self._first_id + self._points.add(fresh) + np.arange(len(fresh))
         earlier = np.column_stack([old.features.pixels[a], old.features.pixels[a, 0] - old.disparities[a]])
         return Earlier(old.frame_index, ids, earlier, found.cam_from_source)
 

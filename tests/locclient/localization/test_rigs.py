@@ -1,0 +1,164 @@
+"""A robot with several views: it is localised by whichever sees the map, and goes on when one of them is covered."""
+
+from dataclasses import replace
+from functools import lru_cache
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+
+from benchmarks.common import estimator_loop
+from fleetmap.geometry import se3, se3_inverse, so3_exp
+from fleetmap.messages import Cause, Status
+from fleetmap.odometry import OdometryStatus
+from fleetmap.relocalization.map_view import MapView
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet
+from fleetsim.motion.routes import Route
+from fleetsim.recorder import Order, prepare
+from fleetsim.scenarios import SCENARIOS, Run, Scenario
+from fleetsim.scene.layout import Layout
+from locclient.localization.estimate import Estimate
+from locclient.localization.localizer import Localizer
+from locclient.localization.settings import LocalizerSettings
+from support.estimator.landmarks import LandmarkField
+from support.estimator.simulated_run import EstimatorSession
+from support.recordings.painted_room import FRAME_NS, IMU_NS, Ride, frame_at, rig
+
+LAYOUT = Layout(aisles=2, bays=4)
+WEST_M, EAST_M, Y_M = 4.5, 8.5, LAYOUT.aisle_y_m(0)
+ALWAYS = (0.0, 1e3)
+
+
+@lru_cache(maxsize=4)
+def views(kind: str, points: tuple[tuple[float, float], ...], covered_s: tuple[float, float]) -> list[EstimatorSession]:
+    """The views of a robot with a pair in front and one behind; covered_s: of the pair in front."""
+    run = Run(kind, (Route(points, rest_s=0.5),), 8.0, is_sharp=True)
+    with patch.dict(SCENARIOS, {"aisle": lambda: Scenario("one aisle", LAYOUT, {kind: run})}):
+        session = prepare(Order("aisle", seed=11, rig="front-rear"))
+    session.renderer.close()
+    field = LandmarkField(session.world)
+    return [EstimatorSession(session, field=field, view=k, covered_s=(0.0, 0.0) if k else covered_s) for k in range(2)]
+
+
+@lru_cache(maxsize=1)
+def east_bound_map() -> MapView:
+    """What a survey with one pair saw on its way east."""
+    survey, _ = views("surveyor", ((WEST_M, Y_M), (EAST_M, Y_M)), (0.0, 0.0))
+    return estimator_loop.map_view(survey, *estimator_loop.survey_map(survey, np.random.default_rng(0), every_m=0.6))
+
+
+def driven(
+    points: tuple[tuple[float, float], ...], covered_s: tuple[float, float], *, has_rear: bool
+) -> list[Estimate]:
+    front, rear = views("runner", points, covered_s)
+    estimates = estimator_loop.run_localizer(front, east_bound_map(), others=[rear] if has_rear else [])
+    known = [(e, truth) for e, truth in zip(estimates, front.map_from_body, strict=True) if e.status is Status.TRACKING]
+    for estimate, truth in known:
+        assert estimate.map_from_body is not None
+        assert np.linalg.norm(estimate.map_from_body[:3, 3] - truth[:3, 3]) < 0.1
+    return estimates
+
+
+def share(estimates: list[Estimate]) -> float:
+    return float(np.mean([estimate.status is Status.TRACKING for estimate in estimates]))
+
+
+def test_against_the_surveys_direction_the_rear_pair_knows_the_place() -> None:
+    west_bound = ((EAST_M - 1.0, Y_M), (WEST_M, Y_M))
+    assert share(driven(west_bound, (0.0, 0.0), has_rear=False)) < 0.3
+    assert share(driven(west_bound, (0.0, 0.0), has_rear=True)) > 0.9
+
+
+def test_with_the_front_covered_all_along_the_rear_pair_localises_it() -> None:
+    """Odometry and fixes come from behind, and every estimate says which view is dark."""
+    west_bound = ((EAST_M - 1.0, Y_M), (WEST_M, Y_M))
+    estimates = driven(west_bound, ALWAYS, has_rear=True)
+    assert share(estimates) > 0.9
+    assert all(estimate.views == (Cause.DARK, Cause.NONE) for estimate in estimates)
+    assert share(driven(west_bound, ALWAYS, has_rear=False)) == 0.0
+
+
+# ------------------------------------------------------------------------------------------------------------- pictures
+
+_REAR = se3(so3_exp(np.array([0.0, 0.0, np.pi])), np.array([-0.1, 0.0, 0.0]))  # body_from_turned
+
+
+def rig_of_two(sensors: SensorSet) -> RigCalibration:
+    front = rig(sensors)
+    rear = [replace(c, body_from_cam=_REAR @ c.body_from_cam) for c in front.cameras]
+    return replace(front, cameras=(*front.cameras, *rear))
+
+
+class TurnedRide(Ride):
+    """The same ride as the rear pair sees it."""
+
+    def map_from_body(self, time_s: float) -> np.ndarray:  # type: ignore[type-arg]
+        return super().map_from_body(time_s) @ _REAR
+
+
+@lru_cache(maxsize=200)
+def seen_at(stamp_ns: int) -> CameraFrame:
+    front, rear = (frame_at(ride, stamp_ns, SensorSet.STEREO) for ride in (Ride(), TurnedRide()))
+    return replace(front, others=(rear,))
+
+
+def imu_between(start_ns: int, end_ns: int) -> ImuSamples:
+    since_ns = np.arange(start_ns, end_ns, IMU_NS, dtype=np.int64)
+    rates, _, forces = (np.array(v) for v in zip(*(Ride().motion(s * 1e-9) for s in since_ns), strict=True))
+    return ImuSamples(1_000_000_000 + since_ns, rates, forces)
+
+
+@pytest.mark.parametrize("sensors", [SensorSet.STEREO, SensorSet.STEREO_INERTIAL])
+@pytest.mark.parametrize("fault", ["covered", "frozen", "dead"])
+def test_odometry_goes_on_with_the_other_pair_and_a_camera_comes_back(sensors: SensorSet, fault: str) -> None:
+    """Of the front pair from 2 to 3.2 s and of the rear pair from 3.4 s on: no frame is lost, and the way is as accurate as before."""
+    calibration = rig_of_two(sensors)
+    rectifier = Rectifier(calibration)
+    mounting = rectifier.camera, rectifier.body_from_cam, 0.0
+    localizer = Localizer(calibration, *mounting, LocalizerSettings(), others=rectifier.mounted[1:])
+    moved, views_of, last = np.eye(4), [], None
+    for stamp_ns in range(0, 4_500_000_000, FRAME_NS):
+        frame, time_s = seen_at(stamp_ns), stamp_ns * 1e-9
+        rng = np.random.default_rng(stamp_ns)  # a sensor's noise: otherwise every frame at rest counts as frozen
+        frame = with_noise(frame, rng)
+        if 2.0 <= time_s < 3.2 or time_s >= 3.4:
+            frame = spoilt(frame, fault, is_rear=time_s > 3.3, last=last)
+        last = frame
+        if sensors is SensorSet.STEREO_INERTIAL:
+            localizer.handle_imu(imu_between(stamp_ns - FRAME_NS, stamp_ns + IMU_NS))
+        estimate = localizer.handle_stereo(rectifier.rectify(frame))
+        odometry = estimate.odometry
+        assert odometry.status is not OdometryStatus.DEGRADED, time_s
+        if odometry.previous_from_body is not None:
+            moved = moved @ odometry.previous_from_body
+        views_of.append(estimate.views)
+    truth = se3_inverse(Ride().map_from_body(0.0)) @ Ride().map_from_body(4.45)
+    assert np.linalg.norm((moved - truth)[:3, 3]) < 0.03
+    front, rear = ([views[k] is not Cause.NONE for views in views_of] for k in (0, 1))
+    assert np.flatnonzero(front).tolist() == [*range(40, 64)]
+    assert np.flatnonzero(rear).tolist() == [*range(68, 90)]
+
+
+def with_noise(frame: CameraFrame, rng: np.random.Generator) -> CameraFrame:
+    def noisy(image: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+        return np.clip(image + rng.integers(-1, 2, image.shape, dtype=np.int16), 0, 255).astype(np.uint8)
+
+    assert frame.right is not None
+    others = tuple(with_noise(each, rng) for each in frame.others if each is not None)
+    return replace(frame, left=noisy(frame.left), right=noisy(frame.right), others=others)
+
+
+def spoilt(frame: CameraFrame, fault: str, *, is_rear: bool, last: CameraFrame | None) -> CameraFrame:
+    """With a covered view, one that repeats the last image, or one without images; a pair in front without them is black."""
+    if fault == "dead" and is_rear:
+        return replace(frame, others=(None,))
+    assert last is not None
+    view, old = (frame.others[0], last.others[0]) if is_rear else (frame, last)
+    assert view is not None
+    bad = replace(view, left=np.zeros_like(view.left), right=np.zeros_like(view.left))
+    if fault == "frozen":
+        assert old is not None
+        bad = replace(view, left=old.left, right=old.right)
+    return replace(frame, others=(bad,)) if is_rear else bad
