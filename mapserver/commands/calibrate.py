@@ -58,7 +58,7 @@ def calibrate(
 
     with ExitStack() as opened:
         how = OpenOptions(calibration, topics)
-        sources = [_sound(opened.enter_context(open_recording(path, how))) for path in recordings]
+        sources = [_sound(opened.enter_context(open_recording(path, how)).first_view()) for path in recordings]
         settings = survey_settings(config_path(context), sources[0].sensor_set)
         estimate = estimate_calibration(sources, settings, opened.enter_context(_shown()))
         rig = sources[0].calibration
@@ -119,7 +119,9 @@ def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Pa
         rig = first_rig(int(known[1]), int(known[2]), baseline_m)
         first.write_text(format_calibration(rig), encoding="utf-8")
         with open_recording(recordings[0], OpenOptions(first, topics)) as recording:
-            found = calibration_from_guess(_sound(recording), survey_settings(config, recording.sensor_set), tools)
+            found = calibration_from_guess(
+                _sound(recording.first_view()), survey_settings(config, recording.sensor_set), tools
+            )
             name = recording.name
     typer.echo("\n".join(guessed_in_words(found)))
     if out is not None:

@@ -41,7 +41,8 @@ def doctor(
     from mapserver.doctor.findings import worst
     from mapserver.doctor.run_checks import frames_to_check
 
-    with open_recording(recording, OpenOptions(calibration, named_topics(topic))) as source:
+    with open_recording(recording, OpenOptions(calibration, named_topics(topic))) as opened:
+        source = opened.first_view()
         with Progress(console=plain_console(stderr=True), transient=True) as progress:
             task = progress.add_task("frames, and steps of the adjustment", total=frames_to_check(source))
             findings = run_checks(source, lambda: progress.advance(task)).findings

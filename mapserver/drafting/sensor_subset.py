@@ -44,10 +44,11 @@ def named_sensor_set(name: str) -> SensorSet:
 
 
 def reduced(recording: Recording, use: SensorSet | None) -> Recording:
-    """Return the recording without the sensors missing from `use`; unchanged without `use`.
+    """Return the recording without the sensors missing from `use`, of a rig its first view; otherwise unchanged without `use`.
 
     Raises RecordingError if the recording lacks a sensor of `use`.
     """
+    recording = recording.first_view()
     if use is None or use is recording.sensor_set:
         return recording
     if use not in REDUCTIONS[recording.sensor_set]:

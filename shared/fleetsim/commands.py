@@ -35,9 +35,14 @@ class _PngWriter(McapRecordingWriter):
     def write_frame(self, frame: CameraFrame | StoredFrame) -> None:
         """Write one frame; already encoded images stay unchanged."""
         if isinstance(frame, CameraFrame):
-            assert frame.right is not None
-            frame = StoredFrame(frame.stamp_ns, png_image(frame.left), png_image(frame.right))
+            frame = _png_frame(frame)
         super().write_frame(frame)
+
+
+def _png_frame(frame: CameraFrame) -> StoredFrame:
+    right = None if frame.right is None else png_image(frame.right)
+    others = tuple(None if other is None else _png_frame(other) for other in frame.others)
+    return StoredFrame(frame.stamp_ns, png_image(frame.left), right, others=others)
 
 
 def record_order(order: Order, out: Path) -> str:

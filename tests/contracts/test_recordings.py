@@ -11,9 +11,11 @@ from mcap.reader import make_reader
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import RECORDING_FORMATS, OpenOptions, Recording, open_recording
 from fleetmap.recordings.mcap.writer import copy_to_mcap
+from fleetmap.sensors.samples import CameraFrame
 from support.recordings.bag_samples import write_rosbag1, write_rosbag2
 from support.recordings.mcap_samples import Message
 from support.recordings.recording_samples import (
+    calibration,
     kalibr_text,
     make_sample,
     world_from_cam0,
@@ -24,8 +26,10 @@ from support.recordings.recording_samples import (
     write_tumvi,
     write_video,
 )
+from support.recordings.rig_samples import write_kitti_raw
 
 SAMPLE = make_sample(5)
+WITHOUT_TRUTH = ("video", "kitti-raw")
 
 
 def _write_mcap(folder: Path) -> Path:
@@ -33,6 +37,13 @@ def _write_mcap(folder: Path) -> Path:
     source = open_recording(write_euroc(folder / "source", SAMPLE))
     copy_to_mcap(source, folder / "copy.mcap")
     return folder / "copy.mcap"
+
+
+def _write_kitti_raw(folder: Path) -> Path:
+    frames = [
+        CameraFrame(int(stamp), *pair) for stamp, *pair in zip(SAMPLE.stamps_ns, SAMPLE.left, SAMPLE.right, strict=True)
+    ]
+    return write_kitti_raw(folder / "drive", calibration(), frames)
 
 
 def _made(folder: Path) -> Path:
@@ -53,6 +64,7 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
     "euroc": lambda folder: write_euroc(folder, SAMPLE),
     "tumvi": lambda folder: write_tumvi(folder, SAMPLE),
     "kitti": lambda folder: write_kitti(folder, SAMPLE),
+    "kitti-raw": _write_kitti_raw,
     "7scenes": lambda folder: write_seven_scenes(folder, SAMPLE),
     "tum-rgbd": lambda folder: write_tum_rgbd(folder, SAMPLE),
     "mcap": _write_mcap,
@@ -129,8 +141,8 @@ def test_the_hash_is_that_of_a_copy_elsewhere_and_not_of_another_recording(path:
 
 def test_truth_is_that_of_the_body(path: Path) -> None:
     recording = opened(path)
-    if recording.format == "video":
-        pytest.skip("a video holds no truth")
+    if recording.format in WITHOUT_TRUTH:
+        pytest.skip("it holds no truth")
     assert recording.ground_truth is not None
     for index, stamp_ns in enumerate(recording.frame_stamps_ns):
         frame_from_body = recording.ground_truth.at(int(stamp_ns))
@@ -159,7 +171,7 @@ def test_a_conversion_to_mcap_loses_nothing(path: Path, tmp_path: Path) -> None:
             )
             for name in ("intrinsics_px", "distortion", "body_from_cam"):
                 np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
-        assert (source.ground_truth is None) == (copy.ground_truth is None) == (source.format == "video")
+        assert (source.ground_truth is None) == (copy.ground_truth is None) == (source.format in WITHOUT_TRUTH)
         if source.ground_truth is None or copy.ground_truth is None:
             return
         np.testing.assert_allclose(copy.ground_truth.frame_from_body, source.ground_truth.frame_from_body, atol=1e-12)

@@ -50,6 +50,9 @@ RECORDING_FORMATS = {
     "euroc": RecordingFormat("a folder with mav0/cam0/data.csv in it", euroc.recognises, euroc.open_euroc),
     "tumvi": RecordingFormat("a folder with cam0/images and camchain.yaml", tumvi.recognises, tumvi.open_tumvi),
     "kitti": RecordingFormat("a folder with image_l or image_0 and calib.txt", kitti.recognises, kitti.open_kitti),
+    "kitti-raw": RecordingFormat(
+        "a folder with image_00/data and calib_cam_to_cam.txt", kitti.recognises_raw, kitti.open_kitti_raw
+    ),
     "7scenes": RecordingFormat(
         "a folder with frame-NNNNNN.color.* and .depth.png", seven_scenes.recognises, seven_scenes.open_seven_scenes
     ),

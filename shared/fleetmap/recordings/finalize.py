@@ -24,7 +24,8 @@ _WINDOW_S, _SMOOTH_S = 0.5, 0.1
 
 @dataclass(frozen=True)
 class RecordingParts:
-    """Parts read by a format, input of `finalize`. The name is the path's unless given."""
+    """Parts read by a format, input of `finalize`. The name is the path's unless given. others: numbers of the calibration's cameras of
+    further views, with images."""
 
     path: Path
     format: str
@@ -33,6 +34,7 @@ class RecordingParts:
     frames: FrameSource
     has_right: bool = False
     has_depth: bool = False
+    others: tuple[int, ...] = ()
     name: str = ""
     imu: ImuSamples = field(default_factory=ImuSamples.empty)
     wheel: tuple[WheelSample, ...] = ()
@@ -63,8 +65,9 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
             f"{parts.path}: {count} cameras are recorded, the calibration describes {len(cameras)}; "
             "pass one that has all with --calibration FILE"
         )
-    if len(cameras) > count and not parts.has_depth:
-        log.note("cameras missing", f"the calibration describes {len(cameras)}, there are images of {count}")
+    recorded = (*cameras[:count], *(cameras[number] for number in parts.others))
+    if len(cameras) > len(recorded) and not parts.has_depth:
+        log.note("cameras missing", f"the calibration describes {len(cameras)}, there are images of {len(recorded)}")
     imu, wheel, truth = parts.imu, parts.wheel, parts.ground_truth
     check_together(imu.stamps_ns, "imu", parts.frame_stamps_ns)
     for what, values in (("wheel odometry", wheel), ("position priors", parts.priors)):
@@ -85,7 +88,7 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
         format=parts.format,
         sensor_set=_sensor_set(parts, imu),
         calibration=RigCalibration(
-            cameras[:count],
+            recorded,
             parts.calibration.imu if len(imu) else None,
             parts.calibration.base_from_body,
             parts.calibration.assumed,

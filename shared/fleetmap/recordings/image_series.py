@@ -1,6 +1,7 @@
 """Images of each camera by stamp, paired to frames and read one frame at a time."""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
@@ -61,6 +62,27 @@ def pair_images(
     return first.take(firsts), second.take(seconds)
 
 
+@dataclass(frozen=True)
+class ViewSeries(Generic[T]):
+    """Images of a further view of a rig: rows (F,) of its image, or pair, at each frame, -1 for none."""
+
+    left: ImageSeries[T]
+    right: ImageSeries[T] | None
+    rows: NDArray[np.int64]
+
+    @classmethod
+    def beside(cls, frame_stamps_ns: Stamps, cameras: "Sequence[ImageSeries[T]]", log: ReadLog) -> "ViewSeries[T]":
+        """The images of one or two cameras that are nearest to each frame (F,), at most half a usual period away."""
+        left, right = (cameras[0], None) if len(cameras) == 1 else pair_images(cameras[0], cameras[1], log)
+        if not len(left):
+            return cls(left, right, np.full(len(frame_stamps_ns), -1))
+        period_ns = int(np.median(np.diff(frame_stamps_ns))) if len(frame_stamps_ns) > 1 else _DAY_NS
+        frames, images = pair_stamps(frame_stamps_ns, left.stamps_ns, period_ns // 2)
+        rows = np.full(len(frame_stamps_ns), -1)
+        rows[frames] = images
+        return cls(left, right, rows)
+
+
 class ImageReader(Protocol[T]):
     """Reads the images of a recording from their storage."""
 
@@ -88,7 +110,8 @@ class DepthRegistration(Protocol):
 class SeriesFrames(Generic[T]):
     """A FrameSource over paired series of equal length.
 
-    grey_bits: used bits of left and right 16-bit images. registration: for depth that is stored unregistered.
+    grey_bits: used bits of left and right 16-bit images. registration: for depth that is stored unregistered. others: the rig's other
+    views, left out of frames unless has_others.
     """
 
     reader: ImageReader[T]
@@ -97,6 +120,8 @@ class SeriesFrames(Generic[T]):
     depth: ImageSeries[T] | None = None
     registration: DepthRegistration | None = None
     grey_bits: int = 16
+    others: tuple[ViewSeries[T], ...] = ()
+    has_others: bool = True
 
     def stored(self, index: int) -> StoredFrame:
         """Frame `index` with its images as stored; registered depth as PNG in whole mm."""
@@ -118,26 +143,43 @@ class SeriesFrames(Generic[T]):
 
     def part(self, indices: NDArray[np.int64]) -> "SeriesFrames[T]":
         right, depth = (None if series is None else series.take(indices) for series in (self.right, self.depth))
-        return replace(self, reader=self.reader.apart(), left=self.left.take(indices), right=right, depth=depth)
+        others = tuple(replace(view, rows=view.rows[indices]) for view in self.others)
+        series = {"left": self.left.take(indices), "right": right, "depth": depth, "others": others}
+        return replace(self, reader=self.reader.apart(), **series)  # type: ignore[arg-type]
+
+    @property
+    def other_numbers(self) -> tuple[int, ...]:
+        """Numbers of the cameras of other views, if all cameras follow one another view by view."""
+        first = 1 if self.right is None else 2
+        return tuple(range(first, first + sum(1 if view.right is None else 2 for view in self.others)))
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
-        self.reader.hash_into(
-            digest, [s for series in (self.left, self.right, self.depth) if series for s in series.sources]
-        )
+        others = (series for view in self.others for series in (view.left, view.right))
+        read = (self.left, self.right, self.depth, *others)
+        self.reader.hash_into(digest, [s for series in read if series for s in series.sources])
 
     def close(self) -> None:
         self.reader.close()
 
     def _stored(self, index: int) -> StoredFrame:
-        left, right, depth = (
-            None if series is None else self.reader.read(series.sources[index], int(series.stamps_ns[index]))
-            for series in (self.left, self.right, self.depth)
+        others = (
+            None if view.rows[index] < 0 else self._images(int(view.rows[index]), view.left, view.right)
+            for view in (self.others if self.has_others else ())
         )
-        assert left is not None
+        return replace(self._images(index, self.left, self.right, self.depth), others=tuple(others))
+
+    def _images(
+        self, row: int, left: ImageSeries[T], right: ImageSeries[T] | None, depth: ImageSeries[T] | None = None
+    ) -> StoredFrame:
+        first, second, third = (
+            None if series is None else self.reader.read(series.sources[row], int(series.stamps_ns[row]))
+            for series in (left, right, depth)
+        )
+        assert first is not None
         if self.grey_bits < 16:
-            left = replace(left, bits=self.grey_bits)
-            right = None if right is None else replace(right, bits=self.grey_bits)
-        return StoredFrame(int(self.left.stamps_ns[index]), left, right, depth)
+            first = replace(first, bits=self.grey_bits)
+            second = None if second is None else replace(second, bits=self.grey_bits)
+        return StoredFrame(int(left.stamps_ns[row]), first, second, third)
 
     def _registered_mm(self, depth_m: NDArray[np.float32], where: str) -> NDArray[np.float32]:
         assert self.registration is not None

@@ -166,13 +166,14 @@ class StoredImage:
 class StoredFrame:
     """One moment of the rig with its images as stored.
 
-    Depth is registered to left, in mm if whole numbers, else m.
+    Depth is registered to left, in mm if whole numbers, else m. others: of the rig's other views, None for one without images.
     """
 
     stamp_ns: int
     left: StoredImage
     right: StoredImage | None = None
     depth: StoredImage | None = None
+    others: "tuple[StoredFrame | None, ...]" = ()
 
 
 def decode_frame(stored: StoredFrame) -> CameraFrame:
@@ -181,7 +182,9 @@ def decode_frame(stored: StoredFrame) -> CameraFrame:
     left = _BESIDE.submit(decode_grey, stored.left) if is_slow else None
     right = None if stored.right is None else decode_grey(stored.right)
     depth = None if stored.depth is None else decode_depth(stored.depth)
-    return CameraFrame(stored.stamp_ns, decode_grey(stored.left) if left is None else left.result(), right, depth)
+    others = tuple(None if other is None else decode_frame(other) for other in stored.others)
+    first = decode_grey(stored.left) if left is None else left.result()
+    return CameraFrame(stored.stamp_ns, first, right, depth, others)
 
 
 def decode_grey(stored: StoredImage) -> Image:
@@ -302,7 +305,8 @@ def store_frame(frame: CameraFrame) -> StoredFrame:
     """Store a decoded frame as rows of pixels."""
     right = None if frame.right is None else grey_image(frame.right)
     depth = None if frame.depth_m is None else depth_image(frame.depth_m)
-    return StoredFrame(frame.stamp_ns, grey_image(frame.left), right, depth)
+    others = tuple(None if other is None else store_frame(other) for other in frame.others)
+    return StoredFrame(frame.stamp_ns, grey_image(frame.left), right, depth, others)
 
 
 def check_image(stored: StoredImage) -> tuple[int, int]:

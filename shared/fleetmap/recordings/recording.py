@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError, UsageError
+from fleetmap.recordings.image_series import SeriesFrames
 from fleetmap.recordings.images import StoredFrame, file_kind
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import (
@@ -182,6 +183,14 @@ class Recording:
     def part(self, indices: NDArray[np.int64]) -> "Recording":
         """The recording with only the frames at indices (K,), renumbered; see `FrameSource.part`."""
         return replace(self, frame_stamps_ns=self.frame_stamps_ns[indices], frames=self.frames.part(indices))
+
+    def first_view(self) -> "Recording":
+        """The recording of a rig's first view alone, for what uses one; its content's hash is that of all views."""
+        cameras, (first, *others) = self.calibration.cameras, self.calibration.views
+        if not others or not isinstance(self.frames, SeriesFrames):
+            return self
+        calibration = replace(self.calibration, cameras=tuple(cameras[number] for number in first))
+        return replace(self, calibration=calibration, frames=replace(self.frames, has_others=False))
 
     def content_hash(self) -> str:
         """SHA-256 (hex) of the content, including images; the same on every machine."""

@@ -130,12 +130,19 @@ class Rectifier:
     """
 
     def __init__(
-        self, calibration: RigCalibration, *, has_depth: bool = False, pinhole: StereoCamera | None = None
+        self,
+        calibration: RigCalibration,
+        *,
+        has_depth: bool = False,
+        pinhole: StereoCamera | None = None,
+        first_camera: int = 0,
     ) -> None:
+        """first_camera: its number in messages."""
         if not calibration.cameras:
             raise CalibrationError("the calibration holds no camera; pass one with --calibration FILE")
-        self._numbers, *others = calibration.views
-        cameras = tuple(calibration.cameras[number] for number in self._numbers)
+        view, *others = calibration.views
+        cameras = tuple(calibration.cameras[number] for number in view)
+        self._numbers = tuple(first_camera + number for number in view)
         self._sizes = [(c.height_px, c.width_px) for c in cameras]
         self.has_depth = has_depth
         if has_depth or len(cameras) == 1:
@@ -169,9 +176,7 @@ class Rectifier:
         view = replace(calibration, cameras=tuple(calibration.cameras[number] for number in numbers))
         focal_px = float(np.mean([camera.intrinsics_px[:2].mean() for camera in view.cameras]))
         is_alike = 1 / _MAX_ZOOM < focal_px / self.camera.focal_px < _MAX_ZOOM
-        other = Rectifier(view, pinhole=self.camera if is_alike else None)
-        other._numbers = numbers
-        return other
+        return Rectifier(view, pinhole=self.camera if is_alike else None, first_camera=numbers[0])
 
     @property
     def mounted(self) -> tuple[MountedCamera, ...]:

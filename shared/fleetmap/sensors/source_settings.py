@@ -23,8 +23,12 @@ class SourceSection(Section, frozen=True):
     delay_s: float = 0.0
 
 
+CAMERA_ROLES = ("left", "right", "cam2", "cam3", "cam4", "cam5", "cam6", "cam7")
+
+
 class Topics(Section, frozen=True):
-    """Topic names in MCAP files and ROS bags. An image topic also matches itself followed by `/compressed`."""
+    """Topic names in MCAP files and ROS bags. An image topic also matches itself followed by `/compressed`. left and right are cameras
+    0 and 1 of the calibration, cam2 to cam7 the others."""
 
     left: str = "/cam0/image_raw"
     right: str = "/cam1/image_raw"
@@ -36,3 +40,14 @@ class Topics(Section, frozen=True):
     prior: str = "/prior"
     ground_truth: str = "/ground_truth"
     tf_static: str = "/tf_static"
+    cam2: str = "/cam2/image_raw"
+    cam3: str = "/cam3/image_raw"
+    cam4: str = "/cam4/image_raw"
+    cam5: str = "/cam5/image_raw"
+    cam6: str = "/cam6/image_raw"
+    cam7: str = "/cam7/image_raw"
+
+    def camera(self, number: int) -> str:
+        """The topic of a camera's images by its number in the calibration; empty beyond the eighth."""
+        roles = CAMERA_ROLES[number : number + 1]
+        return str(getattr(self, roles[0])) if roles else ""

@@ -51,8 +51,11 @@ class ReplaySource:
 
     def frame(self, number: int) -> CameraFrame:
         """Frame `number` of the playback, decoded."""
-        frame = self.recording.read_frame(int(self.indices[number]))
-        return replace(frame, stamp_ns=self.played_stamp_ns(frame.stamp_ns))
+        return self._played(self.recording.read_frame(int(self.indices[number])))
+
+    def _played(self, frame: CameraFrame) -> CameraFrame:
+        others = tuple(None if other is None else self._played(other) for other in frame.others)
+        return replace(frame, stamp_ns=self.played_stamp_ns(frame.stamp_ns), others=others)
 
     def imu_before_each(self) -> Iterator[ImuSamples]:
         """For each frame of the playback, the IMU samples that arrive before it is handled."""

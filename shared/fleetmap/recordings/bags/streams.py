@@ -35,7 +35,7 @@ from fleetmap.recordings.bags.topics import (
 from fleetmap.recordings.calibration_files import CalibrationFile, parse_calibration
 from fleetmap.recordings.files import hash_file
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
-from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, pair_images
+from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, ViewSeries, pair_images
 from fleetmap.recordings.images import StoredImage, check_image
 from fleetmap.recordings.ordering import (
     DEPTH_TOLERANCE_NS,
@@ -50,7 +50,7 @@ from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.recordings.ros2.messages import CameraInfo
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, Stamps, Trajectory, WheelSample
-from fleetmap.sensors.source_settings import Topics
+from fleetmap.sensors.source_settings import CAMERA_ROLES, Topics
 
 _LAST_NS = 2**63 - 1  # MCAP's times have a bit more
 _SAME_LENS = 0.02  # of the focal length
@@ -210,11 +210,22 @@ def _parts(
     left = _images(roles["left"], "left images", log, lenses.get("left"))
     right = _images(roles["right"], "right images", log, lenses.get("right")) if "right" in roles else None
     depth = _images(roles["depth"], "depth images", log) if "depth" in roles else None
+    alone = {0: left} if right is None else {0: left, 1: right}
     if right is not None:
         (left, right), depth = pair_images(left, right, log), None
     elif depth is not None:
         left, depth = pair_images(left, depth, log, DEPTH_TOLERANCE_NS)
     calibration = given.calibration if given else _calibration(container, roles, lenses, imu_frame, log)
+    numbers, views = list[int](), tuple[ViewSeries[_Source], ...]()
+    if depth is None and len(calibration.cameras) > 1:
+        for number in range(2, min(len(calibration.cameras), len(CAMERA_ROLES))):
+            if (role := CAMERA_ROLES[number]) in roles:
+                alone[number] = _images(roles[role], f"{role} images", log)
+        first, *further = _views_of(calibration, list(alone))
+        if len(first) == 1:
+            left, right = alone[0], None
+        views = tuple(ViewSeries.beside(left.stamps_ns, [alone[n] for n in view], log) for view in further)
+        numbers = [number for view in further for number in view]
     if depth is not None:
         _note_unregistered(streams, roles, calibration.cameras[0], log)
     wheel = _samples([v for s in roles.get("wheel", ()) for v in s.values(s.decoder.wheel)], "wheel odometry", log)
@@ -230,7 +241,8 @@ def _parts(
         format="",
         calibration=calibration,
         frame_stamps_ns=left.stamps_ns,
-        frames=SeriesFrames(MessageReader(opener, container, log.files), left, right, depth),
+        frames=SeriesFrames(MessageReader(opener, container, log.files), left, right, depth, others=views),
+        others=tuple(numbers),
         has_right=right is not None,
         has_depth=depth is not None,
         imu=imu,
@@ -238,6 +250,13 @@ def _parts(
         priors=priors,
         ground_truth=ground_truth,
     )
+
+
+def _views_of(calibration: RigCalibration, present: list[int]) -> list[tuple[int, ...]]:
+    """Numbers of the cameras of each view, of those with images."""
+    described = [number for number in present if number < len(calibration.cameras)]
+    recorded = replace(calibration, cameras=tuple(calibration.cameras[number] for number in described))
+    return [tuple(described[k] for k in view) for view in recorded.views]
 
 
 def _collect(container: Container, topics: Topics, log: ReadLog) -> tuple[list[_Stream], list[Channel]]:
@@ -312,7 +331,7 @@ def _takes_lens(stream: _Stream, data: bytes) -> bool:
 def _with_hints(topics: Topics, given: CalibrationFile | None, present: set[str]) -> Topics:
     """The wanted topics, completed by those noted in a Kalibr file if they exist and the caller chose no other."""
     changes = {}
-    for role, key in (("left", "cam0"), ("right", "cam1"), ("imu", "imu0")):
+    for role, key in (*((role, f"cam{number}") for number, role in enumerate(CAMERA_ROLES)), ("imu", "imu0")):
         hint = given.topics.get(key, "") if given else ""
         if hint in present and getattr(topics, role) == getattr(Topics(), role):
             changes[role] = hint

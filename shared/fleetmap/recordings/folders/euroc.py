@@ -17,11 +17,10 @@ from fleetmap.recordings.calibration_files import (
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.folders.layout import (
     existing_images,
-    file_frames,
-    paired_cameras,
     read_ground_truth,
     read_image_list,
     read_imu,
+    rig_frames,
 )
 from fleetmap.recordings.ordering import ReadLog
 from fleetmap.recordings.recording import OpenOptions, Recording
@@ -30,6 +29,7 @@ from fleetmap.sensors.samples import Trajectory
 
 # The second kind is TUM-VI's, whose motion-capture poses are those of the IMU
 _GROUND_TRUTHS = ("mav0/state_groundtruth_estimate0/data.csv", "dso/gt_imu.csv", "mav0/mocap0/data.csv")
+_MOST_CAMERAS = 16
 _CAMCHAINS = ("camchain.yaml", "dso/camchain.yaml", "mav0/camchain.yaml")
 
 
@@ -48,21 +48,22 @@ def open_euroc(path: Path, options: OpenOptions) -> Recording:
             f"{root}/mav0/cam0 is missing (there is {', '.join(found) or 'nothing'}); copy the recording again"
         )
     cameras = []
-    for folder in (root / "mav0/cam0", root / "mav0/cam1"):
+    for folder in (root / f"mav0/cam{number}" for number in range(_MOST_CAMERAS)):
         if folder.is_dir():
             stamps_ns, names = read_image_list(folder / "data.csv", log)
             images = [folder / "data" / name.relative_to(folder) for name in names]
             cameras.append(existing_images(stamps_ns, images, folder.name, log))
     calibration, euroc_from_imu = _calibration(root, len(cameras), options, log)
-    left, right = paired_cameras(cameras, log)
+    frames = rig_frames(root, log, cameras, calibration)
     parts = RecordingParts(
         path=path,
         name=root.resolve().name,
         format="euroc",
         calibration=calibration,
-        frame_stamps_ns=left.stamps_ns,
-        frames=file_frames(root, log, left, right),
-        has_right=right is not None,
+        frame_stamps_ns=frames.left.stamps_ns,
+        frames=frames,
+        has_right=frames.right is not None,
+        others=frames.other_numbers,
         imu=read_imu(root / "mav0/imu0/data.csv", log),
         ground_truth=_ground_truth(root, euroc_from_imu, log),
     )

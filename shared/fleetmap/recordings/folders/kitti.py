@@ -1,4 +1,6 @@
-"""KITTI odometry folders: rectified image pairs, calib.txt, poses.txt and times.txt if present. No IMU."""
+"""KITTI folders, without an IMU. Odometry: rectified image pairs, calib.txt, poses.txt and times.txt if present. Raw: image_00 to image_03,
+each with its images in data and their timestamps.txt; calib_cam_to_cam.txt is there or in the folder above.
+"""
 
 import re
 from pathlib import Path
@@ -6,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
-from fleetmap.geometry import Array, se3
+from fleetmap.geometry import Array, se3, se3_inverse
 from fleetmap.recordings.files import natural_key
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.folders.layout import (
@@ -17,23 +19,101 @@ from fleetmap.recordings.folders.layout import (
     read_image,
     read_numbers,
     read_table,
+    rig_frames,
 )
 from fleetmap.recordings.image_series import pair_images
 from fleetmap.recordings.images import decode_grey
 from fleetmap.recordings.ordering import ReadLog, check_seconds
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration, check_camera
+from fleetmap.sensors.cameras import lens_of
 from fleetmap.sensors.samples import Stamps, Trajectory
 
 # Folder names and the rows of calib.txt that describe them
 _PAIRS = (("image_l", "image_r", 0, 1), ("image_0", "image_1", 0, 1), ("image_2", "image_3", 2, 3))
 _PERIOD_NS = 100_000_000
 _MOST_NUMBER = 10**10  # three decades
+_RAW_CAMERAS = ("image_00", "image_01", "image_02", "image_03")
 
 
 def recognises(path: Path) -> bool:
     """True for a folder with a KITTI image folder."""
     return any((path / left).is_dir() or (path / right).is_dir() for left, right, _, _ in _PAIRS)
+
+
+def recognises_raw(path: Path) -> bool:
+    """True for a drive of KITTI's raw data."""
+    return (path / "image_00/data").is_dir()
+
+
+def open_kitti_raw(path: Path, options: OpenOptions) -> Recording:
+    """Open the drive in a folder of KITTI's raw data, rectified or not, all of its cameras. The body is camera 0."""
+    log = ReadLog()
+    present = [name for name in _RAW_CAMERAS if (path / name / "data").is_dir()]
+    cameras = [_images(path / name / "data", _raw_stamps(path / name / "timestamps.txt", log), log) for name in present]
+    if given := calibration_of_options(options, log):
+        calibration = given.calibration
+    else:
+        files = [folder / "calib_cam_to_cam.txt" for folder in (path, path.resolve().parent)]
+        file = next((each for each in files if each.is_file()), files[0])
+        calibration = RigCalibration(
+            tuple(
+                _raw_camera(file, name[-2:], series.sources[0]) for name, series in zip(present, cameras, strict=True)
+            )
+        )
+        log.files.append(file)
+    frames = rig_frames(path, log, cameras, calibration)
+    parts = RecordingParts(
+        path=path,
+        format="kitti-raw",
+        calibration=calibration,
+        frame_stamps_ns=frames.left.stamps_ns,
+        frames=frames,
+        has_right=frames.right is not None,
+        others=frames.other_numbers,
+    )
+    return finalize(parts, log)
+
+
+def _raw_stamps(file: Path, log: ReadLog) -> Stamps:
+    """Stamps of lines such as `2011-09-26 13:02:25.964389445`."""
+    stamps = []
+    for number, line in enumerate(read_table(file).split("\n"), start=1):
+        if not line.strip():
+            continue
+        try:
+            stamps.append(int(np.datetime64(line.strip().replace(" ", "T"), "ns").astype(np.int64)))
+        except ValueError:
+            raise RecordingError(f"{file}, line {number}: {line[:60]!r} is not a date and a time") from None
+    log.files.append(file)
+    return np.array(stamps, np.int64)
+
+
+def _raw_camera(file: Path, number: str, first_image: Path) -> CameraCalibration:
+    """A camera, by the size of its images: of rectified ones by P_rect, else by K and D, and R and T, which lead from camera 0 to it."""
+    if not file.is_file():
+        raise CalibrationError(f"{file} is missing; add it or pass a calibration with --calibration FILE")
+    rows = dict(line.split(":", 1) for line in read_table(file).splitlines() if ":" in line)
+
+    def numbers(name: str, count: int) -> Array:
+        try:
+            values = np.array([float(word) for word in rows[f"{name}_{number}"].split()])
+        except (KeyError, ValueError):
+            values = np.zeros(0)
+        if len(values) != count or not np.isfinite(values).all():
+            raise CalibrationError(f"{file}: {name}_{number} are not {count} numbers; copy the file again")
+        return values
+
+    height, width = decode_grey(read_image(first_image)).shape
+    size_px = width, height
+    if np.array_equal(numbers("S_rect", 2), size_px):
+        return _projected(numbers("P_rect", 12).reshape(3, 4), size_px, f"{file}: P_rect_{number}")
+    matrix, turn = (numbers(name, 9).reshape(3, 3) for name in "KR")
+    intrinsics = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+    body_from_cam = se3_inverse(se3(turn, numbers("T", 3)))
+    model, distortion = lens_of("radtan", numbers("D", 5), f"{file}: D_{number}")
+    camera = CameraCalibration(model, *size_px, intrinsics, distortion, body_from_cam)
+    return check_camera(camera, f"{file}: camera {number}")
 
 
 def open_kitti(path: Path, options: OpenOptions) -> Recording:
@@ -100,14 +180,19 @@ def _calibration(file: Path, first_image: Path, numbers: tuple[int, int]) -> Rig
             raise CalibrationError(
                 f"{file} has no P{number}; it describes {', '.join(f'P{r}' for r in rows) or 'no camera'}"
             )
-        matrix = rows[number][:, :3]
-        if np.linalg.det(matrix) == 0:
-            raise CalibrationError(f"{file}: P{number} is {rows[number].tolist()}, which is not a camera's projection")
-        body_from_cam = se3(np.eye(3), np.asarray(-np.linalg.solve(matrix, rows[number][:, 3]), np.float64))
-        intrinsics = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
-        camera = CameraCalibration("radial-tangential", width, height, intrinsics, np.zeros(0), body_from_cam)
-        cameras.append(check_camera(camera, f"{file}: P{number}"))
+        cameras.append(_projected(rows[number], (width, height), f"{file}: P{number}"))
     return RigCalibration(tuple(cameras))
+
+
+def _projected(projection: Array, size_px: tuple[int, int], where: str) -> CameraCalibration:
+    """The camera of rectified images with a projection (3, 4) from the rectified camera 0."""
+    matrix = projection[:, :3]
+    if np.linalg.det(matrix) == 0:
+        raise CalibrationError(f"{where} is {projection.tolist()}, which is not a camera's projection")
+    body_from_cam = se3(np.eye(3), np.asarray(-np.linalg.solve(matrix, projection[:, 3]), np.float64))
+    intrinsics = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
+    camera = CameraCalibration("radial-tangential", *size_px, intrinsics, np.zeros(0), body_from_cam)
+    return check_camera(camera, where)
 
 
 def _projections(file: Path) -> dict[int, Array]:

@@ -7,19 +7,20 @@ import os
 import re
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from fleetmap.errors import RecordingError
+from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.recordings.files import hash_file, read_text, what_instead
-from fleetmap.recordings.image_series import DepthRegistration, ImageSeries, SeriesFrames, pair_images
+from fleetmap.recordings.image_series import DepthRegistration, ImageSeries, SeriesFrames, ViewSeries, pair_images
 from fleetmap.recordings.images import StoredImage, file_kind, image_size, is_cut, is_damaged_png
 from fleetmap.recordings.limits import MAX_IMAGE_BYTES
 from fleetmap.recordings.ordering import ReadLog, clean_imu, trajectory_of_rows, usual_size, wrong_unit
 from fleetmap.recordings.tum import parse_stamp_ns
+from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples, Stamps, Trajectory
 
 _HEAD_BYTES, _TAIL_BYTES = 4096, 8192
@@ -70,9 +71,21 @@ def file_frames(
     return SeriesFrames(FileReader(root, log.files), left, right, depth, registration)
 
 
-def paired_cameras(cameras: Sequence[ImageFiles], log: ReadLog) -> tuple[ImageFiles, ImageFiles | None]:
-    """Pair left and right images by time, see `pair_images`; no right images for one camera."""
-    return (cameras[0], None) if len(cameras) == 1 else pair_images(cameras[0], cameras[1], log)
+def rig_frames(
+    root: Path, log: ReadLog, cameras: Sequence[ImageFiles], calibration: RigCalibration
+) -> SeriesFrames[Path]:
+    """Frames of all cameras, paired by time (see `pair_images`) and view by view; CalibrationError for more cameras than described."""
+    described = len(calibration.cameras)
+    if described < len(cameras):
+        raise CalibrationError(
+            f"{root}: {len(cameras)} cameras are recorded, the calibration describes {described}; "
+            "pass one that has all with --calibration FILE"
+        )
+    recorded = replace(calibration, cameras=calibration.cameras[: len(cameras)])
+    first, *others = ([cameras[number] for number in numbers] for numbers in recorded.views)
+    left, right = (first[0], None) if len(first) == 1 else pair_images(first[0], first[1], log)
+    frames = file_frames(root, log, left, right)
+    return replace(frames, others=tuple(ViewSeries.beside(left.stamps_ns, each, log) for each in others))
 
 
 def read_image(path: Path) -> StoredImage:

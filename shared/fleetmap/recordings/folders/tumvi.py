@@ -11,11 +11,10 @@ from fleetmap.recordings.finalize import RecordingParts, calibration_of_options,
 from fleetmap.recordings.folders.layout import (
     ImageFiles,
     existing_images,
-    file_frames,
-    paired_cameras,
     read_ground_truth,
     read_imu,
     read_table,
+    rig_frames,
 )
 from fleetmap.recordings.ordering import ReadLog, check_seconds
 from fleetmap.recordings.recording import OpenOptions, Recording
@@ -33,7 +32,7 @@ def open_tumvi(path: Path, options: OpenOptions) -> Recording:
     if not (path / "cam0/images").is_dir():
         raise RecordingError(f"{path / 'cam0/images'} is missing, cam1 is there; copy the recording again")
     present = [name for name in ("cam0", "cam1") if (path / name / "images").is_dir()]
-    left, right = paired_cameras([_images(path / name, name, log) for name in present], log)
+    cameras = [_images(path / name, name, log) for name in present]
     given = calibration_of_options(options, log)
     if given is None:
         camchain = path / "camchain.yaml"
@@ -41,13 +40,15 @@ def open_tumvi(path: Path, options: OpenOptions) -> Recording:
             raise CalibrationError(f"{camchain} is missing; pass a calibration with --calibration FILE")
         log.files.append(camchain)
         given = load_calibration(camchain)
+    frames = rig_frames(path, log, cameras, given.calibration)
     parts = RecordingParts(
         path=path,
         format="tumvi",
         calibration=given.calibration,
-        frame_stamps_ns=left.stamps_ns,
-        frames=file_frames(path, log, left, right),
-        has_right=right is not None,
+        frame_stamps_ns=frames.left.stamps_ns,
+        frames=frames,
+        has_right=frames.right is not None,
+        others=frames.other_numbers,
         imu=read_imu(path / "imu.txt", log),
         ground_truth=read_ground_truth(path / "gt_imu.csv", log),
     )

@@ -94,6 +94,14 @@ class McapRecordingWriter:
             self._write_camera_info(topics.right_info, stamp_ns, 1)
         if stored.depth is not None:
             self._write_image(topics.depth, stamp_ns, "cam0", stored.depth, is_depth=True)
+        for numbers, view in zip(self._calibration.views[1:], stored.others, strict=False):
+            if view is None:
+                continue
+            for number, image in zip(numbers, (view.left, view.right), strict=False):
+                if image is not None:
+                    topic = topics.camera(number)
+                    self._write_image(topic, view.stamp_ns, f"cam{number}", image)
+                    self._write_camera_info(f"{topic.rpartition('/')[0]}/camera_info", view.stamp_ns, number)
 
     def write_imu(self, samples: ImuSamples) -> None:
         for stamp_ns, gyro, accel in zip(

@@ -1,0 +1,150 @@
+"""Recordings of rigs with several views: every format that has them gives the images of all cameras."""
+
+import shutil
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import CalibrationError
+from fleetmap.geometry import se3, se3_inverse
+from fleetmap.recordings import OpenOptions, Recording, format_calibration, open_recording, read_calibration
+from fleetmap.recordings.mcap.writer import McapRecordingWriter, copy_to_mcap
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.samples import CameraFrame, SensorSet
+from fleetsim.recorder import Order, prepare
+from support.recordings.recording_samples import make_sample, write_euroc
+from support.recordings.rig_samples import images_of, write_kitti_raw
+
+
+@lru_cache(maxsize=2)
+def simulated(rig: str) -> tuple[RigCalibration, tuple[CameraFrame, ...]]:
+    """Four frames of a robot in the simulator, which has no IMU here."""
+    session = prepare(Order("clip", frames=4, size_px=(96, 72), rig=rig))
+    try:
+        return replace(session.nominal, imu=None), tuple(session.frames())
+    finally:
+        session.renderer.close()
+
+
+def written(file: Path, rig: str, frames: tuple[CameraFrame, ...] | None = None) -> Recording:
+    calibration, recorded = simulated(rig)
+    with McapRecordingWriter(file, calibration) as writer:
+        for frame in frames or recorded:
+            writer.write_frame(frame)
+    return open_recording(file)
+
+
+def shows_the_same(one: CameraFrame, other: CameraFrame) -> bool:
+    pairs = zip(images_of(one), images_of(other), strict=True)
+    return one.stamp_ns == other.stamp_ns and all(np.array_equal(a, b) for a, b in pairs)
+
+
+@pytest.mark.parametrize(("rig", "views"), [("front-rear", ((0, 1), (2, 3))), ("front-sides", ((0, 1), (2,), (3,)))])
+def test_a_simulated_rig_is_written_read_and_copied(
+    tmp_path: Path, rig: str, views: tuple[tuple[int, ...], ...]
+) -> None:
+    calibration, frames = simulated(rig)
+    with written(tmp_path / "a.mcap", rig) as recording:
+        assert recording.calibration.views == calibration.views == views
+        assert recording.sensor_set is SensorSet.STEREO and not recording.issues
+        assert all(shows_the_same(recording.read_frame(k), frame) for k, frame in enumerate(frames))
+        copy_to_mcap(recording, tmp_path / "b.mcap")
+        part = recording.part(np.array([2, 3]))
+        assert shows_the_same(part.read_frame(1), frames[3])
+    with open_recording(tmp_path / "b.mcap") as copy:
+        assert shows_the_same(copy.read_frame(3), frames[3])
+    assert len({image.tobytes() for image in images_of(frames[0])}) == 4
+
+
+def test_views_look_where_the_robot_turns_them() -> None:
+    rear = simulated("front-rear")[0].cameras
+    turned = se3_inverse(rear[0].body_from_cam) @ rear[2].body_from_cam
+    assert turned[2, 2] == pytest.approx(-1.0, abs=0.01)
+    rectifier = Rectifier(simulated("front-rear")[0])
+    assert [mounted.camera.baseline_m for mounted in rectifier.mounted] == pytest.approx([0.12, 0.12])
+    sides = Rectifier(simulated("front-sides")[0]).mounted
+    assert [mounted.camera.baseline_m for mounted in sides] == pytest.approx([0.12, 0.0, 0.0])
+
+
+def test_a_view_without_images_at_a_moment_is_none_there(tmp_path: Path) -> None:
+    _, frames = simulated("front-rear")
+    gone = (frames[0], replace(frames[1], others=(None,)), *frames[2:])
+    with written(tmp_path / "a.mcap", "front-rear", gone) as recording:
+        assert [recording.read_frame(k).others[0] is None for k in range(4)] == [False, True, False, False]
+
+
+def test_cameras_with_stamps_of_their_own_are_the_nearest_of_each_frame(tmp_path: Path) -> None:
+    """The rear pair is 20 ms late; the rectified frame has the first view's clock."""
+    calibration, frames = simulated("front-rear")
+    later = [
+        replace(f, others=tuple(replace(o, stamp_ns=o.stamp_ns + 20_000_000) for o in f.others if o)) for f in frames
+    ]
+    with written(tmp_path / "a.mcap", "front-rear", tuple(later)) as recording:
+        frame = recording.read_frame(2)
+        assert frame.others[0] is not None and frame.others[0].stamp_ns == frame.stamp_ns + 20_000_000
+        offset = [replace(c, imu_minus_cam_s=-0.02 if n > 1 else 0.0) for n, c in enumerate(calibration.cameras)]
+        rear = Rectifier(replace(calibration, cameras=tuple(offset))).rectify(frame).view(1)
+        assert rear is not None and rear.stamp_ns == frame.stamp_ns
+
+
+def test_a_drive_of_kittis_raw_data_is_a_rig_of_two_pairs(tmp_path: Path) -> None:
+    calibration, frames = simulated("front-rear")
+    drive = write_kitti_raw(tmp_path / "2024_01_01_drive_0001", calibration, frames)
+    with open_recording(drive) as recording:
+        assert recording.format == "kitti-raw" and recording.calibration.views == ((0, 1), (2, 3))
+        assert all(shows_the_same(recording.read_frame(k), frame) for k, frame in enumerate(frames))
+        first = se3_inverse(calibration.cameras[0].body_from_cam)
+        for ours, wanted in zip(recording.calibration.cameras, calibration.cameras, strict=True):
+            np.testing.assert_allclose(ours.body_from_cam, first @ wanted.body_from_cam, atol=1e-9)
+            np.testing.assert_allclose(ours.intrinsics_px, wanted.intrinsics_px)
+    shutil.move(drive / "calib_cam_to_cam.txt", tmp_path)  # where one of all drives of a day is
+    with open_recording(drive) as recording:
+        assert len(recording.calibration.cameras) == 4
+    (tmp_path / "calib_cam_to_cam.txt").write_text("K_00: 1 2 3\n")
+    with pytest.raises(CalibrationError, match="_00 are not"):
+        open_recording(drive)
+    (drive / "image_01/timestamps.txt").write_text("yesterday\n")
+    with pytest.raises(Exception, match="line 1: 'yesterday' is not a date"):
+        open_recording(drive)
+
+
+def test_rectified_images_of_kittis_raw_data_are_described_by_p_rect(tmp_path: Path) -> None:
+    calibration, frames = simulated("front-rear")
+    drive = write_kitti_raw(tmp_path / "drive", calibration, frames)
+    file = drive / "calib_cam_to_cam.txt"
+    text = file.read_text().replace("S_rect_", "was_S_rect_").replace("P_rect_", "was_P_rect_")
+    for number in range(4):
+        shift = -70.0 * 0.5 * number
+        text += f"S_rect_{number:02d}: 96 72\nP_rect_{number:02d}: 70 0 48 {shift} 0 70 36 0 0 0 1 0\n"
+    file.write_text(text)
+    with open_recording(drive) as recording:
+        assert [c.body_from_cam[0, 3] for c in recording.calibration.cameras] == pytest.approx([0.0, 0.5, 1.0, 1.5])
+
+
+def test_eurocs_folder_with_four_cameras(tmp_path: Path) -> None:
+    folder = write_euroc(tmp_path / "drive", make_sample(3))
+    with open_recording(folder) as recording:
+        kept = recording.calibration
+    turned = se3(np.diag([-1.0, -1.0, 1.0]), np.array([-0.3, 0.0, 0.0]))  # body_from_turned
+    for number in (0, 1):
+        shutil.copytree(folder / f"mav0/cam{number}", folder / f"mav0/cam{number + 2}")
+    rig = replace(
+        kept, cameras=(*kept.cameras, *(replace(c, body_from_cam=turned @ c.body_from_cam) for c in kept.cameras))
+    )
+    file = tmp_path / "camchain.yaml"
+    file.write_text(format_calibration(rig))
+    assert read_calibration(file).views == ((0, 1), (2, 3))
+    with open_recording(folder, OpenOptions(calibration_file=file)) as recording:
+        frame = recording.read_frame(1)
+        assert frame.others[0] is not None and np.array_equal(frame.others[0].left, frame.left)
+        assert recording.sensor_set is SensorSet.STEREO_INERTIAL
+    file.write_text(format_calibration(kept))
+    with pytest.raises(CalibrationError, match="4 cameras are recorded, the calibration describes 2"):
+        open_recording(folder, OpenOptions(calibration_file=file))
+    exchanged = replace(rig, cameras=(*rig.cameras[:2], rig.cameras[3], rig.cameras[2]))
+    with pytest.raises(CalibrationError, match=r"cam3 lies at .* in cam2's axes"):
+        Rectifier(exchanged)

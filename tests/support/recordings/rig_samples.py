@@ -1,0 +1,50 @@
+"""Folders of rigs with any number of cameras, written from frames."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.samples import CameraFrame, Image
+
+
+def images_of(frame: CameraFrame) -> list[Image]:
+    """The images of all cameras, in the order of the calibration."""
+    views = [frame, *frame.others]
+    return [image for view in views if view is not None for image in (view.left, view.right) if image is not None]
+
+
+def write_kitti_raw(drive: Path, calibration: RigCalibration, frames: Sequence[CameraFrame]) -> Path:
+    """A drive in the layout of KITTI's raw data, not rectified; camera 0 is the origin."""
+    stamps = [str(np.datetime64(frame.stamp_ns, "ns")).replace("T", " ") for frame in frames]
+    first_from_body, lines = se3_inverse(calibration.cameras[0].body_from_cam), ["calib_time: 01-Jan-2024 10:00:00"]
+    for number, camera in enumerate(calibration.cameras):
+        folder = drive / f"image_{number:02d}"
+        (folder / "data").mkdir(parents=True)
+        (folder / "timestamps.txt").write_text("\n".join(stamps) + "\n")
+        for index, frame in enumerate(frames):
+            cv2.imwrite(str(folder / f"data/{index:010d}.png"), images_of(frame)[number])
+        fx, fy, cx, cy = camera.intrinsics_px
+        cam_from_first = se3_inverse(first_from_body @ camera.body_from_cam)
+        distortion = np.zeros(5)
+        distortion[: len(camera.distortion)] = camera.distortion
+        size = np.array([camera.width_px, camera.height_px])
+        for name, values in (
+            ("S", size),
+            ("K", np.array([fx, 0, cx, 0, fy, cy, 0, 0, 1])),
+            ("D", distortion),
+            ("R", cam_from_first[:3, :3].ravel()),
+            ("T", cam_from_first[:3, 3]),
+            ("S_rect", size - 10),
+            ("P_rect", np.zeros(12)),
+        ):
+            lines.append(f"{name}_{number:02d}: {_words(values)}")
+    (drive / "calib_cam_to_cam.txt").write_text("\n".join(lines) + "\n")
+    return drive
+
+
+def _words(values: Array) -> str:
+    return " ".join(repr(float(value)) for value in values)
