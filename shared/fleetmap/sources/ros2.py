@@ -5,20 +5,24 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from fleetmap.bus import Bus, Handle
 from fleetmap.errors import FleetmapError, RecordingError
 from fleetmap.recordings import StoredFrame, Topics
 from fleetmap.recordings.bags.topics import transports
-from fleetmap.recordings.images import StoredImage, grey_bits, grey_peak
+from fleetmap.recordings.images import StoredImage, grey_bits, grey_image, grey_peak
 from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS
 from fleetmap.recordings.ros2 import messages
 from fleetmap.recordings.ros2.graph import KeyLayout
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples
+from fleetmap.sensors.source_settings import CAMERA_ROLES
 from fleetmap.sources.intake import Intake
 
 _IDLE_S = 1.0
 _WAITING_IMAGES = 8  # images of each side waiting for their partner
+_DEAD_NS = 500_000_000
 Take = Callable[[Intake, bool, bytes], None]
 
 
@@ -48,6 +52,67 @@ class StereoPairs:
         return StoredFrame(stamp_ns if side == "left" else partner[0], left, right)
 
 
+class RigFrames:
+    """Adds to each frame of a rig's first view the images of the other views that are nearest to it, at most half a period away.
+
+    A frame waits for the views that still send, at most until the next one. While the first view has sent nothing for half a second,
+    frames are black there, so that the others carry on.
+    """
+
+    def __init__(self, calibration: RigCalibration) -> None:
+        self._views = calibration.views
+        self._pairs = [StereoPairs() if len(view) > 1 else None for view in self._views]
+        self._recent = [deque[StoredFrame](maxlen=_WAITING_IMAGES) for _ in self._views]  # of each view
+        self._waiting: StoredFrame | None = None
+        first = calibration.cameras[0]
+        self._black = grey_image(np.zeros((first.height_px, first.width_px), np.uint8))
+
+    @property
+    def unpaired(self) -> int:
+        return sum(pairs.unpaired for pairs in self._pairs if pairs is not None)
+
+    def add(self, number: int, stamp_ns: int, image: StoredImage) -> list[StoredFrame]:
+        """Add an image of a camera; return the frames that are complete."""
+        view = next(k for k, numbers in enumerate(self._views) if number in numbers)
+        pairs, side = self._pairs[view], "left" if number == self._views[view][0] else "right"
+        frame = StoredFrame(stamp_ns, image) if pairs is None else pairs.add(side, stamp_ns, image)
+        if frame is None:
+            return []
+        done: list[StoredFrame] = []
+        first = self._recent[0]
+        if view and first and frame.stamp_ns - first[-1].stamp_ns > _DEAD_NS:
+            is_ahead = all(not other or other[-1].stamp_ns < frame.stamp_ns for other in self._recent[1:])
+            self._recent[view].append(frame)
+            return [self._with_others(StoredFrame(frame.stamp_ns, self._black))] if is_ahead else []
+        self._recent[view].append(frame)
+        if view == 0:
+            done += [] if self._waiting is None else [self._with_others(self._waiting)]
+            self._waiting = frame
+        if self._waiting is not None and not any(map(self._is_expected, self._recent[1:])):
+            done.append(self._with_others(self._waiting))
+            self._waiting = None
+        return done
+
+    def _is_expected(self, recent: deque[StoredFrame]) -> bool:
+        """True if a view that sent an image since the frame before has none for the waiting frame yet."""
+        assert self._waiting is not None
+        if not recent or recent[-1].stamp_ns >= self._waiting.stamp_ns:
+            return False
+        return self._waiting.stamp_ns - recent[-1].stamp_ns < 1.5 * self._period_ns()
+
+    def _period_ns(self) -> int:
+        stamps = [frame.stamp_ns for frame in self._recent[0]]
+        return int(np.median(np.diff(stamps))) if len(stamps) > 1 else _DEAD_NS
+
+    def _with_others(self, frame: StoredFrame) -> StoredFrame:
+        others = list[StoredFrame | None]()
+        for recent in list(self._recent)[1:]:
+            near = min(recent, key=lambda other: abs(other.stamp_ns - frame.stamp_ns), default=None)
+            is_near = near is not None and abs(near.stamp_ns - frame.stamp_ns) <= self._period_ns() // 2
+            others.append(near if is_near else None)
+        return replace(frame, others=tuple(others))
+
+
 class Ros2Source:
     """Subscribes to the topics, to image topics also in image_transport's variants; the key names the type of a message."""
 
@@ -69,6 +134,7 @@ class Ros2Source:
         self._bus, self._layout = bus, layout
         self.calibration, self.has_depth = calibration, has_depth
         self._pairs = StereoPairs()
+        self._rig: RigFrames | None = None  # of a rig with several views
         self._grey_peak = 0  # used bits of 16-bit images, until one has more than 12
         self._topics: list[tuple[str, Take]] = [
             (topics.wheel, _take_wheel),
@@ -80,9 +146,13 @@ class Ros2Source:
             roles = (
                 ("left", "depth" if has_depth else "right") if has_depth or len(calibration.cameras) > 1 else ("left",)
             )
-            for side, role in zip(("left", "right"), roles, strict=False):
+            if not has_depth and len(calibration.views) > 1:
+                self._rig = RigFrames(calibration)
+            further = () if self._rig is None else CAMERA_ROLES[2 : len(calibration.cameras)]
+            named = zip(("left", "right", *further), (*roles, *further), strict=False)
+            for number, (side, role) in enumerate(named):
                 names = transports(getattr(topics, role), role)
-                self._topics += [(name, partial(self._take_image, side)) for name in names]
+                self._topics += [(name, partial(self._take_image, number, side)) for name in names]
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
         handles = self.subscribe(intake)
@@ -115,13 +185,17 @@ class Ros2Source:
             # An unreadable message is skipped; the health report counts them.
             intake.count_unreadable(str(error))
 
-    def _take_image(self, side: str, intake: Intake, is_compressed: bool, payload: bytes) -> None:
+    def _take_image(self, number: int, side: str, intake: Intake, is_compressed: bool, payload: bytes) -> None:
         stamp_ns, _ = messages.header_of(payload)
         decode = messages.decode_compressed_image if is_compressed else messages.decode_image
         image = decode(payload, f"{side} at {stamp_ns}")
         if side == "left" or not self.has_depth:
             self._grey_peak = max(self._grey_peak, grey_peak(image) if self._grey_peak < 1 << 12 else 0)
             image = replace(image, bits=grey_bits(self._grey_peak))
+        if self._rig is not None:
+            for complete in self._rig.add(number, stamp_ns, image):
+                intake.put_frame(complete)
+            return
         if not self.has_depth and len(self.calibration.cameras) == 1:
             intake.put_frame(StoredFrame(stamp_ns, image))
             return
