@@ -307,7 +307,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         for s, session in zip(built.taken, judged, strict=True)
     ]
     grid_before = {} if parent is None else parent.grid
-    grid_grower = GridGrower(corrections.grid_before(grid_before), run.settings.stereo)
+    grid_grower = GridGrower(corrections.grid_before(grid_before))
     growers: dict[str, Grower] = {"grid": grid_grower} if run.settings.occupancy_grid else {}
     if run.settings.surfel_map:
         known = SurfelTiles() if parent is None else known_surfels(parent.manifest, maps.blob)

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.features.settings import StereoSettings
-from fleetmap.geometry import Array
+from fleetmap.geometry import AnyArray, Array
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 
 DENSE_SIGMA_PX = 0.3  # of a disparity of the matcher on textured surfaces
@@ -15,7 +15,7 @@ _ROW_STEP, _BLOCK = 2, 3
 BLOCK_PX = _ROW_STEP * (_BLOCK - 1) + 3  # rows that a disparity depends on: of a block, each smoothed over three
 _NEAREST_M, _FRACTIONS = 0.6, 16
 _ROWS = np.array([[1.0], [2.0], [1.0]], np.float32) / 4
-_SMOOTH, _SMALLER = 16 * _BLOCK * _BLOCK, 4
+_SMOOTH, _SPECKLE_SHARE, _SMALLER = 16 * _BLOCK * _BLOCK, 3000, 4
 _MIN_TEXTURE, _TEXTURE_PX = 1.5, 9  # mean horizontal gradient in grey levels, of a square around the pixel
 _FLOOR_REACH_M, _FLOOR_BIN_M, _MIN_FLOOR_POINTS = 4.0, 0.02, 400
 _FLOOR_APART_M, _FLOOR_SHARE = 0.05, 0.6
@@ -41,8 +41,8 @@ def dense_disparity(
     return np.where(is_textured, rows, np.float32(np.nan)), DENSE_SIGMA_PX
 
 
-def _matched(left: NDArray[np.uint8], right: NDArray[np.uint8], nearest_px: float) -> NDArray[np.float32]:
-    """Return the disparities of a pair up to `nearest_px`, NaN if unknown."""
+def _matched(left: AnyArray, right: AnyArray, nearest_px: float) -> NDArray[np.float32]:
+    """Return the disparities of a pair of grey pictures up to `nearest_px`, NaN if unknown."""
     matcher = cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=16 * int(np.ceil(nearest_px / 16)),
@@ -52,7 +52,7 @@ def _matched(left: NDArray[np.uint8], right: NDArray[np.uint8], nearest_px: floa
         disp12MaxDiff=1,
         preFilterCap=31,
         uniquenessRatio=10,
-        speckleWindowSize=50,
+        speckleWindowSize=left.size // _SPECKLE_SHARE,
         speckleRange=2,
         mode=cv2.StereoSGBM_MODE_SGBM_3WAY,
     )
@@ -72,9 +72,9 @@ def _largest_disparity_px(left: NDArray[np.uint8], right: NDArray[np.uint8], far
 def _between(rows: NDArray[np.float32], height: int) -> NDArray[np.float32]:
     """Return (height, W) disparities from those of every second row: means of like neighbours between them, NaN elsewhere."""
     every = np.full((height, rows.shape[1]), np.float32(np.nan))
-    every[::2] = rows
+    every[::_ROW_STEP] = rows
     above, below = rows[: (height - 1) // 2], rows[1 : 1 + (height - 1) // 2]
-    every[1 : height - 1 : 2] = np.where(np.abs(above - below) <= 1.0, (above + below) / 2, np.float32(np.nan))
+    every[1 : height - 1 : _ROW_STEP] = np.where(np.abs(above - below) <= 1.0, (above + below) / 2, np.float32(np.nan))
     return every
 
 

@@ -17,7 +17,7 @@ from mapserver.grid.dense_stereo import BLOCK_PX
 _RANGE_CELLS = 160  # of a view
 # A view that hits a voxel counts as two that pass it, since rays also pass at its rim. An earlier state stays until two more views
 # contradict it, and is unknown until the deciding number: few views see into an emptied slot, and one night must suffice.
-HIT, OCCUPIED, _FREE, AGAINST = 2, 4, 4, 2
+HIT, OCCUPIED, FREE, AGAINST = 2, 4, 4, 2
 # A pixel's depth may belong to any point in the matched block, and its ray represents the pixels up to the next one.
 REACH_PX = (BLOCK_PX + core.GRID_RAY_STRIDE_PX) // 2
 _WIDTH_M, _STEP_M = 0.5, 1.5  # width of the camera's carrier; distance of keyframes of one drive
@@ -74,7 +74,7 @@ class SessionViews:
         for tile in np.unique(cells // TILE_CELLS, axis=0):
             mine = cells[(cells // TILE_CELLS == tile).all(axis=1)] - tile * TILE_CELLS
             passes = self._tile(*tile.tolist())[1]
-            passes[mine[:, 1], mine[:, 0], :levels] = np.maximum(passes[mine[:, 1], mine[:, 0], :levels], _FREE)
+            passes[mine[:, 1], mine[:, 0], :levels] = np.maximum(passes[mine[:, 1], mine[:, 0], :levels], FREE)
 
     def _tile(self, x: int, y: int) -> tuple[Counts, Counts, Counts, Counts]:
         if (x, y) not in self.tiles:
@@ -116,7 +116,7 @@ def updated(views: SessionViews) -> Tiles:
         score = HIT * hits.astype(np.int16) - passes
         occupied = (score >= OCCUPIED) | (was_occupied & (score > -AGAINST))
         is_hidden = (hidden >= AGAINST) & (score > -AGAINST)
-        free = ~occupied & ((score <= -_FREE) | (was_free & (score < AGAINST) & ~is_hidden))
+        free = ~occupied & ((score <= -FREE) | (was_free & (score < AGAINST) & ~is_hidden))
         bits = [np.packbits(mask, axis=-1, bitorder="little")[..., 0] for mask in (occupied, free)]
         low, high = (_height(old[..., 2 + i], heights[..., 1 + 2 * i]) for i in (0, 1))
         # An object seen there by a few views only has left no voxel.

@@ -15,7 +15,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat.grid_tile import CELL_M
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.grid.site_grid import AGAINST, HIT, OCCUPIED
-from mapserver.grid.survey_grid import DepthView, GridSession, measures_depth
+from mapserver.grid.survey_grid import DepthView, GridSession
 from mapserver.surfels.exposure import Exposure, Sample, estimate_exposure, squared_tangent
 from mapserver.surfels.surfel_map import (
     EDGE_M,
@@ -69,9 +69,7 @@ class SurfelGrower:
     def __init__(self, before: SurfelTiles) -> None:
         self.surfels = before
 
-    def begin(self, session: GridSession) -> str | None:
-        if not measures_depth(session.survey):
-            return "one camera measures no depth; surfels need a stereo pair or a depth camera"
+    def begin(self, session: GridSession, some: Sequence[DepthView]) -> str | None:
         self._camera, self._looks = session.survey.state.camera, list[_Look]()
         self._seen: dict[_Place, list[int]] = {}  # by tile, the views that measured something in it or its halo
         self._images: ImageStore = session.survey.odometry.keyframes[0].images

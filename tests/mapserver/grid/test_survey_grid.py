@@ -1,12 +1,18 @@
 """Pictures of a room become its grid; what shows no depth or no floor is told by name."""
 
+from collections.abc import Sequence
+
 import numpy as np
 import pytest
 
+from fleetmap.features.settings import StereoSettings
+from fleetmap.geometry import so3_exp
 from fleetmap.mapformat.grid_tile import CELL_M
 from fleetmap.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.version_grid import occupancy
+from mapserver.grid.site_grid import FREE as FREE_VIEWS
+from mapserver.grid.survey_grid import DepthView, GridSession, grow
 from support.recordings.recording_samples import FOCAL, HEIGHT, WIDTH
 from support.storage.room_sessions import CAMERA, grown_grid, ride, session_at
 from support.worlds.box_room import ROOM_M
@@ -41,3 +47,31 @@ def test_a_camera_that_is_carried_by_hand_has_no_floor() -> None:
     heights = [0.6, 0.75, 0.9, 1.05, 1.2, 1.35]
     _, without = grown_grid({}, [session_at(ride(heights))])
     assert "carried by hand" in without["ride"]
+
+
+class _Counted:
+    """Keeps the numbers of the frames that it gets."""
+
+    def begin(self, session: GridSession, some: Sequence[DepthView]) -> str | None:
+        self.frames, self.some = list[int](), {view.keyframe.frame_index: view for view in some}
+        return None
+
+    def add(self, view: DepthView) -> None:
+        self.frames.append(view.keyframe.frame_index)
+        assert self.some.get(view.keyframe.frame_index, view) is view  # matched once
+
+    def end(self) -> None:
+        """Nothing to do."""
+
+
+def test_of_many_drives_along_a_way_the_last_ones_are_matched() -> None:
+    """Enough of them to free a voxel; a place that was passed once, and one from which the camera looked elsewhere, stay."""
+    lap = ride([0.8] * 21)[::3]
+    away = lap[0].copy()
+    away[:3, :3] = so3_exp(np.array([0.0, 0.0, 0.5])) @ away[:3, :3]
+    counted = _Counted()
+    grow({"counted": counted}, [session_at([away, *lap * 9], has_depth=True)], StereoSettings())
+    assert counted.frames == [0, *range(1 + len(lap) * (9 - FREE_VIEWS), 1 + len(lap) * 9)]
+    once = session_at(lap, has_depth=True)
+    grow({"counted": counted}, [once], StereoSettings())
+    assert counted.frames == list(range(len(lap)))

@@ -58,7 +58,7 @@ def ride(height_m: list[float]) -> list[Array]:
 
 def grown_grid(before: Tiles, sessions: Sequence[GridSession]) -> tuple[Tiles, dict[str, str]]:
     """Tiles after these sessions, and why recordings add nothing."""
-    grower = GridGrower(before, StereoSettings())
+    grower = GridGrower(before)
     without = grow({"grid": grower}, sessions, StereoSettings())
     return grower.tiles, without["grid"]
 
