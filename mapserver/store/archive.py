@@ -82,12 +82,11 @@ def encode_archive(survey: SurveyMap) -> bytes:
             "arrays": [{"name": n, "dtype": _ARRAYS[n][0], "shape": list(a.shape)} for n, a in arrays.items()],
         }
     )
-    body = [array.tobytes() for array in arrays.values()]
-    size = _HEAD_SIZE.size + len(head) + sum(len(part) for part in body)
+    size = _HEAD_SIZE.size + len(head) + sum(array.nbytes for array in arrays.values())
     if size > MAX_ARCHIVE_PAYLOAD_BYTES:
         reason = f"archive of {size} bytes, the limit is {MAX_ARCHIVE_PAYLOAD_BYTES}; survey in several parts"
         raise MapFormatError(reason)
-    payload = b"".join([_HEAD_SIZE.pack(len(head)), head, *body])
+    payload = b"".join([_HEAD_SIZE.pack(len(head)), head, *(array.data for array in arrays.values())])  # copied once
     return pack(ARCHIVE_MAGIC, ARCHIVE_FORMAT, payload, level=_LEVEL)
 
 
