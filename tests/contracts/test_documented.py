@@ -83,7 +83,7 @@ EVIDENCE = (
     figures.TileDirections, figures.Starts, figures.LookAlike, figures.Repetition, figures.SurveyedViews,
     figures.BlindView, figures.RigEvidence,
 )  # fmt: skip
-RUN_KEYS = {"aligned_error_m", "peak_rss_mb", "map_version", "not_localised_m", "failures_detected"}
+RUN_KEYS = {"aligned_error_m", "peak_rss_mb", "map_version", "not_localised_m", "failures_detected", "starts"}
 
 
 @pytest.mark.parametrize(

@@ -41,7 +41,7 @@ def both(first: Aisle, second: Aisle) -> Aisle:
 
 
 def report(seen: Aisle, surveyed: Array, driven: Array, *, dark: str = "") -> Report:
-    """Of a site with two aisles: frames along `driven`, in the map of a survey along `surveyed`. dark: an aisle in which frames show nothing."""
+    """Of a site with two aisles: frames along `driven`, in the map of a survey along `surveyed`. dark: an aisle whose frames show nothing."""
     rng, view = np.random.default_rng(3), relocalizer(seen, surveyed)[0].view
 
     def where(place_m: Array) -> str:
@@ -58,7 +58,7 @@ def report(seen: Aisle, surveyed: Array, driven: Array, *, dark: str = "") -> Re
         grey = 5.0 if is_dark else 100.0
         # Of a camera that needs a grey level of 12.
         rungs = {"darkness": {n: (grey / 2**n, fix is not None and grey / 2**n > DARK) for n in STOPS}}
-        rungs |= {"blur": {n: (grey, fix is not None) for n in BLUR_PX}}
+        rungs |= {"blur": dict.fromkeys(BLUR_PX, (grey, fix is not None))}
         pictures.append(Picture(probe, grey, error_m, False, rungs))
         outcome = "lost" if fix is None else "ambiguous" if aliases(view, probe) else "found"
         starts.append(Start(place[:2, 3], outcome))
