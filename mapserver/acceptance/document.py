@@ -86,7 +86,7 @@ def _coverage(areas: Sequence[AreaFigures]) -> Section:
         if a.name not in (UNKNOWN_PLACE, ALL)
     ]
     words = ["Places of the map by the direction in which the camera looked (E along x of the map, N along y)."]
-    return Section("Coverage", words, header=("area", "places", "seen facing", "nobody drove"), rows=rows)
+    return Section("Coverage", words, header=("area", "places", "seen facing", "not driven facing"), rows=rows)
 
 
 def _directions(seen: Mapping[str, int]) -> str:

@@ -73,7 +73,7 @@ def _of_areas(report: Report, settings: GateSettings) -> Iterator[tuple[str, str
             ways = ", ".join(area.missing)
             words = missing_words(TileDirections((0, 0), area.seen, area.missing))
             yield (
-                f"{area.name} was surveyed in one direction only, nobody drove {ways}",
+                f"{area.name} was surveyed in one direction only, nobody drove it facing {ways}",
                 f"{area.name}: drive it facing {ways} ({words})",
             )
         starts = area.starts.found_of_all

@@ -27,7 +27,7 @@ def test_a_room_is_accepted_signed_and_equal_to_itself(site: RoomSite, tmp_path:
         assert first.startswith("ACCEPTED" if told.exit_code == 0 else "NOT ACCEPTED")
         assert first in (out / "acceptance.html").read_text()
         assert (out / "acceptance.pdf").read_bytes().startswith(b"%PDF")
-        assert "unchanged" in run(mapserver_app, "trust", "verify", out, "--store", site.store)
+        assert "unchanged" in run(mapserver_app, "trust", "verify", out, "--store", maps)
     replay = site.replay(tmp_path)
     (drive,) = report["drives"]
     for name in ("median", "p95", "p99", "max"):

@@ -41,7 +41,7 @@ def both(first: Aisle, second: Aisle) -> Aisle:
 
 
 def report(seen: Aisle, surveyed: Array, driven: Array, *, dark: str = "") -> Report:
-    """Of a site with two aisles: frames along `driven`, in the map of a survey along `surveyed`. dark: an aisle whose frames show nothing."""
+    """Two aisles: frames along `driven`, in the map of a survey along `surveyed`. dark: an aisle whose frames show nothing."""
     rng, view = np.random.default_rng(3), relocalizer(seen, surveyed)[0].view
 
     def where(place_m: Array) -> str:
@@ -104,7 +104,10 @@ def test_a_site_surveyed_in_one_direction_is_told_so(good: Report) -> None:
     one_way = report(DIFFERENT, np.concatenate([ONE, TWO, TWO[::-1] @ BACK]), DRIVEN)
     found = verdict(one_way)
     assert not found.is_accepted
-    assert found.verdict == "NOT ACCEPTED: hall, version 3: aisle 1 was surveyed in one direction only, nobody drove W."
+    assert (
+        found.verdict
+        == "NOT ACCEPTED: hall, version 3: aisle 1 was surveyed in one direction only, nobody drove it facing W."
+    )
     assert found.survey_again[0].startswith("aisle 1: drive it facing W")
     assert verdict(one_way, ONE_WAY).is_accepted
     assert "if robots drive every aisle as it was surveyed" in verdict(one_way, ONE_WAY).verdict
