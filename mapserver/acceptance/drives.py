@@ -230,14 +230,18 @@ def _off(map_from_body: Array, truth: Array) -> tuple[float, float]:
 
 def _errors_m(localised: Trajectory, reference: Trajectory) -> list[float]:
     pairs = zip(localised.stamps_ns.tolist(), localised.frame_from_body, strict=True)
-    return [_off(pose, truth)[0] for stamp, pose in pairs if (truth := reference.at(stamp)) is not None]
+    return [
+        _off(map_from_body, truth)[0] for stamp, map_from_body in pairs if (truth := reference.at(stamp)) is not None
+    ]
 
 
 def _silent(localised: Trajectory, reference: Trajectory) -> int:
     """Return the number of silent failures among localized frames."""
     pairs = zip(localised.stamps_ns.tolist(), localised.frame_from_body, strict=True)
     return _silent_runs(
-        (stamp, is_wrong(*_off(pose, truth))) for stamp, pose in pairs if (truth := reference.at(stamp)) is not None
+        (stamp, is_wrong(*_off(map_from_body, truth)))
+        for stamp, map_from_body in pairs
+        if (truth := reference.at(stamp)) is not None
     )
 
 
