@@ -13,7 +13,7 @@ from mapserver.dashboard.plan import Plan
 from mapserver.dashboard.rendering import share, size
 from mapserver.drafting.area_corrections import waiting
 from mapserver.floor_plan.alignment import Alignment
-from mapserver.floor_plan.areas import Areas
+from mapserver.floor_plan.areas import Area, Areas
 from mapserver.floor_plan.survey_requests import courses
 from mapserver.quality.directions import missing_words
 from mapserver.quality.figures import trusted_calibrations
@@ -79,7 +79,10 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         return {"shown": None}
     info, plan, requests = maps.store.version(site, shown), maps.plan(site, shown), maps.store.survey_requests(site)
     changes, compares = _changes(maps, context, rows, before, after or shown), "after" in context.query
-    asked_for = [Outline([[(x, y) for x, y in one.corners_map_m]], f"survey {one.id}") for one in requests]
+    forgets = _waiting(maps, site)
+    drawn = [area.rings[0].round(2).tolist() for area in forgets]  # requests of their own, which hide nothing
+    others = [one for one in requests if one.corners_map_m not in drawn]
+    asked_for = [Outline([[(x, y) for x, y in one.corners_map_m]], f"survey {one.id}") for one in others]
     over = [
         Layer("Failures", heat(services.health.places(site, *span_ns), box_of(plan)), shown=False),
         Layer("Changed tiles", squares(plan, changes["tiles"]), shown=compares),
@@ -100,7 +103,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         "changes": changes,
         "alignment": _aligned(maps.store.alignment(site)),
         "corrected": _CORRECTED,
-        "waiting": _waiting(maps, site),
+        "waiting": [area.name for area in forgets],
         "areas": sorted(maps.store.areas(site).areas, key=lambda area: area.name),
         "requests": requests,
         "courses": courses((e.stamp_ns, e.kind, e.detail) for e in maps.store.events(site, _lately())),
@@ -115,12 +118,10 @@ def _lately() -> tuple[int, int]:
     return now_ns - _COURSES_NS, now_ns
 
 
-def _waiting(maps: MapData, site: str) -> list[str]:
-    """Names of the areas to be learned anew that the current version has not forgotten yet."""
+def _waiting(maps: MapData, site: str) -> list[Area]:
+    """The areas to be learned anew that the current version has not forgotten yet."""
     current = maps.current_version(site)
-    if current is None:
-        return []
-    return [area.name for area in waiting(maps.store.areas(site), maps.store.manifest(site, current))]
+    return [] if current is None else waiting(maps.store.areas(site), maps.store.manifest(site, current))
 
 
 def _used(services: Services, rows: SiteReleases) -> str:
