@@ -330,9 +330,9 @@ def test_a_site_that_is_in_the_map_once_has_no_look_alikes() -> None:
 def test_probes_are_extracted_as_the_survey_did(monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[OrbSettings] = []
 
-    def other(image: Image, settings: OrbSettings) -> TimeSliced[Features]:
+    def other(image: Image, settings: OrbSettings, clearance_px: Image | None = None) -> TimeSliced[Features]:
         asked.append(settings)
-        return (yield from detect_in_slices(image, settings))
+        return (yield from detect_in_slices(image, settings, clearance_px))
 
     monkeypatch.setitem(extraction.EXTRACTORS, "other", other)
     rectifier = Rectifier(calibration())

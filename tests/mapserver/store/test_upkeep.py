@@ -233,6 +233,7 @@ def test_a_store_moves_out_of_its_folder_and_back(tmp_path: Path, s3: str, postg
         assert restored.verify().faults == []
         assert chain_faults(restored.audit_lines()) == []
         assert (restored.blob(tile), restored.jobs()[0].report) == (data, {"progress": {"stage": "bundle"}})
+        restored.update_job(job, "failed", "the server is gone", {})
     with pytest.raises(StoreError, match="holds a store already"):
         MapStore.attach(tmp_path / "restored", Places(None, database))
 
