@@ -192,7 +192,9 @@ class PoseTracker:
         if self.confirmed is not None:
             found.append(self.confirmed)
         found.extend(each.frame for each in self._unmatched)
-        return found if self._query_frame is None else [*found, self._query_frame]
+        if self._query_frame is not None and all(each.frame is not self._query_frame for each in self._unmatched):
+            found.append(self._query_frame)  # kept while its search goes on, it must not move twice
+        return found
 
     # --- fixes of a map query -----------------------------------------------------------------------------------------
 
