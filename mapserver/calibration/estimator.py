@@ -94,7 +94,8 @@ def adjust(data: CalibrationData) -> Adjusted:
             problem.slopes = problem.seen.measured_slopes(theta)
         problem.prepare(state, theta, scales)
         theta, state = problem.descend(theta, state, _TOLERANCE if last else _ROUGH_TOLERANCE)
-        squares, redundancy = problem.variance_components(theta, state)
+        # Redundancies follow from what was observed, and from scales only by their ratios: every other round is enough.
+        squares, redundancy = problem.variance_components(theta, state, None if round_number % 2 == 0 else redundancy)
         if not last:
             scales = scales.corrected(squares, redundancy)
     information = problem.calibration_information(theta, state)
@@ -205,8 +206,9 @@ class Problem:
         norm = np.linalg.norm(rows[np.isfinite(self.seen.row_sigmas[:, 0])], axis=1)
         return ErrorScales(np.full(4, max(1.0, float(np.median(norm)) / _MEDIAN_NORM) if len(norm) else 1.0))
 
-    def variance_components(self, theta: Array, state: MotionState) -> tuple[Array, Array]:
-        """(6,) sums of squares of pixels, disparities, row differences, gyro, accelerometer and wheels along the way, and redundancies.
+    def variance_components(self, theta: Array, state: MotionState, known: Array | None = None) -> tuple[Array, Array]:
+        """(6,) sums of squares of pixels, disparities, row differences, gyro, accelerometer and wheels along the way, and redundancies,
+        measured unless they are known.
 
         A redundancy is n - tr(H^-1 H_g) of n residuals that give H_g to the information H (Förstner and Wrobel 2016); the trace is how log
         det H grows with the share of H_g.
@@ -224,6 +226,8 @@ class Problem:
         kinds = felt[:, :3], felt[:, 3:9], rolled
         squares = np.array([sums[0] + sums[1], *sums[2:], *((kind**2).sum() for kind in kinds)])
         numbers = np.array([counted[:2].sum(), counted[2].sum(), counted[3].sum(), *(kind.size for kind in kinds)])
+        if known is not None:
+            return squares, known
         redundancy, alone = numbers.astype(np.float64), self._log_determinant(theta, state, rows, np.ones(6))
         for kind in np.flatnonzero(numbers):
             grown = self._log_determinant(theta, state, rows, 1.0 + _SHARE * (np.arange(6) == kind))
