@@ -4,19 +4,22 @@ import logging
 import re
 import threading
 from dataclasses import dataclass
+from pathlib import Path
 
-from fleetmap.errors import FleetmapError, LinkError, StateError, UsageError
+from fleetmap.errors import FleetmapError, LinkError, StateError
 from fleetmap.failure_summary import MAX_DRIVE_BYTES, ReplayPart
 from fleetmap.messages import FailureAck
 from mapserver.fleet.rate_limit import RateLimit
-from mapserver.floor_plan.survey_requests import DRIVEN, KIND
+from mapserver.floor_plan.survey_requests import DRIVEN, KIND, SurveyRequest
 from mapserver.nightly.inbox import arrivals
 from mapserver.nightly.upload import Upload
 from mapserver.serving.night_runs import SETTLE_S, NightRuns
 from mapserver.store import Actor, MapStore
 
-# A robot hands in two drives for each request; one that always begins anew fills no disk.
+# A robot hands in two drives for each request; one that always begins anew, or under many names, fills no disk.
 DRIVE_BURST, DRIVES_PER_S = 6, 1 / 1200
+SITE_BURST, SITE_DRIVES_PER_S = 24, 1 / 600
+MOST_OF_A_REQUEST = 24
 _MOST_AT_ONCE = 4
 _IDLE_NS = 120_000_000_000
 _ID = re.compile(r"[0-9a-f]{8,32}")
@@ -39,17 +42,29 @@ class RobotDrives:
         self._store, self._nights, self._lock = store, nights, threading.Lock()
         self._drives: dict[tuple[str, str], _Drive] = {}
         self._rates = RateLimit(DRIVE_BURST, DRIVES_PER_S, store.now_ns)
+        self._site_rates = RateLimit(SITE_BURST, SITE_DRIVES_PER_S, store.now_ns)
 
     def take(self, site: str, robot: str, part: ReplayPart) -> FailureAck:
         """Return the received length of a drive; a permanent refusal is in the answer. LinkError if the robot must retry later."""
         if not _ID.fullmatch(part.id) or part.total_bytes > MAX_DRIVE_BYTES:
             return FailureAck(id=part.id, refused=f"not a drive of at most {MAX_DRIVE_BYTES} bytes")
-        if part.survey not in {request.id for request in self._store.survey_requests(site)}:
+        request = next((asked for asked in self._store.survey_requests(site) if asked.id == part.survey), None)
+        if request is None:
             return FailureAck(id=part.id, refused="its survey is not requested any more")
+        key = (site, robot)
         with self._lock:
-            drive = self._drive(site, robot, part)
-            if drive is None:
-                return FailureAck(id=part.id)  # begin again
+            drive = self._drives.get(key)
+            if drive is None or (drive.id, drive.total_bytes) != (part.id, part.total_bytes):
+                known = self._handed_in(site, request)
+                if (robot, part.id) in known:  # the answer to its last part was lost
+                    return FailureAck(id=part.id, received_bytes=part.total_bytes)
+                if self._path(site, robot, part).exists():
+                    return self._ended(site, robot, part)
+                if len(known) >= MOST_OF_A_REQUEST:
+                    return FailureAck(id=part.id, refused=f"{len(known)} drives were handed in for its survey already")
+                if part.offset:
+                    return FailureAck(id=part.id)  # begin again
+                drive = self._begun(site, robot, part)
             try:
                 if part.offset == drive.upload.size_bytes:
                     drive.upload.write(part.data[: part.total_bytes - part.offset])
@@ -57,13 +72,11 @@ class RobotDrives:
                 if drive.upload.size_bytes < drive.total_bytes:
                     return FailureAck(id=part.id, received_bytes=drive.upload.size_bytes)
                 drive.upload.end()
-                self._drop((site, robot))  # closes the file, which has its name now
-            except (StateError, UsageError) as error:
-                self._drop((site, robot))
-                return FailureAck(id=part.id, refused=str(error)[:2000])
-        who = Actor(robot, f"{drive.total_bytes / 1e6:.1f} MB")
-        self._store.log_event(site, f"{KIND}{part.survey}", f"{DRIVEN}{robot}", actor=who)
-        return FailureAck(id=part.id, received_bytes=part.total_bytes)
+            except FleetmapError as error:
+                self._drop(key)
+                raise LinkError(f"later: {error}") from error
+            self._drop(key)  # closes the file, which has its name now
+        return self._ended(site, robot, part)
 
     def build(self) -> None:
         """Start a night of a site whose inbox has a complete drive, unless one runs. The night judges and publishes as always."""
@@ -74,27 +87,39 @@ class RobotDrives:
                 except StateError as error:
                     _log.info("robots' drives at %s wait: %s", inbox.name, error)
 
-    def _drive(self, site: str, robot: str, part: ReplayPart) -> _Drive | None:
-        """Return the drive that a part belongs to, None to begin it again. The caller holds the lock."""
+    def _handed_in(self, site: str, request: SurveyRequest) -> set[tuple[str, str]]:
+        """Return robot and id of the drives for a request, by the log: those that other servers took, too."""
+        events = self._store.events(site, (request.asked_ns, None))
+        driven = (e for e in events if e.kind == KIND + request.id and e.detail.startswith(DRIVEN))
+        return {(event.actor, event.reason.partition(",")[0]) for event in driven}
+
+    def _ended(self, site: str, robot: str, part: ReplayPart) -> FailureAck:
+        who = Actor(robot, f"{part.id}, {part.total_bytes / 1e6:.1f} MB")
+        self._store.log_event(site, f"{KIND}{part.survey}", f"{DRIVEN}{robot}", actor=who)
+        return FailureAck(id=part.id, received_bytes=part.total_bytes)
+
+    def _path(self, site: str, robot: str, part: ReplayPart) -> Path:
+        return self._nights.inbox / site / f"survey-{part.survey}-{robot}-{part.id}.mcap"
+
+    def _begun(self, site: str, robot: str, part: ReplayPart) -> _Drive:
+        """Begin a drive, instead of an earlier one of its robot. The caller holds the lock."""
         now_ns, key = self._store.now_ns(), (site, robot)
-        drive = self._drives.get(key)
-        if drive is not None and (drive.id, drive.total_bytes) == (part.id, part.total_bytes):
-            return drive
         for other in [k for k, each in self._drives.items() if k == key or abs(now_ns - each.heard_ns) > _IDLE_NS]:
             self._drop(other)
-        if part.offset:
-            return None
         if len(self._drives) >= _MOST_AT_ONCE:
             raise LinkError(f"later: {_MOST_AT_ONCE} robots are already handing in drives")
         if not self._rates.admits(key):
             raise LinkError(
                 f"later: robot {robot[:80]!r} handed in {DRIVE_BURST} drives; now one in twenty minutes is accepted"
             )
-        inbox, name = self._nights.inbox / site, f"survey-{part.survey}-{robot}-{part.id}.mcap"
+        if not self._site_rates.admits(site):
+            raise LinkError(f"later: site {site} got {SITE_BURST} drives; now one in ten minutes is accepted")
+        path = self._path(site, robot, part)
         try:
-            self._drives[key] = _Drive(part.id, part.total_bytes, Upload(inbox, name, part.total_bytes), now_ns)
+            upload = Upload(path.parent, path.name, part.total_bytes)
         except FleetmapError as error:
             raise LinkError(f"later: {error}") from error
+        self._drives[key] = _Drive(part.id, part.total_bytes, upload, now_ns)
         return self._drives[key]
 
     def _drop(self, key: tuple[str, str]) -> None:

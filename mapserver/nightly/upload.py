@@ -1,6 +1,8 @@
 """A recording that is uploaded: a hidden file beside the inbox's recordings, which gets its name once all of it is on the disk."""
 
+import fcntl
 import os
+import secrets
 import threading
 from contextlib import suppress
 from pathlib import Path
@@ -16,9 +18,10 @@ _KEPT_SHARE, _KEPT_BYTES = 10, 20 << 30  # a build needs space too: a tenth of t
 
 
 def remove_unfinished(folder: Path) -> None:
-    """Remove what a killed server left of uploads into the inboxes in this folder."""
-    with suppress(OSError):
-        for path in folder.glob(f"*/.*{_PART}"):
+    """Remove what a killed server left of uploads into the inboxes in this folder; those of a living one are locked."""
+    for path in folder.glob(f"*/.*{_PART}"):
+        with suppress(OSError), os.fdopen(os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK), "rb") as file:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             path.unlink()
 
 
@@ -28,24 +31,28 @@ class Upload:
     def __init__(self, inbox: Path, name: str, stated_bytes: int | None) -> None:
         """inbox: of the site, made if it is missing. stated_bytes: as the client says, None if it does not."""
         self._lock, self._stated_bytes, self.size_bytes = threading.Lock(), stated_bytes, 0
-        self._path, self._part = check_upload_name(inbox, name), inbox / f".{name}{_PART}"
+        self._path = check_upload_name(inbox, name)
+        # Another server may receive the same recording, from a robot that has changed to it.
+        self._part = inbox / f".{name}.{secrets.token_hex(4)}{_PART}"
         self._descriptor: int | None = None
         with disk_errors(*self._words()):
             make_folder(inbox)
             self._check_space(stated_bytes or 0)
-            flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC | os.O_NOFOLLOW
+            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
             self._descriptor = os.open(self._part, flags, OWN_FILE)
+            with suppress(OSError):  # a network disk without locks
+                fcntl.flock(self._descriptor, fcntl.LOCK_EX)
 
     def write(self, data: bytes) -> None:
-        """Append bytes; StateError where the disk would get too full."""
+        """Append bytes; StateError where the disk would get too full. After an error it is discarded."""
         with self._lock, disk_errors(*self._words()):
             if self._descriptor is None:
                 return
-            self.size_bytes += len(data)
             self._check_space(len(data))
             view = memoryview(data)
             while view:
                 view = view[os.write(self._descriptor, view) :]
+            self.size_bytes += len(data)
 
     def end(self) -> None:
         """Give it its name. UsageError if it is not as long as stated or empty, StateError if there is one of this name meanwhile."""
