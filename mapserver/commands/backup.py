@@ -140,7 +140,7 @@ def attach(
     with _progress("blobs") as progress:
         copied = MapStore.attach(store, Places(content, database), progress)
     typer.echo(
-        f"{store} uses {content or 'its content'} and {database or 'its database'}; {copied} bytes of content were copied"
+        f"{store} uses {content or 'its content'} and {'the named' if database else 'its'} database; {copied} bytes of content were copied"
     )
 
 

@@ -3,12 +3,13 @@
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from urllib.parse import urlsplit
 
 import obstore
 from obstore.exceptions import BaseError
 from obstore.store import ObjectStore, from_url
 
-from fleetmap.errors import StoreError
+from fleetmap.errors import StoreError, UsageError
 from fleetmap.mapformat import blob_path
 from mapserver.store.blobs import Blobs
 
@@ -16,7 +17,18 @@ _FOLDER = "blobs"
 
 
 def open_objects(url: str) -> ObjectStore:
-    """Return the object store under a URL. Raises StoreError for one that cannot be opened; nothing is sent yet."""
+    """Return the object store under a URL; nothing is sent yet.
+
+    Raises StoreError for one that cannot be opened, UsageError for one with a user, password or query: messages show URLs.
+    """
+    with object_errors("the object store's URL is invalid"):
+        parts = urlsplit(url)
+    has_user = parts.username is not None and not parts.scheme.startswith("abfs")  # which names the container so
+    if has_user or parts.password is not None or parts.query or parts.fragment:
+        raise UsageError(
+            f"{parts.scheme}://{parts.hostname}: write the URL like s3://bucket/prefix; the credentials belong into AWS_ACCESS_KEY_ID and "
+            "AWS_SECRET_ACCESS_KEY (or those of its kind), the server's address into AWS_ENDPOINT_URL"
+        )
     with object_errors(url):
         return from_url(url, client_options={"allow_http": True})
 

@@ -11,6 +11,7 @@ from fleetmap.mapformat import blob_path
 from mapserver import releases
 from mapserver.store import MapStore
 from support.storage.map_samples import save_sample_draft
+from support.storage.postgres_server import PostgresServer
 
 
 def test_a_life_of_versions(run, tmp_path: Path) -> None:
@@ -56,6 +57,23 @@ def test_content_goes_where_attach_says(run, tmp_path: Path, s3: str) -> None:
     assert "clean" in run("verify", "--store", tmp_path / "store")
     (tmp_path / "store" / "places.json").write_text('{"contents": "s3://typing-error"}')
     assert "places.json" in run("verify", "--store", tmp_path / "store", status=2)
+
+
+@pytest.mark.parametrize(
+    "url", ["s3://key:secret@a/b", "s3://secret@a/b", "s3://a/b?aws_secret_access_key=secret", "s3://a#secret"]
+)
+def test_a_secret_in_a_url_is_not_shown(run, tmp_path: Path, url: str) -> None:
+    MapStore.open(tmp_path / "store", create=True).close()
+    for command in (("attach", "--content", url), ("backup", url)):
+        told = run(*command, "--store", tmp_path / "store", status=2)
+        assert "AWS_SECRET_ACCESS_KEY" in told
+        assert "secret" not in told
+
+
+def test_the_password_of_a_database_is_not_shown(run, tmp_path: Path, postgres: PostgresServer) -> None:
+    url = postgres.database().replace("fleet@", "fleet:secret@")
+    MapStore.open(tmp_path / "store", create=True).close()
+    assert "secret" not in run("attach", "--store", tmp_path / "store", "--database", url)
 
 
 def test_verify_ends_with_a_status_of_its_own(run, tmp_path: Path) -> None:

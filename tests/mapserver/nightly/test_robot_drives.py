@@ -143,7 +143,7 @@ def test_what_the_disk_refuses_is_sent_again(scene: Scene, monkeypatch: pytest.M
         return write(descriptor, data)
 
     monkeypatch.setattr(os, "write", written)
-    with pytest.raises(LinkError, match="later: .*cannot be written"):
+    with pytest.raises(LinkError, match=r"later: .*cannot be written"):
         scene.send()
     assert scene.arrived() == []
     assert scene.send() == [4096, 8192, len(DATA)]
@@ -155,7 +155,7 @@ def test_a_disk_that_gets_full_in_the_middle_loses_no_drive(scene: Scene, monkey
     with monkeypatch.context() as patch:
         patch.setattr(upload, "_KEPT_SHARE", 0.001)
         patch.setattr(upload, "_KEPT_BYTES", 1 << 60)
-        with pytest.raises(LinkError, match="later: .*the disk has room"):
+        with pytest.raises(LinkError, match=r"later: .*the disk has room"):
             scene.send()
     assert scene.send()[-1] == len(DATA)
 
