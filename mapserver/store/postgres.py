@@ -1,7 +1,7 @@
 """The PostgreSQL database of an open store, whose tables and statements are those of SQLite, translated.
 
 Locks and writes share one session, so the database itself ends the locks of a process or machine that dies, and a process that has lost a
-lock cannot write under it any more. A failed commit is asked for in a new session: it counts once, whatever became of its answer.
+lock cannot write under it any more. What became of a commit whose answer was lost is asked in a new session: it counts once.
 """
 
 import hashlib
@@ -10,6 +10,7 @@ import os
 import re
 import ssl
 import threading
+import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -26,12 +27,13 @@ from fleetmap.errors import NewerFormatError, StoreError, UsageError
 from mapserver.store.database import SqliteTransactions
 from mapserver.store.files import take_lock
 from mapserver.store.schema import FORMAT, STATEMENTS, TABLES
-from mapserver.store.transactions import Connection, Transactions
+from mapserver.store.transactions import NUL, Connection, Transactions
 
 # A machine that vanishes is noticed, and its locks end, after 30 s.
 _KEEPALIVE = "-c tcp_keepalives_idle=10 -c tcp_keepalives_interval=5 -c tcp_keepalives_count=4"
 _WAITS = "-c lock_timeout=30s -c idle_in_transaction_session_timeout=60s"
 _ANSWER_WITHIN_S = 60
+_SETTLED_WITHIN_S = 90.0  # by then the database has ended a lost session, by one of these limits
 _READERS = 4
 _PLACE = r"\?(\d*)"
 _MOST_VALUES = 30_000  # of one statement; the protocol counts in 16 bits
@@ -69,14 +71,15 @@ class PostgresTransactions(Transactions):
             named = make_url(url)
         except SQLAlchemyError as error:
             raise UsageError("the database's URL is invalid; write it like postgresql://user@host/name") from error
-        self._name = named.render_as_string(hide_password=True)
+        self._name = named.set(query={}).render_as_string(hide_password=True)  # it may hold a password, too
         if named.drivername != "postgresql":
             raise UsageError(
                 f"{self._name}: metadata can be in PostgreSQL alone; write the URL like postgresql://user@host/name"
             )
         mode = named.query.get("sslmode", "disable")
-        if mode not in ("disable", "verify-full"):
-            raise UsageError(f"{self._name}: sslmode is disable or verify-full")
+        if mode not in ("disable", "verify-full") or named.query.keys() - {"sslmode"}:
+            words = "sslmode=disable or sslmode=verify-full; a password belongs before the host or into PGPASSWORD"
+            raise UsageError(f"{self._name}: after its ? an URL may have {words}")
         named = named.difference_update_query(["sslmode"]).set(drivername="postgresql+pg8000")
         self._engine = create_engine(
             named if named.password else named.set(password=os.environ.get("PGPASSWORD")),
@@ -92,6 +95,7 @@ class PostgresTransactions(Transactions):
         self._lock = threading.RLock()
         self._session: Session | None = None
         self._writing_thread: int | None = None
+        self._leading_lock = threading.Lock()  # not that of writes, which would wait for an answer to this one
         self._leading: Session | None = None
         self._held = Counter[tuple[str, bool]]()  # locks by name and whether they are shared
         try:
@@ -101,7 +105,7 @@ class PostgresTransactions(Transactions):
             raise
 
     def close(self) -> None:
-        with self._lock:
+        with self._lock, self._leading_lock:
             for session in (self._session, self._leading):
                 if session is not None:
                     with suppress(SQLAlchemyError):
@@ -132,8 +136,14 @@ class PostgresTransactions(Transactions):
             try:
                 session.exec_driver_sql("COMMIT")
             except DBAPIError as error:
-                if not error.connection_invalidated or not self._is_committed(number):
+                outcome = self._outcome(number) if error.connection_invalidated else "aborted"
+                if outcome == "aborted":
                     raise
+                if outcome != "committed":
+                    raise StoreError(
+                        f"the connection to {self._name} was lost at the end of a change, and the database does not say "
+                        "whether it is made; see whether it is before you make it again"
+                    ) from error
 
     def query(self, sql: str, values: tuple[object, ...] = ()) -> list[dict[str, Any]]:
         with self._errors("read"):
@@ -211,7 +221,7 @@ class PostgresTransactions(Transactions):
                         self._session.exec_driver_sql(f"SELECT pg_advisory_unlock{suffix}({_key(name)})")
 
     def leads(self) -> bool:
-        with self._lock, self._errors("read"):
+        with self._leading_lock, self._errors("read"):
             try:
                 if self._leading is not None:
                     self._leading.exec_driver_sql("SELECT 1")
@@ -270,9 +280,18 @@ class PostgresTransactions(Transactions):
                 raise
         return self._connected().exec_driver_sql(sql)
 
-    def _is_committed(self, number: str | None) -> bool:
-        with self._engine.connect() as session:
-            return session.exec_driver_sql("SELECT pg_xact_status(%s::xid8)", (number,)).scalar() == "committed"
+    def _outcome(self, number: str | None) -> str | None:
+        """Return "committed" or "aborted" of a transaction whose session was lost at its end; None if the database does not say."""
+        until_s = time.monotonic() + _SETTLED_WITHIN_S
+        while time.monotonic() < until_s:
+            with suppress(SQLAlchemyError), self._engine.connect() as session:
+                # While it is in progress it holds this lock.
+                session.exec_driver_sql(f"SELECT pg_advisory_xact_lock({_key('write')})")
+                with suppress(SQLAlchemyError):  # it is of another database, which has taken over
+                    return session.exec_driver_sql("SELECT pg_xact_status(%s::xid8)", (number,)).scalar()
+                return None
+            time.sleep(0.5)
+        return None
 
     @contextmanager
     def _errors(self, done: str) -> Iterator[None]:
@@ -303,21 +322,26 @@ class _Translating:
         for first in range(0, len(every), at_once):
             some = every[first : first + at_once]
             many = text.replace(group[0], f"VALUES {', '.join([group[1]] * len(some))}")
-            self._session.exec_driver_sql(many, tuple(value for row in some for value in row))
+            self._session.exec_driver_sql(many, tuple(_plain(value) for row in some for value in row))
 
 
 def _translated(sql: str, values: Sequence[object] | Mapping[str, object]) -> tuple[str, tuple[object, ...]]:
     """Return a statement and its values in the driver's style."""
     if isinstance(values, Mapping):
         text, names = _placed(sql, r"(?<!:):(\w+)")
-        return text, tuple(values[name] for name in names)
+        return text, tuple(_plain(values[name]) for name in names)
     given = values
 
     def chosen(found: "re.Match[str]") -> str:
         return "TRUE" if given[int(found[1]) - 1] is None else found[2]
 
     text, places = _placed(re.sub(r"\(\?(\d+) IS NULL OR ([^()]+)\)", chosen, sql), _PLACE)
-    return text, tuple(given[int(place) - 1 if place else number] for number, place in enumerate(places))
+    return text, tuple(_plain(given[int(place) - 1 if place else number]) for number, place in enumerate(places))
+
+
+def _plain(value: object) -> object:
+    """Return a value without the character that PostgreSQL refuses in text."""
+    return value.replace("\0", NUL) if isinstance(value, str) else value
 
 
 @lru_cache(1000)

@@ -11,6 +11,9 @@ from mapserver.store.access.chain import COLUMNS, AuditLine, chain_head, line_sh
 from mapserver.store.rows import UNLIMITED, LogEntry
 from mapserver.store.schema import TABLES
 
+NUL = r"\x00"
+"""Text in place of a NUL character, which PostgreSQL does not store."""
+
 Row = TypeVar("Row")
 Values = Sequence[object] | Mapping[str, object]
 
@@ -110,6 +113,8 @@ class Transactions(ABC):
             before = chain_head(self.audit_lines())
         values: tuple[object, ...] = (number + 1, self.now_ns(), site, entry.kind, entry.detail, entry.version)
         values += (actor.name, actor.reason, actor.operator, actor.address)
+        # Before the hash, which is of what every database stores.
+        values = tuple(value.replace("\0", NUL) if isinstance(value, str) else value for value in values)
         connection.execute(
             f"INSERT INTO events ({COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
             (*values, line_sha256(before, values)),

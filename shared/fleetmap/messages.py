@@ -34,10 +34,12 @@ _ROOT = "fleetmap"
 MAP_PARTS = ("manifests", "blobs", "trust")  # of a robot's map queries, after its name
 _MAX_KEY = 256  # two names and two addresses of bytes
 
-Name = Annotated[str, msgspec.Meta(max_length=64)]
-Text = Annotated[str, msgspec.Meta(max_length=2000)]
+_STORED = r"\A[^\x00]*\Z"  # not every database takes NUL in text
+Name = Annotated[str, msgspec.Meta(max_length=64, pattern=_STORED)]
+Text = Annotated[str, msgspec.Meta(max_length=2000, pattern=_STORED)]
 Version = Annotated[int, msgspec.Meta(ge=1, le=(1 << 31))]
-Metrics = Annotated[dict[Name, float | int | Text | bool | None], msgspec.Meta(max_length=256)]
+_Key = Annotated[str, msgspec.Meta(max_length=64)]  # in JSON, where NUL is escaped
+Metrics = Annotated[dict[_Key, float | int | Text | bool | None], msgspec.Meta(max_length=256)]
 Flags = Annotated[tuple[Name, ...], msgspec.Meta(max_length=64)]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import LinkError, UsageError
-from fleetmap.messages import FailureReport, PoseMessage, RobotHealth, Thumbnail, encode_message
+from fleetmap.messages import FailureReport, PoseMessage, RobotHealth, Thumbnail, decode_message, encode_message
 from mapserver import releases
 from mapserver.fleet import fleet as fleet_module
 from mapserver.fleet.fleet import MAX_FAILURE_BYTES, Fleet
@@ -139,6 +139,16 @@ def test_a_failure_has_a_size(store: MapStore, fleet: Fleet, clock: Clock, monke
     assert len(large) > kept.stat().st_size == MAX_FAILURE_BYTES, "of what is too large its beginning is set aside"
     monkeypatch.setattr(fleet_module, "MAX_FAILURE_BYTES", 1 << 30)
     assert fleet.take_failure_bytes("lab", "r1", large).refused == "", "the control"
+
+
+def test_text_that_a_database_cannot_hold_is_refused(store: MapStore, fleet: Fleet, clock: Clock) -> None:
+    """One robot's report would keep those of all others from the database."""
+    nul = msgspec.structs.replace(failure(clock, 1), cause="dark\0")
+    assert "matching regex" in fleet.take_failure_bytes("lab", "r1", encode_message(nul)).refused
+    health = RobotHealth(site="lab", robot="r1", stamp_ns=1, status="TRACKING\0", version=1, metrics={"a\0": "b"})
+    for text in (health, msgspec.structs.replace(health, status="TRACKING", metrics={"a": "b\0"})):
+        with pytest.raises(LinkError, match="matching regex"):
+            decode_message(encode_message(text), RobotHealth)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 from fleetmap.errors import GateRefusedError, MapFormatError, NewerFormatError, StoreError, UsageError
 from fleetmap.mapformat import current_path, decode_tile, sha256_hex
 from mapserver import releases
-from mapserver.store import DraftContent, MapStore, map_store, queries, schema
+from mapserver.store import Actor, DraftContent, MapStore, chain_faults, map_store, queries, schema
 from mapserver.store.places import read_places
 from mapserver.store.schema import FORMAT
 from support.storage.map_samples import draft_details, publish_samples, random_tile, save_sample_draft
@@ -262,3 +262,14 @@ def test_what_a_killed_writer_left_goes_after_a_day(tmp_path: Path) -> None:
 
 def test_the_table_names_every_served_kind_of_a_version() -> None:
     assert all(f"'{kind}'" in schema._TABLES for kind in queries._OF_VERSIONS)
+
+
+def test_text_from_outside_is_kept_alike(metadata_folder: Path) -> None:
+    """Also NUL, which PostgreSQL does not store."""
+    with MapStore.open(metadata_folder, create=True) as store:
+        number = store.begin_job("lab", "build")
+        store.update_job(number, "failed", "topic /a\0 cannot be read", {"topic": "/a\0"})
+        store.audit("note", "a\0b", actor=Actor("ada", "\0"))
+        assert store.job(number).report == {"topic": "/a\0"}
+        assert [(line.detail, line.reason) for line in store.audit_lines()] == [(r"a\x00b", r"\x00")]
+        assert chain_faults(store.audit_lines()) == []

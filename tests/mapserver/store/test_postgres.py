@@ -3,11 +3,13 @@
 import os
 import subprocess
 import sys
+import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
+from sqlalchemy import Connection as Session
 from sqlalchemy.exc import OperationalError
 
 from fleetmap.errors import BusyError, NewerFormatError, StoreError, UsageError
@@ -79,30 +81,63 @@ def test_one_leads_until_it_is_gone(folders: tuple[Path, Path], postgres: Postgr
         assert other.leads(), "in a new session"
 
 
-@pytest.mark.parametrize("is_done", [True, False])
+@pytest.mark.parametrize("end", ["COMMIT", "ROLLBACK", "COMMIT later", "COMMIT of another database"])
 def test_a_commit_without_an_answer_counts_once(
-    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, is_done: bool
+    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, end: str
 ) -> None:
-    with MapStore.open(folders[0]) as store:
+    with MapStore.open(folders[0]) as store, ThreadPoolExecutor(1) as thread:
         session = store._transactions._connected()
         real = type(session).exec_driver_sql
+        asked = threading.Event()
 
-        def cut(self: object, sql: str, *more: object) -> object:
+        def finish(ended: Session) -> None:
+            if end == "COMMIT later":
+                asked.wait(30)
+                time.sleep(0.3)
+            real(ended, end.partition(" ")[0])
+            ended.invalidate()
+
+        def cut(self: Session, sql: str, values: tuple[object, ...] = ()) -> object:
+            if sql.startswith("SELECT pg_advisory_xact_lock"):
+                asked.set()
+            if sql.startswith("SELECT pg_xact_status") and end.endswith("database"):
+                values = ("99999999",)
             if sql != "COMMIT":
-                return real(self, sql, *more)
-            real(self, "COMMIT" if is_done else "ROLLBACK")
-            self.invalidate()
+                return real(self, sql, values)
+            done = thread.submit(finish, self)
+            if end != "COMMIT later":
+                done.result()
             raise OperationalError(sql, (), OSError("network error"), connection_invalidated=True)
 
         with monkeypatch.context() as patch:
             patch.setattr(type(session), "exec_driver_sql", cut)
-            if is_done:
+            if end in ("COMMIT", "COMMIT later"):
                 store.audit("note", "x")
             else:
-                with pytest.raises(StoreError, match="network error"):
+                with pytest.raises(StoreError, match="network error" if end == "ROLLBACK" else "does not say whether"):
                     store.audit("note", "x")
-        assert [line.kind for line in store.audit_lines()].count("note") == int(is_done)
+        assert [line.kind for line in store.audit_lines()].count("note") == (end != "ROLLBACK")
         assert chain_faults(store.audit_lines()) == []
+
+
+def test_a_write_does_not_wait_for_the_leader(folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The network of the session that leads is slow."""
+    with MapStore.open(folders[0]) as store, ThreadPoolExecutor(1) as thread:
+        assert store.leads()
+        real, asked, written = Session.exec_driver_sql, threading.Event(), threading.Event()
+
+        def slow(self: Session, sql: str, *more: object) -> object:
+            if sql == "SELECT 1":
+                asked.set()
+                assert written.wait(20), "a write waits"
+            return real(self, sql, *more)
+
+        monkeypatch.setattr(Session, "exec_driver_sql", slow)
+        led = thread.submit(store.leads)
+        assert asked.wait(20)
+        store.audit("note", "x")
+        written.set()
+        assert led.result()
 
 
 def test_lists_and_enrolled_robots_are_those_of_all_servers(folders: tuple[Path, Path]) -> None:
@@ -153,9 +188,12 @@ def test_wrong_words_get_a_next_step(tmp_path: Path, postgres: PostgresServer) -
         ("nonsense", "invalid"),
         ("mysql://a/b", "PostgreSQL alone"),
         (f"{url}?sslmode=maybe", "verify-full"),
+        (f"{url}?password=secret", "PGPASSWORD"),
+        ("mysql://a:secret@b/c?password=secret", "PostgreSQL alone"),
     ):
-        with pytest.raises(UsageError, match=words):
+        with pytest.raises(UsageError, match=words) as refused:
             PostgresTransactions(wrong, lambda: 1)
+        assert "secret" not in str(refused.value)
     with pytest.raises(StoreError, match="mapserver attach"):
         PostgresTransactions(url, lambda: 1)
     with pytest.raises(StoreError, match="check the database") as error:
