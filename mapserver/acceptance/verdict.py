@@ -53,11 +53,11 @@ def judged(report: Report, settings: GateSettings, evidence: Evidence | None, fl
 def _of_areas(report: Report, settings: GateSettings) -> Iterator[tuple[str, str]]:
     """Yield reasons against areas, each with the survey that would end it ("" for none)."""
     for area in report.areas:
+        if area.starts.silent:
+            yield f"{area.name}: {area.starts.silent} starts without a guess are silently wrong", ""
         if area.name == UNKNOWN_PLACE:
             continue
         dark = report.darkest_grey is not None and area.grey is not None and area.grey <= report.darkest_grey
-        if area.starts.silent:
-            yield f"{area.name}: {area.starts.silent} starts without a guess are silently wrong", ""
         if _is_below(area.frames, settings):
             why = f"too dark (grey level {area.grey:.0f} of 255)" if dark else "not localized"
             light = " with more light" if dark else ""
@@ -101,6 +101,15 @@ def _of_site(report: Report, settings: GateSettings) -> Iterator[tuple[str, str]
     median = percentile(whole.errors_mm, 50)
     if silent := sum(drive.silent for drive in report.drives):
         yield f"{silent} silent failures while driving", ""
+    # Of areas with few tries each, which judge none of them, all together may be below.
+    if _is_below(whole.frames, settings) and not any(_is_below(area.frames, settings) for area in report.areas):
+        yield f"only {whole.frames.text} frames get a fix", "all areas: survey them"
+    if KNOWN_STARTS not in report.promises:
+        starts = whole.starts.found_of_all
+        if not starts.tries:
+            yield "no start without a guess was tried: record a longer drive", ""
+        elif _is_below(starts, settings) and not any(_is_below(a.starts.found_of_all, settings) for a in report.areas):
+            yield f"only {starts.text} starts without a guess found their place", "all areas: survey them"
     if whole.frames.tries and whole.wrong / whole.frames.tries > settings.max_wrong_share:
         yield f"{whole.wrong} of {whole.frames.tries} frames are localized at a wrong place", ""
     if median is not None and median > 1e3 * settings.max_median_error_m:

@@ -10,7 +10,7 @@ from fleetmap.geometry import Array, se3, so3_exp
 from mapserver.acceptance.document import drawn, sections
 from mapserver.acceptance.drives import Drive, Picture, Start
 from mapserver.acceptance.examine import area_name, areas_of, similar
-from mapserver.acceptance.figures import Count, DriveFigures, Incidents, Report
+from mapserver.acceptance.figures import UNKNOWN_PLACE, AreaFigures, Count, DriveFigures, Incidents, Report, StartCounts
 from mapserver.acceptance.ladders import BLUR_PX, STOPS
 from mapserver.acceptance.pdf import pdf
 from mapserver.acceptance.verdict import KNOWN_STARTS, ONE_WAY, compared, judged
@@ -170,6 +170,27 @@ def test_a_few_misses_are_chance_and_no_reason(good: Report) -> None:
     few = copy.deepcopy(good)
     few.areas[0].frames = Count(1, 4)
     assert verdict(few).is_accepted  # the share may well be a half
+
+
+def test_many_areas_of_few_tries_are_judged_together(good: Report) -> None:
+    bad = copy.deepcopy(good)
+    bad.areas = [copy.deepcopy(good.areas[0]) for _ in range(20)]
+    for number, area in enumerate(bad.areas):
+        area.name, area.starts, area.frames = f"tile {number},0", StartCounts(lost=2), Count(2, 2)
+    assert "only 0 of 40 starts without a guess found their place" in verdict(bad).verdict
+    assert verdict(bad, KNOWN_STARTS).is_accepted
+    for area in bad.areas:
+        area.frames, area.errors_mm = Count(0, 2), []
+    assert "only 0 of 40 frames get a fix" in verdict(bad, KNOWN_STARTS).verdict
+
+
+def test_what_was_not_tried_is_not_accepted(good: Report) -> None:
+    bad = copy.deepcopy(good)
+    for area in bad.areas:
+        area.starts = StartCounts()
+    assert "no start without a guess was tried" in verdict(bad).verdict
+    bad.areas.append(AreaFigures(UNKNOWN_PLACE, starts=StartCounts(found=12, silent=1)))
+    assert "unknown place: 1 starts without a guess are silently wrong" in verdict(bad).verdict
 
 
 def test_equal_reports_differ_in_nothing(good: Report) -> None:
