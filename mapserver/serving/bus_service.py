@@ -240,18 +240,33 @@ class ByteCache:
     def __init__(self, max_bytes: int, read: Callable[[str], bytes]) -> None:
         self._max_bytes, self._read = max_bytes, read
         self._held: dict[str, bytes] = {}  # in the order of their last use
-        self._lock = threading.Lock()
+        self._lock, self._reading = threading.Lock(), dict[str, threading.Lock]()
 
     def get(self, sha256: str) -> bytes:
         """Return the bytes of an address, read if not cached; errors as of `read`."""
         with self._lock:
-            if (held := self._held.pop(sha256, None)) is not None:
-                self._held[sha256] = held
+            if (held := self._known(sha256)) is not None:
                 return held
-            data = self._held[sha256] = self._read(sha256)
-            while self.total_bytes() > self._max_bytes:
-                del self._held[next(iter(self._held))]
+            reading = self._reading.setdefault(sha256, threading.Lock())
+        with reading:  # of one address alone: an object store may take seconds
+            with self._lock:
+                if (held := self._known(sha256)) is not None:
+                    return held
+            try:
+                data = self._read(sha256)
+                with self._lock:
+                    self._held[sha256] = data
+                    while self.total_bytes() > self._max_bytes:
+                        del self._held[next(iter(self._held))]
+            finally:
+                with self._lock:
+                    self._reading.pop(sha256, None)
             return data
+
+    def _known(self, sha256: str) -> bytes | None:
+        if (held := self._held.pop(sha256, None)) is not None:
+            self._held[sha256] = held
+        return held
 
     def total_bytes(self) -> int:
         return sum(len(data) + _ENTRY_BYTES for data in self._held.values())

@@ -68,6 +68,7 @@ class StoreQueries:
         self._transactions = open_database(root, places, clock_ns, create=create, read_only=read_only)
         self.fleet = FleetQueries(self._transactions)
         self._areas: dict[str, tuple[tuple[str, ...], Areas]] = {}  # by the addresses of their source files
+        self._requests: dict[str, dict[tuple[str, str], SurveyRequest]] = {}
         self.operators = OperatorQueries(self._transactions)
         self.files = SharedFiles(root, self._transactions)
         self.locked, self.leads = self._transactions.locked, self._transactions.leads
@@ -231,8 +232,14 @@ class StoreQueries:
         """Return the open survey requests, oldest first; empty for an unknown site."""
         query = "SELECT kind, sha256 FROM site_files WHERE site = ? AND substr(kind, 1, ?) = ?"
         rows = self._transactions.query(query, (site, len(KIND), KIND))
-        found = [read_request(row["kind"], self._blobs.get(row["sha256"])) for row in rows]
-        return sorted(found, key=lambda request: (request.asked_ns, request.id))
+        known = self._requests.get(site, {})  # every robot asks every few seconds, and an object store answers slowly
+        found = {
+            key: known.get(key) or read_request(row["kind"], self._blobs.get(row["sha256"]))
+            for row in rows
+            for key in [(row["kind"], row["sha256"])]
+        }
+        self._requests[site] = found
+        return sorted(found.values(), key=lambda request: (request.asked_ns, request.id))
 
     def site_file_sha256(self, site: str, kind: str) -> str | None:
         rows = self._transactions.query("SELECT sha256 FROM site_files WHERE site = ? AND kind = ?", (site, kind))

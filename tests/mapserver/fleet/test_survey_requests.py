@@ -47,6 +47,16 @@ def test_tiles_of_a_polygon(corners: list[tuple[float, float]], tiles: list[tupl
     assert SurveyRequest("0", 0, "", "", [list(corner) for corner in corners]).tiles(16.0) == tiles
 
 
+def test_a_request_is_read_once(store: MapStore, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every robot asks for all of them again and again, and they may be in an object store."""
+    made = [ask_for_survey(store, SITE, AISLE, ADA) for _ in range(2)]
+    assert store.survey_requests(SITE) == made
+    monkeypatch.setattr(store._blobs, "get", lambda _: pytest.fail("read again"))
+    assert store.survey_requests(SITE) == made
+    end_request(store, SITE, made[0].id, ADA)
+    assert store.survey_requests(SITE) == made[1:]
+
+
 def test_what_is_asked_for_leads_the_list_until_it_is_done(store: MapStore, tmp_path: Path) -> None:
     def listed() -> list[tuple[str, str]]:
         found = resurvey_list(store, SITE, ResurveySettings(), store.now_ns())

@@ -50,3 +50,22 @@ def test_what_many_ask_for_at_once_is_read_once() -> None:
         failed = sum(answer.exception() is not None for answer in asked)
         answers = [answer.result() for answer in asked if answer.exception() is None]
     assert (failed, answers, len(read)) == (1, [b"tile"] * 7, 2)
+
+
+def test_nobody_waits_for_other_bytes() -> None:
+    """An object store that answers slowly stops only those who ask for the same."""
+    begun, slow = threading.Event(), threading.Event()
+
+    def blob(key: str) -> bytes:
+        if key == "slow":
+            begun.set()
+            assert slow.wait(20)
+        return key.encode()
+
+    held = ByteCache(1000, blob)
+    with ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(held.get, "slow")
+        assert begun.wait(20)
+        assert [held.get(key) for key in ("known", "known")] == [b"known"] * 2
+        slow.set()
+        assert asked.result() == b"slow"
