@@ -13,7 +13,7 @@ import hashlib
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, closing, contextmanager, nullcontext
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, cast
@@ -50,6 +50,7 @@ from mapserver.store.files import (
     check_no_link,
     is_plain_file,
     keep_reserve,
+    locked,
     make_folder,
     make_own_file,
     read_file,
@@ -156,6 +157,12 @@ class MapStore(StoreQueries):
         """
         before = read_places(path)
         places = Places(places.content or before.content, places.database or before.database)
+        if before.database not in (None, places.database) or (
+            before.database and before.content not in (None, places.content)
+        ):
+            raise UsageError(
+                f"{path} shares its store with others; restore a backup into a new folder, and attach that to the new place"
+            )
         file = path / DATABASE
         if not file.is_file() and before.database is None:
             if None in (places.content, places.database):
@@ -170,10 +177,11 @@ class MapStore(StoreQueries):
             if running := store.running_jobs():
                 raise BusyError(f"job {running[0].id} of site {running[0].site} runs; wait for its end")
             copied = store._copy_content(open_blobs(path, places), progress) if places.content != before.content else 0
-            if places.database != before.database:
-                with closing(open_database(path, places, clock_ns, create=True, read_only=False)) as target:
-                    target.copy_from(store._transactions)
-            write_places(path, places)
+            with store._transactions.write():  # nobody writes what is not copied any more
+                if places.database != before.database:
+                    with closing(open_database(path, places, clock_ns, create=True, read_only=False)) as target:
+                        target.copy_from(store._transactions)
+                write_places(path, places)
         if places.database is not None:
             with cls.open(path, clock_ns=clock_ns) as store:
                 for folder in SHARED:
@@ -187,7 +195,7 @@ class MapStore(StoreQueries):
 
     def served(self, *, shared: bool = True) -> AbstractContextManager[None]:
         """Note for the block that a server has the store in this folder open; BusyError for its exclusive use while one has."""
-        return nullcontext() if self.is_shared else self.locked("served.lock", shared=shared, waits=False)
+        return locked(self._root / "served.lock", shared=shared, waits=False)
 
     def _copy_content(self, target: Blobs, progress: Callable[[int, int], None]) -> int:
         known, named, copied = target.sizes(), sorted(mentioned(self._transactions)), 0

@@ -116,7 +116,7 @@ class PostgresTransactions(Transactions):
     @contextmanager
     def write(self, *, durable: bool = True) -> Iterator[Connection]:
         with self._lock, self._errors("written"):
-            self._first("BEGIN")
+            self._first("BEGIN ISOLATION LEVEL READ COMMITTED")  # what the lock was waited for is seen
             session = self._connected()
             self._writing_thread = threading.get_ident()
             number = None
@@ -236,6 +236,9 @@ class PostgresTransactions(Transactions):
             return self._leading is not None
 
     def _prepare(self, *, create: bool) -> None:
+        encoding = self.query("SELECT current_setting('server_encoding') encoding")[0]["encoding"]
+        if encoding != "UTF8":
+            raise UsageError(f"{self._name} has encoding {encoding}; create it with ENCODING 'UTF8' TEMPLATE template0")
         if not self._has_tables():
             if not create:
                 raise StoreError(

@@ -1,11 +1,13 @@
 """What PostgreSQL alone brings: a database that goes away and comes back, locks of several machines, files that servers share."""
 
 import os
+import sqlite3
 import subprocess
 import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -18,7 +20,9 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore, chain_faults
 from mapserver.store.places import Places, read_places, write_places
 from mapserver.store.postgres import PostgresTransactions
+from mapserver.store.rows import NOBODY, LogEntry
 from mapserver.store.schema import FORMAT
+from mapserver.store.transactions import Transactions
 from mapserver.trust import SignedLists, init_here
 from mapserver.trust.signing import update_lists
 from support.storage.map_samples import publish_samples, save_sample_draft
@@ -182,6 +186,30 @@ def test_all_writers_get_their_turn(folders: tuple[Path, Path]) -> None:
         assert chain_faults(lines) == []
 
 
+def test_a_writer_that_waited_sees_what_the_other_wrote(folders: tuple[Path, Path]) -> None:
+    """Also where the database gives every transaction the state at its beginning."""
+    with MapStore.open(folders[0]) as store, ThreadPoolExecutor(1) as pool:
+        with store._transactions.write() as connection:
+            connection.execute("ALTER ROLE fleet SET default_transaction_isolation = 'repeatable read'")
+        try:
+            with MapStore.open(folders[1]) as other:
+                with store._transactions.write() as connection:
+                    waits = pool.submit(other.audit, "note", "second")
+                    while (
+                        not store._transactions._engine.connect()
+                        .exec_driver_sql("SELECT 1 FROM pg_stat_activity WHERE wait_event = 'advisory'")
+                        .all()
+                    ):
+                        time.sleep(0.01)
+                    store._transactions.log(connection, "", LogEntry("note", "first", None, NOBODY))
+                waits.result()
+        finally:
+            with store._transactions.write() as connection:
+                connection.execute("ALTER ROLE fleet RESET default_transaction_isolation")
+        assert [line.detail for line in store.audit_lines()][-2:] == ["first", "second"]
+        assert chain_faults(store.audit_lines()) == []
+
+
 def test_wrong_words_get_a_next_step(tmp_path: Path, postgres: PostgresServer) -> None:
     url = postgres.database()
     for wrong, words in (
@@ -196,6 +224,10 @@ def test_wrong_words_get_a_next_step(tmp_path: Path, postgres: PostgresServer) -
         assert "secret" not in str(refused.value)
     with pytest.raises(StoreError, match="mapserver attach"):
         PostgresTransactions(url, lambda: 1)
+    with pytest.raises(UsageError, match="ENCODING 'UTF8'"):
+        PostgresTransactions(
+            postgres.database("-E", "SQL_ASCII", "-T", "template0", "--locale=C"), lambda: 1, create=True
+        )
     with pytest.raises(StoreError, match="check the database") as error:
         PostgresTransactions("postgresql://fleet:secret@127.0.0.1:9/none", lambda: 1)
     assert "secret" not in str(error.value)
@@ -217,6 +249,39 @@ def test_a_served_store_is_not_moved(tmp_path: Path, s3: str) -> None:
         store.begin_job("lab", "build")
         with pytest.raises(BusyError, match="job 1"):
             MapStore.attach(tmp_path / "store", Places(s3))
+
+
+def test_a_shared_store_moves_only_with_its_server_stopped_and_not_on(
+    tmp_path: Path, postgres: PostgresServer, s3: str
+) -> None:
+    with MapStore.open(tmp_path, create=True):
+        pass
+    MapStore.attach(tmp_path, Places(database=postgres.database()))
+    with MapStore.open(tmp_path) as store, store.served(), pytest.raises(BusyError, match="served"):
+        MapStore.attach(tmp_path, Places(s3))
+    MapStore.attach(tmp_path, Places(s3))
+    for places in (Places(database=postgres.database()), Places(f"{s3}/other")):
+        with pytest.raises(UsageError, match="restore a backup"):
+            MapStore.attach(tmp_path, places)
+
+
+def test_nobody_writes_what_is_not_copied(
+    tmp_path: Path, postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with MapStore.open(tmp_path, create=True):
+        pass
+    copy, tried = PostgresTransactions.copy_from, list[str]()
+
+    def copied(self: PostgresTransactions, source: Transactions) -> None:
+        copy(self, source)
+        with closing(sqlite3.connect(tmp_path / "store.sqlite3", timeout=0)) as other:
+            with pytest.raises(sqlite3.OperationalError, match="locked"):
+                other.execute("DELETE FROM jobs")
+            tried.append("an operator's command")
+
+    monkeypatch.setattr(PostgresTransactions, "copy_from", copied)
+    MapStore.attach(tmp_path, Places(database=postgres.database()))
+    assert tried
 
 
 def test_a_killed_writer_holds_nothing(folders: tuple[Path, Path]) -> None:

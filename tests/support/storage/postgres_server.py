@@ -58,10 +58,10 @@ class PostgresServer:
         self._process.send_signal(signal.SIGQUIT)
         self._process.wait(timeout=60)
 
-    def database(self) -> str:
-        """The URL of a new database."""
+    def database(self, *options: str) -> str:
+        """The URL of a new database. options: of createdb."""
         self._count += 1
-        self._run("createdb", "-h", "127.0.0.1", "-p", str(self._port), "-U", "fleet", f"d{self._count}")
+        self._run("createdb", *options, "-h", "127.0.0.1", "-p", str(self._port), "-U", "fleet", f"d{self._count}")
         return f"postgresql://fleet@127.0.0.1:{self._port}/d{self._count}"
 
     def _run(self, program: str, *words: str) -> None:
