@@ -92,6 +92,26 @@ def test_a_slow_answer_is_silence_not_a_refusal() -> None:
         assert robot.get("slow") == b"late"
 
 
+def test_a_server_that_is_behind_answers_the_last_of_equal_questions() -> None:
+    go, asked = threading.Event(), list[bytes]()
+
+    def answer(_: str, payload: bytes) -> bytes:
+        asked.append(payload)
+        return payload if go.wait(20) else b""
+
+    key = "fleetmap/s/robots/r/failures"
+    with Bus.listen("tcp/127.0.0.1:0") as server, Bus.connect(server.endpoint) as robot:
+        server.queryable(key, answer)
+        assert eventually(robot.connected)
+        for payload in (b"first", b"again", b"again", b"again", b"other"):
+            with pytest.raises(UnreachableError):
+                robot.get(key, payload, timeout_s=0.5)
+        go.set()
+        assert robot.get(key, b"again") == b"again"
+        assert asked[:3] == [b"first", b"again", b"other"]
+        assert asked.count(b"again") <= 2, "of four"
+
+
 def test_who_connects_hears_bursts_and_images_whole() -> None:
     """As cameras publish them: a server alone drops what floods it."""
     with Bus.listen("tcp/127.0.0.1:0") as server, Bus.connect(server.endpoint) as robot:

@@ -2,6 +2,7 @@
 
 import threading
 import time
+from functools import partial
 
 from fleetmap.bus import Bus
 from fleetmap.bus.fair_queue import SHARED, FairQueue, sender_of
@@ -46,6 +47,29 @@ def test_what_waits_is_bounded_in_number_and_bytes() -> None:
     assert (queue._all_bytes, queue._bytes) == (0, {})
     queue.close()
     assert not queue.put("a", 1, lambda: None)
+
+
+def test_a_question_asked_again_is_answered_once() -> None:
+    """Otherwise a server that is behind answers those only who do not wait any more, and never catches up."""
+    queue, found, gate, ended = FairQueue("test"), list[str](), threading.Event(), threading.Event()
+    queue.put("a", 1, gate.wait)
+    while queue._jobs:
+        time.sleep(0.001)
+    for number in range(100):
+        for sender, question in (("a", "x"), ("a", "y"), ("b", "x")):
+            job = partial(found.append, f"{sender} {question} {number}")
+            assert queue.put(sender, 1, job, question)
+        if number < 2:
+            queue.put(SHARED, 1, partial(found.append, f"shared {number}"), "x")
+    queue.put("c", 1, lambda: None)
+    queue.put("a", 1, ended.set)
+    gate.set()
+    assert ended.wait(10)
+    assert sorted(found) == ["a x 99", "a y 99", "b x 99", "shared 0", "shared 1"], (
+        "who is nobody's robot asks for itself"
+    )
+    assert (queue._all_bytes, queue._bytes) == (0, {})
+    queue.close()
 
 
 def test_jobs_of_one_sender_keep_their_order() -> None:

@@ -3,7 +3,7 @@
 import logging
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 
 _MAX_SENDERS = 20_000
 _MAX_BYTES = 32 << 20  # of all senders together
@@ -26,16 +26,24 @@ class FairQueue:
 
     def __init__(self, name: str) -> None:
         self._ready = threading.Condition()
-        self._jobs: dict[str, deque[tuple[int, Callable[[], None]]]] = {}  # in round-robin order
+        self._jobs: dict[str, deque[tuple[int, Callable[[], None], Hashable]]] = {}  # in round-robin order
         self._bytes: dict[str, int] = {}
         self._all_bytes = 0
         self._is_closed = False
         threading.Thread(target=self._run, name=name, daemon=True).start()
 
-    def put(self, sender: str, size: int, job: Callable[[], None]) -> bool:
-        """Queue a job of `size` bytes; return False if it is dropped because the sender's limit or the common limit is reached."""
+    def put(self, sender: str, size: int, job: Callable[[], None], question: Hashable = None) -> bool:
+        """Queue a job of `size` bytes; return False if it is dropped because the sender's limit or the common limit is reached.
+
+        question: that the job answers, None for none. It takes the place of one that waits for the same robot and question, whose answer
+        nobody expects any more: a server that is behind does not work for those who have asked again.
+        """
         with self._ready:
             waiting = self._jobs.get(sender)
+            known = [] if question is None or sender == SHARED else [each[::2] for each in waiting or ()]
+            if waiting and (size, question) in known:
+                waiting[known.index((size, question))] = size, job, question
+                return True
             if waiting is None:
                 if len(self._jobs) >= _MAX_SENDERS:
                     return False
@@ -47,7 +55,7 @@ class FairQueue:
                 if not waiting:
                     del self._jobs[sender]
                 return False
-            waiting.append((size, job))
+            waiting.append((size, job, question))
             self._bytes[sender], self._all_bytes = own, self._all_bytes + size + _JOB_BYTES
             self._ready.notify()
             return True
@@ -68,7 +76,7 @@ class FairQueue:
                     return
                 sender = next(iter(self._jobs))
                 waiting = self._jobs.pop(sender)
-                size, job = waiting.popleft()
+                size, job, _ = waiting.popleft()
                 self._all_bytes -= size + _JOB_BYTES
                 if waiting:
                     self._jobs[sender] = waiting  # behind the others

@@ -202,7 +202,8 @@ class Bus:
         def take(query: Any) -> None:
             key = str(query.key_expr)
             size = _size(query, key) + len(str(query.parameters))
-            if not queue.put(sender_of(key), size, partial(reply, query, key)):
+            question = key, hash(b"" if query.payload is None else query.payload.to_bytes())
+            if not queue.put(sender_of(key), size, partial(reply, query, key), question):
                 with query:
                     query.reply_err(_BUSY)
 
