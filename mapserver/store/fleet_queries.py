@@ -43,6 +43,7 @@ _ADD = f"""INSERT INTO tallies (key_id, hour, {", ".join(COUNTER_COLUMNS)})
     VALUES (?, ?, {", ".join("?" * len(COUNTER_COLUMNS))})
     ON CONFLICT (key_id, hour)
     DO UPDATE SET {", ".join(f"{name} = tallies.{name} + excluded.{name}" for name in COUNTER_COLUMNS)}"""
+_KEYS_AT_ONCE = 100
 _REPORT_COLUMNS = ("site", "robot", "duration_s", "kind", "cause", "status", "version")
 _TRACED = tuple(TraceRow.__dataclass_fields__)[2:]
 _TRACE_COLUMNS = ", ".join(_TRACED)
@@ -66,7 +67,6 @@ class FleetQueries:
 
     def __init__(self, transactions: Transactions) -> None:
         self._transactions = transactions
-        self._key_ids: dict[tuple[str, str, str], int] = {}
         self._picture_bytes = -(1 << 62)  # looked up at the first failure
 
     def add(self, batch: FleetBatch) -> None:
@@ -82,7 +82,6 @@ class FleetQueries:
                 [(key_id, *astuple(row)[2:]) for key_id, row in where],
             )
             keep_last_reports(connection, batch.last_reports)
-        self._key_ids |= ids  # only what was committed
 
     def add_failure(
         self,
@@ -264,13 +263,24 @@ class FleetQueries:
         }
 
     def _ids(self, connection: Connection, keys: Iterable[tuple[str, str, str]]) -> dict[tuple[str, str, str], int]:
-        """Return the numbers of keys, which are never removed: cached ones stay valid."""
-        found = {key: self._key_ids.get(key, 0) for key in keys}
-        for key in (key for key, number in found.items() if number == 0):
-            connection.execute("INSERT INTO tally_keys (site, axis, key) VALUES (?, ?, ?) ON CONFLICT DO NOTHING", key)
-            row = connection.execute("SELECT id FROM tally_keys WHERE site = ? AND axis = ? AND key = ?", key)
-            found[key] = int(row.fetchone()[0])
+        """Return the numbers of keys, new ones for unknown keys. They are asked for each time: a database that crashed, or was replaced by
+        its replica, may have lost keys that a cache would still know, and counts would go to another one."""
+        wanted, found = list(dict.fromkeys(keys)), dict[tuple[str, str, str], int]()
+        for first in range(0, len(wanted), _KEYS_AT_ONCE):
+            some = wanted[first : first + _KEYS_AT_ONCE]
+            found |= _known_ids(connection, some)
+            if new := [key for key in some if key not in found]:
+                connection.executemany("INSERT INTO tally_keys (site, axis, key) VALUES (?, ?, ?)", new)
+                found |= _known_ids(connection, new)
         return found
+
+
+def _known_ids(connection: Connection, keys: Sequence[tuple[str, str, str]]) -> dict[tuple[str, str, str], int]:
+    rows = connection.execute(
+        f"SELECT site, axis, key, id FROM tally_keys WHERE (site, axis, key) IN (VALUES {', '.join(['(?, ?, ?)'] * len(keys))})",
+        [part for key in keys for part in key],
+    )
+    return {(site, axis, key): int(number) for site, axis, key, number in rows.fetchall()}
 
 
 def name_failures(connection: Connection, site: str, areas: Areas) -> None:

@@ -172,8 +172,10 @@ class StoreQueries:
 
     def current(self, site: str) -> VersionInfo | None:
         """Return the site's current version, None before the first publication; raises UsageError for an unknown site."""
-        self._check_site(site)
-        return self._current_row(site)
+        row = self._current_row(site)
+        if row is None:
+            self._check_site(site)
+        return row
 
     def releases(self, site: str) -> SiteReleases:
         """Return the present state of a site's releases, for decisions; raises UsageError for an unknown site."""

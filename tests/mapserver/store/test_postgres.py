@@ -177,6 +177,26 @@ def test_robots_of_another_server_are_known(folders: tuple[Path, Path]) -> None:
         assert [robot.is_present for robot in there.robots()] == [False], "it reports to nobody any more"
 
 
+def test_counts_go_to_no_other_key(folders: tuple[Path, Path]) -> None:
+    """After a crash the database may lack the last commits of health, after a takeover by its replica more."""
+
+    def report(fleet: Fleet, robot: str) -> None:
+        for stamp_ns in range(3):
+            health = RobotHealth(site="lab", robot=robot, stamp_ns=stamp_ns * 10**9, status="TRACKING", version=1)
+            fleet.take_health("lab", robot, health)
+        fleet.flush()
+
+    with MapStore.open(folders[0]) as store, MapStore.open(folders[1]) as other:
+        here, there = Fleet(store), Fleet(other)
+        report(here, "r1")
+        with other._transactions.write() as connection:
+            connection.execute("TRUNCATE tally_keys, tallies, traces RESTART IDENTITY")
+        report(there, "r2")
+        report(here, "r1")
+        counted = {key: counts.reports for (_, key), counts in store.fleet.counters("lab", "robot").items()}
+        assert counted == {"r1": 3, "r2": 3}
+
+
 def test_all_writers_get_their_turn(folders: tuple[Path, Path]) -> None:
     with MapStore.open(folders[0]) as store, MapStore.open(folders[1]) as other, ThreadPoolExecutor(4) as pool:
         for done in [pool.submit(each.audit, "note", str(n)) for n in range(40) for each in (store, other)]:
