@@ -18,7 +18,7 @@ from fastapi.staticfiles import StaticFiles
 from markupsafe import Markup
 
 from fleetmap.encoding import to_json
-from fleetmap.errors import FleetmapError, UsageError
+from fleetmap.errors import FleetmapError, StoreError, UsageError
 from fleetmap.mapformat import sha256_hex
 from mapserver.api.guard import SIGN_IN, SIGN_OUT
 from mapserver.api.moments import moment_text, read_moment, read_range, written, zone_of
@@ -219,7 +219,8 @@ class Console:
             context = PageContext(root, site, zone, request.query_params)
             found = {"context": context} | await load(lambda: fill(self.services, context, **request.path_params))
         except FleetmapError as error:
-            template, found, status = "problem.html", {"words": str(error)}, 404
+            template, found = "problem.html", {"words": str(error)}
+            status = 503 if isinstance(error, StoreError) else 404
             site = site if site in sites else None  # links lead somewhere
         listed = f"{root}/{page if page in PAGES else ''}"  # what is of one site is not looked for in another
         look, who = request.cookies.get(_LOOK_COOKIE, ""), getattr(request.state, "operator", None)

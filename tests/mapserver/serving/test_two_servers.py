@@ -1,6 +1,14 @@
 """Two servers share a store; one after the other is killed while robots report and ask."""
 
+from pathlib import Path
+
+import httpx
+
+from mapserver.store import MapStore
+from mapserver.store.places import Places
+from support.fleet.dashboard_scene import serving
 from support.fleet.two_servers import run
+from support.storage.map_samples import publish_samples
 from support.storage.postgres_server import PostgresServer
 
 
@@ -9,3 +17,22 @@ def test_nothing_acknowledged_is_lost_and_nothing_is_counted_twice(postgres: Pos
     assert found["wrong"] == []
     assert found["kills"] >= 2
     assert found["acknowledged"] and found["questions"]
+
+
+def test_a_server_whose_database_is_away_says_so_and_goes_on(tmp_path: Path, postgres: PostgresServer) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        publish_samples(store, 1)
+    MapStore.attach(tmp_path, Places(database=postgres.database()))
+
+    def statuses(http: str) -> list[int]:
+        pages = ("/readyz", "/v1/sites", "/metrics", "/dashboard/map")
+        return [httpx.get(f"{http}{page}", timeout=60, follow_redirects=True).status_code for page in pages]
+
+    with serving(tmp_path) as served:
+        assert statuses(served.http) == [200] * 4
+        postgres.stop()
+        try:
+            assert statuses(served.http) == [503] * 4
+        finally:
+            postgres.start()
+        assert statuses(served.http) == [200] * 4
