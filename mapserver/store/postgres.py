@@ -6,6 +6,7 @@ lock cannot write under it any more. What became of a commit whose answer was lo
 
 import hashlib
 import logging
+import math
 import os
 import re
 import ssl
@@ -343,8 +344,10 @@ def _translated(sql: str, values: Sequence[object] | Mapping[str, object]) -> tu
 
 
 def _plain(value: object) -> object:
-    """Return a value without the character that PostgreSQL refuses in text."""
-    return value.replace("\0", NUL) if isinstance(value, str) else value
+    """Return a value as SQLite keeps it, which knows no NaN, and without the character that PostgreSQL refuses in text."""
+    if isinstance(value, str):
+        return value.replace("\0", NUL)
+    return None if isinstance(value, float) and math.isnan(value) else value
 
 
 @lru_cache(1000)

@@ -13,7 +13,7 @@ import pytest
 from msgspec.structs import replace as replace_struct
 
 from fleetmap.errors import LinkError, StoreError
-from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
+from fleetmap.messages import FailureReport, Placement, PoseMessage, RobotHealth
 from mapserver import releases
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.fleet.fleet import Fleet
@@ -340,3 +340,14 @@ def _size(folder: Path) -> int:
 def test_settings_reach_the_retention() -> None:
     settings = IngestSettings(tally_days=3.0, failure_days=4.0, picture_bytes=5, trace_days=6.0)
     assert settings.retention() == FleetRetention(3.0, 4.0, 5, 6.0)
+
+
+def test_a_place_that_is_no_number_is_none(site: Site) -> None:
+    nowhere = Placement(position_m=(float("nan"), 1.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0))
+    report = FailureReport(
+        site="lab", robot="r1", id="f1", stamp_ns=1, wall_ns=START_NS, duration_s=1.0, kind="blind", status="LOST", cause="dark",
+        version=1, tile=None, map_from_base=nowhere,
+    )  # fmt: skip
+    assert site.fleet.take_failure("lab", "r1", report).refused == ""
+    (row,) = site.store.fleet.failures(FailureFilter())
+    assert row.x_map_m is None
