@@ -148,4 +148,6 @@ def _before(
         raise UsageError(
             f"{options.before} has format {found.format}, this program writes {FORMAT}; compare by the version's number"
         )
+    if found.site != options.site:
+        raise UsageError(f"{options.before} is a report of site {found.site}; name one of site {options.site}")
     return found

@@ -1,11 +1,15 @@
 """Sites that must fail are told so in the first line, by the figures of maps and frames without pictures; and what a change made better."""
 
 import copy
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 
+from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, se3, so3_exp
 from mapserver.acceptance.document import drawn, sections
 from mapserver.acceptance.drives import Drive, Picture, Start
@@ -14,6 +18,7 @@ from mapserver.acceptance.figures import UNKNOWN_PLACE, AreaFigures, Count, Driv
 from mapserver.acceptance.ladders import BLUR_PX, STOPS
 from mapserver.acceptance.pdf import pdf
 from mapserver.acceptance.verdict import KNOWN_STARTS, ONE_WAY, compared, judged
+from mapserver.commands.accept import _before
 from mapserver.dashboard.acceptance_page import html_page
 from mapserver.floor_plan.areas import Area, Areas
 from mapserver.quality.figures import Evidence, RigEvidence, SurveyedViews
@@ -221,3 +226,25 @@ def test_documents_begin_with_the_verdict_and_are_the_same_each_time(good: Repor
     assert one.startswith(b"%PDF")
     assert one == pdf(found, shown, picture)
     assert msgspec.json.decode(msgspec.json.encode(found), type=Report) == found
+
+
+@pytest.mark.parametrize("name", ["<b>&amp;</font>\0\n\x1b[31m", "w" * 255, "\u05d0\U0001f600"])
+def test_names_from_outside_break_no_document(good: Report, name: str) -> None:
+    bad = copy.deepcopy(good)
+    bad.areas[0].name = name
+    bad = verdict(msgspec.structs.replace(bad, drives=[msgspec.structs.replace(good.drives[0], name=name)]))
+    picture = drawn(np.zeros((3, 2)), [])
+    page = html_page(bad, sections(bad), picture)
+    assert "<b>" not in page
+    assert page.encode()
+    assert pdf(bad, sections(bad), picture).startswith(b"%PDF")
+
+
+def test_a_report_is_compared_with_one_of_its_site(good: Report, tmp_path: Path) -> None:
+    (tmp_path / "acceptance.json").write_bytes(msgspec.json.encode(good))
+    options: Any = SimpleNamespace(before=str(tmp_path / "acceptance.json"), site="hall")
+    nothing: Any = None
+    assert _before(nothing, nothing, [], options, nothing) == good
+    options.site = "yard"
+    with pytest.raises(UsageError, match="of site hall"):
+        _before(nothing, nothing, [], options, nothing)
