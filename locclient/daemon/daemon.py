@@ -156,7 +156,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             fleet_manager = _fleet_manager(config, site, server, caches[0], intake)
         mounting = (robot.base_from_body, rectifier.body_from_cam, rectifier.camera)
         clock = (calibration.imu, rectifier.imu_minus_cam_s)
-        profile = RobotProfile(site, name, *mounting, config.localizer, *clock, pictures=run.replays)
+        profile = RobotProfile(site, name, *mounting, config.localizer, *clock, run.replays, rectifier.mounted[1:])
         replays: ReplayQueue | None = None
         if server is not None and keeps_replay:
             server.replays = Outbox(replay_outbox(outbox_file), max_bytes=run.replays_bytes, is_needed=False)

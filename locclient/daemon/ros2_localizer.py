@@ -292,6 +292,8 @@ class Ros2Localizer(Publisher):
                 "refused": self._fix_refused,
                 "calibration": estimate.calibration.text,
             }
+            if estimate.views_in_words:
+                values["views"] = estimate.views_in_words
             if estimate.cov_rot_trans is not None:
                 values["radius_95_m"] = f"{radius_95_m(estimate.cov_rot_trans):.3f}"
         if fault := self._tf_fault():

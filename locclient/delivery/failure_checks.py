@@ -18,6 +18,7 @@ from fleetmap.config import Section
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import AnyArray
 from fleetmap.sensors.rectification import StereoCamera
+from locclient.localization.percept import QueryInput
 
 MAX_ROWS = 10_000  # of an array, and members of a list
 _MAX_INT, _MAX_SETTING, _MAX_SIDE_PX = 1 << 62, 1_000_000, 10_000
@@ -72,6 +73,10 @@ def _stereo_pixels(pixels: AnyArray, camera: StereoCamera) -> bool:
     return _within(pixels[:, :2], camera) and bool(np.all(is_column))
 
 
+def _clearance(clearance_px: AnyArray, camera: StereoCamera) -> bool:
+    return clearance_px.shape == (camera.height_px, camera.width_px)
+
+
 def _octaves(octaves: AnyArray, _: StereoCamera) -> bool:
     return bool(np.all((octaves >= 0) & (octaves < 32)))
 
@@ -95,20 +100,17 @@ ARRAYS: Mapping[str, Kind] = {
     "Features.angles_deg": Kind("<f4", ("n",), _finite),
     "Features.descriptors": Kind("|u1", ("n", 32), _any),
     "FrameFeatures.pixels": Kind("<f8", ("n", 3), _stereo_pixels),
+    "clearance_px": Kind("|u1", ("h", "w"), _clearance),
     "track_ids": Kind("<i8", (0,), _any),  # of the odometry; recordings do not keep its tracks
 }
 
 
 def check_record(record: Any) -> None:
     """Raise RecordingError, naming the field, for an invalid LocalizerRecord."""
-    camera = record.camera
-    sizes = camera.width_px, camera.height_px
-    numbers = camera.focal_px, camera.cx_px, camera.cy_px, camera.baseline_m
-    if not all(map(isfinite, numbers)) or not all(1 <= side <= _MAX_SIDE_PX for side in sizes):
-        raise _refused("camera", f"{sizes[0]}x{sizes[1]} px, focal length and centre {numbers}")
-    if not (0 < camera.focal_px < 1e5 and 0 <= camera.baseline_m < 10 and max(map(abs, numbers)) < 1e5):
-        raise _refused("camera", f"focal length, centre and baseline {numbers}")
-    _Walk(camera).check(record, "")
+    cameras = [record.camera, *(mounted.camera for mounted in record.others)]
+    for camera in cameras:
+        _check_camera(camera)
+    _Walk(cameras).check(record, "")
     stamps = [percept.odometry.stamp_ns for _, percept in record.frames]
     if any(later <= earlier for earlier, later in pairwise(stamps)):
         raise _refused("frames", "stamps that do not increase")
@@ -126,15 +128,25 @@ def check_record(record: Any) -> None:
         raise _refused("start", "a pose without its covariance, or the other way round")
 
 
+def _check_camera(camera: StereoCamera) -> None:
+    sizes = camera.width_px, camera.height_px
+    numbers = camera.focal_px, camera.cx_px, camera.cy_px, camera.baseline_m
+    if not all(map(isfinite, numbers)) or not all(1 <= side <= _MAX_SIDE_PX for side in sizes):
+        raise _refused("camera", f"{sizes[0]}x{sizes[1]} px, focal length and centre {numbers}")
+    if not (0 < camera.focal_px < 1e5 and 0 <= camera.baseline_m < 10 and max(map(abs, numbers)) < 1e5):
+        raise _refused("camera", f"focal length, centre and baseline {numbers}")
+
+
 def _refused(where: str, what: str) -> RecordingError:
     return RecordingError(f"{where}: {what}; no robot writes that; Foxglove opens the recording")
 
 
 class _Walk:
-    """Traverses all values of a record."""
+    """Traverses all values of a record; cameras: of each view. Pixels are within the image of the camera that comes last before them, in a
+    query that of its view."""
 
-    def __init__(self, camera: StereoCamera) -> None:
-        self._camera = camera
+    def __init__(self, cameras: Sequence[StereoCamera]) -> None:
+        self._cameras, self._camera = cameras, cameras[0]
 
     def check(self, value: Any, where: str) -> None:
         if isinstance(value, Section):
@@ -152,6 +164,12 @@ class _Walk:
 
     def _members(self, value: Any, names: Sequence[str], where: str) -> None:
         lengths: dict[str, int] = {}
+        if isinstance(value, StereoCamera):
+            self._camera = value
+        elif isinstance(value, QueryInput):
+            if not 0 <= value.view < len(self._cameras):
+                raise _refused(f"{where}.view", f"{value.view} of a rig of {len(self._cameras)} views")
+            self._camera = self._cameras[value.view]
         for name in names:
             member, at = getattr(value, name), f"{where}.{name}".lstrip(".")
             if isinstance(member, np.ndarray):

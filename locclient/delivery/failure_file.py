@@ -27,10 +27,10 @@ from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
-from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Image
 from locclient.delivery.failure_checks import MAX_ROWS, check_record
-from locclient.localization.percept import Percept, QueryInput
+from locclient.localization.percept import Percept
 from locclient.localization.pose_tracker import Start
 from locclient.localization.settings import LocalizerSettings
 from locclient.robot.failure_report import RobotProfile, without_detail
@@ -56,6 +56,7 @@ class LocalizerRecord(msgspec.Struct, frozen=True, kw_only=True):
     start: Start
     used: UsedMap | None
     frames: Annotated[list[tuple[Commands, Percept]], msgspec.Meta(min_length=1, max_length=2000)]
+    others: Annotated[tuple[MountedCamera, ...], msgspec.Meta(max_length=15)] = ()  # of the rig's other views
 
 
 def failure_file(cut: FailureCut, report: FailureReport, profile: RobotProfile, pictures: str) -> bytes:
@@ -81,6 +82,7 @@ def failure_file(cut: FailureCut, report: FailureReport, profile: RobotProfile, 
         start=cut.start,
         used=cut.used,
         frames=[(frame.commands, _with_depth(frame, profile)) for frame in cut.frames],
+        others=profile.others,
     )
     packed = zstandard.ZstdCompressor(level=3).compress(msgspec.msgpack.encode(record, enc_hook=_encoded_array))
     with TemporaryDirectory() as folder:
@@ -94,7 +96,8 @@ def failure_file(cut: FailureCut, report: FailureReport, profile: RobotProfile, 
                 writer.write_wheel(frame.wheel)
                 writer.write_prior(frame.commands.priors)
                 if frame.picture is not None:
-                    writer.write_frame(_reduced(frame.picture, pictures))
+                    view = 0 if frame.percept.query is None else frame.percept.query.view
+                    writer.write_frame(_reduced(frame.picture, pictures, view))
         return path.read_bytes()
 
 
@@ -143,13 +146,14 @@ def _with_depth(frame: RingFrame, profile: RobotProfile) -> Percept:
     if query is None or query.features is None:
         return frame.percept
     found, pixels = query.features.features, query.features.pixels.copy()
-    if frame.picture is not None:
+    shown, (camera, _) = None if frame.picture is None else frame.picture.view(query.view), profile.mounted(query.view)
+    if shown is not None:
         is_tried = query.features.is_tried
         untried = np.ones(len(found), bool) if is_tried is None else ~is_tried
         left = found.pixels[untried]
-        disparities = stereo.disparities(frame.picture, profile.camera, left, profile.settings.stereo)[:, 0]
+        disparities = stereo.disparities(shown, camera, left, profile.settings.stereo)[:, 0]
         pixels[untried, 2] = left[:, 0] - disparities
-    return replace(frame.percept, query=QueryInput(query.slices, FrameFeatures(found, pixels)))
+    return replace(frame.percept, query=replace(query, features=FrameFeatures(found, pixels)))
 
 
 def _encoded_array(value: Any) -> Any:
@@ -181,7 +185,16 @@ def _step(width_px: int) -> int:
 
 def _reduced_rig(frames: Sequence[RingFrame], profile: RobotProfile) -> RigCalibration:
     """Return the rectified rig at the pictures' size."""
-    camera, step = profile.camera, _step(profile.camera.width_px)
+    has_right = any(frame.picture is not None and frame.picture.right is not None for frame in frames)
+    pairs = [has_right, *(each.camera.baseline_m > 0 for each in profile.others)]
+    views = (_reduced_view(profile, view, is_pair=is_pair) for view, is_pair in enumerate(pairs))
+    cameras = tuple(camera for view in views for camera in view)
+    return RigCalibration(cameras, profile.imu, profile.base_from_body)
+
+
+def _reduced_view(profile: RobotProfile, view: int, *, is_pair: bool) -> list[CameraCalibration]:
+    camera, body_from_cam = profile.mounted(view)
+    step = _step(camera.width_px)
     center = [(value + 0.5) / step - 0.5 for value in (camera.cx_px, camera.cy_px)]
     left = CameraCalibration(
         "radial-tangential",
@@ -189,19 +202,20 @@ def _reduced_rig(frames: Sequence[RingFrame], profile: RobotProfile) -> RigCalib
         camera.height_px // step,
         np.array([camera.focal_px / step, camera.focal_px / step, *center]),
         np.zeros(4),
-        profile.body_from_cam,
+        body_from_cam,
         profile.imu_minus_cam_s,
     )
-    has_right = any(frame.picture is not None and frame.picture.right is not None for frame in frames)
-    right_from_body = profile.body_from_cam @ se3(np.eye(3), np.array([camera.baseline_m, 0.0, 0.0]))
-    cameras = (left, replace(left, body_from_cam=right_from_body)) if has_right else (left,)
-    return RigCalibration(cameras, profile.imu, profile.base_from_body)
+    body_from_right = body_from_cam @ se3(np.eye(3), np.array([camera.baseline_m, 0.0, 0.0]))
+    return [left, replace(left, body_from_cam=body_from_right)] if is_pair else [left]
 
 
-def _reduced(frame: RectifiedFrame, pictures: str) -> StoredFrame:
+def _reduced(frame: RectifiedFrame, pictures: str, view: int = 0) -> StoredFrame:
+    """Return the pictures of the first view, and of the one whose features were compared with the map."""
     left, right = (None if image is None else _jpeg(image, pictures) for image in (frame.left, frame.right))
     assert left is not None
-    return StoredFrame(frame.stamp_ns, left, right, None)
+    shown = [frame.view(number) if number == view else None for number in range(1, len(frame.others) + 1)]
+    others = tuple(None if each is None else _reduced(each, pictures) for each in shown)
+    return StoredFrame(frame.stamp_ns, left, right, None, others)
 
 
 def _jpeg(image: Image, pictures: str) -> StoredImage:

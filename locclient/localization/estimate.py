@@ -36,7 +36,8 @@ class Estimate:
     distance between fix and prediction; innovation_m: metres, for fixes that were accepted or found at the predicted place. moved_m: for
     a pose confirmed with this frame, its distance from the pose that was claimed until fixes contradicted it, if beyond its
     covariance: one of the two was wrong. hypotheses: the competing poses while AMBIGUOUS. stage_s: seconds by stage, by the given
-    clock. calibration: its state by the map. views: faults of the images of each of the rig's views, NONE for those in use.
+    clock. calibration: its state by the map. views: faults of the images of each of the rig's views, NONE for good ones;
+    view: the one of the last map query.
     """
 
     stamp_ns: int
@@ -57,6 +58,18 @@ class Estimate:
     moved_m: float | None = None
     calibration: CalibrationState = NOT_JUDGED
     views: tuple[Cause, ...] = (Cause.NONE,)
+    view: int = 0
+
+    @property
+    def views_in_words(self) -> str:
+        """Return the state of each view, and which one is compared with the map; empty for a rig of one view."""
+        if len(self.views) == 1:
+            return ""
+        used = (" (compared with the map)" if number == self.view else "" for number in range(len(self.views)))
+        return ", ".join(
+            f"view {n}: {cause.value or 'good'}{use}"
+            for n, (cause, use) in enumerate(zip(self.views, used, strict=True))
+        )
 
 
 class QueryResult(NamedTuple):

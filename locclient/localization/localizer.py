@@ -3,6 +3,8 @@
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from fleetmap.bow import Vocabulary
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
@@ -22,6 +24,8 @@ from locclient.localization.percept import Percept
 from locclient.localization.pose_hypothesis import Motion
 from locclient.localization.pose_tracker import PoseTracker, Start
 from locclient.localization.settings import LocalizerSettings
+
+_DEAD_NS = 500_000_000  # without images, a view is dead
 
 
 class Localizer:
@@ -48,6 +52,7 @@ class Localizer:
         self.odometry = Odometry(*rig, settings.odometry, settings.stereo, others)
         self.percept: Percept | None = None  # of the last frame
         self._images = [ImageQualityMonitor(settings.image_quality) for _ in self._mounted]
+        self._judged: tuple[RectifiedFrame, list[ImageQuality]] | None = None  # the last frame
         self._followed = 0  # view of the odometry
         self._last_frame: RectifiedFrame | None = None  # of a rig with several views
         self._mounting = Mounting(se3_inverse(body_from_cam), calibration.base_from_body)
@@ -110,18 +115,27 @@ class Localizer:
         self._tracker.begin(start)
         self._query.failed = start.failed_queries
 
+    def awaits(self, frame: RectifiedFrame) -> bool:
+        """Return True if a frame is to be left out: the followed view, alone usable, has images at a lower rate and none in this frame; or
+        its last one is newer."""
+        if self.percept is None or len(self._mounted) == 1:
+            return False
+        followed, since_ns = self._followed, frame.stamp_ns - self.percept.odometry.stamp_ns
+        is_missing = followed > 0 and frame.others[followed - 1 : followed] in ((), (None,)) and since_ns < _DEAD_NS
+        return since_ns <= 0 or (is_missing and all(image.cause in UNUSABLE for image in self._judge(frame)))
+
     def handle_stereo(self, frame: RectifiedFrame) -> Estimate:
         """Return the estimate at `frame`, which must be newer than all before."""
         begun_s = self._clock()
-        images = [self._judged(frame, number) for number in range(len(self._mounted))]
+        images = self._judge(frame)
         self._choose_view([image.cause for image in images])
         number = self._followed
-        image, followed = images[number], frame.view(number)
-        if image.cause is Cause.FROZEN and followed is not None:
+        image, followed = images[number], frame.view(number) or self._black(number, frame.stamp_ns)
+        if image.cause is Cause.FROZEN:
             followed = self._images[number].without_frozen(followed)
-        frame = followed if number == 0 and followed is not None else frame
+        frame = frame if number else followed
         judged_s = self._clock()
-        odometry = self.odometry.handle_stereo(frame if followed is None else followed)
+        odometry = self.odometry.handle_stereo(followed)
         if image.cause is Cause.NONE:
             image = replace(image, cause=self._images[number].judge_depth(odometry.scene_depth_m))
         tracked_s = self._clock()
@@ -134,21 +148,33 @@ class Localizer:
         )
         return estimate
 
-    def _judged(self, frame: RectifiedFrame, number: int) -> ImageQuality:
+    def _judge(self, frame: RectifiedFrame) -> list[ImageQuality]:
+        """Return the quality of the images of every view; each frame is judged once."""
+        if self._judged is None or self._judged[0] is not frame:
+            self._judged = frame, [self._quality(frame, number) for number in range(len(self._mounted))]
+        return self._judged[1]
+
+    def _quality(self, frame: RectifiedFrame, number: int) -> ImageQuality:
         """Return the quality of a view's images: of the first as rectified, of others as recorded, since few of them are rectified."""
         if number == 0:
             return self._images[0].judge(frame)
         other = frame.others[number - 1] if number <= len(frame.others) else None
         return ImageQuality(Cause.NO_FRAMES) if other is None else self._images[number].judge(other.recorded)
 
+    def _black(self, number: int, stamp_ns: int) -> RectifiedFrame:
+        """Return the frame of a view without images."""
+        camera = self._mounted[number].camera
+        return RectifiedFrame(stamp_ns, np.zeros((camera.height_px, camera.width_px), np.uint8), None, None)
+
     def _choose_view(self, causes: Sequence[Cause]) -> None:
-        """Let the odometry follow another view that measures depth, if the images of the present one are unusable."""
+        """Let the odometry follow another view that measures depth, or the first one, if the images of the present one are unusable."""
         present, last = self._followed, self.percept
         is_occluded = last is not None and last.image.cause is Cause.OCCLUDED
         if not (causes[present] in UNUSABLE or is_occluded):
             return
         for number, cause in enumerate(causes):
-            if number != present and cause not in UNUSABLE and self._mounted[number].camera.baseline_m > 0:
+            may_lead = number == 0 or self._mounted[number].camera.baseline_m > 0
+            if number != present and cause not in UNUSABLE and may_lead:
                 before = None if self._last_frame is None else self._last_frame.view(number)
                 self.odometry.follow(number, before)
                 self._followed = number
@@ -193,6 +219,7 @@ class Localizer:
             cause=percept.image.cause or (Cause.CARRIED if tracker.is_carried else Cause.NONE),
             image=percept.image,
             views=percept.views,
+            view=self._query.view,
             **result._asdict(),
         )
         estimate = assemble(

@@ -35,7 +35,7 @@ Load = Callable[[UsedMap], LoadedMap]
 def replay_failure(record: LocalizerRecord, load: Load) -> list[Moment]:
     """Return the results of the present localizer for every frame. Errors as of `load`."""
     rig = RigCalibration((), None, record.base_from_body)
-    localizer = Localizer(rig, record.camera, record.body_from_cam, 0.0, record.settings)
+    localizer = Localizer(rig, record.camera, record.body_from_cam, 0.0, record.settings, others=record.others)
     if record.used is not None:
         _use(localizer, load(record.used))
     localizer.begin(record.start)

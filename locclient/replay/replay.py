@@ -90,7 +90,8 @@ def replay(
     if options.export is not None:
         mounting = (robot.base_from_body, rectifier.body_from_cam, rectifier.camera)
         clock = (source.calibration.imu, rectifier.imu_minus_cam_s)
-        profile = RobotProfile(connection.site, connection.robot, *mounting, options.settings, *clock)
+        others = rectifier.mounted[1:]
+        profile = RobotProfile(connection.site, connection.robot, *mounting, options.settings, *clock, others=others)
         options.export.begin(first_ns, loaded, profile, rectifier)
     unread: list[str] = []
     for number, imu in enumerate(source.imu_before_each()):

@@ -11,6 +11,7 @@ from fleetmap.failure_definition import ERROR_LIMIT_M, radius_95_m
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.messages import Cause, FailureKind
 from fleetmap.odometry import OdometryStatus
+from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import Image
 from locclient.localization.estimate import Estimate
 
@@ -49,7 +50,7 @@ class Belief:
 
 @dataclass(frozen=True, slots=True)
 class Onset:
-    """The first frame of a failure. left: its left image; pictures: stamps and small images, the oldest first.
+    """The first frame of a failure. left: its left image, of the view compared with the map; pictures: stamps, small images, oldest first.
 
     map_from_body (4, 4): the belief, propagated to this frame; None, as is belief, if the robot had claimed no pose.
     """
@@ -59,6 +60,7 @@ class Onset:
     pictures: tuple[tuple[int, Image], ...]
     belief: Belief | None
     map_from_body: Array | None
+    view: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,34 +103,34 @@ class OnsetRecorder:
         self._last: tuple[Estimate, Array] | None = None
 
     def handle(
-        self, estimate: Estimate, left: Image, odom_from_body: Array, begun_ns: Mapping[FailureKind, int]
+        self, estimate: Estimate, frame: RectifiedFrame, odom_from_body: Array, begun_ns: Mapping[FailureKind, int]
     ) -> None:
         """Add a frame. begun_ns: start of conditions that may become a failure, by kind; odom_from_body as of `Belief`."""
         stamp_ns, last, self._last = estimate.stamp_ns, self._last, (estimate, odom_from_body)
         step_ns = 0 if last is None else stamp_ns - last[0].stamp_ns
         self._note_belief(estimate, odom_from_body)
         if self._breaks(estimate, step_ns):
-            self._break = self._onset(stamp_ns, left, odom_from_body)
+            self._break = self._onset(stamp_ns, frame, odom_from_body, estimate.view)
         for kind, began_ns in begun_ns.items():
             if kind not in self._open or self._open[kind].stamp_ns != began_ns:
-                self._open[kind] = self._onset(began_ns, left, odom_from_body)
+                self._open[kind] = self._onset(began_ns, frame, odom_from_body, estimate.view)
         for kind in [kind for kind in self._open if kind not in begun_ns]:
             del self._open[kind]
         if not self._pictures or stamp_ns - self._pictures[-1][0] >= _EVERY_NS:
-            self._pictures.append((stamp_ns, _small(left)))
+            self._pictures.append((stamp_ns, _small(_left(frame, estimate.view))))
 
     @property
     def search(self) -> Onset | None:
         """Return the onset of the ongoing search for the pose."""
         return self._open.get(FailureKind.NOT_FOUND)
 
-    def onset(self, kind: FailureKind, began_ns: int, left: Image, *, was_carried: bool = False) -> Onset:
+    def onset(self, kind: FailureKind, began_ns: int, frame: RectifiedFrame, *, was_carried: bool = False) -> Onset:
         """Return the onset of a detected failure; for a carried robot, that of the lost tracks."""
         assert self._last is not None
         if was_carried and self._break is not None and self._is_break_of(began_ns):
             return self._break
         found = self._open.get(kind)
-        return found if found is not None else self._onset(began_ns, left, self._last[1])
+        return found if found is not None else self._onset(began_ns, frame, self._last[1], self._last[0].view)
 
     def evidence(self, estimate: Estimate, kind: FailureKind, began_ns: int, odom_from_body: Array) -> Evidence:
         """Return evidence for the cause of a failure detected with this estimate."""
@@ -167,12 +169,12 @@ class OnsetRecorder:
         claimed = (estimate.map_from_body, estimate.cov_rot_trans, odom_from_body)
         self._belief = Belief(estimate.stamp_ns, *claimed, *self._fix)
 
-    def _onset(self, stamp_ns: int, left: Image, odom_from_body: Array) -> Onset:
+    def _onset(self, stamp_ns: int, frame: RectifiedFrame, odom_from_body: Array, view: int) -> Onset:
         before = [self._nearest(stamp_ns - age_ns, stamp_ns) for age_ns in _BEFORE_NS]
         chosen = {picture[0]: picture[1] for picture in before if picture is not None}
-        belief = self._belief
+        belief, left = self._belief, _left(frame, view)
         map_from_body = None if belief is None else belief.carried_on(odom_from_body)
-        return Onset(stamp_ns, left, (*chosen.items(), (stamp_ns, _small(left))), belief, map_from_body)
+        return Onset(stamp_ns, left, (*chosen.items(), (stamp_ns, _small(left))), belief, map_from_body, view)
 
     def _nearest(self, wanted_ns: int, before_ns: int) -> tuple[int, Image] | None:
         """Return the picture nearest to a stamp, at most 0.5 s off and before `before_ns`."""
@@ -189,6 +191,11 @@ def _is_beyond(map_from_body: Array, belief: Belief, odom_from_body: Array) -> b
 
 def _distance_m(one: Array, other: Array) -> float:
     return float(np.linalg.norm(one[:3, 3] - other[:3, 3]))
+
+
+def _left(frame: RectifiedFrame, view: int) -> Image:
+    """Return the left image of a view, of the first one where that has none."""
+    return (frame.view(view) or frame).left
 
 
 def _small(left: Image) -> Image:

@@ -14,7 +14,7 @@ from fleetmap.mapformat import Tile
 from fleetmap.messages import MAX_THUMBNAIL_BYTES, CameraNote, Cause, FailureReport, Placement, Thumbnail
 from fleetmap.relocalization.landmark_visibility import cones_of_tiles, match_visible, visible_landmarks
 from fleetmap.sensors.calibration import ImuNoise
-from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.sensors.rectification import MountedCamera, StereoCamera
 from fleetmap.sensors.samples import Image
 from locclient.localization.settings import LocalizerSettings
 from locclient.robot.failure_onset import PICTURE_WIDTH_PX
@@ -101,8 +101,8 @@ _MATCHES_WIDTH_PX = 800
 
 @dataclass(frozen=True)
 class RobotProfile:
-    """Common data of all reports of a robot: site, name, mounting, rectified camera, settings, noise and clock of the IMU, and the
-    privacy of its pictures: full, blurred or off (none)."""
+    """Common data of all reports of a robot: site, name, mounting, rectified camera, settings, noise and clock of the IMU, the privacy of
+    its pictures: full, blurred or off (none), and the rectified cameras of its other views."""
 
     site: str
     robot: str
@@ -113,6 +113,11 @@ class RobotProfile:
     imu: ImuNoise | None = None
     imu_minus_cam_s: float = 0.0
     pictures: str = "blurred"
+    others: tuple[MountedCamera, ...] = ()
+
+    def mounted(self, view: int) -> MountedCamera:
+        """Return the camera of a view."""
+        return self.others[view - 1] if view else MountedCamera(self.camera, self.body_from_cam)
 
 
 def failure_report(context: FailureContext, profile: RobotProfile, *, report_id: str, wall_ns: int) -> FailureReport:
@@ -151,18 +156,19 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
         sharpness=None if image is None else image.sharpness,
         fixes=failure.fixes,
         calibration=failure.estimate.calibration.text[:2000],
-        camera=_camera(profile),
+        camera=_camera(profile, onset.view),
+        view=onset.view if profile.others else None,
         thumbnails=_thumbnails(context, profile, matches, cause),
     )
 
 
-def _camera(profile: RobotProfile) -> CameraNote:
-    camera = profile.camera
+def _camera(profile: RobotProfile, view: int) -> CameraNote:
+    camera, body_from_cam = profile.mounted(view)
     return CameraNote(
         size_px=(camera.width_px, camera.height_px),
         focal_px=float(camera.focal_px),
         centre_px=(float(camera.cx_px), float(camera.cy_px)),
-        base_from_cam=Placement.of(profile.base_from_body @ profile.body_from_cam),
+        base_from_cam=Placement.of(profile.base_from_body @ body_from_cam),
     )
 
 
@@ -178,8 +184,9 @@ def _matches(context: FailureContext, profile: RobotProfile) -> Matches | None:
     onset, running = context.unmatched, context.running
     if onset.map_from_body is None or running is None:
         return None
-    map_from_cam = onset.map_from_body @ profile.body_from_cam
-    return expected_matches(onset.left, profile.camera, map_from_cam, running.tiles.values(), profile.settings)
+    camera, body_from_cam = profile.mounted(onset.view)
+    map_from_cam = onset.map_from_body @ body_from_cam
+    return expected_matches(onset.left, camera, map_from_cam, running.tiles.values(), profile.settings)
 
 
 def _has_map_changed(context: FailureContext, profile: RobotProfile, expected: int, seen: int) -> bool:

@@ -192,6 +192,6 @@ class FailureRing:
             if query is not None and query.features is not None and query.features.frame is not None:
                 found = query.features
                 tried = None if found.is_tried is None else found.is_tried.copy()
-                copied = QueryInput(query.slices, FrameFeatures(found.features, found.pixels.copy(), None, tried))
+                copied = replace(query, features=FrameFeatures(found.features, found.pixels.copy(), None, tried))
                 frames[place] = replace(frame, percept=replace(frame.percept, query=copied))
         cut.frames = tuple(frames) or None

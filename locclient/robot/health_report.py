@@ -193,6 +193,7 @@ class HealthFigures:
         if last is not None:
             figures["exposure"], figures["sharpness"] = last.image.exposure, last.image.sharpness
             figures |= last.calibration.figures
+            figures |= {"views": last.views_in_words} if last.views_in_words else {}
             flags += [Cause.CALIBRATION] if last.calibration.is_wrong else []
             flags += [Flag.BLIND] if is_blind(last.status, radius_95_m(last.cov_rot_trans)) else []
             flags += [last.image.cause] if last.image.cause else []

@@ -132,7 +132,7 @@ class Robot:
         self._place_in_building()
 
     def handle(self, bundle: SensorBundle) -> Outcome | None:
-        """Return results of a bundle with a frame; None without one. RecordingError for unreadable images."""
+        """Return results of a bundle with a frame; None without one that the localizer uses. RecordingError for unreadable images."""
         self.localizer.handle_imu(bundle.imu)
         if bundle.wheel and self._wheels_fault and not self._wheels_unused:
             self._wheels_unused = {Flag.WHEELS_UNMOUNTED: f"the wheels are left out: {self._wheels_fault}"}
@@ -151,6 +151,8 @@ class Robot:
         decoded_s = self._clock_s()
         frame = self._rectifier.rectify(raw)
         rectified_s = self._clock_s()
+        if self.localizer.awaits(frame):
+            return None
         estimate = self.localizer.handle_stereo(frame)
         cpu_s = self._clock_s() - begun_s
         stage_s = {"decode": decoded_s - begun_s, "rectify": rectified_s - decoded_s, **estimate.stage_s}
@@ -165,7 +167,7 @@ class Robot:
             self.ring.handle(self.localizer.percept, frame, estimate, self.localizer.start(), self.monitor.begun_ns)
         odom_from_body = published.odom_from_base @ self.base_from_body
         context = None if failure is None else self._context(failure, odom_from_body)
-        self._onsets.handle(estimate, frame.left, odom_from_body, self.monitor.begun_ns)
+        self._onsets.handle(estimate, frame, odom_from_body, self.monitor.begun_ns)
         dock_error_m = self._docks.handle(bundle.priors, estimate)
         return Outcome(
             estimate, published, cpu_s, stage_s, context, dock_error_m, speed_mps, is_covered, self._left_out()
@@ -201,7 +203,7 @@ class Robot:
             evidence = self._onsets.evidence(failure.estimate, failure.kind, began_ns, odom_from_body)
         failure = replace(failure, cause=refined_cause(failure.cause, evidence))
         was_carried = failure.cause is Cause.CARRIED
-        onset = self._onsets.onset(failure.kind, began_ns, frame.left, was_carried=was_carried)
+        onset = self._onsets.onset(failure.kind, began_ns, frame, was_carried=was_carried)
         lasted_s = failure.duration_s + max(0, began_ns - onset.stamp_ns) * 1e-9
         failure = replace(failure, stamp_ns=min(began_ns, onset.stamp_ns), duration_s=lasted_s)
         unmatched = onset if was_carried else self._onsets.search or onset

@@ -120,5 +120,6 @@ def _facts(context: PageContext, row: FailureRow, report: FailureReport) -> list
         ("Brightness of the image (0 to 1)", figure(report.exposure)),
         ("Sharpness (1 is usual)", figure(report.sharpness)),
         ("Calibration", report.calibration),
+        ("View of the rig (0 is the first)", "" if report.view is None else str(report.view)),
     ]
     return [(name, value) for name, value in found if value]

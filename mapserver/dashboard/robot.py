@@ -117,6 +117,7 @@ def _facts(robot: LiveRobot) -> list[tuple[str, str]]:
             for words, name, form in _FIGURES
             if isinstance(value := robot.metrics.get(name), int | float)
         ),
+        ("Cameras", str(robot.metrics.get("views") or "")),
         ("Clock against the server's", "" if clock_s is None else f"{clock_s:+.2f} s"),
         ("Cameras against the map", "; ".join(f"{PARAMETERS[f.name]} {f.words}" for f in robot.calibration)),
     ]

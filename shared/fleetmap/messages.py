@@ -310,6 +310,7 @@ class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
     the place of fixes that agree with each other, None without such fixes. landmarks_expected, landmarks_seen: in the first image in which
     the robot was not localised, by its estimate then. exposure: mean brightness of the left image, 0 to 1; sharpness: variance of the steps
     between neighbouring pixels of a row, 1 is typical for the robot. calibration: the wrong parameter and its error, empty for none.
+    view: of a rig with several, the one that was compared with the map, whose camera and pictures these are; None with one.
     """
 
     site: Name
@@ -334,6 +335,7 @@ class FailureReport(msgspec.Struct, frozen=True, kw_only=True):
     sharpness: float | None = None
     calibration: Text = ""
     camera: CameraNote | None = None
+    view: Annotated[int, msgspec.Meta(ge=0, le=15)] | None = None
     fixes: Annotated[tuple[FixNote, ...], msgspec.Meta(max_length=20)] = ()
     thumbnails: Annotated[tuple[Thumbnail, ...], msgspec.Meta(max_length=4)] = ()
 

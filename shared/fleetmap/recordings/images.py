@@ -177,14 +177,22 @@ class StoredFrame:
 
 
 def decode_frame(stored: StoredFrame) -> CameraFrame:
-    """Decode the images of a frame, files two at a time; RecordingError naming an image that cannot be decoded."""
+    """Decode the images of a frame, files two at a time; RecordingError naming an image of the first view that cannot be decoded. Another
+    view with one has no images."""
     is_slow = stored.left.encoding == "file" and (stored.right or stored.depth) is not None
     left = _BESIDE.submit(decode_grey, stored.left) if is_slow else None
     right = None if stored.right is None else decode_grey(stored.right)
     depth = None if stored.depth is None else decode_depth(stored.depth)
-    others = tuple(None if other is None else decode_frame(other) for other in stored.others)
+    others = tuple(map(_decoded_if_sound, stored.others))
     first = decode_grey(stored.left) if left is None else left.result()
     return CameraFrame(stored.stamp_ns, first, right, depth, others)
+
+
+def _decoded_if_sound(other: StoredFrame | None) -> CameraFrame | None:
+    try:
+        return None if other is None else decode_frame(other)
+    except RecordingError:
+        return None
 
 
 def decode_grey(stored: StoredImage) -> Image:

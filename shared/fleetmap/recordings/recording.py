@@ -125,11 +125,18 @@ class Recording:
         """
         self._check_index(index)
         frame = self.frames.frame(index)
-        images = zip((frame.left, frame.right), self.calibration.cameras, strict=False)
-        for number, (image, camera) in enumerate(images):
+        views = zip((frame, *frame.others), self.calibration.views, strict=False)
+        images = [
+            (view, *each)
+            for view, numbers in views
+            if view
+            for each in zip((view.left, view.right), numbers, strict=False)
+        ]
+        for view, image, number in images:
+            camera = self.calibration.cameras[number]
             if image is not None and image.shape != (camera.height_px, camera.width_px):
                 raise RecordingError(
-                    f"{self.path}: the cam{number} image at {frame.stamp_ns} is {image.shape[1]}x{image.shape[0]} px, "
+                    f"{self.path}: the cam{number} image at {view.stamp_ns} is {image.shape[1]}x{image.shape[0]} px, "
                     f"the calibration says {camera.width_px}x{camera.height_px}; pass the matching one with "
                     "--calibration FILE"
                 )

@@ -184,7 +184,8 @@ class Rectifier:
         return tuple(MountedCamera(each.camera, each.body_from_cam) for each in (self, *self.others))
 
     def rectify(self, frame: CameraFrame) -> RectifiedFrame:
-        """Rectify a frame, its other views once they are needed; RecordingError for an image of another size than the calibration's."""
+        """Rectify a frame, its other views once they are needed; RecordingError for images of other sizes than the calibration's. Another
+        view with one has no images."""
         left = self._remap(frame.left, 0, frame.stamp_ns)
         right = self._remap(frame.right, 1, frame.stamp_ns) if frame.right is not None and len(self._maps) > 1 else None
         disparity = None
@@ -198,7 +199,10 @@ class Rectifier:
         return RectifiedFrame(frame.stamp_ns, left, right, disparity, tuple(others))
 
     def _other(self, frame: CameraFrame | None, rectifier: "Rectifier") -> OtherView | None:
-        if frame is None:
+        if frame is None or any(
+            image is not None and image.shape != size_px
+            for image, size_px in zip((frame.left, frame.right), rectifier._sizes, strict=False)
+        ):
             return None
         later_ns = round((rectifier.imu_minus_cam_s - self.imu_minus_cam_s) * 1e9)
         return OtherView(replace(frame, stamp_ns=frame.stamp_ns + later_ns), rectifier)

@@ -141,6 +141,43 @@ def test_odometry_goes_on_with_the_other_pair_and_a_camera_comes_back(sensors: S
     assert np.flatnonzero(rear).tolist() == [*range(68, 90)]
 
 
+@pytest.mark.parametrize("front", ["covered pair", "single camera"])
+def test_a_slower_or_dying_rear_pair_is_not_taken_for_the_front(front: str) -> None:
+    """In front a pair that is covered all along while the rear pair has half the rate; or one camera, covered until the rear pair dies."""
+    calibration, is_single = rig_of_two(SensorSet.STEREO_INERTIAL), front == "single camera"
+    calibration = replace(calibration, cameras=calibration.cameras[is_single and 1 :])
+    rectifier = Rectifier(calibration)
+    mounting = rectifier.camera, rectifier.body_from_cam, 0.0
+    localizer = Localizer(calibration, *mounting, LocalizerSettings(), others=rectifier.mounted[1:])
+    places, lost = [], 0
+    for number, stamp_ns in enumerate(range(0, 4_500_000_000, FRAME_NS)):
+        frame = with_noise(seen_at(stamp_ns), np.random.default_rng(stamp_ns))
+        is_dead = stamp_ns >= 2_000_000_000 and is_single
+        if not is_dead and stamp_ns >= 1_000_000_000:
+            frame = replace(frame, left=np.zeros_like(frame.left), right=np.zeros_like(frame.left))
+        if is_single:
+            frame = replace(
+                frame, left=frame.left if frame.right is None or not frame.left.any() else frame.right, right=None
+            )
+        if is_dead or (number % 2 and not is_single):
+            frame = replace(frame, others=(None,))
+        localizer.handle_imu(imu_between(stamp_ns - FRAME_NS, stamp_ns + IMU_NS))
+        rectified = rectifier.rectify(frame)
+        if localizer.awaits(rectified):
+            continue
+        odometry = localizer.handle_stereo(rectified).odometry
+        lost += odometry.status is OdometryStatus.DEGRADED
+        places.append((stamp_ns, odometry.odom_from_body))
+    moved = se3_inverse(at(places, 2_200_000_000)) @ at(places, 3_000_000_000)
+    truth = se3_inverse(Ride().map_from_body(2.2)) @ Ride().map_from_body(3.0)
+    assert np.linalg.norm((moved - truth)[:3, 3]) < 0.03
+    assert is_single or lost <= 2, "with both pairs gone for a frame; one camera measures no depth here"
+
+
+def at(places: list[tuple[int, np.ndarray]], stamp_ns: int) -> np.ndarray:  # type: ignore[type-arg]
+    return min(places, key=lambda place: abs(place[0] - stamp_ns))[1]
+
+
 def with_noise(frame: CameraFrame, rng: np.random.Generator) -> CameraFrame:
     def noisy(image: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
         return np.clip(image + rng.integers(-1, 2, image.shape, dtype=np.int16), 0, 255).astype(np.uint8)

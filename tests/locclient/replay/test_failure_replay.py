@@ -17,7 +17,7 @@ import pytest
 import zstandard
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import se3_inverse
+from fleetmap.geometry import se3, se3_inverse
 from fleetmap.messages import FailureReport
 from fleetmap.recordings import open_recording
 from fleetmap.recordings.failure_recording import LOCALIZER, SUMMARY, attachments_of
@@ -143,6 +143,55 @@ def test_blurred_pictures_show_no_detail(carried: Carried, tmp_path: Path) -> No
         detail = [cv2.Laplacian(each.read_frame(3).left, cv2.CV_64F).var() for each in (sharp, blurred)]
     assert detail[1] < 0.1 * detail[0]
     assert read_failure_file(tmp_path / "blurred.mcap")[0].pictures == "blurred"
+
+
+_TURNED = se3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))  # body_from_turned
+_MASK = ((0.0, 0.0), (319.0, 0.0), (319.0, 60.0), (0.0, 60.0))
+
+
+@pytest.mark.parametrize("rig", ["rear", "mask"])
+def test_a_robot_that_saw_the_map_behind_it_or_beside_a_mask_is_replayed_as_well(tmp_path: Path, rig: str) -> None:
+    """With lenses covered in front, its report and recording show what the rear pair saw, by the rear pair's camera."""
+    known, ride = calibration(), list(robot_world.carried(90, 75))
+    whole = replace(known, cameras=tuple(replace(camera, mask=(_MASK,)) for camera in known.cameras))
+    if rig == "rear":
+        front = (replace(camera, body_from_cam=_TURNED @ camera.body_from_cam) for camera in known.cameras)
+        whole = replace(known, cameras=(*front, *known.cameras))
+        dark = np.zeros_like(ride[0].frame.left)
+        ride = [replace(b, frame=replace(b.frame, left=dark, right=dark, others=(b.frame,))) for b in ride]
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        robot_world.save(store)
+        found = failed(ride, robot_world.loaded(store), "full", whole)
+    assert found is not None
+    report, data, said = found
+    assert (report.cause, report.view) == ("carried", 1 if rig == "rear" else None)
+    np.testing.assert_allclose(
+        report.camera.base_from_cam.target_from_source, known.cameras[0].body_from_cam, atol=0.02
+    )
+    shown = [cv2.imdecode(np.frombuffer(each.jpeg, np.uint8), cv2.IMREAD_GRAYSCALE) for each in report.thumbnails]
+    assert min(picture.std() for picture in shown) > 20, "none is black"
+    (tmp_path / "failure.mcap").write_bytes(data)
+    failure = read_failure_file(tmp_path / "failure.mcap")
+    again = compare_failure(failure, LocalMapSource(tmp_path / "store", "room"))
+    assert [moment.status for moment in again.now] == said
+    assert "TRACKING" in said
+    assert again.first_difference_ns is None
+    with open_recording(tmp_path / "failure.mcap") as recording:
+        assert len(recording.calibration.views) == (2 if rig == "rear" else 1)
+        if rig == "rear":
+            pictures = [
+                each for k in range(len(recording)) for each in recording.read_frame(k).others if each is not None
+            ]
+            assert len(pictures) > 5 and pictures[0].left.std() > 20
+
+
+@pytest.mark.parametrize("view", [-1, 1])
+def test_a_query_of_a_view_that_the_rig_does_not_have_is_refused(carried: Carried, tmp_path: Path, view: int) -> None:
+    state = _state_of(carried, 10_000)
+    next(percept["query"] for _, percept in state["frames"] if percept["query"])["view"] = view
+    spoiled = zstandard.ZstdCompressor().compress(msgspec.msgpack.encode(state))
+    with pytest.raises(RecordingError, match=f"{view} of a rig of 1 views"):
+        read_failure_file(_changed(carried, tmp_path / "spoiled.mcap", spoiled))
 
 
 def _changed(carried: Carried, path: Path, localizer: bytes) -> Path:

@@ -12,6 +12,7 @@ from fleetmap import failure_definition
 from fleetmap.geometry import se3
 from fleetmap.messages import Cause, FailureKind, FailureReport, Status
 from fleetmap.odometry import OdometryStatus
+from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.estimate import Estimate, Hypothesis
 from locclient.localization.image_quality import ImageQuality
@@ -25,9 +26,9 @@ from support.worlds import robot_world
 BLIND, NOT_FOUND = FailureKind.BLIND, FailureKind.NOT_FOUND
 
 
-def left(number: int) -> np.ndarray:
-    """An image that says which one it is."""
-    return np.full((48, 64), number, np.uint8)
+def left(number: int) -> RectifiedFrame:
+    """A frame whose image says which one it is."""
+    return RectifiedFrame(number, np.full((48, 64), number, np.uint8), None, None)
 
 
 def played(recorder: OnsetRecorder, estimates: Iterable[Estimate], begun_s: float | None = None) -> None:
@@ -61,7 +62,8 @@ def test_pictures_cost_little_memory() -> None:
     recorder, large = OnsetRecorder(), np.zeros((1200, 1920), np.uint8)
     for number in range(200):
         moment = estimate(0.05 * number)
-        recorder.handle(moment, large, moment.odometry.odom_from_body, {})
+        frame = RectifiedFrame(moment.stamp_ns, large, None, None)
+        recorder.handle(moment, frame, moment.odometry.odom_from_body, {})
     held = recorder._pictures
     assert sum(picture.nbytes for _, picture in held) <= 10 * 240 * 150
 

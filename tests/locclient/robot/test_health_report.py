@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import se3_inverse
-from fleetmap.messages import HEALTH_FIGURES, Status
+from fleetmap.messages import HEALTH_FIGURES, Cause, Status
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.estimate import Estimate
 from locclient.robot.continuous_odom import ContinuousOdom
@@ -106,3 +106,16 @@ def test_the_server_counts_what_a_robot_tells() -> None:
     assert sum(s.landmarks_expected for s in sums) == 49 * 50, "since the first report"
     assert sum(s.landmarks_seen for s in sums) == 49 * 40
     assert (health.metrics["exposure"], health.metrics["sharpness"]) == (said.image.exposure, said.image.sharpness)
+
+
+@pytest.mark.parametrize(
+    ("views", "words"),
+    [((Cause.NONE,), None), ((Cause.DARK, Cause.NONE), "view 0: dark, view 1: good (compared with the map)")],
+)
+def test_a_rig_says_which_of_its_views_are_in_use_and_why_others_are_not(
+    views: tuple[Cause, ...], words: str | None
+) -> None:
+    figures, seen = HealthFigures(), replace(estimate(0.0), views=views, view=len(views) - 1)
+    published = ContinuousOdom(np.eye(4)).handle(seen)
+    figures.handle(Outcome(seen, published, 0.0, {}, None))
+    assert figures.report("lab", "r1", 0, {}, silent=False).metrics.get("views") == words

@@ -11,6 +11,8 @@ from fleetmap.messages import PART_BYTES, FailureReport, encode_message
 from fleetmap.recordings.failure_recording import LOCALIZER, SUMMARY
 from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.delivery.failure_file import failure_file
 from locclient.maps.loaded_map import LoadedMap
@@ -21,17 +23,19 @@ from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
 
 
-def profile(robot: Robot) -> RobotProfile:
-    rig = robot_world.rectifier()
+def profile(robot: Robot, rig: Rectifier | None = None) -> RobotProfile:
+    rig = rig or robot_world.rectifier()
     mounting = (robot.base_from_body, rig.body_from_cam, rig.camera)
-    return RobotProfile("room", "r1", *mounting, robot_world.SETTINGS, calibration().imu, rig.imu_minus_cam_s)
+    clock = calibration().imu, rig.imu_minus_cam_s
+    return RobotProfile("room", "r1", *mounting, robot_world.SETTINGS, *clock, others=rig.mounted[1:])
 
 
 def failed(
-    ride: Iterable[SensorBundle], loaded: LoadedMap, pictures: str = "full"
+    ride: Iterable[SensorBundle], loaded: LoadedMap, pictures: str = "full", rig: RigCalibration | None = None
 ) -> tuple[FailureReport, bytes, list[str]] | None:
     """The first failure of a ride: its report, its recording, and the robot's estimates for its frames."""
-    robot = Robot(calibration(), robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
+    rectifier = robot_world.rectifier() if rig is None else Rectifier(rig)
+    robot = Robot(rig or calibration(), rectifier, robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
     robot.use(loaded)
     context, said = None, {}
     for bundle in ride:
@@ -44,8 +48,8 @@ def failed(
         return None
     robot.ring.finish()
     stamps = [frame.stamp_ns for frame in context.cut.frames]
-    report = failure_report(context, profile(robot), report_id="f1", wall_ns=10**18)
-    data = failure_file(context.cut, report, profile(robot), pictures)
+    report = failure_report(context, profile(robot, rectifier), report_id="f1", wall_ns=10**18)
+    data = failure_file(context.cut, report, profile(robot, rectifier), pictures)
     return report, data, [said[stamp_ns] for stamp_ns in stamps]
 
 
