@@ -155,7 +155,8 @@ class SurveyDrives:
             self._writer.write_wheel(taken.wheel)
             if taken.frame is not None and not self._is_full:
                 frame = _stored(taken.frame)
-                self._bytes += sum(len(image.data) for image in (frame.left, frame.right, frame.depth) if image)
+                views = [frame, *(other for other in frame.others if other is not None)]
+                self._bytes += sum(len(each.data) for v in views for each in (v.left, v.right, v.depth) if each)
                 self._writer.write_frame(frame)
                 self._is_full = self._bytes > 0.9 * MAX_DRIVE_BYTES  # the rest: samples, and the frames until it ends
 
@@ -180,7 +181,9 @@ def _off_m(area: SurveyArea, place: Array) -> float:
 def _stored(frame: CameraFrame | StoredFrame) -> StoredFrame:
     """Return a frame with its grey images as files, compressed if they are not."""
     stored = frame if isinstance(frame, StoredFrame) else store_frame(frame)
-    return replace(stored, left=_file(stored.left), right=None if stored.right is None else _file(stored.right))
+    others = tuple(None if other is None else _stored(other) for other in stored.others)
+    right = None if stored.right is None else _file(stored.right)
+    return replace(stored, left=_file(stored.left), right=right, others=others)
 
 
 def _file(image: StoredImage) -> StoredImage:

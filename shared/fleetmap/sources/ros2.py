@@ -55,8 +55,8 @@ class StereoPairs:
 class RigFrames:
     """Adds to each frame of a rig's first view the images of the other views that are nearest to it, at most half a period away.
 
-    A frame waits for the views that still send, at most until the next one. While the first view has sent nothing for half a second,
-    frames are black there, so that the others carry on.
+    A frame waits for the views that still send, at most until the next one. While the first view sends nothing for half a second of another
+    view's stamps, that view leads: frames have its stamps and are black in the first view, so that the others carry on.
     """
 
     def __init__(self, calibration: RigCalibration) -> None:
@@ -64,6 +64,9 @@ class RigFrames:
         self._pairs = [StereoPairs() if len(view) > 1 else None for view in self._views]
         self._recent = [deque[StoredFrame](maxlen=_WAITING_IMAGES) for _ in self._views]  # of each view
         self._waiting: StoredFrame | None = None
+        self._leader = 0
+        self._silent_since_ns = dict[int, int]()  # first stamps of other views since the first view's last frame
+        self._used_ns = dict[int, int]()  # last stamps in a frame, of other views
         first = calibration.cameras[0]
         self._black = grey_image(np.zeros((first.height_px, first.width_px), np.uint8))
 
@@ -78,39 +81,59 @@ class RigFrames:
         frame = StoredFrame(stamp_ns, image) if pairs is None else pairs.add(side, stamp_ns, image)
         if frame is None:
             return []
-        done: list[StoredFrame] = []
-        first = self._recent[0]
-        if view and first and frame.stamp_ns - first[-1].stamp_ns > _DEAD_NS:
-            is_ahead = all(not other or other[-1].stamp_ns < frame.stamp_ns for other in self._recent[1:])
-            self._recent[view].append(frame)
-            return [self._with_others(StoredFrame(frame.stamp_ns, self._black))] if is_ahead else []
-        self._recent[view].append(frame)
-        if view == 0:
+        recent = self._recent[view]
+        if recent and frame.stamp_ns <= recent[-1].stamp_ns:  # its clock was set
+            recent.clear()
+            self._used_ns.pop(view, None)
+        recent.append(frame)
+        done = list[StoredFrame]()
+        if self._leads(view, frame.stamp_ns):
             done += [] if self._waiting is None else [self._with_others(self._waiting)]
-            self._waiting = frame
+            self._waiting = frame if view == 0 else StoredFrame(frame.stamp_ns, self._black)
         if self._waiting is not None and not any(map(self._is_expected, self._recent[1:])):
             done.append(self._with_others(self._waiting))
             self._waiting = None
         return done
 
+    def _leads(self, view: int, stamp_ns: int) -> bool:
+        """True if frames have the stamps of this view, the first one or one that stands in for it."""
+        if view == 0:
+            self._leader = 0
+            self._silent_since_ns.clear()
+        elif stamp_ns - self._silent_since_ns.setdefault(view, stamp_ns) > _DEAD_NS and (
+            self._leader == 0 or abs(stamp_ns - self._recent[self._leader][-1].stamp_ns) > _DEAD_NS
+        ):
+            self._leader = view
+        return view == self._leader
+
     def _is_expected(self, recent: deque[StoredFrame]) -> bool:
-        """True if a view that sent an image since the frame before has none for the waiting frame yet."""
+        """True if the next image of a view that still sends belongs to the waiting frame, by the rate of that view."""
         assert self._waiting is not None
         if not recent or recent[-1].stamp_ns >= self._waiting.stamp_ns:
             return False
-        return self._waiting.stamp_ns - recent[-1].stamp_ns < 1.5 * self._period_ns()
+        leader_ns = self._period_ns()
+        own_ns, since_ns = _period_ns(recent) or leader_ns, self._waiting.stamp_ns - recent[-1].stamp_ns
+        return own_ns - leader_ns // 2 <= since_ns < 1.5 * own_ns
 
     def _period_ns(self) -> int:
-        stamps = [frame.stamp_ns for frame in self._recent[0]]
-        return int(np.median(np.diff(stamps))) if len(stamps) > 1 else _DEAD_NS
+        return _period_ns(self._recent[self._leader]) or _DEAD_NS
 
     def _with_others(self, frame: StoredFrame) -> StoredFrame:
         others = list[StoredFrame | None]()
-        for recent in list(self._recent)[1:]:
-            near = min(recent, key=lambda other: abs(other.stamp_ns - frame.stamp_ns), default=None)
-            is_near = near is not None and abs(near.stamp_ns - frame.stamp_ns) <= self._period_ns() // 2
-            others.append(near if is_near else None)
+        for view, recent in enumerate(list(self._recent)[1:], start=1):
+            unused = [other for other in recent if other.stamp_ns > self._used_ns.get(view, other.stamp_ns - 1)]
+            near = min(unused, key=lambda other: abs(other.stamp_ns - frame.stamp_ns), default=None)
+            if near is not None and abs(near.stamp_ns - frame.stamp_ns) > self._period_ns() // 2:
+                near = None
+            if near is not None:
+                self._used_ns[view] = near.stamp_ns
+            others.append(near)
         return replace(frame, others=tuple(others))
+
+
+def _period_ns(recent: deque[StoredFrame]) -> int | None:
+    stamps = [frame.stamp_ns for frame in recent]
+    return int(np.median(np.diff(stamps))) if len(stamps) > 1 else None
 
 
 class Ros2Source:

@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleetmap.errors import CalibrationError
+from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import se3, se3_inverse
 from fleetmap.recordings import OpenOptions, Recording, format_calibration, open_recording, read_calibration
+from fleetmap.recordings.images import StoredImage, decode_frame, store_frame
 from fleetmap.recordings.mcap.writer import McapRecordingWriter, copy_to_mcap
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
@@ -148,3 +149,22 @@ def test_eurocs_folder_with_four_cameras(tmp_path: Path) -> None:
     exchanged = replace(rig, cameras=(*rig.cameras[:2], rig.cameras[3], rig.cameras[2]))
     with pytest.raises(CalibrationError, match=r"cam3 lies at .* in cam2's axes"):
         Rectifier(exchanged)
+
+
+def test_a_damaged_or_wrong_image_of_another_view_leaves_the_first_one_usable(tmp_path: Path) -> None:
+    calibration, frames = simulated("front-rear")
+    stored = store_frame(frames[1])
+    (rear,) = stored.others
+    assert rear is not None
+    damaged = replace(stored, others=(replace(rear, left=StoredImage("file", b"\xff\xd8 no more")),))
+    assert decode_frame(damaged).others == (None,)
+    large = np.zeros((100, 100), np.uint8)
+    other = replace(frames[1], others=(CameraFrame(frames[1].stamp_ns, large, large),))
+    rectified = Rectifier(calibration).rectify(other)
+    assert rectified.view(1) is None and rectified.left.any()
+    with pytest.raises(RecordingError, match=r"cam2 image at .* is 100x100 px, the calibration says 96x72"):
+        written(
+            tmp_path / "a.mcap",
+            "front-rear",
+            tuple(replace(f, others=(CameraFrame(f.stamp_ns, large, large),)) for f in frames),
+        )

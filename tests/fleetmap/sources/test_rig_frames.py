@@ -51,8 +51,73 @@ def test_while_the_pair_in_front_is_dead_the_rear_pair_carries_on() -> None:
     # It is dead for who hears nothing of it for half a second.
     done = [frame for k in range(3, 20) for frame in sent(frames, k, (2, 3))]
     black = [frame for frame in done if not decode_grey(frame.left).any()]
-    assert len(black) == 20 - 12 and all(frame.others[0] is not None for frame in black)
+    assert len(black) == 20 - 13 and all(frame.others[0] is not None for frame in black)
     back = [frame for k in range(20, 24) for frame in sent(frames, k, (0, 1, 2, 3))]
     assert all(decode_grey(frame.left).any() for frame in back)
     stamps = [frame.stamp_ns for frame in (*done, *back)]
     assert stamps == sorted(set(stamps))
+
+
+def black_in_front(frames: list[StoredFrame]) -> list[bool]:
+    return [not decode_grey(frame.left).any() for frame in frames]
+
+
+def test_a_front_that_never_sends_does_not_keep_the_rear_from_it() -> None:
+    frames = RigFrames(rig())
+    done = [frame for k in range(20) for frame in sent(frames, k, (2, 3))]
+    assert len(done) == 20 - 11 and all(black_in_front(done))
+    assert all(frame.others[0] is not None for frame in done)
+
+
+def test_of_two_views_beside_a_dead_one_the_first_gives_the_stamps() -> None:
+    """Side cameras 3 and 6 ms after each other: a frame a period, with both, not two."""
+    front, rear = rig().cameras[:2], rig().cameras[2]
+    turned = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3))
+    side = replace(rear, body_from_cam=turned @ rear.body_from_cam)
+    frames = RigFrames(RigCalibration((*front, rear, side)))
+
+    def at(k: int, *numbers: int) -> list[StoredFrame]:
+        stamps = {n: 1_000_000_000 + k * PERIOD_NS + LATE_NS * max(n - 1, 0) for n in numbers}
+        return [done for n, stamp_ns in stamps.items() for done in frames.add(n, stamp_ns, IMAGE)]
+
+    for k in range(3):
+        at(k, 0, 1, 2, 3)
+    done = [frame for k in range(3, 24) for frame in at(k, 2, 3)]
+    black = [frame for frame in done if not decode_grey(frame.left).any()]
+    assert len(black) == 24 - 13
+    assert all(each is not None for frame in black[1:] for each in frame.others)
+    done += [frame for k in range(24, 28) for frame in at(k, 0, 1, 3)]  # now the first of them dies
+    stamps = [frame.stamp_ns for frame in done]
+    assert stamps == sorted(set(stamps))
+    assert done[-1].others[0] is None and done[-1].others[1] is not None
+
+
+def test_a_rear_pair_with_another_clock_does_not_blind_the_front() -> None:
+    """An hour ahead, it belongs to no frame; the frames of the front are what they are."""
+    frames = RigFrames(rig())
+    done = []
+    for k in range(40):
+        stamp_ns = 1_000_000_000 + k * PERIOD_NS
+        for number in range(4):
+            done += frames.add(number, stamp_ns + 3600 * 10**9 * (number > 1), IMAGE)
+    assert [frame.stamp_ns for frame in done] == [1_000_000_000 + k * PERIOD_NS for k in range(40)]
+    assert not any(black_in_front(done)) and not any(frame.others[0] for frame in done)
+
+
+def test_images_of_half_the_rate_belong_to_every_second_frame_and_delay_no_other() -> None:
+    frames = RigFrames(rig())
+    counts, done = [], list[StoredFrame]()
+    for k in range(12):
+        found = [sent(frames, k, numbers) for numbers in ((0, 1), (2, 3) if k % 2 else ())]
+        counts.append([len(each) for each in found])
+        done += [frame for each in found for frame in each]
+    assert [frame.others[0] is not None for frame in done[4:]] == [k % 2 == 1 for k in range(4, 12)]
+    assert counts[4:] == [[1, 0], [0, 1]] * 4
+
+
+def test_a_clock_that_is_set_back_begins_anew() -> None:
+    frames = RigFrames(rig())
+    for k in range(100, 110):
+        sent(frames, k, (0, 1, 2, 3))
+    done = [frame for k in range(10) for frame in sent(frames, k, (0, 1, 2, 3))]
+    assert [frame.others[0] is not None for frame in done[-8:]] == [True] * 8

@@ -1,6 +1,7 @@
 """Drives through requested areas: what a robot keeps of them, and how it hands them in."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +14,7 @@ from fleetmap.failure_summary import ReplayPart
 from fleetmap.geometry import se3
 from fleetmap.messages import FailureAck, Status, SurveyArea
 from fleetmap.recordings import open_recording
+from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.delivery import survey_drives
@@ -31,7 +33,11 @@ def made(folder: Path) -> SurveyDrives:
 
 
 def drive(
-    drives: SurveyDrives, x_m: Iterable[float], start_ns: int = 10**12, lost: tuple[float, float] = (0, 0)
+    drives: SurveyDrives,
+    x_m: Iterable[float],
+    start_ns: int = 10**12,
+    lost: tuple[float, float] = (0, 0),
+    others: tuple[CameraFrame, ...] = (),
 ) -> None:
     """Along x, without a known place between two of them."""
     for number, x in enumerate(x_m):
@@ -42,7 +48,8 @@ def drive(
             map_from_body=None if is_lost else se3(np.eye(3), np.array([x, 0.0, 0.0])),
             stamp_ns=stamp_ns,
         )
-        drives.handle(SensorBundle(CameraFrame(stamp_ns, PICTURE, PICTURE)), estimate)
+        seen = tuple(replace(other, stamp_ns=stamp_ns) for other in others)
+        drives.handle(SensorBundle(CameraFrame(stamp_ns, PICTURE, PICTURE, others=seen)), estimate)
         drives.work()
 
 
@@ -99,6 +106,23 @@ def test_a_drive_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     before = len(kept(tmp_path))
     drive(drives, np.arange(18.0, 40.0, 0.05), 3 * 10**12)
     assert all(path.stat().st_size <= 50_000 for path in sorted(tmp_path.glob("*.mcap"))[before:])
+
+
+def test_a_rigs_drive_is_bounded_by_the_images_of_all_its_views(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A drive that grew too large would be lost at its end."""
+    front, turned = calibration().cameras, se3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    rear = tuple(replace(camera, body_from_cam=turned @ camera.body_from_cam) for camera in front)
+    drives = SurveyDrives(tmp_path, RigCalibration((*front, *rear), calibration().imu))
+    drives.requests = (AREA,)
+    monkeypatch.setattr(survey_drives, "MAX_DRIVE_BYTES", 400_000)
+    noise = np.random.default_rng(1).integers(0, 255, PICTURE.shape, np.uint8)
+    drive(drives, np.arange(0.0, 50.0, 0.1), others=(CameraFrame(0, noise, noise),))
+    paths = list(tmp_path.glob("*.mcap"))
+    assert paths and all(path.stat().st_size <= 400_000 for path in paths)
+    with open_recording(paths[0]) as recording:
+        assert len(recording.calibration.views) == 2 and recording.read_frame(0).others[0] is not None
 
 
 def test_parts_are_sent_in_order_and_begun_again(tmp_path: Path) -> None:
