@@ -77,7 +77,7 @@ class CalibrationEstimate:
         return theta
 
     def corrected(self, rig: RigCalibration) -> RigCalibration:
-        """Return `rig`, which must be that of the recordings, with all judged parameters corrected."""
+        """Return `rig`, which must be that of the recordings, with all judged parameters of its first view corrected."""
         return corrected_rig(rig, RigAxes.of(rig, Rectifier(rig)), self.corrections())
 
 
@@ -211,5 +211,9 @@ def corrected_file(estimate: CalibrationEstimate, rig: RigCalibration, names: li
         value, sigma = in_words(p)
         what = f"corrected by {value}, sigma {sigma}" if p.is_judged else f"NOT JUDGED, old value kept: {p.reason}"
         lines.append(f"# {p.name.value}: {what}")
+    if len(rig.views) > 1:
+        lines.append(
+            f"# Cameras from cam{rig.views[1][0]} on are as they were: check their mounting with `mapserver doctor`."
+        )
     lines.append("# The wheels' scale and the IMU's noise are for information: this file keeps the noise that it had.")
     return "\n".join(lines) + "\n" + format_calibration(estimate.corrected(rig))

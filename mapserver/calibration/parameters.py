@@ -116,7 +116,7 @@ class RigAxes:
 
 
 def corrected_rig(rig: RigCalibration, axes: RigAxes, theta: Array) -> RigCalibration:
-    """Return `rig` with corrections theta: lenses, pair, mount on the IMU, clocks. Theta (UNKNOWNS,) includes distortion."""
+    """Return `rig` with corrections theta of its first view: lenses, pair, mount, clocks. Theta (UNKNOWNS,) includes distortion."""
     left = _camera(rig.cameras[0], theta, 0)
     body_from_rect = axes.body_from_rect @ so3_exp(theta[INDEX[P.CAMERA_IMU_X] : INDEX[P.CAMERA_IMU_Z] + 1])
     shift = theta[INDEX[P.CAMERA_POSITION_X] : INDEX[P.CAMERA_POSITION_Z] + 1]
@@ -126,7 +126,7 @@ def corrected_rig(rig: RigCalibration, axes: RigAxes, theta: Array) -> RigCalibr
         right_in_rect, apart = right_camera(axes, theta)
         body_from_right = se3(body_from_rect @ right_in_rect, place + body_from_rect @ apart)
         cameras.append(replace(_camera(rig.cameras[1], theta, 1), body_from_cam=body_from_right))
-    return replace(rig, cameras=tuple(cameras))
+    return replace(rig, cameras=(*cameras, *rig.cameras[len(cameras) :]))
 
 
 def right_camera(axes: RigAxes, theta: Array) -> tuple[Array, Array]:

@@ -58,10 +58,11 @@ def calibrate(
 
     with ExitStack() as opened:
         how = OpenOptions(calibration, topics)
-        sources = [_sound(opened.enter_context(open_recording(path, how)).first_view()) for path in recordings]
+        recorded = [opened.enter_context(open_recording(path, how)) for path in recordings]
+        sources = [_sound(recording.view(0)) for recording in recorded]
         settings = survey_settings(config_path(context), sources[0].sensor_set)
         estimate = estimate_calibration(sources, settings, opened.enter_context(_shown()))
-        rig = sources[0].calibration
+        rig = recorded[0].calibration
     _print(plain_console(), estimate)
     if out is None:
         return
@@ -120,7 +121,7 @@ def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Pa
         first.write_text(format_calibration(rig), encoding="utf-8")
         with open_recording(recordings[0], OpenOptions(first, topics)) as recording:
             found = calibration_from_guess(
-                _sound(recording.first_view()), survey_settings(config, recording.sensor_set), tools
+                _sound(recording.view(0)), survey_settings(config, recording.sensor_set), tools
             )
             name = recording.name
     typer.echo("\n".join(guessed_in_words(found)))

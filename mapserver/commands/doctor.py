@@ -37,15 +37,14 @@ def doctor(
 
     from fleetmap.console import plain_console
     from fleetmap.recordings import OpenOptions, named_topics, open_recording
-    from mapserver.doctor import Verdict, run_checks
+    from mapserver.doctor import Verdict
     from mapserver.doctor.findings import worst
-    from mapserver.doctor.run_checks import frames_to_check
+    from mapserver.doctor.rig import check_rig, frames_of_rig
 
-    with open_recording(recording, OpenOptions(calibration, named_topics(topic))) as opened:
-        source = opened.first_view()
+    with open_recording(recording, OpenOptions(calibration, named_topics(topic))) as source:
         with Progress(console=plain_console(stderr=True), transient=True) as progress:
-            task = progress.add_task("frames, and steps of the adjustment", total=frames_to_check(source))
-            findings = run_checks(source, lambda: progress.advance(task)).findings
+            task = progress.add_task("frames, and steps of the adjustment", total=frames_of_rig(source))
+            findings = check_rig(source, lambda: progress.advance(task))
         if json_file != _STDOUT:
             _print(source, findings)
         if json_file == _STDOUT:

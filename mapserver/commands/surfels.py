@@ -95,7 +95,7 @@ def refine(
             names = ", ".join(entry.name for entry in manifest.recordings)
             raise UsageError(f"{recording} is not of version {version} of site {site}, which was built from: {names}")
         own_rig = len(manifest.recordings) == 1
-        views = looks_of(opened.first_view(), decode_archive(archive), surfels, own_rig=own_rig)
+        views = looks_of(opened.view(0), decode_archive(archive), surfels, own_rig=own_rig)
     done = refined_by(Splats.of(surfels), views, steps, np.random.default_rng(seed))
     said = (
         f"{done.held_out} held-out views: PSNR {done.before.psnr_db:.2f} dB before, {done.after.psnr_db:.2f} dB after, "

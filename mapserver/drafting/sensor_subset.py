@@ -48,7 +48,7 @@ def reduced(recording: Recording, use: SensorSet | None) -> Recording:
 
     Raises RecordingError if the recording lacks a sensor of `use`.
     """
-    recording = recording.first_view()
+    recording = recording.view(0)
     if use is None or use is recording.sensor_set:
         return recording
     if use not in REDUCTIONS[recording.sensor_set]:

@@ -72,7 +72,7 @@ class RecordedDrive:
         """given: the `--frames` option of the indices."""
         if not (np.isfinite(speed) and speed >= 0):
             raise UsageError(f"--speed {speed}: give 1 for the recording's own speed, 0 for as fast as it goes")
-        recording = recording.first_view()
+        recording = recording.view(0)
         self.name, self.calibration = recording.name, recording.calibration
         self.has_depth = recording.sensor_set is SensorSet.RGBD
         self.rectifier = Rectifier(recording.calibration, has_depth=self.has_depth)

@@ -147,6 +147,13 @@ class SeriesFrames(Generic[T]):
         series = {"left": self.left.take(indices), "right": right, "depth": depth, "others": others}
         return replace(self, reader=self.reader.apart(), **series)  # type: ignore[arg-type]
 
+    def of_view(self, number: int) -> "SeriesFrames[T]":
+        """The images of one of the other views, counted from 1, at the frames that have them."""
+        view = self.others[number - 1]
+        rows = view.rows[view.rows >= 0]
+        right = None if view.right is None else view.right.take(rows)
+        return replace(self, left=view.left.take(rows), right=right, depth=None, others=())
+
     @property
     def other_numbers(self) -> tuple[int, ...]:
         """Numbers of the cameras of other views, if all cameras follow one another view by view."""

@@ -191,13 +191,20 @@ class Recording:
         """The recording with only the frames at indices (K,), renumbered; see `FrameSource.part`."""
         return replace(self, frame_stamps_ns=self.frame_stamps_ns[indices], frames=self.frames.part(indices))
 
-    def first_view(self) -> "Recording":
-        """The recording of a rig's first view alone, for what uses one; its content's hash is that of all views."""
-        cameras, (first, *others) = self.calibration.cameras, self.calibration.views
-        if not others or not isinstance(self.frames, SeriesFrames):
+    def view(self, number: int) -> "Recording":
+        """The recording of one of a rig's views alone, with its own stamps; the content's hash is that of all views for the first one."""
+        cameras, views = self.calibration.cameras, self.calibration.views
+        if len(views) == 1 or not isinstance(self.frames, SeriesFrames):
             return self
-        calibration = replace(self.calibration, cameras=tuple(cameras[number] for number in first))
-        return replace(self, calibration=calibration, frames=replace(self.frames, has_others=False))
+        calibration = replace(self.calibration, cameras=tuple(cameras[camera] for camera in views[number]))
+        if number == 0:
+            return replace(self, calibration=calibration, frames=replace(self.frames, has_others=False))
+        of_pair = {SensorSet.MONO: SensorSet.STEREO, SensorSet.MONO_INERTIAL: SensorSet.STEREO_INERTIAL}
+        of_one = {pair: one for one, pair in of_pair.items()}
+        sensor_set = (of_pair if len(views[number]) == 2 else of_one).get(self.sensor_set, self.sensor_set)
+        frames = self.frames.of_view(number)
+        stamps_ns = frames.left.stamps_ns
+        return replace(self, calibration=calibration, frames=frames, frame_stamps_ns=stamps_ns, sensor_set=sensor_set)
 
     def content_hash(self) -> str:
         """SHA-256 (hex) of the content, including images; the same on every machine."""

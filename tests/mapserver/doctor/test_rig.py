@@ -1,0 +1,139 @@
+"""Rigs of several views: cameras of a further pair, and its mounting against the first one, are checked by name."""
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
+from fleetmap.recordings import OpenOptions, format_calibration, open_recording
+from fleetmap.recordings.mcap.writer import McapRecordingWriter
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.samples import CameraFrame, SensorSet
+from mapserver.cli import app
+from mapserver.doctor.findings import Finding, Verdict
+from mapserver.doctor.rig import check_mountings, judge_mounting, mounting_error
+from support.recordings.painted_room import FRAME_NS, Ride, frame_at, rig
+
+REAR = se3(so3_exp(np.array([0.0, 0.0, np.pi])), np.array([-0.1, 0.0, 0.0]))  # body_from_turned
+HALF_DEGREE = np.radians(0.5)
+
+
+def motions(
+    rng: np.random.Generator, error: Array, *, turns: bool = True, has_ways: bool = True, count: int = 400
+) -> list[tuple[Array, Array]]:
+    """Steps of 20 cm and a few degrees by two views, each with noise of 2 mm and 0.4 mrad; some of the second are wrong altogether."""
+    found = []
+    for number in range(count):
+        turn = np.array([0.0, 0.0, rng.normal(0.0, 0.06 if turns else 1e-5)])
+        true = se3(so3_exp(turn), np.array([0.2, 0.0, 0.0]))
+        seen = [true, se3_inverse(error) @ true @ error]
+        seen = [m @ se3(so3_exp(rng.normal(0.0, 4e-4, 3)), rng.normal(0.0, 2e-3, 3)) for m in seen]
+        if number % 15 == 0:
+            seen[1] = se3(so3_exp(rng.normal(0.0, 0.1, 3)), rng.normal(0.0, 0.3, 3))
+        if not has_ways:
+            seen[1][:3, 3] = np.nan
+        found.append((seen[0], seen[1]))
+    return found
+
+
+def test_errors_are_as_large_as_their_covariance_says() -> None:
+    """Of 60 drives: the squared Mahalanobis distance of the true error has the mean of three degrees of freedom."""
+    distances = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        turn = rng.normal(0.0, 0.02, 3)
+        found = mounting_error(motions(rng, se3(so3_exp(turn), rng.normal(0.0, 0.02, 3)), count=100))
+        assert found is not None
+        off = found.turn_rad - turn
+        distances.append(off @ np.linalg.solve(found.cov, off))
+    assert 2.0 < np.mean(distances) < 4.5
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("degrees", [0.0, 0.5, -0.5, 30.0, 178.0])
+def test_half_a_degree_between_two_pairs_is_found(axis: int, degrees: float) -> None:
+    rng = np.random.default_rng(round(degrees) + 7 * axis + 400)
+    error = se3(so3_exp(np.radians(degrees) * np.eye(3)[axis]), np.array([0.01, -0.02, 0.0]))
+    found = judge_mounting("cam2 and cam3 against cam0 and cam1", mounting_error(motions(rng, error)))
+    if degrees:
+        assert found.verdict is (Verdict.WARN if abs(degrees) < 1 else Verdict.FAIL)
+        assert found.value == pytest.approx(abs(degrees), abs=0.2)
+    else:
+        assert found.verdict is Verdict.OK
+
+
+def test_what_a_drive_does_not_show_is_not_judged() -> None:
+    """A single camera without a way, on the level: its turn about the vertical axis has no effect."""
+    rng = np.random.default_rng(1)
+    aside = se3(so3_exp(np.array([0.0, 0.0, HALF_DEGREE])), np.zeros(3))
+    assert judge_mounting("cam2", mounting_error(motions(rng, aside, has_ways=False))).verdict is Verdict.NOT_JUDGED
+    straight = mounting_error(motions(rng, np.eye(4), turns=False))
+    assert judge_mounting("cam2", straight).verdict is Verdict.NOT_JUDGED, "a roll about the way"
+    assert judge_mounting("cam2", mounting_error(motions(rng, np.eye(4), count=10))).verdict is Verdict.NOT_JUDGED
+
+
+class Turned(Ride):
+    def map_from_body(self, time_s: float) -> Array:
+        return np.asarray(super().map_from_body(time_s) @ REAR)
+
+
+@lru_cache(maxsize=1)
+def ride() -> tuple[RigCalibration, list[CameraFrame]]:
+    """A ride in the painted room with a pair in front and one behind, without an IMU."""
+    front = rig(SensorSet.STEREO)
+    rear = (replace(camera, body_from_cam=REAR @ camera.body_from_cam) for camera in front.cameras)
+    stamps = range(2_000_000_000, 4_500_000_000, FRAME_NS)
+    pairs = [[frame_at(each, stamp, SensorSet.STEREO) for each in (Ride(), Turned())] for stamp in stamps]
+    return replace(front, cameras=(*front.cameras, *rear)), [replace(a, others=(b,)) for a, b in pairs]
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    calibration, frames = ride()
+    path = tmp_path_factory.mktemp("rig") / "ride.mcap"
+    with McapRecordingWriter(path, calibration) as writer:
+        for frame in frames:
+            writer.write_frame(frame)
+    return path
+
+
+def with_turned(calibration: RigCalibration, numbers: tuple[int, ...]) -> RigCalibration:
+    """Cameras turned by half a degree about the vertical axis, in their place."""
+    off = se3(so3_exp(np.array([0.0, 0.0, HALF_DEGREE])), np.zeros(3))
+    middle = se3(np.eye(3), np.mean([calibration.cameras[n].body_from_cam[:3, 3] for n in numbers], axis=0))
+    turned = middle @ off @ se3_inverse(middle)
+    cameras = [
+        replace(c, body_from_cam=turned @ c.body_from_cam) if n in numbers else c
+        for n, c in enumerate(calibration.cameras)
+    ]
+    return replace(calibration, cameras=tuple(cameras))
+
+
+@pytest.mark.parametrize("turned", [(), (2, 3)])
+def test_a_rear_pair_turned_by_half_a_degree_is_named(recorded: Path, tmp_path: Path, turned: tuple[int, ...]) -> None:
+    (tmp_path / "cams.yaml").write_text(format_calibration(with_turned(ride()[0], turned) if turned else ride()[0]))
+    with open_recording(recorded, OpenOptions(tmp_path / "cams.yaml")) as recording:
+        (found,) = check_mountings(recording)
+    assert found.name == "cam2 and cam3 against cam0 and cam1"
+    assert found.verdict is (Verdict.WARN if turned else Verdict.OK), found.sentence
+
+
+def test_the_doctor_names_the_pair_whose_images_are_exchanged(tmp_path: Path) -> None:
+    calibration, frames = ride()
+    with McapRecordingWriter(tmp_path / "ride.mcap", calibration) as writer:
+        for frame in frames[::4]:
+            (rear,) = frame.others
+            assert rear is not None and rear.right is not None
+            writer.write_frame(replace(frame, others=(replace(rear, left=rear.right, right=rear.left),)))
+    done = CliRunner().invoke(app, ["doctor", str(tmp_path / "ride.mcap"), "--json", "-"])
+    assert done.exit_code == 3
+    import json
+
+    findings = {f["name"]: Finding(**f) for f in json.loads(done.stdout)["findings"]}
+    assert findings["left and right"].verdict == "ok"
+    assert findings["left and right of cam2 and cam3"].verdict == "fail"
+    assert "camera rate of cam2 and cam3" in findings
