@@ -12,7 +12,9 @@ from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import se3, se3_inverse
 from fleetmap.recordings import OpenOptions, Recording, format_calibration, open_recording, read_calibration
 from fleetmap.recordings.images import StoredImage, decode_frame, store_frame
+from fleetmap.recordings.mcap import writer
 from fleetmap.recordings.mcap.writer import McapRecordingWriter, copy_to_mcap
+from fleetmap.recordings.ros2 import messages
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
@@ -168,3 +170,40 @@ def test_a_damaged_or_wrong_image_of_another_view_leaves_the_first_one_usable(tm
             "front-rear",
             tuple(replace(f, others=(CameraFrame(f.stamp_ns, large, large),)) for f in frames),
         )
+
+
+@pytest.mark.parametrize(
+    ("lacks", "cameras", "issue"),
+    [
+        ((), 4, None),
+        (("cam3", "/tf_static"), 3, "cam3: no transform connects cam3 to cam0"),
+        (("cam2", "/camera_info"), 3, "cam2: no CameraInfo beside /cam2/image_raw"),
+    ],
+)
+def test_a_rig_is_described_by_camera_info_and_transforms(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, lacks: tuple[str, ...], cameras: int, issue: str | None
+) -> None:
+    calibration, frames = simulated("front-rear")
+    monkeypatch.setattr(writer, "CALIBRATION_ATTACHMENT", "something else.yaml")
+    written_as = McapRecordingWriter._write
+
+    def some(self: McapRecordingWriter, topic: str, type_name: str, stamp_ns: int, data: bytes) -> None:
+        if lacks and topic == "/tf_static" and lacks[1] == topic:
+            links = [link for link in messages.decode_frame_links(data) if lacks[0] not in (link.parent, link.child)]
+            data = messages.encode_frame_links(stamp_ns, links)
+        if not lacks or topic != f"/{lacks[0]}{lacks[1]}":
+            written_as(self, topic, type_name, stamp_ns, data)
+
+    monkeypatch.setattr(McapRecordingWriter, "_write", some)
+    with written(tmp_path / "a.mcap", "front-rear") as recording:
+        assert len(recording.calibration.cameras) == cameras
+        first = se3_inverse(calibration.cameras[0].body_from_cam)
+        shown = [c for n, c in enumerate(calibration.cameras) if not lacks or f"cam{n}" != lacks[0]]
+        for ours, wanted in zip(recording.calibration.cameras, shown, strict=True):
+            np.testing.assert_allclose(ours.body_from_cam, first @ wanted.body_from_cam, atol=1e-9)
+        assert recording.calibration.views == (((0, 1), (2, 3)) if cameras == 4 else ((0, 1), (2,)))
+        (other,) = recording.read_frame(1).others
+        (recorded,) = frames[1].others
+        assert other is not None and recorded is not None and recorded.right is not None
+        assert np.array_equal(other.left, recorded.right if lacks[:1] == ("cam2",) else recorded.left)
+        assert any(issue in each.detail for each in recording.issues) if issue else not recording.issues

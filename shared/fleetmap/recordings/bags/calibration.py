@@ -77,18 +77,26 @@ def info_of_images(info: CameraInfo, size_px: tuple[int, int], where: str) -> Ca
 def calibration_of_messages(
     cameras: Sequence[InfoCamera], links: Sequence[FrameLink], imu_frame: str | None, where: str
 ) -> RigCalibration:
-    """Build the calibration from CameraInfo (left first) and transforms between frames.
+    """Build the calibration from CameraInfo (left first, further ones as `mounted` gives them) and transforms between frames.
 
     The body is `imu_frame` if transforms connect it to every camera (the IMU's noise is then the default),
     else the left camera; the right camera's pose then comes from the transforms or from the baseline in its
     projection matrix.
     """
     lenses = [_lens(camera, where) for camera in cameras]
-    found = [_target_from_source(links, imu_frame, camera.frame) if imu_frame else None for camera in cameras]
+    found = [_target_from_source(links, imu_frame, camera.frame) if imu_frame else None for camera in cameras[:2]]
     body_from_cams = [body_from_cam for body_from_cam in found if body_from_cam is not None]
-    has_imu = len(body_from_cams) == len(cameras)
+    has_imu = len(body_from_cams) == len(cameras[:2])
     if not has_imu:
-        body_from_cams = [np.eye(4)] + [_left_from_right(cameras, links, where) for _ in cameras[1:]]
+        body_from_cams = [np.eye(4)] + [_left_from_right(cameras, links, where) for _ in cameras[1:2]]
+    for number in range(2, len(cameras)):
+        before, camera = cameras[number - 1 : number + 1]
+        if camera.frame == before.frame:
+            body_from_cams.append(body_from_cams[-1] @ _left_from_right((before, camera), links, where))
+        else:
+            cam0_from_cam = _target_from_source(links, cameras[0].frame, camera.frame)
+            assert cam0_from_cam is not None, "as `mounted` says"
+            body_from_cams.append(body_from_cams[0] @ cam0_from_cam)
     placed = [
         check_camera(replace(lens, body_from_cam=body_from_cam), f"{where}: {camera.info.frame_id}")
         for lens, body_from_cam, camera in zip(lenses, body_from_cams, cameras, strict=True)
@@ -99,6 +107,19 @@ def calibration_of_messages(
     assumed = (*(["imu"] if has_imu else []), *(["base_from_body"] if base_from_body is None else []))
     base = np.eye(4) if base_from_body is None else base_from_body
     return RigCalibration(tuple(placed), ImuNoise() if has_imu else None, base, assumed)
+
+
+def mounted(cameras: Sequence[InfoCamera], links: Sequence[FrameLink]) -> list[int]:
+    """Numbers of the cameras whose pose is known: the first two, whatever they lack; further ones that transforms connect to the first, and
+    those behind such a one in its frame, with a baseline in the projection."""
+    numbers = list(range(len(cameras[:2])))
+    for number in range(2, len(cameras)):
+        before, camera = cameras[number - 1 : number + 1]
+        is_beside = camera.frame == before.frame and number - 1 in numbers[2:] and camera.info.projection[0, 3] < 0
+        is_linked = camera.frame not in (cameras[0].frame, before.frame)
+        if is_beside or (is_linked and _target_from_source(links, cameras[0].frame, camera.frame) is not None):
+            numbers.append(number)
+    return numbers
 
 
 def frames_not_optical(cameras: Sequence[InfoCamera], links: Sequence[FrameLink]) -> list[str]:

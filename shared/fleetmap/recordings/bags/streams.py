@@ -19,6 +19,7 @@ from fleetmap.recordings.bags.calibration import (
     calibration_of_messages,
     frames_not_optical,
     info_of_images,
+    mounted,
     same_lens,
     setting_of,
 )
@@ -205,8 +206,14 @@ def _parts(
     imu, imu_frame = _imu(roles.get("imu", ()), log)
     lenses: dict[str, _Lenses] = {}
     if given is None and CALIBRATION_ATTACHMENT not in container.attachments:
-        sides = [side for side in ("left", "right") if side in roles]
+        sides = [side for side in (CAMERA_ROLES[:2] if "depth" in roles else CAMERA_ROLES) if side in roles]
         lenses = {side: _lenses(roles[side], roles.get(f"{side}_info", ())) for side in sides}
+        for side in [side for side in sides[1:] if not lenses[side].infos and side not in CAMERA_ROLES[:2]]:
+            log.note(
+                "camera without a lens",
+                f"{side}: no CameraInfo beside {roles[side][0].channel.topic}; its images are not used",
+            )
+            del lenses[side]
     left = _images(roles["left"], "left images", log, lenses.get("left"))
     right = _images(roles["right"], "right images", log, lenses.get("right")) if "right" in roles else None
     depth = _images(roles["depth"], "depth images", log) if "depth" in roles else None
@@ -215,12 +222,16 @@ def _parts(
         (left, right), depth = pair_images(left, right, log), None
     elif depth is not None:
         left, depth = pair_images(left, depth, log, DEPTH_TOLERANCE_NS)
-    calibration = given.calibration if given else _calibration(container, roles, lenses, imu_frame, log)
+    described: tuple[str, ...] = CAMERA_ROLES
+    if given:
+        calibration = given.calibration
+    else:
+        calibration, described = _calibration(container, roles, lenses, imu_frame, log)
     numbers, views = list[int](), tuple[ViewSeries[_Source], ...]()
     if depth is None and len(calibration.cameras) > 1:
-        for number in range(2, min(len(calibration.cameras), len(CAMERA_ROLES))):
-            if (role := CAMERA_ROLES[number]) in roles:
-                alone[number] = _images(roles[role], f"{role} images", log)
+        for number, role in list(enumerate(described))[len(alone) : len(calibration.cameras)]:
+            if role in roles:
+                alone[number] = _images(roles[role], f"{role} images", log, lenses.get(role))
         first, *further = _views_of(calibration, list(alone))
         if len(first) == 1:
             left, right = alone[0], None
@@ -456,12 +467,13 @@ def _note_unregistered(streams: Iterable[_Stream], roles: _Roles, camera: Camera
 
 def _calibration(
     container: Container, roles: _Roles, lenses: Mapping[str, _Lenses], imu_frame: str | None, log: ReadLog
-) -> RigCalibration:
+) -> tuple[RigCalibration, tuple[str, ...]]:
+    """The calibration in the container, and the roles of its cameras."""
     attached = container.attachments.get(CALIBRATION_ATTACHMENT)
     if attached is not None:
         where = f"{container.path}: attachment {CALIBRATION_ATTACHMENT}"
-        return parse_calibration(attached.decode("utf-8", "replace"), where).calibration
-    cameras = []
+        return parse_calibration(attached.decode("utf-8", "replace"), where).calibration, CAMERA_ROLES
+    cameras, sides = [], tuple(lenses)
     for side, told in lenses.items():
         image_topic = roles[side][0].channel.topic
         if not told.infos:
@@ -484,6 +496,11 @@ def _calibration(
     links = [link for stream in streams for _, found in stream.values(stream.decoder.links) for link in found]
     for issue in dict.fromkeys(link.issue for link in links if link.issue):
         log.note("transform not sound", issue)
+    numbers = mounted(cameras, links)
+    for number in sorted({*range(len(cameras))} - {*numbers}):
+        what = f"no transform connects {cameras[number].frame} to {cameras[0].frame}"
+        log.note("camera not mounted", f"{sides[number]}: {what}; its images are not used")
+    cameras, sides = [cameras[number] for number in numbers], tuple(sides[number] for number in numbers)
     for words in frames_not_optical(cameras, links):
         log.note("camera frame not optical", words)
-    return calibration_of_messages(cameras, links, imu_frame, str(container.path))
+    return calibration_of_messages(cameras, links, imu_frame, str(container.path)), sides

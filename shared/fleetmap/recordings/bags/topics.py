@@ -79,16 +79,20 @@ def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str, log: 
     _choose_images(by_topic, chosen, where, log)
     _choose_infos(by_topic, chosen)
     for role, topic in chosen.items():
-        others = [channel for channel in by_topic[topic] if channel.type_name not in _TYPES[role]]
+        others = [channel for channel in by_topic[topic] if channel.type_name not in _types(role)]
         if others:
             names = ", ".join(channel.type_name for channel in others)
             log.note(
-                "messages of another type", f"{topic}: {names} left out; {' or '.join(_TYPES[role])} is read as {role}"
+                "messages of another type", f"{topic}: {names} left out; {' or '.join(_types(role))} is read as {role}"
             )
     return {
-        role: [channel.id for channel in by_topic[topic] if channel.type_name in _TYPES[role]]
+        role: [channel.id for channel in by_topic[topic] if channel.type_name in _types(role)]
         for role, topic in chosen.items()
     }
+
+
+def _types(role: str) -> tuple[str, ...]:
+    return _TYPES.get(role, INFO_TYPES)  # lenses of further cameras have the names that belong to their images
 
 
 def _has_type(by_topic: Mapping[str, list[Channel]], topic: str, types: tuple[str, ...]) -> bool:
@@ -140,7 +144,7 @@ def _camera(topic: str) -> str:
 
 
 def _choose_infos(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str]) -> None:
-    for role in ("left", "right"):
+    for role in CAMERA_ROLES:
         if role not in chosen or f"{role}_info" in chosen:
             continue
         info = next(
