@@ -1,6 +1,7 @@
 """`mapserver verify`, `gc`, `export`, `import` and `audit`: the store as a whole, and versions as files."""
 
 import shlex
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -8,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options, settings_of
-from fleetmap.errors import StoreError
+from fleetmap.errors import BusyError, StoreError
+from fleetmap.mapformat.names import is_name
 from mapserver.commands.options import (
     ActorOptions,
     Json,
@@ -22,7 +24,7 @@ from mapserver.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from mapserver.store import AuditLine
+    from mapserver.store import AuditLine, MapStore
     from mapserver.store.garbage_collection import Garbage
 
 EXIT_STATUS_FAULTS = 3
@@ -119,13 +121,27 @@ def retention(
     from mapserver.nightly.retention import apply_retention
 
     inboxes = [] if inbox is None else [inbox, *(inbox / site for site in sites_of(inbox))]
-    with open_store(store) as maps:
-        removed = apply_retention(maps, settings_of(context).ingest.retention(), inboxes, dry_run=dry_run)
+    with open_store(store) as maps, ExitStack() as locks:
+        free = [each for each in inboxes if not is_name(each.name) or _is_free(maps, each.name, locks)]
+        removed = apply_retention(maps, settings_of(context).ingest.retention(), free, dry_run=dry_run)
+    for each in sorted({*inboxes} - {*free}):
+        typer.echo(f"{each}: a night reads its recordings; it removed what was old at its start", err=True)
     if json:
         print_json(removed)
         return
     for name, count in removed.items():
         typer.echo(f"{name}: {count} {'would be ' if dry_run else ''}removed")
+
+
+def _is_free(maps: "MapStore", site: str, locks: ExitStack) -> bool:
+    """Keep nights of a site away from its recordings until `locks` end; False if one runs."""
+    from mapserver.drafting.job_lock import only_one
+
+    try:
+        locks.enter_context(only_one(maps, site))
+    except BusyError:
+        return False
+    return True
 
 
 def export(

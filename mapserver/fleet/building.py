@@ -14,7 +14,7 @@ from fleetmap.geometry import Array
 from fleetmap.mapformat.building import ALIGNMENT, AREAS
 from mapserver.fleet.survey_requests import ask_for_survey
 from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment, map_corners_m
-from mapserver.floor_plan.areas import Area, Areas, Correction, CorrectionKind, read_areas
+from mapserver.floor_plan.areas import MAX_REASON, Area, Areas, Correction, CorrectionKind, read_areas
 from mapserver.floor_plan.pins import Fit, Pin, fit_pins
 from mapserver.floor_plan.plan_file import PlanFile, upwards
 from mapserver.grid.masks import check_masks_on_map
@@ -42,7 +42,8 @@ def keep_areas(
     for area in after.corrections if current is not None else ():
         if area.correction not in known and area.correction and area.correction.kind is CorrectionKind.FORGET:
             with suppress(UsageError, StateError):  # too large or too many for requests: somebody surveys it
-                ask_for_survey(store, site, [(x, y) for x, y in area.rings[0].tolist()], actor)
+                for ring in area.outlines:
+                    ask_for_survey(store, site, [(x, y) for x, y in ring.tolist()], actor)
     return after
 
 
@@ -53,7 +54,7 @@ def correct_area(store: MapStore, site: str, name: str, kind: CorrectionKind | N
         raise UsageError(
             f"site {site} has no area {name[:80]!r}; see `mapserver areas list`, or draw it on the Maps page"
         )
-    correction = None if kind is None else Correction(kind, actor.reason)
+    correction = None if kind is None else Correction(kind, _one_line(actor.reason))
     changed = [replace(area, correction=correction) if area.name == name else area for area in areas.areas]
     data = to_json(Areas.of(changed).geojson(site))
     return replace_areas(store, site, data, actor, tag=store.areas_tag(site))
@@ -64,6 +65,8 @@ def undo_areas(store: MapStore, site: str, actor: Actor) -> Areas:
     they are as now. Errors as of `keep_areas`.
     """
     store.current(site)  # raises for an unknown site
+    if store.site_file(site, AREAS_BEFORE) is None and store.site_file(site, AREAS) is None:
+        raise StateError(f"the areas of site {site} were never changed; there is nothing to undo")
     store.keep_site_files(site, {AREAS: store.site_file(site, AREAS_BEFORE)}, "last change undone", actor=actor)
     return store.areas(site)
 
@@ -86,12 +89,16 @@ def _dated(data: bytes, areas: Areas, before: Areas, actor: Actor, now_ns: int) 
         if area is None or area.correction is None:
             continue
         known = next((old.correction for old in before.corrections if _is_same(old, area)), None)
-        reason = area.correction.reason.strip() or (known.reason if known else actor.reason)
+        reason = area.correction.reason.strip() or (known.reason if known else _one_line(actor.reason))
         if not reason:
             raise UsageError(f"area {area.name!r}: a correction of the map needs a reason; add it, or --reason")
         since_ns = known.since_ns if known else now_ns + number  # each has another one, by which versions know it
         feature["properties"]["correction"] = {"kind": area.correction.kind, "reason": reason, "since_ns": since_ns}
     return to_json(collection)
+
+
+def _one_line(reason: str) -> str:
+    return " ".join(reason.split())[:MAX_REASON]
 
 
 def _is_same(before: Area, after: Area) -> bool:

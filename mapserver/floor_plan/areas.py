@@ -24,6 +24,7 @@ OUTSIDE = "outside"
 MAX_AREAS_BYTES = 8 << 20
 _MAX_AREAS, _MAX_CORNERS, _MAX_RING = 2000, 50_000, 2000
 _MAX_NAME = 64
+MAX_REASON = 500
 _MAX_M = 1e6
 _EDGES_AT_ONCE = 64
 _SAMPLES = 16  # sample points of a tile each way
@@ -60,7 +61,7 @@ class Correction(msgspec.Struct, frozen=True):
     """Why an area corrects the map, and since when, in nanoseconds since 1970. since_ns: None until the site keeps it."""
 
     kind: CorrectionKind
-    reason: Annotated[str, msgspec.Meta(max_length=500)] = ""
+    reason: Annotated[str, msgspec.Meta(max_length=MAX_REASON)] = ""
     since_ns: Annotated[int, msgspec.Meta(ge=0)] | None = None
 
 
@@ -110,6 +111,13 @@ class Area:
     def size_m2(self) -> float:
         """Sum over the outlines; holes are neglected."""
         return max(abs(_doubled_area(ring)) for ring in self.rings) / 2
+
+    @property
+    def outlines(self) -> list[Array]:
+        """Its rings but for holes: those within no other ring."""
+        return [
+            ring for ring in self.rings if not any(inside_rings(ring[:1], [o])[0] for o in self.rings if o is not ring)
+        ]
 
     def holds(self, points_m: Array) -> NDArray[np.bool_]:
         """Return a mask (N,) of the points (N, 2) inside."""
@@ -251,6 +259,11 @@ def _area(feature: _Feature, map_from_building: Array | None) -> Area:
         raise UsageError(
             f"area {name[:80]!r}: a name has 1 to {_MAX_NAME} printable characters, and is not {OUTSIDE!r}"
         )
+    correction = feature.properties.correction
+    if correction is not None and not correction.reason.isprintable():
+        raise UsageError(
+            f"area {name!r}: the reason of its correction has characters that cannot be shown; write one line"
+        )
     mask, percent = feature.properties.mask, feature.properties.percent
     if (percent is None) == (mask is MaskKind.SPEED):
         raise UsageError(f"area {name!r}: mask {mask and mask.value} with percent {percent}; give {_MASK_WORDS}")
@@ -261,7 +274,7 @@ def _area(feature: _Feature, map_from_building: Array | None) -> Area:
         raise UsageError(f"area {name!r} has no corners; draw it as a polygon")
     if map_from_building is not None:
         rings = [_moved(ring, map_from_building) for ring in rings]
-    return Area(name, tuple(rings), mask, percent, feature.properties.correction)
+    return Area(name, tuple(rings), mask, percent, correction)
 
 
 def _ring(positions: list[list[float]], where: str) -> Array:

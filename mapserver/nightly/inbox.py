@@ -396,12 +396,13 @@ def remove_old(inbox: Path, days: float, now_ns: int, *, dry_run: bool = False) 
         with disk_errors(f"old recordings of {folder} cannot be removed", "check the rights of the inbox"):
             paths = sorted(folder.iterdir()) if folder.is_dir() and not folder.is_symlink() else []
             for path in paths:
-                if path.name.endswith(_REASON) or path.lstat().st_ctime_ns >= now_ns - days * _DAY_S * 1e9:
-                    continue
-                found += 1
-                if not dry_run:
-                    path.unlink() if not path.is_dir() or path.is_symlink() else shutil.rmtree(path)
-                    Path(f"{path}{_REASON}").unlink(missing_ok=True)
+                with suppress(FileNotFoundError):  # removed by somebody else meanwhile
+                    if path.name.endswith(_REASON) or path.lstat().st_ctime_ns >= now_ns - days * _DAY_S * 1e9:
+                        continue
+                    if not dry_run:
+                        path.unlink() if not path.is_dir() or path.is_symlink() else shutil.rmtree(path)
+                        Path(f"{path}{_REASON}").unlink(missing_ok=True)
+                    found += 1
     return found
 
 

@@ -79,7 +79,10 @@ class RobotDrives:
         return self._ended(site, robot, part)
 
     def build(self) -> None:
-        """Start a night of a site whose inbox has a complete drive, unless one runs. The night judges and publishes as always."""
+        """Start a night of a site whose inbox has a complete drive, unless one runs. The night judges and publishes as always. Drives of
+        robots that fell silent are dropped."""
+        with self._lock:
+            self._drop_idle(self._store.now_ns())
         for inbox in sorted(self._nights.inbox.glob("*")):
             if any(_DRIVE.fullmatch(path.name) for path in arrivals(inbox, SETTLE_S, self._store.now_ns()).complete):
                 try:
@@ -104,8 +107,8 @@ class RobotDrives:
     def _begun(self, site: str, robot: str, part: ReplayPart) -> _Drive:
         """Begin a drive, instead of an earlier one of its robot. The caller holds the lock."""
         now_ns, key = self._store.now_ns(), (site, robot)
-        for other in [k for k, each in self._drives.items() if k == key or abs(now_ns - each.heard_ns) > _IDLE_NS]:
-            self._drop(other)
+        self._drop(key)
+        self._drop_idle(now_ns)
         if len(self._drives) >= _MOST_AT_ONCE:
             raise LinkError(f"later: {_MOST_AT_ONCE} robots are already handing in drives")
         if not self._rates.admits(key):
@@ -121,6 +124,10 @@ class RobotDrives:
             raise LinkError(f"later: {error}") from error
         self._drives[key] = _Drive(part.id, part.total_bytes, upload, now_ns)
         return self._drives[key]
+
+    def _drop_idle(self, now_ns: int) -> None:
+        for key in [key for key, each in self._drives.items() if abs(now_ns - each.heard_ns) > _IDLE_NS]:
+            self._drop(key)
 
     def _drop(self, key: tuple[str, str]) -> None:
         if (drive := self._drives.pop(key, None)) is not None:

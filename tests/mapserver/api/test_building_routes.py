@@ -100,8 +100,30 @@ def test_a_correction_keeps_its_moment_and_reason_until_it_is_another(server: Se
         (["correct", "a", "nothing"], "a: 12.0 m2\n"),
     ):
         assert CliRunner().invoke(app, ["areas", *words, *site]).output == said
+    several = [*site[:-1], "two\nlines" + " of many words" * 40]
+    assert CliRunner().invoke(app, ["areas", "correct", "a", "freeze", *several]).exit_code == 0
+    assert kept()[0][1].startswith("two lines of many") and len(kept()[0][1]) >= 499
+    assert CliRunner().invoke(app, ["areas", "correct", "a", "nothing", *site]).exit_code == 0
     assert "1 areas, as before" in CliRunner().invoke(app, ["areas", "undo", *site]).output
     assert [name for name, *_ in kept()] == ["a"]
+
+
+def test_what_was_never_changed_cannot_be_undone(server: Server) -> None:
+    check_problem(server.client.post(f"{AREAS}/undo", json=ADA), 409, "nothing to undo")
+    put(server, drawn("a"))
+    assert server.client.post(f"{AREAS}/undo", json=ADA).json()["features"] == []
+
+
+def test_every_part_of_an_area_to_forget_is_requested(server: Server) -> None:
+    """Not its hole."""
+    area = json.loads(drawn("racks", correction={"kind": "forget", "reason": "new"}))
+    (outer,) = area["features"][0]["geometry"]["coordinates"]
+    hole = [[1.0, 1.0], [2.0, 1.0], [2.0, 2.0], [1.0, 2.0], [1.0, 1.0]]
+    beside = [[x + 10.0, y] for x, y in outer]
+    area["features"][0]["geometry"] = {"type": "MultiPolygon", "coordinates": [[outer, hole], [beside]]}
+    assert put(server, json.dumps(area).encode()).status_code == 200
+    corners = [request.corners_map_m[0] for request in server.store.survey_requests("lab")]
+    assert sorted(corners) == [[0.0, 0.0], [10.0, 0.0]]
 
 
 @pytest.mark.parametrize(
@@ -114,6 +136,8 @@ def test_a_correction_keeps_its_moment_and_reason_until_it_is_another(server: Se
         (drawn("a", frame="building"), 422, "need the map's pose"),
         (drawn("a", mask="speed"), 422, "percent"),
         (drawn("a", correction={"kind": "burn", "reason": "x"}), 422, "burn"),
+        (drawn("a", correction={"kind": "freeze", "reason": "\x1b[2J"}), 422, "cannot be shown"),
+        (drawn("a", correction={"kind": "freeze", "reason": "x" * 501}), 422, "length <= 500"),
         (drawn("a").replace(b"[4, 3]", b"[0, 3.5]").replace(b"[0, 3]", b"[4, 4]"), 422, "crosses itself"),
         (drawn("a", mask="keep-out").replace(b"4", b"904").replace(b"[0", b"[900"), 422, "outside of version 1"),
         (b" " * (8 << 20) + b"x", 413, "more than 8388608 bytes"),

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ from fleetmap.errors import StateError
 from fleetmap.geometry import se3
 from mapserver import releases
 from mapserver.cli import app
+from mapserver.drafting.job_lock import only_one
 from mapserver.nightly.inbox import BAD, DONE, HELD, put_away, remove_old
 from mapserver.store import FleetRetention, MapStore
 from mapserver.survey.merge.area_corrections import CLOCKS_BEGIN_NS
@@ -83,6 +85,32 @@ def test_recordings_that_were_put_away_go_and_others_stay(inbox: Path) -> None:
     left = sorted(str(path.relative_to(inbox)) for path in inbox.rglob("*"))
     assert left == ["bad", "done", "held", "tonight.mcap"]
     assert Path("/etc/passwd").exists()
+
+
+def test_a_night_that_reads_its_recordings_keeps_them(inbox: Path, tmp_path: Path) -> None:
+    """Also of a build: it begins with the recordings that its night left."""
+    config = tmp_path / "site.toml"
+    config.write_text("[ingest]\nrecording_days = 1e-9\n")
+    command = ["retention", "--store", tmp_path / "store", "--inbox", inbox.parent, "--config", config]
+    with MapStore.open(tmp_path / "store", create=True) as store, only_one(store, "lab"):
+        done = CliRunner().invoke(app, [str(word) for word in command])
+        assert (done.exit_code, "a night reads its recordings" in done.stderr) == (0, True), done.output
+    assert (inbox / "done/single.mcap").exists()
+    done = CliRunner().invoke(app, [str(word) for word in command])
+    assert "recordings of surveys: 5 removed" in done.stdout
+
+
+def test_a_recording_that_somebody_else_removes_meanwhile_ends_nothing(
+    inbox: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    removed = shutil.rmtree
+
+    def twice(path: Path) -> None:
+        removed(path)
+        removed(path)
+
+    monkeypatch.setattr(shutil, "rmtree", twice)
+    assert remove_old(inbox, 1.0, time.time_ns() + 2 * DAY_S * 10**9) == 2, "the file and the link"
 
 
 def test_the_command_takes_its_periods_from_the_file(inbox: Path, tmp_path: Path) -> None:
