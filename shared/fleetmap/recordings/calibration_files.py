@@ -31,17 +31,25 @@ from typing import Any
 import cv2
 import numpy as np
 import yaml
+from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.recordings.files import read_text
 from fleetmap.recordings.images import StoredImage, decode_grey
 from fleetmap.recordings.limits import MAX_CALIBRATION_BYTES, MAX_IMAGE_BYTES
-from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, Polygon, RigCalibration, check_camera
+from fleetmap.sensors.calibration import (
+    CameraCalibration,
+    ImuNoise,
+    Polygon,
+    RigCalibration,
+    check_camera,
+    hidden_pixels,
+)
 from fleetmap.sensors.cameras import lens_of
 
 _SAFE_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_MAX_WORD, _MAX_DEPTH, _MAX_EVENTS = 1000, 16, 20_000
+_MAX_WORD, _MAX_DEPTH, _MAX_EVENTS = 1000, 16, 80_000
 _WORDS = reprlib.Repr()
 _WORDS.maxlevel = 2
 _NOISE_KEYS = {
@@ -62,7 +70,7 @@ _IMU_INTRINSICS: dict[str, Any] = {
     "time_offset": 0.0,
 }
 _LARGEST_PX = 32_768
-_MOST_CORNERS = 4000  # of a mask's polygons
+_MOST_CORNERS = 1000  # of a mask's polygons: those of 16 cameras are 64,000 values
 Values = Mapping[str, Any]
 
 
@@ -340,6 +348,15 @@ def _mask(value: object, size_px: tuple[int, int], where: str, folder: Path | No
         )
     if any(len(polygon) < 3 for polygon in polygons) or not (np.abs(corners) <= _LARGEST_PX).all():
         raise CalibrationError(f"{where} is {_brief(value)}; a polygon has three corners or more, near the image")
+    for polygon in polygons:
+        low, high = np.min(polygon, axis=0), np.max(polygon, axis=0)
+        if (high < 0).any() or (low > np.array(size_px) - 1).any():
+            raise CalibrationError(
+                f"{where}: the polygon from {low.tolist()} to {high.tolist()} lies outside of the {size_px[0]}x{size_px[1]} image; is it "
+                "for another resolution?"
+            )
+    if hidden_pixels(polygons, size_px).all():
+        raise CalibrationError(f"{where} hides the whole image; of an image as mask, 0 is what may be used")
     return polygons
 
 
@@ -350,19 +367,29 @@ def _outlines(name: str, size_px: tuple[int, int], where: str, folder: Path | No
             f"{where}: {name[:80]!r} is not a file beside the calibration; write its polygons instead"
         )
     try:
-        if (folder / name).stat().st_size > MAX_IMAGE_BYTES:
-            raise CalibrationError(f"{where}: {name} is too large for an image")
-        image = decode_grey(StoredImage("file", (folder / name).read_bytes(), str(folder / name)))
+        if not (folder / name).is_file() or (folder / name).stat().st_size > MAX_IMAGE_BYTES:
+            raise CalibrationError(f"{where}: {name} is not there, no file or too large for an image")
+        stored = StoredImage("file", (folder / name).read_bytes(), str(folder / name))
+        size_of_image_px = decode_grey(stored).shape[::-1]  # within the limits of images
     except (OSError, RecordingError) as error:
         raise CalibrationError(f"{where}: {name} cannot be read: {error}") from error
-    if image.shape[::-1] != size_px:
+    if size_of_image_px != size_px:
         width, height = size_px
         raise CalibrationError(
-            f"{where}: {name} is {image.shape[1]}x{image.shape[0]}, the camera's images are {width}x{height}"
+            f"{where}: {name} is {size_of_image_px[0]}x{size_of_image_px[1]}, the camera's images are {width}x{height}"
         )
-    contours, _ = cv2.findContours((image > 0).astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
-    outlines = [cv2.approxPolyDP(contour, 1.0, closed=True).reshape(-1, 2) for contour in contours]
-    return tuple(tuple((float(u), float(v)) for u, v in outline) for outline in outlines if len(outline) > 2)
+    image = cv2.imdecode(np.frombuffer(stored.data, np.uint8), cv2.IMREAD_UNCHANGED)
+    shown = np.atleast_3d(np.asarray(image))[:, :, :3].any(axis=2)
+    contours, _ = cv2.findContours(np.asarray(shown, np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
+    outlines = [_simplified(np.asarray(contour, np.int32).reshape(-1, 2)) for contour in contours]
+    return tuple(tuple((float(u), float(v)) for u, v in outline) for outline in outlines)
+
+
+def _simplified(contour: NDArray[np.int32]) -> NDArray[np.int32]:
+    """A contour (N, 2) to one pixel; that of a thin line, which would vanish, as it is, with three corners or more."""
+    fewer = cv2.approxPolyDP(contour, 1.0, closed=True).reshape(-1, 2)
+    kept = fewer if len(fewer) > 2 else contour
+    return np.concatenate([kept, np.repeat(kept[-1:], max(0, 3 - len(kept)), axis=0)])
 
 
 def _imu_noise(values: Values, where: str) -> ImuNoise | None:

@@ -1,5 +1,6 @@
 """Parts of a camera's image that show the robot itself: nothing is found, tracked or expected there."""
 
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -204,3 +205,57 @@ def test_an_invalid_mask_is_refused(tmp_path: Path, value: str, words: str) -> N
 def test_a_recordings_own_calibration_names_no_file() -> None:
     with pytest.raises(CalibrationError, match="polygons instead"):
         parse_calibration(with_mask("robot.png"), "text")
+
+
+def camchain(mask: object, cameras: int = 1) -> str:
+    first = rig(None).cameras[0]
+    text = format_calibration(RigCalibration((first,) * cameras))
+    return text.replace("  T_cam_imu:", f"  mask: {mask}\n  T_cam_imu:")
+
+
+@pytest.mark.parametrize(
+    ("mask", "words"),
+    [
+        ([[[400, 10], [500, 10], [500, 90]]], "outside of the 320x200 image"),
+        ([[[-90, 10], [-5, 10], [-5, 90]]], "outside of the 320x200 image"),
+        ([[[-1, -1], [320, -1], [320, 200], [-1, 200]]], "hides the whole image"),
+        ([[[0, 0], [1, 0]]], "three corners or more"),
+        ([[[0, 0], [1, 0], [float("inf"), 1]]], "near the image"),
+        ([[[u, u % 2] for u in range(1200)]], "1200 corners"),
+        ("white.png", "hides the whole image"),
+        ("missing.png", "missing.png is not there"),
+        ("pipe", "pipe is not there, no file"),
+        (".", "is not there, no file"),
+        ("small.png", "small.png is 32x20"),
+        ("bomb.png", "bomb.png cannot be read"),
+        ("../white.png", "not a file beside the calibration"),
+    ],
+)
+def test_a_mask_that_cannot_be_meant_is_refused(tmp_path: Path, mask: object, words: str) -> None:
+    for name, size_px in (("white", SIZE_PX), ("small", (32, 20))):
+        cv2.imwrite(str(tmp_path / f"{name}.png"), np.full(size_px[::-1], 255, np.uint8))
+    head = bytearray((tmp_path / "small.png").read_bytes())
+    head[16:24] = (30_000).to_bytes(4, "big") * 2
+    (tmp_path / "bomb.png").write_bytes(head)
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "cams.yaml").write_text(camchain(mask))
+    with pytest.raises(CalibrationError, match=words):
+        read_calibration(tmp_path / "cams.yaml")
+
+
+@pytest.mark.parametrize("kind", ["16 bits", "blue"])
+def test_every_value_but_0_hides_also_thin_lines(tmp_path: Path, kind: str) -> None:
+    """A cable of two pixels, an aerial of one, and a spot; in the least value of 16 bits, or of one colour."""
+    shown = np.zeros((CAMERA.height_px, CAMERA.width_px), bool)
+    shown[20:180, 40:42] = shown[30:150, 90] = shown[100, 200] = True
+    image = shown.astype(np.uint16) if kind == "16 bits" else np.dstack([shown, 0 * shown, 0 * shown]).astype(np.uint8)
+    cv2.imwrite(str(tmp_path / "robot.png"), image)
+    (tmp_path / "cams.yaml").write_text(camchain("robot.png"))
+    mask = read_calibration(tmp_path / "cams.yaml").cameras[0].mask
+    np.testing.assert_array_equal(hidden_pixels(mask, SIZE_PX), shown)
+
+
+def test_masks_of_many_cameras_are_read_as_they_were_written() -> None:
+    corners = [[float(u), float(100 + u % 7)] for u in range(300)] * 3
+    found = parse_calibration(camchain([corners], cameras=16), "x").calibration
+    assert parse_calibration(format_calibration(found), "y").calibration.cameras[15].mask == found.cameras[15].mask
