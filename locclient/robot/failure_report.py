@@ -72,10 +72,15 @@ def match_view(left: Image, matches: Matches, title: str) -> Canvas:
 
 
 def without_detail(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Return an image (H, W) reduced to 32 pixels of width and enlarged again: light and dark areas, without faces and text."""
+    """Return an image (H, W) reduced to 32 pixels of width and enlarged again: light and dark areas, without faces and text.
+
+    Smoothed by a Gaussian of one of those pixels first. Else several pictures of a moving camera would show more than one does: each
+    samples what lies between the pixels of the others. At their Nyquist frequency it leaves 0.7 % of the contrast, less than a grey level.
+    """
     height_px, width_px = image.shape
     coarse = _COARSE_PX, max(1, round(_COARSE_PX * height_px / width_px))
-    few = cv2.resize(image, coarse, interpolation=cv2.INTER_AREA)
+    smooth = cv2.GaussianBlur(image, (0, 0), max(width_px / _COARSE_PX, 1e-3), borderType=cv2.BORDER_REPLICATE)
+    few = cv2.resize(smooth, coarse, interpolation=cv2.INTER_AREA)
     return np.asarray(cv2.resize(few, (width_px, height_px), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 

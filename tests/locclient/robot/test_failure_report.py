@@ -6,6 +6,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pytest
 
 from fleetmap.geometry import se3, so3_exp
 from fleetmap.messages import MAX_MESSAGE_BYTES, MAX_THUMBNAIL_BYTES, encode_message
@@ -117,3 +118,14 @@ def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
     written = json.loads(write_failure(tmp_path / "failures", report).read_text())
     assert written["cause"] == "dark"
     assert all((tmp_path / "failures" / name).stat().st_size > 100 for name in written["thumbnails"])
+
+
+@pytest.mark.parametrize("period", [0.7, 1.3, 1.7])
+@pytest.mark.parametrize("width_px", [240, 320, 640])
+def test_many_blurred_pictures_show_no_more_than_one(width_px: int, period: float) -> None:
+    """Stripes finer than two of the 32 pixels leave no trace, wherever they lie: frames of a moving camera cannot be put together."""
+    columns = np.arange(width_px) / (width_px / 32)
+    shown = [128.0 + 100.0 * np.sin(2.0 * np.pi * (columns / period + shift)) for shift in np.linspace(0.0, 1.0, 20)]
+    blurred = [without_detail(np.tile(each.astype(np.uint8), (width_px // 2, 1))) for each in shown]
+    middle = np.array(blurred)[:, width_px // 4, width_px // 5 : -width_px // 5].astype(float)
+    assert np.ptp(middle, axis=0).max() <= 2.0, "grey levels, of rounding"
