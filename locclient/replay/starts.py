@@ -56,8 +56,8 @@ def starts(
             frame = shown[start + number]
             imu = before if number else before.between(frame.stamp_ns - _IMU_LEAD_NS, 1 << 62)
             outcome = robot.handle(SensorBundle(frame, imu, list(part.wheel_before(number) if number else []), []))
-            assert outcome is not None, "the bundle holds a frame"
-            found.append(outcome.estimate)
+            if outcome is not None:
+                found.append(outcome.estimate)
         yield found
 
 

@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import UsageError
+from fleetmap.geometry import se3
+from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from locclient import cli
 from locclient.maps.map_source import LocalMapSource
 from locclient.prior_option import parse_prior
 from mapserver import releases
 from mapserver.store import MapStore
-from support.recordings.recording_samples import make_sample, write_euroc
+from support.recordings.recording_samples import calibration, make_sample, write_euroc
 from support.storage.map_samples import save_sample_draft
 from support.worlds import robot_world
 
@@ -186,3 +188,24 @@ def test_frames_that_cannot_be_decoded_are_left_out(
             assert ended == 3
             assert "2 of 3 frames cannot be read; the first: " in told.err
             assert "image0.jpg: " in told.err
+
+
+def test_a_rig_whose_covered_front_is_faster_than_its_rear_is_replayed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames in which the followed view has no image are left out."""
+    known, turned = calibration(), se3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    front = tuple(replace(camera, body_from_cam=turned @ camera.body_from_cam) for camera in known.cameras)
+    with MapStore.open(tmp_path / "store", create=True) as maps:
+        robot_world.save(maps)
+    with McapRecordingWriter(tmp_path / "rig.mcap", replace(known, cameras=(*front, *known.cameras))) as writer:
+        for number, bundle in enumerate(robot_world.bundles(50)):
+            dark = np.zeros_like(bundle.frame.left)
+            seen = replace(bundle.frame, left=dark, right=dark, others=(None if number % 2 else bundle.frame,))
+            writer.write_imu(bundle.imu)
+            writer.write_frame(seen)
+    arguments = "--site", "room", "--store", tmp_path / "store", "--report", tmp_path / "report.json"
+    assert status(monkeypatch, "replay", tmp_path / "rig.mcap", *arguments) == 0
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert 20 <= report["frames"] <= 30
+    assert report["localised_share_of_all"] > 0.5
