@@ -175,6 +175,15 @@ def test_many_names_are_one_site_and_one_request(scene: Scene, monkeypatch: pyte
         scene.send("r3")
 
 
+def test_what_a_silent_robot_has_sent_does_not_stay(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene.send(until=4096)
+    scene.drives.build()
+    assert len(scene.arrived()) == 1
+    monkeypatch.setattr(robot_drives, "_IDLE_NS", -1)
+    scene.drives.build()
+    assert scene.arrived() == []
+
+
 def test_robots_are_bounded(scene: Scene) -> None:
     for number in range(robot_drives.DRIVE_BURST):
         scene.send(name=f"{number:08x}")
