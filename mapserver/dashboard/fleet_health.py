@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import scipy
@@ -11,6 +11,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.failure_summary import FailureSummary, decode_summary
 from fleetmap.messages import CameraNote
 from mapserver.dashboard.fleet_parts import Trial, trial_of
+from mapserver.fleet.alerts import Alert
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet.resurvey_list import resurvey_list
 from mapserver.fleet_statistics.area_trend import AreaTrend, area_trends
@@ -34,7 +35,7 @@ class SiteHealth:
     """A site's figures. day: the last 24 h; week: the 7 days before; days: rates of 24 h each, oldest first, the last ends now.
 
     robots: each one's figures of the last 24 h. trend: how day compares with week, in words. areas: the last 7 days beside the 7 before
-    them by named area, or by tile where has_areas says that none is named; week_since_ns: when those 7 days began.
+    them by named area, or by tile where has_areas says that none is named, from week_since_ns on. alerts: of the site and the server.
     """
 
     day: Kpis
@@ -47,15 +48,18 @@ class SiteHealth:
     areas: tuple[AreaTrend, ...]
     has_areas: bool
     week_since_ns: int
+    alerts: tuple[Alert, ...]
 
 
 class HealthData:
     """Reads fleet health from an open store. Thread-safe; errors are the store's."""
 
     def __init__(
-        self, store: MapStore, canary: CanarySettings, resurvey: ResurveySettings, clock_ns: Callable[[], int]
-    ) -> None:
+        self, store: MapStore, canary: CanarySettings, resurvey: ResurveySettings, clock_ns: Callable[[], int],
+        alerts: Callable[[int], Iterable[Alert]],
+    ) -> None:  # fmt: skip
         self._store, self._canary, self._resurvey, self._clock_ns = store, canary, resurvey, clock_ns
+        self._alerts = alerts
         self._lock = threading.Lock()
         self._cached: dict[str, tuple[int, SiteHealth]] = {}
 
@@ -128,6 +132,7 @@ class HealthData:
             tuple(self._area_trends(site, next_hour - WEEK_H, next_hour)),
             has_areas,
             (next_hour - WEEK_H) * HOUR_NS,
+            tuple(alert for alert in self._alerts(now_ns) if alert.site in {"", site}),
         )
 
     def area_trends(self, site: str, since_ns: int | None, until_ns: int | None) -> list[AreaTrend]:
@@ -173,10 +178,8 @@ def trend_words(day: Counters, week: Counters) -> str:
     if total == 0:
         return "none in the week before either"
     share = day.robot_days / (day.robot_days + week.robot_days)
-    if (
-        2 * (1 - float(scipy.special.bdtr(day.position_failures - 1, total, share)) if day.position_failures else 1.0)
-        < _SIGNIFICANCE
-    ):
+    fewer = float(scipy.special.bdtr(day.position_failures - 1, total, share)) if day.position_failures else 0.0
+    if 2 * (1 - fewer) < _SIGNIFICANCE:
         return "more than in the week before"
     if 2 * float(scipy.special.bdtr(day.position_failures, total, share)) < _SIGNIFICANCE:
         return "fewer than in the week before"

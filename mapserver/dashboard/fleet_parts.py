@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Sequence
 from typing import NamedTuple
 
-from mapserver.dashboard.rendering import share
+from mapserver.dashboard.rendering import begun, share
 from mapserver.fleet_statistics.canary_decision import CanaryFinding
 from mapserver.fleet_statistics.kpis import Kpis, Rate, driven_words, figure, format_rate, is_telling
 from mapserver.fleet_statistics.robot_calibration import CalibrationFigure
@@ -90,7 +90,7 @@ def trial_words(trial: Trial, moment: Callable[[int | None], str | None]) -> tup
     tone, sentence = _TRIAL_WORDS[canary.state]
     when = moment(canary.started_ns if canary.ended_ns is None else canary.ended_ns)
     words = f"Version {canary.version} {sentence.format(share=share(canary.share), when=when)}."
-    return tone, words, f"{finding[:1].upper()}{finding[1:]}." if finding else ""
+    return tone, words, f"{begun(finding)}." if finding else ""
 
 
 def trials_shown(

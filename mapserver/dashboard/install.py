@@ -1,6 +1,7 @@
 """Installation of the dashboard in the API's server: pages under /dashboard, and their pictures."""
 
 import time
+from functools import partial
 from typing import Literal
 
 from fastapi import FastAPI, Request, Response
@@ -28,6 +29,7 @@ from mapserver.dashboard.console import PATH, Console, Services
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots
+from mapserver.fleet.alerts import active_alerts
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.live_surveys import LiveSurveys
 from mapserver.store import MapStore
@@ -36,9 +38,10 @@ from mapserver.store import MapStore
 def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: ApiSettings, surveys: LiveSurveys) -> None:
     """Adds the pages to `app`."""
     inbox = None if settings.nights is None else settings.nights.inbox
+    alerts = partial(active_alerts, store, fleet, settings.alerts)
     services = Services(
         MapData(store, settings.gate, settings.canary.share, inbox),
-        HealthData(store, settings.canary, settings.resurvey, time.time_ns),
+        HealthData(store, settings.canary, settings.resurvey, time.time_ns, alerts),
         LiveRobots(fleet, time.monotonic),
         settings,
         surveys,

@@ -10,7 +10,7 @@ from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.data import EVER, MapData
 from mapserver.dashboard.map_layers import Layer, Outline, Picture, box_of, heat, squares
 from mapserver.dashboard.plan import Plan
-from mapserver.dashboard.rendering import share, size
+from mapserver.dashboard.rendering import begun, share, size
 from mapserver.drafting.area_corrections import waiting
 from mapserver.floor_plan.alignment import Alignment
 from mapserver.floor_plan.areas import Area, Areas
@@ -79,7 +79,8 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         return {"shown": None}
     info, plan, requests = maps.store.version(site, shown), maps.plan(site, shown), maps.store.survey_requests(site)
     changes, compares = _changes(maps, context, rows, before, after or shown), "after" in context.query
-    forgets = _waiting(maps, site)
+    forgets, now_ns = _waiting(maps, site), time.time_ns()
+    lately = maps.store.events(site, (now_ns - _COURSES_NS, now_ns))
     drawn = [area.rings[0].round(2).tolist() for area in forgets]  # requests of their own, which hide nothing
     others = [one for one in requests if one.corners_map_m not in drawn]
     asked_for = [Outline([[(x, y) for x, y in one.corners_map_m]], f"survey {one.id}") for one in others]
@@ -106,16 +107,11 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         "waiting": [area.name for area in forgets],
         "areas": sorted(maps.store.areas(site).areas, key=lambda area: area.name),
         "requests": requests,
-        "courses": courses((e.stamp_ns, e.kind, e.detail) for e in maps.store.events(site, _lately())),
+        "courses": courses((e.stamp_ns, e.kind, e.detail) for e in lately),
         "kept": {"version": asked},
         "events": events if span_ns == EVER else maps.store.events(site, span_ns)[::-1][:_EVENTS_SHOWN],
         "no_events": "No events yet." if span_ns == EVER else "Nothing happened in this time.",
     }
-
-
-def _lately() -> tuple[int, int]:
-    now_ns = time.time_ns()
-    return now_ns - _COURSES_NS, now_ns
 
 
 def _waiting(maps: MapData, site: str) -> list[Area]:
@@ -163,7 +159,7 @@ def _card(
         "tone": tone,
         "state": state,
         "gate": verdict_words(verdict, info.state == "draft"),
-        "done": f"{_begun(done)}{by}",
+        "done": f"{begun(done)}{by}",
         "stamp_ns": stamp_ns,
         "why": event.reason if event else "",
         "robots": f"{runs} of {len(robots)} robots" if runs else "",
@@ -183,32 +179,33 @@ def _acts(
     to, back = f"sites/{site}/versions/{version}", f"sites/{site}/rollback"
     everybody = f"all {robots} robots of {site}" if robots != 1 else f"the robot of {site}"
     retires = f"Version {version} is retired; it can be made current again later."
+    gets += f" The trial of version {trial.version} ends." if trial is not None else ""
     if trial is not None and trial.version == version:
         told = f"The robots with version {version} ({share(trial.share)} of all) go back to version {trial.base_version}. {retires}"
         yield f"Stop trying version {version}", back, told, {"canary": trial.id}, "back", True
     if info.state == "current":
         if trial is None and before is not None:
-            told = f"{_begun(everybody)} go from version {version} back to version {before}. {retires}"
+            told = f"{begun(everybody)} go from version {version} back to version {before}. {retires}"
             yield f"Roll back to version {before}", back, told, {"to": before}, "back", True
         return
     through = f"Draft {version} goes through the gate. If the gate accepts it, " if info.state == "draft" else ""
     if info.state == "draft":
-        told = f"{_begun(f'{through}{everybody}')} get it.{gets}"
+        told = f"{begun(f'{through}{everybody}')} get it.{gets}"
         yield f"Publish draft {version}", f"{to}/publish", told, {}, "forward", False
         if verdict is not None and verdict.reasons and set(verdict.reasons) <= set(verdict.report.get("unjudged", ())):
             told = (
                 f"You say that the calibration of draft {version} is right although no recording judged it: all later versions keep "
-                f"its metres. {_begun(everybody)} get it.{gets}"
+                f"its metres. {begun(everybody)} get it.{gets}"
             )
             trusts = {"trust_calibration": True}
             yield f"Trust its calibration, publish draft {version}", f"{to}/publish", told, trusts, "back", True
         elif verdict is not None and verdict.reasons:
-            told = f"The gate refused draft {version}. {_begun(everybody)} get it all the same, if they could use it at all.{gets}"
+            told = f"The gate refused draft {version}. {begun(everybody)} get it all the same, if they could use it at all.{gets}"
             yield f"Publish draft {version} by force", f"{to}/publish", told, {"force": True}, "back", True
     elif version != before or trial is not None:
         is_back = current is not None and version < current
         ends = ", ending its trial" if trial is not None and trial.version == version else ""
-        told = f"{_begun(everybody)} go from version {current} to version {version}.{gets}{' The trial ends.' if trial else ''}"
+        told = f"{begun(everybody)} go from version {current} to version {version}.{gets}"
         words = f"{'Go back to' if is_back else 'Promote'} version {version}{ends}"
         yield words, f"{to}/promote", told, {}, "back" if is_back else "forward", is_back
     if current is not None and trial is None and version > current:
@@ -259,10 +256,6 @@ def verdict_words(verdict: VerdictRow | None, is_draft: bool) -> tuple[str, str]
     return tone, f"{said}: {verdict.reasons[0]}{more}."
 
 
-def _begun(words: str) -> str:
-    return f"{words[:1].upper()}{words[1:]}"
-
-
 def _gate(maps: MapData, info: VersionInfo, verdict: VerdictRow | None) -> dict[str, object] | None:
     """What the gate found, or would find in a draft; None where it never looked."""
     answers = ("accepted", "refused")
@@ -275,15 +268,15 @@ def _gate(maps: MapData, info: VersionInfo, verdict: VerdictRow | None) -> dict[
     for name in report.get("passed", ()):
         tried = (evidence.get(_FRAMES.get(name)) or {}).get("draft")
         told = f": {tried['localised_share']:.0%} of {tried['frames']} localised" if tried else ""
-        passed.append(f"{_begun(CHECKS[name])}{told}")
+        passed.append(f"{begun(CHECKS[name])}{told}")
     not_judged = report.get("not_judged", ())
-    unknown = [f"{_begun(CHECKS[name])}: {_UNKNOWN[name]}" if name in CHECKS else name for name in not_judged]
+    unknown = [f"{begun(CHECKS[name])}: {_UNKNOWN[name]}" if name in CHECKS else name for name in not_judged]
     return {
         "tone": "good" if verdict.accepted else "bad",
         "words": f"The gate {answers[not verdict.accepted]} it.",
-        "failed": [_begun(reason) for reason in verdict.reasons],
+        "failed": [begun(reason) for reason in verdict.reasons],
         "passed": passed,
-        "warned": [_begun(warning) for warning in report.get("warnings", ())],
+        "warned": [begun(warning) for warning in report.get("warnings", ())],
         "not_judged": unknown,
     }
 
@@ -296,18 +289,14 @@ def _facts(maps: MapData, info: VersionInfo, plan: Plan) -> list[tuple[str, obje
         for name, (words, pattern) in _FIGURES.items()
         if isinstance(report.get(name), int | float)
     ]
-    has_vocabulary = shipped_vocabulary(info.vocabulary_sha256) is not None
-    download = size(info.map_bytes + (0 if has_vocabulary else info.vocabulary_bytes))
-    words = "the vocabulary is on every robot" if has_vocabulary else f"{size(info.vocabulary_bytes)} of it vocabulary"
+    is_shipped = shipped_vocabulary(info.vocabulary_sha256) is not None  # then every robot has it
     pairs += [
         ("Built on", f"version {info.parent}" if info.parent else "nothing: it is the first"),
         ("For robots", f"{info.landmarks} landmarks and {plan.places} places"),
         ("Area with tiles", f"{len(plan.tiles) * plan.tile_size_m**2:.0f} m² in {info.tiles} tiles"),
-        ("Download for a robot", f"{download}; {words}"),
+        ("Download for a robot", size(info.map_bytes + (0 if is_shipped else info.vocabulary_bytes))),
     ]
-    loops, findings = report.get("loops"), report.get("findings")
-    if isinstance(loops, dict):
-        pairs.append(("Loops", f"{loops.get('accepted', 0)} accepted of {loops.get('candidates', 0)} candidates"))
+    findings = report.get("findings")
     recordings = ", ".join(f"{entry.name} ({entry.frames} frames)" for entry in manifest.recordings)
     pairs += [
         ("Recordings", recordings),
@@ -367,7 +356,6 @@ def _changed(found: Difference) -> list[tuple[str, object]]:
         ("Landmarks", landmarks),
         ("Landmarks that moved", moved),
         ("A robot downloads", f"{size(found.fetch_bytes)} of {size(found.full_bytes)}"),
-        ("Vocabulary", "changed" if found.vocabulary_changed else "unchanged"),
     ]
     for name, (words, pattern) in _FIGURES.items():
         both = found.quality.get(name)

@@ -5,18 +5,26 @@ pages; the Overview is kept up to date by a stream of server-sent events.
 import time
 
 from mapserver.dashboard import fleet_parts
-from mapserver.dashboard.console import PageContext, Services, scene_of
+from mapserver.dashboard.console import PAGES, PageContext, Services, scene_of
 from mapserver.dashboard.data import EVER
 from mapserver.dashboard.fleet_health import SiteHealth
 from mapserver.dashboard.fleet_parts import Bars, Figure
 from mapserver.dashboard.live import LiveRobot, LiveSite
 from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
-from mapserver.dashboard.rendering import age, share
+from mapserver.dashboard.map_page import verdict_words
+from mapserver.dashboard.rendering import age, begun, share
 from mapserver.fleet_statistics.area_trend import trend_sentence
-from mapserver.fleet_statistics.kpis import Rate, driven_words, figure, is_telling
+from mapserver.fleet_statistics.kpis import Rate, figure, is_telling
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.floor_plan.areas import OUTSIDE, Areas
 
+# The page that says more of an alert; those of robots and trials have words of their own.
+_ALERTS = {
+    "FleetmapNightFailed": "surveys",
+    "FleetmapFailureRate": "failures",
+    "FleetmapDiskFills": "administration",
+    "FleetmapTrustFault": "administration",
+}
 _MANY = 20  # robots, whose places say better than the map's tiles what to show first
 
 
@@ -47,7 +55,7 @@ def now(services: Services, context: PageContext) -> dict[str, object]:
     robots = sorted(live.robots, key=lambda robot: robot.tone in {"good", "quiet"} and not _is_troubled(robot))
     return {
         "line": site_line(live),
-        "notices": _notices(context, health),
+        "notices": _notices(services, context, health),
         "figures": _figures(live, health),
         "robots": [_robot(context, robot, health, areas) for robot in robots],
         "marks": _marks(context, live),
@@ -67,10 +75,8 @@ def site_line(live: LiveSite) -> dict[str, str]:
     counts = ((lost, "not localised"), (unsure, "uncertain"), (troubled, "localised with a problem"))
     parts = [f"{count} {words}" for count, words in counts if count]
     if not parts:
-        words = (
-            f"All {len(online)} robots online are localised." if len(online) > 1 else f"{online[0].name} is localised."
-        )
-        return {"tone": "good", "words": words}
+        all_of_them = f"All {len(online)} robots online are" if len(online) > 1 else f"{online[0].name} is"
+        return {"tone": "good", "words": f"{all_of_them} localised."}
     told = f"Of {len(online)} robot{'s' * (len(online) > 1)} online: {', '.join(parts)}."
     return {"tone": "bad" if lost else "warn", "words": told}
 
@@ -111,11 +117,8 @@ def _robot(context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Ar
     words, own = remarks(robot), health.robots.get(robot.name)
     failures = 0 if own is None else own.failures.events + own.failures_running
     words += [f"{failures} failure{'s' if failures > 1 else ''} in 24 h"] if failures else []
-    words += (
-        [f"suspected failures: {own.silent_estimated.events}"]
-        if own is not None and own.silent_estimated.events
-        else []
-    )
+    if own is not None and own.silent_estimated.events:
+        words.append(f"suspected failures: {own.silent_estimated.events}")
     since, exact = ("", "") if robot.tone == "good" else since_words(context, robot)
     since += " ago" if robot.tone == "quiet" else ""
     return {
@@ -149,12 +152,20 @@ def _figures(live: LiveSite, health: SiteHealth) -> list[dict[str, object]]:
     return found
 
 
-def _notices(context: PageContext, health: SiteHealth) -> list[dict[str, str]]:
-    """Trials of versions, running or just ended, and what got worse this week, each with a page that says more."""
-    found = []
+def _notices(services: Services, context: PageContext, health: SiteHealth) -> list[dict[str, str]]:
+    """Alerts, a draft that waits, trials, running or just ended, and what got worse this week, each with a page that says more."""
+    store, site = services.maps.store, context.site
+    told = [("bad", f"{begun(one.words)}.", _ALERTS[one.name]) for one in health.alerts if one.name in _ALERTS]
+    versions = store.releases(site).versions if services.maps.is_mapped(site) else {}
+    newest = next(reversed(versions.values()), None)
+    if newest is not None and newest.state == "draft":
+        tone, said = verdict_words(store.last_verdicts(site).get(newest.version), is_draft=True)
+        told.append((tone, f"Draft {newest.version} is not published. {said}", "map"))
     for trial in health.trials:
         tone, words, said = fleet_parts.trial_words(trial, context.moment)
-        found.append({"tone": tone, "words": f"{words} {said}", "to": context.to("trends"), "more": "Trends"})
+        verdict, stop, _ = said.partition(". ")  # the page of trends has the rates
+        told.append((tone, f"{words} {verdict}{stop}", "trends"))
+    found = [{"tone": tone, "words": words, "to": context.to(page), "more": PAGES[page]} for tone, words, page in told]
     if health.areas:
         words = f"This week: {trend_sentence(list(health.areas))}."
         found.append({"tone": "quiet", "words": words, "to": f"{context.to('trends')}#worse", "more": "Area by area"})
@@ -186,7 +197,6 @@ def trends(services: Services, context: PageContext) -> dict[str, object]:
         "outside": OUTSIDE,
         "kept": {"since": context.written(span_ns[0] or health.week_since_ns), "until": context.query.get("until")},
         "days": _bars(health.days),
-        "last_day": _last_day(health),
         "cameras": cameras,
         "parameters": {name: words for name, words in PARAMETERS.items() if any(name in told for _, told in cameras)},
         "concerns": health.resurvey,
@@ -198,8 +208,3 @@ def _bars(days: tuple[Rate, ...]) -> Bars:
     last = len(days) - 1
     names = ["24 h" if n == last else f"-{last - n} d" for n in range(len(days))]
     return Bars("Failures per robot-day", [fleet_parts.rate_bar(*day) for day in zip(names, days, strict=True)])
-
-
-def _last_day(health: SiteHealth) -> str:
-    day = health.day.failures
-    return f"A bar for each 24 hours. Last 24 hours: {day.events} in {driven_words(day.robot_days)}, {health.trend}."

@@ -15,10 +15,8 @@ from mapserver.quality.figures import TileDirections
 
 _LONG_SIDE_PX = 1600
 _FINEST_M = 0.04  # metres per pixel: below, single landmarks are dots far apart
-_BEYOND_M, _MARGIN_M = (
-    12.0,
-    1.0,
-)  # around the robots' path, and around most landmarks: those of far walls would shrink everything else
+# Around the robots' path, and around most landmarks: those of far walls would shrink everything else.
+_BEYOND_M, _MARGIN_M = 12.0, 1.0
 _FEW = 1.0  # per cent
 _LANDMARK_BGR, _PLACE_BGR = (140, 128, 118), (235, 120, 50)  # middle tones, to be seen on white and on black
 

@@ -28,6 +28,11 @@ def size(number: int | None) -> str | None:
     return f"{value:.2f} GB" if value < 1000 else f"{value / 1000:.2f} TB"
 
 
+def begun(words: str) -> str:
+    """The beginning of a sentence: its first letter is large."""
+    return f"{words[:1].upper()}{words[1:]}"
+
+
 def share(value: float | None) -> str | None:
     """A share in percent."""
     return None if value is None else f"{100 * value:.1f} %"

@@ -24,11 +24,7 @@ _FIGURES = (
     ("Speed", "speed_mps", "{:.2f} m/s"),
     ("Failure reports that wait", "spool_waiting", "{:.0f}"),
 )
-_CURVES = (
-    ("CPU of a frame", "frame_ms", "{:.1f} ms"),
-    ("Brightness of the image (0 to 1)", "exposure", "{:.2f}"),
-    ("Sharpness (1 is usual)", "sharpness", "{:.2f}"),
-)
+_CURVES = (("CPU of a frame", "frame_ms", "{:.1f} ms"), *_FIGURES[2:4])  # and brightness and sharpness
 
 
 def page(services: Services, context: PageContext, robot: str) -> dict[str, object]:

@@ -40,7 +40,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     if chosen is not None:
         context = replace(context, site=chosen.site)  # whatever site the address names, or none
     jobs = services.maps.store.jobs(context.site, context.time_range(), limit=JOBS_SHOWN)
-    chosen = chosen or next((job for job in jobs if job.report and job.state != "running"), None)
+    chosen = chosen or next((job for job in jobs if job.state != "running" and _recordings(job)), None)
     shown: dict[str, object] = {
         "context": context,
         "site": context.site,

@@ -316,7 +316,7 @@ def test_chance_alone_seldom_makes_a_trend() -> None:
 def test_health_of_a_site(store: MapStore) -> None:
     import time
 
-    health = HealthData(store, CanarySettings(), ResurveySettings(), time.time_ns)
+    health = HealthData(store, CanarySettings(), ResurveySettings(), time.time_ns, lambda _: ())
     found = health.site(SITE)
     assert (found.day.failures.events, found.day.silent_estimated.events) == (1, 1)
     assert len(found.days) == 14

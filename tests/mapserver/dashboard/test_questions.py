@@ -202,8 +202,11 @@ def test_questions_that_a_page_answers(operator: Operator) -> None:
         )
         ask_for_survey(store, SITE, [(20.0, 2.0), (30.0, 2.0), (30.0, 9.0)], Actor("bob", "new racks"))
         trial = releases.start_canary(store, SITE, 1, 0.2)
+        store.update_job(store.begin_job(SITE, "nightly"), "failed", "it was interrupted", {"waiting": []})
     failures = r"1\d failures of 8 robots\. Most: no match \(1\d\), in aisle 2 \(\d+\)\."
     for question, links, where, words in (
+        ("what needs me now", [], "#notices p", r"The night of hall failed \(job \d+\): it was interrupted\. Surveys"),
+        ("what needs me now", [], "#notices p", r"Draft 3 is not published\. .* Map"),
         ("is it one robot or one place", ["Failures"], "#answer", failures),
         (
             "who published last and why",
@@ -238,6 +241,10 @@ def test_questions_that_a_page_answers(operator: Operator) -> None:
             operator.go(link)
         answer = operator.page.locator(where).filter(has_text=re.compile(words, re.DOTALL)).first
         expect(answer, question).to_be_in_viewport()
+    operator.begin()
+    operator.go("Map")
+    operator.click(operator.page.get_by_role("button", name="Publish draft 3", exact=True))
+    expect(operator.page.get_by_role("dialog")).to_contain_text("The trial of version 1 ends.")
     with MapStore.open(operator.served.folder) as store:
         releases.end_canary(store, trial, promote=False, outcome="tried enough")
 

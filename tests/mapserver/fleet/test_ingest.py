@@ -172,7 +172,7 @@ def test_a_robot_that_is_lost_for_long_fails_in_every_window(site: Site, first: 
     assert kpis(after).localised_share_of_all == 0.0
     assert kpis(window()).availability == pytest.approx(0.0, abs=0.01)
     assert (
-        HealthData(site.store, CanarySettings(), ResurveySettings(), lambda: now_ns)
+        HealthData(site.store, CanarySettings(), ResurveySettings(), lambda: now_ns, lambda _: ())
         .site("lab")
         .robots["r0"]
         .failures.events
