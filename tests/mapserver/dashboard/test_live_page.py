@@ -40,7 +40,7 @@ def test_a_survey_is_followed_to_its_end(page: Page, served: Served) -> None:
             if page.locator(".site-map").count():
                 break
         seen = watch(page)
-        expect(page.locator("h1")).to_have_text("Survey of yard")
+        expect(page.locator("h1")).to_have_text("Live survey of yard")
         bus.publish(live_key("yard"), encode_message(msgspec.structs.replace(STATE, keyframes=41)))
         expect(page.locator(".key-figures")).to_contain_text("41")
         expect(page.locator(".key-figures")).to_contain_text("17 ms")

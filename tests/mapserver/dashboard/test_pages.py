@@ -39,7 +39,7 @@ PAGES = {
     "failures/1": "Failure 1 of tug-7",
     "robots/tug-7": "tug-7",
     "surveys": "Surveys of hall",
-    "live": "Survey of hall",
+    "live": "Live survey of hall",
     "administration": "Administration",
     "administration/people": "Administration",
 }

@@ -136,7 +136,7 @@ def test_an_empty_version_is_empty() -> None:
 
 def test_the_map_is_seen_in_space_with_its_robots(page: Page, served: Served) -> None:
     seen = opened(page, served, "space")
-    expect(page.locator("h1")).to_have_text("Map of hall in space")
+    expect(page.locator("h1")).to_have_text("3D view of hall")
     wait_until(page, f"document.querySelector('.space-view').seen && {SEEN}.robots.length === {ROBOTS}")
     assert page.evaluate(SEEN)["landmarks"] > 50
     page.get_by_role("checkbox", name="floor").uncheck()
