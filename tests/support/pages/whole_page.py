@@ -42,6 +42,8 @@ def assert_whole(page: Page) -> None:
             assert page.evaluate("document.documentElement.scrollWidth <= innerWidth"), (
                 f"{page.url} is wider than {width}"
             )
+            fits = "!document.body.matches('.console') || document.documentElement.scrollHeight <= innerHeight"
+            assert page.evaluate(fits), f"{page.url} scrolls as a whole"
             contrast, words = page.evaluate(WEAKEST_CONTRAST)
             assert contrast >= 4.5, f"{page.url}, {look}: {words}"
     narrow_px = page.evaluate(
