@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import count
 from typing import Any, Protocol
 
@@ -79,7 +79,8 @@ class Keyframe:
     """One keyframe: features (N), disparities (N, 2) with sigma, their points; its pictures are in an image store.
 
     from_views: the disparities come from other keyframes, so they locate points but are not measurements. nodes (N, 2): the
-    vocabulary's branches nearest to each feature; None if all descriptors are compared.
+    vocabulary's branches nearest to each feature; None if all descriptors are compared. others: those of the rig's other views at the same
+    moment, converted to the first view's camera.
     """
 
     frame_index: int
@@ -91,6 +92,7 @@ class Keyframe:
     image_number: int
     from_views: bool = False
     nodes: NDArray[np.int32] | None = None
+    others: "tuple[Keyframe, ...]" = ()
 
     @property
     def pictures(self) -> Pictures:
@@ -108,11 +110,15 @@ class Keyframe:
         """Return the same keyframe with the left picture's pyramid and the depth image in memory, and no right picture."""
         images, pyramid = MemoryImageStore(), self.pyramid
         frame = RectifiedFrame(self.stamp_ns, pyramid[0], None, self.frame.disparity_px)
-        return replace(self, images=images, image_number=images.put(Pictures(frame, pyramid)))
+        return replace(self, images=images, image_number=images.put(Pictures(frame, pyramid)), others=())
 
     def without_pictures(self) -> "Keyframe":
         """Return the same keyframe with an empty image store, cheap to send if only features are compared."""
-        return replace(self, images=MemoryImageStore(), image_number=0)
+        return replace(self, images=MemoryImageStore(), image_number=0, others=())
+
+    def numbered(self, frame_index: int) -> "Keyframe":
+        """Return the same keyframe with another frame number."""
+        return replace(self, frame_index=frame_index, others=tuple(o.numbered(frame_index) for o in self.others))
 
     def measured(self, features: NDArray[np.integer]) -> Array:
         """Return (n, 2) measured disparities of features (n,) and their sigmas; NaN if they come from other keyframes."""
@@ -134,12 +140,16 @@ class Keyframe:
 
 @dataclass(frozen=True, slots=True)
 class PosedKeyframes:
-    """K keyframes at map_from_body (K, 4, 4), of one camera with the mount body_from_cam (4, 4)."""
+    """K keyframes at map_from_body (K, 4, 4), of one camera with the mount body_from_cam (4, 4).
+
+    Those of a rig are the views of all its keyframes, in turn: see `SurveyState.body_from_view` and `map_from_view`.
+    """
 
     keyframes: list[Keyframe]
     map_from_body: Array
     body_from_cam: Array
     camera: StereoCamera
+    body_from_view: Array = field(default_factory=lambda: np.eye(4)[None])
 
     @property
     def map_from_cam(self) -> Array:
@@ -218,6 +228,10 @@ class OdometryPass:
     def keyframe_frames(self) -> list[int]:
         """Frame number of each keyframe."""
         return [k.frame_index for k in self.keyframes]
+
+    def views(self, count: int) -> list[Keyframe]:
+        """Return so many views of each keyframe: those of the first keyframe, those of the second one, and so on."""
+        return [view for keyframe in self.keyframes for view in (keyframe, *keyframe.others)[:count]]
 
 
 @dataclass(frozen=True)
@@ -347,7 +361,9 @@ class KeyframeMotion:
 class SurveyState:
     """Variables of the adjustment: K keyframes and the landmarks.
 
-    priors: of its docks, tags and zones, in `map`; a survey with any is itself in `map`.
+    priors: of its docks, tags and zones, in `map`; a survey with any is itself in `map`. body_from_view (V, 4, 4): one for each view of a
+    rig, the first one the identity: a view sees what `camera` at body_from_cam would see from body_from_view. With V views
+    obs_keyframe of the landmarks is the number of the keyframe times V plus that of the view.
     """
 
     stamps_ns: Indices
@@ -358,12 +374,35 @@ class SurveyState:
     landmarks: Landmarks
     is_depth_camera: bool = False
     priors: Sequence[PriorTerm] = ()
+    body_from_view: Array = field(default_factory=lambda: np.eye(4)[None])
+
+    @property
+    def view_count(self) -> int:
+        """Number V of views."""
+        return len(self.body_from_view)
+
+    @property
+    def map_from_view(self) -> Array:
+        """(K * V, 4, 4): the bodies from which the first view's camera would see what the views see."""
+        return poses_of_views(self.map_from_body, self.body_from_view)
+
+    @property
+    def observers(self) -> NDArray[np.int32]:
+        """(M,) the keyframe of each observation, by whichever view."""
+        return self.landmarks.obs_keyframe // np.int32(self.view_count)
+
+    def apart(self) -> "SurveyState":
+        """Return the same views as keyframes of one camera, each with a pose of its own; their motion is not that of bodies."""
+        if self.view_count == 1:
+            return self
+        stamps_ns = np.repeat(self.stamps_ns, self.view_count)
+        return replace(self, stamps_ns=stamps_ns, map_from_body=self.map_from_view, body_from_view=np.eye(4)[None])
 
     def of(self, chosen: Mask) -> "SurveyState":
         """Return a separate state of the chosen keyframes (K,) and of the landmarks seen by two of them."""
-        number = np.cumsum(chosen) - 1
-        marks = self.landmarks.keep_observations(chosen[self.landmarks.obs_keyframe], 2)
-        marks = replace(marks, obs_keyframe=number[marks.obs_keyframe].astype(np.int32))
+        views, number = np.repeat(chosen, self.view_count), np.cumsum(chosen) - 1
+        marks = self.landmarks.keep_observations(views[self.landmarks.obs_keyframe], 2)
+        marks = replace(marks, obs_keyframe=(np.cumsum(views) - 1)[marks.obs_keyframe].astype(np.int32))
         return replace(
             self,
             stamps_ns=self.stamps_ns[chosen],
@@ -378,6 +417,13 @@ class SurveyState:
         rotations = map_from_body[:, :3, :3] @ self.map_from_body[:, :3, :3].transpose(0, 2, 1)
         velocities = np.einsum("kij,kj->ki", rotations, self.motion.velocities_mps)
         return replace(self, map_from_body=map_from_body, motion=replace(self.motion, velocities_mps=velocities))
+
+
+def poses_of_views(map_from_body: Array, body_from_view: Array) -> Array:
+    """Return (K * V, 4, 4) of keyframes (K, 4, 4) with views (V, 4, 4)."""
+    if len(body_from_view) == 1:
+        return map_from_body
+    return np.asarray((map_from_body[:, None] @ body_from_view).reshape(-1, 4, 4))
 
 
 def survey_camera(camera: StereoCamera) -> StereoCamera:

@@ -98,8 +98,10 @@ struct BundleSolver::Residual {
 
 BundleSolver::BundleSolver(BundleProblem problem, BundleState start, double huber, double cutoff)
     : problem_(std::move(problem)), state_(std::move(start)), moved_(state_), huber_(huber), cutoff_(cutoff) {
-  cam_from_body_ = transposed(problem_.body_from_cam.rotation);
-  body_in_cam_ = -(cam_from_body_ * problem_.body_from_cam.translation);
+  for (const SE3& body_from_cam : problem_.body_from_cams) {
+    cam_from_body_.push_back(transposed(body_from_cam.rotation));
+    body_in_cam_.push_back(-(cam_from_body_.back() * body_from_cam.translation));
+  }
   const size_t keyframes = state_.map_from_body.size(), size = size_t(problem_.unknowns);
   slots_.assign(keyframes, -1);
   for (size_t k = 0; k < keyframes; ++k) {
@@ -113,7 +115,7 @@ BundleSolver::BundleSolver(BundleProblem problem, BundleState start, double hube
   sort_observations();
   find_pattern();
   const size_t landmarks = state_.points.size();
-  cam_from_map_.resize(keyframes);
+  cam_from_map_.resize(keyframes * cam_from_body_.size());
   squared_.resize(seen_.size());
   obs_info_.resize(seen_.size());
   point_info_.resize(landmarks), point_inverse_.resize(landmarks), point_rhs_.resize(landmarks);
@@ -139,6 +141,7 @@ void BundleSolver::sort_observations() {
     const double weight = 1.0 / each.sigma_px[0];
     order_[to] = n;
     seen_[to] = {each.keyframe,
+                 each.camera,
                  each.landmark,
                  {each.pixels[0], each.pixels[1], has_right ? disparity : 0.0},
                  {weight, weight, has_right ? 1.0 / each.sigma_px[1] : 0.0}};
@@ -192,14 +195,17 @@ std::vector<double> BundleSolver::squared_sigmas() const {
 }
 
 void BundleSolver::view(const BundleState& state) {
-  for (size_t k = 0; k < cam_from_map_.size(); ++k) cam_from_map_[k] = cam_from_body_ * transposed(state.map_from_body[k].rotation);
+  for (size_t k = 0, n = 0; k < state.map_from_body.size(); ++k)
+    for (const Mat3& cam_from_body : cam_from_body_) cam_from_map_[n++] = cam_from_body * transposed(state.map_from_body[k].rotation);
 }
 
 // The residual of a point at q from the keyframe's body, in map axes; false if it is behind the camera.
-bool BundleSolver::residual(const Seen& seen, const Mat3& cam_from_map, Vec3 q, Residual& out) const {
-  const double z = dot(vec3(cam_from_map[2]), q) + body_in_cam_[2];
+bool BundleSolver::residual(const Seen& seen, Vec3 q, Residual& out) const {
+  const Mat3& rot = cam_from_map(seen);
+  const Vec3& body = body_in_cam_[size_t(seen.camera)];
+  const double z = dot(vec3(rot[2]), q) + body[2];
   if (z < kMinDepth) return false;
-  const double x = (dot(vec3(cam_from_map[0]), q) + body_in_cam_[0]) / z, y = (dot(vec3(cam_from_map[1]), q) + body_in_cam_[1]) / z;
+  const double x = (dot(vec3(rot[0]), q) + body[0]) / z, y = (dot(vec3(rot[1]), q) + body[1]) / z;
   out = {x,
          y,
          z,
@@ -232,7 +238,7 @@ void BundleSolver::measure(const BundleState& state) {
     const Seen& seen = seen_[n];
     const size_t k = size_t(seen.keyframe);
     Residual found;
-    const bool ahead = residual(seen, cam_from_map_[k], state.points[size_t(seen.landmark)] - state.map_from_body[k].translation, found);
+    const bool ahead = residual(seen, state.points[size_t(seen.landmark)] - state.map_from_body[k].translation, found);
     squared_[n] = ahead ? dot(found.off, found.off) : kBehindSigmas * kBehindSigmas;
   }
 }
@@ -267,9 +273,9 @@ void BundleSolver::linearise() {
 
 // A and w J^T r of an observation of the camera whose point is at q from the body, in map axes; false if it has no weight.
 bool BundleSolver::linearise(const Seen& seen, Vec3 q, Symmetric& info, Vec3& slope) const {
-  const Mat3& rot = cam_from_map_[size_t(seen.keyframe)];
+  const Mat3& rot = cam_from_map(seen);
   Residual at;
-  if (!residual(seen, rot, q, at)) return false;
+  if (!residual(seen, q, at)) return false;
   const double weight = robust_weight(norm(at.off), huber_, cutoff_);
   if (weight == 0.0) return false;
   const double scale = problem_.focal_px / at.z * seen.weights[0];

@@ -49,7 +49,7 @@ struct ImageRows {
 // Unknowns and measurements: K keyframes, N landmarks, M observations. Fields without comment are as in _core.pyi.
 struct BundleProblem {
   struct Observation {
-    int32_t keyframe, landmark;
+    int32_t keyframe, camera, landmark;
     Vec3 pixels;         // u and v in the left image, u in the right one, NaN without it
     double sigma_px[2];  // of u and v, and of the disparity
   };
@@ -70,9 +70,9 @@ struct BundleProblem {
   };
 
   double focal_px, cx_px, cy_px, focal_baseline_px_m;
-  SE3 body_from_cam;
-  int unknowns;               // of each keyframe: 6, or 15 with motion
-  std::vector<uint8_t> free;  // (K, unknowns)
+  std::vector<SE3> body_from_cams;  // of all cameras of a rig, with the same lens
+  int unknowns;                     // of each keyframe: 6, or 15 with motion
+  std::vector<uint8_t> free;        // (K, unknowns)
   bool points_held;
   std::vector<Observation> observations;
   std::vector<Prior> priors;
@@ -128,7 +128,7 @@ class BundleSolver {
 
  private:
   struct Seen {  // an observation as the camera sees it; weights: 1 / sigma, of the disparity 0 without a right image
-    int32_t keyframe, landmark;
+    int32_t keyframe, camera, landmark;
     Vec3 pixels, weights;
   };
   using Symmetric = std::array<double, 6>;  // xx, xy, xz, yy, yz, zz
@@ -140,7 +140,10 @@ class BundleSolver {
   void find_pattern();
   size_t block_of(int32_t row, int32_t col) const;
   void view(const BundleState& state);
-  bool residual(const Seen& seen, const Mat3& cam_from_map, Vec3 q, Residual& out) const;
+  const Mat3& cam_from_map(const Seen& seen) const {
+    return cam_from_map_[size_t(seen.keyframe) * body_in_cam_.size() + size_t(seen.camera)];
+  }
+  bool residual(const Seen& seen, Vec3 q, Residual& out) const;
   void measure(const BundleState& state);
   double cost_of(const BundleState& state);
   Linear<6, 13> relative(const BundleState& state, const BundleProblem::Relative& each) const;
@@ -163,8 +166,8 @@ class BundleSolver {
   BundleProblem problem_;
   BundleState state_, moved_;
   double huber_, cutoff_;
-  Vec3 body_in_cam_;
-  Mat3 cam_from_body_;
+  std::vector<Vec3> body_in_cam_;  // of each camera
+  std::vector<Mat3> cam_from_body_;
   // Structure: observations by landmark, of the problem's number order_; slots of the keyframes with unknowns, -1 for others.
   std::vector<Seen> seen_;
   std::vector<size_t> order_, landmark_starts_, slot_starts_;
@@ -175,7 +178,7 @@ class BundleSolver {
   std::vector<int32_t> cols_;
   std::unique_ptr<BlockCholesky> sparse_;
   // At a state.
-  std::vector<Mat3> cam_from_map_;
+  std::vector<Mat3> cam_from_map_;  // of the cameras of each keyframe
   std::vector<double> squared_;
   // Normal equations.
   std::vector<Symmetric> obs_info_, point_info_;

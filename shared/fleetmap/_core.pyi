@@ -677,8 +677,9 @@ def inertial_residual(
 class BundleSolver:
     """Bundle adjustment of K keyframes, N landmarks, M observations.
 
-    lens (4,): focal, cx, cy, focal times baseline. motions (K, 9): velocity, gyro bias, accelerometer bias, or (K, 0). free (K, 6 or 15):
-    unknowns that move, of pose and motion. obs_pixels (M, 3): u and v in the left image, u in the right one, NaN without it.
+    lens (4,): focal, cx, cy, focal times baseline, of the cameras body_from_cams (V, 4, 4) of each keyframe. motions (K, 9): velocity, gyro
+    bias, accelerometer bias, or (K, 0). free (K, 6 or 15): unknowns that move, of pose and motion. obs_keyframe (M,): the keyframe, times
+    V, plus the camera. obs_pixels (M, 3): u and v in the left image, u in the right one, NaN without it.
     obs_sigma_px (M, 2): of u and v, and of the disparity. Relative poses i_from_j (R, 4, 4), priors of poses (Q, 4, 4), each with its
     information (6, 6); inertial edges with increments (E, 67) and information (E, 15, 15); motion_mean (K, 9), motion_weight (K, 9)
     1 / sigma^2. huber, cutoff: sigmas of an observation from which its cost is linear, and constant. calibration: further unknowns, theta
@@ -690,7 +691,7 @@ class BundleSolver:
     def __init__(
         self,
         lens: _Reals,
-        body_from_cam: _Reals,
+        body_from_cams: _Reals,
         map_from_body: _Reals,
         motions: _Reals,
         points_map: _Reals,

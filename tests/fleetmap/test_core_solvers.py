@@ -16,7 +16,7 @@ POSES, EYES, NONE = np.tile(np.eye(4), (3, 1, 1)), np.tile(np.eye(6), (1, 1, 1))
 # Three keyframes with motion, four landmarks, each seen by two keyframes, and one of every other measurement.
 BUNDLE: dict[str, Any] = {
     "lens": np.array([500.0, 320.0, 240.0, 50.0]),
-    "body_from_cam": np.eye(4),
+    "body_from_cams": np.eye(4)[None],
     "map_from_body": POSES,
     "motions": np.zeros((3, 9)),
     "points_map": np.array([[0.0, 0.0, 4.0], [1.0, 0.0, 4.0], [0.0, 1.0, 5.0], [1.0, 1.0, 6.0]]),

@@ -49,7 +49,7 @@ def solver_of(problem: BundleProblem, settings: BundleSettings) -> core.BundleSo
     _check(problem)
     solver = core.BundleSolver(
         problem.camera.lens,
-        np.array(problem.body_from_cam, np.float64, order="C"),
+        np.array(problem.body_from_view @ problem.body_from_cam, np.float64, order="C"),
         np.array(problem.map_from_body, np.float64, order="C"),
         _motions(problem),
         np.array(problem.points_map, np.float64, order="C").reshape(-1, 3),
@@ -95,10 +95,11 @@ def _first_bad(problem: BundleProblem, squared: Array) -> str:
 
 def _check(problem: BundleProblem) -> None:
     count, observations = len(problem.map_from_body), len(problem.obs_keyframe)
+    views = count * len(problem.body_from_view)
     assert problem.fixed.shape == (count,)
     assert problem.obs_pixels.shape == (observations, 3)
     assert problem.obs_sigma_px.shape == (observations, 2)
-    assert observations == 0 or (problem.obs_keyframe.min() >= 0 and problem.obs_keyframe.max() < count)
+    assert observations == 0 or (problem.obs_keyframe.min() >= 0 and problem.obs_keyframe.max() < views)
     assert observations == 0 or (
         problem.obs_landmark.min() >= 0 and problem.obs_landmark.max() < len(problem.points_map)
     )

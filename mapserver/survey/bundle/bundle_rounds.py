@@ -41,7 +41,7 @@ def bundle_rounds(
         if not last:
             keep = result.squared_sigmas < settings.noise.cut_sigmas**2
             if free is not None:
-                keep |= ~np.isin(state.landmarks.obs_keyframe, np.flatnonzero(free))
+                keep |= ~np.isin(state.observers, np.flatnonzero(free))
             state = replace(state, landmarks=state.landmarks.keep_observations(keep, settings.min_observations))
         del problem, result  # frees the dropped observations
     return state
@@ -164,6 +164,7 @@ def bundle_problem(state: SurveyState, settings: SurveySettings, free: NDArray[n
         relative=motion.relative,
         priors=priors,
         gauge="yaw_position" if motion.inertial and holds_all and not priors else "pose",
+        body_from_view=state.body_from_view,
     )
 
 

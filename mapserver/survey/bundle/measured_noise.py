@@ -34,7 +34,7 @@ def measured_sigmas(problem: BundleProblem, huber_sigmas: float) -> Array:
 
 def _residuals(problem: BundleProblem) -> tuple[Array, Array]:
     """Return lengths (M,) of the residuals of pixel and disparity, NaN if absent."""
-    cam_from_map = se3_inverse(problem.map_from_body @ problem.body_from_cam)
+    cam_from_map = se3_inverse(problem.map_from_cam)
     pixel, disparity = np.empty((2, len(problem.obs_keyframe)))
     for first in range(0, len(pixel), _CHUNK):
         rows = slice(first, first + _CHUNK)

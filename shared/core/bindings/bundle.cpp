@@ -80,7 +80,7 @@ ImageRows rows_at(const nb::callable& said, const BundleState& state, bool deriv
   return {residuals.data(), by_point.data(), by_calibration.data(), reinterpret_cast<const Vec3*>(positions.data()), kept(rows)};
 }
 
-void make(BundleSolver* self, const Reals<4>& lens, const Reals<4, 4>& body_from_cam, const Reals<-1, 4, 4>& map_from_body,
+void make(BundleSolver* self, const Reals<4>& lens, const Reals<-1, 4, 4>& body_from_cams, const Reals<-1, 4, 4>& map_from_body,
           const Reals<-1, -1>& motions, const Reals<-1, 3>& points_map, const Array<bool, -1, -1>& free, bool points_held,
           const Indices<-1>& obs_keyframe, const Indices<-1>& obs_landmark, const Reals<-1, 3>& obs_pixels,
           const Reals<-1, 2>& obs_sigma_px, const Indices<-1, 2>& relative_ends, const Reals<-1, 4, 4>& i_from_j,
@@ -95,7 +95,8 @@ void make(BundleSolver* self, const Reals<4>& lens, const Reals<4, 4>& body_from
                const BundleState& state, bool derivatives) { return rows_at(*said, state, derivatives, observations); };
   const nb::gil_scoped_release others_run;
   constexpr size_t kMost = size_t(1) << 31;
-  const size_t keyframes = map_from_body.shape(0), landmarks = points_map.shape(0), observations = obs_keyframe.shape(0);
+  const size_t cameras = body_from_cams.shape(0), keyframes = map_from_body.shape(0), landmarks = points_map.shape(0),
+               observations = obs_keyframe.shape(0);
   const bool inertial = free.shape(1) == 15;
   const size_t motion_size = inertial ? 9 : 0;
   check(inertial || free.shape(1) == 6, "free: 6 or 15 unknowns of each keyframe");
@@ -103,7 +104,9 @@ void make(BundleSolver* self, const Reals<4>& lens, const Reals<4, 4>& body_from
   for (const auto* each : {&motions, &motion_mean, &motion_weight})
     check(each->shape(0) == keyframes && each->shape(1) == motion_size,
           "motions, motion_mean, motion_weight: 9 or no columns as free says");
-  check(keyframes * 15 < kMost && landmarks < kMost && observations < kMost, "points_map, obs_keyframe: fewer than 2^31");
+  check(cameras > 0 && cameras < 1000, "body_from_cams: 1 to 999 cameras");
+  check(keyframes * std::max<size_t>(15, cameras) < kMost && landmarks < kMost && observations < kMost,
+        "points_map, obs_keyframe: fewer than 2^31");
   check(obs_landmark.shape(0) == observations && obs_pixels.shape(0) == observations && obs_sigma_px.shape(0) == observations,
         "obs_landmark, obs_pixels, obs_sigma_px: one for each of obs_keyframe");
   check(i_from_j.shape(0) == relative_ends.shape(0) && relative_information.shape(0) == relative_ends.shape(0),
@@ -113,7 +116,7 @@ void make(BundleSolver* self, const Reals<4>& lens, const Reals<4, 4>& body_from
   check(increments.shape(0) == edge_ends.shape(0) && edge_information.shape(0) == edge_ends.shape(0),
         "increments, edge_information: one for each of edge_ends");
   check(inertial || edge_ends.size() == 0, "edge_ends: of keyframes with motion");
-  check_below(obs_keyframe, keyframes, "obs_keyframe: keyframes");
+  check_below(obs_keyframe, keyframes * cameras, "obs_keyframe: keyframes, camera by camera");
   check_below(obs_landmark, landmarks, "obs_landmark: landmarks");
   check_below(relative_ends, keyframes, "relative_ends: keyframes");
   check_below(prior_keyframe, keyframes, "prior_keyframe: keyframes");
@@ -121,13 +124,18 @@ void make(BundleSolver* self, const Reals<4>& lens, const Reals<4, 4>& body_from
 
   BundleProblem problem = {};
   problem.focal_px = lens(0), problem.cx_px = lens(1), problem.cy_px = lens(2), problem.focal_baseline_px_m = lens(3);
-  problem.body_from_cam = se3(body_from_cam.data());
+  for (size_t v = 0; v < cameras; ++v) problem.body_from_cams.push_back(se3(&body_from_cams(v, 0, 0)));
   problem.unknowns = int(free.shape(1));
   problem.free.assign(free.data(), free.data() + free.size());
   problem.points_held = points_held;
-  for (size_t n = 0; n < observations; ++n)
-    problem.observations.push_back(
-        {int32_t(obs_keyframe(n)), int32_t(obs_landmark(n)), vec3(&obs_pixels(n, 0)), {obs_sigma_px(n, 0), obs_sigma_px(n, 1)}});
+  for (size_t n = 0; n < observations; ++n) {
+    const size_t view = size_t(obs_keyframe(n));
+    problem.observations.push_back({int32_t(view / cameras),
+                                    int32_t(view % cameras),
+                                    int32_t(obs_landmark(n)),
+                                    vec3(&obs_pixels(n, 0)),
+                                    {obs_sigma_px(n, 0), obs_sigma_px(n, 1)}});
+  }
   for (size_t n = 0; n < prior_keyframe.shape(0); ++n)
     problem.priors.push_back({int32_t(prior_keyframe(n)), se3(&prior_map_from_body(n, 0, 0)), copied(&prior_information(n, 0, 0), 36)});
   for (size_t n = 0; n < relative_ends.shape(0); ++n)
@@ -220,7 +228,7 @@ auto inertial_residual(const Reals<2, 4, 4>& map_from_body, const Reals<2, 9>& m
 void bind_bundle(nb::module_& module) {
   const auto damping = "damping"_a;
   nb::class_<BundleSolver>(module, "BundleSolver")
-      .def("__init__", &make, "lens"_a.noconvert(), "body_from_cam"_a.noconvert(), "map_from_body"_a.noconvert(), "motions"_a.noconvert(),
+      .def("__init__", &make, "lens"_a.noconvert(), "body_from_cams"_a.noconvert(), "map_from_body"_a.noconvert(), "motions"_a.noconvert(),
            "points_map"_a.noconvert(), "free"_a.noconvert(), "points_held"_a, "obs_keyframe"_a.noconvert(), "obs_landmark"_a.noconvert(),
            "obs_pixels"_a.noconvert(), "obs_sigma_px"_a.noconvert(), "relative_ends"_a.noconvert(), "i_from_j"_a.noconvert(),
            "relative_information"_a.noconvert(), "prior_keyframe"_a.noconvert(), "prior_map_from_body"_a.noconvert(),

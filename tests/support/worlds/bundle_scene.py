@@ -9,6 +9,7 @@ from fleetmap.inertial import GRAVITY_MAP, preintegrate
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.bundle.problem import BundleProblem, InertialTerms
+from mapserver.survey.state import poses_of_views
 from support.worlds.inertial_motion import analytic_motion, corrected, sample_motion
 
 CAMERA = StereoCamera(focal_px=400.0, cx_px=320.0, cy_px=240.0, baseline_m=0.12, width_px=640, height_px=480)
@@ -18,6 +19,7 @@ BODY_FROM_CAM = se3(
 )
 GYRO_BIAS, ACCEL_BIAS = np.array([0.01, -0.02, 0.015]), np.array([0.1, -0.05, 0.08])
 NOISE = ImuNoise()
+ONE_VIEW = np.eye(4)[None]
 
 
 @dataclass(frozen=True)
@@ -38,8 +40,9 @@ def make_scene(
     noise_px: float = 0.0,
     inertial: bool = False,
     mono_share: float = 0.2,
+    body_from_view: Array = ONE_VIEW,
 ) -> Scene:
-    """Keyframes along the analytic motion, landmarks all around; every visible one is observed."""
+    """Keyframes along the analytic motion, landmarks all around; every visible one is observed, by each of the rig's views."""
     rng = np.random.default_rng(seed)
     times = 0.5 + step_s * np.arange(keyframes)
     states = [analytic_motion(t) for t in times]
@@ -47,8 +50,8 @@ def make_scene(
     away = rng.normal(size=(landmarks, 3)) * [1, 1, 0.4]
     points = away / np.linalg.norm(away, axis=1)[:, None] * rng.uniform(4, 9, (landmarks, 1))
     seen = []
-    for k in range(keyframes):
-        inside = transform_points(se3_inverse(map_from_body[k] @ BODY_FROM_CAM), points)
+    for k, map_from_view in enumerate(poses_of_views(map_from_body, body_from_view)):
+        inside = transform_points(se3_inverse(map_from_view @ BODY_FROM_CAM), points)
         pixels = CAMERA.pixel_from_point(inside)
         visible = (
             (inside[:, 2] > 0.5) & (pixels[:, 0] > 0) & (pixels[:, 0] < 640) & (pixels[:, 1] > 0) & (pixels[:, 1] < 480)
@@ -76,6 +79,7 @@ def make_scene(
         obs_landmark=table[:, 1].astype(np.int32),
         obs_pixels=pixels,
         obs_sigma_px=sigma,
+        body_from_view=body_from_view,
     )
     if inertial:
         problem.inertial = _inertial_terms(times, velocities)
@@ -119,7 +123,8 @@ def plain_residuals(problem: BundleProblem, pose_step: Array, motion_step: Array
     for k, n, pixel, sigma in zip(
         problem.obs_keyframe, problem.obs_landmark, problem.obs_pixels, problem.obs_sigma_px, strict=True
     ):
-        cam_from_map = se3_inverse(map_from_body[k] @ problem.body_from_cam)
+        body, view = divmod(int(k), len(problem.body_from_view))
+        cam_from_map = se3_inverse(map_from_body[body] @ problem.body_from_view[view] @ problem.body_from_cam)
         u, v, u_right = problem.camera.pixel_from_point((cam_from_map[:3, :3] @ points[n] + cam_from_map[:3, 3])[None])[
             0
         ]
