@@ -12,6 +12,7 @@ from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.bundle.odometry_factors import carried
 from mapserver.survey.keyframes.keyframes import KeyframePolicy, make_keyframes
+from mapserver.survey.keyframes.rig_views import other_views
 from mapserver.survey.odometry_pass import summary_of
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import FrameTracks, OdometryPass
@@ -80,7 +81,8 @@ def poses_as_odometry(
             if policy.wants(summary_of(frame, estimate, odom_from_body[number])):
                 yield number, frame
 
-    keyframes = list(make_keyframes(chosen(), rectifier.camera, settings, tools.images, tools.executor))
+    how = settings, tools.images, tools.executor, other_views(rectifier)
+    keyframes = list(make_keyframes(chosen(), rectifier.camera, *how))
     tied = np.ones(len(given), bool)
     return OdometryPass(
         estimates, odom_from_body, covariances, tied, keyframes, inertial, tracks=FrameTracks.joined(seen)

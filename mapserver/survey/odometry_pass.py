@@ -13,6 +13,7 @@ from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample, wheel_between
 from mapserver.survey.bundle.odometry_factors import carried
 from mapserver.survey.keyframes.keyframes import FrameSummary, KeyframePolicy, make_keyframes, sharpness
+from mapserver.survey.keyframes.rig_views import other_views
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import FrameTracks, OdometryPass
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
@@ -94,7 +95,8 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
             if tracked.is_keyframe:
                 yield tracked.number, tracked.frame
 
-    keyframes = list(make_keyframes(chosen(), rectifier.camera, settings, tools.images, tools.executor))
+    how = settings, tools.images, tools.executor, other_views(rectifier)
+    keyframes = list(make_keyframes(chosen(), rectifier.camera, *how))
     estimates = run.chain.estimates
     inertial = bool(estimates) and inputs.calibration.imu is not None and estimates[-1].inertial
     done = OdometryPass(

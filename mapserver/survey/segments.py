@@ -18,7 +18,16 @@ from fleetmap.sensors.samples import CameraFrame, ImuSamples, Stamps, WheelSampl
 from mapserver.survey.bundle.odometry_factors import blackout_factors, carried, edge_covariance, initial_state
 from mapserver.survey.keyframes.keyframes import set_aside
 from mapserver.survey.settings import SegmentSettings, SurveySettings
-from mapserver.survey.state import Cut, FrameTracks, ImageStore, Landmarks, MemoryImageStore, OdometryPass, SurveyState
+from mapserver.survey.state import (
+    Cut,
+    FrameTracks,
+    ImageStore,
+    Keyframe,
+    Landmarks,
+    MemoryImageStore,
+    OdometryPass,
+    SurveyState,
+)
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyInputs, SurveyTools
 
 _MARGIN_NS = 1_000_000_000  # of IMU and wheels after the last frame
@@ -141,11 +150,16 @@ def _in_parallel(
 
 
 def _stored(survey: SegmentSurvey, images: ImageStore) -> SegmentSurvey:
-    keyframes = [
-        k if k.images is images else set_aside(replace(k, images=images, image_number=images.put(k.pictures)), images)
-        for k in survey.odometry.keyframes
-    ]
+    keyframes = [_kept(keyframe, images) for keyframe in survey.odometry.keyframes]
     return replace(survey, odometry=replace(survey.odometry, keyframes=keyframes))
+
+
+def _kept(keyframe: Keyframe, images: ImageStore) -> Keyframe:
+    if keyframe.images is images:
+        return keyframe
+    others = tuple(_kept(other, images) for other in keyframe.others)
+    kept = replace(keyframe, images=images, image_number=images.put(keyframe.pictures), others=others)
+    return set_aside(kept, images)
 
 
 def _task_of(segment: Segment, inputs: SurveyInputs, images: ImageStore) -> _Task:
@@ -203,7 +217,7 @@ def _without_lead(chain: AdjustedChain, segment: Segment) -> SegmentSurvey:
         odom_from_body=odom_from_body[first:end],
         covariances=odometry.covariances[first:end],
         tracked=odometry.tracked[first:end],
-        keyframes=[replace(k, frame_index=k.frame_index + lead) for k in keyframes],
+        keyframes=[k.numbered(k.frame_index + lead) for k in keyframes],
         tracks=None,
     )
     return SegmentSurvey(

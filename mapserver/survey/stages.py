@@ -40,6 +40,7 @@ from mapserver.survey.keyframes.connected_components import (
     only_kept,
 )
 from mapserver.survey.keyframes.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
+from mapserver.survey.keyframes.rig_views import body_from_views
 from mapserver.survey.loops.loops import LoopCloser, Loops
 from mapserver.survey.loops.sim3_loops import gate_covariances, solve_scaled
 from mapserver.survey.odometry_pass import run_odometry
@@ -119,7 +120,7 @@ def finish_survey(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConf
     odometry = chain.odometry
     # Landmarks so far are those of neighbours; all are built again, and nothing may hold the old ones meanwhile.
     del chain
-    state = replace(state, landmarks=Landmarks.empty())
+    state = replace(state, landmarks=Landmarks.empty(), body_from_view=body_from_views(inputs.rectifier))
     odometry, state, stereo_yaw = adjust_globally(odometry, state, depths, matched, tracks, settings, tools)
     tools.at("global adjustment", 2, 2)
     frames_of = np.array(odometry.keyframe_frames, np.int64)
@@ -200,8 +201,9 @@ def close_loops(
         marginals = GraphMarginals(placed, known)
         state = replace(state.moved(placed), priors=learn_priors(marginals, terms))
     groups = find_groups(state, _sigmas_m(odometry), settings.join_sigma_m)
+    posed = _posed(odometry, replace(state, body_from_view=body_from_views(inputs.rectifier)))
     closer = LoopCloser(
-        _posed(odometry, state),
+        posed,
         config,
         marginals,
         begun.matched,
@@ -209,9 +211,9 @@ def close_loops(
         groups,
         measures_scale=not odometry.scale_known,
     )
-    for i in range(len(odometry.keyframes)):
+    for i in range(len(posed.keyframes)):
         closer.close(i)
-        tools.at("loops", i + 1, len(odometry.keyframes))
+        tools.at("loops", i + 1, len(posed.keyframes))
     loops = closer.loops
     if odometry.scale_known:
         return _solved(state, closer.begin, chain, loops)
@@ -251,9 +253,10 @@ def adjust_globally(
 ) -> tuple[OdometryPass, SurveyState, StereoYaw]:
     """Match all views at the poses after loop closure and adjust them together, twice: the first result gives the stereo yaw error.
 
-    matched: pairs that need not be matched again, and their tracks.
+    matched: pairs of the first view that need not be matched again, and their tracks.
     """
-    yaw, redundant = NO_YAW, np.zeros(len(odometry.keyframes), bool)
+    views, redundant = state.view_count, np.zeros(len(odometry.keyframes), bool)
+    yaws = [NO_YAW] * views
     finder = _pair_finder(odometry, state, settings, tools)
     for round_number in range(2):
         tools.at("global adjustment", round_number, 2)
@@ -263,24 +266,29 @@ def adjust_globally(
             finder = _pair_finder(odometry, state, settings, tools)
         posed = _posed(odometry, state)
         if search:
-            every = finder.candidates(state.map_from_body, previous=settings.pairs.previous)
-            candidates = [pair for pair in every if pair not in matched]
+            every = finder.candidates(state.map_from_view, previous=settings.pairs.previous)
+            known = {(views * i, views * j) for i, j in matched}
+            candidates = [pair for pair in every if pair not in known]
             pairs = finder.match(
                 candidates,
-                state.map_from_body,
-                fixed_allowance_m(state.map_from_body),
+                state.map_from_view,
+                fixed_allowance_m(state.map_from_view),
                 rotation_sigma_rad=_ADJUSTED_SIGMA_RAD,
                 progress=_progress_of(tools, "matching again", len(candidates)),
             )
+            if tracks is not None:
+                tracks = replace(tracks, keyframes=views * tracks.keyframes)
             joined = tracks_of(pairs, tracks)
-            redundant = redundant_keyframes(joined, odometry.keyframes, settings)
+            redundant = redundant_keyframes(joined, posed.keyframes, settings, views)
             redundant[[term.k for term in state.priors]] = False
-            landmarks = build_landmarks(posed, joined, settings, tools.executor, redundant)
+            spared = np.repeat(redundant, views)
+            landmarks = build_landmarks(posed, joined, settings, tools.executor, spared)
             observed_from = posed.map_from_cam
             del pairs, joined
         else:  # a second search finds almost no further matches; its coordinates are more accurate
             landmarks = refine_observations(posed, state.landmarks, settings, tools.executor, observed_from)
-        held = [replace(state, landmarks=without_stereo_yaw(landmarks, state.camera, yaw.correction_px))]
+        corrections_px = [yaw.correction_px for yaw in yaws]
+        held = [replace(state, landmarks=without_stereo_yaw(landmarks, state.camera, *corrections_px))]
         del landmarks, state  # otherwise observations would be in memory twice
         tools.release()
         state = adjust_visits(held.pop(), settings, redundant, rounds=3 if search else 2)
@@ -288,8 +296,10 @@ def adjust_globally(
         if not believed:
             state = adjust_visits(replace(state, priors=priors), settings, redundant, rounds=2)
         if round_number == 0:
-            yaw = estimate_stereo_yaw(without_redundant(state, redundant), settings)
-    return odometry, state, yaw
+            part = without_redundant(state, redundant)
+            yaws = [estimate_stereo_yaw(part, settings, view) for view in range(views)]
+            del part
+    return odometry, state, yaws[0]
 
 
 def keep_largest(
@@ -310,11 +320,13 @@ def _with_depths(odometry: OdometryPass, state: SurveyState, depths: MonoDepths 
 def _pair_finder(
     odometry: OdometryPass, state: SurveyState, settings: SurveySettings, tools: SurveyTools
 ) -> PairFinder:
-    return PairFinder(odometry.keyframes, state.camera, state.body_from_cam, settings.pairs, tools.executor)
+    rig = odometry.views(state.view_count), state.camera, state.body_from_cam
+    return PairFinder(*rig, settings.pairs, tools.executor, state.view_count)
 
 
 def _posed(odometry: OdometryPass, state: SurveyState) -> PosedKeyframes:
-    return PosedKeyframes(odometry.keyframes, state.map_from_body, state.body_from_cam, state.camera)
+    rig = state.body_from_cam, state.camera, state.body_from_view
+    return PosedKeyframes(odometry.views(state.view_count), state.map_from_view, *rig)
 
 
 def _sigmas_m(odometry: OdometryPass) -> SigmaBetween:

@@ -46,31 +46,31 @@ def disparity_shift(camera: StereoCamera, pixels: Array) -> Array:
     return np.asarray(1.0 + ((pixels[:, 0] - camera.cx_px) / camera.focal_px) ** 2)
 
 
-def without_stereo_yaw(landmarks: Landmarks, camera: StereoCamera, correction_px: float) -> Landmarks:
-    """Return the landmarks with all observed disparities reduced by the shift."""
-    if correction_px == 0.0:
+def without_stereo_yaw(landmarks: Landmarks, camera: StereoCamera, *corrections_px: float) -> Landmarks:
+    """Return the landmarks with all observed disparities reduced by the shift, one for each view of a rig."""
+    if not any(corrections_px):
         return landmarks
-    pixels = landmarks.obs_pixels.copy()
-    pixels[:, 2] += correction_px * disparity_shift(camera, pixels)
+    pixels, view = landmarks.obs_pixels.copy(), landmarks.obs_keyframe % len(corrections_px)
+    pixels[:, 2] += np.array(corrections_px)[view] * disparity_shift(camera, pixels)
     return replace(landmarks, obs_pixels=pixels)
 
 
-def estimate_stereo_yaw(state: SurveyState, settings: SurveySettings) -> StereoYaw:
-    """Return the yaw error with the best fit to the adjusted survey; corrected if significantly different from zero.
+def estimate_stereo_yaw(state: SurveyState, settings: SurveySettings, view: int = 0) -> StereoYaw:
+    """Return the yaw error of the pair of a view with the best fit to the adjusted survey; corrected if significantly different from zero.
 
     sigma_px combines the adjustment's own with `noise.turn_floor_px`, since matching alone is overconfident. NO_YAW if too few
     disparities are known or if the cost has no minimum nearby.
     """
-    measured = np.isfinite(state.landmarks.obs_pixels[:, 2])
-    if measured.sum() < _MIN_DISPARITIES or state.is_depth_camera:
+    measured = np.isfinite(state.landmarks.obs_pixels[:, 2]) & (state.landmarks.obs_keyframe % state.view_count == view)
+    if measured.sum() < _MIN_DISPARITIES or (state.is_depth_camera and view == 0):
         return NO_YAW
     problem = bundle_problem(state, settings, None)
     problem = replace(problem, obs_sigma_px=measured_sigmas(problem, settings.final_bundle.huber_sigmas))
-    slope = _slope(problem, state.landmarks, 0.0, settings)
+    slope = _slope(problem, state.landmarks, 0.0, settings, view)
     shift, curvature = 0.0, 0.0
     step = _FIRST_TRY_PX if slope < 0 else -_FIRST_TRY_PX
     for _ in range(_MAX_STEPS):
-        moved = _slope(problem, state.landmarks, shift + step, settings)
+        moved = _slope(problem, state.landmarks, shift + step, settings, view)
         curvature = (moved - slope) / step
         if not curvature > 0.0:
             return NO_YAW
@@ -83,11 +83,14 @@ def estimate_stereo_yaw(state: SurveyState, settings: SurveySettings) -> StereoY
     return StereoYaw(float(shift), sigma, corrected=abs(shift) > settings.noise.turn_sigmas * sigma)
 
 
-def _slope(problem: BundleProblem, marks: Landmarks, shift_px: float, settings: SurveySettings) -> float:
-    """Return the derivative of the adjusted cost by the shift, everything else at its optimum for this shift."""
-    camera, marks = problem.camera, without_stereo_yaw(marks, problem.camera, shift_px)
+def _slope(problem: BundleProblem, marks: Landmarks, shift_px: float, settings: SurveySettings, view: int) -> float:
+    """Return the derivative of the adjusted cost by the view's shift, everything else at its optimum for this shift."""
+    camera, shifts_px = problem.camera, np.zeros(len(problem.body_from_view))
+    shifts_px[view] = shift_px
+    marks = without_stereo_yaw(marks, camera, *shifts_px)
     result = optimize(replace(problem, obs_pixels=marks.obs_pixels), settings.final_bundle)
-    ahead = se3_inverse(result.map_from_body @ problem.body_from_cam)[marks.obs_keyframe, 2]
+    map_from_cam = replace(problem, map_from_body=result.map_from_body).map_from_cam
+    ahead = se3_inverse(map_from_cam)[marks.obs_keyframe, 2]
     points = result.points_map[marks.obs_landmark]
     depth = np.einsum("mj,mj->m", ahead[:, :3], points) + ahead[:, 3]
     off = marks.obs_pixels[:, 0] - marks.obs_pixels[:, 2] - camera.focal_px * camera.baseline_m / depth
@@ -96,4 +99,5 @@ def _slope(problem: BundleProblem, marks: Landmarks, shift_px: float, settings: 
     weights = np.minimum(1.0, robust.huber_sigmas / np.maximum(norm, 1e-9))
     weights[norm > robust.cutoff_sigmas] = 0.0
     pull = weights * off / problem.obs_sigma_px[:, 1] ** 2
-    return -float(np.nansum(pull * disparity_shift(camera, marks.obs_pixels)))
+    own = marks.obs_keyframe % len(shifts_px) == view
+    return -float(np.nansum((pull * disparity_shift(camera, marks.obs_pixels))[own]))

@@ -42,7 +42,7 @@ def cull(
 def parallax_rad(state: SurveyState) -> Array:
     """Return (N,) the parallax angle of each landmark's observations: largest between any and the first, or across the baseline."""
     marks = state.landmarks
-    centres = (state.map_from_body @ state.body_from_cam)[marks.obs_keyframe, :3, 3]
+    centres = (state.map_from_view @ state.body_from_cam)[marks.obs_keyframe, :3, 3]
     rays = centres - marks.points_map[marks.obs_landmark]
     distances = np.maximum(np.linalg.norm(rays, axis=1), 1e-6)
     rays /= distances[:, None]

@@ -71,7 +71,7 @@ def place_frames(
     """
     chain = _Chain(odometry, state, settings, correction_px)
     placed, seen = chain.map_from_body.copy(), np.zeros(len(chain.map_from_body), bool)
-    seen[chain.numbers] = np.bincount(state.landmarks.obs_keyframe, minlength=len(chain.numbers)) >= MIN_SEEN
+    seen[chain.numbers] = np.bincount(state.observers, minlength=len(chain.numbers)) >= MIN_SEEN
     if odometry.tracks is None:
         return PlacedFrames(placed, seen)
     ends = pairwise([-1, *chain.numbers.tolist(), len(placed)])

@@ -25,10 +25,11 @@ def assemble(
     state: SurveyState, odometry: OdometryPass, placed: PlacedFrames, settings: SurveySettings
 ) -> tuple[SurveyMap, NDArray[np.int64], Culled]:
     """Return the SurveyMap of an adjusted survey, in the survey's own frame, its landmarks as rows of the state, and the removed ones."""
+    views, state = odometry.views(state.view_count), state.apart()
     every_sigma = point_sigmas_m(state)
-    seen, kept, culled = cull(state, odometry.keyframes, every_sigma, settings.cull)
+    seen, kept, culled = cull(state, views, every_sigma, settings.cull)
     marks, rows = state.landmarks.keep_observations(seen, 1), np.unique(state.landmarks.obs_landmark[seen])
-    keyframes = [k for k, keep in zip(odometry.keyframes, kept, strict=True) if keep]
+    keyframes = [k for k, keep in zip(views, kept, strict=True) if keep]
     marks = replace(marks, obs_keyframe=(np.cumsum(kept) - 1)[marks.obs_keyframe].astype(np.int32))
     octaves = marks.of_features([k.features.octaves for k in keyframes])
     frame_stamps = np.array([e.stamp_ns for e in odometry.estimates], np.int64)

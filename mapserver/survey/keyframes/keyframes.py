@@ -1,7 +1,7 @@
 """Keyframe selection, and the data of each keyframe."""
 
 from collections import deque
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
 
@@ -14,6 +14,7 @@ from fleetmap.features.extraction import extract
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from mapserver.survey.executor import SERIAL, Executor
+from mapserver.survey.keyframes.rig_views import frame_of_view
 from mapserver.survey.settings import KeyframeSettings, SurveySettings
 from mapserver.survey.state import ImageStore, Keyframe, MemoryImageStore, Pictures
 
@@ -31,37 +32,62 @@ def make_keyframes(
     settings: SurveySettings,
     images: ImageStore | None = None,
     executor: Executor = SERIAL,
+    others: Sequence[tuple[int, StereoCamera]] = (),
 ) -> Iterator[Keyframe]:
     """Return keyframes of numbered frames; the executor extracts features while the next frames are awaited.
 
-    images: store for the pictures; by default memory.
+    images: store for the pictures; by default memory. others: see rig_views.
     """
     kept = MemoryImageStore() if images is None else images
-    waiting: deque[tuple[int, RectifiedFrame]] = deque()
+    waiting: deque[tuple[int, list[RectifiedFrame]]] = deque()
+    cameras = [camera, *(other for _, other in others)]
 
-    def batches() -> Iterator[list[RectifiedFrame]]:
+    def batches() -> Iterator[list[list[RectifiedFrame]]]:
         source = iter(frames)
         while batch := list(islice(source, _BATCH)):
-            waiting.extend(batch)
-            yield [frame for _, frame in batch]
+            views = [
+                [frame, *(frame_of_view(frame, view) or _black(frame) for view, _ in others)] for _, frame in batch
+            ]
+            waiting.extend((number, seen) for (number, _), seen in zip(batch, views, strict=True))
+            yield views
 
-    for found in executor.map(_extract, (camera, settings), batches()):
-        for features, disparities in found:
-            number, frame = waiting.popleft()
-            points = camera.point_from_pixel(features.pixels, disparities[:, 0])
-            place = kept.put(Pictures(frame, patch_align.half_pyramid(frame.left)))
-            yield set_aside(Keyframe(number, frame.stamp_ns, features, disparities, points, kept, place), kept)
+    for found in executor.map(_extract, (cameras, settings), batches()):
+        for each in found:
+            number, views = waiting.popleft()
+            first, *rest = (
+                _keyframe(number, frame, camera, features, kept) for frame, features in zip(views, each, strict=True)
+            )
+            yield replace(first, others=tuple(rest)) if rest else first
+
+
+def _keyframe(
+    number: int, frame: RectifiedFrame, camera: StereoCamera, found: tuple[orb.Features, Array], kept: ImageStore
+) -> Keyframe:
+    features, disparities = found
+    points = camera.point_from_pixel(features.pixels, disparities[:, 0])
+    pictures = Pictures(replace(frame, others=()) if frame.others else frame, patch_align.half_pyramid(frame.left))
+    return set_aside(Keyframe(number, frame.stamp_ns, features, disparities, points, kept, kept.put(pictures)), kept)
+
+
+def _black(frame: RectifiedFrame) -> RectifiedFrame:
+    black = np.zeros_like(frame.left)
+    return RectifiedFrame(frame.stamp_ns, black, black, None)
 
 
 def _extract(
-    shared: tuple[StereoCamera, SurveySettings], frames: list[RectifiedFrame]
-) -> list[tuple[orb.Features, Array]]:
-    """Return features and disparities of some frames."""
-    camera, settings = shared
+    shared: tuple[list[StereoCamera], SurveySettings], frames: list[list[RectifiedFrame]]
+) -> list[list[tuple[orb.Features, Array]]]:
+    """Return features and disparities of the views of some frames; disparities are those of the first view's baseline."""
+    cameras, settings = shared
     found = []
-    for frame in frames:
-        features = extract(frame.left, settings.orb, camera.clearance_px)
-        found.append((features, stereo.disparities(frame, camera, features.pixels, settings.stereo)))
+    for views in frames:
+        found.append(list[tuple[orb.Features, Array]]())
+        for frame, camera in zip(views, cameras, strict=True):
+            features = extract(frame.left, settings.orb, camera.clearance_px)
+            disparities = stereo.disparities(frame, camera, features.pixels, settings.stereo)
+            if camera.baseline_m != cameras[0].baseline_m:
+                disparities = disparities * (cameras[0].baseline_m / camera.baseline_m)
+            found[-1].append((features, disparities))
     return found
 
 

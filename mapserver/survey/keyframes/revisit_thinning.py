@@ -23,26 +23,30 @@ from mapserver.survey.tracks.tracks import Tracks
 _LONGEST_GAP_S = 3.0  # longest IMU bridge across left-out keyframes
 
 
-def redundant_keyframes(tracks: Tracks, keyframes: list[Keyframe], settings: SurveySettings) -> NDArray[np.bool_]:
+def redundant_keyframes(
+    tracks: Tracks, keyframes: list[Keyframe], settings: SurveySettings, views: int = 1
+) -> NDArray[np.bool_]:
     """Return (K,) keyframes without which `repeated_visits` other visits still see `repeated_share` of their tracks, as finely.
 
     A visit ends when no keyframe has seen a track for longer than the shortest loop. The last keyframes are removed first, so that
     whole drives remain. None are redundant if no place has more visits than those. Keyframes that then share too
-    few tracks with the others, such as blind ones, are redundant too: their neighbours are more accurate.
+    few tracks with the others, such as blind ones, are redundant too: their neighbours are more accurate. views: of each, in turn in
+    `keyframes`, to which the tracks refer.
     """
     cull = settings.cull
     first_of = np.cumsum([0, *(len(k.features) for k in keyframes)])
     octaves = np.concatenate([np.zeros(0, np.int8), *(k.features.octaves for k in keyframes)])
     starts = np.append(tracks.starts, len(tracks.keyframes))
-    order = np.argsort(tracks.keyframes, kind="stable")
+    owners = tracks.keyframes // views
+    order = np.argsort(owners, kind="stable")
     track = np.repeat(np.arange(len(tracks.starts)), np.diff(starts))
-    row_starts = np.searchsorted(tracks.keyframes[order], np.arange(len(keyframes) + 1))
+    row_starts = np.searchsorted(owners[order], np.arange(len(keyframes) // views + 1))
     octaves = octaves[first_of[tracks.keyframes] + tracks.features]
     gap, least = settings.loops.min_gap_keyframes, settings.loops.alone_inliers
-    members = track, starts, tracks.keyframes, octaves
+    members = track, starts, owners, octaves
     limits = gap, cull.repeated_visits, cull.repeated_share, least
     redundant = core.spare_keyframes(order, row_starts, *members, *limits)
-    while (alone := _left_alone(tracks.keyframes, track, redundant, least)).any():
+    while (alone := _left_alone(owners, track, redundant, least)).any():
         redundant |= alone
     return redundant
 
@@ -77,8 +81,9 @@ def adjust_visits(
         del state  # otherwise its observations would be in memory twice
         return bundle_rounds(held.pop(), settings, rounds=rounds, final=True)
     part = bundle_rounds(without_redundant(state, redundant), settings, rounds=rounds, final=True)
-    numbers = np.flatnonzero(~redundant)
-    seen = _seen_by(redundant, state.landmarks, part.landmarks, numbers)
+    views = np.repeat(redundant, state.view_count)
+    numbers = np.flatnonzero(~views)
+    seen = _seen_by(views, state.landmarks, part.landmarks, numbers)
     state = _localize(replace(_with_keyframes_of(state, ~redundant, part), landmarks=seen), settings, redundant)
     return replace(state, landmarks=_together(part.landmarks, numbers, state.landmarks))
 

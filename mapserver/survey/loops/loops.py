@@ -93,8 +93,9 @@ class Loops:
 class LoopCloser:
     """Searches a chain of keyframes for revisits: candidates pass a gate, are verified one by one and decided together.
 
-    `marginals` narrows with every accepted loop. loops: the outcome so far. learned: loops used to narrow the gate.
-    scales: if measured, the scale difference of each verified loop's keyframes: (log scale, sigma) by (new, old).
+    Every view of a rig is searched among all views. `marginals` narrows with every accepted loop. loops: the outcome so far. learned:
+    loops used to narrow the gate. scales: if measured, the scale difference of each verified loop's keyframes: (log scale, sigma) by
+    (new, old).
     """
 
     def __init__(
@@ -109,7 +110,8 @@ class LoopCloser:
         measures_scale: bool = False,
     ) -> None:
         """matched: pairs of keyframes matched as neighbours, which are not loops. groups: joined here by certain revisits; None
-        if all keyframes belong together.
+        if all keyframes belong together. Pairs, groups, marginals, records and edges have the numbers of keyframes; each has a view
+        or several, in turn in `posed`.
         """
         self.loops, self.learned = Loops(), list[PoseEdge]()
         self.groups, self.scales = groups, dict[tuple[int, int], tuple[float, float]]()
@@ -127,15 +129,18 @@ class LoopCloser:
 
     def grow(self, posed: PosedKeyframes, marginals: GraphMarginals, matched: Iterable[tuple[int, int]]) -> None:
         """Extend the chain: all keyframes at their present poses, known ones first; `matched` adds to earlier pairs."""
-        self._posed, self._map_from_body, self._marginals = posed, posed.map_from_body, marginals
+        self._views, self._body_from_cams = len(posed.body_from_view), posed.body_from_view @ posed.body_from_cam
+        self._posed, self._map_from_body, self._marginals = posed, posed.map_from_body[:: self._views], marginals
         vocabulary, new = self._config.vocabulary, posed.keyframes[len(self._vectors) :]
         self._vectors += [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in new]
-        for i, j in sorted(matched):
+        views = range(self._views)
+        for i, j in sorted((self._views * i + v, self._views * j + v) for i, j in matched for v in views):
             self._neighbours.setdefault(i, []).append(j)
             self._neighbours.setdefault(j, []).append(i)
         bare = [replace(k.without_pictures(), nodes=vocabulary.branches(k.features.descriptors)) for k in new]
         self._bare.update(enumerate(bare, len(self._bare)))
-        self._depths_m = np.append(self._depths_m, [keyframe.median_depth_m for keyframe in new])
+        depths_m = np.array([keyframe.median_depth_m for keyframe in new])
+        self._depths_m = np.append(self._depths_m, depths_m.reshape(-1, self._views).max(axis=1))
 
     @property
     def begin(self) -> Array:
@@ -143,15 +148,15 @@ class LoopCloser:
         return self._marginals.linearised_at
 
     def close(self, i: int) -> None:
-        """Search revisits of keyframe i among the earlier ones, then add it to the index. Call in order."""
+        """Search revisits of view i among the earlier ones, then add it to the index. Call in order."""
         candidates = self._gate(i, self._alike(i))
         self._decide(self._verify(i, candidates))
         self._index.add(i, self._vectors[i])
 
     def _alike(self, i: int) -> "_Candidates":
-        """Return old keyframes that share words with i and are not matched with it."""
+        """Return old views that share words with view i and are not matched with it."""
         ids = self._index.place_ids
-        new = i - ids >= self._settings.min_gap_keyframes
+        new = i - ids >= self._settings.min_gap_keyframes * self._views
         new &= ~np.isin(ids, self._neighbours.get(i, []))
         if not new.any():
             return _Candidates(np.zeros(0, np.int64), np.zeros(0), [])
@@ -159,21 +164,22 @@ class LoopCloser:
         return _Candidates(ids, scores, [])
 
     def _gate(self, i: int, found: "_Candidates") -> "_Candidates":
-        """Choose at most `top` candidates that may be seen from possible poses of i.
+        """Choose at most `top` candidates that may be seen from possible poses of view i.
 
         With repeated aisles the most similar candidates may all be in other aisles, so the gate goes down the
         list and records the refused ones.
         """
         far, zoned = list[int](), list[int]()
+        i, bodies = i // self._views, found.ids // self._views
         for start in range(0, len(found.ids), _CHUNK):
-            js = found.ids[start : start + _CHUNK]
+            js = bodies[start : start + _CHUNK]
             reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[i], self._depths_m[js])
             reachable = self._marginals.reachable(i, js, reach_m)
             # A loop there would add no information; the global adjustment matches common views anyway.
             apart_m = np.linalg.norm(self._map_from_body[js, :3, 3] - self._map_from_body[i, :3, 3], axis=1)
             known = (apart_m < _ALIAS_REACH * reach_m) & self._marginals.known(i, js, _WELL_KNOWN)
             for n, is_reachable in enumerate(reachable.tolist(), start):
-                here, there = self._map_from_body[[i, found.ids[n]], :3, 3]
+                here, there = self._map_from_body[[i, bodies[n]], :3, 3]
                 if not is_reachable:
                     far.append(n)
                 elif known[n - start]:
@@ -184,7 +190,7 @@ class LoopCloser:
                     found.chosen.append(n)
         for refused, reason in ((far, _FAR), (zoned, "in different zones")):
             if refused:
-                first, *others = (int(found.ids[n]) for n in refused)
+                first, *others = (int(bodies[n]) for n in refused)
                 fate = float(found.scores[refused[0]]), LoopVerdict.GATED_OUT, reason
                 self.loops.records.append(LoopRecord(i, first, *fate, also=tuple(others)))
         del found.chosen[self._settings.top :]
@@ -195,8 +201,9 @@ class LoopCloser:
         verified: list[tuple[PoseEdge, LoopRecord]] = []
         tasks = [PairTask.of([self._predict(i, int(found.ids[n]))], self._inputs) for n in found.chosen]
         matches = self._executor.map(match_task, self._shared, tasks)
+        i, bodies = i // self._views, found.ids // self._views
         for n, (match,) in zip(found.chosen, matches, strict=True):
-            j, score = int(found.ids[n]), float(found.scores[n])
+            j, score = int(bodies[n]), float(found.scores[n])
             others = np.array([edge.j for edge, _ in verified], np.int64)
             same = others[~self._are_apart(j, others)].tolist() if len(others) else []
             if len(same) >= self._settings.per_place:
@@ -204,7 +211,7 @@ class LoopCloser:
                 self.loops.records.append(LoopRecord(i, j, score, LoopVerdict.REJECTED, reason))
                 continue
             edge = None if match is None else self._edge(match)
-            aliases = found.ids[found.scores >= _ALIAS_SCORE * score]
+            aliases = bodies[found.scores >= _ALIAS_SCORE * score]
             verdict, reason = self._examined(match, edge, aliases)
             record = LoopRecord(i, j, score, verdict, reason, 0 if match is None else len(match.features))
             if edge is not None and verdict is LoopVerdict.ACCEPTED:
@@ -318,13 +325,15 @@ class LoopCloser:
         return self.groups is None or self.groups.of(edge.i) == self.groups.of(edge.j)
 
     def _cam_from_cam(self, j: int, i: int) -> Array:
-        body_from_cam = self._posed.body_from_cam
-        cam_from_map = se3_inverse(body_from_cam) @ se3_inverse(self._map_from_body[j])
-        return np.asarray(cam_from_map @ self._map_from_body[i] @ body_from_cam)
+        """Return the motion (4, 4) between the cameras of two views."""
+        (body_j, view_j), (body_i, view_i) = (divmod(n, self._views) for n in (j, i))
+        cam_from_map = se3_inverse(self._body_from_cams[view_j]) @ se3_inverse(self._map_from_body[body_j])
+        return np.asarray(cam_from_map @ self._map_from_body[body_i] @ self._body_from_cams[view_i])
 
     def _predict(self, i: int, j: int) -> tuple[int, int, PredictedMotion]:
         """Return the predicted motion to match j (as reference) with i; the graph's rotation is used if it is accurate enough."""
-        sigma = float(np.sqrt(np.trace(self._marginals.relative_cov(i, j)[:3, :3])))
+        between = self._marginals.relative_cov(i // self._views, j // self._views)
+        sigma = float(np.sqrt(np.trace(between[:3, :3])))
         known = max(sigma, 0.02) if sigma < self._settings.rotation_sigma_limit_rad else None
         return j, i, PredictedMotion(self._cam_from_cam(i, j), known)
 
@@ -333,11 +342,13 @@ class LoopCloser:
             points_old = self._posed.keyframes[match.i].points_cam[match.features[:, 0]]
             points_new = self._posed.keyframes[match.j].points_cam[match.features[:, 1]]
             self.scales[match.j, match.i] = measured_log_scale(points_old, points_new, match.j_from_i)
-        edge, old = body_edge(match, self._posed.body_from_cam), self._posed.keyframes[match.i]
+        (i, new_view), (j, old_view) = (divmod(n, self._views) for n in (match.j, match.i))
+        mount, old = self._body_from_cams[new_view], self._posed.keyframes[match.i]
+        edge = replace(body_edge(match, mount, self._body_from_cams[old_view]), i=i, j=j)
         if old.from_views:
             return edge
         per_px = by_disparity(old.points_cam[match.features[:, 0]], match.j_from_i, self._posed.camera)
-        shared = self._config.settings.noise.disparity_sigma_px * adjoint(self._posed.body_from_cam) @ per_px
+        shared = self._config.settings.noise.disparity_sigma_px * adjoint(mount) @ per_px
         return replace(edge, cov_rot_trans=edge.cov_rot_trans + np.outer(shared, shared))
 
     def _neighbours_agree(self, match: PairMatch) -> bool | None:
@@ -353,7 +364,7 @@ class LoopCloser:
                 continue
             tried += 1
             off = se3_inverse(predicted) @ other.j_from_i
-            if np.linalg.norm(off[:3, 3]) < 0.1 + 0.05 * self._depths_m[i]:
+            if np.linalg.norm(off[:3, 3]) < 0.1 + 0.05 * self._depths_m[i // self._views]:
                 return True
         return False if tried else None
 
@@ -402,9 +413,11 @@ class _Candidates:
     chosen: list[int]
 
 
-def body_edge(match: PairMatch, body_from_cam: Array) -> PoseEdge:
-    """Return body i from body j as a loop; the match has camera i (its j) from camera j (its i)."""
-    body_from_body = body_from_cam @ match.j_from_i @ se3_inverse(body_from_cam)
+def body_edge(match: PairMatch, body_from_cam: Array, old_body_from_cam: Array | None = None) -> PoseEdge:
+    """Return body i from body j as a loop; the match has camera i (its j) from camera j (its i), which may be mounted differently."""
+    body_from_body = (
+        body_from_cam @ match.j_from_i @ se3_inverse(body_from_cam if old_body_from_cam is None else old_body_from_cam)
+    )
     carry = adjoint(body_from_cam)
     covariance = _CORRELATION**2 * carry @ match.cov_rot_trans @ carry.T + np.diag([1e-6] * 3 + [1e-5] * 3)
     return PoseEdge(match.j, match.i, body_from_body, covariance, is_loop=True)

@@ -17,7 +17,7 @@ from mapserver.survey.merge.landmark_persistence import Shift, shifts
 from mapserver.survey.merge.merge import Change
 from mapserver.survey.settings import SessionSettings, SurveySettings
 from mapserver.survey.stages import Survey
-from mapserver.survey.state import Keyframe, Landmarks
+from mapserver.survey.state import Keyframe, Landmarks, poses_of_views
 
 _CELLS = COLUMNS * ROWS
 _MIN_IN_CELL = 3  # fewer confirmed landmarks do not prove a gap in the map
@@ -38,7 +38,7 @@ def what_changes(
 ) -> tuple[Change, int, int]:
     """Return the change, and how many keyframes and landmarks of the map moved. gone (N,): faded landmarks."""
     marks, body_from_cam = survey.state.landmarks, survey.state.body_from_cam
-    map_from_cam = joint.map_from_body @ body_from_cam
+    map_from_cam = poses_of_views(joint.map_from_body, survey.state.body_from_view) @ body_from_cam
     moved_keyframes = np.zeros(len(base.map_from_cam), bool)
     moved_keyframes[joint.base_keyframes] = _keyframes_moved(base, joint, settings.sessions) if anchored else True
     moved_keyframes &= ~limits.freezes(base.map_from_cam[:, :3, 3])
@@ -52,7 +52,8 @@ def what_changes(
     keep = ~gone
     keep[judged.rows[alone]] = False
     free = free_observations(marks, joint.sightings)
-    fresh = _new_landmarks(base, survey.odometry.keyframes, marks, joint, free, settings.sessions)
+    views = survey.odometry.views(survey.state.view_count)
+    fresh = _new_landmarks(base, views, marks, joint, free, settings.sessions)
     fresh &= known_well(survey, joint, settings)
     fresh &= ~limits.closes(joint.own_points_map, int(survey.map.trajectory.stamps_ns[-1]))
     again = _resighted(base, judged.rows[alone], judged.points_map[alone], joint.sightings)

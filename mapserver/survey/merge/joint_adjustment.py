@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.geometry import AnyArray, Array, se3_inverse, transform_points
 from fleetmap.relocalization.landmark_visibility import Rows
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_problem, inertial_edges
@@ -24,7 +24,7 @@ from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.merge.merge import Change
 from mapserver.survey.pose_graph.position_priors import in_frame, judged_priors, level_fit
 from mapserver.survey.settings import BundleSettings, SessionSettings, SurveySettings
-from mapserver.survey.state import Landmarks, PriorTerm, RelativeTerm, SurveyState
+from mapserver.survey.state import Landmarks, PriorTerm, RelativeTerm, SurveyState, poses_of_views
 from mapserver.survey.survey_map import SurveyMap, history_of
 
 _LONGEST_GAP_NS = 10_000_000_000
@@ -37,8 +37,9 @@ _STEP = floor_of(inertial=True)._replace(rotation_share=0.0, translation_share=0
 class Measured:
     """Constraints of a map, at its optimum: the observations, motion and priors of its keyframes.
 
-    keyframes (K,), landmarks (N,): numbers of those of the map in the problem, -1 if not included. map_from_docks (4, 4): the map keeps
-    the frame of its first survey, whose docks place it only to their own accuracy; None for a map without docks.
+    keyframes (K,), landmarks (N,): numbers of those of the map in the problem, where each keyframe is a view; -1 if not included.
+    map_from_docks (4, 4): the map keeps the frame of its first survey, whose docks place it only to their own accuracy; None for a map
+    without docks.
     """
 
     problem: BundleProblem
@@ -55,7 +56,7 @@ class JointSolution:
     poses; base_rows (R,) landmarks of the map that took part, base_points_map (R, 3); own_points_map (N, 3) of the
     survey's own landmarks, NaN if not included; sightings without outliers. measured: the problem at its optimum,
     the map's keyframes first; own_numbers (N,): those of the own landmarks in it, -1 if not included. priors_refused: docks, tags and zones
-    of the survey that contradict it or the map.
+    of the survey that contradict it or the map. own_views: numbers of the survey's views in the problem.
     """
 
     map_from_body: Array
@@ -67,6 +68,7 @@ class JointSolution:
     sightings: list[Sighting | None]
     measured: Measured
     own_numbers: Rows
+    own_views: Rows
     priors_refused: int
 
 
@@ -113,6 +115,7 @@ def _solved(
     marks = state.landmarks
     seen = [(k, s) for k, s in enumerate(sightings) if s is not None]
     known = known or _published(base, state, seen, settings.sessions)
+    known, own_views = _with_views_of(known, state)
     earlier, old, points = known.problem, len(known.problem.map_from_body), len(known.problem.points_map)
     # A feature that shows a landmark of the map is counted as its observation.
     free = free_observations(marks, sightings)
@@ -128,7 +131,11 @@ def _solved(
         np.concatenate([*(s.sigmas_px for _, s in seen), marks.obs_sigma_px[own]]),
         baseline_ratio(camera, state.camera),
     )
-    keyframes = [earlier.obs_keyframe, *(np.full(len(s.rows), old + k) for k, s in seen), old + marks.obs_keyframe[own]]
+    keyframes = [
+        earlier.obs_keyframe,
+        *(np.full(len(s.rows), own_views[k]) for k, s in seen),
+        own_views[marks.obs_keyframe[own]],
+    ]
     landmarks = [
         earlier.obs_landmark,
         *(known.landmarks[s.rows] for _, s in seen),
@@ -168,19 +175,42 @@ def _solved(
     base_keyframes, base_rows = np.flatnonzero(known.keyframes >= 0), np.flatnonzero(known.landmarks >= 0)
     own_points_map = np.full((len(marks.points_map), 3), np.nan)
     own_points_map[own_used] = result.points_map[points:]
-    placed = result.map_from_body @ rig_from_body
+    map_from_view = poses_of_views(result.map_from_body, problem.body_from_view)
     return JointSolution(
-        map_from_body=placed[old:],
+        map_from_body=result.map_from_body[old:] @ rig_from_body,
         base_keyframes=base_keyframes,
-        base_from_body=placed[known.keyframes[base_keyframes]],
+        base_from_body=map_from_view[known.keyframes[base_keyframes]] @ rig_from_body,
         base_rows=base_rows,
         base_points_map=result.points_map[known.landmarks[base_rows]],
         own_points_map=own_points_map,
         sightings=fitting,
         measured=Measured(continued(problem, result), known.keyframes, known.landmarks, map_from_docks),
         own_numbers=own_numbers,
+        own_views=own_views,
         priors_refused=sum(not prior.is_believed for prior in state.priors),
     )
+
+
+def _with_views_of(known: Measured, state: SurveyState) -> tuple[Measured, Rows]:
+    """Return the constraints with the survey's views among those of the problem, and (K * V,) their numbers after all of the map."""
+    problem = known.problem
+    rig_from_body = problem.body_from_cam @ se3_inverse(state.body_from_cam)
+    views, which = list(problem.body_from_view), [0]
+    for own in rig_from_body @ state.body_from_view[1:] @ se3_inverse(rig_from_body):
+        same = [n for n, view in enumerate(views) if np.allclose(view, own, atol=1e-9)]
+        which.append(same[0] if same else len(views))
+        views += [] if same else [own]
+    before, after = len(problem.body_from_view), len(views)
+
+    def numbered(keyframes: AnyArray) -> AnyArray:
+        return np.where(keyframes < 0, -1, keyframes // before * after + keyframes % before)
+
+    bodies = len(problem.map_from_body) + np.arange(len(state.stamps_ns))
+    own_views = (after * bodies[:, None] + which).ravel()
+    if after == before:
+        return known, own_views
+    problem = replace(problem, obs_keyframe=numbered(problem.obs_keyframe), body_from_view=np.array(views))
+    return replace(known, problem=problem, keyframes=numbered(known.keyframes)), own_views
 
 
 def _published(
@@ -251,7 +281,7 @@ def _carried(state: SurveyState, map_from_body: Array) -> tuple[Array, Array]:
     marks = state.landmarks
     turn = map_from_body[:, :3, :3] @ state.map_from_body[:, :3, :3].transpose(0, 2, 1)
     shift = map_from_body[:, :3, 3] - np.einsum("kij,kj->ki", turn, state.map_from_body[:, :3, 3])
-    first = marks.obs_keyframe[marks.firsts]
+    first = state.observers[marks.firsts]
     return turn, np.einsum("nij,nj->ni", turn[first], marks.points_map) + shift[first]
 
 
@@ -284,7 +314,11 @@ def _inertial(
 
 def begun(state: SurveyState, survey_map: SurveyMap, landmarks: Rows, settings: SurveySettings) -> Measured:
     """Return the constraints of a map's first survey, its state in the map's frame; landmarks (N,): rows of the state in the map."""
-    keyframes = np.searchsorted(state.stamps_ns, survey_map.keyframe_stamps_ns)
+    views = state.view_count
+    keyframes = views * np.searchsorted(state.stamps_ns, survey_map.keyframe_stamps_ns)
+    if views > 1:  # the view at the pose of the map's keyframe
+        beside = state.map_from_view[keyframes[:, None] + np.arange(views)]
+        keyframes += np.abs(beside - survey_map.map_from_body[:, None]).sum(axis=(2, 3)).argmin(axis=1)
     problem = bundle_problem(state, settings, None)
     return Measured(problem, keyframes, landmarks, np.eye(4) if problem.priors else None)
 
@@ -292,9 +326,9 @@ def begun(state: SurveyState, survey_map: SurveyMap, landmarks: Rows, settings: 
 def grown(joint: JointSolution, change: Change, base: BaseMap, after: SurveyMap) -> Measured:
     """Return the constraints of the map after a change; a moved landmark is at its position by the new survey."""
     before, problem, is_new = joint.measured, joint.measured.problem, change.added_rows < 0
-    old = len(problem.map_from_body) - len(joint.map_from_body)
+    old = int(joint.own_views[0])
     stay = np.isin(base.history.keyframe_ids, history_of(after).keyframe_ids)
-    keyframes = np.concatenate([before.keyframes[stay], old + np.unique(change.added.obs_keyframe)])
+    keyframes = np.concatenate([before.keyframes[stay], joint.own_views[np.unique(change.added.obs_keyframe)]])
     added = np.where(is_new, joint.own_numbers[change.added_own], before.landmarks[change.added_rows])
     landmarks = np.concatenate([before.landmarks[change.keep], added])
     keep = (problem.obs_keyframe >= old) | ~np.isin(problem.obs_landmark, added[~is_new])

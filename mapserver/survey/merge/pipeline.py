@@ -25,6 +25,7 @@ from mapserver.survey.merge.membership import (
 from mapserver.survey.merge.merge import merged
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import Survey
+from mapserver.survey.state import poses_of_views
 from mapserver.survey.survey_map import SurveyMap
 
 _NO_LIMITS = SurveyLimits()
@@ -97,11 +98,11 @@ def extend(
     refused = test.judged(located, located.seen)
     if refused is not None and contradicts(located.seen):
         return refused
-    map_from_body = located.map_from_body
+    map_from_body, views = located.map_from_body, guess.views(state.view_count)
     for radius_px in (settings.sessions.search_px, settings.sessions.guided_px):
         sightings = [
             match_keyframe(base, relocalizer, keyframe, place @ state.body_from_cam, radius_px, settings)
-            for keyframe, place in zip(guess.keyframes, map_from_body, strict=True)
+            for keyframe, place in zip(views, poses_of_views(map_from_body, state.body_from_view), strict=True)
         ]
         finely = radius_px == settings.sessions.guided_px
         joint = adjust_jointly(base, known, state, map_from_body, sightings, settings, finely=finely)
@@ -110,7 +111,8 @@ def extend(
     refused = test.judged(located, seen)
     if refused is not None:
         return refused
-    found = count_landmarks(base, guess.keyframes, map_from_body @ state.body_from_cam, joint.sightings)
+    map_from_cam = poses_of_views(map_from_body, state.body_from_view) @ state.body_from_cam
+    found = count_landmarks(base, views, map_from_cam, joint.sightings)
     anchored = known is None
     gone = faded(base, found, settings) if anchored else np.zeros(len(base.points_map), bool)
     gone &= ~limits.freezes(base.points_map)
@@ -122,7 +124,7 @@ def extend(
     stamps_ns, survey_from_body = survey.map.trajectory.stamps_ns, survey.map.trajectory.frame_from_body
     placed = frame_trajectory(stamps_ns, survey_from_body, guess.keyframe_frames, map_from_body)
     result = replace(
-        merged(base, change, found, guess.keyframes, settings.sessions.new_place_landmarks, limits.freezes(cameras)),
+        merged(base, change, found, views, settings.sessions.new_place_landmarks, limits.freezes(cameras)),
         trajectory=Trajectory(stamps_ns, placed),
         trajectory_estimated=survey.map.trajectory_estimated,
     )

@@ -29,9 +29,11 @@ class PairFinder:
         body_from_cam: Array,
         settings: PairSettings,
         executor: Executor = SERIAL,
+        views: int = 1,
     ) -> None:
+        """views: of a rig, in turn in `keyframes`."""
         self._keyframes, self._camera, self._body_from_cam, self._settings = keyframes, camera, body_from_cam, settings
-        self._executor = executor
+        self._executor, self._views = executor, views
         self._inputs = MatchInputs([k.without_pictures() for k in keyframes], camera, settings)
         self._shared = replace(self._inputs, keyframes={})
         self._depths_m = np.array([k.median_depth_m for k in keyframes])
@@ -48,8 +50,8 @@ class PairFinder:
         found: list[tuple[int, int]] = []
         for j in range(1, len(map_from_cam)):
             first = 0 if only_near is None else max(0, j - only_near)
-            chosen = set(range(max(first, j - previous), j))
-            until = max(j - previous, first)
+            until = max(j - previous * self._views, first)
+            chosen = {i for i in range(until, j) if (j - i) % self._views == 0}
             earlier = np.arange(first, until) if around is None else around.before(j, until)
             distance = np.linalg.norm(positions[earlier] - positions[j], axis=1)
             near = (distance < np.maximum(reach_m[earlier], reach_m[j])) & (

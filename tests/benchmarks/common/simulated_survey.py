@@ -39,6 +39,7 @@ _ALIGNED_PX, _DISPARITY_PX = (
 )  # errors of aligned coordinates and of disparities, as rendered pictures show them
 _SIZE_PX = (480, 640)
 _TURNING_M = 4.0
+_MOST_VIEWS = 9
 _EVER_NS = -(2**62)
 
 
@@ -67,7 +68,7 @@ class GreyPictures:
 
 @dataclass(frozen=True)
 class SimulatedSurvey:
-    """The odometry of a session, and for each of its K keyframes which landmark a feature shows and where that is, exactly.
+    """The odometry of a session, and for each view of its keyframes, K in all, which landmark a feature shows and where that is, exactly.
 
     landmarks: K arrays (N,), 0 for clutter; exact_px: K arrays (N, 3) u_left v u_right; map_from_body (F, 4, 4) the truth of all frames.
     """
@@ -139,9 +140,13 @@ def _one_after_the_other(routes: Sequence[Route]) -> Route:
     return replace(routes[0], way_points_map=tuple(points))
 
 
-def simulated_survey(session: EstimatorSession, settings: SurveySettings) -> SimulatedSurvey:
-    """The odometry over a session, with the keyframes that its policy chooses."""
+def simulated_survey(
+    session: EstimatorSession, settings: SurveySettings, others: Sequence[EstimatorSession] = ()
+) -> SimulatedSurvey:
+    """The odometry over a session, with the keyframes that its policy chooses. others: the rig's other views."""
     nominal = session.session.nominal
+    if not others:
+        nominal = replace(nominal, cameras=tuple(nominal.cameras[number] for number in nominal.views[0]))
     rectifier = Rectifier(nominal)
     run = OdometryRun(nominal, rectifier, settings)
     run._odometry._tracker = EstimatorTracker(session, session.camera, settings.odometry.tracker)  # type: ignore[attr-defined]
@@ -153,10 +158,11 @@ def simulated_survey(session: EstimatorSession, settings: SurveySettings) -> Sim
         tracked = run.handle(frame, *feed.until(frame.stamp_ns))
         seen.append(FrameTracks.of_frame(tracked.estimate))
         if tracked.is_keyframe:
-            keyframe, ids, exact = _keyframe(session, number, images)
-            keyframes.append(keyframe)
-            landmarks.append(ids)
-            exact_px.append(exact)
+            views = [_keyframe(each, number, images) for each in (session, *others)]
+            (first, *further), ids, exact = zip(*views, strict=True)
+            keyframes.append(replace(first, others=tuple(further)))
+            landmarks.extend(ids)
+            exact_px.extend(exact)
     estimates = run.chain.estimates
     odometry = OdometryPass(
         estimates, run.chain.odom_from_body(), run.chain.covariances(),
@@ -186,7 +192,7 @@ def _keyframe(
 @contextmanager
 def drawn_alignment(survey: SimulatedSurvey) -> Iterator[None]:
     """Alignment's results are drawn while this holds; equal arguments give equal results."""
-    number = {id(keyframe.features): k for k, keyframe in enumerate(survey.odometry.keyframes)}
+    number = {id(keyframe.features): k for k, keyframe in enumerate(survey.odometry.views(_MOST_VIEWS))}
 
     def observe(
         posed: PosedKeyframes, table: NDArray[np.int64], points_map: Array, settings: SurveySettings, executor: Executor

@@ -121,6 +121,7 @@ def test_nobody_holds_what_was_begun_once_its_loops_are_closed(euroc: Path, monk
     class State:
         camera: StereoCamera
         landmarks: object = None
+        body_from_view: object = None
 
     def adjust(*_: object) -> None:
         raise SurveyError("held" if begun() else "let go of")

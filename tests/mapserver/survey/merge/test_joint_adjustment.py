@@ -16,7 +16,7 @@ from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.merge.joint_adjustment import Measured, adjust_jointly
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import KeyframeMotion, Landmarks, PriorTerm, RelativeTerm, SurveyState
+from mapserver.survey.state import KeyframeMotion, Landmarks, PriorTerm, RelativeTerm, SurveyState, poses_of_views
 from mapserver.survey.survey_map import SurveyMap
 
 CAMERA = StereoCamera(420.0, 320.0, 240.0, 0.12, 640, 480)
@@ -24,6 +24,8 @@ BODY_FROM_CAM = se3(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), np.array([0
 SETTINGS = SurveySettings()
 CLAIMED_PX = np.array([np.hypot(0.35, 0.1), np.hypot(0.2, 0.13)])
 AISLES_M, LENGTH_M = 4.6, 20.0
+ONE_VIEW = np.eye(4)[None]
+REAR, ASIDE = (se3(so3_exp(np.array([0, 0, yaw])), np.array([-0.3, 0.05, 0.0])) for yaw in (np.pi, 1.5))
 
 
 @dataclass(frozen=True)
@@ -65,11 +67,13 @@ def places(corners: list[tuple[float, float]]) -> Array:
     return np.array(found)
 
 
-def drive(points: Array, at_edge: Any, corners: list[tuple[float, float]], rng: np.random.Generator) -> Drive:
+def drive(
+    points: Array, at_edge: Any, corners: list[tuple[float, float]], rng: np.random.Generator, views: Array = ONE_VIEW
+) -> Drive:
     """A drive's survey: planes' disparities are good to 0.06 px, those at far depth edges too large and never too small."""
     truth = places(corners)
     keyframe, which, pixels = [], [], []
-    for k, map_from_cam in enumerate(truth @ BODY_FROM_CAM):
+    for k, map_from_cam in enumerate(poses_of_views(truth, views) @ BODY_FROM_CAM):
         cam = (points - map_from_cam[:3, 3]) @ map_from_cam[:3, :3]
         z = np.maximum(cam[:, 2], 1e-3)
         exact = CAMERA.pixel_from_point(np.column_stack([cam[:, :2], z]))
@@ -90,7 +94,7 @@ def drive(points: Array, at_edge: Any, corners: list[tuple[float, float]], rng: 
     motion = KeyframeMotion(False, ImuSamples.empty(), None, 0.0, none, none, none, [])
     owners = seen_by[order].astype(np.int32), landmark.astype(np.int32)
     marks = Landmarks(points[used], *owners, order, observed[order], np.tile(CLAIMED_PX, (len(order), 1)))
-    state = SurveyState(np.arange(len(truth)), truth, BODY_FROM_CAM, CAMERA, motion, marks)
+    state = SurveyState(np.arange(len(truth)), truth, BODY_FROM_CAM, CAMERA, motion, marks, body_from_view=views)
     state = bundle_rounds(state, SETTINGS, rounds=2, final=True)
     named = state.landmarks.obs_feature[state.landmarks.firsts]
     return Drive(state, truth, seen[named], seen_by, seen, observed)
@@ -114,13 +118,13 @@ def beside(first: Drive, later: Drive, points: int) -> tuple[Measured, list[Sigh
     """What holds the first drive's map, and what the later one sees of it."""
     known = Measured(
         bundle_problem(first.state, SETTINGS, None),
-        np.arange(len(first.state.stamps_ns)),
+        np.arange(len(first.state.map_from_view)),
         np.arange(len(first.points)),
     )
     row = np.full(points, -1)
     row[first.points] = np.arange(len(first.points))
     sightings: list[Sighting | None] = []
-    for k in range(len(later.map_from_body)):
+    for k in range(len(later.state.map_from_view)):
         features = np.flatnonzero((later.seen_by == k) & (row[later.seen] >= 0))
         sigmas = np.tile(CLAIMED_PX, (len(features), 1))
         sightings.append(Sighting(row[later.seen[features]], features, later.pixels[features], sigmas))
@@ -173,6 +177,27 @@ def test_a_single_camera_and_a_pair_join_each_other(map_m: float, survey_m: floa
     joint = adjust_jointly(base, known, later.state, later.map_from_body, sightings, SETTINGS, finely=True)
     assert joint.measured.problem.camera.baseline_m == max(map_m, survey_m)
     assert np.linalg.norm((joint.map_from_body - later.map_from_body)[:, :3, 3], axis=1).max() < 0.1
+
+
+@pytest.mark.parametrize("of_map", [[], [REAR]])
+@pytest.mark.parametrize("of_survey", [[], [REAR], [ASIDE]])
+def test_rigs_with_different_views_join_each_other(of_map: list[Array], of_survey: list[Array]) -> None:
+    rng = np.random.default_rng(3)
+    points, at_edge = shelves(rng)
+    map_views, survey_views = (np.array([np.eye(4), *views]) for views in (of_map, of_survey))
+    first = drive(points, at_edge, [(-2, 0), (6, 0)], rng, map_views)
+    later = drive(points, at_edge, [(-2, 0), (6, 0)], rng, survey_views)
+    known, sightings = beside(first, later, len(points))
+    base: Any = None
+    joint = adjust_jointly(base, known, later.state, later.map_from_body, sightings, SETTINGS, finely=True)
+    assert len(joint.measured.problem.body_from_view) == 1 + len({id(view) for view in (*of_map, *of_survey)})
+    for found, truth in (
+        (joint.map_from_body, later.map_from_body),
+        (joint.base_from_body, poses_of_views(first.map_from_body, map_views)),
+    ):
+        assert np.linalg.norm((found - truth)[:, :3, 3], axis=1).max() < 0.03
+    tied = joint.base_from_body.reshape(-1, len(map_views), 4, 4)
+    np.testing.assert_allclose(tied, tied[:, :1] @ map_views, atol=1e-9)
 
 
 def docked(made: Drive, keyframes: list[int], moved_m: float = 0.0) -> list[PriorTerm]:

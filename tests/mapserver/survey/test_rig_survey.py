@@ -1,0 +1,122 @@
+"""Surveys of a rig with a second pair that looks back, without pictures: all views observe into one state."""
+
+from dataclasses import replace
+from functools import lru_cache
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from benchmarks.common.estimator_loop import SETTINGS as ROBOT
+from benchmarks.common.estimator_loop import SessionRelocalizer, blank
+from benchmarks.common.simulated_survey import SimulatedSurvey, drawn_alignment, simulated_survey
+from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.geometry import Array, se3_inverse, se3_log
+from fleetmap.relocalization.map_view import MapView
+from fleetmap.sensors.samples import SensorSet
+from fleetmap.time_sliced import finished
+from fleetsim.motion.routes import Route
+from fleetsim.recorder import Order, prepare
+from fleetsim.scenarios import SCENARIOS, find_scenario
+from mapserver.config import survey_settings
+from mapserver.survey.finish.map_transform import transform_map
+from mapserver.survey.stages import Survey, survey_from
+from mapserver.survey.survey_inputs import SurveyConfig
+from mapserver.tiles.tiling import tiles_from_survey
+from support.estimator.landmarks import LandmarkField
+from support.estimator.simulated_run import EstimatorSession
+
+SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
+_ALONG = "along"  # one way
+_BACK = "back"  # and back on the other side of the aisle
+
+
+def driven(name: str, day: int = 0) -> list[EstimatorSession]:
+    """Both views of a drive in an aisle."""
+    base = find_scenario("clip")
+    y = base.layout.aisle_y_m(0)
+    way = ((4.5, y - 0.4), (8.5, y - 0.4)) + (((8.5, y + 0.4), (4.5, y + 0.4)) if name == _BACK else ())
+    runs = {name: replace(base.runs["survey"], routes=(Route(way, rest_s=0.5),), rate_hz=5.0)}
+    with patch.dict(SCENARIOS, clip=lambda: replace(base, runs=runs)):
+        session = prepare(Order("clip", seed=4, day=day, robot=name, rig="front-rear"))
+    session.renderer.close()
+    field = LandmarkField(session.world)
+    return [EstimatorSession(session, field=field, view=view) for view in (0, 1)]
+
+
+@lru_cache(maxsize=4)
+def surveyed(name: str, views: int) -> tuple[SimulatedSurvey, Survey]:
+    first, *others = driven(name)[:views]
+    made = simulated_survey(first, SETTINGS, others)
+    with drawn_alignment(made):
+        return made, survey_from(made.odometry, made.inputs, SurveyConfig(SETTINGS, default_vocabulary()))
+
+
+def robots_view(made: SimulatedSurvey, done: Survey) -> MapView:
+    """The survey as robots have it, in the frame of the truth at its beginning."""
+    shift = made.map_from_body[0] @ se3_inverse(done.map.trajectory.frame_from_body[0])
+    tiles = tiles_from_survey(transform_map(done.map, shift))
+    return MapView(tiles, default_vocabulary(), done.map.camera.focal_px)
+
+
+def steps_off_m(made: SimulatedSurvey, done: Survey) -> float:
+    """Root mean square error of all frames' positions as seen from the middle one."""
+
+    def from_middle(poses: Array) -> Array:
+        return (se3_inverse(poses[len(poses) // 2]) @ poses)[:, :3, 3]
+
+    off = from_middle(done.map.trajectory.frame_from_body) - from_middle(made.map_from_body)
+    return float(np.sqrt((off**2).sum(axis=1).mean()))
+
+
+def test_a_robot_against_the_survey_finds_itself_by_landmarks_of_the_rear_pair() -> None:
+    """What the rear pair shows on another day is what a robot with one pair would see that drives the other way."""
+    facing_back = driven(_ALONG, day=1)[1]
+    fixed = {}
+    for views in (1, 2):
+        made, done = surveyed(_ALONG, views)
+        relocalizer = SessionRelocalizer(robots_view(made, done), facing_back, ROBOT)
+        fixed[views] = 0
+        for number in range(0, len(facing_back), 4):
+            features = finished(relocalizer.extract(blank(facing_back, number)))
+            fixes = finished(relocalizer.anywhere(features))
+            truth = facing_back.map_from_body[number] @ facing_back.body_from_cam
+            assert all(np.linalg.norm(fix.map_from_cam[:3, 3] - truth[:3, 3]) < 0.1 for fix in fixes)
+            fixed[views] += len(fixes) > 0
+    assert fixed[1] == 0 and fixed[2] >= 3, fixed
+
+
+def test_views_share_the_pose_of_their_keyframe() -> None:
+    made, done = surveyed(_ALONG, 2)
+    places = done.map.map_from_body
+    rear = done.state.body_from_view[1]
+    assert len(places) == 2 * len(made.odometry.keyframes) == 2 * len(done.state.map_from_body)
+    np.testing.assert_allclose(places[1::2], places[0::2] @ rear, atol=1e-12)
+    assert set(np.unique(done.map.obs_keyframe % 2)) == {0, 1}
+    assert steps_off_m(made, done) <= steps_off_m(*surveyed(_ALONG, 1))
+
+
+def test_the_way_back_is_tied_to_the_way_out_by_the_other_view() -> None:
+    opposite = {}
+    for views in (1, 2):
+        made, done = surveyed(_BACK, views)
+        ahead = made.map_from_body[made.odometry.keyframe_frames][:, :3, 0]
+        across = [edge for edge in done.loops.edges if ahead[edge.i] @ ahead[edge.j] < -0.9]
+        opposite[views] = len(across)
+        for edge in across:
+            frames = [made.odometry.keyframe_frames[k] for k in (edge.i, edge.j)]
+            i_from_j = se3_inverse(made.map_from_body[frames[0]]) @ made.map_from_body[frames[1]]
+            off = se3_log(i_from_j @ se3_inverse(edge.i_from_j))
+            assert off @ np.linalg.solve(edge.cov_rot_trans, off) < chi2.ppf(0.9999, 6)
+    assert opposite[1] == 0 and opposite[2] > 0, opposite
+    assert steps_off_m(*surveyed(_BACK, 2)) <= steps_off_m(*surveyed(_BACK, 1))
+
+
+@pytest.mark.parametrize("views", [1, 2])
+def test_the_same_survey_gives_the_same_bytes(views: int) -> None:
+    made, done = surveyed(_ALONG, views)
+    with drawn_alignment(made):
+        again = survey_from(made.odometry, made.inputs, SurveyConfig(SETTINGS, default_vocabulary()))
+    assert again.map.points_map.tobytes() == done.map.points_map.tobytes()
+    assert again.map.map_from_body.tobytes() == done.map.map_from_body.tobytes()
