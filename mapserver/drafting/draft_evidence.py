@@ -36,6 +36,7 @@ from mapserver.quality.probes import (
 )
 from mapserver.store import MapStore
 from mapserver.survey.executor import SERIAL, Executor
+from mapserver.survey.keyframes.rig_views import frame_of_view, other_views
 from mapserver.survey.stages import Survey
 from mapserver.survey.survey_map import SurveyMap, history_of
 
@@ -45,9 +46,9 @@ _HELD_OUT = 2 * PROBES  # every second one has a say in the landmarks for robots
 
 @dataclass(frozen=True, slots=True)
 class ProbedFrame:
-    """A frame of a surveyed recording: its number among the selected ones, its camera and features.
+    """A frame of a surveyed recording, or one of a rig's other views: its number among the selected ones, its camera and features.
 
-    is_held_out: True if the build did not use it; else an end of the drive that is a keyframe.
+    is_held_out: True if the build did not use it; else an end of the drive that is a keyframe. view: its number.
     """
 
     number: int
@@ -55,6 +56,7 @@ class ProbedFrame:
     body_from_cam: Array
     features: FrameFeatures
     is_held_out: bool = True
+    view: int = 0
 
     def probe(self, map_from_body: Array) -> Probe:
         """Return it as a probe; map_from_body (F, 4, 4) of all selected frames."""
@@ -70,15 +72,19 @@ class JudgedSession(NamedTuple):
 
     def asked(self, recordings: int) -> list[ProbedFrame]:
         """Return the frames whose views get landmarks: every second held-out one of one of so many recordings, and both ends."""
-        return [*self._held_out(recordings)[1::2], *self.probed[:1], *self.probed[-1:]]
+        ends = {frame.number for frame in (*self.probed[:1], *self.probed[-1:])}
+        return [*self._held_out(recordings, 1), *(frame for frame in self.probed if frame.number in ends)]
 
     def judging(self, recordings: int) -> list[ProbedFrame]:
         """Return the other held-out frames: the tiles do not depend on them."""
         asked = {frame.number for frame in self.asked(recordings)}
-        return [frame for frame in self._held_out(recordings)[::2] if frame.number not in asked]
+        return [frame for frame in self._held_out(recordings, 0) if frame.number not in asked]
 
-    def _held_out(self, recordings: int) -> list[ProbedFrame]:
-        return [frame for frame in self.probed if frame.is_held_out][::recordings]
+    def _held_out(self, recordings: int, first: int) -> list[ProbedFrame]:
+        """Return all views of every second held-out frame of one of so many recordings."""
+        numbers = list(dict.fromkeys(frame.number for frame in self.probed if frame.is_held_out))
+        chosen = set(numbers[::recordings][first::2])
+        return [frame for frame in self.probed if frame.number in chosen]
 
 
 def probed_frames(
@@ -109,8 +115,11 @@ def _read(
             frame = rectifier.rectify(recording.read_frame(int(selected[number])))
         except RecordingError:
             continue
-        features = probe_features(frame, rectifier.camera, orb)
-        found.append(ProbedFrame(number, rectifier.camera, rectifier.body_from_cam, features))
+        for view in (0, *(view for view, _ in other_views(rectifier))):
+            if (seen := frame_of_view(frame, view)) is not None:
+                camera, body_from_cam = rectifier.mounted[view]
+                features = probe_features(seen, camera, orb)
+                found.append(ProbedFrame(number, camera, body_from_cam, features, view=view))
     return found
 
 

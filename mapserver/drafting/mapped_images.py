@@ -127,16 +127,21 @@ class KeptFrames:
             self._store.note(index)
             return self._frames[index]
         frame = self._source.frame(index)
-        images = (frame.left, frame.right, frame.depth_m)
         if self._keeps:
             try:
-                kept: list[Any] = [None if image is None else self._store.keep([image])[0] for image in images]
-                self._frames[index] = CameraFrame(frame.stamp_ns, *kept)
-                self._bytes += sum(image.nbytes for image in images if image is not None)
+                self._frames[index] = self._kept(frame)
                 self._keeps = self._bytes < _KEPT_BYTES
             except StoreError:  # disk full: the frame is decoded again next time
                 self._keeps = False
         return frame
+
+    def _kept(self, frame: CameraFrame) -> CameraFrame:
+        images = (frame.left, frame.right, frame.depth_m)
+        left, right, depth_m = (None if image is None else self._store.keep([image])[0] for image in images)
+        self._bytes += sum(image.nbytes for image in images if image is not None)
+        others = tuple(None if other is None else self._kept(other) for other in frame.others)
+        kept: dict[str, Any] = {"left": left, "right": right, "depth_m": depth_m}
+        return replace(frame, **kept, others=others)
 
     def close(self) -> None:
         """See FrameSource."""

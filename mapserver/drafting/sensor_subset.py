@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError, UsageError
 from fleetmap.recordings import OpenOptions, Recording, open_recording
+from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet
 
 if TYPE_CHECKING:
@@ -44,13 +45,13 @@ def named_sensor_set(name: str) -> SensorSet:
 
 
 def reduced(recording: Recording, use: SensorSet | None) -> Recording:
-    """Return the recording without the sensors missing from `use`, of a rig its first view; otherwise unchanged without `use`.
+    """Return the recording without the sensors missing from `use`, then of a rig its first view; unchanged without `use`.
 
     Raises RecordingError if the recording lacks a sensor of `use`.
     """
-    recording = recording.view(0)
     if use is None or use is recording.sensor_set:
         return recording
+    recording = recording.view(0)
     if use not in REDUCTIONS[recording.sensor_set]:
         possible = ", ".join(REDUCTIONS[recording.sensor_set])
         raise RecordingError(
@@ -64,6 +65,16 @@ def reduced(recording: Recording, use: SensorSet | None) -> Recording:
     return replace(
         recording, sensor_set=use, calibration=calibration, imu=imu, frames=_Reduced(recording.frames, use in _SINGLE)
     )
+
+
+def with_other_views(rig: RigCalibration, whole: RigCalibration) -> RigCalibration:
+    """Return a first view's calibration, perhaps corrected, with the other views of `whole`, whose clock it corrects too."""
+    cameras, count = whole.cameras, len(whole.views[0])
+    if len(cameras) == count:
+        return rig
+    later_s = rig.cameras[0].imu_minus_cam_s - cameras[0].imu_minus_cam_s
+    others = [replace(camera, imu_minus_cam_s=camera.imu_minus_cam_s + later_s) for camera in cameras[count:]]
+    return replace(rig, cameras=(*rig.cameras, *others))
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ from mapserver.drafting.admission import DECISIVE, SAMPLED_FRAMES, TURN_FRAMES, 
 from mapserver.drafting.draft_evidence import ProbedFrame, probed_frames
 from mapserver.drafting.mapped_images import KeptFrames
 from mapserver.drafting.report import check_truth
-from mapserver.drafting.sensor_subset import reduced
+from mapserver.drafting.sensor_subset import reduced, with_other_views
 from mapserver.drafting.trajectory import GivenPoses, OtherTrajectory, given_poses, with_depths
 from mapserver.drafting.worker import read_ahead
 from mapserver.quality.figures import RigEvidence
@@ -223,15 +223,18 @@ _LONGEST_S = 120.0  # of a drive tracked as a whole; a longer one is judged by i
 class BegunSurvey:
     """The first stages of a recording's survey, which also measure its calibration: they run only once if that is right."""
 
-    def __init__(self, indices: NDArray[np.int64], settings: SurveySettings, tools: SurveyTools) -> None:
-        """indices (F,): of the selected frames."""
-        self._indices, self._settings, self._tools = indices, settings, tools
+    def __init__(
+        self, whole: Recording, indices: NDArray[np.int64], settings: SurveySettings, tools: SurveyTools
+    ) -> None:
+        """whole: with all views of its rig, of which the calibration concerns the first. indices (F,): of the selected frames."""
+        self._whole, self._indices, self._settings, self._tools = whole, indices, settings, tools
         self._made: tuple[RigCalibration, AdjustedChain] | None = None
 
     def __call__(self, recording: Recording, rig: RigCalibration) -> CalibrationData:
         """Return the data of the frames under the calibration `rig`. SurveyError if they are too few to be tracked."""
-        rectifier, images = Rectifier(rig), self._tools.images
-        inputs = survey_inputs_of(replace(recording, calibration=rig), self._indices, rectifier, None)
+        calibration, images = with_other_views(rig, self._whole.calibration), self._tools.images
+        rectifier, seen = Rectifier(calibration), replace(recording, calibration=calibration, frames=self._whole.frames)
+        inputs = survey_inputs_of(seen, self._indices, rectifier, None)
         is_believed = rig is recording.calibration
         with nullcontext(images) if is_believed or images is None else images.apart() as images:
             chain = begin_survey(inputs, self._settings, replace(self._tools, images=images))
@@ -310,19 +313,20 @@ def _admission(
             console.print(f"issue: {issue.what}: {issue.detail}", markup=False)
         if needs_truth:
             check_truth(str(recording.path), recording.frame_stamps_ns[indices], recording.ground_truth)
-        total, done = frames_to_check(recording, SAMPLED_FRAMES, TURN_FRAMES), count(1)
+        first = recording.view(0)
+        total, done = frames_to_check(first, SAMPLED_FRAMES, TURN_FRAMES), count(1)
         begun = None
         if settings is not None and options.trajectory is None and BegunSurvey.suits(recording, indices):
-            begun = BegunSurvey(indices, settings, tools)
+            begun = BegunSurvey(recording, indices, settings, tools)
         result = checked(
-            recording, lambda: tools.progress("examination", min(next(done), total - 1), total), tools.executor, begun
+            first, lambda: tools.progress("examination", min(next(done), total - 1), total), tools.executor, begun
         )
         tools.at("examination", total, total)
         for remark in result.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)
         if options.trajectory is None:
             return Admission(result, begun=None if begun is None else begun.chain_of(result.rig))
-        given = given_poses(replace(recording, calibration=result.rig), indices, options.trajectory)
+        given = given_poses(replace(first, calibration=result.rig), indices, options.trajectory)
         console.print(f"{recording.name}: {given.words}", markup=False)
         return Admission(result, given)
 
@@ -337,8 +341,9 @@ def survey_recording(
 ) -> Surveyed:
     """Survey one recording resampled to `pinhole` (or the camera that suits it). The caller drops its references to the first stages."""
     found, given, chain = admission.checked, admission.given, admission.begun
-    rig, said = found.rig, () if given is None else (given.words,)
+    said = () if given is None else (given.words,)
     with reading.open(path) as (opened, indices):
+        rig = with_other_views(found.rig, opened.calibration)
         recording = replace(opened, calibration=rig)
         if found.leaves_wheels_out:
             recording = replace(recording, wheel=())

@@ -37,7 +37,7 @@ def asked_views(sessions: Sequence[JudgedSession]) -> list[AskedView]:
     for session in sessions:
         map_from_body, positions_m = session.trajectory.frame_from_body, session.trajectory.positions_m
         path_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(positions_m, axis=0), axis=1))])
-        frames = list({frame.number: frame for frame in session.asked(len(sessions))}.values())
+        frames = list({(frame.number, frame.view): frame for frame in session.asked(len(sessions))}.values())
         found += [AskedView(frame.probe(map_from_body), float(path_m[frame.number])) for frame in frames]
     return found
 

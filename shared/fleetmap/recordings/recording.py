@@ -194,9 +194,12 @@ class Recording:
     def view(self, number: int) -> "Recording":
         """The recording of one of a rig's views alone, with its own stamps; the content's hash is that of all views for the first one."""
         cameras, views = self.calibration.cameras, self.calibration.views
-        if len(views) == 1 or not isinstance(self.frames, SeriesFrames):
+        if len(views) == 1:
             return self
         calibration = replace(self.calibration, cameras=tuple(cameras[camera] for camera in views[number]))
+        if not isinstance(self.frames, SeriesFrames):  # other views of its frames find no camera in that calibration
+            assert number == 0
+            return replace(self, calibration=calibration)
         if number == 0:
             return replace(self, calibration=calibration, frames=replace(self.frames, has_others=False))
         of_pair = {SensorSet.MONO: SensorSet.STEREO, SensorSet.MONO_INERTIAL: SensorSet.STEREO_INERTIAL}

@@ -260,8 +260,8 @@ def _as_pinhole(pinhole: StereoCamera, own: StereoCamera) -> StereoCamera:
 
 
 @lru_cache(
-    maxsize=4
-)  # tables of two pairs: a build creates the rectifier of a recording for its checks, and again for its survey
+    maxsize=16
+)  # tables of some rigs: a build creates the rectifier of a recording for its checks, and again for its survey
 def _remap_tables(
     rectified: StereoCamera,
     model: str,

@@ -102,7 +102,7 @@ def test_a_survey_goes_on_from_what_was_followed_under_its_calibration(
     monkeypatch.setattr(survey_recordings, "begin_survey", lambda _inputs, _settings, tools: [tools.images])
     monkeypatch.setattr(survey_recordings, "busiest_stretch", lambda chain, *_: chain)
     with open_recording(euroc) as recording, mapped_images.MappedImageStore(tmp_path) as images:
-        begun = BegunSurvey(np.arange(8), SurveySettings(), SurveyTools(images=images))
+        begun = BegunSurvey(recording, np.arange(8), SurveySettings(), SurveyTools(images=images))
         given = recording.calibration
         tried, corrected = replace(given), replace(given)
         assert begun.chain_of(given) is None

@@ -1,0 +1,113 @@
+"""A build reads all views of a rig: its checks take the first one, its survey and the frames that judge it all."""
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fleetmap.recordings.mcap.writer import McapRecordingWriter
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.samples import CameraFrame, SensorSet
+from fleetsim.recorder import Order, prepare
+from mapserver.drafting.draft_evidence import JudgedSession, ProbedFrame
+from mapserver.drafting.sensor_subset import with_other_views
+from mapserver.drafting.survey_recordings import OpenRecordings, RecordingOptions
+from mapserver.survey.keyframes.keyframes import make_keyframes
+from mapserver.survey.keyframes.rig_views import body_from_views, other_views
+from mapserver.survey.settings import SurveySettings
+from support.recordings.rig_samples import images_of
+
+
+@lru_cache(maxsize=1)
+def simulated() -> tuple[RigCalibration, tuple[CameraFrame, ...]]:
+    session = prepare(Order("clip", frames=3, size_px=(160, 120), rig="front-rear"))
+    try:
+        return session.nominal, tuple(session.frames())
+    finally:
+        session.renderer.close()
+
+
+@pytest.fixture
+def recorded(tmp_path: Path) -> Path:
+    calibration, frames = simulated()
+    with McapRecordingWriter(tmp_path / "rig.mcap", replace(calibration, imu=None)) as writer:
+        for frame in frames:
+            writer.write_frame(frame)
+    return tmp_path / "rig.mcap"
+
+
+def test_frames_keep_all_views_when_they_are_read_again(recorded: Path, tmp_path: Path) -> None:
+    with OpenRecordings(RecordingOptions(), tmp_path) as reading:
+        for _ in range(2):
+            with reading.open(recorded) as (recording, _indices):
+                images = images_of(recording.read_frame(1))
+                expected = images_of(simulated()[1][1])
+                assert len(recording.calibration.cameras) == 4
+                assert all(np.array_equal(a, b) for a, b in zip(images, expected, strict=True))
+                assert len(recording.view(0).calibration.cameras) == 2
+
+
+def test_a_smaller_set_of_sensors_is_that_of_the_first_view(recorded: Path) -> None:
+    with RecordingOptions(use=SensorSet.MONO).open(recorded) as (recording, _):
+        assert len(recording.calibration.cameras) == 1
+        assert len(images_of(recording.read_frame(0))) == 1
+
+
+def test_a_corrected_clock_is_that_of_all_views() -> None:
+    whole = simulated()[0]
+    first = replace(
+        whole, cameras=tuple(replace(c, imu_minus_cam_s=c.imu_minus_cam_s + 0.01) for c in whole.cameras[:2])
+    )
+    later = with_other_views(first, whole)
+    assert [c.imu_minus_cam_s for c in later.cameras] == [c.imu_minus_cam_s + 0.01 for c in whole.cameras]
+    assert with_other_views(first, replace(whole, cameras=whole.cameras[:2])) is first
+
+
+def test_a_keyframe_has_the_views_that_measure_depth() -> None:
+    calibration, frames = simulated()
+    rectifier = Rectifier(calibration)
+    frame = rectifier.rectify(frames[0])
+    others = other_views(rectifier)
+    assert [number for number, _ in others] == [1] and body_from_views(rectifier).shape == (2, 4, 4)
+    sides = replace(calibration, cameras=(*calibration.cameras[:2], calibration.cameras[2]))
+    assert other_views(Rectifier(sides)) == []
+    rows = [(0, frame), (1, replace(frame, others=(None,)))]
+    first, alone = make_keyframes(rows, rectifier.camera, SurveySettings(), others=others)
+    assert [len(view.features) > 0 for view in first.others] == [True]
+    assert [len(view.features) for view in alone.others] == [0]
+    assert first.others[0].frame.left.tobytes() != first.frame.left.tobytes() and not first.frame.others
+
+
+def test_a_shorter_baseline_of_another_view_is_converted_to_the_first_one() -> None:
+    """What the view measures is as far away as before."""
+    calibration, frames = simulated()
+    rectifier = Rectifier(calibration)
+    frame, others = rectifier.rectify(frames[0]), other_views(rectifier)
+    short = [(number, replace(camera, baseline_m=camera.baseline_m / 2)) for number, camera in others]
+    (same,), (nearer,) = (
+        next(make_keyframes([(0, frame)], rectifier.camera, SurveySettings(), others=how)).others
+        for how in (others, short)
+    )
+    known = np.isfinite(same.points_cam).all(axis=1) & np.isfinite(nearer.points_cam).all(axis=1)
+    np.testing.assert_allclose(nearer.points_cam[known], same.points_cam[known] / 2, rtol=1e-9)
+
+
+@pytest.mark.parametrize("recordings", [1, 2])
+def test_all_views_of_a_frame_either_judge_a_draft_or_choose_its_landmarks(recordings: int) -> None:
+    nothing: Any = None
+    probed = [
+        ProbedFrame(number, nothing, np.eye(4), nothing, is_held_out=number not in (0, 19), view=view)
+        for number in range(20)
+        for view in (0, 1)
+    ]
+    session = JudgedSession(nothing, probed, nothing)
+    asked, judging = (
+        [(f.number, f.view) for f in part] for part in (session.asked(recordings), session.judging(recordings))
+    )
+    assert not {number for number, _ in asked} & {number for number, _ in judging}
+    assert {view for _, view in judging} == {0, 1} and len(judging) == 2 * len({number for number, _ in judging})
+    assert {0, 19} <= {number for number, _ in asked}
