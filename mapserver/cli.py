@@ -12,6 +12,7 @@ from mapserver.commands.align import align
 from mapserver.commands.areas import AREAS_GROUP
 from mapserver.commands.backup import attach, backup, backups, restore
 from mapserver.commands.build import build
+from mapserver.commands.building import BUILDING
 from mapserver.commands.calibrate import calibrate
 from mapserver.commands.convert import convert
 from mapserver.commands.doctor import doctor
@@ -58,6 +59,7 @@ COMMANDS: Commands = {
     "accept": accept,
     "align": align,
     "areas": AREAS_GROUP,
+    "building": BUILDING,
     "fleet": FLEET,
     "robots": ROBOTS,
     "grid": GRID,

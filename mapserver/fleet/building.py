@@ -11,7 +11,7 @@ import numpy as np
 from fleetmap.encoding import to_json
 from fleetmap.errors import StateError, UsageError
 from fleetmap.geometry import Array
-from fleetmap.mapformat.building import ALIGNMENT, AREAS
+from fleetmap.mapformat.building import ALIGNMENT, AREAS, FLOORS
 from mapserver.fleet.survey_requests import ask_for_survey
 from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment, map_corners_m
 from mapserver.floor_plan.areas import MAX_REASON, Area, Areas, Correction, CorrectionKind, read_areas
@@ -151,7 +151,12 @@ def align(
 
 
 def forget_alignment(store: MapStore, site: str, actor: Actor) -> None:
-    """Remove the alignment and the drawing of a site; robots use the alignment of their version. UsageError while areas need it."""
+    """Remove the alignment and the drawing of a site; robots use the alignment of their version. UsageError while areas or a building
+    need it."""
+    if store.site_file_sha256(site, FLOORS) is not None:
+        raise UsageError(
+            f"site {site} is a floor of a building, which needs its pose; remove the building's floors first"
+        )
     store.keep_site_files(site, {ALIGNMENT: None, PLAN: None}, "forgotten", actor=actor)
 
 

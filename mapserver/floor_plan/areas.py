@@ -70,6 +70,7 @@ class _Properties(msgspec.Struct):
     mask: MaskKind | None = None
     percent: Annotated[int, msgspec.Meta(ge=1, le=99)] | None = None
     correction: Correction | None = None
+    lift: Annotated[str, msgspec.Meta(min_length=1, max_length=64)] | None = None
 
 
 class _Feature(msgspec.Struct):
@@ -89,7 +90,7 @@ class Area:
     """rings: (V, 2) corners in `map`, metres, not repeated at the end; inside by the even-odd rule over all rings.
 
     mask: effect on planners, None if absent. percent: of the robot's largest speed, in an area of the kind SPEED.
-    correction: effect on maps, None if absent.
+    correction: effect on maps, None if absent. lift: name of the lift whose cabin stands here, the same on every floor of a building.
     """
 
     name: str
@@ -97,12 +98,14 @@ class Area:
     mask: MaskKind | None = None
     percent: int | None = None
     correction: Correction | None = None
+    lift: str | None = None
 
     @property
     def effects(self) -> str:
         """Effects on planners and maps as text, each after a comma; empty without any."""
         speed = "" if self.percent is None else f" {self.percent} %"
         masked = "" if self.mask is None else f", {self.mask.value}{speed}"
+        masked += "" if self.lift is None else f", lift {self.lift}"
         return (
             masked if self.correction is None else f"{masked}, {self.correction.kind.value}: {self.correction.reason}"
         )
@@ -131,7 +134,7 @@ class Area:
         return {
             "type": "Feature",
             "geometry": {"type": "Polygon", "coordinates": coordinates},
-            "properties": {"name": self.name} | effects | corrects,
+            "properties": {"name": self.name} | effects | corrects | ({"lift": self.lift} if self.lift else {}),
         }
 
 
@@ -274,7 +277,7 @@ def _area(feature: _Feature, map_from_building: Array | None) -> Area:
         raise UsageError(f"area {name!r} has no corners; draw it as a polygon")
     if map_from_building is not None:
         rings = [_moved(ring, map_from_building) for ring in rings]
-    return Area(name, tuple(rings), mask, percent, correction)
+    return Area(name, tuple(rings), mask, percent, correction, feature.properties.lift)
 
 
 def _ring(positions: list[list[float]], where: str) -> Array:

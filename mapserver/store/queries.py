@@ -11,7 +11,8 @@ import msgspec
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, StateError, StoreError, UsageError
 from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manifest, sha256_hex
-from fleetmap.mapformat.building import ALIGNMENT, AREAS, FOR_ROBOTS
+from fleetmap.mapformat.building import ALIGNMENT, AREAS, FLOORS, FOR_ROBOTS
+from fleetmap.mapformat.floors import Building, read_building
 from mapserver.floor_plan.alignment import Alignment, decode_alignment
 from mapserver.floor_plan.areas import Areas, read_areas
 from mapserver.floor_plan.survey_requests import KIND, SurveyRequest, read_request
@@ -251,6 +252,11 @@ class StoreQueries:
         """Return the pose of the site's map in the drawing of its building; None if not aligned."""
         data = self.site_file(site, ALIGNMENT)
         return None if data is None else decode_alignment(data)
+
+    def building(self, site: str) -> Building | None:
+        """Return the building of which a site is a floor; None without one. Errors as of `blob`."""
+        data = self.site_file(site, FLOORS)
+        return None if data is None else read_building(data)
 
     def areas(self, site: str) -> Areas:
         """Return the named areas of a site, in `map` by the present alignment; empty if absent. UsageError if an alignment is missing."""

@@ -61,17 +61,17 @@ class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
         """Mark of its next certificate: known in advance, so that a renewal need not change the rules."""
         return hashlib.sha256(self.mark.encode()).hexdigest()[:8]
 
-    def holders(self, now_ns: int) -> Iterator[Holder]:
+    def holders(self, now_ns: int, floors: tuple[str, ...] = ()) -> Iterator[Holder]:
         """Yield the certificates allowed for this robot. A renewed one ends after 12 to 24 hours, for all robots at the same
         time, because new rules interrupt all connections: from then on it may only repeat the renewal, whose answer may have been lost."""
-        yield Holder(self.certificate, self.site, self.robot)
+        yield Holder(self.certificate, self.site, self.robot, floors=floors)
         started_ns = (now_ns // _RULES_NS - 1) * _RULES_NS
         is_new = self.renewed_ns is None or started_ns <= self.renewed_ns <= now_ns + _RULES_NS
         if self.mark_before:
             purpose = Purpose.ROBOT if is_new else Purpose.ENROL
-            yield Holder(self._named(self.mark_before), self.site, self.robot, purpose)
+            yield Holder(self._named(self.mark_before), self.site, self.robot, purpose, floors)
         if not is_new or not self.mark_before:
-            yield Holder(self._named(self.next_mark), self.site, self.robot)
+            yield Holder(self._named(self.next_mark), self.site, self.robot, floors=floors)
 
     def _named(self, mark: str) -> str:
         return f"{self.robot[:_NAME_LENGTH]}.{mark}"
@@ -134,15 +134,20 @@ class RobotRegister:
         """Return the present rules for the bus."""
         now_ns, holders = self._store.now_ns(), [SURVEY]
         for entry in self.robots():
-            holders.extend(entry.holders(now_ns))
+            holders.extend(entry.holders(now_ns, self._floors(entry.site)))
             # Used ones too, while their certificate is valid: the owner of a copy then gets a reason, and it is logged.
             if now_ns - entry.enrolled_ns < DAYS["enrol"] * _DAY_NS:
                 holders.append(Holder(entry.bundle, entry.site, entry.robot, Purpose.ENROL))
         return Access(holders)
 
     def state(self) -> object:
-        """Return a value that changes with robots, an authority or the server's certificate."""
-        return (_stamp(self._path), self.tls_state())
+        """Return a value that changes with robots, buildings, an authority or the server's certificate."""
+        return (_stamp(self._path), self.tls_state(), [self._floors(info.site) for info in self._store.sites()])
+
+    def _floors(self, site: str) -> tuple[str, ...]:
+        """Return the other floors of a site's building."""
+        building = self._store.building(site)
+        return () if building is None else tuple(floor.site for floor in building.floors if floor.site != site)
 
     def tls_state(self) -> object:
         tls = self.authorities.tls

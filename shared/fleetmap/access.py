@@ -50,12 +50,15 @@ class Purpose(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Holder:
-    """Holder of a certificate. certificate: its common name; site and robot: empty for a survey."""
+    """Holder of a certificate. certificate: its common name; site and robot: empty for a survey. floors: other sites of the robot's
+    building, whose published maps it may fetch too.
+    """
 
     certificate: str
     site: str = ""
     robot: str = ""
     purpose: Purpose = Purpose.ROBOT
+    floors: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +145,7 @@ def _rules(holder: Holder) -> tuple[Rule, ...]:
             Rule(f"{name}-enrolled", Direction.OUT, (Act.REPLY,), renew),
         )
     questions = own((*QUESTIONS, *(f"{what}/*" for what in MAP_PARTS)))
+    questions += tuple(robot_key(floor, holder.robot, f"{what}/*") for floor in holder.floors for what in MAP_PARTS)
     return (
         Rule(f"{name}-asks", Direction.IN, (Act.QUERY,), questions),
         Rule(f"{name}-told", Direction.OUT, (Act.REPLY,), questions),

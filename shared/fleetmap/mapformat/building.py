@@ -12,7 +12,7 @@ from fleetmap.geometry import Array, se3, so3_exp
 BUILDING_KEY = "building"
 """Key in `configuration` of a manifest, where older readers ignore it: elsewhere format 1 refuses unknown keys."""
 
-ALIGNMENT, AREAS = FOR_ROBOTS = ("alignment", "areas")
+ALIGNMENT, AREAS, FLOORS = FOR_ROBOTS = ("alignment", "areas", "floors")
 """Kinds of a site's further files, beside its versions, which robots may fetch by the addresses in the signed list."""
 
 Coordinate = Annotated[float, msgspec.Meta(ge=-1e7, le=1e7)]

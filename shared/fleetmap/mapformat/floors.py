@@ -1,0 +1,132 @@
+"""A building of several floors: every floor is a site with its own map, versions and areas. Lifts are areas of the floors."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+import msgspec
+import numpy as np
+
+from fleetmap.errors import FleetmapError, MapFormatError
+from fleetmap.geometry import Array, inside_rings, se3_inverse, transform_points
+from fleetmap.mapformat.building import BuildingFrame, Coordinate
+from fleetmap.mapformat.names import check_name
+
+MAX_FLOORS_BYTES = 64_000
+_MAX_FLOORS = 100
+
+_Text = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+
+
+class FloorEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One floor: its site, its level's name for fleet managers, and the height of its map's z = 0 in the building."""
+
+    site: _Text
+    level: _Text
+    height_m: Coordinate
+
+
+class Building(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The floors of a building, from below; the same bytes are a file (kind FLOORS) of each of its sites."""
+
+    name: _Text
+    floors: Annotated[tuple[FloorEntry, ...], msgspec.Meta(min_length=2, max_length=_MAX_FLOORS)]
+
+
+@dataclass(frozen=True)
+class Floor:
+    """A floor with the pose of its map in the building, and the outlines of its lifts: rings (V, 2) in its `map`, by the lift's name."""
+
+    entry: FloorEntry
+    frame: BuildingFrame
+    lifts: Mapping[str, tuple[Array, ...]] = field(default_factory=dict)
+
+    @property
+    def building_from_map(self) -> Array:
+        """(4, 4), with the floor's height."""
+        pose = self.frame.building_from_map.copy()
+        pose[2, 3] += self.entry.height_m
+        return pose
+
+    def lift_at(self, position_m: Array, reach_m: float) -> str | None:
+        """Return the lift whose outline holds a position (2,) or is at most reach_m from it; None without one."""
+        for name, rings in sorted(self.lifts.items()):
+            if inside_rings(position_m[None], rings)[0] or _distance_m(position_m, rings) <= reach_m:
+                return name
+        return None
+
+
+def check_building(building: Building) -> Building:
+    """Return the building with its floors from below; MapFormatError for repeated sites, levels or heights."""
+    for floor in building.floors:
+        check_name(floor.site, "site")
+    for what in ("site", "level", "height_m"):
+        values = [getattr(floor, what) for floor in building.floors]
+        if len(set(values)) < len(values):
+            raise MapFormatError(f"building {building.name!r}: two floors have the same {what}: {values}")
+    return msgspec.structs.replace(building, floors=tuple(sorted(building.floors, key=lambda floor: floor.height_m)))
+
+
+def read_building(data: bytes) -> Building:
+    """Read a site's file of kind FLOORS; MapFormatError for anything else."""
+    try:
+        return check_building(msgspec.json.decode(data, type=Building))
+    except FleetmapError as error:
+        raise MapFormatError(str(error)) from error
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise MapFormatError(f"the building's floors cannot be read ({error}); set the building again") from error
+
+
+class _Shape(msgspec.Struct):
+    type: Literal["Polygon", "MultiPolygon"]
+    coordinates: msgspec.Raw
+
+
+class _Properties(msgspec.Struct):
+    lift: str | None = None
+
+
+class _Feature(msgspec.Struct):
+    geometry: _Shape
+    properties: _Properties
+
+
+class _Areas(msgspec.Struct):
+    features: list[_Feature]
+    frame: Literal["map", "building"] | None = None
+
+
+def read_lifts(areas: bytes | None, frame: BuildingFrame) -> dict[str, tuple[Array, ...]]:
+    """Return the lifts in a site's file of areas, as `Floor.lifts`; areas of one lift are joined. MapFormatError for an invalid file.
+
+    frame: the site's alignment, for areas that were drawn in the building.
+    """
+    lifts: dict[str, tuple[Array, ...]] = {}
+    try:
+        read = _Areas([]) if areas is None else msgspec.json.decode(areas, type=_Areas)
+        for feature in read.features:
+            if feature.properties.lift is None:
+                continue
+            if feature.geometry.type == "Polygon":
+                polygons = [msgspec.json.decode(feature.geometry.coordinates, type=list[list[list[float]]])]
+            else:
+                polygons = msgspec.json.decode(feature.geometry.coordinates, type=list[list[list[list[float]]]])
+            rings = [np.array([corner[:2] for corner in ring[:-1]], float) for polygon in polygons for ring in polygon]
+            if read.frame == "building":
+                map_from_building = se3_inverse(frame.building_from_map)
+                rings = [transform_points(map_from_building, np.c_[r, np.zeros(len(r))])[:, :2] for r in rings]
+            lifts[feature.properties.lift] = (*lifts.get(feature.properties.lift, ()), *rings)
+    except (msgspec.MsgspecError, ValueError, IndexError) as error:
+        raise MapFormatError(f"the site's areas cannot be read ({error}); import them again") from error
+    return lifts
+
+
+def _distance_m(position_m: Array, rings: tuple[Array, ...]) -> float:
+    """Return the distance of a position (2,) from the nearest edge of the rings."""
+    nearest_m = np.inf
+    for ring in rings:
+        edges = np.roll(ring, -1, axis=0) - ring
+        along = np.einsum("ij,ij->i", position_m - ring, edges) / np.maximum(np.einsum("ij,ij->i", edges, edges), 1e-12)
+        feet = ring + np.clip(along, 0.0, 1.0)[:, None] * edges
+        nearest_m = min(nearest_m, float(np.linalg.norm(position_m - feet, axis=1).min()))
+    return nearest_m
