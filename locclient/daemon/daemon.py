@@ -5,6 +5,7 @@ import shlex
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -28,6 +29,7 @@ from locclient.delivery.report_delivery import ReplayQueue
 from locclient.delivery.survey_drives import SurveyDrives
 from locclient.identity import GivenAddress, MapAddress, check_reach
 from locclient.maps.connection import cache_folder, open_bus, outbox_path, replay_outbox, trusted_map
+from locclient.maps.floor_maps import FloorMaps
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource
 from locclient.maps.tile_cache import TileCache
@@ -140,6 +142,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             client.require(trusted_map(bus, address, cache_folder(run.cache)))
             maps, first = CachedMap(caches[1], site), client.active()
             server = ServerSync(client, outbox, retry_s=run.trial.retry_s, upkeep=_upkeep(address, bus))
+        floors = _floor_maps(config, address, bus, caches, server, maps)
         keeps_replay = server is not None and run.replays != "off"
         robot = Robot(calibration, rectifier, config.localizer, run.trial, time.thread_time, keeps_replay=keeps_replay)
         if prior is not None:
@@ -177,8 +180,35 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             failures_folder=None if run.failures is None else Path(run.failures),
             caches=caches,
             fleet_manager=fleet_manager,
+            floors=floors,
             drives=None if server is None else server.drives,
         )
+
+
+def _floor_maps(
+    config: LocclientConfig,
+    address: MapAddress,
+    bus: Bus | None,
+    caches: tuple[TileCache, ...],
+    server: ServerSync | None,
+    maps: MapSource,
+) -> FloorMaps:
+    """Return the maps of the other floors of the robot's building, as far as its disk has them."""
+    folder = Path(config.run.store or "")
+
+    def over_the_bus(site: str) -> MapSource:
+        assert bus is not None
+        client = MapClient(bus, caches[0], site, address.robot, patience_s=_PATIENCE_S)
+        client.require(trusted_map(bus, replace(address, site=site), cache_folder(config.run.cache)))
+        return client
+
+    if server is None:
+        floors = FloorMaps(maps, lambda site: LocalMapSource(folder, site))
+        floors.refresh()
+    else:
+        floors = server.floors = FloorMaps(server.client, over_the_bus)
+        floors.refresh(asks=False)
+    return floors
 
 
 def _upkeep(address: MapAddress, bus: Bus) -> Callable[[], None]:

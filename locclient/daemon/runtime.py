@@ -24,6 +24,7 @@ from locclient.daemon.service_manager import ServiceManager
 from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.delivery.report_delivery import ReplayQueue, write_failure
 from locclient.delivery.survey_drives import SurveyDrives
+from locclient.maps.floor_maps import FloorMaps
 from locclient.maps.loaded_map import Cell, LoadedMap, PositionBound, PositionBoundTracker
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
@@ -61,6 +62,7 @@ class RuntimeParts:
     drives: SurveyDrives | None = None
     caches: tuple[TileCache, ...] = ()
     fleet_manager: MqttLink | None = None
+    floors: FloorMaps | None = None
 
 
 class Runtime:
@@ -142,6 +144,9 @@ class Runtime:
             give_back_free_memory()  # of the previous version and of loading this one; takes 0.5 ms
         while server is not None and server.frames:
             robot.align(server.frames.popleft())
+        while self._parts.floors is not None and self._parts.floors.changes:
+            robot.use_floors(*self._parts.floors.changes.popleft())
+            give_back_free_memory()
         while server is not None and server.priors:
             intake.put_prior(server.priors.popleft())
         outcome = None

@@ -13,6 +13,7 @@ from fleetmap.sensors.samples import PositionPrior
 from locclient.delivery.outbox import Outbox
 from locclient.delivery.report_delivery import deliver, deliver_replay_part
 from locclient.delivery.survey_drives import SurveyDrives
+from locclient.maps.floor_maps import FloorMaps
 from locclient.maps.map_client import MapClient
 from locclient.prior_option import told_prior
 from locclient.robot.version_trial import Change, VersionChange
@@ -44,6 +45,7 @@ class ServerSync:
         """retry_s: delay before a postponed version is offered again. upkeep: called once an hour; its errors are logged."""
         self.replays: Outbox | None = None  # recordings of failures, which may be large
         self.drives: SurveyDrives | None = None  # through areas that operators want to be surveyed
+        self.floors: FloorMaps | None = None  # of the robot's building
         self._replayed_bytes: dict[str, int] = {}
         self._replay_at_s = self._deliver_at_s = 0.0
         self.follows = True  # the server selects the version; False: the fleet manager does
@@ -115,6 +117,8 @@ class ServerSync:
         if self.drives is not None:
             self.drives.requests = self.client.surveys
         self._learn_frame()
+        if self.floors is not None:
+            self.floors.refresh()
         sha256 = wanted.manifest_sha256
         if sha256 is None:
             words = (

@@ -20,10 +20,11 @@ from locclient.localization.settings import TrackSettings
 
 @dataclass(frozen=True, slots=True)
 class Hypothesis:
-    """A possible pose of the robot, map_from_body (4, 4), and the number of fixes that support it."""
+    """A possible pose of the robot, map_from_body (4, 4), and the number of fixes that support it. floor: whose map, see `Estimate`."""
 
     map_from_body: Array
     support: int
+    floor: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +39,7 @@ class Estimate:
     covariance: one of the two was wrong. hypotheses: the competing poses while AMBIGUOUS. stage_s: seconds by stage, by the given
     clock. calibration: its state by the map. views: faults of the images of each of the rig's views, NONE for good ones;
     view: the one of the last map query.
+    floor: site whose map the pose and map_version are of, in a building; empty for the robot's own. Without a pose the last known one.
     """
 
     stamp_ns: int
@@ -59,6 +61,7 @@ class Estimate:
     calibration: CalibrationState = NOT_JUDGED
     views: tuple[Cause, ...] = (Cause.NONE,)
     view: int = 0
+    floor: str = ""
 
     @property
     def views_in_words(self) -> str:
@@ -161,8 +164,11 @@ def _with_pose(estimate: Estimate, hypothesis: PoseHypothesis, settings: TrackSe
     if np.isnan(hypothesis.now_map_from_body).any() or np.isnan(hypothesis.now_cov).any():
         return estimate
     of_map = np.diag([settings.map_sigma_rad**2] * 3 + [settings.map_sigma_m**2] * 3)
-    return replace(estimate, map_from_body=hypothesis.now_map_from_body, cov_rot_trans=hypothesis.now_cov + of_map)
+    covariance = hypothesis.now_cov + of_map
+    return replace(
+        estimate, map_from_body=hypothesis.now_map_from_body, cov_rot_trans=covariance, floor=hypothesis.floor
+    )
 
 
 def _published(hypotheses: Sequence[PoseHypothesis]) -> tuple[Hypothesis, ...]:
-    return tuple(Hypothesis(h.now_map_from_body, h.support) for h in hypotheses)
+    return tuple(Hypothesis(h.now_map_from_body, h.support, h.floor) for h in hypotheses)

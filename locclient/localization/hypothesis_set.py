@@ -16,6 +16,7 @@ from locclient.localization.settings import TrackSettings
 
 _PAIRS_AT_ONCE = 4  # comparisons in a time slice of a query
 _MAX_WRONG_SHARE = 0.05  # of unmapped places that weak fixes of a standing robot may confirm by mistake
+_STOREY_M = 2.5  # at least, between two floors
 
 # The fixes of one query, each with its pose propagated to the present.
 Observations = Sequence[tuple[Fix, PoseHypothesis]]
@@ -87,7 +88,8 @@ class HypothesisSet:
         error, covariance = boxminus(fresh.now_map_from_body, hypothesis.now_map_from_body), hypothesis.now_cov
         far_m = self._settings.hypothesis_distance_m + 3 * np.sqrt(np.trace(covariance[3:, 3:]))
         far_rad = np.radians(self._settings.hypothesis_angle_deg) + 3 * np.sqrt(np.trace(covariance[:3, :3]))
-        return bool(np.linalg.norm(error[3:]) < far_m and np.linalg.norm(error[:3]) < far_rad)
+        is_near = bool(np.linalg.norm(error[3:]) < far_m and np.linalg.norm(error[:3]) < far_rad)
+        return is_near and fresh.floor == hypothesis.floor
 
     def update(self, observations: Observations, odom_from_body: Array) -> TimeSliced[None]:
         """Run `observe` and the disambiguation, in time slices."""
@@ -188,10 +190,13 @@ class HypothesisSet:
         return self.is_supported(hypothesis)
 
     def moved_m(self, hypothesis: PoseHypothesis) -> float | None:
-        """Return the distance of a hypothesis from the abandoned pose; None if within their covariances (Mahalanobis test)."""
+        """Return the distance of a hypothesis from the abandoned pose, at least a storey on another floor; None if within their covariances
+        (Mahalanobis test)."""
         if self.abandoned is None:
             return None
         error = boxminus(hypothesis.now_map_from_body, self.abandoned.now_map_from_body)
+        if self.abandoned.floor != hypothesis.floor:
+            return max(_STOREY_M, float(np.linalg.norm(error[3:])))
         covariance = hypothesis.now_cov + self.abandoned.now_cov
         is_beyond = error @ np.linalg.solve(covariance, error) > self._settings.innovation_limit
         return float(np.linalg.norm(error[3:])) if is_beyond else None

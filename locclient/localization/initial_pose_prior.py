@@ -1,10 +1,12 @@
 """Initial pose prior, from a dock or an operator, in force until the map has confirmed a pose. Pure."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.failure_definition import radius_95_m
-from fleetmap.geometry import Array, se3_inverse, so3_log
+from fleetmap.geometry import Array, se3_inverse, so3_log, transform_points
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.sensors.samples import PositionPrior
@@ -24,6 +26,8 @@ _PLACE_REACH_M = 3.0  # maximum distance between the robot and a place with the 
 
 def agrees(prior: PositionPrior, confirmed: PoseHypothesis, base_from_body: Array) -> bool:
     """Return True if a confirmed pose lies within the bound of a prior's position and heading."""
+    if prior.floor not in (None, confirmed.floor):
+        return False
     map_from_base = confirmed.now_map_from_body @ se3_inverse(base_from_body)
     off_m = map_from_base[:2, 3] - prior.map_from_base[:2, 3]
     cov_m2 = _WIDER * prior.cov_rot_trans[3:5, 3:5] + confirmed.now_cov[3:5, 3:5] + _SIGMA_M**2 * np.eye(2)
@@ -39,11 +43,20 @@ class InitialPosePrior:
 
     hypothesis: the pose by both, published while the map gives none; None for priors with an unknown heading. contradictions: places
     of fixes outside a revisable prior. is_told: True for a prior from outside, such as a dock, a zone or an operator; else it is the
-    robot's own estimate by odometry.
+    robot's own estimate by odometry. floors: those on which the robot may be, with prior_from_map (4, 4), from each one's map to that of
+    the prior; None for the same map.
     """
 
-    def __init__(self, prior: PositionPrior, base_from_body: Array, settings: TrackSettings) -> None:
+    def __init__(
+        self,
+        prior: PositionPrior,
+        base_from_body: Array,
+        settings: TrackSettings,
+        floors: Mapping[str, Array | None] | None = None,
+    ) -> None:
+        """floors: default: that of the prior alone."""
         self._prior, self._base_from_body, self._settings = prior, base_from_body, settings
+        self.floors: Mapping[str, Array | None] = floors or {prior.floor or "": None}
         self.travelled_m = 0.0
         self._since: PoseHypothesis | None = None  # the first frame after it, as the identity
         self.hypothesis: PoseHypothesis | None = None
@@ -52,12 +65,20 @@ class InitialPosePrior:
 
     @classmethod
     def at(
-        cls, known: PoseHypothesis, base_from_body: Array, settings: TrackSettings, *, is_revisable: bool, is_told: bool
+        cls,
+        known: PoseHypothesis,
+        base_from_body: Array,
+        settings: TrackSettings,
+        *,
+        is_revisable: bool,
+        is_told: bool,
+        floors: Mapping[str, Array | None] | None = None,
     ) -> "InitialPosePrior":
         """Return a pose at a frame of the odometry as a prior."""
         map_from_base = known.map_from_body @ se3_inverse(base_from_body)
         covariance = transport_cov(known.cov_rot_trans, map_from_base[:3, 3] - known.map_from_body[:3, 3])
-        made = cls(PositionPrior(known.stamp_ns, map_from_base, covariance, is_revisable), base_from_body, settings)
+        prior = PositionPrior(known.stamp_ns, map_from_base, covariance, is_revisable, known.floor)
+        made = cls(prior, base_from_body, settings, floors)
         identity = np.eye(4), np.zeros((6, 6))
         made.is_told = is_told
         made.hypothesis, made._since = known, PoseHypothesis(known.frame_index, known.stamp_ns, *identity, *identity)
@@ -77,20 +98,27 @@ class InitialPosePrior:
             map_from_body = self._prior.map_from_base @ self._base_from_body
             lever_m = map_from_body[:3, 3] - self._prior.map_from_base[:3, 3]
             covariance = transport_cov(self._prior.cov_rot_trans, lever_m)
-            self.hypothesis = PoseHypothesis.at(odometry, map_from_body, covariance)
+            self.hypothesis = PoseHypothesis.at(odometry, map_from_body, covariance, self._prior.floor or "")
 
     def tracked(self) -> list[PoseHypothesis]:
         return [*filter(None, (self.hypothesis, self._since)), *self.contradictions.hypotheses]
 
     def is_compatible(self, hypothesis: PoseHypothesis) -> bool:
-        """Return True if a present pose, traced back by the robot's motion, lies within the bound of the prior's position."""
+        """Return True if a present pose, traced back by the robot's motion, lies within the bound of the prior's position, on one of its
+        floors."""
+        if hypothesis.floor not in self.floors:
+            return False
         if self._since is None:
             return True
         since, now = ((h.now_map_from_body, h.now_cov) for h in (self._since, hypothesis))
         map_from_then, covariance = compose_inverse_cov(*now, *since)
         map_from_base = map_from_then @ se3_inverse(self._base_from_body)
+        prior_from_map, cov_m2 = self.floors[hypothesis.floor], covariance[3:5, 3:5]
+        if prior_from_map is not None:
+            map_from_base = prior_from_map @ map_from_base
+            cov_m2 = prior_from_map[:2, :2] @ cov_m2 @ prior_from_map[:2, :2].T
         off_m = map_from_base[:2, 3] - self._prior.map_from_base[:2, 3]
-        return bool(off_m @ np.linalg.solve(self._cov_m2(_WIDER) + covariance[3:5, 3:5], off_m) < _CHI2_999)
+        return bool(off_m @ np.linalg.solve(self._cov_m2(_WIDER) + cov_m2, off_m) < _CHI2_999)
 
     def is_contradicted(self, observations: Observations, lookalikes: LookAlikes | None) -> bool:
         """Return True if the fixes of a query, none within the prior, and earlier ones outweigh it.
@@ -108,8 +136,11 @@ class InitialPosePrior:
         is_telling = not self.is_told and order[0].speaks_against_others(self._settings)  # as against a confirmed pose
         return has_more and (is_telling or found.is_supported(order[0])) and not found.may_be_lookalike(order[0])
 
-    def is_near(self, positions_map: Array) -> NDArray[np.bool_]:
-        """Return flags (N,) of the positions (N, 3) from which the robot may have its present view."""
+    def is_near(self, positions_map: Array, floor: str = "") -> NDArray[np.bool_]:
+        """Return flags (N,) of the positions (N, 3) on one of the prior's floors from which the robot may have its present view."""
+        prior_from_map = self.floors[floor]
+        if prior_from_map is not None:
+            positions_map = transform_points(prior_from_map, positions_map)
         off_m = np.linalg.norm(positions_map[:, :2] - self._prior.map_from_base[:2, 3], axis=1)
         return np.asarray(off_m < _BOUND_SIGMAS * self._sigma_m(_WIDER) + self.travelled_m + _PLACE_REACH_M)
 

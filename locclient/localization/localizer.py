@@ -1,13 +1,15 @@
 """The localizer: samples and tiles in, one estimate for each frame out. Pure."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 
 from fleetmap.bow import Vocabulary
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
+from fleetmap.mapformat.floors import Floor
 from fleetmap.messages import Cause, Status
 from fleetmap.odometry import Odometry, is_away
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes, MapView
@@ -26,6 +28,14 @@ from locclient.localization.pose_tracker import PoseTracker, Start
 from locclient.localization.settings import LocalizerSettings
 
 _DEAD_NS = 500_000_000  # without images, a view is dead
+
+
+class _FloorMap(NamedTuple):
+    """What `handle_version` tells of a floor's version."""
+
+    version: int
+    lookalikes: LookAlikes | None
+    alias_step_m: float
 
 
 class Localizer:
@@ -59,7 +69,8 @@ class Localizer:
         self._calibration = CalibrationMonitor(self._mounting, settings.relocalizer, imu_minus_cam_s)
         self._tracker = PoseTracker(settings, self._mounted, calibration.base_from_body)
         self._query = MapQuery(self._tracker, settings)
-        self._map_version: int | None = None
+        self._maps: dict[str, _FloorMap] = {}
+        self._floors: dict[str, Floor] = {}
         self._last_ns: int | None = None
 
     def handle_imu(self, samples: ImuSamples) -> None:
@@ -93,17 +104,45 @@ class Localizer:
         survey_focal_px: float,
         lookalikes: LookAlikes | None = None,
         alias_step_m: float = ALIAS_STEP_M,
+        floor: str = "",
     ) -> None:
         """Use these tiles, all of one version, from now on; cancel a running map query.
+
+        floor: site of another floor of the robot's building, one of those of `handle_floors`; empty for its own site.
 
         lookalikes: similarity of unmapped places to the map; None if not measured. alias_step_m: smallest distance at which its
         places look alike.
         """
-        self._tracker.lookalikes, self._tracker.alias_step_m = lookalikes, alias_step_m
-        self._map_version = version
+        self._maps[floor] = _FloorMap(version, lookalikes, alias_step_m)
+        self._compare_maps()
         view = MapView(tiles, vocabulary, survey_focal_px)
-        self._query.use(*(Relocalizer(view, camera, self._settings.relocalizer) for camera, _ in self._mounted))
+        relocalizers = (Relocalizer(view, camera, self._settings.relocalizer) for camera, _ in self._mounted)
+        self._query.use(*relocalizers, floor=floor)
         self._calibration.give_up()
+
+    def handle_floors(self, floors: Mapping[str, Floor]) -> None:
+        """Use the floors of the robot's building: its own site's, which is called "", and others by their sites. Their maps follow by
+        `handle_version`; those of floors that are none any more are dropped. Without any, the robot has its own site alone."""
+        self._floors = dict(floors)
+        self._query.use_floors({site: floor.frame.building_from_map for site, floor in floors.items()})
+        self._maps = {floor: held for floor, held in self._maps.items() if not floor or floor in floors}
+        self._compare_maps()
+        if self._tracker.floor and self._tracker.floor not in floors:
+            self._tracker.floor = ""
+            self.forget_pose()
+
+    def _compare_maps(self) -> None:
+        """Take the look-alikes of all floors together: a fix may be on any of them."""
+        known = [held.lookalikes for held in self._maps.values() if held.lookalikes is not None]
+        self._tracker.lookalikes = None
+        if known:
+            shares = [each.max_wrong_share for each in known] + [1.0] * (len(self._maps) - len(known))
+            self._tracker.lookalikes = LookAlikes(max(each.recall for each in known), max(shares))
+        self._tracker.alias_step_m = min((held.alias_step_m for held in self._maps.values()), default=ALIAS_STEP_M)
+
+    def _version_on(self, floor: str) -> int | None:
+        held = self._maps.get(floor)
+        return None if held is None else held.version
 
     def start(self) -> Start | None:
         """Return the state with which another localizer of the same odometry can start; None during a map query, whose fix is missing."""
@@ -212,7 +251,7 @@ class Localizer:
             status=Status.INITIALISING,
             map_from_body=None,
             cov_rot_trans=None,
-            map_version=self._map_version,
+            map_version=self._version_on(tracker.floor),
             hypotheses=(),
             odometry=odometry,
             stage_s={},
@@ -220,6 +259,7 @@ class Localizer:
             image=percept.image,
             views=percept.views,
             view=self._query.view,
+            floor=tracker.floor,
             **result._asdict(),
         )
         estimate = assemble(
@@ -231,6 +271,8 @@ class Localizer:
             has_failed=self._query.failed > 0,
             was_tracking=tracker.was_tracking,
         )
+        if estimate.floor != tracker.floor:
+            estimate = replace(estimate, map_version=self._version_on(estimate.floor))
         fixed_ns = None if tracker.confirmed is None or percept.is_reversed else tracker.confirmed.stamp_ns
         return with_calibration(
             estimate, percept.calibration, self._mounting, fixed_ns, was_localized=tracker.was_tracking

@@ -1,12 +1,14 @@
 """Map queries: their start, and their work spread over frames. Pure."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import Array, interpolate_se3
+from fleetmap.geometry import Array, interpolate_se3, se3_inverse
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, Relocalizer
@@ -26,6 +28,7 @@ _SPREAD_SHARE = 0.45  # of the query interval: if frames are farther apart, a qu
 _HYPOTHESES_AT_ONCE = 3  # in one time slice of a search
 # Per frame, where a late estimate does no harm: from an unchanged viewpoint, in the first searches without a prior, and after lost tracks.
 _MORE_SLICES = 3
+_COUNTERPART_M = 3.0  # around the place of a fix on another floor, whose map may lie so far off in the building
 _FIRST_SEARCHES = 10  # then the robot probably drives where nothing is mapped, and keeps to the time of a frame
 
 
@@ -58,7 +61,8 @@ class MapQuery:
 
     def __init__(self, tracker: PoseTracker, settings: LocalizerSettings) -> None:
         self._tracker, self._settings, self._track = tracker, settings, settings.track
-        self._relocalizers: tuple[Relocalizer, ...] = ()  # of each view
+        self._relocalizers: dict[str, tuple[Relocalizer, ...]] = {}  # of each floor, for each view
+        self._plan_from_map: Mapping[str, Array] = {}  # of each floor of a building, along the floor
         self.view = 0  # whose frame is queried
         self.failed = 0
         self.finished: FinishedQuery | None = None  # finished with the last frame
@@ -68,25 +72,42 @@ class MapQuery:
         self._slices, self._is_urgent = 1, False  # of that job: slices per frame; started by lost tracks
         self._last_ns: int | None = None  # of the last frame
         self._gates = [ViewpointGate()]  # of each view
-        self._failed_places: list[list[Array]] = [[]]  # searched without success from the viewpoint of the gate
+        # Of each view, by floor: searched without success from the viewpoint of the gate.
+        self._failed_places: list[defaultdict[str, list[Array]]] = [defaultdict(list)]
 
     @property
     def is_under_way(self) -> bool:
         return self._job is not None
 
-    def use(self, *relocalizers: Relocalizer) -> None:
-        """Use another map, by a relocalizer for each of the rig's views; cancel a running query."""
+    def use(self, *relocalizers: Relocalizer, floor: str = "") -> None:
+        """Use another map of a floor, by a relocalizer for each of the rig's views; cancel a running query."""
         if len(relocalizers) != len(self._gates):
             self._gates = [ViewpointGate() for _ in relocalizers]
-        self._relocalizers = relocalizers
+        self._relocalizers[floor] = relocalizers
+        self._note_missing()
         self._cancel()
-        self._failed_places = [[] for _ in relocalizers]
+        self._failed_places = [defaultdict(list) for _ in relocalizers]
+
+    def use_floors(self, plan_from_map: Mapping[str, Array]) -> None:
+        """Search these floors only, besides the robot's own; cancel a running query.
+
+        plan_from_map (4, 4): of each floor, with the same building coordinates for places one above the other, and z of its map.
+        """
+        self._plan_from_map = plan_from_map
+        self._relocalizers = {
+            floor: r for floor, r in self._relocalizers.items() if not floor or floor in plan_from_map
+        }
+        self._note_missing()
+        self._cancel()
+
+    def _note_missing(self) -> None:
+        self._tracker.missing_floors = self._plan_from_map.keys() - self._relocalizers.keys()
 
     def forget(self) -> None:
         """Forget the pose; cancel a running query."""
         self._cancel()
         self.failed = 0
-        self._failed_places = [[] for _ in self._gates]
+        self._failed_places = [defaultdict(list) for _ in self._gates]
 
     def _cancel(self) -> None:
         self._job = None
@@ -133,7 +154,7 @@ class MapQuery:
 
     def _next_view(self, percept: Percept, frame: RectifiedFrame) -> int:
         """Return the view to query: the last one as long as it gives fixes, else the next one with good images."""
-        count, first = len(self._relocalizers), self.view + bool(self.failed)
+        count, first = len(self._gates), self.view + bool(self.failed)
         order = [(first + k) % count for k in range(count)]
         return next((k for k in order if percept.views[k] not in UNUSABLE), self.view)
 
@@ -161,7 +182,7 @@ class MapQuery:
         if not is_at_rest:
             self._failed_places[view].clear()
         is_sparse = self._is_sparse(odometry.stamp_ns)
-        self._job = self._run(percept.query, frame, self._relocalizers[view], is_sparse=is_sparse)
+        self._job = self._run(percept.query, frame, is_sparse=is_sparse)
 
     def _advance(self, *, is_at_once: bool) -> QueryResult:
         if self._job is None:
@@ -180,26 +201,30 @@ class MapQuery:
             percept, frame = self._begun
             if frame is not None and percept.query is not None and percept.query.features is not None:
                 is_confirmed = self._tracker.confirmed is not None
-                relocalizer = self._relocalizers[self.view]
+                floor = self._tracker.floor if result.fix is None else result.fix.floor
+                relocalizer = self._on(floor) or next(iter(self._relocalizers.values()))[self.view]
                 looked = percept.odometry, percept.query.features, result.fix, relocalizer, is_confirmed
                 self.finished = FinishedQuery(frame, *looked)
             return result
         return QueryResult()
 
-    def _run(
-        self, query: QueryInput, frame: RectifiedFrame | None, relocalizer: Relocalizer, *, is_sparse: bool
-    ) -> TimeSliced[QueryResult]:
+    def _on(self, floor: str) -> Relocalizer | None:
+        """Return the relocalizer of the queried view on a floor; None if the robot does not hold its map."""
+        held = self._relocalizers.get(floor)
+        return None if held is None else held[self.view]
+
+    def _run(self, query: QueryInput, frame: RectifiedFrame | None, *, is_sparse: bool) -> TimeSliced[QueryResult]:
         tracker = self._tracker
-        features = yield from _extract(query, frame, relocalizer)
+        features = yield from _extract(query, frame, next(iter(self._relocalizers.values()))[self.view])
         confirmed = tracker.confirmed
         if confirmed is None:
             tracker.forget_frames()
-            fixes, outside = yield from self._search(features, relocalizer)
+            fixes, outside = yield from self._search(features)
             return (yield from tracker.update_candidates(fixes, outside=outside))
-        near = self._near(features, relocalizer, confirmed)
+        near = self._near(features, confirmed)
         if near is None and (earlier := tracker.earlier_frames()):
             yield
-            near = self._near(features, relocalizer, confirmed, earlier)
+            near = self._near(features, confirmed, earlier)
         if near is None:
             tracker.keep_frame(features)
         else:
@@ -207,41 +232,50 @@ class MapQuery:
         fixes = [] if near is None else [near]
         if near is None and (is_sparse or self.failed + 1 >= self._track.search_after_failed):
             yield
-            fixes = yield from relocalizer.anywhere(features, None, self._rotation(confirmed))
+            fixes = yield from self._anywhere(confirmed.floor, features, None, self._rotation(confirmed))
             fixes = [fix for fix in fixes if fix.inliers >= self._settings.fix.min_inliers]
         return tracker.update(fixes, confirmed, is_near=near is not None)
 
     def _near(
         self,
         features: FrameFeatures,
-        relocalizer: Relocalizer,
         hypothesis: PoseHypothesis,
         earlier: Sequence[EarlierFrame] = (),
     ) -> Fix | None:
         """Return the fix near a hypothesis at the frame of the query, by that frame and earlier ones."""
+        relocalizer = self._on(hypothesis.floor)
+        if relocalizer is None:
+            return None
         map_from_body = hypothesis.query_map_from_body
         map_from_cam = map_from_body @ self._tracker.body_from_cam
         cov_cam = transport_cov(hypothesis.query_cov, map_from_cam[:3, 3] - map_from_body[:3, 3])
-        return relocalizer.near(features, map_from_cam, cov_cam, earlier)
+        fix = relocalizer.near(features, map_from_cam, cov_cam, earlier)
+        return None if fix is None else _at_floor([fix], hypothesis.floor)[0]
 
     def _rotation(self, hypothesis: PoseHypothesis) -> Array:
         return (hypothesis.query_map_from_body @ self._tracker.body_from_cam)[:3, :3]
 
-    def _search(self, features: FrameFeatures, relocalizer: Relocalizer) -> TimeSliced[tuple[list[Fix], bool]]:
-        """Return fixes in the whole map, or within the prior; near the candidates first. True if some lie outside the prior."""
-        tracker, fixes = self._tracker, list[Fix]()
+    def _search(self, features: FrameFeatures) -> TimeSliced[tuple[list[Fix], bool]]:
+        """Return fixes in all maps, or within the prior; near the candidates first. True if some lie outside the prior."""
+        tracker, found = self._tracker, list[Fix]()
         candidates = tracker.candidates.hypotheses
         for number, candidate in enumerate(candidates, start=1):
-            fix = self._near(features, relocalizer, candidate)
+            fix = self._near(features, candidate)
             if fix is not None:
-                fixes.append(fix)
+                found.append(fix)
             if number % _HYPOTHESES_AT_ONCE == 0:
                 yield
-        rotation = self._rotation(candidates[0]) if len(candidates) == 1 else None
-        prior = tracker.prior
-        near = None if prior is None else prior.is_near(relocalizer.view.map_from_cam[:, :3, 3])
-        fixes = yield from relocalizer.anywhere(features, near, rotation, fixes, self._failed_places[self.view])
-        fixes = tracker.believed(fixes)
+        only = candidates[0] if len(candidates) == 1 else None
+        prior, fixes = tracker.prior, list[Fix]()
+        floors = [floor for floor in self._relocalizers if prior is None or floor in prior.floors]
+        for floor in floors:
+            places = self._relocalizers[floor][self.view].view.map_from_cam[:, :3, 3]
+            near = None if prior is None else prior.is_near(places, floor)
+            rotation = self._rotation(only) if only is not None and only.floor == floor else None
+            here, failed = [fix for fix in found if fix.floor == floor], self._failed_places[self.view][floor]
+            fixes += yield from self._anywhere(floor, features, near, rotation, here, failed)
+        fixes += yield from self._counterparts(features, fixes, floors)
+        fixes = tracker.believed(sorted(fixes, key=lambda fix: -fix.inliers))
         prior = tracker.prior
         if prior is None:
             return fixes, False
@@ -250,9 +284,55 @@ class MapQuery:
             # An operator may have chosen an alias of the place.
             return fixes if prior.is_revisable else within, len(within) < len(fixes)
         yield
-        fixes = yield from relocalizer.anywhere(features, None, None)
-        fixes = [fix for fix in fixes if tracker.is_reliable(fix)]
+        fixes = []
+        for floor in self._relocalizers:
+            fixes += yield from self._anywhere(floor, features)
+        fixes = [fix for fix in sorted(fixes, key=lambda fix: -fix.inliers) if tracker.is_reliable(fix)]
         return fixes if tracker.drops_prior(fixes) else [], bool(fixes)
+
+    def _anywhere(
+        self,
+        floor: str,
+        features: FrameFeatures,
+        near: NDArray[np.bool_] | None = None,
+        rotation: Array | None = None,
+        found: Sequence[Fix] = (),
+        failed: list[Array] | None = None,
+    ) -> TimeSliced[list[Fix]]:
+        """Return the fixes on one floor; arguments as of `Relocalizer.anywhere`."""
+        relocalizer = self._on(floor)
+        if relocalizer is None:
+            return []
+        fixes = yield from relocalizer.anywhere(features, near, rotation, found, failed)
+        return _at_floor(fixes, floor)
+
+    def _counterparts(
+        self, features: FrameFeatures, fixes: Sequence[Fix], floors: Sequence[str]
+    ) -> TimeSliced[list[Fix]]:
+        """Return fixes at the places above and below the best fix of each floor that have none yet: floors may look alike, and a search
+        that fails on the robot's own must not leave another one without competitors."""
+        added: list[Fix] = []
+        known = self._plan_from_map
+        for floor in floors if len(floors) > 1 else ():
+            best = next((fix for fix in fixes if fix.floor == floor), None)
+            relocalizer = self._on(floor)
+            for other in floors if best is not None and relocalizer is not None else ():
+                there = self._on(other)
+                if other == floor or best is None or there is None or not {floor, other} <= known.keys():
+                    continue
+                place = se3_inverse(known[other]) @ known[floor] @ best.map_from_cam
+                here = [fix for fix in (*fixes, *added) if fix.floor == other]
+                if any(np.linalg.norm(fix.map_from_cam[:2, 3] - place[:2, 3]) < _COUNTERPART_M for fix in here):
+                    continue
+                near = np.linalg.norm(there.view.map_from_cam[:, :2, 3] - place[:2, 3], axis=1) < _COUNTERPART_M
+                yield
+                new = yield from self._anywhere(other, features, near, place[:3, :3], here)
+                added += [fix for fix in new if not any(fix.map_from_cam is each.map_from_cam for each in here)]
+        return added
+
+
+def _at_floor(fixes: list[Fix], floor: str) -> list[Fix]:
+    return [fix if fix.floor == floor else replace(fix, floor=floor) for fix in fixes]
 
 
 def _extract(query: QueryInput, frame: RectifiedFrame | None, relocalizer: Relocalizer) -> TimeSliced[FrameFeatures]:

@@ -35,7 +35,8 @@ class PoseHypothesis:
     agreeing fixes. inlier_sum, recall_sum, queries: sums of inliers, of landmark recall, and of map queries, older ones
     decayed. query_inliers, query_recall: of this query's fix, 0 without. recall_total, looks: landmark recall of all queries, 0
     for those without a fix, and their number. misses: queries since the last fix. told_log_odds: log odds that an operator who chose
-    this place is right, 0 without one. has_broken: tracks were lost since the last fix.
+    this place is right, 0 without one. has_broken: tracks were lost since the last fix. floor: whose `map` it is, empty for the
+    robot's own.
     """
 
     frame_index: int
@@ -58,18 +59,24 @@ class PoseHypothesis:
     travelled_m: float = 0.0
     told_log_odds: float = 0.0
     has_broken: bool = False
+    floor: str = ""
     history: ObservationHistory = field(default_factory=ObservationHistory)
 
     @classmethod
-    def at(cls, odometry: OdometryEstimate, map_from_body: Array, cov_rot_trans: Array) -> "PoseHypothesis":
-        return cls(odometry.frame_index, odometry.stamp_ns, map_from_body, cov_rot_trans, map_from_body, cov_rot_trans)
+    def at(
+        cls, odometry: OdometryEstimate, map_from_body: Array, cov_rot_trans: Array, floor: str = ""
+    ) -> "PoseHypothesis":
+        at_frame = map_from_body, cov_rot_trans
+        return cls(odometry.frame_index, odometry.stamp_ns, *at_frame, *at_frame, floor=floor)
 
     @classmethod
-    def at_query(cls, query: "PoseHypothesis", map_from_body: Array, cov_rot_trans: Array) -> "PoseHypothesis":
+    def at_query(
+        cls, query: "PoseHypothesis", map_from_body: Array, cov_rot_trans: Array, floor: str
+    ) -> "PoseHypothesis":
         """Propagate a pose at the frame of a map query to the present. query: the identity at that frame, propagated to the present."""
         then = compose_end_cov(map_from_body, cov_rot_trans, query.map_from_body, query.cov_rot_trans)
         now = compose_end_cov(map_from_body, cov_rot_trans, query.now_map_from_body, query.now_cov)
-        return cls(query.frame_index, query.stamp_ns, *then, *now, has_broken=query.has_broken)
+        return cls(query.frame_index, query.stamp_ns, *then, *now, has_broken=query.has_broken, floor=floor)
 
     @property
     def evidence(self) -> str:

@@ -1,6 +1,6 @@
 """Pose tracking in the map: a prior, competing candidates or one confirmed pose, propagated by the odometry. Pure."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -95,6 +95,8 @@ class PoseTracker:
         self.odom_from_body: Array | None = None  # of the last frame
         self._query_frame: PoseHypothesis | None = None  # of the running map query, as the identity
         self._query_index: int | None = None  # of the last map query's frame
+        self.floor = ""  # of the last confirmed pose
+        self.missing_floors: Set[str] = frozenset()  # whose maps the robot does not hold
         # Frames of queries since the last fix, each as the identity.
         self._unmatched: list[_Unmatched] = []
 
@@ -102,6 +104,7 @@ class PoseTracker:
 
     def handle_prior(self, prior: PositionPrior) -> None:
         """Use a prior at this moment; it replaces any earlier one."""
+        prior = replace(prior, floor=self.floor if prior.floor is None else prior.floor)
         self.prior = InitialPosePrior(prior, self._base_from_body, self._track)
 
     def is_contradicted_by(self, prior: PositionPrior) -> bool:
@@ -156,8 +159,7 @@ class PoseTracker:
             self.prior.travelled_m = start.travelled_m
 
     def _prior_at(self, known: PoseHypothesis, *, is_revisable: bool, is_told: bool) -> InitialPosePrior:
-        how = {"is_revisable": is_revisable, "is_told": is_told}
-        return InitialPosePrior.at(known, self._base_from_body, self._track, **how)
+        return InitialPosePrior.at(known, self._base_from_body, self._track, is_revisable=is_revisable, is_told=is_told)
 
     # --- propagation --------------------------------------------------------------------------------------------------
 
@@ -221,7 +223,7 @@ class PoseTracker:
         self.candidates.abandoned, self.confirmed = confirmed, None
         self.prior = None
         if np.isfinite(confirmed.now_cov).all() and np.isfinite(confirmed.now_map_from_body).all():
-            at_present = PoseHypothesis.at(odometry, confirmed.now_map_from_body, confirmed.now_cov)
+            at_present = PoseHypothesis.at(odometry, confirmed.now_map_from_body, confirmed.now_cov, confirmed.floor)
             self.prior = self._prior_at(at_present, is_revisable=True, is_told=False)
 
     def end_query(self) -> None:
@@ -255,7 +257,7 @@ class PoseTracker:
     def observations(self, fixes: Sequence[Fix]) -> Observations:
         """Return the fixes of the running query with their poses at present."""
         assert self._query_frame is not None
-        found = [(fix, PoseHypothesis.at_query(self._query_frame, *self._at_body(fix))) for fix in fixes]
+        found = [(fix, PoseHypothesis.at_query(self._query_frame, *self._at_body(fix), fix.floor)) for fix in fixes]
         return found if self.prior is None else self.prior.weighed(found)
 
     def is_reliable(self, fix: Fix) -> bool:
@@ -270,7 +272,7 @@ class PoseTracker:
         return [fix for fix, at in self.observations(fixes) if self.is_reliable(fix) or self._is_at(known, fix, at)]
 
     def _is_at(self, known: PoseHypothesis | None, fix: Fix, at: PoseHypothesis) -> bool:
-        if known is None or fix.inliers < self._settings.fix.min_inliers:
+        if known is None or fix.inliers < self._settings.fix.min_inliers or fix.floor != known.floor:
             return False
         _, innovation = innovation_of(at.now_map_from_body, at.now_cov, known.now_map_from_body, known.now_cov)
         return innovation <= self._track.innovation_limit
@@ -318,7 +320,7 @@ class PoseTracker:
             return QueryResult(None, reason, innovation, off_m if is_near else None)
         _, cov_fix = self._at_body(fix)
         updated = kalman_update(map_from_body, covariance, error, cov_fix)
-        self.confirmed = PoseHypothesis.at_query(self._query_frame, *updated)
+        self.confirmed = PoseHypothesis.at_query(self._query_frame, *updated, confirmed.floor)
         self.confirmed.support = confirmed.support + 1
         self.candidates.reset()
         return QueryResult(fix, "", innovation, off_m)
@@ -353,6 +355,8 @@ class PoseTracker:
             return QueryResult(None, f"{len(competitors) + 1} places match the image: {told}")
         moved_m = None
         has_prior = self.prior is not None and self.prior.confirms(best)
+        if not has_prior and self.missing_floors:
+            return QueryResult(None, f"floor {min(self.missing_floors)}, whose map is not here yet, may look the same")
         if not has_prior and candidates.may_be_lookalike(best):
             assert self.lookalikes is not None
             told = f"{best.evidence} here, {self.lookalikes.recall:.0%} there"
@@ -360,10 +364,11 @@ class PoseTracker:
         if has_prior or candidates.is_confirmed(best, fixes):
             moved_m = candidates.moved_m(best)
             candidates.reset()
-            self.confirmed, self.prior = best, None
+            self.confirmed, self.prior, self.floor = best, None, best.floor
             self.was_tracking, self.is_carried = True, False
         best_m = best.now_map_from_body[:3, 3]
         for fix, hypothesis in self.observations(fixes):
-            if np.linalg.norm(hypothesis.now_map_from_body[:3, 3] - best_m) < _OWN_FIX_M:
+            off_m = np.linalg.norm(hypothesis.now_map_from_body[:3, 3] - best_m)
+            if off_m < _OWN_FIX_M and hypothesis.floor == best.floor:
                 return QueryResult(fix, moved_m=moved_m)
         return QueryResult(None, "the fix does not agree with those before", moved_m=moved_m)

@@ -219,6 +219,29 @@ class MapClient(MapSource):
             return ReadyVersion(self.wanted(), str(error))
         return ReadyVersion(wanted)
 
+    def newest(self, *, asks: bool = True) -> WantedVersion:
+        """Return the version that the site's signed list names as current, fetched and active; else the active one.
+
+        The server chooses no version for a robot of another site, so that it tries none there. Errors as of `fetch`, without an active one.
+        """
+        active = self.active()
+        if not asks and active is not None:
+            return active
+        try:
+            if not asks:
+                raise LinkError(f"the cache has no version of site {self._site} yet")
+            if self._trust is None:
+                raise UntrustedError("signature", "this robot has no signed lists")
+            wanted = self._trust.current()
+            if wanted != active:
+                self.bring(wanted)
+        except (LinkError, MapFormatError, StoreError) as error:
+            if active is None:
+                raise
+            _log.info("floor %s: version %s stays active: %s", self._site, active.version, error)
+            return active
+        return wanted
+
     def bring(self, wanted: WantedVersion) -> None:
         """Fetch all of a version into the cache and activate it; errors as of `fetch` and `activate`."""
         self.activate(self.fetch(wanted), wanted)

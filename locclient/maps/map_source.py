@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UsageError, disk_errors
@@ -49,6 +50,19 @@ class MapSource(ABC):
     def __init__(self, site: str) -> None:
         """Raises UsageError for an invalid site name."""
         self._site = check_name(site, "site")
+
+    @property
+    def site(self) -> str:
+        return self._site
+
+    def newest(self, *, asks: bool = True) -> WantedVersion:
+        """Return the site's current version, complete where the robot can read it; asks: False for the one on its disk. Errors as of
+        `manifest`."""
+        return self.ready().wanted
+
+    def site_file(self, kind: str, max_bytes: int) -> bytes | None:
+        """Return the file of this kind that the site keeps beside its versions; None without one."""
+        raise NotImplementedError
 
     @abstractmethod
     def ready(self) -> ReadyVersion:
@@ -139,22 +153,31 @@ class LocalMapSource(MapSource):
         version = decode_manifest(self.blob(sha256)).version
         return WantedVersion(site=self._site, version=version, manifest_sha256=sha256)
 
+    def site_file(self, kind: str, max_bytes: int) -> bytes | None:
+        """Return the file of this kind that the site keeps beside its versions; None without one. Errors as of `wanted` and `blob`."""
+        sha256 = self._rows("SELECT kind, sha256 FROM site_files WHERE site = ?").get(kind)
+        return None if sha256 is None else self.blob(sha256)
+
     def _asked(self, number: int) -> WantedVersion:
-        path, query = self._folder / "store.sqlite3", "SELECT version, manifest_sha256 FROM versions WHERE site = ?"
+        known = self._rows("SELECT version, manifest_sha256 FROM versions WHERE site = ?")
+        if number not in known:
+            names = ", ".join(str(version) for version in sorted(known)) or "none"
+            raise UsageError(f"site {self._site} has no version {number} in {self._folder}; it has: {names}")
+        return WantedVersion(site=self._site, version=number, manifest_sha256=known[number])
+
+    def _rows(self, query: str) -> dict[Any, str]:
+        """Return the two columns of a query for this site; StoreError if the database cannot be read."""
+        path = self._folder / "store.sqlite3"
         # Without write access beside the database, and without a write-ahead log, SQLite must open it as immutable.
         log = path.with_name(f"{path.name}-wal")
         how = "mode=ro" if os.access(self._folder, os.W_OK) or log.exists() else "mode=ro&immutable=1"
         try:
             with closing(sqlite3.connect(f"{path.absolute().as_uri()}?{how}", uri=True)) as database:
-                known = dict(database.execute(query, (self._site,)).fetchall())
+                return dict(database.execute(query, (self._site,)).fetchall())
         except sqlite3.Error as error:
             raise StoreError(
                 f"{path} cannot be read ({error}); check the store with `mapserver verify --store {shlex.quote(str(self._folder))}`"
             ) from error
-        if number not in known:
-            names = ", ".join(str(version) for version in sorted(known)) or "none"
-            raise UsageError(f"site {self._site} has no version {number} in {self._folder}; it has: {names}")
-        return WantedVersion(site=self._site, version=number, manifest_sha256=known[number])
 
     def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
         """Return the verified bytes of an address; StoreError for missing ones, MapFormatError for damaged ones."""

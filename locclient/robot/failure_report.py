@@ -128,8 +128,8 @@ class RobotProfile:
 def failure_report(context: FailureContext, profile: RobotProfile, *, report_id: str, wall_ns: int) -> FailureReport:
     """Return the message. wall_ns: the robot's wall clock when the failure began."""
     failure, onset, image = context.failure, context.onset, context.failure.image
-    belief, map_from_base = onset.belief, None
-    if onset.map_from_body is not None:
+    belief, map_from_base, is_own = onset.belief, None, not failure.estimate.floor
+    if onset.map_from_body is not None and is_own:  # the server has no place for one on another site's floor
         map_from_base = onset.map_from_body @ se3_inverse(profile.base_from_body)
     matches = _matches(context, profile)
     seen = None if matches is None else int((matches[2] >= 0).sum())
@@ -148,7 +148,7 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
         kind=failure.kind,
         status=failure.estimate.status,
         cause=cause,
-        version=failure.estimate.map_version,
+        version=failure.estimate.map_version if is_own else None,
         tile=_tile(context, map_from_base),
         map_from_base=None if map_from_base is None else Placement.of(map_from_base),
         radius_95_m=None if belief is None else belief.radius_95_m,

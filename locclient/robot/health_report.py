@@ -202,12 +202,13 @@ class HealthFigures:
             flags += [Cause.NO_MAP] if last.map_version is None else []
             figures["not_localised_m"] = self.search.metres
             flags += [] if self.last is None else self.last.left_out
+            figures |= {"floor": last.floor} if last.floor else {}
         return RobotHealth(
             site=site,
             robot=robot,
             stamp_ns=0 if last is None else last.stamp_ns,
             wall_ns=wall_ns,
-            version=None if last is None else last.map_version,
+            version=None if last is None or last.floor else last.map_version,
             status=Status.INITIALISING if last is None else last.status,
             flags=tuple(flags),
             metrics={**figures, **more},

@@ -1,11 +1,12 @@
 """One robot, frame by frame: localization, detection of failures, trials of new map versions. Pure."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from fleetmap.failure_definition import may_be_mapped, radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.mapformat.building import BuildingFrame
+from fleetmap.mapformat.floors import Floor
 from fleetmap.mapformat.manifest import building_frame
 from fleetmap.messages import Cause, Flag, PoseMessage, Status
 from fleetmap.recordings.images import StoredFrame, decode_frame
@@ -69,9 +70,9 @@ class Outcome:
     left_out: Mapping[Flag, str] = field(default_factory=dict)
 
     def pose_message(self) -> PoseMessage | None:
-        """Return the pose for the server; None while there is no single one with a covariance."""
+        """Return the pose for the server; None while there is no single one with a covariance, or it is on another site's floor."""
         estimate, map_from_base, cov = self.estimate, self.published.map_from_base, self.published.cov_rot_trans
-        if map_from_base is None or cov is None:
+        if map_from_base is None or cov is None or estimate.floor:
             return None
         return PoseMessage.of(estimate.stamp_ns, map_from_base, cov, estimate.status, estimate.map_version)
 
@@ -106,7 +107,9 @@ class Robot:
         self._wheels_fault, self._wheels_unused = calibration.wheels_fault, dict[Flag, str]()
         self._aligned: BuildingFrame | None = None
         self._of_version: BuildingFrame | None = None
-        self._building_from_map: Array | None = None
+        self._floors: dict[str, Floor] = {}
+        self._visited: dict[str, LoadedMap] = {}  # maps of the other floors
+        self._floor = ""  # of the last estimate
 
     @property
     def held(self) -> list[LoadedMap]:
@@ -115,7 +118,8 @@ class Robot:
 
     @property
     def running(self) -> LoadedMap | None:
-        return self._versions.running
+        """Return the map of the floor where the robot is."""
+        return self._visited.get(self._floor) if self._floor else self._versions.running
 
     def take_changes(self) -> list[VersionChange]:
         """Return changes of versions since the last call."""
@@ -126,10 +130,21 @@ class Robot:
         """Use other tiles of a held version, or a new version: the first one is adopted at once, any other is put on trial."""
         self._versions.use(loaded)
 
+    def use_floors(self, floors: Mapping[str, Floor], maps: Sequence[LoadedMap]) -> None:
+        """Use the floors of the robot's building, as `Localizer.handle_floors`, and new versions of the others.
+
+        Those are used without a trial: they are current on their own site, where its robots have tried them.
+        """
+        self._floors = dict(floors)
+        self._visited = {site: held for site, held in self._visited.items() if site in floors}
+        self.localizer.handle_floors(floors)
+        for loaded in maps:
+            self._visited[loaded.wanted.site] = loaded
+            self._give(loaded, loaded.wanted.site)
+
     def align(self, frame: BuildingFrame | None) -> None:
         """Set the pose of the site's map in its building, which overrides that of versions; None: each version defines it."""
         self._aligned = frame
-        self._place_in_building()
 
     def handle(self, bundle: SensorBundle) -> Outcome | None:
         """Return results of a bundle with a frame; None without one that the localizer uses. RecordingError for unreadable images."""
@@ -157,8 +172,12 @@ class Robot:
         cpu_s = self._clock_s() - begun_s
         stage_s = {"decode": decoded_s - begun_s, "rectify": rectified_s - decoded_s, **estimate.stage_s}
         self._last = (frame, estimate)
-        self._versions.handle(estimate)
-        published = replace(self._odom.handle(estimate), building_from_map=self._building_from_map)
+        self._enter(estimate.floor)
+        if estimate.floor:
+            self._versions.pause()
+        else:
+            self._versions.handle(estimate)
+        published = replace(self._odom.handle(estimate), building_from_map=self._building_from_map())
         speed_mps = self._speed.handle(wheel, estimate.odometry, published.odom_from_base)
         self._wheels.handle(wheel if self._wheels_fault else bundle.wheel, estimate.odometry)
         is_covered = self._may_be_mapped(estimate)
@@ -211,15 +230,26 @@ class Robot:
         return FailureContext(failure, onset, unmatched, evidence, self.running, cut)
 
     def _show(self, loaded: LoadedMap) -> None:
-        focal_px, tiles = loaded.manifest.camera.focal_px, loaded.tiles.values()
-        if self.ring is not None:
+        if self.ring is not None and not self._floor:
             self.ring.use(loaded)
         self._of_version = building_frame(loaded.manifest)
-        self._place_in_building()
-        self.localizer.handle_version(
-            loaded.version, tiles, loaded.vocabulary, focal_px, loaded.lookalikes, loaded.alias_step_m
-        )
+        self._give(loaded, "")
 
-    def _place_in_building(self) -> None:
+    def _give(self, loaded: LoadedMap, floor: str) -> None:
+        focal_px, tiles, like = loaded.manifest.camera.focal_px, loaded.tiles.values(), loaded.lookalikes
+        shown = (loaded.version, tiles, loaded.vocabulary, focal_px, like, loaded.alias_step_m)
+        self.localizer.handle_version(*shown, floor=floor)
+
+    def _enter(self, floor: str) -> None:
+        """Note the floor where the robot is; recordings of failures need its map."""
+        if floor == self._floor:
+            return
+        self._floor = floor
+        if self.ring is not None and self.running is not None:
+            self.ring.use(self.running)
+
+    def _building_from_map(self) -> Array | None:
+        if self._floors:
+            return self._floors[self._floor].building_from_map
         frame = self._aligned or self._of_version
-        self._building_from_map = None if frame is None else frame.building_from_map
+        return None if frame is None else frame.building_from_map

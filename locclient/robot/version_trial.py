@@ -174,6 +174,10 @@ class VersionTrials:
             return
         self._candidate = self._trial = self._failed_reason = None
 
+    def pause(self) -> None:
+        """Interrupt a trial while the robot is on another site's floor; it begins again on its own."""
+        self._last = self._trial = None
+
     def _begin_trial(self) -> None:
         """Begin the trial at the last frame of the previous version; without one, at the next frame."""
         self._trial = None if self._last is None else VersionTrial(self._settings, self._last)

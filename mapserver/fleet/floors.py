@@ -12,7 +12,7 @@ from mapserver.store import Actor, MapStore
 def keep_building(store: MapStore, building: Building, actor: Actor) -> Building:
     """Make the sites the floors of a building, and return it, from below; sites that it had before leave it.
 
-    Raises UsageError for an unknown site, one without its pose in the building, one of another building, and repeated levels or heights.
+    Raises UsageError for an unknown site, one without a version or pose, one of another building, and repeated levels or heights.
     """
     try:
         building = check_building(building)
@@ -20,7 +20,8 @@ def keep_building(store: MapStore, building: Building, actor: Actor) -> Building
         raise UsageError(str(error)) from error
     sites = [floor.site for floor in building.floors]
     for site in sites:
-        store.current(site)  # raises for an unknown site
+        if store.current(site) is None:  # it raises for an unknown site
+            raise UsageError(f"site {site} has no published version; robots need the maps of all floors")
         known = store.building(site)
         if known is not None and known.name != building.name:
             raise UsageError(f"site {site} is a floor of {known.name!r}; remove that building first")

@@ -44,9 +44,9 @@ class Floor:
     @property
     def building_from_map(self) -> Array:
         """(4, 4), with the floor's height."""
-        pose = self.frame.building_from_map.copy()
-        pose[2, 3] += self.entry.height_m
-        return pose
+        building_from_map = self.frame.building_from_map.copy()
+        building_from_map[2, 3] += self.entry.height_m
+        return building_from_map
 
     def lift_at(self, position_m: Array, reach_m: float) -> str | None:
         """Return the lift whose outline holds a position (2,) or is at most reach_m from it; None without one."""

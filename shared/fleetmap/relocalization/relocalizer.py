@@ -36,7 +36,7 @@ class Fix:
     expected, seen: numbers of these landmarks and of the found ones; 0 if none is expected.
     alias_ratio: support of the best other place relative to this one; 1 if no other place was searched for.
     covisible: the landmarks behind landmark_recall, None if the survey did not pass here.
-    matched: all final matches, before any gate.
+    matched: all final matches, before any gate. floor: whose map it is in, of a building; empty for the robot's own site.
     """
 
     map_from_cam: Array
@@ -51,6 +51,7 @@ class Fix:
     matches: NDArray[np.int64] | None = field(default=None, repr=False, compare=False)
     covisible: CovisibleLandmarks | None = field(default=None, repr=False, compare=False)
     matched: Correspondences | None = field(default=None, repr=False, compare=False)
+    floor: str = ""
 
 
 @dataclass(frozen=True, slots=True)

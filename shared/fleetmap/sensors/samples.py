@@ -91,13 +91,15 @@ class PositionPrior:
     """A coarse pose in `map` from a dock, tag, zone or operator.
 
     map_from_base (4, 4); cov_rot_trans (6, 6) of a perturbation in map axes; infinite where unknown. is_revisable: from an operator, who
-    may err: it replaces the robot's estimate, and fixes may contradict it.
+    may err: it replaces the robot's estimate, and fixes may contradict it. floor: whose `map` it is in, of a building; empty for the
+    robot's own site, None for the floor where it is.
     """
 
     stamp_ns: int
     map_from_base: Array
     cov_rot_trans: Array
     is_revisable: bool = False
+    floor: str | None = None
 
 
 # Default sigmas of an operator's pose: roll pitch yaw (rad), x y z (m). Yaw, x and y are those of RViz.

@@ -123,6 +123,16 @@ class TrustedMap:
             f"{words} {self._list.serial}, which admits {numbers or 'none'}; `mapserver trust status` on the server shows why",
         )
 
+    def current(self) -> WantedVersion:
+        """Fetch the lists and return the site's current version; errors as of `admitted`."""
+        self.refresh()
+        if self._fault is not None:
+            raise self._fault
+        entry = None if self._list is None else self._list.state("current")
+        if entry is None:
+            raise UntrustedError("signature", f"the signed list of site {self._site} names no current version")
+        return WantedVersion(site=self._site, version=entry.about.version, manifest_sha256=entry.sha256)
+
     @property
     def files(self) -> dict[str, str] | None:
         """Addresses of the site's further files, by kind; None without fresh lists."""

@@ -193,11 +193,11 @@ def wanted(store: MapStore, site: str = SITE) -> WantedVersion:
     return WantedVersion(site=site, version=current.version, manifest_sha256=current.manifest_sha256)
 
 
-def loaded(store: MapStore, of: tuple[Tile, ...] | None = None) -> LoadedMap:
+def loaded(store: MapStore, of: tuple[Tile, ...] | None = None, *, site: str = SITE) -> LoadedMap:
     """The current version, in memory, with these tiles."""
-    version = wanted(store)
+    version = wanted(store, site)
     held = {(tile.tile_x, tile.tile_y): tile for tile in (tiles() if of is None else of)}
-    return LoadedMap(version, store.manifest(SITE, version.version), decode_vocabulary(vocabulary()), held)
+    return LoadedMap(version, store.manifest(site, version.version), decode_vocabulary(vocabulary()), held)
 
 
 def moved(offset_m: Array) -> tuple[Tile, ...]:

@@ -1,0 +1,109 @@
+"""The floors of a robot's building and the maps of the others than its own site's: followed, and held whole in memory."""
+
+import logging
+from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple
+
+from fleetmap.bow import decode_vocabulary
+from fleetmap.errors import FleetmapError, MapFormatError, UnreachableError
+from fleetmap.mapformat.building import ALIGNMENT, AREAS, FLOORS, BuildingFrame, aligned_frame
+from fleetmap.mapformat.floors import MAX_FLOORS_BYTES, Floor, FloorEntry, read_building, read_lifts
+from locclient.maps.loaded_map import LoadedMap
+from locclient.maps.map_source import MapSource
+
+_MAX_ALIGNMENT_BYTES, _MAX_AREAS_BYTES = 1 << 20, 8 << 20
+_UNKNOWN = BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0)  # of a floor whose files are missing, and so its map
+_log = logging.getLogger(__name__)
+
+
+class FloorChange(NamedTuple):
+    """Floors as of `Localizer.handle_floors`, all of them, and new versions of the others."""
+
+    floors: dict[str, Floor]
+    maps: list[LoadedMap]
+
+
+class FloorMaps:
+    """`refresh` reads the record of the robot's own site, and the other sites by their own signed lists; changes wait in `changes`.
+
+    A floor whose files cannot be read stays as it was. One whose map is missing stays a floor, on which the robot may be.
+    """
+
+    def __init__(self, own: MapSource, open_site: Callable[[str], MapSource]) -> None:
+        """open_site: opens the source of another site."""
+        self._own, self._open_site = own, open_site
+        self._sources: dict[str, MapSource] = {}
+        self._floors: dict[str, Floor] = {}
+        self._held: dict[str, str] = {}  # addresses of manifests
+        self._made_of = b""  # the record and the files of the floors
+        self._faults: dict[str, str] = {}
+        self.changes: deque[FloorChange] = deque()
+
+    def refresh(self, *, asks: bool = True) -> None:
+        """Read everything anew; asks: False reads the disk alone. UnreachableError without an answer of a server; all else is logged."""
+        try:
+            data = self._own.site_file(FLOORS, MAX_FLOORS_BYTES)
+            entries = () if data is None else read_building(data).floors
+            if entries and self._own.site not in {entry.site for entry in entries}:
+                raise MapFormatError(f"the building of site {self._own.site} has no such floor; set it again")
+        except UnreachableError:
+            raise
+        except FleetmapError as error:
+            return self._note(self._own.site, str(error))
+        floors, files, maps = dict[str, Floor](), list[bytes | None](), list[LoadedMap]()
+        for entry in entries:
+            key = "" if entry.site == self._own.site else entry.site
+            floors[key] = self._floors.get(key, Floor(entry, _UNKNOWN))
+            try:
+                source = self._own if not key else self._source(key)
+                loaded = (
+                    self._newest(source, asks=asks) if key else None
+                )  # first: it reads the signed list, which names the files
+                floors[key] = _floor(entry, source, files)
+                maps += [] if loaded is None else [loaded]
+                self._note(entry.site, "")
+            except FleetmapError as error:
+                if asks and isinstance(error, UnreachableError):
+                    raise
+                self._note(entry.site, str(error))
+        made_of = repr([(key, floor.entry) for key, floor in floors.items()] + files).encode() if floors else b""
+        if made_of != self._made_of or maps:
+            self._floors, self._made_of = floors, made_of
+            self._sources = {site: source for site, source in self._sources.items() if site in floors}
+            self._held = {site: sha256 for site, sha256 in self._held.items() if site in floors}
+            self._held |= {loaded.wanted.site: loaded.wanted.manifest_sha256 or "" for loaded in maps}
+            self.changes.append(FloorChange(floors, maps))
+        return None
+
+    def _source(self, site: str) -> MapSource:
+        if site not in self._sources:
+            self._sources[site] = self._open_site(site)
+        return self._sources[site]
+
+    def _newest(self, source: MapSource, *, asks: bool) -> LoadedMap | None:
+        """Return the current version with all of its usable tiles; None if the robot holds it already."""
+        wanted = source.newest(asks=asks)
+        if wanted.manifest_sha256 == self._held.get(source.site):
+            return None
+        manifest = source.manifest(wanted)
+        tiles = source.tiles(manifest)
+        for reason in tiles.refused.values():
+            _log.warning("floor %s: a tile is left out: %s", source.site, reason)
+        return LoadedMap(wanted, manifest, decode_vocabulary(source.vocabulary(manifest)), tiles.tiles)
+
+    def _note(self, site: str, fault: str) -> None:
+        if fault and fault != self._faults.get(site):
+            _log.warning("floor %s stays as it was: %s", site, fault)
+        self._faults[site] = fault
+
+
+def _floor(entry: FloorEntry, source: MapSource, files: list[bytes | None]) -> Floor:
+    """Read a floor, and append the files that it is made of."""
+    alignment = source.site_file(ALIGNMENT, _MAX_ALIGNMENT_BYTES)
+    if alignment is None:
+        raise MapFormatError(f"site {entry.site} has no pose in the building; `mapserver align` estimates it")
+    frame, areas = aligned_frame(alignment), source.site_file(AREAS, _MAX_AREAS_BYTES)
+    floor = Floor(entry, frame, read_lifts(areas, frame))
+    files += [alignment, areas]
+    return floor

@@ -1,0 +1,35 @@
+"""A building of two floors in a store, of maps of the painted room."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from fleetmap.mapformat import Tile
+from fleetmap.mapformat.building import BuildingFrame
+from fleetmap.mapformat.floors import Building, FloorEntry
+from mapserver.fleet.floors import keep_building
+from mapserver.floor_plan.alignment import Alignment, encode_alignment
+from mapserver.store import NOBODY, MapStore
+from support.worlds import robot_world
+
+SITES = ("low", "high")
+
+
+def strange(tiles: tuple[Tile, ...]) -> tuple[Tile, ...]:
+    """A floor that looks like no other."""
+    rng = np.random.default_rng(1)
+    return tuple(replace(t, descriptors=rng.integers(0, 256, t.descriptors.shape, np.uint8)) for t in tiles)
+
+
+def house(folder: Path, low: tuple[Tile, ...], high: tuple[Tile, ...], x_m: float = 0.0) -> MapStore:
+    """A building of two floors; the map of the upper one lies x_m beside the lower one's."""
+    store = MapStore.open(folder, create=True)
+    for site, tiles, at_m in (("low", low, 0.0), ("high", high, x_m)):
+        robot_world.save(store, site=site, of=tiles)
+        frame = BuildingFrame(x_m=at_m, y_m=0.0, yaw_rad=0.0)
+        aligned = Alignment(frame=frame, metres_per_unit=1.0, method="pins", plan=None, off_m={})
+        store.keep_site_files(site, {"alignment": encode_alignment(aligned)}, "")
+    floors = tuple(FloorEntry(site=site, level=f"L{n}", height_m=4.0 * n) for n, site in enumerate(SITES))
+    keep_building(store, Building(name="tower", floors=floors), NOBODY)
+    return store
