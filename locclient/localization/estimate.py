@@ -95,10 +95,12 @@ def assemble(
     prior: PoseHypothesis | None,
     has_failed: bool,
     was_tracking: bool,
+    rides: Sequence[PoseHypothesis] = (),
 ) -> Estimate:
     """Return `estimate`, whose cause is that of its images, completed by status, pose and cause.
 
-    prior: pose by the prior and the motion since. has_failed: the last map query found no fix.
+    prior: pose by the prior and the motion since. has_failed: the last map query found no fix. rides: the places where the robot may be
+    after a ride in a lift, on each floor.
     """
     if confirmed is not None:
         return _of_confirmed(estimate, confirmed, candidates.hypotheses, has_failed, settings)
@@ -106,6 +108,8 @@ def assemble(
     is_open = bool(competitors) or (bool(ranking) and candidates.may_be_lookalike(ranking[0]))
     status = Status.AMBIGUOUS if is_open else Status.LOST if was_tracking else Status.INITIALISING
     estimate = replace(estimate, status=status, hypotheses=_published(ranking))
+    if rides and not is_open:
+        return replace(estimate, status=Status.AMBIGUOUS, hypotheses=_published(rides))
     if ranking and (is_open or prior is None or not was_tracking):
         return estimate if is_open else _with_pose(estimate, ranking[0], settings)
     if prior is None or estimate.map_version is None:

@@ -175,11 +175,13 @@ class HypothesisSet:
         has_enough = hypothesis.support >= settings.confirming_fixes
         return has_enough and hypothesis.travelled_m >= settings.confirming_distance_m
 
-    def is_confirmed(self, hypothesis: PoseHypothesis, fixes: Sequence[Fix]) -> bool:
+    def is_confirmed(self, hypothesis: PoseHypothesis, fixes: Sequence[Fix], *, floors: int = 1) -> bool:
         """Return True after enough fixes over enough distance, or for the only hypothesis after an unambiguous fix: a strong one, or one
-        of enough agreeing fixes if the map's look-alikes were measured well enough, so that no distance is needed to exclude them."""
+        of enough agreeing fixes if the map's look-alikes were measured well enough, so that no distance is needed to exclude them.
+
+        floors: number of those that were searched; of several, one fix says too little: it may be missing on the robot's own."""
         settings = self._settings
-        if len(self.hypotheses) == len(fixes) == 1:
+        if floors == 1 and len(self.hypotheses) == len(fixes) == 1:
             fix = fixes[0]
             # It agrees too well for any other place of this map.
             is_unambiguous = fix.inlier_share >= settings.strong_share and fix.alias_ratio < settings.strong_alias_share

@@ -44,7 +44,7 @@ class InitialPosePrior:
     hypothesis: the pose by both, published while the map gives none; None for priors with an unknown heading. contradictions: places
     of fixes outside a revisable prior. is_told: True for a prior from outside, such as a dock, a zone or an operator; else it is the
     robot's own estimate by odometry. floors: those on which the robot may be, with prior_from_map (4, 4), from each one's map to that of
-    the prior; None for the same map.
+    the prior; None for the same map. is_ride: the robot may have ridden a lift to any of them.
     """
 
     def __init__(
@@ -61,7 +61,7 @@ class InitialPosePrior:
         self._since: PoseHypothesis | None = None  # the first frame after it, as the identity
         self.hypothesis: PoseHypothesis | None = None
         self.contradictions = HypothesisSet(settings)
-        self.is_revisable, self.is_told = prior.is_revisable, True
+        self.is_revisable, self.is_told, self.is_ride = prior.is_revisable, True, False
 
     @classmethod
     def at(
@@ -99,6 +99,18 @@ class InitialPosePrior:
             lever_m = map_from_body[:3, 3] - self._prior.map_from_base[:3, 3]
             covariance = transport_cov(self._prior.cov_rot_trans, lever_m)
             self.hypothesis = PoseHypothesis.at(odometry, map_from_body, covariance, self._prior.floor or "")
+
+    def on_each_floor(self) -> list[PoseHypothesis]:
+        """Return the pose by the prior on each of its floors; empty without a heading."""
+        known, found = self.hypothesis, list[PoseHypothesis]()
+        for floor, prior_from_map in self.floors.items() if known is not None else ():
+            assert known is not None
+            map_from_body = known.now_map_from_body
+            if prior_from_map is not None:
+                map_from_body = se3_inverse(prior_from_map) @ map_from_body
+            at_frame = map_from_body, known.now_cov
+            found.append(PoseHypothesis(known.frame_index, known.stamp_ns, *at_frame, *at_frame, floor=floor))
+        return found
 
     def tracked(self) -> list[PoseHypothesis]:
         return [*filter(None, (self.hypothesis, self._since)), *self.contradictions.hypotheses]

@@ -11,7 +11,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.mapformat.floors import Floor
 from fleetmap.messages import Cause, Status
-from fleetmap.odometry import Odometry, is_away
+from fleetmap.odometry import Odometry, OdometryEstimate, is_away
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.calibration import RigCalibration
@@ -21,9 +21,19 @@ from locclient.localization.calibration.monitor import CalibrationMonitor, with_
 from locclient.localization.calibration.watch import Mounting
 from locclient.localization.estimate import Estimate, assemble
 from locclient.localization.image_quality import UNUSABLE, ImageQuality, ImageQualityMonitor
+from locclient.localization.lift_ride import (
+    CARRIED_M,
+    LIFT_SIGMAS,
+    PLAN_SIGMA_M,
+    SHORTEST_RIDE_S,
+    LiftVisit,
+    Ride,
+    RideGauge,
+    floors_after,
+)
 from locclient.localization.map_query import MapQuery
 from locclient.localization.percept import Percept
-from locclient.localization.pose_hypothesis import Motion
+from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
 from locclient.localization.pose_tracker import PoseTracker, Start
 from locclient.localization.settings import LocalizerSettings
 
@@ -71,13 +81,23 @@ class Localizer:
         self._query = MapQuery(self._tracker, settings)
         self._maps: dict[str, _FloorMap] = {}
         self._floors: dict[str, Floor] = {}
+        self._gauge = RideGauge(calibration.imu)
+        self._body_from_base, self._imu_minus_cam_ns = (
+            se3_inverse(calibration.base_from_body),
+            int(imu_minus_cam_s * 1e9),
+        )
+        self._lift: LiftVisit | None = None
         self._last_ns: int | None = None
 
     def handle_imu(self, samples: ImuSamples) -> None:
         self.odometry.handle_imu(samples)
+        if self._floors:
+            self._gauge.handle_imu(samples)
 
     def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
         self.odometry.handle_wheel(samples)
+        if self._floors:
+            self._gauge.handle_wheel(samples)
         self._calibration.watch.handle_wheel(samples)
 
     def handle_prior(self, prior: PositionPrior) -> None:
@@ -123,7 +143,7 @@ class Localizer:
     def handle_floors(self, floors: Mapping[str, Floor]) -> None:
         """Use the floors of the robot's building: its own site's, which is called "", and others by their sites. Their maps follow by
         `handle_version`; those of floors that are none any more are dropped. Without any, the robot has its own site alone."""
-        self._floors = dict(floors)
+        self._floors, self._lift, self._query.is_riding = dict(floors), None, False
         self._query.use_floors({site: floor.frame.building_from_map for site, floor in floors.items()})
         self._maps = {floor: held for floor, held in self._maps.items() if not floor or floor in floors}
         self._compare_maps()
@@ -139,6 +159,66 @@ class Localizer:
             shares = [each.max_wrong_share for each in known] + [1.0] * (len(self._maps) - len(known))
             self._tracker.lookalikes = LookAlikes(max(each.recall for each in known), max(shares))
         self._tracker.alias_step_m = min((held.alias_step_m for held in self._maps.values()), default=ALIAS_STEP_M)
+
+    def _cause(self, percept: Percept) -> Cause:
+        if self._query.is_riding or (self._lift is not None and self._tracker.confirmed is None):
+            return Cause.RIDING
+        return percept.image.cause or (Cause.CARRIED if self._tracker.is_carried else Cause.NONE)
+
+    def _follow_lift(self, odometry: OdometryEstimate, ride: Ride) -> bool:
+        """Return True while the robot rides, when no place may be confirmed. After a ride it may be on those floors of the lift to which
+        the measured rise leads; on all of them if that is not known."""
+        tracker, visit = self._tracker, self._lift
+        prior = tracker.prior
+        known = tracker.confirmed or (None if prior is None else prior.hypothesis)
+        lift = None if known is None else self._lift_at(known)
+        if known is None or lift is None:
+            self._lift = None
+            return self._follow_elsewhere(ride)
+        if visit is None or visit.lift != lift or (tracker.confirmed is not None and visit.is_ride):
+            self._gauge.reset()  # it stands on a known floor, or came in without one
+            ride = ride._replace(rise_m=0.0, sigma_m=ride.sigma_m if np.isinf(ride.sigma_m) else 0.0)
+            visit = LiftVisit(lift, known.floor, odometry.stamp_ns)
+        stays_s = min(ride.rest_s, (odometry.stamp_ns - visit.since_ns) * 1e-9)
+        floors = floors_after(self._floors, visit, ride)
+        may_have_ridden = floors.keys() != {visit.floor} and (visit.is_doubted or stays_s >= SHORTEST_RIDE_S)
+        if tracker.confirmed is None and prior is not None and prior.is_ride:
+            prior.floors = floors
+        elif ride.is_moving or may_have_ridden:
+            if tracker.confirmed is None:
+                tracker.forget()
+            else:
+                tracker.ride(odometry, floors, PLAN_SIGMA_M)
+            self._query.forget()
+            self._calibration.give_up()
+            visit = visit._replace(is_ride=True)
+        self._lift = visit
+        return ride.is_moving
+
+    def _follow_elsewhere(self, ride: Ride) -> bool:
+        """Follow a robot outside of every known lift, or without a place; return True while it must not find one."""
+        tracker = self._tracker
+        if tracker.prior is not None and tracker.prior.is_ride:
+            return False  # it drives out
+        if tracker.confirmed is None and ride.is_moving:
+            tracker.candidates.reset()
+            return True
+        if abs(ride.rise_m) > max(CARRIED_M, LIFT_SIGMAS * ride.sigma_m):  # a lift that is in no map, or a fork
+            tracker.forget(is_carried=True)
+            self._query.forget()
+            self._calibration.give_up()
+            self._gauge.reset()
+        elif not ride.rest_s:
+            self._gauge.reset()
+        return False
+
+    def _lift_at(self, known: PoseHypothesis) -> str | None:
+        """Return the lift in which the robot may stand, by a pose's covariance."""
+        floor = self._floors.get(known.floor)
+        if floor is None or not floor.lifts or not np.isfinite(known.now_cov).all():
+            return None
+        reach_m = LIFT_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(known.now_cov[3:5, 3:5])[-1]))
+        return floor.lift_at((known.now_map_from_body @ self._body_from_base)[:2, 3], reach_m)
 
     def _version_on(self, floor: str) -> int | None:
         held = self._maps.get(floor)
@@ -180,6 +260,11 @@ class Localizer:
         tracked_s = self._clock()
         causes = [image.cause if k == number else each.cause for k, each in enumerate(images)]
         self.percept = Percept(odometry, image, self._motions(), views=tuple(causes))
+        if self._floors:
+            if self.odometry.refuses_imu or self.odometry.accelerometer_fault:
+                self._gauge.doubt()
+            dt_s = 0.0 if self._last_ns is None else (odometry.stamp_ns - self._last_ns) * 1e-9
+            self.percept.ride = self._gauge.advance(odometry.stamp_ns + self._imu_minus_cam_ns, dt_s)
         self._last_frame = frame if frame.others else None
         estimate = self.localize(self.percept, frame)
         estimate.stage_s.update(
@@ -230,12 +315,16 @@ class Localizer:
     def localize(self, percept: Percept, frame: RectifiedFrame | None = None) -> Estimate:
         """Return the estimate by a percept, newer than all before. frame: its images; None if `percept` has all data of the frame."""
         odometry, tracker = percept.odometry, self._tracker
-        if odometry.is_lifted or (self._last_ns is not None and is_away(self._last_ns, odometry)):
+        if odometry.is_lifted and self._lift is not None:  # by the lift: the gauge knows how far, or nobody does
+            self._lift = self._lift._replace(is_doubted=True)
+        elif odometry.is_lifted or (self._last_ns is not None and is_away(self._last_ns, odometry)):
             tracker.forget(keeps_new_prior=True, is_carried=odometry.is_lifted)
             self._query.forget()
             self._calibration.give_up()
         self._last_ns = odometry.stamp_ns
         tracker.propagate(odometry, percept.motions, has_broken=percept.has_broken)
+        if percept.ride is not None:
+            self._query.is_riding = self._follow_lift(odometry, percept.ride)
         if frame is not None:
             self._calibration.work()
             percept.is_reversed = self._followed == 0 and self._calibration.is_reversed(
@@ -255,7 +344,7 @@ class Localizer:
             hypotheses=(),
             odometry=odometry,
             stage_s={},
-            cause=percept.image.cause or (Cause.CARRIED if tracker.is_carried else Cause.NONE),
+            cause=self._cause(percept),
             image=percept.image,
             views=percept.views,
             view=self._query.view,
@@ -270,6 +359,7 @@ class Localizer:
             prior=None if tracker.prior is None else tracker.prior.hypothesis,
             has_failed=self._query.failed > 0,
             was_tracking=tracker.was_tracking,
+            rides=() if tracker.prior is None or not tracker.prior.is_ride else tracker.prior.on_each_floor(),
         )
         if estimate.floor != tracker.floor:
             estimate = replace(estimate, map_version=self._version_on(estimate.floor))

@@ -66,6 +66,7 @@ class MapQuery:
         self.view = 0  # whose frame is queried
         self.failed = 0
         self.finished: FinishedQuery | None = None  # finished with the last frame
+        self.is_riding = False  # in a lift, whose cabin looks the same on every floor
         self._job: TimeSliced[QueryResult] | None = None
         self._begun: tuple[Percept, RectifiedFrame | None] | None = None  # the frame of that job, or of the last one
         self._begun_ns: int | None = None
@@ -123,7 +124,11 @@ class MapQuery:
         if percept.odometry.new_odom_from_old_odom is not None:
             for gate in self._gates:
                 gate.redefine_odom(percept.odometry.new_odom_from_old_odom)
-        result = QueryResult(refused=REVERSED_TEXT) if percept.is_reversed else self._step(percept, frame)
+        if self.is_riding:
+            self.forget()
+            result = QueryResult(refused="the robot rides in a lift")
+        else:
+            result = QueryResult(refused=REVERSED_TEXT) if percept.is_reversed else self._step(percept, frame)
         self._last_ns = percept.odometry.stamp_ns
         return result
 
@@ -220,7 +225,9 @@ class MapQuery:
         if confirmed is None:
             tracker.forget_frames()
             fixes, outside = yield from self._search(features)
-            return (yield from tracker.update_candidates(fixes, outside=outside))
+            prior = tracker.prior
+            floors = sum(prior is None or floor in prior.floors for floor in self._relocalizers)
+            return (yield from tracker.update_candidates(fixes, outside=outside, floors=floors))
         near = self._near(features, confirmed)
         if near is None and (earlier := tracker.earlier_frames()):
             yield

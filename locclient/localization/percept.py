@@ -7,6 +7,7 @@ from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.frame_features import FrameFeatures
 from locclient.localization.calibration.parameters import NOT_JUDGED, CalibrationState
 from locclient.localization.image_quality import ImageQuality
+from locclient.localization.lift_ride import Ride
 from locclient.localization.pose_hypothesis import Motion
 
 
@@ -28,7 +29,7 @@ class Percept:
 
     motions: of the odometry, from start frames of hypotheses. is_reversed: left and right image are exchanged or mirrored.
     calibration: its state by the map before this frame. query: of a map query that begins with this frame. image: of the view that the
-    odometry follows; views: faults of the images of each view.
+    odometry follows; views: faults of the images of each view. ride: motion in a lift, None for a robot without a building.
     """
 
     odometry: OdometryEstimate
@@ -38,6 +39,7 @@ class Percept:
     calibration: CalibrationState = NOT_JUDGED
     query: QueryInput | None = None
     views: tuple[Cause, ...] = (Cause.NONE,)
+    ride: Ride | None = None
 
     @property
     def has_broken(self) -> bool:

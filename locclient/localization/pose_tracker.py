@@ -226,6 +226,23 @@ class PoseTracker:
             at_present = PoseHypothesis.at(odometry, confirmed.now_map_from_body, confirmed.now_cov, confirmed.floor)
             self.prior = self._prior_at(at_present, is_revisable=True, is_told=False)
 
+    def ride(self, odometry: OdometryEstimate, floors: Mapping[str, Array | None], sigma_m: float) -> None:
+        """Turn the confirmed pose into a prior on all floors of a lift; sigma_m: of one floor's map above another one's.
+
+        floors: confirmed_from_map (4, 4), None for the floor of the pose.
+        """
+        known = self.confirmed
+        assert known is not None
+        self.candidates.reset()
+        self.forget_frames()
+        self.confirmed = self.prior = None
+        if np.isfinite(known.now_cov).all() and np.isfinite(known.now_map_from_body).all():
+            covariance = known.now_cov + np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 0.0]) * sigma_m**2
+            at_present = PoseHypothesis.at(odometry, known.now_map_from_body, covariance, known.floor)
+            how = (at_present, self._base_from_body, self._track)
+            self.prior = InitialPosePrior.at(*how, is_revisable=True, is_told=False, floors=floors)
+            self.prior.is_ride = True
+
     def end_query(self) -> None:
         self._query_frame = None
 
@@ -335,10 +352,10 @@ class PoseTracker:
             self.confirmed = None
             self.prior = None  # it led to that pose
 
-    def update_candidates(self, fixes: list[Fix], *, outside: bool) -> TimeSliced[QueryResult]:
+    def update_candidates(self, fixes: list[Fix], *, outside: bool, floors: int = 1) -> TimeSliced[QueryResult]:
         """Update the candidates, and confirm one without competitors and with enough support or a tight prior.
 
-        outside: True if fixes outside the prior were left out.
+        outside: True if fixes outside the prior were left out. floors: number of those that were searched.
         """
         assert self.odom_from_body is not None
         candidates = self.candidates
@@ -361,7 +378,7 @@ class PoseTracker:
             assert self.lookalikes is not None
             told = f"{best.evidence} here, {self.lookalikes.recall:.0%} there"
             return QueryResult(None, f"a place that is not in the map may look the same: {told}")
-        if has_prior or candidates.is_confirmed(best, fixes):
+        if has_prior or candidates.is_confirmed(best, fixes, floors=floors):
             moved_m = candidates.moved_m(best)
             candidates.reset()
             self.confirmed, self.prior, self.floor = best, None, best.floor

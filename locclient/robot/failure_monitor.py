@@ -85,7 +85,7 @@ class FailureMonitor:
         contradicted_ns = self._contradicted_ns or now_ns
         self._note_fix(estimate)
         self._had_fix |= estimate.fix is not None
-        blind = self._had_fix and is_blind(estimate.status, radius_m)
+        blind = self._had_fix and is_blind(estimate.status, radius_m) and estimate.cause is not Cause.RIDING
         self._follow(now_ns, blind, self._contradicting_looks >= CONTRADICTING_LOOKS)
         if blind:
             self._causes[failure_cause(estimate)] += 1

@@ -75,6 +75,7 @@ class Cause(StrEnum):
     FIX_REFUSED = "fix_refused"
     MOVED = "moved"
     CARRIED = "carried"
+    RIDING = "riding"
     ALIASED = "aliased"
     MAP_CHANGED = "map_changed"
     CALIBRATION = "calibration"

@@ -69,7 +69,7 @@ def test_a_floor_whose_map_is_missing_is_where_it_may_be(folder: Path) -> None:
     with house(folder, robot_world.tiles(), strange(robot_world.tiles())) as store:
         robot = robot_of(store, missing=True)
         assert not [e for e in drive(robot, frames=30) if e.status is Status.TRACKING]
-        assert drive(robot_of(store), frames=30)[-1].status is Status.TRACKING
+        assert drive(robot_of(store))[-1].status is Status.TRACKING
 
 
 def test_a_site_without_a_building_is_as_before(folder: Path) -> None:

@@ -1,0 +1,168 @@
+"""Rides in lifts: a robot comes out on the right floor, or says that it does not know; never on a wrong one."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from fleetmap.messages import Cause, Status
+from fleetmap.sensors.calibration import ImuNoise
+from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
+from locclient.localization.lift_ride import Ride, RideGauge
+from locclient.robot.failure_monitor import FailureMonitor
+from support.worlds.lift_world import FRAME_S, LiftWorld, RideResult, ride
+
+ALIKE = {"floors": 2, "likeness": 0.97}
+OTHER = {"floors": 3, "likeness": 0.0}
+WHOLE = {"has_stock": True, "track": {"is_whole_site_mapped": True}}
+
+
+def world_of(monkeypatch: pytest.MonkeyPatch, seed: int, **how: Any) -> LiftWorld:
+    """A robot that knows its place on the lowest floor, by a dock where the floors look alike."""
+    world = LiftWorld(monkeypatch, seed=seed, **how)
+    list(world.stand(0.2, sees=True))
+    if world.likeness:
+        dock = np.diag([0.02**2] * 3 + [0.1**2] * 3)
+        stamp_ns = int(world.frames * FRAME_S * 1e9) + 1
+        world.localizer.handle_prior(PositionPrior(stamp_ns, world.map_from_body, dock, floor=""))
+    return world
+
+
+def rides(monkeypatch: pytest.MonkeyPatch, seeds: range, **how: Any) -> list[RideResult]:
+    """Rides without a silent failure; in each the robot names the floors of the lift."""
+    results, wrong = [], 0
+    for seed in seeds:
+        world = world_of(monkeypatch, seed, **how)
+        results.append(ride(world, 1 + seed % (world.floors - 1)))
+        wrong += world.wrong
+    assert wrong == 0
+    assert all("" in result.floors_named and len(result.floors_named) > 1 for result in results)
+    return results
+
+
+@pytest.mark.parametrize("how", [ALIKE, OTHER, OTHER | {"has_imu": False}, ALIKE | WHOLE | {"has_imu": False}])
+def test_it_comes_out_on_the_right_floor(monkeypatch: pytest.MonkeyPatch, how: dict[str, Any]) -> None:
+    results = rides(monkeypatch, range(2), **how)
+    assert all(result.found_m is not None and result.found_m < 3.5 for result in results)
+    assert how.get("has_imu") is False or not sum(result.claimed_while_riding for result in results)
+
+
+@pytest.mark.parametrize(
+    "how", [ALIKE, ALIKE | WHOLE, OTHER, OTHER | {"has_imu": False}, ALIKE | WHOLE | {"has_imu": False}]
+)
+def test_forty_rides(monkeypatch: pytest.MonkeyPatch, how: dict[str, Any]) -> None:
+    """Seeds that nothing was developed with."""
+    results = rides(monkeypatch, range(1000, 1040), **how)
+    assert sum(result.is_in_time for result in results) >= 38
+
+
+def test_without_an_accelerometer_equal_floors_stay_both(monkeypatch: pytest.MonkeyPatch) -> None:
+    results = rides(monkeypatch, range(2), **ALIKE, has_imu=False)
+    assert all(result.found_s is None for result in results)
+
+
+def test_a_slow_lift_is_a_ride_of_unknown_height(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So slow that its speed may not be told from a drifting accelerometer's."""
+    world = world_of(monkeypatch, 3, **ALIKE)
+    assert ride(world, 1, fastest_mps=0.15, accel_mps2=0.2).found_s is None
+    assert not world.wrong
+
+
+def test_a_stay_without_a_ride_keeps_the_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = world_of(monkeypatch, 4, **ALIKE)
+    said = [*world.drive(9.5), *world.stand(12.0), *world.drive(-4.0)]
+    assert not any(e.status is Status.AMBIGUOUS or e.cause is Cause.RIDING for e in said)
+    assert world.is_right(said[-1])
+
+
+def test_two_rides_without_a_look_between_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = world_of(monkeypatch, 5, floors=3, likeness=0.97)
+    said = [*world.drive(9.5), *world.stand(4.0), *world.ride(1), *world.stand(4.0), *world.ride(2), *world.stand(3.0)]
+    assert [h.floor for h in said[-1].hypotheses] == ["floor-2"]
+    assert said[-1].status is Status.AMBIGUOUS, "until the pictures say so"
+    assert said[-1].map_from_body is None
+    out = list(world.drive(-6.0))
+    assert not world.wrong
+    assert world.is_right(out[-1])
+
+
+def test_a_lift_that_is_in_no_map_ends_the_pose(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = world_of(monkeypatch, 6, **ALIKE)
+    said = [*world.drive(3.0), *world.stand(4.0), *world.ride(1), *world.stand(3.0), *world.drive(4.0)]
+    assert not world.wrong
+    assert Cause.CARRIED in {e.cause for e in said}
+
+
+def test_a_robot_that_finds_its_place_in_a_ride_does_not_take_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It starts in the cabin; what it saw before the ride is of another floor."""
+    world = LiftWorld(monkeypatch, seed=7, **ALIKE)  # type: ignore[arg-type]
+    world.plan_from_body[0, 3] = 9.5
+    said = [*world.stand(4.0, sees=True), *world.ride(1), *world.stand(2.0, sees=True), *world.drive(-6.0)]
+    assert not world.wrong
+    assert {h.floor for h in said[-1].hypotheses} == {"", "floor-1"}
+
+
+def test_a_lift_that_shakes_the_robot_loses_no_floor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The odometry says that it is lifted, in the moment in which the cabin starts."""
+    world = world_of(monkeypatch, 8, **ALIKE)
+    list(world.drive(9.5))
+    list(world.stand(4.0))
+    world.odometry.lifts = True
+    said = [*world.ride(1), *world.stand(2.0)]
+    assert {e.cause for e in said} == {Cause.RIDING}
+    out = list(world.drive(-6.0))
+    assert not world.wrong
+    assert world.is_right(out[-1])
+
+
+def test_a_ride_is_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    world, monitor = world_of(monkeypatch, 9, **ALIKE), FailureMonitor()
+    said = [*world.drive(9.5), *world.stand(4.0), *world.ride(1, fastest_mps=0.3), *world.stand(2.0)]
+    failures = [monitor.handle(e, 0.0) for e in said]
+    assert next(e.cause for e in said if e.status is Status.AMBIGUOUS) is Cause.RIDING
+    assert not any(failures)
+
+
+# --- the gauge ------------------------------------------------------------------------------------------------------
+
+
+def gauged(accel_mps2: np.ndarray[Any, Any], seed: int, noise: ImuNoise, *, gap: bool = False) -> Ride:
+    """The rise after 4 s at rest, this acceleration at 200 Hz, and 2 s at rest."""
+    rng, gauge = np.random.default_rng(seed), RideGauge(noise)
+    accel = np.concatenate([np.zeros(800), accel_mps2, np.zeros(400)])
+    walk = noise.accel_walk_mps3_rthz * np.sqrt(0.005) * rng.normal(size=len(accel))
+    force = 9.81 + rng.normal(0.0, 0.2) + accel + np.cumsum(walk) + 0.03 * rng.normal(size=len(accel))
+    found = Ride(False, 0.0, 0.0, 0.0)
+    for first in range(0, len(accel) - 19, 20):
+        stamps = np.arange(first, first + 20) * 5_000_000 + 1
+        if not (gap and 900 <= first < 960):
+            gauge.handle_imu(ImuSamples(stamps, np.zeros((20, 3)), np.c_[np.zeros((20, 2)), force[first : first + 20]]))
+        gauge.handle_wheel([WheelSample(int(stamps[-1]), np.zeros(3), 0.0, 0.01, 0.01)])
+        found = gauge.advance(int(stamps[-1]), 0.1)
+    return found
+
+
+@pytest.mark.parametrize("noise", [ImuNoise(), ImuNoise(accel_noise_mps2_rthz=2e-3, accel_walk_mps3_rthz=3e-4)])
+@pytest.mark.parametrize(("rise_m", "fastest_mps"), [(3.5, 1.0), (-3.5, 1.0), (14.0, 1.6)])
+def test_the_rise_is_within_its_sigma(noise: ImuNoise, rise_m: float, fastest_mps: float) -> None:
+    pulse = np.full(round(200 * fastest_mps), np.sign(rise_m))
+    accel = np.concatenate([pulse, np.zeros(round(200 * (abs(rise_m) / fastest_mps - fastest_mps))), -pulse])
+    off = [(found.rise_m - rise_m) / found.sigma_m for found in (gauged(accel, seed, noise) for seed in range(10))]
+    assert np.abs(off).max() < 3.0
+    assert not gauged(accel, 0, noise).is_moving
+    assert gauged(accel, 0, noise).sigma_m < 0.5
+
+
+def test_without_samples_the_rise_is_unknown() -> None:
+    pulse = np.ones(200)
+    accel = np.concatenate([pulse, np.zeros(500), -pulse])
+    assert np.isinf(gauged(accel, 0, ImuNoise(), gap=True).sigma_m)
+    gauge = RideGauge(ImuNoise())  # without wheels: it may drive
+    for k in range(40):
+        push = np.full((20, 3), [0.0, 0.0, 11.0])
+        gauge.handle_imu(ImuSamples(np.arange(20 * k, 20 * k + 20) * 5_000_000 + 1, np.zeros((20, 3)), push))
+        found = gauge.advance((20 * k + 20) * 5_000_000, 0.1)
+    assert not found.is_moving
+    assert np.isinf(found.sigma_m)
+    gauge = RideGauge(None)
+    assert np.isinf(gauge.advance(1, 0.1).sigma_m)
