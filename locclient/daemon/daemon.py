@@ -20,7 +20,7 @@ from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import open_source
 from locclient.config import LocclientConfig, RunSection
 from locclient.daemon.output_section import check_for_ros2
-from locclient.daemon.publishers import open_publisher
+from locclient.daemon.publishers import Publisher, open_publisher
 from locclient.daemon.runtime import RuntimeParts
 from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.failure_file import PICTURES
@@ -142,7 +142,6 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             client.require(trusted_map(bus, address, cache_folder(run.cache)))
             maps, first = CachedMap(caches[1], site), client.active()
             server = ServerSync(client, outbox, retry_s=run.trial.retry_s, upkeep=_upkeep(address, bus))
-        floors = _floor_maps(config, address, bus, caches, server, maps)
         keeps_replay = server is not None and run.replays != "off"
         robot = Robot(calibration, rectifier, config.localizer, run.trial, time.thread_time, keeps_replay=keeps_replay)
         if prior is not None:
@@ -154,6 +153,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             stack.callback(publisher.close)
             if server is not None:
                 server.client.takes_grids = publisher.grid_height_m is not None
+        floors = _floor_maps(config, address, bus, caches, server, maps, publisher)
         fleet_manager: MqttLink | None = None
         if server is not None and config.vda5050.broker is not None:
             fleet_manager = _fleet_manager(config, site, server, caches[0], intake)
@@ -192,22 +192,24 @@ def _floor_maps(
     caches: tuple[TileCache, ...],
     server: ServerSync | None,
     maps: MapSource,
+    publisher: Publisher | None,
 ) -> FloorMaps:
     """Return the maps of the other floors of the robot's building, as far as its disk has them."""
-    folder = Path(config.run.store or "")
+    folder, grid_height_m = Path(config.run.store or ""), None if publisher is None else publisher.grid_height_m
 
     def over_the_bus(site: str) -> MapSource:
         assert bus is not None
         client = MapClient(bus, caches[0], site, address.robot, patience_s=_PATIENCE_S)
+        client.takes_grids = grid_height_m is not None
         client.require(trusted_map(bus, replace(address, site=site), cache_folder(config.run.cache)))
         return client
 
     if server is None:
         floors = FloorMaps(maps, lambda site: LocalMapSource(folder, site))
-        floors.refresh()
     else:
         floors = server.floors = FloorMaps(server.client, over_the_bus)
-        floors.refresh(asks=False)
+    floors.grid_height_m = grid_height_m
+    floors.refresh(asks=server is None)
     return floors
 
 

@@ -57,6 +57,8 @@ class MessagePackPublisher(Publisher):
             if published.cov_rot_trans is None
             else tuple(float(v) for v in published.cov_rot_trans.ravel()),
             hypotheses=tuple(Placement.of(h.map_from_body @ body_from_base) for h in hypotheses),
+            floor=estimate.floor,
+            hypothesis_floors=tuple(h.floor for h in hypotheses) if published.level else (),
         )
         self._bus.publish(self._key, encode_message(message), may_drop=True)
 

@@ -294,6 +294,10 @@ class Ros2Localizer(Publisher):
             }
             if estimate.views_in_words:
                 values["views"] = estimate.views_in_words
+            if self._last is not None and self._last[1].level:
+                floors = sorted({hypothesis.floor or "own" for hypothesis in estimate.hypotheses})
+                values |= {"floor": estimate.floor or "own", "level": self._last[1].level}
+                values |= {"hypothesis_floors": ", ".join(floors)} if floors else {}
             if estimate.cov_rot_trans is not None:
                 values["radius_95_m"] = f"{radius_95_m(estimate.cov_rot_trans):.3f}"
         if fault := self._tf_fault():
@@ -318,7 +322,7 @@ class Ros2Localizer(Publisher):
         return fault
 
     def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:
-        """Publish the grid. Without one the last grid stays on the topic: all versions share the map's frame."""
+        """Publish the grid. Without one the last grid stays on the topic: all versions of a floor share the map's frame."""
         self._map_words = why if grid is None else f"grid of version {version}"
         if grid is None:
             _log.warning("planners get no new map: %s", why)

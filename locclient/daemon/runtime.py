@@ -24,7 +24,7 @@ from locclient.daemon.service_manager import ServiceManager
 from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.delivery.report_delivery import ReplayQueue, write_failure
 from locclient.delivery.survey_drives import SurveyDrives
-from locclient.maps.floor_maps import FloorMaps
+from locclient.maps.floor_maps import NO_GRID, FloorMaps
 from locclient.maps.loaded_map import Cell, LoadedMap, PositionBound, PositionBoundTracker
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
@@ -78,6 +78,7 @@ class Runtime:
         self._bound = PositionBound()
         self._held: list[WantedVersion] = []
         self._loaded: deque[LoadedMap] = deque()
+        self._floor = ""  # where the robot is
         self._failures: deque[tuple[FailureContext, int]] = deque(maxlen=_MAX_PENDING)
         # Owned by the localizing thread.
         self._figures = HealthFigures()
@@ -89,7 +90,7 @@ class Runtime:
         # Owned by the disk thread.
         self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
         self._fetched_again: set[str] = set()
-        self._shown_grid: WantedVersion | None = None
+        self._shown_grid: tuple[str, WantedVersion] | None = None  # with its floor
         self._refused_tiles: dict[str, dict[Cell, str]] = {}
 
     def stop(self) -> None:
@@ -170,11 +171,12 @@ class Runtime:
 
     def _after_frame(self, outcome: Outcome) -> None:
         estimate, fleet_manager = outcome.estimate, self._parts.fleet_manager
+        self._floor = estimate.floor
         if self._publisher is not None:
             _send(partial(self._publisher.publish, estimate, outcome.published, self._robot.base_from_body))
         if fleet_manager is not None:
             held = frozenset(loaded.version for loaded in self._robot.held)
-            fleet_manager.adapter.after_frame(outcome, held)
+            fleet_manager.adapter.after_frame(outcome, held, self._robot.floors, self._robot.visited_versions)
         was_lost = self._figures.search.is_long
         before = {} if self._figures.last is None else self._figures.last.left_out
         for flag in outcome.left_out.keys() - before.keys():
@@ -255,7 +257,7 @@ class Runtime:
         loader, server, bound = self._parts.tile_loader, self._server, self._bound
         while server is not None and server.fetched:
             version = server.fetched.popleft()
-            self._shown_grid = None if version == self._shown_grid else self._shown_grid
+            self._shown_grid = None if ("", version) == self._shown_grid else self._shown_grid
             self._offers[version.manifest_sha256 or ""] = version
             loader.retry_refused(version)
         held = self._held
@@ -278,18 +280,32 @@ class Runtime:
         self._refused_tiles = {sha256: cells for sha256, cells in self._refused_tiles.items() if sha256 in known}
 
     def _show_grid(self, version: WantedVersion) -> None:
-        """Publish the grid of the confirmed version. If an older client did not fetch it with the version, fetch it now, once."""
-        publisher = self._publisher
+        """Publish the grid of the floor's map: of the confirmed version, or of another floor. If an older client did not fetch it with
+        the version, fetch it now, once."""
+        publisher, floor = self._publisher, self._floor
         height_m = None if publisher is None else publisher.grid_height_m
-        if publisher is None or height_m is None or version == self._shown_grid:
+        if floor and self._parts.floors is not None:
+            version = self._parts.floors.held.get(floor, version)
+        if publisher is None or height_m is None or (floor, version) == self._shown_grid:
             return
-        self._shown_grid, grid, why = version, None, ""
+        is_other_floor = self._shown_grid is not None and self._shown_grid[0] != floor
+        self._shown_grid, grid, why = (floor, version), None, ""
         try:
-            grid = self._parts.tile_loader.grid(version, height_m)
+            if floor and self._parts.floors is not None:
+                grid = self._parts.floors.grid(floor)
+            else:
+                grid = self._parts.tile_loader.grid(version, height_m)
         except FleetmapError as error:
             why = str(error)
             key = f"grid {version.manifest_sha256}"
-            if isinstance(error, LinkError) and self._server is not None and key not in self._fetched_again:
+            if is_other_floor:  # a planner must not use the floor where the robot was
+                _send(partial(publisher.show_grid, version.version or 0, NO_GRID, ""))
+            if (
+                not floor
+                and isinstance(error, LinkError)
+                and self._server is not None
+                and key not in self._fetched_again
+            ):
                 self._fetched_again.add(key)
                 self._server.refetch.append(version)
                 return

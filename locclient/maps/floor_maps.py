@@ -5,14 +5,20 @@ from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
+import numpy as np
+
 from fleetmap.bow import decode_vocabulary
-from fleetmap.errors import FleetmapError, MapFormatError, UnreachableError
+from fleetmap.errors import FleetmapError, MapFormatError, StateError, UnreachableError
 from fleetmap.mapformat.building import ALIGNMENT, AREAS, FLOORS, BuildingFrame, aligned_frame
 from fleetmap.mapformat.floors import MAX_FLOORS_BYTES, Floor, FloorEntry, read_building, read_lifts
+from fleetmap.messages import WantedVersion
+from fleetmap.occupancy_grid import UNKNOWN, OccupancyGrid
+from fleetmap.version_grid import grid_of, occupancy
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.map_source import MapSource
 
 _MAX_ALIGNMENT_BYTES, _MAX_AREAS_BYTES = 1 << 20, 8 << 20
+NO_GRID = OccupancyGrid(np.full((1, 1), UNKNOWN, np.int8), 0.05, np.eye(4))  # for planners on a floor without one
 _UNKNOWN = BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0)  # of a floor whose files are missing, and so its map
 _log = logging.getLogger(__name__)
 
@@ -35,7 +41,9 @@ class FloorMaps:
         self._own, self._open_site = own, open_site
         self._sources: dict[str, MapSource] = {}
         self._floors: dict[str, Floor] = {}
-        self._held: dict[str, str] = {}  # addresses of manifests
+        self.held: dict[str, WantedVersion] = {}  # of the others
+        self.grid_height_m: float | None = None  # of the robot, if planners need grids
+        self._grids: dict[str, OccupancyGrid | str] = {}  # or why there is none
         self._made_of = b""  # the record and the files of the floors
         self._faults: dict[str, str] = {}
         self.changes: deque[FloorChange] = deque()
@@ -71,10 +79,17 @@ class FloorMaps:
         if made_of != self._made_of or maps:
             self._floors, self._made_of = floors, made_of
             self._sources = {site: source for site, source in self._sources.items() if site in floors}
-            self._held = {site: sha256 for site, sha256 in self._held.items() if site in floors}
-            self._held |= {loaded.wanted.site: loaded.wanted.manifest_sha256 or "" for loaded in maps}
+            held = {site: wanted for site, wanted in self.held.items() if site in floors}
+            self.held = held | {loaded.wanted.site: loaded.wanted for loaded in maps}
             self.changes.append(FloorChange(floors, maps))
         return None
+
+    def grid(self, site: str) -> OccupancyGrid:
+        """Return the grid of another floor for planners; StateError with the reason without one. Thread-safe."""
+        grid = self._grids.get(site, "its map is not here yet")
+        if isinstance(grid, str):
+            raise StateError(f"floor {site} has no grid: {grid}")
+        return grid
 
     def _source(self, site: str) -> MapSource:
         if site not in self._sources:
@@ -84,12 +99,17 @@ class FloorMaps:
     def _newest(self, source: MapSource, *, asks: bool) -> LoadedMap | None:
         """Return the current version with all of its usable tiles; None if the robot holds it already."""
         wanted = source.newest(asks=asks)
-        if wanted.manifest_sha256 == self._held.get(source.site):
+        if wanted == self.held.get(source.site):
             return None
         manifest = source.manifest(wanted)
         tiles = source.tiles(manifest)
         for reason in tiles.refused.values():
             _log.warning("floor %s: a tile is left out: %s", source.site, reason)
+        if self.grid_height_m is not None:
+            try:
+                self._grids[source.site] = occupancy(grid_of(manifest, source.blob), self.grid_height_m)
+            except FleetmapError as error:
+                self._grids[source.site] = str(error)
         return LoadedMap(wanted, manifest, decode_vocabulary(source.vocabulary(manifest)), tiles.tiles)
 
     def _note(self, site: str, fault: str) -> None:

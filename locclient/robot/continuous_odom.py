@@ -13,13 +13,14 @@ class PublishedPose:
     """One estimate in the published frames; map_from_odom is None while there is no single pose.
 
     building_from_map: of the robot's map, None if the map does not define it. cov_rot_trans (6, 6): of map_from_base, map axes, about
-    the base, None if the estimate has none.
+    the base, None if the estimate has none. level: name of the floor's level, of a building; else empty.
     """
 
     odom_from_base: Array
     map_from_odom: Array | None
     building_from_map: Array | None = None
     cov_rot_trans: Array | None = None
+    level: str = ""
 
     @property
     def map_from_base(self) -> Array | None:

@@ -107,7 +107,7 @@ class Robot:
         self._wheels_fault, self._wheels_unused = calibration.wheels_fault, dict[Flag, str]()
         self._aligned: BuildingFrame | None = None
         self._of_version: BuildingFrame | None = None
-        self._floors: dict[str, Floor] = {}
+        self.floors: dict[str, Floor] = {}  # of the building, by `Localizer.handle_floors`
         self._visited: dict[str, LoadedMap] = {}  # maps of the other floors
         self._floor = ""  # of the last estimate
 
@@ -120,6 +120,11 @@ class Robot:
     def running(self) -> LoadedMap | None:
         """Return the map of the floor where the robot is."""
         return self._visited.get(self._floor) if self._floor else self._versions.running
+
+    @property
+    def visited_versions(self) -> dict[str, int]:
+        """Return the versions of the other floors' maps, by their sites."""
+        return {site: loaded.version for site, loaded in self._visited.items()}
 
     def take_changes(self) -> list[VersionChange]:
         """Return changes of versions since the last call."""
@@ -135,7 +140,7 @@ class Robot:
 
         Those are used without a trial: they are current on their own site, where its robots have tried them.
         """
-        self._floors = dict(floors)
+        self.floors = dict(floors)
         self._visited = {site: held for site, held in self._visited.items() if site in floors}
         self.localizer.handle_floors(floors)
         for loaded in maps:
@@ -177,7 +182,8 @@ class Robot:
             self._versions.pause()
         else:
             self._versions.handle(estimate)
-        published = replace(self._odom.handle(estimate), building_from_map=self._building_from_map())
+        level = self.floors[self._floor].entry.level if self.floors else ""
+        published = replace(self._odom.handle(estimate), building_from_map=self._building_from_map(), level=level)
         speed_mps = self._speed.handle(wheel, estimate.odometry, published.odom_from_base)
         self._wheels.handle(wheel if self._wheels_fault else bundle.wheel, estimate.odometry)
         is_covered = self._may_be_mapped(estimate)
@@ -249,7 +255,7 @@ class Robot:
             self.ring.use(self.running)
 
     def _building_from_map(self) -> Array | None:
-        if self._floors:
-            return self._floors[self._floor].building_from_map
+        if self.floors:
+            return self.floors[self._floor].building_from_map
         frame = self._aligned or self._of_version
         return None if frame is None else frame.building_from_map

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -13,6 +13,7 @@ from fleetmap.encoding import to_plain
 from fleetmap.errors import FleetmapError, LinkError
 from fleetmap.failure_definition import is_driving
 from fleetmap.geometry import se3, se3_inverse, so3_exp
+from fleetmap.mapformat.floors import Floor
 from fleetmap.messages import Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient.robot.robot import Outcome
@@ -83,6 +84,8 @@ class FleetAdapter:
         self._last_said: object = None
         self._versions: list[tuple[int, bool]] = []
         self._in_use: frozenset[int] = frozenset()
+        self._floors: Mapping[str, Floor] = {}  # of the robot's building
+        self._floor_versions: Mapping[str, int] = {}  # of the others' maps, whose ids are their sites
         # None while the map does not define its pose in the fleet manager's frame.
         self._fleet_from_map = np.eye(4) if section.frame == "map" else None
 
@@ -110,7 +113,7 @@ class FleetAdapter:
                 return
             self._book.end("order")
             named = {node.node_position.map_id for node in message.nodes if node.node_position is not None}
-            known = {self.map_id} if self._versions else set()
+            known = self._floor_versions.keys() | ({self.map_id} if self._versions else set())
             for map_id in sorted(named - known)[:20]:
                 words = f"the order {message.order_id[:200]!r} names a map that is not on the robot: {map_id[:200]!r}"
                 references = {"orderId": message.order_id, "mapId": map_id}
@@ -246,9 +249,13 @@ class FleetAdapter:
 
     def _initialize(self, action: Action, given: dict[str, Any]) -> None:
         now, section = self._localization, self._section
+        floor = given["mapId"] if given["mapId"] in self._floor_versions else ""
         fleet_from_map = self._fleet_from_map
+        if section.frame == "building" and self._floors:
+            fleet_from_map = self._floors[floor].frame.building_from_map
         words = ""
-        if given["mapId"] != self.map_id or not any(is_enabled for _, is_enabled in self._versions):
+        is_own = given["mapId"] == self.map_id and any(is_enabled for _, is_enabled in self._versions)
+        if not (floor or is_own):
             words = f"map {given['mapId'][:80]!r} is not enabled here"
         elif abs(given["theta"]) > np.pi + 1e-6:
             words = f"theta = {given['theta']} is beyond -pi to pi"
@@ -260,7 +267,7 @@ class FleetAdapter:
             return self._book.fail(action, "INITIALIZE_POSITION_FAILED", words)
         if self._placing is not None:
             self._book.set(self._placing[0], "FAILED", "replaced by another initializePosition")
-        place = Position(float(given["x"]), float(given["y"]), float(given["theta"]))
+        place = Position(float(given["x"]), float(given["y"]), float(given["theta"]), floor=floor)
         self._placing = (action, place, self._clock_s() + section.initialize_s)
         self._book.set(action, "RUNNING")
         if now.status == Status.TRACKING:  # a pose confirmed by fixes is not dropped for an operator's
@@ -268,13 +275,23 @@ class FleetAdapter:
         sigmas = [_TILT_SIGMA_RAD] * 2 + [section.initial_sigma_rad] + [section.initial_sigma_m] * 2 + [_HEIGHT_SIGMA_M]
         fleet_from_base = se3(so3_exp(np.array([0.0, 0.0, place.theta_rad])), np.array([place.x_m, place.y_m, 0.0]))
         map_from_base = se3_inverse(fleet_from_map) @ fleet_from_base
-        self._put_prior(PositionPrior(now.stamp_ns + 1, map_from_base, np.diag(np.square(sigmas))))
+        self._put_prior(PositionPrior(now.stamp_ns + 1, map_from_base, np.diag(np.square(sigmas)), floor=floor))
         return None
 
-    def after_frame(self, outcome: Outcome, in_use: frozenset[int]) -> None:
-        """Handle the results of a frame, and the versions that the localizer holds; on the localizing thread."""
+    def after_frame(
+        self,
+        outcome: Outcome,
+        in_use: frozenset[int],
+        floors: Mapping[str, Floor] | None = None,
+        floor_versions: Mapping[str, int] | None = None,
+    ) -> None:
+        """Handle the results of a frame, and the versions that the localizer holds; on the localizing thread.
+
+        floors: of the robot's building, by `Localizer.handle_floors`; floor_versions: of the others' maps, by their sites.
+        """
         with self._lock:
-            self._in_use = in_use
+            self._in_use, self._floors = in_use, floors or {}
+            self._floor_versions = floor_versions or {}
             if self._section.frame == "building":
                 self._fleet_from_map = outcome.published.building_from_map
             how = (outcome, self._lost_radius_m, self._fleet_from_map)
@@ -337,6 +354,10 @@ class FleetAdapter:
             found["maps"] = [
                 {"mapId": self.map_id, "mapVersion": str(number), "mapStatus": "ENABLED" if on else "DISABLED"}
                 for number, on in self._versions
+            ]
+            found["maps"] += [
+                {"mapId": site, "mapVersion": str(number), "mapStatus": "ENABLED"}
+                for site, number in self._floor_versions.items()
             ]
             place = now.mobile_robot_position(self.map_id, self._lost_radius_m)
             if place is not None:

@@ -20,6 +20,7 @@ _WORDS = {
     Cause.OCCLUDED: "an object is close in front of the cameras",
     Cause.ODOMETRY: "the odometry is lost",
     Cause.UNMATCHED: "nothing in the map matches the images: changed, not mapped, or mapped from another side only",
+    Cause.RIDING: "the robot is in a lift; it drives out, and pictures then tell its floor",
     Cause.CALIBRATION: "images contradict the map as only a wrong calibration does; check the cameras' mounting",
 }
 _STATUS_WORDS = {
@@ -31,15 +32,20 @@ _STATUS_WORDS = {
 
 @dataclass(frozen=True)
 class Position:
-    """A pose of the base in the fleet manager's frame. radius_m: of 95 %, infinite if the robot is not localized."""
+    """A pose of the base in the fleet manager's frame. radius_m: of 95 %, infinite if the robot is not localized. floor: site of another
+    floor of the robot's building, empty for its own.
+    """
 
     x_m: float
     y_m: float
     theta_rad: float
     radius_m: float = float("inf")
+    floor: str = ""
 
     def away_from(self, other: "Position") -> tuple[float, float]:
-        """Return the distance in metres, and the angle in radians from 0 to pi."""
+        """Return the distance in metres, infinite on another floor, and the angle in radians from 0 to pi."""
+        if self.floor != other.floor:
+            return float("inf"), pi
         turn = abs(self.theta_rad - other.theta_rad) % (2 * pi)
         return hypot(self.x_m - other.x_m, self.y_m - other.y_m), min(turn, 2 * pi - turn)
 
@@ -71,7 +77,7 @@ class Localization:
             position = None
         elif published.map_from_odom is not None and estimate.cov_rot_trans is not None:
             map_from_base = published.map_from_odom @ published.odom_from_base
-            position = _position(fleet_from_map @ map_from_base, radius_95_m(estimate.cov_rot_trans))
+            position = _position(fleet_from_map @ map_from_base, radius_95_m(estimate.cov_rot_trans), estimate.floor)
             is_localized = estimate.status in {Status.TRACKING, Status.DEGRADED} and position.radius_m <= lost_radius_m
         return Localization(
             estimate.status,
@@ -86,11 +92,19 @@ class Localization:
         )
 
     def mobile_robot_position(self, map_id: str, lost_radius_m: float) -> dict[str, object] | None:
-        """Return the object of the state; None before the first pose. The score is 1 for an exact pose, 0 at lost_radius_m."""
+        """Return the object of the state; None before the first pose. The score is 1 for an exact pose, 0 at lost_radius_m.
+
+        map_id: of the robot's own site; other floors are called by their sites.
+        """
         place, is_localized = self.position, self.is_localized and not self.is_silent
         if place is None:
             return None
-        found: dict[str, object] = {"x": place.x_m, "y": place.y_m, "theta": place.theta_rad, "mapId": map_id}
+        found: dict[str, object] = {
+            "x": place.x_m,
+            "y": place.y_m,
+            "theta": place.theta_rad,
+            "mapId": place.floor or map_id,
+        }
         found |= {"localized": is_localized, "localizationScore": 0.0}
         if is_localized:
             found["localizationScore"] = max(0.0, 1.0 - place.radius_m / lost_radius_m)
@@ -119,6 +133,6 @@ class Localization:
         )
 
 
-def _position(fleet_from_base: Array, radius_m: float) -> Position:
+def _position(fleet_from_base: Array, radius_m: float, floor: str) -> Position:
     x_m, y_m = (float(value) for value in fleet_from_base[:2, 3])
-    return Position(x_m, y_m, float(atan2(fleet_from_base[1, 0], fleet_from_base[0, 0])), radius_m)
+    return Position(x_m, y_m, float(atan2(fleet_from_base[1, 0], fleet_from_base[0, 0])), radius_m, floor)

@@ -29,7 +29,10 @@ def align(
         float | None, typer.Option(min=1e-6, max=1e3, help="Scale of the plan; default: estimated from the pins.")
     ] = None,
     show: Annotated[bool, typer.Option("--show", help="Print the stored alignment; change nothing.")] = False,
-    level: Annotated[str, typer.Option(metavar="NAME", help="Name of the level for Open-RMF.")] = "L1",
+    level: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Name of the level for Open-RMF; default: the building's, else L1."),
+    ] = None,
     json: Json = False,
     by: ActorOptions,
     forget: Annotated[bool, typer.Option("--forget", help="Forget the alignment and the plan.")] = False,
@@ -56,7 +59,10 @@ def align(
                 typer.echo(f"note: {words}", err=True)
             off_m = 2 * fit.far_sigma_m
             typer.echo(f"at the far end of the map positions in the building are known to {off_m:.2f} m (95 %)")
-        alignment = maps.alignment(where.site)
+        alignment, tower = maps.alignment(where.site), maps.building(where.site)
+    if level is None:
+        levels = {} if tower is None else {floor.site: floor.level for floor in tower.floors}
+        level = levels.get(where.site, "L1")
     if alignment is None:
         raise UsageError(f"site {where.site} is not aligned; `mapserver align --plan FILE --pin ...` does it")
     if json:

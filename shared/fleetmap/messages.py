@@ -254,7 +254,8 @@ class EstimateMessage(msgspec.Struct, frozen=True, kw_only=True):
 
     cause: a `Cause`, why the status is not TRACKING. odom_from_base is continuous; map_from_odom moves with every fix and is None
     while there is no single pose. cov_rot_trans: of map_from_base in map axes, rotation first, row by row, None with it.
-    hypotheses: competing poses while AMBIGUOUS. calibration: the wrong parameter and its error, if that is the cause.
+    hypotheses: competing poses while AMBIGUOUS. calibration: the wrong parameter and its error, if that is the cause. floor: site whose map
+    the pose is of, in a building, empty for the robot's own; hypothesis_floors: of each hypothesis, empty for a site without floors.
     """
 
     stamp_ns: int
@@ -266,6 +267,8 @@ class EstimateMessage(msgspec.Struct, frozen=True, kw_only=True):
     map_from_odom: Placement | None
     cov_rot_trans: Annotated[tuple[float, ...], msgspec.Meta(min_length=36, max_length=36)] | None
     hypotheses: Annotated[tuple[Placement, ...], msgspec.Meta(max_length=16)] = ()
+    floor: Name = ""
+    hypothesis_floors: Annotated[tuple[Name, ...], msgspec.Meta(max_length=16)] = ()
 
 
 class FixNote(msgspec.Struct, frozen=True, kw_only=True):

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,6 +31,7 @@ from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.service_manager import ServiceManager
 from locclient.delivery.outbox import Outbox
 from locclient.localization.estimate import Estimate
+from locclient.maps.floor_maps import FloorMaps
 from locclient.maps.loaded_map import PositionBound, TileSelectionSettings
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import CachedMap, LocalMapSource
@@ -45,6 +47,7 @@ from mapserver.store import Actor, MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
+from support.worlds.building import house
 
 
 @dataclass
@@ -291,3 +294,26 @@ def test_a_spool_on_a_disk_that_refuses_costs_no_estimate(world: World, monkeypa
         monkeypatch.setattr(parts.outbox, name, refuse)
     Runtime(parts, ServiceManager("")).run()
     assert len(listener.estimates) == 5
+
+
+@pytest.mark.parametrize("has_grid", [True, False])
+def test_planners_get_the_grid_of_the_floor(tmp_path: Path, has_grid: bool) -> None:
+    """At the change; of a floor without one an empty grid, and never that of the floor where the robot was."""
+    with house(tmp_path / "store", robot_world.tiles(), robot_world.tiles(), has_grid=has_grid) as store:
+        source = LocalMapSource(store.folder, "low")
+        floors = FloorMaps(source, lambda site: LocalMapSource(store.folder, site))
+        floors.grid_height_m = 0.5
+        floors.refresh()
+        low, listener = robot_world.wanted(store, "low"), Listener(grid_height_m=0.5)
+        parts = SimpleNamespace(
+            server=None, publisher=listener, floors=floors, tile_loader=TileLoader(source, TileSelectionSettings())
+        )
+        made = Runtime.__new__(Runtime)
+        made._parts, made._server, made._publisher, made._shown_grid = parts, None, listener, None  # type: ignore[assignment]
+        for made._floor in ("", "high", "high", ""):
+            made._show_grid(low)
+    shown = [grid for _, grid, _ in listener.grids]
+    if has_grid:
+        assert [grid.cells.size > 1 for grid in shown if grid is not None] == [True] * 3
+    else:
+        assert [None if grid is None else grid.cells.tolist() for grid in shown] == [None, [[-1]], None, [[-1]], None]

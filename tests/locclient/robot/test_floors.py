@@ -114,6 +114,7 @@ def test_a_robot_that_visits_a_floor_reports_no_pose_on_its_own(folder: Path) ->
         outcomes = [robot.handle(bundle) for bundle in robot_world.bundles(50)]
     last = outcomes[-1]
     assert last is not None
+    assert last.published.level == "L1"
     assert last.published.map_from_base is not None
     np.testing.assert_allclose(
         last.published.map_from_base, last.estimate.map_from_body @ se3_inverse(robot.base_from_body), atol=1e-9

@@ -14,6 +14,8 @@ import pytest
 
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3, so3_exp
+from fleetmap.mapformat.building import BuildingFrame
+from fleetmap.mapformat.floors import Floor, FloorEntry
 from fleetmap.messages import Cause, Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient.robot.continuous_odom import PublishedPose
@@ -124,7 +126,12 @@ def test_a_robot_that_is_not_localized_says_why(status: Status, cause: str) -> N
 def test_a_position_beyond_the_lost_radius_is_none(sigma_m: float, is_localized: bool) -> None:
     """The check of the calibration widens covariances of estimates that keep their status."""
     estimate = SimpleNamespace(
-        status=Status.DEGRADED, cause=Cause.CALIBRATION, stamp_ns=7, cov_rot_trans=np.eye(6) * sigma_m**2, map_version=1
+        status=Status.DEGRADED,
+        cause=Cause.CALIBRATION,
+        stamp_ns=7,
+        cov_rot_trans=np.eye(6) * sigma_m**2,
+        map_version=1,
+        floor="",
     )
     outcome = SimpleNamespace(estimate=estimate, published=PublishedPose(np.eye(4), np.eye(4)), speed_mps=0.0)
     adapter = Adapter()
@@ -133,11 +140,55 @@ def test_a_position_beyond_the_lost_radius_is_none(sigma_m: float, is_localized:
     assert ("LOCALIZATION_ERROR" in adapter.error_types()) is not is_localized
 
 
+def test_each_floor_has_its_map_id() -> None:
+    """The site's name; in the building's frame positions of a floor are by its own alignment."""
+    adapter, floors = Adapter(frame="building"), {}
+    for number, site in enumerate(("", "hall-2")):
+        entry = FloorEntry(site=site or "hall", level=f"L{number}", height_m=4.0 * number)
+        floors[site] = Floor(entry, BuildingFrame(x_m=10.0 * number, y_m=0.0, yaw_rad=0.0))
+    estimate = SimpleNamespace(
+        status=Status.TRACKING,
+        cause=Cause.NONE,
+        stamp_ns=7,
+        cov_rot_trans=np.eye(6) * 1e-4,
+        map_version=5,
+        floor="hall-2",
+    )
+    placed = PublishedPose(np.eye(4), np.eye(4), floors["hall-2"].building_from_map)
+    outcome = SimpleNamespace(estimate=estimate, published=placed, speed_mps=0.0)
+    adapter.after_frame(outcome, frozenset({1}), floors, {"hall-2": 5})  # type: ignore[arg-type]
+    state = adapter.said()
+    assert (state["mobileRobotPosition"]["mapId"], state["mobileRobotPosition"]["x"]) == ("hall-2", 10.0)
+    assert {"mapId": "hall-2", "mapVersion": "5", "mapStatus": "ENABLED"} in state["maps"]
+    nodes = [
+        {
+            "nodeId": "n",
+            "sequenceId": 0,
+            "released": True,
+            "nodePosition": {"x": 0.0, "y": 0.0, "mapId": "hall-2"},
+            "actions": [],
+        }
+    ]
+    order = {**HEADER, "orderId": "o", "orderUpdateId": 0, "nodes": nodes, "edges": []}
+    adapter.order(json.dumps(order).encode())
+    assert "UNKNOWN_MAP_ID" not in adapter.error_types()
+    estimate.status = Status.LOST
+    adapter.after_frame(outcome, frozenset({1}), floors, {"hall-2": 5})  # type: ignore[arg-type]
+    given = {"x": 12.0, "y": 1.0, "theta": 0.0, "lastNodeId": "n"}
+    assert adapter.ask("initializePosition", "a", mapId="hall-2", **given)["actionStatus"] == "RUNNING"
+    (prior,) = adapter.priors
+    assert prior.floor == "hall-2"
+    np.testing.assert_allclose(prior.map_from_base[:2, 3], [2.0, 1.0])
+    assert adapter.ask("initializePosition", "b", mapId="hall-3", **given)["actionStatus"] == "FAILED"
+    here, other = Position(1.0, 2.0, 0.0), Position(1.0, 2.0, 0.0, floor="hall-2")
+    assert here.away_from(other)[0] == np.inf
+
+
 def test_positions_are_in_the_building_where_that_is_asked_for() -> None:
     adapter = Adapter(frame="building")
     building_from_map = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([10.0, -20.0, 0.0]))
     estimate = SimpleNamespace(
-        status=Status.TRACKING, cause=Cause.NONE, stamp_ns=7, cov_rot_trans=np.eye(6) * 1e-4, map_version=1
+        status=Status.TRACKING, cause=Cause.NONE, stamp_ns=7, cov_rot_trans=np.eye(6) * 1e-4, map_version=1, floor=""
     )
     map_from_odom = se3(np.eye(3), np.array([3.0, 1.0, 0.0]))
     given = {"x": 9.0, "y": -17.0, "theta": np.pi / 2, "mapId": "hall", "lastNodeId": "n"}

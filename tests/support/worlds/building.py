@@ -22,11 +22,13 @@ def strange(tiles: tuple[Tile, ...]) -> tuple[Tile, ...]:
     return tuple(replace(t, descriptors=rng.integers(0, 256, t.descriptors.shape, np.uint8)) for t in tiles)
 
 
-def house(folder: Path, low: tuple[Tile, ...], high: tuple[Tile, ...], x_m: float = 0.0) -> MapStore:
+def house(
+    folder: Path, low: tuple[Tile, ...], high: tuple[Tile, ...], x_m: float = 0.0, *, has_grid: bool = False
+) -> MapStore:
     """A building of two floors; the map of the upper one lies x_m beside the lower one's."""
     store = MapStore.open(folder, create=True)
     for site, tiles, at_m in (("low", low, 0.0), ("high", high, x_m)):
-        robot_world.save(store, site=site, of=tiles)
+        robot_world.save(store, site=site, of=tiles, has_grid=has_grid)
         frame = BuildingFrame(x_m=at_m, y_m=0.0, yaw_rad=0.0)
         aligned = Alignment(frame=frame, metres_per_unit=1.0, method="pins", plan=None, off_m={})
         store.keep_site_files(site, {"alignment": encode_alignment(aligned)}, "")
