@@ -19,12 +19,9 @@ from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.floor_plan.areas import OUTSIDE, Areas
 
 # The page that says more of an alert; those of robots and trials have words of their own.
-_ALERTS = {
-    "FleetmapNightFailed": "surveys",
-    "FleetmapFailureRate": "failures",
-    "FleetmapDiskFills": "administration",
-    "FleetmapTrustFault": "administration",
-}
+_ALERTS = {"FleetmapNightFailed": "surveys", "FleetmapFailureRate": "failures"} | dict.fromkeys(
+    ("FleetmapDiskFills", "FleetmapTrustFault"), "administration"
+)
 _MANY = 20  # robots, whose places say better than the map's tiles what to show first
 
 
