@@ -3,6 +3,7 @@
 With sign-in on, every request except those in `_OPEN` needs a scope; an unlisted path needs the strongest scope of its method.
 """
 
+import logging
 import re
 from dataclasses import dataclass
 from html import escape
@@ -18,6 +19,7 @@ from starlette.requests import cookie_parser
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from fleetmap.errors import StoreError
 from mapserver.api.problems import problem
 from mapserver.api.sign_in_proxy import SignInProxy, proxied_name
 from mapserver.operators.operators import LIFE_S, Operators
@@ -26,6 +28,7 @@ from mapserver.operators.roles import Scope as Right
 from mapserver.serving.http_connections import is_loopback_name
 from mapserver.store import Actor
 
+_log = logging.getLogger(__name__)
 SIGN_IN, SIGN_OUT, STYLE = "/sign-in", "/sign-out", "/dashboard/static/style.css"
 _OPEN = {"/healthz", "/readyz", SIGN_IN, SIGN_OUT, STYLE}
 _RIGHTS = (  # needed for reading, too
@@ -135,7 +138,11 @@ class Guard:
             return await send({"type": "websocket.close", "code": 4403})
         if scope["type"] != "http":
             return await self._app(scope, receive, send)
-        refusal = self._refused_place(scope) or await to_thread.run_sync(self._refused_person, scope)
+        try:
+            refusal = self._refused_place(scope) or await to_thread.run_sync(self._refused_person, scope)
+        except StoreError as error:  # who asks may be a stranger, to whom it says nothing of the store
+            _log.error("%s %r: %s", scope["method"], scope["path"][:200], error)
+            refusal = _refuse(scope, 503, "the store does not answer; see the server's log")
 
         async def answer(message: Message) -> None:
             if message["type"] == "http.response.start":
@@ -173,12 +180,12 @@ class Guard:
     def _refused_person(self, scope: Scope) -> Response | None:
         """Refuse requests without a session or token, or with insufficient rights."""
         right = _needed(scope)
+        if right is None:
+            return None
         if not self._settings.is_sign_in_on:
             is_open = right not in {Right.OPERATORS, Right.ROBOTS} or _is_from_here(scope)
             words = "without operators only the server's own machine may do this; `mapserver operators add NAME --role admin` there"
             return None if is_open else _refuse(scope, 403, words)
-        if right is None:
-            return None
         who = self._settings.identify(scope, uses=_is_somebodys(scope))
         if who is None and (name := proxied_name(scope)):
             return _refuse(

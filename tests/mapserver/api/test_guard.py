@@ -14,6 +14,7 @@ from fastapi.testclient import TestClient
 from starlette.types import ASGIApp, Message
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
+from fleetmap.errors import StoreError
 from mapserver.api import request_limits
 from mapserver.api.app import create_app
 from mapserver.api.guard import Guard, GuardSettings, set_session
@@ -91,6 +92,22 @@ def test_a_page_from_elsewhere_changes_nothing(server: Server) -> None:
             publish = f"/v1/sites/lab/versions/{number}/publish"
             assert client.post(publish, json=ACT, headers=headers).status_code == 200, headers
             save_sample_draft(server.store, seed=number + 1)
+
+
+@pytest.mark.parametrize("asked", ["are_there", "session"])
+def test_a_store_that_does_not_answer_lets_nobody_in(
+    server: Server, monkeypatch: pytest.MonkeyPatch, asked: str
+) -> None:
+    def away(*_: object) -> None:
+        raise StoreError("postgresql://db.example/site_a cannot be read")
+
+    vic = named(server)["vic"] if asked == "session" else {}
+    monkeypatch.setattr(type(server.store.operators), asked, away)
+    with client_of(server) as client:
+        answer = client.get("/v1/sites", headers=vic)
+        check_problem(answer, 503, "the store does not answer")
+        assert "db.example" not in answer.text
+        assert client.get("/healthz").status_code == 200
 
 
 @pytest.mark.parametrize("headers", [{}, {"Origin": "http://127.0.0.1", "Sec-Fetch-Site": "same-origin"}])

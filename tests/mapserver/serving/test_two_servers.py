@@ -33,6 +33,7 @@ def test_a_server_whose_database_is_away_says_so_and_goes_on(tmp_path: Path, pos
         postgres.stop()
         try:
             assert statuses(served.http) == [503] * 4
+            assert httpx.get(f"{served.http}/healthz", timeout=60).status_code == 200
         finally:
             postgres.start()
         assert statuses(served.http) == [200] * 4
