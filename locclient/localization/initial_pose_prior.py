@@ -100,6 +100,11 @@ class InitialPosePrior:
             covariance = transport_cov(self._prior.cov_rot_trans, lever_m)
             self.hypothesis = PoseHypothesis.at(odometry, map_from_body, covariance, self._prior.floor or "")
 
+    @property
+    def names_floor(self) -> bool:
+        """True if the prior says on which floor the robot is, without pictures."""
+        return not self.is_ride and len(self.floors) == 1
+
     def on_each_floor(self) -> list[PoseHypothesis]:
         """Return the pose by the prior on each of its floors; empty without a heading."""
         known, found = self.hypothesis, list[PoseHypothesis]()
@@ -167,12 +172,12 @@ class InitialPosePrior:
 
     def confirms(self, hypothesis: PoseHypothesis) -> bool:
         """Return True if the prior is told and so tight that one fix within it confirms a pose; an operator's, only at its own place."""
-        is_named = not self.is_revisable or hypothesis.told_log_odds > 0.0
+        is_named = self.names_floor and (not self.is_revisable or hypothesis.told_log_odds > 0.0)
         return self.is_told and is_named and self.is_tight(self._settings.tight_prior_sigma_m)
 
     def known_pose(self, radius_m: float) -> PoseHypothesis | None:
         """Return the pose by an exact source and the motion since, while its 95 % radius is at most `radius_m`; else None."""
-        known = self.hypothesis if self.is_told and not self.is_revisable else None
+        known = self.hypothesis if self.is_told and not self.is_revisable and self.names_floor else None
         return known if known is not None and radius_95_m(known.now_cov) <= radius_m else None
 
     def is_tight(self, sigma_m: float) -> bool:

@@ -25,6 +25,9 @@ _GATE = 3.0  # sigmas of a speed that may be zero
 _MIN_MPS = 0.05  # of a ride: slower steps are vibrations of a floor
 _SLOWED_SHARE = 0.3  # of the largest speed, below which a ride may have ended
 _KNOWN_SHARE = 0.2  # of the largest speed: a speed with a larger sigma does not show the end of a ride
+_LONGEST_S = (
+    180.0  # of a ride: a robot that must find its place before it may roll would wait for ever after a wrong one
+)
 _BIAS_SIGMA_MPS2 = 0.3  # before the first rest
 _SCALE_SIGMA = 0.02  # of an accelerometer, calibrated or not
 _HEIGHT_SIGMA_M = 0.15  # of the recorded heights of floors
@@ -85,7 +88,7 @@ class RideGauge:
         self._wheel_ns: int | None = None
         self._still_s = self._rest_s = 0.0
         self._speeds = deque[tuple[float, float]]()  # of the last half second at rest: time since the last test, speed
-        self._fastest_mps = 0.0  # of this ride; 0 before one
+        self._fastest_mps = self._riding_s = 0.0  # of this ride; 0 before one
         self._is_known = noise is not None
 
     def handle_imu(self, samples: ImuSamples) -> None:
@@ -129,6 +132,10 @@ class RideGauge:
                 self._speeds.popleft()
             if self._still_s >= _STILL_S:
                 self._test_rest()
+        self._riding_s = self._riding_s + dt_s if self._fastest_mps else 0.0
+        if self._riding_s > _LONGEST_S:
+            self._stop()
+            self._is_known, self._cov[2, 2] = False, _BIAS_SIGMA_MPS2**2
         speed_mps, sigma_mps = abs(self._state[1]), float(np.sqrt(self._cov[1, 1]))
         if not is_rolling and speed_mps > _MIN_MPS + _GATE * sigma_mps:
             self._fastest_mps = max(self._fastest_mps, float(speed_mps))

@@ -183,7 +183,10 @@ class Localizer:
         floors = floors_after(self._floors, visit, ride)
         may_have_ridden = floors.keys() != {visit.floor} and (visit.is_doubted or stays_s >= SHORTEST_RIDE_S)
         if tracker.confirmed is None and prior is not None and prior.is_ride:
-            prior.floors = floors
+            if prior.floors.keys() != floors.keys():
+                prior.floors = floors
+                tracker.candidates.reset()
+                self._query.forget()
         elif ride.is_moving or may_have_ridden:
             if tracker.confirmed is None:
                 tracker.forget()
@@ -359,7 +362,7 @@ class Localizer:
             prior=None if tracker.prior is None else tracker.prior.hypothesis,
             has_failed=self._query.failed > 0,
             was_tracking=tracker.was_tracking,
-            rides=() if tracker.prior is None or not tracker.prior.is_ride else tracker.prior.on_each_floor(),
+            rides=() if tracker.prior is None or tracker.prior.names_floor else tracker.prior.on_each_floor(),
         )
         if estimate.floor != tracker.floor:
             estimate = replace(estimate, map_version=self._version_on(estimate.floor))

@@ -102,6 +102,7 @@ class MapQuery:
         self._cancel()
 
     def _note_missing(self) -> None:
+        self._tracker.building = self._plan_from_map.keys()
         self._tracker.missing_floors = self._plan_from_map.keys() - self._relocalizers.keys()
 
     def forget(self) -> None:

@@ -96,6 +96,7 @@ class PoseTracker:
         self._query_frame: PoseHypothesis | None = None  # of the running map query, as the identity
         self._query_index: int | None = None  # of the last map query's frame
         self.floor = ""  # of the last confirmed pose
+        self.building: Set[str] = frozenset()  # its floors
         self.missing_floors: Set[str] = frozenset()  # whose maps the robot does not hold
         # Frames of queries since the last fix, each as the identity.
         self._unmatched: list[_Unmatched] = []
@@ -103,9 +104,15 @@ class PoseTracker:
     # --- priors and starts --------------------------------------------------------------------------------------------
 
     def handle_prior(self, prior: PositionPrior) -> None:
-        """Use a prior at this moment; it replaces any earlier one."""
+        """Use a prior at this moment; it replaces any earlier one.
+
+        Without a floor, an operator's is of the floor that the robot was on; a dock's, while that is not known, of any.
+        """
+        floors: Mapping[str, Array | None] | None = None
+        if prior.floor is None and self.confirmed is None and not prior.is_revisable and len(self.building) > 1:
+            floors = dict.fromkeys(sorted(self.building))
         prior = replace(prior, floor=self.floor if prior.floor is None else prior.floor)
-        self.prior = InitialPosePrior(prior, self._base_from_body, self._track)
+        self.prior = InitialPosePrior(prior, self._base_from_body, self._track, floors)
 
     def is_contradicted_by(self, prior: PositionPrior) -> bool:
         """Return True if a confirmed pose lies outside the bound of a prior."""

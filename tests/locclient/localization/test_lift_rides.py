@@ -115,6 +115,33 @@ def test_a_lift_that_shakes_the_robot_loses_no_floor(monkeypatch: pytest.MonkeyP
     assert world.is_right(out[-1])
 
 
+def test_a_dock_that_names_no_floor_is_one_of_any(monkeypatch: pytest.MonkeyPatch) -> None:
+    """After a ride of unknown height: it is not taken for a dock of the floor where the robot was."""
+    world = world_of(monkeypatch, 10, **ALIKE, has_imu=False)
+    list(world.drive(9.5))
+    list(world.stand(4.0))
+    list(world.ride(1))
+    list(world.drive(-3.0, sees=False))
+    covariance, stamp_ns = np.diag([0.02**2] * 3 + [0.1**2] * 3), int(world.frames * FRAME_S * 1e9) + 1
+    world.localizer.handle_prior(PositionPrior(stamp_ns, world.map_from_body, covariance))
+    list(world.drive(-4.0))
+    assert not world.wrong
+
+
+def test_a_ride_ends_for_a_robot_that_waits_for_its_place() -> None:
+    """A knock that the gauge takes for a ride must not stop the search for ever."""
+    gauge, found = RideGauge(ImuNoise()), Ride(False, 0.0, 0.0, 0.0)
+    moving = 0
+    for k in range(2200):
+        force = np.full((20, 3), [0.0, 0.0, 9.81 + (0.5 if k > 30 else 0.0)])
+        gauge.handle_imu(ImuSamples(np.arange(20 * k, 20 * k + 20) * 5_000_000 + 1, np.zeros((20, 3)), force))
+        gauge.handle_wheel([WheelSample((20 * k + 19) * 5_000_000, np.zeros(3), 0.0, 0.01, 0.01)])
+        found = gauge.advance((20 * k + 20) * 5_000_000, 0.1)
+        moving += found.is_moving
+    assert 0 < moving < 2000
+    assert np.isinf(found.sigma_m)
+
+
 def test_a_ride_is_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     world, monitor = world_of(monkeypatch, 9, **ALIKE), FailureMonitor()
     said = [*world.drive(9.5), *world.stand(4.0), *world.ride(1, fastest_mps=0.3), *world.stand(2.0)]
