@@ -92,6 +92,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     ]
     return {
         "used": _used(services, rows),
+        "building": maps.store.building(site),
         "versions": [
             _card(maps, rows, events, verdicts.get(info.version), info, robots, shown)
             for info in reversed(rows.versions.values())

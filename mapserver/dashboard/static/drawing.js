@@ -54,11 +54,12 @@ function drawn() {
 const described = ({ name, mask, percent, correction, reason }) => ({
   name, ...(mask && { mask }), ...(mask === "speed" && { percent: Number(percent) }), ...(correction && { correction: { kind: correction, reason } }),
 });
+const lift = ({ properties }) => properties.lift && { lift: properties.lift };
 const isCalled = (name) => ({ properties }) => properties.name === name;
 const outlined = () => ({ type: "Polygon", coordinates: [[...corners, corners[0]]] });
 const CHANGES = {
   add: (areas, _, fields) => [...areas, { type: "Feature", geometry: outlined(), properties: described(fields) }],
-  change: (areas, name, fields) => areas.map((area) => (isCalled(name)(area) ? { ...area, properties: described(fields) } : area)),
+  change: (areas, name, fields) => areas.map((area) => (isCalled(name)(area) ? { ...area, properties: { ...lift(area), ...described(fields) } } : area)),
   remove: (areas, name) => areas.filter((area) => !isCalled(name)(area)),
 };
 

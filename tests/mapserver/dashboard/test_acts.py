@@ -192,6 +192,7 @@ def test_an_area_is_drawn_named_changed_and_removed(page: Page, tmp_path: Path) 
         dialog.get_by_label("Your name").fill("ada")
         found = store.areas(SITE).geojson(SITE)
         shape = {"type": "Polygon", "coordinates": [[[0, 0], [4, 0], [4, 3], [0, 0]]]}
+        found["features"][0]["properties"]["lift"] = "A"  # which the page does not change
         found["features"].append({"type": "Feature", "geometry": shape, "properties": {"name": "gate"}})
         replace_areas(store, SITE, to_json(found), Actor("bob"), tag=None)
         dialog.get_by_role("button", name=re.compile("^Yes")).click()
@@ -203,7 +204,7 @@ def test_an_area_is_drawn_named_changed_and_removed(page: Page, tmp_path: Path) 
         dialog.get_by_label("For planners").select_option("no effect")
         dialog.get_by_role("button", name=re.compile("^Yes")).click()
         expect(areas).to_contain_text("aisle 5: 128 m²")
-        assert listed() == "aisle 5: 128.0 m2\ngate: 6.0 m2\n2 areas\n"
+        assert listed() == "aisle 5: 128.0 m2, lift A\ngate: 6.0 m2\n2 areas\n"
 
         page.get_by_role("button", name="Change aisle 5").click()
         dialog.get_by_label("Correct the map").select_option("forget what is here, learn it anew")
@@ -215,7 +216,7 @@ def test_an_area_is_drawn_named_changed_and_removed(page: Page, tmp_path: Path) 
         expect(areas).to_contain_text(
             re.compile(r"to be forgotten once a recording shows it anew, \d+ s ago: new racks")
         )
-        assert listed().startswith("aisle 5: 128.0 m2, forget: new racks\n")
+        assert listed().startswith("aisle 5: 128.0 m2, lift A, forget: new racks\n")
         expect(page.locator(".site-map path.area.warn")).to_have_count(1)
         change(page, "Undo the last change of areas")
         expect(areas).not_to_contain_text("new racks")

@@ -1,6 +1,7 @@
 """Sites as the floors of a building: the command, what robots get, who may fetch what."""
 
 from pathlib import Path
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from mapserver.floor_plan.alignment import Alignment, encode_alignment
 from mapserver.releases import publish
 from mapserver.store import NOBODY, MapStore
 from mapserver.trust.signing import admitted_versions
+from support.fleet.dashboard_scene import serving
 from support.room_site import run
 from support.storage.map_samples import save_sample_draft
 
@@ -98,6 +100,15 @@ def test_a_site_is_a_floor_of_one_building_and_leaves_it(house: Path) -> None:
         kept = store.areas("hall-1")
         keep_areas(store, "hall-1", to_json(kept.geojson("hall-1")), "", NOBODY)
         assert store.areas("hall-1").areas[0].lift == "A", "it survives a change of the areas by a page"
+
+
+def test_the_page_of_maps_leads_to_the_other_floors(house: Path) -> None:
+    floors = tuple(FloorEntry(site=f"hall-{n}", level=f"L{n}", height_m=4.0 * n) for n in (1, 2))
+    with MapStore.open(house) as store:
+        keep_building(store, Building(name="tower", floors=floors), NOBODY)
+    with serving(house) as served, urlopen(f"{served.http}/dashboard/map?site=hall-1") as answer:
+        text = answer.read().decode()
+    assert '<p id="floors">tower: <a href="/dashboard/map?site=hall-2">L2</a> · <strong>L1</strong></p>' in text
 
 
 def test_lifts_drawn_in_the_building_come_back_in_the_map(house: Path) -> None:
