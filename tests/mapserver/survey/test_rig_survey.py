@@ -63,8 +63,8 @@ def robots_view(made: SimulatedSurvey, done: Survey) -> MapView:
 def steps_off_m(made: SimulatedSurvey, done: Survey) -> float:
     """Root mean square error of all frames' positions as seen from the middle one."""
 
-    def from_middle(poses: Array) -> Array:
-        return (se3_inverse(poses[len(poses) // 2]) @ poses)[:, :3, 3]
+    def from_middle(map_from_body: Array) -> Array:
+        return (se3_inverse(map_from_body[len(map_from_body) // 2]) @ map_from_body)[:, :3, 3]
 
     off = from_middle(done.map.trajectory.frame_from_body) - from_middle(made.map_from_body)
     return float(np.sqrt((off**2).sum(axis=1).mean()))
