@@ -17,9 +17,9 @@ STEP = se3(so3_exp(np.array([0.0, 0.0, 0.1])), np.array([0.07, 0.0, 0.0]))
 
 
 def odometry(frame: int) -> OdometryEstimate:
-    pose = np.linalg.matrix_power(STEP, frame)
+    odom_from_body = np.linalg.matrix_power(STEP, frame)
     return OdometryEstimate(
-        frame, frame, pose, 1e-8 * np.eye(6), np.zeros(3), np.zeros(3), np.zeros(3), OdometryStatus.TRACKING,
+        frame, frame, odom_from_body, 1e-8 * np.eye(6), np.zeros(3), np.zeros(3), np.zeros(3), OdometryStatus.TRACKING,
         np.arange(50), 5.0, 1.0, False, True, None, previous_from_body=STEP,
     )  # fmt: skip
 
