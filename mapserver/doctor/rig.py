@@ -46,7 +46,12 @@ def frames_of_rig(recording: Recording) -> int:
 def check_rig(recording: Recording, on_frame: Callable[[], None] = lambda: None) -> list[Finding]:
     """Return the findings of the first view; of each further pair those about its cameras, with their names, and of each further view its
     mounting against the first one."""
-    found, names = run_checks(recording.view(0), on_frame).findings, _names(recording)
+    return run_checks(recording.view(0), on_frame).findings + further_findings(recording, on_frame)
+
+
+def further_findings(recording: Recording, on_frame: Callable[[], None] = lambda: None) -> list[Finding]:
+    """Return the findings of `check_rig` without those of the first view."""
+    found, names = list[Finding](), _names(recording)
     for number, numbers in enumerate(recording.calibration.views[1:], start=1):
         if len(numbers) == 2 and len(recording.view(number)):
             beside = run_checks(recording.view(number), on_frame).findings

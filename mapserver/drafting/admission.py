@@ -14,6 +14,7 @@ from mapserver.doctor import Finding, Verdict, accelerometer_images, images, run
 from mapserver.doctor.calibration import TOLERANCES, corrected, in_words, measure_calibration
 from mapserver.doctor.findings import grouped
 from mapserver.doctor.metres import METRES, WHEELS
+from mapserver.doctor.rig import further_findings
 from mapserver.doctor.run_checks import run_cheap_checks
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.executor import SERIAL, Executor
@@ -134,6 +135,13 @@ def checked(
     return CheckedRecording(rig, checks.findings, found, corrections)
 
 
+def with_further_views(result: CheckedRecording, recording: Recording) -> CheckedRecording:
+    """Add the findings of a rig's views but the first. RecordingError if a decisive check of one failed, or a mounting is wrong."""
+    beside = further_findings(recording)
+    _refuse(recording, beside)
+    return replace(result, findings=[*result.findings, *beside])
+
+
 def refuse_hopeless(recording: Recording) -> None:
     """Raise RecordingError for what `checked` would refuse, as far as a check within a second shows it, before a useless drive."""
     _refuse(recording, run_cheap_checks(recording, SAMPLED_FRAMES))
@@ -141,7 +149,9 @@ def refuse_hopeless(recording: Recording) -> None:
 
 def _refuse(recording: Recording, findings: Sequence[Finding]) -> None:
     for finding in findings:
-        if finding.verdict is Verdict.FAIL and finding.name in DECISIVE:
+        check, beside, _ = finding.name.partition(" of cam")
+        is_mounting = not beside and " against cam" in finding.name
+        if finding.verdict is Verdict.FAIL and (check in DECISIVE or is_mounting):
             raise RecordingError(
                 f"{recording.path}: {finding.name}: {finding.sentence}; a map of it would be wrong. "
                 "`mapserver doctor` shows every check"

@@ -115,7 +115,7 @@ class KeptFrames:
     """Frames of another source, each decoded once: stored in a temporary file in `folder`, up to a GB."""
 
     def __init__(self, source: "FrameSource", folder: Path) -> None:
-        self._source, self._store = source, MappedImageStore(folder)
+        self.source, self._store = source, MappedImageStore(folder)
         self.stored, self.part, self.hash_into = source.stored, source.part, source.hash_into
         self._frames: dict[int, CameraFrame] = {}
         self._bytes = 0
@@ -126,7 +126,7 @@ class KeptFrames:
         if index in self._frames:
             self._store.note(index)
             return self._frames[index]
-        frame = self._source.frame(index)
+        frame = self.source.frame(index)
         if self._keeps:
             try:
                 self._frames[index] = self._kept(frame)
@@ -145,5 +145,5 @@ class KeptFrames:
 
     def close(self) -> None:
         """See FrameSource."""
-        self._source.close()
+        self.source.close()
         self._store.__exit__()

@@ -27,7 +27,14 @@ from mapserver.calibration.recordings import LONGEST_S, busiest_stretch
 from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES
 from mapserver.doctor.findings import summary
 from mapserver.doctor.run_checks import frames_to_check
-from mapserver.drafting.admission import DECISIVE, SAMPLED_FRAMES, TURN_FRAMES, CheckedRecording, checked
+from mapserver.drafting.admission import (
+    DECISIVE,
+    SAMPLED_FRAMES,
+    TURN_FRAMES,
+    CheckedRecording,
+    checked,
+    with_further_views,
+)
 from mapserver.drafting.draft_evidence import ProbedFrame, probed_frames
 from mapserver.drafting.mapped_images import KeptFrames
 from mapserver.drafting.report import check_truth
@@ -321,6 +328,7 @@ def _admission(
         result = checked(
             first, lambda: tools.progress("examination", min(next(done), total - 1), total), tools.executor, begun
         )
+        result = with_further_views(result, recording)
         tools.at("examination", total, total)
         for remark in result.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)

@@ -4,7 +4,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 import msgspec
 import numpy as np
@@ -197,15 +197,19 @@ class Recording:
         if len(views) == 1:
             return self
         calibration = replace(self.calibration, cameras=tuple(cameras[camera] for camera in views[number]))
-        if not isinstance(self.frames, SeriesFrames):  # other views of its frames find no camera in that calibration
-            assert number == 0
-            return replace(self, calibration=calibration)
         if number == 0:
+            if not isinstance(
+                self.frames, SeriesFrames
+            ):  # other views of its frames find no camera in that calibration
+                return replace(self, calibration=calibration)
             return replace(self, calibration=calibration, frames=replace(self.frames, has_others=False))
+        series: Any = self.frames
+        while not isinstance(series, SeriesFrames):
+            series = series.source  # of frames that are kept, or some of all
         of_pair = {SensorSet.MONO: SensorSet.STEREO, SensorSet.MONO_INERTIAL: SensorSet.STEREO_INERTIAL}
         of_one = {pair: one for one, pair in of_pair.items()}
         sensor_set = (of_pair if len(views[number]) == 2 else of_one).get(self.sensor_set, self.sensor_set)
-        frames = self.frames.of_view(number)
+        frames = series.of_view(number)
         stamps_ns = frames.left.stamps_ns
         return replace(self, calibration=calibration, frames=frames, frame_stamps_ns=stamps_ns, sensor_set=sensor_set)
 

@@ -1,5 +1,6 @@
 """Rigs of several views: cameras of a further pair, and its mounting against the first one, are checked by name."""
 
+import json
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.recordings import OpenOptions, format_calibration, open_recording
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
@@ -131,9 +133,12 @@ def test_the_doctor_names_the_pair_whose_images_are_exchanged(tmp_path: Path) ->
             writer.write_frame(replace(frame, others=(replace(rear, left=rear.right, right=rear.left),)))
     done = CliRunner().invoke(app, ["doctor", str(tmp_path / "ride.mcap"), "--json", "-"])
     assert done.exit_code == 3
-    import json
-
     findings = {f["name"]: Finding(**f) for f in json.loads(done.stdout)["findings"]}
     assert findings["left and right"].verdict == "ok"
     assert findings["left and right of cam2 and cam3"].verdict == "fail"
     assert "camera rate of cam2 and cam3" in findings
+    built = CliRunner().invoke(
+        app, ["build", str(tmp_path / "ride.mcap"), "--site", "s", "--store", str(tmp_path / "s")]
+    )
+    assert isinstance(built.exception, RecordingError)
+    assert "left and right of cam2 and cam3" in str(built.exception)
