@@ -10,7 +10,6 @@ import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options, settings_of
 from fleetmap.errors import BusyError, StoreError
-from fleetmap.mapformat.names import is_name
 from mapserver.commands.options import (
     ActorOptions,
     Json,
@@ -117,6 +116,7 @@ def retention(
 
     Versions of maps are removed by `gc`.
     """
+    from fleetmap.mapformat.names import is_name
     from mapserver.nightly.inbox import sites_of
     from mapserver.nightly.retention import apply_retention
 
