@@ -124,7 +124,7 @@ def calls(name: str) -> Iterator[Callable[[], object]]:
     """A function or method with plain arguments of many kinds, of which it refuses some."""
     owner, _, method = name.rpartition(".")
     made = MEMBERS[owner or name]
-    for seed in range(100):
+    for seed in range(1000):
         arguments = Arguments(seed, plain_size=8)
         call = partial(made, *given(owner or name, arguments, made.__init__ if owner else made))
         if owner and method != "__init__":
