@@ -48,26 +48,31 @@ class Ride(NamedTuple):
 
 
 class LiftVisit(NamedTuple):
-    """A stay in a lift since it was entered on a floor, or since its place was confirmed there. is_ride: it has ridden, or may have;
-    is_doubted: something lifted the robot."""
+    """A stay in one of `lifts` since it was entered on a floor, or since its place was confirmed there.
 
-    lift: str
+    is_ride: it has ridden, or may have, and its floor is open, also outside of the lift (is_inside: False). is_doubted: something lifted
+    the robot.
+    """
+
+    lifts: frozenset[str]
     floor: str
     since_ns: int
     is_ride: bool = False
     is_doubted: bool = False
+    is_inside: bool = True
 
 
 def floors_after(floors: Mapping[str, Floor], visit: LiftVisit, ride: Ride) -> dict[str, Array | None]:
     """Return the floors of the lift where the robot may be, with from_map (4, 4), from each one's map along the floor to that where it
-    entered; None for the same. All of them while it moves and if the rise is unknown or leads to none."""
-    served = {key: floor for key, floor in floors.items() if visit.lift in floor.lifts}
+    entered; None for the same. All of the lift's while it moves and if the rise is unknown; all of the building if it leads to none of
+    those: a lift may be in the map of some floors only."""
+    served = {key: floor for key, floor in floors.items() if not visit.lifts.isdisjoint(floor.lifts)}
     entered = floors[visit.floor]
     if not ride.is_moving and not (visit.is_doubted and not visit.is_ride) and np.isfinite(ride.sigma_m):
         bound_m = _BOUND_SIGMAS * float(np.hypot(ride.sigma_m, _HEIGHT_SIGMA_M))
         rises_m = {key: floor.entry.height_m - entered.entry.height_m for key, floor in served.items()}
         reached = {key: floor for key, floor in served.items() if abs(rises_m[key] - ride.rise_m) <= bound_m}
-        served = reached or served
+        served = reached or dict(floors)
     map_from_building = se3_inverse(entered.frame.building_from_map)
     return {
         key: None if key == visit.floor else map_from_building @ floor.frame.building_from_map

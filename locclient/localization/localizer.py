@@ -104,6 +104,8 @@ class Localizer:
         """Use a prior at this moment until a pose is confirmed, with a covariance that grows with the distance since. A prior with finite
         covariance is published, DEGRADED and propagated by odometry, until the map gives a pose. An operator's prior replaces a confirmed
         pose that it contradicts, until fixes outweigh it."""
+        if prior.floor and prior.floor not in self._floors:
+            return  # a floor that the building had a moment ago
         if prior.is_revisable and self._tracker.confirmed is not None:
             if not self._tracker.is_contradicted_by(prior):
                 return
@@ -142,14 +144,18 @@ class Localizer:
 
     def handle_floors(self, floors: Mapping[str, Floor]) -> None:
         """Use the floors of the robot's building: its own site's, which is called "", and others by their sites. Their maps follow by
-        `handle_version`; those of floors that are none any more are dropped. Without any, the robot has its own site alone."""
+        `handle_version`; those of floors that are none any more are dropped. Without any, the robot has its own site alone. A robot whose
+        floor is none any more, or not known after a ride by the floors before, searches all of them."""
         self._floors, self._lift, self._query.is_riding = dict(floors), None, False
         self._query.use_floors({site: floor.frame.building_from_map for site, floor in floors.items()})
         self._maps = {floor: held for floor, held in self._maps.items() if not floor or floor in floors}
         self._compare_maps()
-        if self._tracker.floor and self._tracker.floor not in floors:
-            self._tracker.floor = ""
+        known, prior = floors.keys() | {""}, self._tracker.prior
+        if self._tracker.floor not in known or (
+            prior is not None and (prior.is_ride or not prior.floors.keys() <= known)
+        ):
             self.forget_pose()
+        self._tracker.floor = self._tracker.floor if self._tracker.floor in known else ""
 
     def _compare_maps(self) -> None:
         """Take the look-alikes of all floors together: a fix may be on any of them."""
@@ -160,8 +166,12 @@ class Localizer:
             self._tracker.lookalikes = LookAlikes(max(each.recall for each in known), max(shares))
         self._tracker.alias_step_m = min((held.alias_step_m for held in self._maps.values()), default=ALIAS_STEP_M)
 
+    @property
+    def _is_in_lift(self) -> bool:
+        return self._lift is not None and self._lift.is_inside
+
     def _cause(self, percept: Percept) -> Cause:
-        if self._query.is_riding or (self._lift is not None and self._tracker.confirmed is None):
+        if self._query.is_riding or (self._is_in_lift and self._tracker.confirmed is None):
             return Cause.RIDING
         return percept.image.cause or (Cause.CARRIED if self._tracker.is_carried else Cause.NONE)
 
@@ -170,15 +180,22 @@ class Localizer:
         the measured rise leads; on all of them if that is not known."""
         tracker, visit = self._tracker, self._lift
         prior = tracker.prior
-        known = tracker.confirmed or (None if prior is None else prior.hypothesis)
-        lift = None if known is None else self._lift_at(known)
-        if known is None or lift is None:
-            self._lift = None
+        is_open = tracker.confirmed is None and prior is not None and prior.is_ride
+        if tracker.confirmed is not None:
+            places = [tracker.confirmed]
+        else:
+            places = [] if prior is None else prior.on_each_floor()
+        lifts = frozenset[str]().union(*map(self._lifts_at, places))
+        if not lifts:
+            self._lift = visit._replace(is_inside=False) if is_open and visit is not None else None
             return self._follow_elsewhere(ride)
-        if visit is None or visit.lift != lift or (tracker.confirmed is not None and visit.is_ride):
+        # Until pictures have told the floor, the rises of all rides add up, also of a robot that has been outside between them.
+        if visit is not None and (is_open or not (visit.is_ride or visit.lifts.isdisjoint(lifts))):
+            visit = visit._replace(lifts=visit.lifts | lifts, is_inside=True)
+        else:
             self._gauge.reset()  # it stands on a known floor, or came in without one
             ride = ride._replace(rise_m=0.0, sigma_m=ride.sigma_m if np.isinf(ride.sigma_m) else 0.0)
-            visit = LiftVisit(lift, known.floor, odometry.stamp_ns)
+            visit = LiftVisit(lifts, places[0].floor, odometry.stamp_ns)
         stays_s = min(ride.rest_s, (odometry.stamp_ns - visit.since_ns) * 1e-9)
         floors = floors_after(self._floors, visit, ride)
         may_have_ridden = floors.keys() != {visit.floor} and (visit.is_doubted or stays_s >= SHORTEST_RIDE_S)
@@ -202,7 +219,9 @@ class Localizer:
         """Follow a robot outside of every known lift, or without a place; return True while it must not find one."""
         tracker = self._tracker
         if tracker.prior is not None and tracker.prior.is_ride:
-            return False  # it drives out
+            if ride.is_moving:  # in a lift that is in no map
+                tracker.forget()
+            return ride.is_moving  # else it drives out
         if tracker.confirmed is None and ride.is_moving:
             tracker.candidates.reset()
             return True
@@ -215,13 +234,13 @@ class Localizer:
             self._gauge.reset()
         return False
 
-    def _lift_at(self, known: PoseHypothesis) -> str | None:
-        """Return the lift in which the robot may stand, by a pose's covariance."""
+    def _lifts_at(self, known: PoseHypothesis) -> frozenset[str]:
+        """Return the lifts in which the robot may stand, by a pose's covariance."""
         floor = self._floors.get(known.floor)
         if floor is None or not floor.lifts or not np.isfinite(known.now_cov).all():
-            return None
+            return frozenset()
         reach_m = LIFT_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(known.now_cov[3:5, 3:5])[-1]))
-        return floor.lift_at((known.now_map_from_body @ self._body_from_base)[:2, 3], reach_m)
+        return floor.lifts_at((known.now_map_from_body @ self._body_from_base)[:2, 3], reach_m)
 
     def _version_on(self, floor: str) -> int | None:
         held = self._maps.get(floor)
@@ -318,7 +337,9 @@ class Localizer:
     def localize(self, percept: Percept, frame: RectifiedFrame | None = None) -> Estimate:
         """Return the estimate by a percept, newer than all before. frame: its images; None if `percept` has all data of the frame."""
         odometry, tracker = percept.odometry, self._tracker
-        if odometry.is_lifted and self._lift is not None:  # by the lift: the gauge knows how far, or nobody does
+        if (
+            odometry.is_lifted and self._lift is not None and self._is_in_lift
+        ):  # by the lift: the gauge knows how far, or nobody does
             self._lift = self._lift._replace(is_doubted=True)
         elif odometry.is_lifted or (self._last_ns is not None and is_away(self._last_ns, odometry)):
             tracker.forget(keeps_new_prior=True, is_carried=odometry.is_lifted)

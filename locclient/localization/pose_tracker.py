@@ -106,10 +106,12 @@ class PoseTracker:
     def handle_prior(self, prior: PositionPrior) -> None:
         """Use a prior at this moment; it replaces any earlier one.
 
-        Without a floor, an operator's is of the floor that the robot was on; a dock's, while that is not known, of any.
+        Without a floor, an operator's is of the floor that the robot was on; a dock's, while that is not known, and any after a ride is of
+        any.
         """
         floors: Mapping[str, Array | None] | None = None
-        if prior.floor is None and self.confirmed is None and not prior.is_revisable and len(self.building) > 1:
+        is_open = not prior.is_revisable or (self.prior is not None and not self.prior.names_floor)
+        if prior.floor is None and self.confirmed is None and is_open and len(self.building) > 1:
             floors = dict.fromkeys(sorted(self.building))
         prior = replace(prior, floor=self.floor if prior.floor is None else prior.floor)
         self.prior = InitialPosePrior(prior, self._base_from_body, self._track, floors)

@@ -77,6 +77,7 @@ class FloorMaps:
                 self._note(entry.site, str(error))
         made_of = repr([(key, floor.entry) for key, floor in floors.items()] + files).encode() if floors else b""
         if made_of != self._made_of or maps:
+            floors = self._floors if made_of == self._made_of else floors  # the same object: a ride goes on
             self._floors, self._made_of = floors, made_of
             self._sources = {site: source for site, source in self._sources.items() if site in floors}
             held = {site: wanted for site, wanted in self.held.items() if site in floors}

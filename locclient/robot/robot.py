@@ -107,7 +107,7 @@ class Robot:
         self._wheels_fault, self._wheels_unused = calibration.wheels_fault, dict[Flag, str]()
         self._aligned: BuildingFrame | None = None
         self._of_version: BuildingFrame | None = None
-        self.floors: dict[str, Floor] = {}  # of the building, by `Localizer.handle_floors`
+        self.floors: Mapping[str, Floor] = {}  # of the building, by `Localizer.handle_floors`
         self._visited: dict[str, LoadedMap] = {}  # maps of the other floors
         self._floor = ""  # of the last estimate
 
@@ -140,9 +140,10 @@ class Robot:
 
         Those are used without a trial: they are current on their own site, where its robots have tried them.
         """
-        self.floors = dict(floors)
-        self._visited = {site: held for site, held in self._visited.items() if site in floors}
-        self.localizer.handle_floors(floors)
+        if floors is not self.floors:  # they change less often than maps
+            self.floors = floors
+            self._visited = {site: held for site, held in self._visited.items() if site in floors}
+            self.localizer.handle_floors(floors)
         for loaded in maps:
             self._visited[loaded.wanted.site] = loaded
             self._give(loaded, loaded.wanted.site)

@@ -48,12 +48,13 @@ class Floor:
         building_from_map[2, 3] += self.entry.height_m
         return building_from_map
 
-    def lift_at(self, position_m: Array, reach_m: float) -> str | None:
-        """Return the lift whose outline holds a position (2,) or is at most reach_m from it; None without one."""
-        for name, rings in sorted(self.lifts.items()):
-            if inside_rings(position_m[None], rings)[0] or _distance_m(position_m, rings) <= reach_m:
-                return name
-        return None
+    def lifts_at(self, position_m: Array, reach_m: float) -> frozenset[str]:
+        """Return the lifts whose outlines hold a position (2,) or are at most reach_m from it: several of a bank of lifts."""
+        return frozenset(
+            name
+            for name, rings in self.lifts.items()
+            if inside_rings(position_m[None], rings)[0] or _distance_m(position_m, rings) <= reach_m
+        )
 
 
 def check_building(building: Building) -> Building:
@@ -74,7 +75,7 @@ def read_building(data: bytes) -> Building:
     except FleetmapError as error:
         raise MapFormatError(str(error)) from error
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise MapFormatError(f"the building's floors cannot be read ({error}); set the building again") from error
+        raise MapFormatError(f"a building of these floors cannot be read ({error}); set the building again") from error
 
 
 class _Shape(msgspec.Struct):
@@ -112,6 +113,8 @@ def read_lifts(areas: bytes | None, frame: BuildingFrame) -> dict[str, tuple[Arr
             else:
                 polygons = msgspec.json.decode(feature.geometry.coordinates, type=list[list[list[list[float]]]])
             rings = [np.array([corner[:2] for corner in ring[:-1]], float) for polygon in polygons for ring in polygon]
+            if not all(ring.ndim == 2 and ring.shape[1] == 2 and len(ring) >= 3 for ring in rings):
+                raise ValueError(f"lift {feature.properties.lift[:64]!r} has no outline")
             if read.frame == "building":
                 map_from_building = se3_inverse(frame.building_from_map)
                 rings = [transform_points(map_from_building, np.c_[r, np.zeros(len(r))])[:, :2] for r in rings]

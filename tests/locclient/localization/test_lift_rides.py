@@ -150,6 +150,85 @@ def test_a_ride_is_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not any(failures)
 
 
+def test_a_robot_that_comes_back_into_the_lift_keeps_its_floor_open(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No picture has told the floor: it has not come back to the floor where it first went in."""
+    world = world_of(monkeypatch, 11, **ALIKE)
+    list(world.drive(9.5))
+    list(world.stand(4.0))
+    list(world.ride(1))
+    list(world.stand(2.0))
+    list(world.drive(-5.0, sees=False))
+    said = [*world.drive(5.0, sees=False), *world.stand(4.0)]
+    assert [h.floor for h in said[-1].hypotheses] == ["floor-1"]
+    list(world.drive(-6.0))
+    assert not world.wrong
+
+
+def test_a_change_of_the_building_in_a_ride_ends_the_ride(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What rises after it is not the whole rise."""
+    world = world_of(monkeypatch, 12, floors=3, likeness=0.97)
+    list(world.drive(9.5))
+    list(world.stand(4.0))
+    for number, _ in enumerate(world.ride(2)):
+        if number == 20:
+            world.localizer.handle_floors(dict(world.localizer._floors))
+    list(world.stand(2.0))
+    said = list(world.drive(-6.0))
+    assert not world.wrong
+    assert "floor-2" in {h.floor for h in said[-1].hypotheses} or world.is_right(said[-1])
+
+
+def test_a_lift_that_one_floor_alone_has_leads_to_any(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = world_of(monkeypatch, 13, **ALIKE)
+    world.redraw(1, {})
+    list(world.drive(9.5))
+    list(world.stand(4.0))
+    list(world.ride(1))
+    list(world.stand(2.0))
+    list(world.drive(-6.0))
+    assert not world.wrong
+
+
+def test_of_two_lifts_side_by_side_it_may_ride_either(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The other one, which serves fewer floors, is within reach of the pose after the ride."""
+    world = world_of(monkeypatch, 14, floors=3, likeness=0.97, has_imu=False)
+    for number in range(3):
+        lifts = world.localizer._floors[world.keys[number]].lifts
+        (ring,) = lifts["A"]
+        turn = world.map_from_plan[number][:2, :2]
+        beside = {"0": (ring + turn @ np.array([0.0, 2.1]),)} if number < 2 else {}
+        world.redraw(number, {"A": (ring,)} | beside)
+    list(world.drive(9.5))
+    list(world.stand(4.0))
+    said = [*world.ride(2), *world.stand(2.0)]
+    assert {h.floor for h in said[-1].hypotheses} == {"", "floor-1", "floor-2"}
+
+
+def test_an_operator_without_a_floor_names_none_after_a_ride(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = world_of(monkeypatch, 15, **ALIKE, has_imu=False)
+    list(world.drive(9.5))
+    list(world.stand(4.0))
+    list(world.ride(1))
+    list(world.drive(-3.0, sees=False))
+    covariance, stamp_ns = np.diag([0.02**2] * 3 + [0.2**2] * 3), int(world.frames * FRAME_S * 1e9) + 1
+    before = world.map_from_plan[0] @ world.plan_from_body  # as RViz shows it, on the floor before
+    world.localizer.handle_prior(PositionPrior(stamp_ns, before, covariance, is_revisable=True))
+    list(world.drive(-4.0))
+    assert not world.wrong
+
+
+def test_a_pose_on_a_floor_that_is_gone_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = LiftWorld(monkeypatch, floors=2, likeness=0.0, seed=16)
+    list(world.stand(0.2))
+    covariance, floors = np.diag([0.02**2] * 3 + [0.1**2] * 3), dict(world.localizer._floors)
+    world.localizer.handle_prior(PositionPrior(1, np.eye(4), covariance, floor="gone"))
+    assert world.step(0.0, sees=False).floor == ""
+    world.localizer.handle_prior(PositionPrior(2, np.eye(4), covariance, floor="floor-1"))
+    assert world.step(0.0, sees=False).floor == "floor-1"
+    world.localizer.handle_floors({"": floors[""]})
+    assert world.step(0.0, sees=False).floor == ""
+
+
 # --- the gauge ------------------------------------------------------------------------------------------------------
 
 

@@ -94,9 +94,9 @@ def test_a_site_is_a_floor_of_one_building_and_leaves_it(house: Path) -> None:
             keep_building(store, Building(name="annex", floors=(one, two)), NOBODY)
         low, high = floors_of(store, Building(name="tower", floors=(one, two)))
         assert high.building_from_map[:3, 3].tolist() == [10.0, 0.0, 8.0]
-        assert low.lift_at(np.array([2.0, 2.0]), 0.0) == "A"
-        assert low.lift_at(np.array([3.4, 2.0]), 0.3) is None
-        assert low.lift_at(np.array([3.4, 2.0]), 0.5) == "A"
+        assert low.lifts_at(np.array([2.0, 2.0]), 0.0) == {"A"}
+        assert not low.lifts_at(np.array([3.4, 2.0]), 0.3)
+        assert low.lifts_at(np.array([3.4, 2.0]), 0.5) == {"A"}
         kept = store.areas("hall-1")
         keep_areas(store, "hall-1", to_json(kept.geojson("hall-1")), "", NOBODY)
         assert store.areas("hall-1").areas[0].lift == "A", "it survives a change of the areas by a page"
@@ -137,4 +137,4 @@ def test_a_robot_may_fetch_the_maps_of_its_other_floors_and_report_nothing_there
 
 def test_a_floor_without_a_lift_has_none() -> None:
     floor = Floor(FloorEntry(site="a", level="L1", height_m=0.0), BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0))
-    assert floor.lift_at(np.zeros(2), 100.0) is None
+    assert not floor.lifts_at(np.zeros(2), 100.0)

@@ -143,6 +143,12 @@ class LiftWorld:
         self._looks = np.random.default_rng(7).integers(0, 256, (*self._stock.shape[:2], 32), np.uint8)
         self._bias_mps2 = self.rng.normal(0.0, 0.1)
 
+    def redraw(self, number: int, lifts: dict[str, tuple[Array, ...]]) -> None:
+        """Draw other lifts on a floor."""
+        floors = dict(self.localizer._floors)
+        floors[self.keys[number]] = replace(floors[self.keys[number]], lifts=lifts)
+        self.localizer.handle_floors(floors)
+
     @property
     def map_from_body(self) -> Array:
         """Truth, in the map of the robot's floor."""
