@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, UsageError
 from fleetmap.mapformat.building import AREAS, FLOORS
-from fleetmap.mapformat.floors import Building, Floor, FloorEntry, check_building, read_lifts
+from fleetmap.mapformat.floors import Building, Floor, FloorEntry, read_building, read_lifts
 from mapserver.store import Actor, MapStore
 
 
@@ -15,7 +15,7 @@ def keep_building(store: MapStore, building: Building, actor: Actor) -> Building
     Raises UsageError for an unknown site, one without a version or pose, one of another building, and repeated levels or heights.
     """
     try:
-        building = check_building(building)
+        building = read_building(to_json(building))
     except MapFormatError as error:
         raise UsageError(str(error)) from error
     sites = [floor.site for floor in building.floors]

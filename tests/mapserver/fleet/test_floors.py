@@ -71,9 +71,10 @@ def test_one_command_makes_floors_that_robots_get_signed(house: Path) -> None:
         (("hall-1=L1@0", "hall-2=L2@0"), "the same height_m"),
         (("hall-1=L1@0", "hall-1=L2@4"), "the same site"),
         (("hall-1=L1", "hall-2=L2@4"), "SITE=LEVEL@HEIGHT"),
+        (("hall-1=L1@0",), "length >= 2"),
     ],
 )
-def test_floors_that_cannot_be(house: Path, floors: tuple[str, str], words: str) -> None:
+def test_floors_that_cannot_be(house: Path, floors: tuple[str, ...], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         run(
             app,
@@ -138,3 +139,11 @@ def test_a_robot_may_fetch_the_maps_of_its_other_floors_and_report_nothing_there
 def test_a_floor_without_a_lift_has_none() -> None:
     floor = Floor(FloorEntry(site="a", level="L1", height_m=0.0), BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0))
     assert not floor.lifts_at(np.zeros(2), 100.0)
+
+
+@pytest.mark.parametrize("ring", ["[]", "[[0.0,0.0]]", "[[],[],[],[]]"])
+def test_a_lift_without_an_outline_is_refused(ring: str) -> None:
+    """A robot that measured its distance from it would stop."""
+    data = f'{{"features":[{{"geometry":{{"type":"Polygon","coordinates":[{ring}]}},"properties":{{"lift":"A"}}}}]}}'
+    with pytest.raises(MapFormatError, match="outline"):
+        read_lifts(data.encode(), BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0))
