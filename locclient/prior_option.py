@@ -32,4 +32,4 @@ def told_prior(told: InitialPoseMessage) -> PositionPrior:
     if told.heading_rad is None:
         sigmas[2] = np.inf
     map_from_base = se3(so3_exp(np.array([0.0, 0.0, told.heading_rad or 0.0])), np.array([*values[:2], 0.0]))
-    return PositionPrior(0, map_from_base, np.diag(sigmas**2), is_revisable=True)
+    return PositionPrior(0, map_from_base, np.diag(sigmas**2), is_revisable=True, floor="")

@@ -46,6 +46,9 @@ class PositionBoundTracker:
         self._known: tuple[int, Array] | None = None  # stamp and position of the last estimate with a pose
 
     def handle(self, estimate: Estimate) -> PositionBound:
+        if estimate.floor:  # another site's map, which says nothing of this one's tiles
+            self._known = None
+            return PositionBound()
         if estimate.map_from_body is not None and estimate.status in {Status.TRACKING, Status.DEGRADED}:
             self._known = (estimate.stamp_ns, estimate.map_from_body[:3, 3])
             odometry = estimate.odometry

@@ -38,6 +38,7 @@ class Belief:
     odom_from_body: Array
     fix_ns: int
     recall: float
+    floor: str = ""  # as of `Estimate`
 
     def carried_on(self, odom_from_body: Array) -> Array:
         return self.map_from_body @ se3_inverse(self.odom_from_body) @ odom_from_body
@@ -167,7 +168,7 @@ class OnsetRecorder:
         if estimate.map_from_body is None or estimate.cov_rot_trans is None or estimate.hypotheses:
             return
         claimed = (estimate.map_from_body, estimate.cov_rot_trans, odom_from_body)
-        self._belief = Belief(estimate.stamp_ns, *claimed, *self._fix)
+        self._belief = Belief(estimate.stamp_ns, *claimed, *self._fix, estimate.floor)
 
     def _onset(self, stamp_ns: int, frame: RectifiedFrame, odom_from_body: Array, view: int) -> Onset:
         before = [self._nearest(stamp_ns - age_ns, stamp_ns) for age_ns in _BEFORE_NS]

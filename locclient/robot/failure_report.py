@@ -129,7 +129,8 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
     """Return the message. wall_ns: the robot's wall clock when the failure began."""
     failure, onset, image = context.failure, context.onset, context.failure.image
     belief, map_from_base, is_own = onset.belief, None, not failure.estimate.floor
-    if onset.map_from_body is not None and is_own:  # the server has no place for one on another site's floor
+    # The server has no place for a pose on another site's floor.
+    if onset.map_from_body is not None and is_own and not (belief and belief.floor):
         map_from_base = onset.map_from_body @ se3_inverse(profile.base_from_body)
     matches = _matches(context, profile)
     seen = None if matches is None else int((matches[2] >= 0).sum())
@@ -185,9 +186,11 @@ def _tile(context: FailureContext, map_from_base: Array | None) -> tuple[int, in
 
 
 def _matches(context: FailureContext, profile: RobotProfile) -> Matches | None:
-    """Return expected matches at the believed pose, in the image without a fix; None without a pose or a map."""
+    """Return expected matches at the believed pose, in the image without a fix; None without a pose or its floor's map."""
     onset, running = context.unmatched, context.running
     if onset.map_from_body is None or running is None:
+        return None
+    if onset.belief is not None and onset.belief.floor != context.failure.estimate.floor:
         return None
     camera, body_from_cam = profile.mounted(onset.view)
     map_from_cam = onset.map_from_body @ body_from_cam

@@ -32,7 +32,7 @@ class DockCheck:
         """
         self._follow(estimate)
         was_tracking, self._was_tracking = self._was_tracking, estimate.status is Status.TRACKING
-        exact = [prior for prior in priors if _is_exact(prior)]
+        exact = [prior for prior in priors if _is_exact(prior) and prior.floor in (None, estimate.floor)]
         if not exact:
             return None
         arrives, self._path_m = self._path_m > _LEFT_M, 0.0

@@ -322,6 +322,7 @@ def test_a_persons_word_is_a_prior_that_fixes_may_outweigh(
     assert len(world.sync.priors) == is_taken
     for prior in world.sync.priors:
         assert prior.is_revisable
+        assert prior.floor == "", "the server knows the robot's own site alone"
         assert prior.map_from_base[:3, 3].tolist() == [3.0, -2.0, 0.0]
         assert np.sqrt(np.diag(prior.cov_rot_trans))[3:5].tolist() == [0.5, 0.5]
         heading_rad = changes.get("heading_rad")

@@ -88,6 +88,14 @@ def test_a_lost_robot_holds_the_tiles_that_it_can_have_come_to(row: tuple[Path, 
     assert (float(found.position_map_m[0]), found.radius_m) == (140.0, 0.0)  # type: ignore[index]
 
 
+def test_a_place_on_another_floor_bounds_no_tiles_of_its_own_site() -> None:
+    """Coordinates there mean nothing here; without all tiles its own floor would not compete with an equal one."""
+    tracker = PositionBoundTracker(SETTINGS)
+    tracker.handle(estimate(0.0, x_m=40.0))
+    assert tracker.handle(replace(estimate(1.0, x_m=140.0), floor="hall-2")).position_map_m is None
+    assert tracker.handle(estimate(2.0, Status.LOST, known=False)).position_map_m is None
+
+
 def test_bad_tiles_are_left_out(row: tuple[Path, MapStore], tmp_path: Path) -> None:
     folder, store = row
     manifest = store.manifest("row", 1)

@@ -40,6 +40,11 @@ def test_the_error_is_that_of_the_base() -> None:
     assert arrived(DockCheck(BASE_FROM_BODY), 1.0, 2.0, dock(1.0, 2.3, 0.7)) == pytest.approx(0.5)
 
 
+def test_a_dock_of_another_floor_says_nothing_here() -> None:
+    elsewhere = replace(dock(1.0, 2.3, 0.7), floor="hall-2")
+    assert arrived(DockCheck(BASE_FROM_BODY), 1.0, 2.0, elsewhere) is None
+
+
 def test_an_arrival_counts_once_and_the_next_one_again() -> None:
     watch = DockCheck(np.eye(4))
     assert arrived(watch, 1.0, 0.0, dock(1.0, 0.1)) == pytest.approx(0.1)

@@ -92,6 +92,10 @@ def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
     assert [picture.kind for picture in report.thumbnails] == ["frame", "frame", "frame", "matches"]
     map_from_cam = report.map_from_base.target_from_source @ report.camera.base_from_cam.target_from_source
     np.testing.assert_allclose(map_from_cam, told[0].onset.map_from_body @ rig.body_from_cam, atol=1e-9)
+    belief = replace(told[0].onset.belief, floor="hall-2")
+    onset = replace(told[0].onset, belief=belief)
+    other = failure_report(replace(told[0], onset=onset, unmatched=onset), profile, report_id="ab" * 16, wall_ns=7)
+    assert (other.map_from_base, other.tile, other.landmarks_expected) == (None, None, None), "no place on this site"
     assert report.camera.size_px == (rig.camera.width_px, rig.camera.height_px)
     assert (*report.camera.centre_px, report.camera.focal_px) == (
         rig.camera.cx_px,
