@@ -249,7 +249,7 @@ class FleetAdapter:
 
     def _initialize(self, action: Action, given: dict[str, Any]) -> None:
         now, section = self._localization, self._section
-        floor = given["mapId"] if given["mapId"] in self._floor_versions else ""
+        floor = given["mapId"] if given["mapId"] in self._floor_versions.keys() - {self.map_id} else ""
         fleet_from_map = self._fleet_from_map
         if section.frame == "building" and self._floors:
             fleet_from_map = self._floors[floor].frame.building_from_map
@@ -358,6 +358,7 @@ class FleetAdapter:
             found["maps"] += [
                 {"mapId": site, "mapVersion": str(number), "mapStatus": "ENABLED"}
                 for site, number in self._floor_versions.items()
+                if site != self.map_id
             ]
             place = now.mobile_robot_position(self.map_id, self._lost_radius_m)
             if place is not None:

@@ -97,7 +97,9 @@ class Localization:
         map_id: of the robot's own site; other floors are called by their sites.
         """
         place, is_localized = self.position, self.is_localized and not self.is_silent
-        if place is None:
+        if (
+            place is None or place.floor == map_id
+        ):  # a configured id that is another floor's site: fleet managers would take it for the own
             return None
         found: dict[str, object] = {
             "x": place.x_m,

@@ -182,6 +182,10 @@ def test_each_floor_has_its_map_id() -> None:
     assert adapter.ask("initializePosition", "b", mapId="hall-3", **given)["actionStatus"] == "FAILED"
     here, other = Position(1.0, 2.0, 0.0), Position(1.0, 2.0, 0.0, floor="hall-2")
     assert here.away_from(other)[0] == np.inf
+    adapter.map_id = "hall-2"  # as configured for the own site: it names one map
+    assert "mobileRobotPosition" not in adapter.said()
+    assert adapter.ask("initializePosition", "c", mapId="hall-2", **given)["actionStatus"] == "RUNNING"
+    assert adapter.priors[-1].floor == ""
 
 
 def test_positions_are_in_the_building_where_that_is_asked_for() -> None:
