@@ -328,7 +328,8 @@ def _admission(
         result = checked(
             first, lambda: tools.progress("examination", min(next(done), total - 1), total), tools.executor, begun
         )
-        result = with_further_views(result, recording)
+        corrected = replace(recording, calibration=with_other_views(result.rig, recording.calibration))
+        result = with_further_views(result, corrected)
         tools.at("examination", total, total)
         for remark in result.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)

@@ -7,18 +7,25 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from fleetmap.geometry import se3_exp
+from fleetmap.recordings import Recording
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from fleetsim.recorder import Order, prepare
+from mapserver.doctor import Finding
+from mapserver.drafting.admission import CheckedRecording
 from mapserver.drafting.draft_evidence import JudgedSession, ProbedFrame
 from mapserver.drafting.sensor_subset import with_other_views
-from mapserver.drafting.survey_recordings import OpenRecordings, RecordingOptions
+from mapserver.drafting.survey_recordings import OpenRecordings, RecordingOptions, _admission
+from mapserver.quality.figures import RigEvidence
 from mapserver.survey.keyframes.keyframes import make_keyframes
 from mapserver.survey.keyframes.rig_views import body_from_views, other_views
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.survey_inputs import SurveyTools
 from support.recordings.rig_samples import images_of
 
 
@@ -111,3 +118,28 @@ def test_all_views_of_a_frame_either_judge_a_draft_or_choose_its_landmarks(recor
     assert not {number for number, _ in asked} & {number for number, _ in judging}
     assert {view for _, view in judging} == {0, 1} and len(judging) == 2 * len({number for number, _ in judging})
     assert {0, 19} <= {number for number, _ in asked}
+
+
+def test_further_views_are_examined_beside_the_corrected_first_one(
+    recorded: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A plate of cameras that is turned as a whole agrees with itself, and no longer once its first view is corrected."""
+    turn, seen = se3_exp(np.array([0, 0, 0.02, 0, 0, 0])), list[RigCalibration]()
+
+    def checked(recording: Recording, *_: object) -> CheckedRecording:
+        rig = recording.calibration
+        turned = tuple(replace(c, body_from_cam=turn @ c.body_from_cam) for c in rig.cameras)
+        return CheckedRecording(replace(rig, cameras=turned), [], RigEvidence(""), {})
+
+    def further(recording: Recording) -> list[Finding]:
+        seen.append(recording.calibration)
+        return []
+
+    monkeypatch.setattr("mapserver.drafting.survey_recordings.checked", checked)
+    monkeypatch.setattr("mapserver.drafting.admission.further_findings", further)
+    with OpenRecordings(RecordingOptions(), tmp_path) as reading:
+        _admission(recorded, reading, Console(quiet=True), needs_truth=False, settings=None, tools=SurveyTools())
+        with reading.open(recorded) as (recording, _):
+            whole = recording.calibration.cameras
+    for camera, nominal, motion in zip(seen[0].cameras, whole, (turn, turn, np.eye(4), np.eye(4)), strict=True):
+        np.testing.assert_allclose(camera.body_from_cam, motion @ nominal.body_from_cam)
