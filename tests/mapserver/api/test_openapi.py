@@ -24,7 +24,7 @@ from mapserver.api.guard import GuardSettings
 from mapserver.api.metrics import Metrics
 from mapserver.api.version_routes import ApiSettings
 from mapserver.drafting.job_lock import log_path
-from mapserver.fleet.building import align
+from mapserver.fleet.building import align, replace_areas
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.survey_requests import ask_for_survey
 from mapserver.floor_plan.pins import parse_pin
@@ -128,6 +128,7 @@ def test_no_question_breaks_the_server(tmp_path: Path, monkeypatch: pytest.Monke
         releases.start_canary(store, "hall", 1, 0.05)
         releases.roll_back(store, "hall")
         align(store, "hall", [parse_pin(pin) for pin in PINS], None, None, Actor("ada"))
+        replace_areas(store, "hall", AREAS, Actor("ada"), tag=None)
         fleet.take_health("hall", "r1", RobotHealth(site="hall", robot="r1", stamp_ns=5, version=1, status="LOST"))
         fleet.flush()
         init_here(store)
