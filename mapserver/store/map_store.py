@@ -278,7 +278,9 @@ class MapStore(StoreQueries):
                     raise ChangedError(
                         f"the areas of site {site} were changed meanwhile; load them anew, and make the change again"
                     )
-                if AREAS in files:
+                held = "SELECT 1 FROM site_files WHERE site = ? AND kind = ?"
+                has_areas = connection.execute(held, (site, AREAS)).fetchone() is not None
+                if AREAS in files and (has_areas or files[AREAS] is not None):  # none removed once more change nothing
                     connection.execute("DELETE FROM site_files WHERE site = ? AND kind = ?", (site, AREAS_BEFORE))
                     rename = "UPDATE site_files SET kind = ? WHERE site = ? AND kind = ?"
                     connection.execute(rename, (AREAS_BEFORE, site, AREAS))

@@ -112,6 +112,10 @@ def test_what_was_never_changed_cannot_be_undone(server: Server) -> None:
     check_problem(server.client.post(f"{AREAS}/undo", json=ADA), 409, "nothing to undo")
     put(server, drawn("a"))
     assert server.client.post(f"{AREAS}/undo", json=ADA).json()["features"] == []
+    put(server, drawn("a"))
+    for _ in range(2):  # removed, and none removed once more
+        assert server.client.delete(AREAS, params={"actor": "ada"}).status_code == 200
+    assert len(server.client.post(f"{AREAS}/undo", json=ADA).json()["features"]) == 1
 
 
 def test_every_part_of_an_area_to_forget_is_requested(server: Server) -> None:
