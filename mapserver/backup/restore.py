@@ -22,7 +22,7 @@ from mapserver.trust.signing import sign_ahead
 
 _NO_STORE = {"lock", "lost+found", _PART := ".restore"}
 _VERSIONS_AHEAD = 1000  # more than a site gets between a backup and the next restoration
-_ROOTS = 2  # those of an earlier restoration, and one more
+_ROOTS = 2  # beyond all that robots may know: one that the lost store made after its backup, and one more
 _LISTS_AHEAD = 100_000  # the same, of a timestamp each six hours and with each release
 _log = logging.getLogger(__name__)
 Progress = Callable[[int, int], None]
@@ -99,7 +99,7 @@ def restore(
                 with MapStore.open(part) as store:
                     words = f"snapshot {name}, of {snapshot.versions} versions"
                     store.note_restored(words, number * _VERSIONS_AHEAD, actor)
-                    lists = _sign(store, number)
+                    lists = _sign(store, number, target)
                 # The database last: until it is there, the folder is no store.
                 for path in sorted(part.iterdir(), key=lambda path: path.name.startswith("store.sqlite3")):
                     path.replace(folder / path.name)
@@ -117,14 +117,19 @@ def _check_room(folder: Path, needed: int) -> None:
         )
 
 
-def _sign(store: MapStore, number: int) -> Literal["none", "new", "ahead", "old"]:
-    if not SignedLists(store.folder).are_there:
+def _sign(store: MapStore, number: int, target: BackupTarget) -> Literal["none", "new", "ahead", "old"]:
+    lists = SignedLists(store.folder)
+    if not lists.are_there:
         return "none"
+    roots = max(target.known_root() - lists.newest("root"), 0) + _ROOTS
     try:
-        return sign_ahead(store, number * _LISTS_AHEAD, number * _ROOTS)
+        found = sign_ahead(store, number * _LISTS_AHEAD, roots)
     except FleetmapError as error:  # such as a key whose passphrase only the server's unit has
         _log.warning("the lists are not signed: %s", error)
         return "old"
+    if found == "new":
+        target.note_root(number, lists.newest("root"))
+    return found
 
 
 def verify(target: BackupTarget, progress: Progress = lambda done, total: None) -> BackupFindings:

@@ -162,6 +162,16 @@ class BackupTarget:
         self._put(f"{_RESTORES}/{number:06}", b"", mode="create")
         return number
 
+    def note_root(self, number: int, root: int) -> None:
+        """Keep the number of the newest root that a restoration signed."""
+        self._put(f"{_RESTORES}/{number:06}-root-{root}", b"")
+
+    def known_root(self) -> int:
+        """Return the newest root of all restorations, 0 without any."""
+        with self._errors():
+            found = [re.fullmatch(r"[0-9]{6}-root-([0-9]{1,4})", name) for name, _, _ in self._listed(_RESTORES)]
+        return max((int(name[1]) for name in found if name is not None), default=0)
+
     def _listed(self, prefix: str) -> Iterator[tuple[str, int, datetime]]:
         for batch in obstore.list(self._store, prefix):
             for meta in batch:

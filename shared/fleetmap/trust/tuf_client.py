@@ -20,7 +20,7 @@ from fleetmap.errors import FleetmapError, UnreachableError, UntrustedError
 from fleetmap.trust.site_list import manifest_target
 
 CLIENT_LIMITS = UpdaterConfig(
-    max_root_rotations=64,
+    max_root_rotations=1024,  # since the robot was made; a restoration of the server's store takes two
     max_delegations=4,
     root_max_length=64_000,
     timestamp_max_length=4_000,
