@@ -105,7 +105,7 @@ def prepared(seed: int, day: int, name: str, run: Run, movers: tuple[Mover, ...]
     return session
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=3)
 def surveyed_view(seed: int) -> MapView:
     """The map that robots get of a survey on day 0, when every aisle looks like every other.
 
