@@ -14,7 +14,8 @@ from mapserver.store.files import make_folder
 
 MOST_BYTES = 64 << 30  # an hour of two cameras
 _PART = ".upload.part"
-_KEPT_SHARE, _KEPT_BYTES = 10, 20 << 30  # a build needs space too: a tenth of the disk, but no more than that
+# A build needs space too, about a gigabyte for each ten minutes of two cameras: a tenth of the disk, but no more than that.
+_KEPT_SHARE, _KEPT_BYTES = 10, 4 << 30
 
 
 def remove_unfinished(folder: Path) -> None:

@@ -1,5 +1,6 @@
-"""Places of a store's content and metadata: its folder, an object store, PostgreSQL."""
+"""Places of a store's content and metadata: its folder, an object store, PostgreSQL. Disks have room, whatever this machine's have."""
 
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -8,6 +9,19 @@ import pytest
 from mapserver.store.places import Places, write_places
 from support.storage.postgres_server import PostgresServer, postgres_server
 from support.storage.s3_server import KEYS, s3_server
+
+
+@pytest.fixture(autouse=True)
+def roomy_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A terabyte is free on every disk that this process asks for."""
+    statvfs = os.statvfs
+
+    def measured(path: int | Path) -> os.statvfs_result:
+        found = list(statvfs(path))
+        found[1:5] = [1, 2 << 40, 1 << 40, 1 << 40]  # bytes: a block's size, all, free, free for us
+        return os.statvfs_result(found)
+
+    monkeypatch.setattr(os, "statvfs", measured)
 
 
 @pytest.fixture(scope="session")

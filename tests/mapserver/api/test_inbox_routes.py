@@ -164,7 +164,7 @@ def test_a_full_disk_refuses(server: Server, lab: Path, monkeypatch: pytest.Monk
     with monkeypatch.context() as context:
         context.setattr(os, "write", filled)
         check_problem(server.client.put(f"{INBOX}/monday.mcap", params=ADA, content=b"x"), 503, "No space left")
-    free[0] = (10 << 30) + 100
+    free[0] = (4 << 30) + 100
     check_problem(server.client.put(f"{INBOX}/monday.mcap", params=ADA, content=bytes(101)), 409, "is too large")
     check_problem(
         server.client.put(f"{INBOX}/monday.mcap", params=ADA, content=iter([bytes(101)])), 409, "is too large"

@@ -28,7 +28,6 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.serving import webhook
 from mapserver.serving.webhook import AlertWatch, Webhook, check_address
 from mapserver.store import DiskSpace, MapStore
-from mapserver.store.queries import StoreQueries
 from support.fleet.contracts_documents import REPOSITORY
 from support.fleet.webhook_receiver import receiver
 from support.storage.clock import Clock
@@ -51,8 +50,7 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def store(tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> Iterator[MapStore]:
-    monkeypatch.setattr(StoreQueries, "disk_space", lambda _: DiskSpace(10**12, 10**12))  # whatever this machine has
+def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
     with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as opened:
         for seed in range(2):
             save_sample_draft(opened, seed=seed)
