@@ -84,7 +84,8 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
     check_imu_units(imu, str(parts.path))
     recording = Recording(
         path=parts.path,
-        name=parts.name or parts.path.resolve().name,
+        # A file's name may be no UTF-8, which reports cannot hold.
+        name=(parts.name or parts.path.resolve().name).encode("utf-8", "backslashreplace").decode(),
         format=parts.format,
         sensor_set=_sensor_set(parts, imu),
         calibration=RigCalibration(
