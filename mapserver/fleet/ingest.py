@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import msgspec
 
 from fleetmap.config import Section
-from fleetmap.errors import FleetmapError
+from fleetmap.errors import FleetmapError, UnknownOutcomeError
 from fleetmap.messages import FailureKind, FailureReport, PoseMessage, RobotHealth
 from mapserver.fleet_statistics.clock_skew import server_time_ns
 from mapserver.fleet_statistics.health_stream import HealthStream
@@ -162,7 +162,9 @@ class Ingest:
             return bool(self._batch.counters or self._batch.last_reports)
 
     def flush(self) -> None:
-        """Write the counts to the disk. On error raises StoreError and keeps them for the next call."""
+        """Write the counts to the disk. On error raises StoreError and keeps them for the next call, unless the store may have them:
+        what is rather lost than counted twice are those since the last call.
+        """
         with self._flushing:
             with self._lock:
                 batch, self._batch = self._batch, FleetBatch()
@@ -170,6 +172,8 @@ class Ingest:
                 return
             try:
                 self._store.fleet.add(batch)
+            except UnknownOutcomeError:
+                raise
             except FleetmapError:
                 with self._lock:
                     self._put_back(batch)

@@ -24,7 +24,7 @@ from sqlalchemy import Connection as Session
 from sqlalchemy import CursorResult, create_engine, make_url
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
-from fleetmap.errors import NewerFormatError, StoreError, UsageError
+from fleetmap.errors import NewerFormatError, StoreError, UnknownOutcomeError, UsageError
 from mapserver.store.database import SqliteTransactions
 from mapserver.store.files import take_lock
 from mapserver.store.schema import FORMAT, STATEMENTS, TABLES
@@ -141,7 +141,7 @@ class PostgresTransactions(Transactions):
                 if outcome == "aborted":
                     raise
                 if outcome != "committed":
-                    raise StoreError(
+                    raise UnknownOutcomeError(
                         f"the connection to {self._name} was lost at the end of a change, and the database does not say "
                         "whether it is made; see whether it is before you make it again"
                     ) from error

@@ -69,6 +69,10 @@ class StoreError(FleetmapError):
     """A store that cannot be opened, read or written."""
 
 
+class UnknownOutcomeError(StoreError):
+    """A change of which nobody knows whether the store has it."""
+
+
 class LinkError(FleetmapError):
     """The other side cannot be reached, refuses or sends an invalid reply."""
 

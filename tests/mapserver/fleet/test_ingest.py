@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from msgspec.structs import replace as replace_struct
 
-from fleetmap.errors import LinkError, StoreError
+from fleetmap.errors import LinkError, StoreError, UnknownOutcomeError
 from fleetmap.messages import FailureReport, Placement, PoseMessage, RobotHealth
 from mapserver import releases
 from mapserver.dashboard.fleet_health import HealthData
@@ -194,6 +194,32 @@ def test_what_comes_again_is_counted_once(site: Site) -> None:
     assert site.store.fleet.counters("lab", "robot") == before
     rows = site.store.fleet.failures(FailureFilter())
     assert len(rows) == len({(row.robot, row.failure_id) for row in rows}) == len(reports)
+
+
+@pytest.mark.parametrize("fault", [StoreError("full"), UnknownOutcomeError("lost at the end of a change")])
+def test_counts_come_again_unless_the_store_may_have_them(
+    site: Site, monkeypatch: pytest.MonkeyPatch, fault: StoreError
+) -> None:
+    site.run(made(site, 2), 120)
+    before = site.store.fleet.counters("lab", "robot")
+    add = type(site.store.fleet).add
+
+    def cut(*given: object) -> None:
+        if isinstance(fault, UnknownOutcomeError):
+            add(*given)
+        raise fault
+
+    for second in range(4):
+        site.set_ns(START_NS + (121 + second) * NS)
+        health = RobotHealth(site="lab", robot="r0", stamp_ns=(500 + second) * NS, version=1, status="TRACKING")
+        site.fleet.take_health("lab", "r0", health)
+    with monkeypatch.context() as patch:
+        patch.setattr(type(site.store.fleet), "add", cut)
+        with pytest.raises(StoreError):
+            site.fleet.flush()
+    site.fleet.flush()
+    counted = site.store.fleet.counters("lab", "robot")["lab", "r0"].reports - before["lab", "r0"].reports
+    assert counted == 4
 
 
 def test_failures_happen_when_the_servers_clock_says(site: Site) -> None:
