@@ -254,7 +254,8 @@ class Fleet:
             for info in others:
                 known = self._robots.get((info.site, info.robot))
                 if known is None or info.last_seen_ns > known.seen_ns:  # by another server
-                    self._robots[info.site, info.robot] = _stored(info)
+                    fresh = self._robots[info.site, info.robot] = _stored(info)
+                    fresh.copied_ns = None if known is None else known.copied_ns
                     there.add((info.site, info.robot))
             for key, robot in list(self._robots.items()):
                 robot.is_present = key in there

@@ -80,16 +80,15 @@ class BusGuard:
     def look(self) -> list[str]:
         """Return suspicious connections, and log new ones: unknown certificates, one certificate on two machines.
 
-        `copied` names the latter's robots. A robot that lost its connection counts twice until the old lease ends; only a
-        longer double connection is reported.
+        `copied` names the latter's robots; the connections of all servers of the store count. A robot that lost its connection counts
+        twice until the old lease ends; only a longer double connection is reported. Raises StoreError.
         """
-        found, now_s = [], self._clock_s()
+        here, now_s = self._bus.certificates(), self._clock_s()
+        unknown = (name[:64] for name in here if self.access.holder(name) is None)
+        found = [f"certificate {name!r} is connected but not enrolled; it may send nothing" for name in unknown]
         sessions: Counter[tuple[str, str]] = Counter()
-        for name in self._bus.certificates():
-            holder = self.access.holder(name)
-            if holder is None:
-                found.append(f"certificate {name[:64]!r} is connected but not enrolled; it may send nothing")
-            elif holder.robot:
+        for name in (*here, *self.register.connected_elsewhere(here)):
+            if (holder := self.access.holder(name)) is not None and holder.robot:
                 sessions[holder.site, holder.robot] += 1
         self._twice_s = {who: self._twice_s.get(who, now_s) for who, count in sessions.items() if count > 1}
         self.copied = frozenset(who for who, since_s in self._twice_s.items() if now_s - since_s >= COPIED_AFTER_S)

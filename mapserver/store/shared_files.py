@@ -1,20 +1,34 @@
-"""Files in the folders of servers that share a store in PostgreSQL: signed lists, enrolled robots. The database has the present ones."""
+"""Files in the folders of servers that share a store in PostgreSQL: signed lists, enrolled robots. The database has the present ones.
 
+Beside them it has who is connected to which server.
+"""
+
+import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import msgspec
+
+from fleetmap.encoding import to_json
 from fleetmap.errors import BusyError, disk_errors
 from fleetmap.files import write_atomically
 from fleetmap.mapformat import sha256_hex
 from mapserver.store.files import is_plain_file, make_folder
-from mapserver.store.transactions import Transactions
+from mapserver.store.transactions import Connection, Transactions
 
 SHARED = {"trust": "*.json", "keys": "robots.json"}
 """By folder, what its files are called."""
 _LATE = ("1.root.json", "timestamp.json")  # they announce the others
+_CONNECTIONS = "connections"  # under each server's own name
+_PRESENT_NS = 12_000_000_000  # two of its turns; then the server is gone
+
+
+class _Connections(msgspec.Struct, frozen=True):
+    stamp_ns: int
+    certificates: list[str]
 
 
 class SharedFiles:
@@ -22,6 +36,7 @@ class SharedFiles:
 
     def __init__(self, root: Path, transactions: Transactions) -> None:
         self._root, self._transactions = root, transactions
+        self._server = f"{_CONNECTIONS}/{secrets.token_hex(8)}"
 
     @contextmanager
     def changing(self, folder: str) -> Iterator[Path]:
@@ -49,6 +64,26 @@ class SharedFiles:
                 with suppress(BusyError), self._transactions.locked(f"{folder}/lock", waits=False):
                     self._take(folder)
 
+    def connected(self, here: Sequence[str]) -> list[str]:
+        """Tell the other servers which certificates are connected to this one; return those of their connections.
+
+        To be called every five seconds; a server that does not is one without connections. Raises StoreError.
+        """
+        if not self._transactions.is_shared:
+            return []
+        now_ns, found, gone = self._transactions.now_ns(), list[str](), list[tuple[str]]()
+        query = "SELECT name, data FROM shared_files WHERE name LIKE ? AND name != ?"
+        for row in self._transactions.query(query, (f"{_CONNECTIONS}/%", self._server)):
+            told = msgspec.json.decode(bytes(row["data"]), type=_Connections)
+            if abs(now_ns - told.stamp_ns) <= _PRESENT_NS:
+                found += told.certificates
+            else:
+                gone.append((row["name"],))
+        with self._transactions.write(durable=False) as connection:
+            _keep(connection, self._server, to_json(_Connections(now_ns, list(here))))
+            connection.executemany("DELETE FROM shared_files WHERE name = ?", gone)
+        return found
+
     def _take(self, folder: str) -> None:
         differing = self._differing(folder)
         for name in sorted(differing, key=lambda name: (name in _LATE and 1 + _LATE.index(name), name)):
@@ -67,11 +102,7 @@ class SharedFiles:
             for name in there.keys() - here.keys():
                 connection.execute("DELETE FROM shared_files WHERE name = ?", (f"{folder}/{name}",))
             for name in (name for name in here if here[name] != there.get(name)):
-                connection.execute(
-                    """INSERT INTO shared_files (name, sha256, data) VALUES (?, ?, ?)
-                       ON CONFLICT (name) DO UPDATE SET sha256 = excluded.sha256, data = excluded.data""",
-                    (f"{folder}/{name}", here[name], (draft / folder / name).read_bytes()),
-                )
+                _keep(connection, f"{folder}/{name}", (draft / folder / name).read_bytes())
 
     def _differing(self, folder: str) -> dict[str, bool]:
         """Return names of files that are not as in the database, and whether they are there; none before the first change."""
@@ -87,3 +118,11 @@ class SharedFiles:
     def _there(self, folder: str) -> dict[str, str]:
         rows = self._transactions.query("SELECT name, sha256 FROM shared_files")
         return {name: row["sha256"] for row in rows for at, _, name in [row["name"].partition("/")] if at == folder}
+
+
+def _keep(connection: Connection, name: str, data: bytes) -> None:
+    connection.execute(
+        """INSERT INTO shared_files (name, sha256, data) VALUES (?, ?, ?)
+           ON CONFLICT (name) DO UPDATE SET sha256 = excluded.sha256, data = excluded.data""",
+        (name, sha256_hex(data), data),
+    )

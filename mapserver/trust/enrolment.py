@@ -240,6 +240,10 @@ class RobotRegister:
         """Log in the site's history that a robot's certificate was on two connections."""
         self._store.audit("robot connected twice", f"{robot}: was its certificate copied?", site=site)
 
+    def connected_elsewhere(self, here: Sequence[str]) -> list[str]:
+        """Return the certificates connected to other servers of the store, which learn of those connected here. Raises StoreError."""
+        return self._store.files.connected(here)
+
     def survey_tls(self) -> TlsFiles:
         """Return files for a survey of this account on the bus; StateError if the store has no authorities."""
         own = self._keys / "survey.pem"

@@ -14,9 +14,11 @@ import pytest
 from sqlalchemy import Connection as Session
 from sqlalchemy.exc import OperationalError
 
+from fleetmap.access import Access, Holder
 from fleetmap.errors import BusyError, NewerFormatError, StoreError, UsageError
 from fleetmap.messages import RobotHealth
 from mapserver.fleet.fleet import Fleet
+from mapserver.serving.bus_access import BusGuard
 from mapserver.store import MapStore, chain_faults
 from mapserver.store.places import Places, read_places, write_places
 from mapserver.store.postgres import PostgresTransactions
@@ -24,7 +26,9 @@ from mapserver.store.rows import NOBODY, LogEntry
 from mapserver.store.schema import FORMAT
 from mapserver.store.transactions import Transactions
 from mapserver.trust import SignedLists, init_here
+from mapserver.trust.enrolment import RobotRegister
 from mapserver.trust.signing import update_lists
+from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import publish_samples, save_sample_draft
 from support.storage.postgres_server import PostgresServer
 
@@ -175,6 +179,51 @@ def test_robots_of_another_server_are_known(folders: tuple[Path, Path]) -> None:
         assert [(robot.robot, robot.version, robot.is_present) for robot in there.robots()] == [("r1", 1, True)]
         there.take_presence([])
         assert [robot.is_present for robot in there.robots()] == [False], "it reports to nobody any more"
+
+
+def test_a_certificate_on_two_servers_is_told_by_both(folders: tuple[Path, Path]) -> None:
+    """Not where a robot only changed from one to the other, nor of a server that was killed since."""
+    with MapStore.open(folders[0]) as store, MapStore.open(folders[1]) as other:
+        access, clock = Access([Holder("r1.0123", "lab", "r1")]), {"s": 0.0}
+        stores, hubs = (store, other), (MemoryHub(), MemoryHub())
+        for each in stores:
+            each._transactions.now_ns = lambda: round(clock["s"] * 1e9)
+
+        def guard(number: int) -> BusGuard:
+            found = BusGuard(RobotRegister(stores[number]), MemoryBus(hubs[number]), lambda: clock["s"])
+            found.access = access
+            return found
+
+        guards = [guard(0), guard(1)]
+
+        def told(seconds: float, looking: list[BusGuard]) -> list[bool]:
+            for _ in range(round(seconds / 5)):
+                clock["s"] += 5.0
+                for each in looking:
+                    each.look()
+            return [bool(each.copied) for each in looking]
+
+        robot = MemoryBus(hubs[0], "r1.0123")
+        assert told(30, guards) == [False, False]
+        with MemoryBus(hubs[1], "r1.0123"), MemoryBus(hubs[1], "stranger"):
+            assert told(15, guards) == [False, False], "the old connection may count still"
+            assert told(15, guards) == [True, True]
+            assert not any("stranger" in words for words in guards[0].look()), "its own server says so"
+            there = Fleet(other)
+            there.take_question("lab", "r1")
+            there.take_copied(guards[1].copied)
+            here = Fleet(store)
+            here.take_health("lab", "r1", RobotHealth(site="lab", robot="r1", stamp_ns=1, status="TRACKING", version=1))
+            here.flush()
+            there.take_presence([])
+            assert [status.is_copied for status in there.robots()] == [True], "whichever server heard it last"
+            robot.close()
+            assert told(5, guards) == [False, False]
+        killed = MemoryBus(hubs[0], "r1.0123")
+        told(5, guards)
+        with MemoryBus(hubs[1], "r1.0123"):
+            assert told(40, guards[1:]) == [False]
+        killed.close()
 
 
 def test_counts_go_to_no_other_key(folders: tuple[Path, Path]) -> None:
