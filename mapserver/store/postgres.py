@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from sqlalchemy import Connection as Session
-from sqlalchemy import CursorResult, create_engine, make_url
+from sqlalchemy import CursorResult, create_engine, event, make_url
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from fleetmap.errors import NewerFormatError, StoreError, UnknownOutcomeError, UsageError
@@ -77,11 +77,8 @@ class PostgresTransactions(Transactions):
             raise UsageError(
                 f"{self._name}: metadata can be in PostgreSQL alone; write the URL like postgresql://user@host/name"
             )
-        mode = named.query.get("sslmode", "disable")
-        if mode not in ("disable", "verify-full") or named.query.keys() - {"sslmode"}:
-            words = "sslmode=disable or sslmode=verify-full; a password belongs before the host or into PGPASSWORD"
-            raise UsageError(f"{self._name}: after its ? an URL may have {words}")
-        named = named.difference_update_query(["sslmode"]).set(drivername="postgresql+pg8000")
+        tls = self._tls(**named.query)
+        named = named.set(query={}, drivername="postgresql+pg8000")
         self._engine = create_engine(
             named if named.password else named.set(password=os.environ.get("PGPASSWORD")),
             isolation_level="AUTOCOMMIT",
@@ -90,9 +87,10 @@ class PostgresTransactions(Transactions):
                 "timeout": _ANSWER_WITHIN_S,
                 "startup_params": {"options": f"{_KEEPALIVE} {_WAITS}"},
                 "application_name": "fleetmap",
-                "ssl_context": ssl.create_default_context() if mode == "verify-full" else None,
+                "ssl_context": tls,
             },
         )
+        event.listen(self._engine, "do_connect", _connect)
         self._lock = threading.RLock()
         self._session: Session | None = None
         self._writing_thread: int | None = None
@@ -259,6 +257,22 @@ class PostgresTransactions(Transactions):
                 f"{self._name} has store format {number}, this fleetmap reads up to {FORMAT}; update fleetmap to open it"
             )
 
+    def _tls(self, sslmode: Any = "prefer", sslrootcert: Any = None, **others: object) -> ssl.SSLContext | bool | None:
+        """Return the driver's setting for a URL's query: None for TLS, unchecked, if the server has it; False for none."""
+        if sslmode not in ("disable", "prefer", "verify-full") or others or (sslrootcert and sslmode != "verify-full"):
+            words = "sslmode=disable, sslmode=prefer or sslmode=verify-full, the last with &sslrootcert=FILE for an authority of your own"
+            raise UsageError(
+                f"{self._name}: after its ? a URL may have {words}; a password belongs before the host or into PGPASSWORD"
+            )
+        if sslmode != "verify-full":
+            return False if sslmode == "disable" else None
+        try:
+            return ssl.create_default_context(cafile=sslrootcert)
+        except OSError as error:
+            raise UsageError(
+                f"{self._name}: sslrootcert={sslrootcert} cannot be used ({error}); name a PEM file with certificates of authorities"
+            ) from error
+
     def _has_tables(self) -> bool:
         return bool(self.query("SELECT to_regclass('store_format')::text found")[0]["found"])
 
@@ -304,6 +318,18 @@ class PostgresTransactions(Transactions):
         except SQLAlchemyError as error:
             reason = str(getattr(error, "orig", error)).replace("\n", " ")
             raise StoreError(f"{self._name} cannot be {done} ({reason}); check the database and the network") from error
+
+
+def _connect(dialect: Any, _: object, words: Any, options: Any) -> Any:
+    """Connect as usual; the driver lets faults of TLS through as they are."""
+    try:
+        return dialect.connect(*words, **options)
+    except ssl.SSLCertVerificationError as error:
+        words = f"its certificate is refused: {error.verify_message.rstrip('.')}"
+        advice = "is it made for the URL's host, and is its authority in sslrootcert=FILE?"
+        raise dialect.loaded_dbapi.InterfaceError(f"{words}; {advice}") from error
+    except OSError as error:
+        raise dialect.loaded_dbapi.InterfaceError(str(error)) from error
 
 
 class _Translating:

@@ -8,6 +8,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
@@ -26,6 +27,7 @@ from mapserver.store.rows import NOBODY, LogEntry
 from mapserver.store.schema import FORMAT
 from mapserver.store.transactions import Transactions
 from mapserver.trust import SignedLists, init_here
+from mapserver.trust.authorities import Authorities
 from mapserver.trust.enrolment import RobotRegister
 from mapserver.trust.signing import update_lists
 from support.fleet.memory_bus import MemoryBus, MemoryHub
@@ -366,3 +368,48 @@ def test_a_killed_writer_holds_nothing(folders: tuple[Path, Path]) -> None:
     with MapStore.open(folders[0]) as store:
         assert save_sample_draft(store, seed=5) == 2
         store.collect_garbage()
+
+
+def test_a_connection_by_tls_is_checked_when_asked_for(tmp_path: Path, postgres: PostgresServer) -> None:
+    """With a private authority, as most databases of a site have; the certificate is for 127.0.0.1."""
+    for name in ("right", "wrong"):
+        Authorities(tmp_path / name, datetime.now(UTC)).init(["127.0.0.1"], None, None)
+    url, right = postgres.database(), f"sslrootcert={tmp_path}/right/servers-ca.crt"
+
+    def ciphers(words: str, address: str = url) -> list[object]:
+        with closing(PostgresTransactions(f"{address}?{words}", lambda: 1, create=True)) as opened:
+            return [
+                row["cipher"] for row in opened.query("SELECT cipher FROM pg_stat_ssl WHERE pid = pg_backend_pid()")
+            ]
+
+    with pytest.raises(StoreError, match="refuses SSL"):
+        ciphers(f"sslmode=verify-full&{right}")
+    postgres.stop()
+    postgres.start(tmp_path / "right" / "server.pem")
+    try:
+        (checked,) = ciphers(f"sslmode=verify-full&{right}")
+        assert checked
+        assert ciphers("sslmode=prefer") == ciphers("") == [checked], "unchecked"
+        assert ciphers("sslmode=disable") == [None]
+        for words, address in (
+            ("sslmode=verify-full", url),  # not the system's
+            (f"sslmode=verify-full&{right.replace('right', 'wrong')}", url),
+            (f"sslmode=verify-full&{right}", url.replace("127.0.0.1", "localhost")),
+        ):
+            with pytest.raises(StoreError, match=r"certificate is refused.*sslrootcert") as refused:
+                ciphers(words, address)
+            assert "127.0.0.1" in str(refused.value) or "localhost" in str(refused.value)
+        for words in ("sslmode=verify-full&sslrootcert=/none", f"sslmode=verify-full&sslrootcert={__file__}"):
+            with pytest.raises(UsageError, match="sslrootcert"):
+                ciphers(words)
+        with pytest.raises(UsageError, match="sslmode=verify-full"):
+            ciphers(right)
+        with closing(PostgresTransactions(f"{url}?sslmode=verify-full&{right}", lambda: 1)) as opened:
+            postgres.stop()
+            with pytest.raises(StoreError, match="check the database"):
+                opened.query("SELECT 1")
+            postgres.start(tmp_path / "right" / "server.pem")
+            assert opened.query("SELECT 1 one") == [{"one": 1}]
+    finally:
+        postgres.stop()
+        postgres.start()

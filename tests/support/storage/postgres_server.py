@@ -31,10 +31,16 @@ class PostgresServer:
         self._run("initdb", "-D", str(folder / "data"), "-A", "trust", "-U", "fleet", "--no-sync", "-E", "UTF8")
         self.start()
 
-    def start(self) -> None:
-        """Start it as a process that ends with this one, even if this one is killed."""
+    def start(self, certificate: Path | None = None) -> None:
+        """Start it as a process that ends with this one, even if this one is killed. certificate: with its key, for TLS."""
         become = ["--reuid", "postgres", "--regid", "postgres", "--clear-groups"] if self._account else []
         settings = [f"port={self._port}", "listen_addresses=127.0.0.1", "unix_socket_directories=", "fsync=off"]
+        if certificate is not None:
+            own = shutil.copy(certificate, self._folder / "data" / "server.pem")
+            own.chmod(0o600)
+            if self._account:
+                shutil.chown(own, "postgres", "postgres")
+            settings += ["ssl=on", f"ssl_cert_file={own}", f"ssl_key_file={own}"]
         command = [
             "setpriv",
             *become,
