@@ -189,7 +189,7 @@ def rolling_shutter(camera: CameraCalibration, imu: ImuSamples) -> list[Finding]
     if not len(imu):
         return [not_judged("rolling shutter", told, "record an IMU, or use a camera with a global shutter")]
     rate_radps = float(np.percentile(np.linalg.norm(imu.gyro_radps, axis=1), 95))
-    skew_px = rate_radps * readout_s * float(camera.intrinsics_px[0])
+    skew_px = rate_radps * readout_s * float(camera.focal_px[0])
     words = f"{told}: at the turns of this recording (95 %: {rate_radps:.2f} rad/s) a row is shifted by {skew_px:.1f} px against the first"
     if skew_px <= 1.0:
         return [Finding("rolling shutter", Verdict.OK, skew_px, "warn above 1 px", words)]

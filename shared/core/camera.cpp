@@ -37,6 +37,13 @@ bool is_seen(const Equidistant& lens, double, Vec3 point, double* image) {
   return slope > 0;
 }
 
+bool is_seen(const Sphere& lens, double reach, Vec3 point, double* image) {
+  const double squared = point[0] * point[0] + point[1] * point[1];
+  const double w = point[2] + lens.xi * std::sqrt(squared + point[2] * point[2]), d2 = std::sqrt(lens.beta * squared + w * w);
+  const bool grows = w * std::max(lens.a, lens.b) > -d2 * std::min(lens.a, lens.b);
+  return grows && is_seen(lens.plane, reach, Vec3{point[0], point[1], lens.a * d2 + lens.b * w}, image);
+}
+
 }  // namespace
 
 void undistort(const RadialTangential& lens, const double* goal_x, const double* goal_y, size_t count, double* found_x, double* found_y) {
@@ -80,5 +87,6 @@ void register_depth(const float* depth, const double* rays, size_t count, const 
 
 template void register_depth(const float*, const double*, size_t, const SE3&, const LensCamera&, const RadialTangential&, float*);
 template void register_depth(const float*, const double*, size_t, const SE3&, const LensCamera&, const Equidistant&, float*);
+template void register_depth(const float*, const double*, size_t, const SE3&, const LensCamera&, const Sphere&, float*);
 
 }  // namespace fleetmap

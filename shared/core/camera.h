@@ -39,8 +39,15 @@ struct Equidistant {
   double k1, k2, k3, k4;
 };
 
-// Camera with a lens: u = fx x' + cx, v = fy y' + cy of the distorted x', y'. reach: largest x^2 + y^2 of a radial-tangential lens at which
-// the image does not fold back yet.
+// Fisheye by spheres (unified, extended unified, double sphere): a ray is moved along the axis by xi of its length, projected with the
+// weights a and b of sphere and plane, and distorted. Sources: Mei and Rives 2007, Khomutenko et al. 2016, Usenko et al. 2018.
+struct Sphere {
+  RadialTangential plane;
+  double xi, beta, a, b;
+};
+
+// Camera with a lens: u = fx x' + cx, v = fy y' + cy of the distorted x', y'. reach: largest x^2 + y^2 at which the image of
+// radial-tangential distortion does not fold back yet.
 struct LensCamera {
   double fx, fy, cx, cy, reach;
   ptrdiff_t width, height;

@@ -39,7 +39,9 @@ def record(
     robot: Annotated[str | None, Option(help="Robot of the scenario; its first one unless given.")] = None,
     lens: Annotated[
         str | None,
-        Option(help="pinhole, radial-tangential, plumb-bob, rational or equidistant instead of the robot's own."),
+        Option(
+            help="pinhole, radial-tangential, plumb-bob, rational, equidistant, omni, eucm or double-sphere instead of the robot's own."
+        ),
     ] = None,
     rig: Annotated[str, Option(help="pair, front-rear (a second pair) or front-sides (two single cameras).")] = "pair",
     size: Annotated[str | None, Option(metavar="WxH", help="Picture size in pixels, 640x480 unless given.")] = None,

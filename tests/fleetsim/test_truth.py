@@ -40,7 +40,14 @@ def _track(
 
 
 @pytest.mark.parametrize(
-    ("lens", "has_blur"), [("pinhole", False), ("radial-tangential", False), ("equidistant", False), ("pinhole", True)]
+    ("lens", "has_blur"),
+    [
+        ("pinhole", False),
+        ("radial-tangential", False),
+        ("equidistant", False),
+        ("double-sphere", False),
+        ("pinhole", True),
+    ],
 )
 def test_tracks_lie_where_truth_says(lens: str, has_blur: bool) -> None:
     rig, renderer = _renderer(lens, has_blur=has_blur)

@@ -122,7 +122,7 @@ def _pinhole(file: Path, camera: CameraCalibration, shape: tuple[int, ...]) -> A
             f"{file} has images of {width}x{height}, the camera {camera.width_px}x{camera.height_px} px; put the run's intrinsics.npy "
             "beside it, or pass depths of this camera"
         )
-    return np.concatenate([camera.intrinsics_px[:2] * per_px, (camera.intrinsics_px[2:] + 0.5) * per_px - 0.5])
+    return np.concatenate([camera.focal_px * per_px, (camera.intrinsics_px[2:] + 0.5) * per_px - 0.5])
 
 
 @dataclass(frozen=True)

@@ -23,15 +23,19 @@ auto register_depth_of(const Array<float, -1, -1>& depth, const Array<double, -1
   constexpr int64_t kMostPixels = 1 << 26;
   const size_t count = depth.shape(0) * depth.shape(1);
   if (rays.shape(0) != count) throw nb::value_error("rays: one for each pixel of depth");
-  if (lens.shape(0) != 8 && lens.shape(0) != 4) throw nb::value_error("lens: 8 coefficients, radial-tangential, or 4, equidistant");
+  const size_t size = lens.shape(0);
+  if (size != 8 && size != 4 && size != 12)
+    throw nb::value_error("lens: 8 coefficients, radial-tangential, 4, equidistant, or 12, a sphere's");
   if (width < 0 || height < 0 || int64_t(width) * height > kMostPixels) throw nb::value_error("width, height: up to 2^26 pixels");
   const LensCamera camera{intrinsics(0), intrinsics(1), intrinsics(2), intrinsics(3), reach, width, height};
   auto colour = zeros<float>(size_t(width) * size_t(height));
   const auto fill = [&](const auto& coefficients) {
     unlocked([&] { register_depth(depth.data(), rays.data(), count, se3(colour_from_depth.data()), camera, coefficients, colour.data()); });
   };
-  if (lens.shape(0) == 8)
+  if (size == 8)
     fill(radial_tangential(lens.data()));
+  else if (size == 12)
+    fill(Sphere{radial_tangential(lens.data()), lens(8), lens(9), lens(10), lens(11)});
   else
     fill(Equidistant{lens(0), lens(1), lens(2), lens(3)});
   return as_numpy<float, 2>(std::move(colour), {size_t(height), size_t(width)});

@@ -23,7 +23,7 @@ last bits.
 import io
 import reprlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,7 @@ from fleetmap.sensors.calibration import (
     hidden_pixels,
 )
 from fleetmap.sensors.cameras import lens_of
+from fleetmap.sensors.cameras.spheres import LENSES, PLANE
 
 _SAFE_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _MAX_WORD, _MAX_DEPTH, _MAX_EVENTS = 1000, 16, 80_000
@@ -169,10 +170,15 @@ def format_calibration(calibration: RigCalibration) -> str:
     """Format a calibration as YAML text, from which `parse_calibration` restores it bit for bit."""
     out = io.StringIO()
     for number, camera in enumerate(calibration.cameras):
-        model = "radtan" if camera.model == "radial-tangential" else camera.model
-        distortion = "none" if len(camera.distortion) == 0 else model
-        out.write(f"cam{number}:\n  camera_model: pinhole\n  distortion_model: {distortion}\n")
-        out.write(f"  intrinsics: {_row(camera.intrinsics_px)}\n  distortion_coeffs: {_row(camera.distortion)}\n")
+        sphere = LENSES.get(camera.model)
+        model = "equidistant" if camera.model == "equidistant" else "radtan"
+        plane, shape = (camera.distortion[:PLANE], camera.distortion[PLANE:]) if sphere else (camera.distortion, ())
+        plane = plane if plane.any() or not sphere else plane[:0]  # Kalibr has no ds and no eucm with distortion
+        name = "none" if len(plane) == 0 else model
+        out.write(
+            f"cam{number}:\n  camera_model: {sphere.kalibr if sphere else 'pinhole'}\n  distortion_model: {name}\n"
+        )
+        out.write(f"  intrinsics: {_row([*shape, *camera.intrinsics_px])}\n  distortion_coeffs: {_row(plane)}\n")
         out.write(f"  resolution: [{camera.width_px}, {camera.height_px}]\n")
         out.write(f"  timeshift_cam_imu: {float(camera.imu_minus_cam_s)!r}\n")
         if camera.line_delay_s:
@@ -305,21 +311,33 @@ def _body_from_cam(values: Values, previous: CameraCalibration | None, where: st
 
 def _camera(values: Values, distortion_key: str, where: str, folder: Path | None = None) -> CameraCalibration:
     camera_model, name = str(_need(values, "camera_model", where))[:80], str(values.get("distortion_model"))[:80]
-    if camera_model.lower() != "pinhole":
+    spheres = {lens.kalibr: (model, lens) for model, lens in LENSES.items()}
+    if camera_model.lower() not in ("pinhole", *spheres):
         raise CalibrationError(
             f"{where}: camera model {camera_model} with distortion {name} is not known; calibrate as pinhole with radtan, or "
-            "a fisheye as pinhole with equidistant"
+            "a fisheye as pinhole with equidistant, omni with radtan, ds or eucm"
         )
+    sphere_model, sphere = spheres.get(camera_model.lower(), ("", None))
+    shape_names = tuple(sphere.ranges) if sphere else ()
     width, height = _numbers(_need(values, "resolution", where), 2, f"{where}: resolution")
     if any(side != int(side) or not 0 < side <= _LARGEST_PX for side in (width, height)):
         raise CalibrationError(
             f"{where}: resolution is {width:g} x {height:g}; write the images' width and height in pixels"
         )
-    intrinsics = _numbers(_need(values, "intrinsics", where), 4, f"{where}: intrinsics (fx fy cx cy)")
+    order = " ".join((*shape_names, "fx fy cx cy"))
+    numbers = _numbers(_need(values, "intrinsics", where), 4 + len(shape_names), f"{where}: intrinsics ({order})")
+    shape, intrinsics = numbers[: len(shape_names)], numbers[len(shape_names) :]
     if _need(values, "distortion_model", where) != "none":
         _need(values, distortion_key, where)
     coefficients = _numbers(values.get(distortion_key, []), None, f"{where}: {distortion_key}")
     model, distortion = lens_of(name, coefficients, where)
+    if sphere:
+        if model != "radial-tangential" or len(distortion) > PLANE:
+            raise CalibrationError(
+                f"{where}: {camera_model} with {name} of {len(distortion)} coefficients is not supported; calibrate it as "
+                f"{sphere.kalibr} with radtan of {PLANE}, or without"
+            )
+        model, distortion = sphere_model, np.concatenate([distortion, np.zeros(PLANE - len(distortion)), shape])
     line_delay_s = float(_numbers([values.get("line_delay", 0.0)], 1, f"{where}: line_delay")[0])
     if not 0 <= line_delay_s * height < 1.0:
         raise CalibrationError(
@@ -509,7 +527,7 @@ def _check_events(text: str, where: str) -> None:
             raise CalibrationError(f"{where} holds a value of {len(event.value)} characters; the limit is {_MAX_WORD}")
 
 
-def _row(values: Array) -> str:
+def _row(values: Iterable[float]) -> str:
     return "[" + ", ".join(repr(float(v)) for v in values) + "]"
 
 

@@ -19,7 +19,7 @@ Polygon = tuple[tuple[float, float], ...]  # corners (u, v) in pixels as recorde
 class CameraCalibration:
     """One camera.
 
-    model: a key of CAMERA_MODELS. intrinsics_px: fx fy cx cy. body_from_cam (4, 4).
+    model: a key of CAMERA_MODELS. intrinsics_px: fx fy cx cy, as the model defines them. body_from_cam (4, 4).
     imu_minus_cam_s: stamp of the IMU clock minus stamp of the camera clock at one moment (Kalibr's timeshift_cam_imu). line_delay_s: from
     one row to the next of a rolling shutter, 0 for a global one; reported, not corrected. mask: parts of the image that show the robot
     itself, inside an odd number of polygons.
@@ -39,6 +39,11 @@ class CameraCalibration:
         # Values from files are numpy scalars, which encoders do not support.
         _set_numbers(self, int, "width_px", "height_px")
         _set_numbers(self, float, "imu_minus_cam_s", "line_delay_s")
+
+    @property
+    def focal_px(self) -> Array:
+        """(2,) focal lengths along x and y on the optical axis."""
+        return self.intrinsics_px[:2] * CAMERA_MODELS[self.model].axis_scale(self.distortion)
 
     def pixel_from_ray(self, rays_cam: Array) -> Array:
         """(N, 2) pixels of rays (N, 3)."""
@@ -118,6 +123,8 @@ def check_camera(camera: CameraCalibration, name: str) -> CameraCalibration:
         raise CalibrationError(
             f"{name}: {len(camera.distortion)} distortion coefficients for model {camera.model}, which takes {counts}"
         )
+    if fault := CAMERA_MODELS[camera.model].fault(camera.distortion):
+        raise CalibrationError(f"{name}: {fault}; are its parameters in Kalibr's order? Or calibrate again")
     fx, fy, cx, cy = (float(v) for v in camera.intrinsics_px)
     if not (fx > 0 and fy > 0):
         raise CalibrationError(f"{name}: focal lengths fx={fx} fy={fy} must be positive pixels")

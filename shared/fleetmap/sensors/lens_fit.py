@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.calibration import CameraCalibration, Polygon, RigCalibration, hidden_pixels
+from fleetmap.sensors.cameras.spheres import LENSES
 from fleetmap.sensors.samples import CameraFrame, Image, Stamps
 
 _CORNERS, _LEAST_POINTS, _LEAST_ALL, _LEAST_MOTION_PX = 300, 20, 150, 1.0
@@ -156,7 +157,8 @@ def _other_lenses(rig: RigCalibration) -> Iterator[tuple[str, RigCalibration]]:
     if first.model == model:
         model, name = ("equidistant", "equidistant (fisheye)")
     zeros = np.zeros(4)
-    yield f"an {name} lens" if model == "equidistant" else f"a {name} lens", _with_lens(rig, model, None)
+    if first.model not in LENSES:
+        yield f"an {name} lens" if model == "equidistant" else f"a {name} lens", _with_lens(rig, model, None)
     yield "an equidistant lens without coefficients", _with_lens(rig, "equidistant", zeros)
     yield "a lens without distortion", _with_lens(rig, "radial-tangential", zeros)
 
@@ -172,7 +174,9 @@ def _with_lens(rig: RigCalibration, model: str, distortion: Array | None) -> Rig
     for camera in rig.cameras:
         own = np.zeros(4)
         own[: min(4, len(camera.distortion))] = camera.distortion[:4]
-        cameras.append(replace(camera, model=model, distortion=own if distortion is None else distortion))
+        intrinsics_px = np.concatenate([camera.focal_px, camera.intrinsics_px[2:]])
+        given = own if distortion is None else distortion
+        cameras.append(replace(camera, model=model, intrinsics_px=intrinsics_px, distortion=given))
     return replace(rig, cameras=tuple(cameras))
 
 
@@ -210,7 +214,7 @@ def _error_px2(rig: RigCalibration, points: FollowedPoints) -> float:
     known &= (scene[:, 2] > _NEAR_M) & (scene[:, 2] < _FAR_M)
     errors = np.full(len(scene), _MOST_ERROR_PX)
     if known.sum() >= _LEAST_POINTS:
-        moved = _moved(scene[known], seen[known], _MOST_ERROR_PX / camera.intrinsics_px[0])
+        moved = _moved(scene[known], seen[known], _MOST_ERROR_PX / camera.focal_px[0])
         if moved is not None:
             there = camera.pixel_from_ray(moved) - points.later[known]
             here = camera.pixel_from_ray(scene[known]) - points.left[known]

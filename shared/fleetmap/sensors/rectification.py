@@ -174,7 +174,7 @@ class Rectifier:
     def _of_view(self, calibration: RigCalibration, numbers: tuple[int, ...]) -> "Rectifier":
         """The rectifier of another view: to the same pinhole, if its focal length allows."""
         view = replace(calibration, cameras=tuple(calibration.cameras[number] for number in numbers))
-        focal_px = float(np.mean([camera.intrinsics_px[:2].mean() for camera in view.cameras]))
+        focal_px = float(np.mean([camera.focal_px.mean() for camera in view.cameras]))
         is_alike = 1 / _MAX_ZOOM < focal_px / self.camera.focal_px < _MAX_ZOOM
         return Rectifier(view, pinhole=self.camera if is_alike else None, first_camera=numbers[0])
 
@@ -244,7 +244,7 @@ def _rectifying_rotation(
 
 
 def _common_pinhole(cameras: tuple[CameraCalibration, ...], baseline_m: float) -> StereoCamera:
-    focal = float(np.mean([c.intrinsics_px[:2].mean() for c in cameras]))
+    focal = float(np.mean([c.focal_px.mean() for c in cameras]))
     cx, cy = np.mean([c.intrinsics_px[2:] for c in cameras], axis=0)
     return StereoCamera(focal, float(cx), float(cy), baseline_m, cameras[0].width_px, cameras[0].height_px)
 

@@ -48,7 +48,7 @@ def make_optics(camera: CameraCalibration) -> Optics:
         raise CalibrationError(
             f"no pixel of the {camera.model} lens with intrinsics {camera.intrinsics_px.tolist()} has a ray"
         )
-    fx, fy = (_PLANE_SCALE * float(value) for value in camera.intrinsics_px[:2])
+    fx, fy = (_PLANE_SCALE * float(value) for value in camera.focal_px)
     seen = rays[~unseen]
     margin = 2.0
     low_x, low_y = float(seen[:, 0].min()) * fx - margin, float(seen[:, 1].min()) * fy - margin

@@ -19,6 +19,9 @@ LENSES: dict[str, tuple[str, tuple[float, ...], float]] = {
     "plumb-bob": ("radial-tangential", (-0.3, 0.11, 0.0003, -0.0002, -0.018), 0.62),
     "rational": ("radial-tangential", (0.42, 0.03, 0.0002, -0.0001, 0.001, 0.72, 0.14, 0.004), 0.62),
     "equidistant": ("equidistant", (-0.013, 0.02, -0.015, 0.004), 0.55),
+    "omni": ("omni", (-0.02, 0.004, 0.0002, -0.0001, 0.9), 1.04),
+    "double-sphere": ("double-sphere", (0.0, 0.0, 0.0, 0.0, -0.17, 0.59), 0.46),
+    "eucm": ("eucm", (0.0, 0.0, 0.0, 0.0, 0.6, 1.1), 0.55),
 }
 
 

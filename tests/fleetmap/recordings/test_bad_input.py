@@ -206,7 +206,7 @@ def test_backward_stamps_are_dropped_and_counted_never_sorted(euroc: Path) -> No
         ("just words", "mapping"),
         ("left: {}", "no cam0"),
         ("cam0: 3", "cam0 is 3"),
-        ("cam0: {camera_model: omni, distortion_model: radtan}", "omni with distortion radtan is not known"),
+        ("cam0: {camera_model: fov, distortion_model: radtan}", "fov with distortion radtan is not known"),
         (f"cam0: {{{LENS.replace('200, 200', '-9, 9')}}}", "focal lengths"),
         (f"cam0: {{{LENS}}}", "2 cameras are recorded, the calibration describes 1"),
     ],

@@ -25,11 +25,19 @@ def random_rig(seed: int, *, has_imu: bool) -> RigCalibration:
             640,
             480,
             np.array([400, 400, 320, 240]) + rng.standard_normal(4),
-            0.1 * rng.standard_normal(count),
+            np.append(0.1 * rng.standard_normal(count), shape),
             se3_exp(rng.standard_normal(6)),
             float(rng.normal(0, 0.01)),
         )
-        for model, count in (("equidistant", 4), ("radial-tangential", 5), ("radial-tangential", 8))
+        for model, count, shape in (
+            ("equidistant", 4, ()),
+            ("radial-tangential", 5, ()),
+            ("radial-tangential", 8, ()),
+            ("omni", 4, (rng.uniform(0, 2),)),
+            ("eucm", 4, rng.uniform(0.1, 0.9, 2)),
+            ("double-sphere", 4, rng.uniform(-0.2, 0.9, 2).clip(0)),
+            ("double-sphere", 0, (0.0, 0.0, 0.0, 0.0, -0.17, 0.59)),
+        )
     )
     noise = ImuNoise(*np.abs(rng.normal(0, 1e-3, 4)).tolist()) if has_imu else None
     return RigCalibration(cameras, noise, se3_exp(rng.standard_normal(6)))
@@ -93,6 +101,56 @@ def test_the_real_euroc_camera() -> None:
     camera = read_euroc_camera(real_data("euroc_v101_keyframes") / "mav0/cam0/sensor.yaml")
     assert camera.body_from_cam[0, 3] == -0.0216401454975
     assert camera.intrinsics_px.tolist() == [458.654, 457.296, 367.215, 248.375]
+
+
+def sphere_text(**changed: object) -> str:
+    """Kalibr's double sphere, with values changed."""
+    values = {
+        "camera_model": "ds", "distortion_coeffs": [], "distortion_model": "none", "resolution": [1440, 1080],
+        "intrinsics": [-0.1996, 0.5925, 317.55, 316.17, 724.86, 546.57],
+    }  # fmt: skip
+    return yaml.safe_dump({"cam0": values | changed})
+
+
+def test_kalibrs_spheres() -> None:
+    """The parameters of the shape stand before fx; distortion of the plane comes from its own key."""
+    (camera,) = parse_calibration(sphere_text(), "text").calibration.cameras
+    assert camera.model == "double-sphere"
+    assert camera.intrinsics_px.tolist() == [317.55, 316.17, 724.86, 546.57]
+    assert camera.distortion.tolist() == [0.0, 0.0, 0.0, 0.0, -0.1996, 0.5925]
+    assert "distortion_model: none" in format_calibration(RigCalibration((camera,)))
+    omni = sphere_text(
+        camera_model="omni",
+        intrinsics=[0.8, 833.0, 830.3, 373.9, 253.7],
+        distortion_model="radtan",
+        distortion_coeffs=[-0.34, 0.13, 6e-4, 5e-4],
+    )
+    (camera,) = parse_calibration(omni, "text").calibration.cameras
+    assert (camera.model, camera.distortion.tolist()) == ("omni", [-0.34, 0.13, 6e-4, 5e-4, 0.8])
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"camera_model": "sphere"}, "camera model sphere .* not known; .*omni with radtan, ds or eucm"),
+        (
+            {"intrinsics": [317.55, 316.17, 724.86, 546.57]},
+            r"intrinsics \(xi alpha fx fy cx cy\).* 6 numbers are expected",
+        ),
+        (
+            {"intrinsics": [317.55, 316.17, 724.86, 546.57, -0.2, 0.6]},
+            "xi of ds is 317.55, outside of -0.99 to 1.*order",
+        ),
+        ({"camera_model": "eucm"}, "alpha of eucm is -0.1996, outside of 0 to 1"),
+        (
+            {"distortion_model": "equidistant", "distortion_coeffs": [0.1, 0.0, 0.0, 0.0]},
+            "ds with equidistant of 4 coefficients is not supported; calibrate it as ds with radtan",
+        ),
+    ],
+)
+def test_spheres_that_cannot_be_are_refused(changed: dict[str, Any], says: str) -> None:
+    with pytest.raises(CalibrationError, match=f"text: cam0.*{says}"):
+        parse_calibration(sphere_text(**changed), "text")
 
 
 RATIONAL = [0.42, 0.03, 2e-4, -1e-4, 1e-3, 0.72, 0.14, 4e-3]

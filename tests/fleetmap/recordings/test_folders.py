@@ -191,7 +191,13 @@ def test_seven_scenes_with_a_depth_camera_beside_the_colour_camera(tmp_path: Pat
 
 @pytest.mark.parametrize(
     ("model", "distortion"),
-    [("radial-tangential", (0.1, -0.05, 0.002, -0.001)), ("equidistant", (0.03, -0.01, 0.004, -0.001))],
+    [
+        ("radial-tangential", (0.1, -0.05, 0.002, -0.001)),
+        ("equidistant", (0.03, -0.01, 0.004, -0.001)),
+        ("omni", (0.1, -0.05, 0.002, -0.001, 0.7)),
+        ("double-sphere", (0.01, 0.0, 0.0, 0.0, -0.2, 0.6)),
+        ("eucm", (0.0, 0.0, 0.0, 0.0, 0.6, 1.1)),
+    ],
 )
 def test_depth_lands_where_the_colour_lens_sees_it(model: str, distortion: tuple[float, ...]) -> None:
     intrinsics = np.array([60.0, 61.0, 40.0, 30.0])

@@ -86,6 +86,33 @@ def test_a_wrong_lens_is_named(model: str, given: RigCalibration, turns: bool, s
     assert "--calibration FILE" in words
 
 
+@pytest.mark.parametrize("factor", [1.0, 0.7])
+def test_a_fisheye_that_sees_190_degrees(factor: float) -> None:
+    """Points beside and behind the camera lie on no plane z = 1: they neither doubt the right lens nor hide a wrong one."""
+    rng, shape = np.random.default_rng(7), np.array([0.0, 0.0, 0.0, 0.0, -0.17, 0.59])
+
+    def fisheye(focal_px: float) -> RigCalibration:
+        intrinsics = np.array([focal_px, focal_px, 255.5, 255.5])
+        left = CameraCalibration("double-sphere", 512, 512, intrinsics, shape, np.eye(4))
+        return RigCalibration((left, replace(left, body_from_cam=CAM0_FROM_CAM1)))
+
+    true, pairs = fisheye(155.0), []
+    for number in range(8):
+        angle, around, away_m = rng.uniform([0.1, 0.0, 1.0], [1.65, 6.28, 8.0], (250, 3)).T
+        rays = np.column_stack([np.sin(angle) * np.cos(around), np.sin(angle) * np.sin(around), np.cos(angle)])
+        points, turn = away_m[:, None] * rays, so3_exp(np.array([0.0, 0.2 if number % 2 else -0.15, 0.0]))
+        later = transform_points(se3_inverse(se3(turn, np.array([0.02, 0.0, 0.25]))), points)
+        seen_px = [
+            true.cameras[0].pixel_from_ray(each) + rng.normal(0, 0.15, (250, 2))
+            for each in (points, transform_points(se3_inverse(CAM0_FROM_CAM1), points), later)
+        ]
+        good = ((np.array(seen_px) > 0) & (np.array(seen_px) < 511)).all(axis=(0, 2))
+        pairs.append(FollowedPoints(seen_px[0][good], seen_px[1][good], None, seen_px[2][good]))
+    fit = fit_lens(fisheye(factor * 155.0), pairs)
+    assert fit is not None
+    assert fit.is_doubtful == (factor != 1.0)
+
+
 def test_nothing_is_said_of_a_camera_at_rest() -> None:
     pairs = [replace(points, later=points.left) for points in followed("equidistant", turns=False)]
     assert fit_lens(rig("radial-tangential"), pairs) is None

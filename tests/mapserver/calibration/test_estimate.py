@@ -85,7 +85,9 @@ def test_a_straight_drive_leaves_open_what_turns_would_show(straight: Stretch) -
     assert np.array_equal(found.corrected(rig).cameras[0].intrinsics_px[:2], rig.cameras[0].intrinsics_px[:2])
 
 
-@pytest.mark.parametrize("lens", ["pinhole", "radial-tangential", "plumb-bob", "rational", "equidistant"])
+@pytest.mark.parametrize(
+    "lens", ["pinhole", "radial-tangential", "plumb-bob", "rational", "equidistant", "omni", "double-sphere"]
+)
 def test_lenses_of_any_number_of_coefficients_can_be_adjusted(straight: Stretch, lens: str) -> None:
     """Slopes are there for the four coefficients that are left open; those beyond four are held."""
     model, distortion, _ = LENSES[lens]

@@ -76,7 +76,7 @@ class DepthRegistration:
             self._map = np.nan_to_num(pixels, nan=-1e4).astype(np.float32).reshape(colour.height_px, colour.width_px, 2)
         else:
             rays = depth.ray_from_pixel(_pixels(depth))
-            self._rays_depth = rays / rays[:, 2:]
+            self._rays_depth = rays / np.where(rays[:, 2:] > 0, rays[:, 2:], np.nan)
             self._lens = CAMERA_MODELS[colour.model].core_lens(colour.distortion)
 
     def registered(self, depth_m: Depth, where: str) -> Depth:

@@ -9,7 +9,7 @@ import numpy as np
 
 from fleetmap.errors import CalibrationError
 from fleetmap.geometry import Array
-from fleetmap.sensors.cameras import equidistant, radial_tangential
+from fleetmap.sensors.cameras import equidistant, radial_tangential, spheres
 
 
 class _Project(Protocol):
@@ -27,13 +27,17 @@ class CameraModel:
     pixel_from_ray(intrinsics_px (4,) fx fy cx cy, distortion (k,), rays_cam (N, 3)) -> (N, 2) px, NaN outside the lens's field of view.
     ray_from_pixel(intrinsics_px, distortion, pixels (N, 2)) -> (N, 3) unit rays, NaN where no ray maps to the pixel.
     core_lens(distortion) -> the coefficients in the core's order, and the x^2 + y^2 at which a radial-tangential image folds back.
-    The core chooses the lens by their number: 8 are radial-tangential, 4 equidistant.
+    The core chooses the lens by their number: 8 are radial-tangential, 4 equidistant, 12 a sphere's.
+    axis_scale(distortion) -> focal length on the optical axis, in fx and fy.
+    fault(distortion) -> the parameter that no lens has, with its range; empty if all are possible.
     """
 
     pixel_from_ray: _Project
     ray_from_pixel: _Unproject
     core_lens: Callable[[Array], tuple[Array, float]]
     distortion_counts: tuple[int, ...]
+    axis_scale: Callable[[Array], float] = lambda _: 1.0
+    fault: Callable[[Array], str] = lambda _: ""
 
 
 CAMERA_MODELS = {
@@ -42,6 +46,11 @@ CAMERA_MODELS = {
         ("radial-tangential", radial_tangential, (0, 4, 5, 8)),
         ("equidistant", equidistant, (4,)),
     )
+} | {
+    name: CameraModel(
+        lens.pixel_from_ray, lens.ray_from_pixel, lens.core_lens, (lens.count,), lens.axis_scale, lens.fault
+    )
+    for name, lens in spheres.LENSES.items()
 }
 
 # Lens names of ROS, Kalibr, EuRoC, OpenCV and OpenVINS; in ROS an empty name means plumb_bob
@@ -54,6 +63,7 @@ _NAMES = {
     "equidistant": "equidistant",
     "fisheye": "equidistant",
     "kannala_brandt": "equidistant",
+    **{name: name for name in spheres.LENSES},
 }
 _NO_PINHOLES = ("omni", "mei", "sphere", "unified", "eucm")  # even if their coefficients are zero
 _NEXT_STEP = "calibrate with one of these, or record rectified images, or pass a calibration with --calibration FILE"

@@ -200,6 +200,7 @@ RATIONAL = [0.42, 0.03, 2e-4, -1e-4, 1e-3, 0.72, 0.14, 4e-3]
     [
         ("plumb_bob", [0.1, 0.2, 0.0, 0.0, 0.05], "radial-tangential", 5),
         ("equidistant", [0.1, 0.2, 0.0, 0.01], "equidistant", 4),
+        ("double-sphere", [0.0, 0.0, 0.0, 0.0, -0.2, 0.6], "double-sphere", 6),
         ("rational_polynomial", [*RATIONAL, *[0.0] * 6], "radial-tangential", 8),
         ("inverse_brown_conrady", [0.0] * 5, "radial-tangential", 0),
         ("", [], "radial-tangential", 0),
