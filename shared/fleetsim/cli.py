@@ -40,7 +40,8 @@ def record(
     lens: Annotated[
         str | None,
         Option(
-            help="pinhole, radial-tangential, plumb-bob, rational, equidistant, omni, eucm or double-sphere instead of the robot's own."
+            help="pinhole, radial-tangential, plumb-bob, rational, equidistant, omni, eucm, double-sphere or fisheye (190 degrees) "
+            "instead of the robot's own."
         ),
     ] = None,
     rig: Annotated[str, Option(help="pair, front-rear (a second pair) or front-sides (two single cameras).")] = "pair",

@@ -40,7 +40,7 @@ class Look:
 class Shot:
     """A picture with its truth at mid exposure.
 
-    depth_m (H, W): along the optical axis, 0 for nothing; faces (H, W): -1 for nothing.
+    depth_m (H, W): along the optical axis, 0 for nothing; faces (H, W): -1 for nothing. Of a fisheye on several planes, of that in front.
     """
 
     image: Image
@@ -68,7 +68,7 @@ class Painter:
         self._movers = movers
         self._scene: Scene | None = None
         self._groups = np.zeros(3)
-        self._scenes = core.ScenePainter(optics.pinhole, optics.rays)
+        self._scenes = [core.ScenePainter(plane.pinhole, plane.rays) for plane in optics.planes]
         self._normals = np.random.default_rng(99).standard_normal(_NOISE_TABLE).astype(np.float32)
 
     def shoot(self, scene: Scene, groups: Array, path: Path, t_s: float, exposure: Exposure, noise_key: int) -> Shot:
@@ -92,7 +92,7 @@ class Painter:
         before, after = path(t_s - exposure.time_s / 2), path(t_s + exposure.time_s / 2)
         turned = float(np.linalg.norm(before[:3, :3].T @ after[:3, :3] - np.eye(3))) / np.sqrt(2.0)
         moved = float(np.linalg.norm(after[:3, 3] - before[:3, 3])) / _NEAR_THINGS_M
-        wanted = np.ceil(self._optics.pinhole[0] * (turned + moved) / _BLUR_STEP_PX)
+        wanted = np.ceil(self._optics.planes[0].pinhole[0] * (turned + moved) / _BLUR_STEP_PX)
         return int(np.clip(wanted, 1, _MOST_SUBFRAMES))
 
     def _develop(self, radiance: Array, exposure: Exposure, noise_key: int) -> Image:
@@ -143,9 +143,11 @@ class Painter:
         textures = (atlas.texels, atlas.table, world.decals, world.floor_numbers)
         chunks = (self._ranges, self._bounds)
         look = (self._look.most_taps, self._look.reflectance, shadows)
-        self._scenes.add(
-            faces, chunks, textures, cam_from_map, centre, *instant[:3], *look, instant.wants_truth, *canvas
-        )
+        for number, (plane, painter) in enumerate(zip(self._optics.planes, self._scenes, strict=True)):
+            plane_from_map = np.ascontiguousarray(plane.cam_from_plane.T @ cam_from_map)
+            # The truth is that of the plane in front: depths of the others are along other axes
+            wanted = instant.wants_truth and number == 0
+            painter.add(faces, chunks, textures, plane_from_map, centre, *instant[:3], *look, wanted, *canvas)
 
 
 class _Canvas(NamedTuple):

@@ -22,6 +22,7 @@ LENSES: dict[str, tuple[str, tuple[float, ...], float]] = {
     "omni": ("omni", (-0.02, 0.004, 0.0002, -0.0001, 0.9), 1.04),
     "double-sphere": ("double-sphere", (0.0, 0.0, 0.0, 0.0, -0.17, 0.59), 0.46),
     "eucm": ("eucm", (0.0, 0.0, 0.0, 0.0, 0.6, 1.1), 0.55),
+    "fisheye": ("double-sphere", (0.0, 0.0, 0.0, 0.0, -0.17, 0.59), 0.2505),  # 190 degrees from left to right
 }
 
 
