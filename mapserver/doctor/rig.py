@@ -32,31 +32,47 @@ _PLACE_SIGMA_M, _SCALE_SIGMA = (
 _ROUNDS, _FAR_SIGMAS = 8, 3.5
 _MAD_SIGMA = 1.4826  # standard deviation of a normal distribution by its median absolute deviation
 _OF_CAMERAS = {p.value for p in P} - {P.WHEEL_SCALE.value, P.GYRO_NOISE.value, P.ACCEL_NOISE.value}
-_OF_CAMERAS |= {SWAPPED, AXES, OFFSET, "epipolar error", "lens", "sharpness", "images", "camera rate", "camera gaps"}
+_OF_CAMERAS |= {
+    SWAPPED,
+    AXES,
+    OFFSET,
+    "epipolar error",
+    "lens",
+    "sharpness",
+    "images",
+    "camera rate",
+    "camera gaps",
+    "depth",
+}
 _DRIVE = "record a drive of a minute with turns, where every camera sees something near"
 
 
 def frames_of_rig(recording: Recording) -> int:
     """Return the approximate number of `on_frame` calls by `check_rig`."""
     views = recording.calibration.views
-    pairs = [recording.view(n) for n, numbers in enumerate(views) if n == 0 or len(numbers) == 2]
-    return sum(map(frames_to_check, pairs)) + (_INTERVALS if len(views) > 1 else 0)
+    measuring = [recording.view(n) for n in range(len(views)) if n == 0 or _measures_depth(recording, n)]
+    return sum(map(frames_to_check, measuring)) + (_INTERVALS if len(views) > 1 else 0)
 
 
 def check_rig(recording: Recording, on_frame: Callable[[], None] = lambda: None) -> list[Finding]:
-    """Return the findings of the first view; of each further pair those about its cameras, with their names, and of each further view its
-    mounting against the first one."""
+    """Return the findings of the first view; of each further pair and depth camera those about its cameras, with their names, and of each
+    further view its mounting against the first one."""
     return run_checks(recording.view(0), on_frame).findings + further_findings(recording, on_frame)
 
 
 def further_findings(recording: Recording, on_frame: Callable[[], None] = lambda: None) -> list[Finding]:
     """Return the findings of `check_rig` without those of the first view."""
     found, names = list[Finding](), _names(recording)
-    for number, numbers in enumerate(recording.calibration.views[1:], start=1):
-        if len(numbers) == 2 and len(recording.view(number)):
+    for number in range(1, len(names)):
+        if _measures_depth(recording, number) and len(recording.view(number)):
             beside = run_checks(recording.view(number), on_frame).findings
             found += [replace(f, name=f"{f.name} of {names[number]}") for f in beside if f.name in _OF_CAMERAS]
     return found + (check_mountings(recording, on_frame) if len(names) > 1 else [])
+
+
+def _measures_depth(recording: Recording, view: int) -> bool:
+    numbers = recording.calibration.views[view]
+    return len(numbers) == 2 or recording.calibration.cameras[numbers[0]].has_depth
 
 
 def _names(recording: Recording) -> list[str]:

@@ -40,7 +40,7 @@ from mapserver.survey.keyframes.connected_components import (
     only_kept,
 )
 from mapserver.survey.keyframes.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
-from mapserver.survey.keyframes.rig_views import body_from_views
+from mapserver.survey.keyframes.rig_views import body_from_views, depth_views
 from mapserver.survey.loops.loops import LoopCloser, Loops
 from mapserver.survey.loops.sim3_loops import gate_covariances, solve_scaled
 from mapserver.survey.odometry_pass import run_odometry
@@ -120,7 +120,12 @@ def finish_survey(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConf
     odometry = chain.odometry
     # Landmarks so far are those of neighbours; all are built again, and nothing may hold the old ones meanwhile.
     del chain
-    state = replace(state, landmarks=Landmarks.empty(), body_from_view=body_from_views(inputs.rectifier))
+    state = replace(
+        state,
+        landmarks=Landmarks.empty(),
+        body_from_view=body_from_views(inputs.rectifier),
+        depth_views=depth_views(inputs.rectifier),
+    )
     odometry, state, stereo_yaw = adjust_globally(odometry, state, depths, matched, tracks, settings, tools)
     tools.at("global adjustment", 2, 2)
     frames_of = np.array(odometry.keyframe_frames, np.int64)

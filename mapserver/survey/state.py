@@ -80,7 +80,7 @@ class Keyframe:
 
     from_views: the disparities come from other keyframes, so they locate points but are not measurements. nodes (N, 2): the
     vocabulary's branches nearest to each feature; None if all descriptors are compared. others: those of the rig's other views at the same
-    moment, converted to the first view's camera.
+    moment, converted to the first view's camera, whose disparities are disparity_scale times those of their pictures.
     """
 
     frame_index: int
@@ -93,6 +93,7 @@ class Keyframe:
     from_views: bool = False
     nodes: NDArray[np.int32] | None = None
     others: "tuple[Keyframe, ...]" = ()
+    disparity_scale: float = 1.0
 
     @property
     def pictures(self) -> Pictures:
@@ -129,7 +130,8 @@ class Keyframe:
         depth = self.frame.disparity_px
         if depth is None:
             return self.measured(features)
-        return core.match_depth(depth, np.ascontiguousarray(pixels, np.float64), settings.depth_sigma_px)
+        found = core.match_depth(depth, np.ascontiguousarray(pixels, np.float64), settings.depth_sigma_px)
+        return np.asarray(found * self.disparity_scale)
 
     @property
     def median_depth_m(self) -> float:
@@ -363,7 +365,8 @@ class SurveyState:
 
     priors: of its docks, tags and zones, in `map`; a survey with any is itself in `map`. body_from_view (V, 4, 4): one for each view of a
     rig, the first one the identity: a view sees what `camera` at body_from_cam would see from body_from_view. With V views
-    obs_keyframe of the landmarks is the number of the keyframe times V plus that of the view.
+    obs_keyframe of the landmarks is the number of the keyframe times V plus that of the view. depth_views: those
+    of depth cameras.
     """
 
     stamps_ns: Indices
@@ -372,7 +375,7 @@ class SurveyState:
     camera: StereoCamera
     motion: KeyframeMotion
     landmarks: Landmarks
-    is_depth_camera: bool = False
+    depth_views: frozenset[int] = frozenset()
     priors: Sequence[PriorTerm] = ()
     body_from_view: Array = field(default_factory=lambda: np.eye(4)[None])
 

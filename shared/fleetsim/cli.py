@@ -44,7 +44,12 @@ def record(
             "instead of the robot's own."
         ),
     ] = None,
-    rig: Annotated[str, Option(help="pair, front-rear (a second pair) or front-sides (two single cameras).")] = "pair",
+    rig: Annotated[
+        str,
+        Option(
+            help="pair, front-rear (a second pair), front-depth (a depth camera that looks back) or front-sides (two single cameras)."
+        ),
+    ] = "pair",
     size: Annotated[str | None, Option(metavar="WxH", help="Picture size in pixels, 640x480 unless given.")] = None,
     frames: Annotated[int | None, Option(min=1, help="Maximum number of frames.")] = None,
     fault: Annotated[list[str] | None, Option(metavar="NAME@START+SECONDS", help="A fault; repeatable.")] = None,

@@ -42,7 +42,8 @@ class _PngWriter(McapRecordingWriter):
 def _png_frame(frame: CameraFrame) -> StoredFrame:
     right = None if frame.right is None else png_image(frame.right)
     others = tuple(None if other is None else _png_frame(other) for other in frame.others)
-    return StoredFrame(frame.stamp_ns, png_image(frame.left), right, others=others)
+    depth = None if frame.depth_m is None else png_image(np.rint(frame.depth_m * 1000.0).astype(np.uint16))
+    return StoredFrame(frame.stamp_ns, png_image(frame.left), right, depth, others)
 
 
 def record_order(order: Order, out: Path) -> str:

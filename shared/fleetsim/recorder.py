@@ -22,7 +22,14 @@ from fleetsim.scene.layout import Layout
 from fleetsim.scene.light import LIGHT_STATES
 from fleetsim.scene.world import World
 from fleetsim.sensors.faults import LATE_S, Fault, FaultPlan
-from fleetsim.sensors.measurements import measure_imu, measure_priors, measure_wheels, sample_times, stamps_from_s
+from fleetsim.sensors.measurements import (
+    measure_depth,
+    measure_imu,
+    measure_priors,
+    measure_wheels,
+    sample_times,
+    stamps_from_s,
+)
 from fleetsim.sensors.robots import HiddenErrors, RobotKind, nominal_calibration, true_calibration
 
 _TRUTH_STEP_S = 0.02
@@ -72,8 +79,15 @@ class Session:
 
         def made(time_s: float, stamp_ns: int) -> CameraFrame:
             shot = self.renderer.shoot(time_s)
-            others = tuple(CameraFrame(stamp_ns, each[0], each[1] if each[1:] else None) for each in shot.others)
-            return process_frame(CameraFrame(stamp_ns, shot.left, shot.right, others=others), pipeline, self.order.seed)
+            cameras = [self.nominal.cameras[numbers[0]] for numbers in self.nominal.views[1:]]
+            others = list[CameraFrame]()
+            for images, depth_m, camera in zip(shot.others, shot.other_depths_m, cameras, strict=True):
+                rng = np.random.default_rng([self.order.seed, stamp_ns, len(others)])
+                measured_m = measure_depth(depth_m, camera, rng) if camera.has_depth else None
+                others.append(CameraFrame(stamp_ns, images[0], images[1] if images[1:] else None, measured_m))
+            return process_frame(
+                CameraFrame(stamp_ns, shot.left, shot.right, others=tuple(others)), pipeline, self.order.seed
+            )
 
         moments = iter(zip(self.frame_times_s, self.frame_stamps_ns(), strict=True))
         with ThreadPoolExecutor(1, thread_name_prefix="shutter") as shutter:

@@ -63,7 +63,7 @@ def initial_state(odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:
         camera=survey_camera(rectifier.camera),
         motion=motion,
         landmarks=Landmarks.empty(),
-        is_depth_camera=rectifier.has_depth,
+        depth_views=frozenset([0] if rectifier.has_depth else []),
     )
 
 

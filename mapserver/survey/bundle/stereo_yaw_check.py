@@ -62,7 +62,7 @@ def estimate_stereo_yaw(state: SurveyState, settings: SurveySettings, view: int 
     disparities are known or if the cost has no minimum nearby.
     """
     measured = np.isfinite(state.landmarks.obs_pixels[:, 2]) & (state.landmarks.obs_keyframe % state.view_count == view)
-    if measured.sum() < _MIN_DISPARITIES or (state.is_depth_camera and view == 0):
+    if measured.sum() < _MIN_DISPARITIES or view in state.depth_views:
         return NO_YAW
     problem = bundle_problem(state, settings, None)
     problem = replace(problem, obs_sigma_px=measured_sigmas(problem, settings.final_bundle.huber_sigmas))

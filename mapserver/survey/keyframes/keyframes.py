@@ -41,6 +41,7 @@ def make_keyframes(
     kept = MemoryImageStore() if images is None else images
     waiting: deque[tuple[int, list[RectifiedFrame]]] = deque()
     cameras = [camera, *(other for _, other in others)]
+    scales = [_disparity_scale(camera, each) for each in cameras]
 
     def batches() -> Iterator[list[list[RectifiedFrame]]]:
         source = iter(frames)
@@ -55,7 +56,8 @@ def make_keyframes(
         for each in found:
             number, views = waiting.popleft()
             first, *rest = (
-                _keyframe(number, frame, camera, features, kept) for frame, features in zip(views, each, strict=True)
+                replace(_keyframe(number, frame, camera, features, kept), disparity_scale=scale)
+                for frame, features, scale in zip(views, each, scales, strict=True)
             )
             yield replace(first, others=tuple(rest)) if rest else first
 
@@ -74,6 +76,11 @@ def _black(frame: RectifiedFrame) -> RectifiedFrame:
     return RectifiedFrame(frame.stamp_ns, black, black, None)
 
 
+def _disparity_scale(first: StereoCamera, camera: StereoCamera) -> float:
+    """Return the ratio of disparities of the first view's camera to those of a view with its pinhole."""
+    return first.baseline_m / camera.baseline_m if camera.baseline_m > 0 else 1.0
+
+
 def _extract(
     shared: tuple[list[StereoCamera], SurveySettings], frames: list[list[RectifiedFrame]]
 ) -> list[list[tuple[orb.Features, Array]]]:
@@ -85,9 +92,7 @@ def _extract(
         for frame, camera in zip(views, cameras, strict=True):
             features = extract(frame.left, settings.orb, camera.clearance_px)
             disparities = stereo.disparities(frame, camera, features.pixels, settings.stereo)
-            if camera.baseline_m != cameras[0].baseline_m:
-                disparities = disparities * (cameras[0].baseline_m / camera.baseline_m)
-            found[-1].append((features, disparities))
+            found[-1].append((features, disparities * _disparity_scale(cameras[0], camera)))
     return found
 
 

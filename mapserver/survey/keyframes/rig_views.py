@@ -28,6 +28,12 @@ def body_from_views(rectifier: Rectifier) -> Array:
     return np.array([np.eye(4), *(mount @ se3_inverse(rectifier.body_from_cam) for mount in mounts)])
 
 
+def depth_views(rectifier: Rectifier) -> frozenset[int]:
+    """Return the numbers of depth cameras among the first view and `other_views`, counted in this order."""
+    numbers = [0, *(number for number, _ in other_views(rectifier))]
+    return frozenset(k for k, number in enumerate(numbers) if (rectifier, *rectifier.others)[number].has_depth)
+
+
 def frame_of_view(frame: RectifiedFrame, number: int) -> RectifiedFrame | None:
     """Return the frame of a view; None if the view has no images at this moment."""
     seen = frame.view(number)

@@ -300,7 +300,7 @@ class LiveMap:
             camera=self._camera,
             motion=motion,
             landmarks=build_landmarks(posed, tracks_of(pairs), self._settings),
-            is_depth_camera=rig.is_depth_camera,
+            depth_views=frozenset([0] if rig.is_depth_camera else []),
         )
 
     def _relative(self, first: int) -> list[RelativeTerm]:

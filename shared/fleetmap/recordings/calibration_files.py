@@ -14,6 +14,7 @@ and in each camera
 
     mask: [[[0, 380], [639, 380], [639, 479], [0, 479]]]   polygons of pixels (u, v) that show the robot itself; one in another is a hole
     mask: robot.png                                        or an image of the camera's size beside the file, not 0 there
+    has_depth: true                                        a depth camera beside a pair, with depth registered to these images
 
 and `has_imu: false` for a rig described by its cameras alone, and inside a camera `body_from_cam` (4x4 rows), which
 takes precedence over T_cam_imu: this project writes it, because inverting a matrix twice changes the
@@ -152,6 +153,11 @@ def parse_calibration(text: str, where: str, folder: Path | None = None) -> Cali
         previous = cameras[-1] if cameras else None
         cameras.append(_kalibr_camera(camera, previous, f"{where}: {name}", folder))
         topics[name] = str(camera.get("rostopic", ""))
+    if cameras[0].has_depth:
+        raise CalibrationError(
+            f"{where}: cam0: has_depth is for cameras beside the rig's first view; number a stereo pair cam0 and cam1. A depth camera "
+            'without a pair needs no word here: its recording tells it, or [source] sensors = "rgbd"'
+        )
     imu = (noise or ImuNoise()) if has_imu else None
     base = matrix_4x4(values["base_from_body"], f"{where}: base_from_body") if "base_from_body" in values else np.eye(4)
     if isinstance(values.get("imu0"), dict):
@@ -183,6 +189,8 @@ def format_calibration(calibration: RigCalibration) -> str:
         out.write(f"  timeshift_cam_imu: {float(camera.imu_minus_cam_s)!r}\n")
         if camera.line_delay_s:
             out.write(f"  line_delay: {camera.line_delay_s!r}\n")
+        if camera.has_depth:
+            out.write("  has_depth: true\n")
         if camera.mask:
             polygons = [[[float(u), float(v)] for u, v in polygon] for polygon in camera.mask]
             out.write(f"  mask: {polygons}\n")
@@ -344,9 +352,11 @@ def _camera(values: Values, distortion_key: str, where: str, folder: Path | None
             f"{where}: line_delay is {line_delay_s:g} s, {line_delay_s * height:g} s for {height:g} rows; write the seconds from row to row"
         )
     mask = _mask(values.get("mask", []), (int(width), int(height)), f"{where}: mask", folder)
-    return CameraCalibration(
-        model, int(width), int(height), intrinsics, distortion, np.eye(4), line_delay_s=line_delay_s, mask=mask
-    )
+    has_depth = values.get("has_depth", False)
+    if not isinstance(has_depth, bool):
+        raise CalibrationError(f"{where}: has_depth is {_brief(has_depth)}; write true or false")
+    lens = model, int(width), int(height), intrinsics, distortion
+    return CameraCalibration(*lens, np.eye(4), line_delay_s=line_delay_s, mask=mask, has_depth=has_depth)
 
 
 def _mask(value: object, size_px: tuple[int, int], where: str, folder: Path | None) -> tuple[Polygon, ...]:

@@ -66,6 +66,7 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
             "pass one that has all with --calibration FILE"
         )
     recorded = (*cameras[:count], *(cameras[number] for number in parts.others))
+    _check_depths(parts)
     if len(cameras) > len(recorded) and not parts.has_depth:
         log.note("cameras missing", f"the calibration describes {len(cameras)}, there are images of {len(recorded)}")
     imu, wheel, truth = parts.imu, parts.wheel, parts.ground_truth
@@ -108,6 +109,18 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
     if is_mosaic(_first_frame(recording).left):
         log.note("Bayer pattern", "a mosaic of colours remains in the left images; record them with its right encoding")
     return replace(recording, issues=tuple(log.issues))
+
+
+def _check_depths(parts: RecordingParts) -> None:
+    """Raise CalibrationError for a camera of another view that should have depth and has none."""
+    views = parts.frames.others if isinstance(parts.frames, SeriesFrames) else ()
+    firsts = [number for number in parts.others if parts.calibration.cameras[number].has_depth]
+    if len(firsts) > sum(view.depth is not None for view in views):
+        names = " and ".join(f"cam{number} (--topic cam{number}_depth=/NAME)" for number in firsts)
+        raise CalibrationError(
+            f"{parts.path}: the calibration says has_depth of {names}, and not all of these have depth images; name the topic, or take "
+            "has_depth out of the calibration to use the camera without its depth. Depth beside a pair is read from MCAP files and bags"
+        )
 
 
 def _sensor_set(parts: RecordingParts, imu: ImuSamples) -> SensorSet:

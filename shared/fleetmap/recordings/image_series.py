@@ -10,7 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_depth, decode_frame
-from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS, ReadLog, forward_only, nearest, pair_stamps
+from fleetmap.recordings.ordering import (
+    DEPTH_TOLERANCE_NS,
+    PAIR_TOLERANCE_NS,
+    ReadLog,
+    forward_only,
+    nearest,
+    pair_stamps,
+)
 from fleetmap.sensors.samples import CameraFrame, Stamps
 
 T = TypeVar("T")
@@ -64,23 +71,33 @@ def pair_images(
 
 @dataclass(frozen=True)
 class ViewSeries(Generic[T]):
-    """Images of a further view of a rig: rows (F,) of its image, or pair, at each frame, -1 for none."""
+    """Images of a further view of a rig: rows (F,) of its image, pair, or image with depth, at each frame, -1 for none."""
 
     left: ImageSeries[T]
     right: ImageSeries[T] | None
     rows: NDArray[np.int64]
+    depth: ImageSeries[T] | None = None
 
     @classmethod
-    def beside(cls, frame_stamps_ns: Stamps, cameras: "Sequence[ImageSeries[T]]", log: ReadLog) -> "ViewSeries[T]":
-        """The images of one or two cameras that are nearest to each frame (F,), at most half a usual period away."""
+    def beside(
+        cls,
+        frame_stamps_ns: Stamps,
+        cameras: "Sequence[ImageSeries[T]]",
+        log: ReadLog,
+        depth: ImageSeries[T] | None = None,
+    ) -> "ViewSeries[T]":
+        """The images of one or two cameras, or of one with its depth, that are nearest to each frame (F,), at most half a usual period
+        away."""
         left, right = (cameras[0], None) if len(cameras) == 1 else pair_images(cameras[0], cameras[1], log)
+        if depth is not None:
+            left, depth = pair_images(left, depth, log, DEPTH_TOLERANCE_NS)
         if not len(left):
-            return cls(left, right, np.full(len(frame_stamps_ns), -1))
+            return cls(left, right, np.full(len(frame_stamps_ns), -1), depth)
         period_ns = int(np.median(np.diff(frame_stamps_ns))) if len(frame_stamps_ns) > 1 else _DAY_NS
         frames, images = pair_stamps(frame_stamps_ns, left.stamps_ns, period_ns // 2)
         rows = np.full(len(frame_stamps_ns), -1)
         rows[frames] = images
-        return cls(left, right, rows)
+        return cls(left, right, rows, depth)
 
 
 class ImageReader(Protocol[T]):
@@ -151,8 +168,8 @@ class SeriesFrames(Generic[T]):
         """The images of one of the other views, counted from 1, at the frames that have them."""
         view = self.others[number - 1]
         rows = view.rows[view.rows >= 0]
-        right = None if view.right is None else view.right.take(rows)
-        return replace(self, left=view.left.take(rows), right=right, depth=None, others=())
+        right, depth = (None if series is None else series.take(rows) for series in (view.right, view.depth))
+        return replace(self, left=view.left.take(rows), right=right, depth=depth, others=())
 
     @property
     def other_numbers(self) -> tuple[int, ...]:
@@ -161,7 +178,7 @@ class SeriesFrames(Generic[T]):
         return tuple(range(first, first + sum(1 if view.right is None else 2 for view in self.others)))
 
     def hash_into(self, digest: "hashlib._Hash") -> None:
-        others = (series for view in self.others for series in (view.left, view.right))
+        others = (series for view in self.others for series in (view.left, view.right, view.depth))
         read = (self.left, self.right, self.depth, *others)
         self.reader.hash_into(digest, [s for series in read if series for s in series.sources])
 
@@ -170,7 +187,7 @@ class SeriesFrames(Generic[T]):
 
     def _stored(self, index: int) -> StoredFrame:
         others = (
-            None if view.rows[index] < 0 else self._images(int(view.rows[index]), view.left, view.right)
+            None if view.rows[index] < 0 else self._images(int(view.rows[index]), view.left, view.right, view.depth)
             for view in (self.others if self.has_others else ())
         )
         return replace(self._images(index, self.left, self.right, self.depth), others=tuple(others))

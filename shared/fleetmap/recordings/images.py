@@ -261,8 +261,8 @@ def grey_image(image: Image, where: str = "") -> StoredImage:
     return StoredImage("mono8", np.ascontiguousarray(image).tobytes(), where, width, height, width)
 
 
-def png_image(image: Image, where: str = "") -> StoredImage:
-    """Store a grey (H, W) uint8 image as PNG: lossless, at the fastest setting."""
+def png_image(image: Image | NDArray[np.uint16], where: str = "") -> StoredImage:
+    """Store a grey (H, W) image as PNG: lossless, at the fastest setting."""
     _, data = cv2.imencode(".png", image, _FAST_PNG)
     return StoredImage("file", data.tobytes(), where)
 

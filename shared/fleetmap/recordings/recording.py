@@ -140,12 +140,13 @@ class Recording:
                     f"the calibration says {camera.width_px}x{camera.height_px}; pass the matching one with "
                     "--calibration FILE"
                 )
-        if frame.depth_m is not None and frame.depth_m.shape != frame.left.shape:
-            (height, width), (colour_height, colour_width) = frame.depth_m.shape, frame.left.shape
-            raise RecordingError(
-                f"{self.path}: the depth image at {frame.stamp_ns} is {width}x{height} px, the colour image "
-                f"{colour_width}x{colour_height}; record depth registered to colour"
-            )
+        for view in (frame, *(other for other in frame.others if other is not None)):
+            if view.depth_m is not None and view.depth_m.shape != view.left.shape:
+                (height, width), (colour_height, colour_width) = view.depth_m.shape, view.left.shape
+                raise RecordingError(
+                    f"{self.path}: the depth image at {view.stamp_ns} is {width}x{height} px, the colour image "
+                    f"{colour_width}x{colour_height}; record depth registered to colour"
+                )
         return frame
 
     def readable(self, indices: NDArray[np.int64]) -> tuple["Recording", NDArray[np.int64]]:
@@ -209,6 +210,8 @@ class Recording:
         of_pair = {SensorSet.MONO: SensorSet.STEREO, SensorSet.MONO_INERTIAL: SensorSet.STEREO_INERTIAL}
         of_one = {pair: one for one, pair in of_pair.items()}
         sensor_set = (of_pair if len(views[number]) == 2 else of_one).get(self.sensor_set, self.sensor_set)
+        if calibration.cameras[0].has_depth:
+            sensor_set = SensorSet.RGBD
         frames = series.of_view(number)
         stamps_ns = frames.left.stamps_ns
         return replace(self, calibration=calibration, frames=frames, frame_stamps_ns=stamps_ns, sensor_set=sensor_set)

@@ -22,7 +22,7 @@ class CameraCalibration:
     model: a key of CAMERA_MODELS. intrinsics_px: fx fy cx cy, as the model defines them. body_from_cam (4, 4).
     imu_minus_cam_s: stamp of the IMU clock minus stamp of the camera clock at one moment (Kalibr's timeshift_cam_imu). line_delay_s: from
     one row to the next of a rolling shutter, 0 for a global one; reported, not corrected. mask: parts of the image that show the robot
-    itself, inside an odd number of polygons.
+    itself, inside an odd number of polygons. has_depth: a view of its own with depth registered to it, beside the rig's first view.
     """
 
     model: str
@@ -34,6 +34,7 @@ class CameraCalibration:
     imu_minus_cam_s: float = 0.0
     line_delay_s: float = 0.0
     mask: tuple[Polygon, ...] = ()
+    has_depth: bool = False
 
     def __post_init__(self) -> None:
         # Values from files are numpy scalars, which encoders do not support.
@@ -87,11 +88,14 @@ class RigCalibration:
 
     @property
     def views(self) -> tuple[tuple[int, ...], ...]:
-        """Numbers of the cameras of each view, a single camera or a stereo pair: two successive cameras that look the same way."""
+        """Numbers of the cameras of each view: a depth camera, a stereo pair, which is two other successive cameras that look the same
+        way, or a single camera."""
         views, numbers = list[tuple[int, ...]](), list(range(len(self.cameras)))
         while numbers:
-            axes = [self.cameras[number].body_from_cam[:3, 2] for number in numbers[:2]]
-            size = 2 if len(axes) == 2 and axes[0] @ axes[1] > _SAME_WAY_COSINE else 1
+            ahead = [self.cameras[number] for number in numbers[:2]]
+            is_pair = len(ahead) == 2 and not any(camera.has_depth for camera in ahead)
+            axes = [camera.body_from_cam[:3, 2] for camera in ahead]
+            size = 2 if is_pair and axes[0] @ axes[1] > _SAME_WAY_COSINE else 1
             views.append(tuple(numbers[:size]))
             del numbers[:size]
         return tuple(views)

@@ -144,10 +144,10 @@ class Rectifier:
         cameras = tuple(calibration.cameras[number] for number in view)
         self._numbers = tuple(first_camera + number for number in view)
         self._sizes = [(c.height_px, c.width_px) for c in cameras]
-        self.has_depth = has_depth
-        if has_depth or len(cameras) == 1:
+        self.has_depth = has_depth or cameras[0].has_depth
+        if self.has_depth or len(cameras) == 1:
             cam0_from_rect = np.eye(3)
-            baseline = RGBD_BASELINE_M if has_depth else 0.0
+            baseline = RGBD_BASELINE_M if self.has_depth else 0.0
             used = cameras[:1]
         else:
             cam0_from_rect, baseline = _rectifying_rotation(cameras[0], cameras[1], self._numbers)
@@ -199,9 +199,10 @@ class Rectifier:
         return RectifiedFrame(frame.stamp_ns, left, right, disparity, tuple(others))
 
     def _other(self, frame: CameraFrame | None, rectifier: "Rectifier") -> OtherView | None:
+        sizes_px = rectifier._sizes[0], rectifier._sizes[-1], rectifier._sizes[0]
         if frame is None or any(
             image is not None and image.shape != size_px
-            for image, size_px in zip((frame.left, frame.right), rectifier._sizes, strict=False)
+            for image, size_px in zip((frame.left, frame.right, frame.depth_m), sizes_px, strict=True)
         ):
             return None
         later_ns = round((rectifier.imu_minus_cam_s - self.imu_minus_cam_s) * 1e9)

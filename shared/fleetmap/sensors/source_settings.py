@@ -24,11 +24,12 @@ class SourceSection(Section, frozen=True):
 
 
 CAMERA_ROLES = ("left", "right", "cam2", "cam3", "cam4", "cam5", "cam6", "cam7")
+DEPTH_ROLES = ("depth", *(f"{role}_depth" for role in CAMERA_ROLES[2:]))
 
 
 class Topics(Section, frozen=True):
     """Topic names in MCAP files and ROS bags. An image topic also matches itself followed by `/compressed`. left and right are cameras
-    0 and 1 of the calibration, cam2 to cam7 the others."""
+    0 and 1 of the calibration, cam2 to cam7 the others. depth is registered to left, cam2_depth to cam2."""
 
     left: str = "/cam0/image_raw"
     right: str = "/cam1/image_raw"
@@ -46,8 +47,18 @@ class Topics(Section, frozen=True):
     cam5: str = "/cam5/image_raw"
     cam6: str = "/cam6/image_raw"
     cam7: str = "/cam7/image_raw"
+    cam2_depth: str = "/cam2/depth/image_raw"
+    cam3_depth: str = "/cam3/depth/image_raw"
+    cam4_depth: str = "/cam4/depth/image_raw"
+    cam5_depth: str = "/cam5/depth/image_raw"
+    cam6_depth: str = "/cam6/depth/image_raw"
+    cam7_depth: str = "/cam7/depth/image_raw"
 
     def camera(self, number: int) -> str:
         """The topic of a camera's images by its number in the calibration; empty beyond the eighth."""
         roles = CAMERA_ROLES[number : number + 1]
         return str(getattr(self, roles[0])) if roles else ""
+
+    def depth_of(self, number: int) -> str:
+        """The topic of the depth registered to the images of a camera beside the first view; empty beyond the eighth."""
+        return str(getattr(self, f"cam{number}_depth", ""))

@@ -17,7 +17,7 @@ from fleetmap.recordings.ros2 import messages
 from fleetmap.recordings.ros2.graph import KeyLayout
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples
-from fleetmap.sensors.source_settings import CAMERA_ROLES
+from fleetmap.sensors.source_settings import CAMERA_ROLES, DEPTH_ROLES
 from fleetmap.sources.intake import Intake
 
 _IDLE_S = 1.0
@@ -61,7 +61,11 @@ class RigFrames:
 
     def __init__(self, calibration: RigCalibration) -> None:
         self._views = calibration.views
-        self._pairs = [StereoPairs() if len(view) > 1 else None for view in self._views]
+        self._has_depth = [calibration.cameras[view[0]].has_depth for view in self._views]
+        self._pairs = [
+            StereoPairs() if len(view) > 1 or has_depth else None
+            for view, has_depth in zip(self._views, self._has_depth, strict=True)
+        ]
         self._recent = [deque[StoredFrame](maxlen=_WAITING_IMAGES) for _ in self._views]  # of each view
         self._waiting: StoredFrame | None = None
         self._leader = 0
@@ -74,13 +78,15 @@ class RigFrames:
     def unpaired(self) -> int:
         return sum(pairs.unpaired for pairs in self._pairs if pairs is not None)
 
-    def add(self, number: int, stamp_ns: int, image: StoredImage) -> list[StoredFrame]:
-        """Add an image of a camera; return the frames that are complete."""
+    def add(self, number: int, stamp_ns: int, image: StoredImage, *, is_depth: bool = False) -> list[StoredFrame]:
+        """Add an image of a camera, or its depth; return the frames that are complete."""
         view = next(k for k, numbers in enumerate(self._views) if number in numbers)
-        pairs, side = self._pairs[view], "left" if number == self._views[view][0] else "right"
+        pairs, side = self._pairs[view], "left" if number == self._views[view][0] and not is_depth else "right"
         frame = StoredFrame(stamp_ns, image) if pairs is None else pairs.add(side, stamp_ns, image)
         if frame is None:
             return []
+        if self._has_depth[view]:
+            frame = replace(frame, right=None, depth=frame.right)
         recent = self._recent[view]
         if recent and frame.stamp_ns <= recent[-1].stamp_ns:  # its clock was set
             recent.clear()
@@ -172,8 +178,11 @@ class Ros2Source:
             if not has_depth and len(calibration.views) > 1:
                 self._rig = RigFrames(calibration)
             further = () if self._rig is None else CAMERA_ROLES[2 : len(calibration.cameras)]
-            named = zip(("left", "right", *further), (*roles, *further), strict=False)
-            for number, (side, role) in enumerate(named):
+            named = [*enumerate(zip(("left", "right", *further), (*roles, *further), strict=False))]
+            if self._rig is not None:
+                depths = zip(range(2, len(calibration.cameras)), DEPTH_ROLES[1:], strict=False)
+                named += [(n, ("depth", role)) for n, role in depths if calibration.cameras[n].has_depth]
+            for number, (side, role) in named:
                 names = transports(getattr(topics, role), role)
                 self._topics += [(name, partial(self._take_image, number, side)) for name in names]
 
@@ -212,11 +221,12 @@ class Ros2Source:
         stamp_ns, _ = messages.header_of(payload)
         decode = messages.decode_compressed_image if is_compressed else messages.decode_image
         image = decode(payload, f"{side} at {stamp_ns}")
-        if side == "left" or not self.has_depth:
+        is_depth = side == "depth" or (side == "right" and self.has_depth)
+        if not is_depth:
             self._grey_peak = max(self._grey_peak, grey_peak(image) if self._grey_peak < 1 << 12 else 0)
             image = replace(image, bits=grey_bits(self._grey_peak))
         if self._rig is not None:
-            for complete in self._rig.add(number, stamp_ns, image):
+            for complete in self._rig.add(number, stamp_ns, image, is_depth=is_depth):
                 intake.put_frame(complete)
             return
         if not self.has_depth and len(self.calibration.cameras) == 1:

@@ -24,7 +24,8 @@ _PERSON_AHEAD_M = 0.8
 
 @dataclass(frozen=True, slots=True)
 class StereoShot:
-    """A recorded pair, and the ground truth of the left image. others: images of the rig's other views, of a pair or a single camera."""
+    """A recorded pair, and the ground truth of the left image. others: images of the rig's other views, of a pair or a single camera;
+    other_depths_m: of their first ones, exact."""
 
     left: Image
     right: Image
@@ -33,6 +34,7 @@ class StereoShot:
     exposure: Exposure
     subframes: int
     others: tuple[tuple[Image, ...], ...] = ()
+    other_depths_m: tuple[NDArray[np.float32], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,9 +104,10 @@ class StereoRenderer:
         if self.faults.has("camera-frozen", t_s) and self._last_right is not None:
             right_image = self._last_right
         self._last_right = right_image
-        views = (numbers for numbers in self._rig.views[1:])
-        others = tuple(tuple(beside[number - 2].image for number in numbers) for numbers in views)
-        return StereoShot(left.image, right_image, left.depth_m, left.faces, exposure, left.subframes, others)
+        views = [[beside[number - 2] for number in numbers] for numbers in self._rig.views[1:]]
+        others = tuple(tuple(shot.image for shot in shots) for shots in views)
+        depths_m = tuple(first.depth_m for first, *_ in views)
+        return StereoShot(left.image, right_image, left.depth_m, left.faces, exposure, left.subframes, others, depths_m)
 
     def _person_in_front(self, t_s: float) -> tuple[float, float, float] | None:
         if not self.faults.has("person-in-front", t_s):

@@ -67,11 +67,13 @@ class ViewMount:
     forward_m: float
     left_m: float = 0.0
     baseline_m: float = 0.12
+    has_depth: bool = False
 
 
 RIGS: dict[str, tuple[ViewMount, ...]] = {  # beside the pair in front
     "pair": (),
     "front-rear": (ViewMount(math.pi, -0.3),),
+    "front-depth": (ViewMount(math.pi, -0.3, 0.0, 0.0, has_depth=True),),
     "front-sides": (ViewMount(math.pi / 2, 0.0, 0.25, 0.0), ViewMount(-math.pi / 2, 0.0, -0.25, 0.0)),
 }
 
@@ -140,9 +142,8 @@ def nominal_calibration(kind: RobotKind) -> RigCalibration:
         turn = so3_exp(np.array([0.0, 0.0, view.yaw_rad])) if view.yaw_rad else np.eye(3)
         for side in (0.5, -0.5) if view.baseline_m else (0.0,):
             place = middle + turn @ np.array([0.0, side * view.baseline_m, 0.0])
-            camera = CameraCalibration(
-                model, kind.width_px, kind.height_px, intrinsics, np.array(distortion), se3(turn @ rotation, place)
-            )
+            lens = model, kind.width_px, kind.height_px, intrinsics, np.array(distortion)
+            camera = CameraCalibration(*lens, se3(turn @ rotation, place), has_depth=view.has_depth)
             cameras.append(check_camera(camera, f"cam{len(cameras)}"))
     base_from_body = se3(np.eye(3), np.array([0.0, 0.0, kind.body_height_m]))
     return RigCalibration(tuple(cameras), kind.imu.noise, base_from_body)

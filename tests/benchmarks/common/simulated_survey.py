@@ -158,7 +158,8 @@ def simulated_survey(
         tracked = run.handle(frame, *feed.until(frame.stamp_ns))
         seen.append(FrameTracks.of_frame(tracked.estimate))
         if tracked.is_keyframe:
-            views = [_keyframe(each, number, images) for each in (session, *others)]
+            baseline_m = session.camera.baseline_m
+            views = [_keyframe(each, number, images, baseline_m) for each in (session, *others)]
             (first, *further), ids, exact = zip(*views, strict=True)
             keyframes.append(replace(first, others=tuple(further)))
             landmarks.extend(ids)
@@ -174,16 +175,20 @@ def simulated_survey(
 
 
 def _keyframe(
-    session: EstimatorSession, number: int, images: GreyPictures
+    session: EstimatorSession, number: int, images: GreyPictures, baseline_m: float
 ) -> tuple[Keyframe, NDArray[np.uint64], NDArray[np.float32]]:
-    """A keyframe, the landmarks (N,) that its features show, and where these are exactly (N, 3)."""
+    """A keyframe with disparities over baseline_m, the landmarks (N,) that its features show, and where these are exactly (N, 3)."""
     found, sighting = session.features(number), session.sighting(number)
     real = found.rows >= 0
     ids, exact = np.zeros(len(real), np.uint64), np.zeros((len(real), 3), np.float32)
     ids[real], exact[real] = sighting.ids[found.rows[real]], sighting.pixels[found.rows[real]]
     measured = found.pixels[:, 0] - found.pixels[:, 2]
-    disparities = np.column_stack([measured, np.where(np.isfinite(measured), _DISPARITY_PX, np.nan)])
     points = session.camera.point_from_pixel(found.pixels[:, :2], measured)
+    scale = baseline_m / session.camera.baseline_m if session.camera.baseline_m else 1.0
+    if scale != 1.0:
+        exact[:, 2] = exact[:, 0] - np.float32(scale) * (exact[:, 0] - exact[:, 2])
+    sigmas = np.where(np.isfinite(measured), scale * _DISPARITY_PX, np.nan)
+    disparities = np.column_stack([measured * scale, sigmas])
     angles = np.zeros(len(real), np.float32)
     features = orb.Features(found.pixels[:, :2].copy(), found.octaves.copy(), angles, found.descriptors.copy())
     return Keyframe(number, session.stamps_ns[number], features, disparities, points, images, 0), ids, exact
@@ -210,10 +215,12 @@ def drawn_alignment(survey: SimulatedSurvey) -> Iterator[None]:
             shown[rows], octaves[rows] = survey.landmarks[k][features], keyframe.features.octaves[features]
             drawn = np.random.default_rng([7, k]).standard_normal((len(keyframe.features), 3), np.float32)[features]
             pixels[rows] = survey.exact_px[k][features] + drawn * np.float32(_ALIGNED_PX)
-            disparity = survey.exact_px[k][features, 0] - survey.exact_px[k][features, 2] + drawn[:, 2] * _DISPARITY_PX
+            measured = keyframe.measured(features)
+            noise_px = drawn[:, 2] * np.nan_to_num(measured[:, 1].astype(np.float32))
+            disparity = survey.exact_px[k][features, 0] - survey.exact_px[k][features, 2] + noise_px
             pixels[rows, 2] = pixels[rows, 0] - disparity
             own[rows, :2] = keyframe.features.pixels[features]
-            own[rows, 2] = own[rows, 0] - keyframe.disparities[features, 0]
+            own[rows, 2] = own[rows, 0] - measured[:, 0]
         sure = (shown == shown[reference_row]) & (shown > 0)
         sigmas = np.where(sure, noise.aligned_sigma_px, noise.descriptor_sigma_px * 1.2 ** octaves.astype(np.float64))
         measured = np.where(np.isfinite(own[:, 2]), noise.disparity_sigma_px, np.hypot(noise.disparity_sigma_px, 1.0))

@@ -1,9 +1,9 @@
-"""Rigs with a second pair that looks back, without pictures: surveys by one pair and by both, robots against the survey's direction and
+"""Rigs with further views, without pictures: surveys by one pair and by the rig, robots along and against the survey's direction and
 with the pair in front covered.
 
-`PYTHONPATH=tests python tests/benchmarks/robot/bench_rigs.py [--seed SEED] [--count N] [--lens NAME]`: for each of N sites from SEED on,
-ATE of the surveys and their seconds of CPU; shares of frames that are TRACKING, the largest error of one, and frames that are TRACKING
-more than 0.3 m off.
+`PYTHONPATH=tests python tests/benchmarks/robot/bench_rigs.py [--seed SEED] [--count N] [--rig NAME] [--lens NAME]`: for each of N sites
+from SEED on, ATE of the surveys and their seconds of CPU; shares of frames that are TRACKING, errors of these (root mean square and
+largest), and frames that are TRACKING more than 0.3 m off. NAME: of fleetsim's rigs.
 """
 
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
@@ -37,14 +37,13 @@ _WRONG_M = 0.3
 _SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
 
 
-def views(
-    robot: str, seed: int, day: int, covered_s: tuple[float, float] = (0.0, 0.0), lens: str | None = None
-) -> list[EstimatorSession]:
-    """Both views of a robot of the small loop; covered_s: of the pair in front."""
-    session = prepare(Order("small-loop", seed=seed, day=day, robot=robot, rig="front-rear", lens=lens))
+def views(order: Order, covered_s: tuple[float, float] = (0.0, 0.0)) -> list[EstimatorSession]:
+    """All views of a robot; covered_s: of the pair in front."""
+    session = prepare(order)
     session.renderer.close()
-    field = LandmarkField(session.world)
-    return [EstimatorSession(session, field=field, covered_s=covered_s), EstimatorSession(session, field=field, view=1)]
+    field, further = LandmarkField(session.world), range(1, len(session.nominal.views))
+    front = EstimatorSession(session, field=field, covered_s=covered_s)
+    return [front, *(EstimatorSession(session, field=field, view=view) for view in further)]
 
 
 def surveyed(seed: int, front: EstimatorSession, others: list[EstimatorSession]) -> MapView:
@@ -58,7 +57,7 @@ def surveyed(seed: int, front: EstimatorSession, others: list[EstimatorSession])
     true_from_map, _ = align_points(truth, found)
     ate_m = np.sqrt(np.square(transform_points(true_from_map, found) - truth).sum(axis=1).mean())
     accepted = survey.loops.counts()["accepted"]
-    name = "a rear pair" if others else "one pair"
+    name = "the rig" if others else "one pair"
     print(
         f"site {seed}, survey with {name}: ATE {1000 * ate_m:.1f} mm, {accepted} loops, {spent_s:.0f} s of CPU",
         flush=True,
@@ -78,7 +77,9 @@ def told(estimates: list[Estimate], session: EstimatorSession) -> str:
         float(np.linalg.norm(e.map_from_body[:3, 3] - t[:3, 3])) for e, t in tracking if e.map_from_body is not None
     ]
     wrong = sum(error > _WRONG_M for error in errors)
-    return f"{share:6.1%} tracking, at most {1000 * max(errors, default=0.0):.0f} mm off, {wrong} frames wrong"
+    rms_m = float(np.sqrt(np.mean(np.square(errors or [0.0]))))
+    most_m = max(errors, default=0.0)
+    return f"{share:6.1%} tracking, {1000 * rms_m:.1f} mm rms, at most {1000 * most_m:.0f} mm off, {wrong} frames wrong"
 
 
 def main() -> None:
@@ -86,21 +87,30 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--count", type=int, default=1)
+    parser.add_argument("--rig", default="front-rear")
     parser.add_argument("--lens")
     chosen = parser.parse_args()
     for seed in range(chosen.seed, chosen.seed + chosen.count):
-        front, rear = views("survey", seed, 0, lens=chosen.lens)
-        of_front, of_both = (surveyed(seed, front, others) for others in ([], [rear]))
-        against = views("opposite-1", seed, 1, lens=chosen.lens)
-        covered = views("runner-1", seed, 1, _COVERED_S, lens=chosen.lens)
-        for name, view, robot, others in (
+
+        def of(robot: str, day: int, seed: int = seed) -> Order:
+            return Order("small-loop", seed=seed, day=day, robot=robot, rig=chosen.rig, lens=chosen.lens)
+
+        front, *others = views(of("survey", 0))
+        of_front, of_rig = (surveyed(seed, front, each) for each in ([], others))
+        along, against = views(of("runner-1", 1)), views(of("opposite-1", 1))
+        covered = views(of("runner-1", 1), _COVERED_S)
+        for name, view, robot, used in (
+            ("along the survey, one pair on both", of_front, along[0], []),
+            ("along the survey, the rig on the robot", of_front, along[0], along[1:]),
+            ("along the survey, the rig on both", of_rig, along[0], along[1:]),
+            ("along the survey, the rig on the survey's robot", of_rig, along[0], []),
             ("against the survey, one pair on both", of_front, against[0], []),
-            ("against the survey, a rear pair on the robot", of_front, against[0], against[1:]),
-            ("against the survey, a rear pair on the survey's robot", of_both, against[0], []),
-            ("front covered for 20 s, one pair", of_both, covered[0], []),
-            ("front covered for 20 s, a rear pair", of_both, covered[0], covered[1:]),
+            ("against the survey, the rig on the robot", of_front, against[0], against[1:]),
+            ("against the survey, the rig on the survey's robot", of_rig, against[0], []),
+            ("front covered for 20 s, one pair", of_rig, covered[0], []),
+            ("front covered for 20 s, the rig", of_rig, covered[0], covered[1:]),
         ):
-            estimates = estimator_loop.run_localizer(robot, view, others=others)
+            estimates = estimator_loop.run_localizer(robot, view, others=used)
             print(f"site {seed}, {name}: {told(estimates, robot)}", flush=True)
 
 

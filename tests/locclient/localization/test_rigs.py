@@ -31,12 +31,14 @@ WEST_M, EAST_M, Y_M = 4.5, 8.5, LAYOUT.aisle_y_m(0)
 ALWAYS = (0.0, 1e3)
 
 
-@lru_cache(maxsize=4)
-def views(kind: str, points: tuple[tuple[float, float], ...], covered_s: tuple[float, float]) -> list[EstimatorSession]:
-    """The views of a robot with a pair in front and one behind; covered_s: of the pair in front."""
+@lru_cache(maxsize=8)
+def views(
+    kind: str, points: tuple[tuple[float, float], ...], covered_s: tuple[float, float], rig: str = "front-rear"
+) -> list[EstimatorSession]:
+    """The views of a robot with a pair in front and one, or a depth camera, behind; covered_s: of the pair in front."""
     run = Run(kind, (Route(points, rest_s=0.5),), 8.0, is_sharp=True)
     with patch.dict(SCENARIOS, {"aisle": lambda: Scenario("one aisle", LAYOUT, {kind: run})}):
-        session = prepare(Order("aisle", seed=11, rig="front-rear"))
+        session = prepare(Order("aisle", seed=11, rig=rig))
     session.renderer.close()
     field = LandmarkField(session.world)
     return [EstimatorSession(session, field=field, view=k, covered_s=(0.0, 0.0) if k else covered_s) for k in range(2)]
@@ -50,9 +52,9 @@ def east_bound_map() -> MapView:
 
 
 def driven(
-    points: tuple[tuple[float, float], ...], covered_s: tuple[float, float], *, has_rear: bool
+    points: tuple[tuple[float, float], ...], covered_s: tuple[float, float], *, has_rear: bool, rig: str = "front-rear"
 ) -> list[Estimate]:
-    front, rear = views("runner", points, covered_s)
+    front, rear = views("runner", points, covered_s, rig)
     estimates = estimator_loop.run_localizer(front, east_bound_map(), others=[rear] if has_rear else [])
     known = [(e, truth) for e, truth in zip(estimates, front.map_from_body, strict=True) if e.status is Status.TRACKING]
     for estimate, truth in known:
@@ -65,16 +67,18 @@ def share(estimates: list[Estimate]) -> float:
     return float(np.mean([estimate.status is Status.TRACKING for estimate in estimates]))
 
 
-def test_against_the_surveys_direction_the_rear_pair_knows_the_place() -> None:
+@pytest.mark.parametrize("rig", ["front-rear", "front-depth"])
+def test_against_the_surveys_direction_the_rear_view_knows_the_place(rig: str) -> None:
     west_bound = ((EAST_M - 1.0, Y_M), (WEST_M, Y_M))
     assert share(driven(west_bound, (0.0, 0.0), has_rear=False)) < 0.3
-    assert share(driven(west_bound, (0.0, 0.0), has_rear=True)) > 0.9
+    assert share(driven(west_bound, (0.0, 0.0), has_rear=True, rig=rig)) > 0.9
 
 
-def test_with_the_front_covered_all_along_the_rear_pair_localises_it() -> None:
+@pytest.mark.parametrize("rig", ["front-rear", "front-depth"])
+def test_with_the_front_covered_all_along_the_rear_view_localises_it(rig: str) -> None:
     """Odometry and fixes come from behind, and every estimate says which view is dark."""
     west_bound = ((EAST_M - 1.0, Y_M), (WEST_M, Y_M))
-    estimates = driven(west_bound, ALWAYS, has_rear=True)
+    estimates = driven(west_bound, ALWAYS, has_rear=True, rig=rig)
     assert share(estimates) > 0.9
     assert all(estimate.views == (Cause.DARK, Cause.NONE) for estimate in estimates)
     assert share(driven(west_bound, ALWAYS, has_rear=False)) == 0.0

@@ -17,7 +17,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from mapserver.cli import app
 from mapserver.doctor.findings import Finding, Verdict
-from mapserver.doctor.rig import check_mountings, judge_mounting, mounting_error
+from mapserver.doctor.rig import check_mountings, check_rig, judge_mounting, mounting_error
 from support.recordings.painted_room import FRAME_NS, Ride, frame_at, rig
 
 REAR = se3(so3_exp(np.array([0.0, 0.0, np.pi])), np.array([-0.1, 0.0, 0.0]))  # body_from_turned
@@ -78,6 +78,9 @@ def test_what_a_drive_does_not_show_is_not_judged() -> None:
     assert judge_mounting("cam2", mounting_error(motions(rng, np.eye(4), count=10))).verdict is Verdict.NOT_JUDGED
 
 
+STAMPS_NS = range(2_000_000_000, 4_500_000_000, FRAME_NS)
+
+
 class Turned(Ride):
     def map_from_body(self, time_s: float) -> Array:
         return np.asarray(super().map_from_body(time_s) @ REAR)
@@ -88,8 +91,7 @@ def ride() -> tuple[RigCalibration, list[CameraFrame]]:
     """A ride in the painted room with a pair in front and one behind, without an IMU."""
     front = rig(SensorSet.STEREO)
     rear = (replace(camera, body_from_cam=REAR @ camera.body_from_cam) for camera in front.cameras)
-    stamps = range(2_000_000_000, 4_500_000_000, FRAME_NS)
-    pairs = [[frame_at(each, stamp, SensorSet.STEREO) for each in (Ride(), Turned())] for stamp in stamps]
+    pairs = [[frame_at(each, stamp, SensorSet.STEREO) for each in (Ride(), Turned())] for stamp in STAMPS_NS]
     return replace(front, cameras=(*front.cameras, *rear)), [replace(a, others=(b,)) for a, b in pairs]
 
 
@@ -122,6 +124,23 @@ def test_a_rear_pair_turned_by_half_a_degree_is_named(recorded: Path, tmp_path: 
         (found,) = check_mountings(recording)
     assert found.name == "cam2 and cam3 against cam0 and cam1"
     assert found.verdict is (Verdict.WARN if turned else Verdict.OK), found.sentence
+
+
+@pytest.mark.parametrize("turned", [(), (2,)])
+def test_a_depth_camera_behind_is_checked_and_its_mounting_named(tmp_path: Path, turned: tuple[int, ...]) -> None:
+    calibration, frames = ride()
+    rear = replace(calibration.cameras[2], has_depth=True)
+    rig_of_both = replace(calibration, cameras=(*calibration.cameras[:2], rear))
+    rig_of_both = with_turned(rig_of_both, turned) if turned else rig_of_both
+    with McapRecordingWriter(tmp_path / "ride.mcap", rig_of_both) as writer:
+        for frame, stamp_ns in zip(frames, STAMPS_NS, strict=True):
+            behind = frame_at(Turned(), stamp_ns, SensorSet.RGBD)
+            writer.write_frame(replace(frame, others=(behind,)))
+    with open_recording(tmp_path / "ride.mcap") as recording:
+        found = {finding.name: finding for finding in check_rig(recording)}
+    assert found["depth of cam2"].verdict is Verdict.OK, found["depth of cam2"].sentence
+    mounting = found["cam2 against cam0 and cam1"]
+    assert mounting.verdict is (Verdict.WARN if turned else Verdict.OK), mounting.sentence
 
 
 def test_the_doctor_names_the_pair_whose_images_are_exchanged(tmp_path: Path) -> None:

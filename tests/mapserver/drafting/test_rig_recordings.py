@@ -13,7 +13,7 @@ from fleetmap.geometry import se3_exp
 from fleetmap.recordings import Recording
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.rectification import RGBD_BASELINE_M, Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from fleetsim.recorder import Order, prepare
 from mapserver.doctor import Finding
@@ -23,15 +23,15 @@ from mapserver.drafting.sensor_subset import with_other_views
 from mapserver.drafting.survey_recordings import OpenRecordings, RecordingOptions, _admission
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.keyframes.keyframes import make_keyframes
-from mapserver.survey.keyframes.rig_views import body_from_views, other_views
+from mapserver.survey.keyframes.rig_views import body_from_views, depth_views, other_views
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyTools
 from support.recordings.rig_samples import images_of
 
 
-@lru_cache(maxsize=1)
-def simulated() -> tuple[RigCalibration, tuple[CameraFrame, ...]]:
-    session = prepare(Order("clip", frames=3, size_px=(160, 120), rig="front-rear"))
+@lru_cache(maxsize=2)
+def simulated(rig: str = "front-rear") -> tuple[RigCalibration, tuple[CameraFrame, ...]]:
+    session = prepare(Order("clip", frames=3, size_px=(160, 120), rig=rig))
     try:
         return session.nominal, tuple(session.frames())
     finally:
@@ -101,6 +101,26 @@ def test_a_shorter_baseline_of_another_view_is_converted_to_the_first_one() -> N
     )
     known = np.isfinite(same.points_cam).all(axis=1) & np.isfinite(nearer.points_cam).all(axis=1)
     np.testing.assert_allclose(nearer.points_cam[known], same.points_cam[known] / 2, rtol=1e-9)
+
+
+def test_depth_of_another_view_is_read_as_disparities_of_the_first_baseline() -> None:
+    """As far away as the sensor says, with the sensor's noise; also where an adjustment reads its picture again."""
+    calibration, frames = simulated("front-depth")
+    rectifier, settings = Rectifier(calibration), SurveySettings()
+    assert depth_views(rectifier) == {1}
+    rows = [(0, rectifier.rectify(frames[0]))]
+    (rear,) = next(make_keyframes(rows, rectifier.camera, settings, others=other_views(rectifier))).others
+    seen = np.flatnonzero(np.isfinite(rear.disparities[:, 0]))
+    pixels = rear.features.pixels[seen]
+    columns, lines = np.rint(pixels).astype(int).T
+    depth_m = frames[0].others[0].depth_m[lines, columns]  # type: ignore[union-attr, index]
+    assert len(seen) > 20
+    np.testing.assert_allclose(np.median(rear.points_cam[seen, 2] / depth_m), 1.0, atol=0.01)
+    scale = rectifier.camera.baseline_m / RGBD_BASELINE_M
+    np.testing.assert_allclose(rear.disparities[seen, 1], scale * settings.stereo.depth_sigma_px)
+    np.testing.assert_array_equal(
+        rear.with_pyramid().measured_at(seen, pixels, settings.stereo), rear.disparities[seen]
+    )
 
 
 @pytest.mark.parametrize("recordings", [1, 2])

@@ -1,4 +1,4 @@
-"""Surveys of a rig with a second pair that looks back, without pictures: all views observe into one state."""
+"""Surveys of a rig with a second pair, or a depth camera, that looks back, without pictures: all views observe into one state."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -32,22 +32,22 @@ _ALONG = "along"  # one way
 _BACK = "back"  # and back on the other side of the aisle
 
 
-def driven(name: str, day: int = 0) -> list[EstimatorSession]:
+def driven(name: str, day: int = 0, rig: str = "front-rear") -> list[EstimatorSession]:
     """Both views of a drive in an aisle."""
     base = find_scenario("clip")
     y = base.layout.aisle_y_m(0)
     way = ((4.5, y - 0.4), (8.5, y - 0.4)) + (((8.5, y + 0.4), (4.5, y + 0.4)) if name == _BACK else ())
     runs = {name: replace(base.runs["survey"], routes=(Route(way, rest_s=0.5),), rate_hz=5.0)}
     with patch.dict(SCENARIOS, clip=lambda: replace(base, runs=runs)):
-        session = prepare(Order("clip", seed=4, day=day, robot=name, rig="front-rear"))
+        session = prepare(Order("clip", seed=4, day=day, robot=name, rig=rig))
     session.renderer.close()
     field = LandmarkField(session.world)
     return [EstimatorSession(session, field=field, view=view) for view in (0, 1)]
 
 
-@lru_cache(maxsize=4)
-def surveyed(name: str, views: int) -> tuple[SimulatedSurvey, Survey]:
-    first, *others = driven(name)[:views]
+@lru_cache(maxsize=6)
+def surveyed(name: str, views: int, rig: str = "front-rear") -> tuple[SimulatedSurvey, Survey]:
+    first, *others = driven(name, rig=rig)[:views]
     made = simulated_survey(first, SETTINGS, others)
     with drawn_alignment(made):
         return made, survey_from(made.odometry, made.inputs, SurveyConfig(SETTINGS, default_vocabulary()))
@@ -70,12 +70,13 @@ def steps_off_m(made: SimulatedSurvey, done: Survey) -> float:
     return float(np.sqrt((off**2).sum(axis=1).mean()))
 
 
-def test_a_robot_against_the_survey_finds_itself_by_landmarks_of_the_rear_pair() -> None:
+@pytest.mark.parametrize("rig", ["front-rear", "front-depth"])
+def test_a_robot_against_the_survey_finds_itself_by_landmarks_of_the_rear_view(rig: str) -> None:
     """What the rear pair shows on another day is what a robot with one pair would see that drives the other way."""
     facing_back = driven(_ALONG, day=1)[1]
     fixed = {}
     for views in (1, 2):
-        made, done = surveyed(_ALONG, views)
+        made, done = surveyed(_ALONG, views, rig)
         relocalizer = SessionRelocalizer(robots_view(made, done), facing_back, ROBOT)
         fixed[views] = 0
         for number in range(0, len(facing_back), 4):
@@ -87,8 +88,10 @@ def test_a_robot_against_the_survey_finds_itself_by_landmarks_of_the_rear_pair()
     assert fixed[1] == 0 and fixed[2] >= 3, fixed
 
 
-def test_views_share_the_pose_of_their_keyframe() -> None:
-    made, done = surveyed(_ALONG, 2)
+@pytest.mark.parametrize("rig", ["front-rear", "front-depth"])
+def test_views_share_the_pose_of_their_keyframe(rig: str) -> None:
+    made, done = surveyed(_ALONG, 2, rig)
+    assert done.state.depth_views == ({1} if rig == "front-depth" else set())
     places = done.map.map_from_body
     rear = done.state.body_from_view[1]
     assert len(places) == 2 * len(made.odometry.keyframes) == 2 * len(done.state.map_from_body)

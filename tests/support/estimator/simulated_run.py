@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.geometry import Array, se3_inverse
-from fleetmap.sensors.rectification import Rectifier, StereoCamera
+from fleetmap.geometry import Array, se3, se3_inverse
+from fleetmap.sensors.rectification import RGBD_BASELINE_M, Rectifier, StereoCamera
 from fleetsim.recorder import Session
 from support.estimator.landmark_lattice import project
 from support.estimator.landmarks import LandmarkField, Landmarks
@@ -26,6 +26,7 @@ _CONE_MARGIN = 0.3  # of the tangent: what turning and moving within a station m
 _TABLE = 1 << 16
 _FLOW_BORDER_PX = 8.0
 _FLOOR_M = 0.05
+_DEPTH_DISPARITY_PX = 0.08 * RGBD_BASELINE_M / 0.05  # of fleetsim's depth camera, which matches over 50 mm
 _FINEST_OCTAVES = 4.0  # what the flow's corners are found on
 
 Ids = NDArray[np.uint64]
@@ -109,6 +110,13 @@ class EstimatorSession:
             )
             for k in (numbers[0], numbers[-1])
         ]
+        self._least_disparity_px = 0.0 if len(numbers) > 1 else np.inf
+        if session.nominal.cameras[numbers[0]].has_depth:
+            self._least_disparity_px = self.camera.focal_px * self.camera.baseline_m / 10.0  # fleetsim's range, m
+            shift = se3(np.eye(3), np.array([-self.camera.baseline_m, 0.0, 0.0]))
+            self._rect_from_body[1] = shift @ self._rect_from_body[0]
+            self._flow = self._flow._replace(disparity_px=_DEPTH_DISPARITY_PX)
+            self._features = self._features._replace(disparity_px=_DEPTH_DISPARITY_PX)
         self._stations = _stations(self.map_from_body)
         self._seed = session.order.seed * 4096 + session.order.day + (view << 40)
         self._table = np.random.default_rng(98).standard_normal(_TABLE)
@@ -137,7 +145,13 @@ class EstimatorSession:
         instant = (frame, self._seed, self._flow, self._table)
         pixels[kept], held = flow_noise(ids[kept], exact, begun_px[kept], is_floor, *instant)
         kept[kept] = held
+        self._forget_disparities(pixels)
         return pixels, kept
+
+    def _forget_disparities(self, pixels: Array) -> None:
+        """Sets u_right of pixels (N, 3) to NaN where the view measures no depth."""
+        if self._least_disparity_px > 0:
+            pixels[~(pixels[:, 0] - pixels[:, 2] > self._least_disparity_px), 2] = np.nan
 
     def corners(self, frame: int, taken: Array, count: int, min_distance_px: float) -> tuple[Ids, Array]:
         """Up to `count` landmarks to follow from a frame on, and their exact pixels (N, 2).
@@ -169,6 +183,7 @@ class EstimatorSession:
         others = clutter(first, total, key, self._size_px, model.disparity_known_share)
         columns = [np.concatenate([mine[:total], other]) for mine, other in zip(found, others, strict=True)]
         rows, pixels, octaves, words = columns
+        self._forget_disparities(pixels)
         return Found(rows.astype(np.int32), pixels, octaves, words.view(np.uint8).reshape(total, 32))
 
     def _look(self, frame: int) -> Sighting:

@@ -232,10 +232,19 @@ def _parts(
         for number, role in list(enumerate(described))[len(alone) : len(calibration.cameras)]:
             if role in roles:
                 alone[number] = _images(roles[role], f"{role} images", log, lenses.get(role))
+        if not given and CALIBRATION_ATTACHMENT not in container.attachments:
+            calibration = _marked(calibration, [f"{role}_depth" in roles for role in described])
         first, *further = _views_of(calibration, list(alone))
         if len(first) == 1:
             left, right = alone[0], None
-        views = tuple(ViewSeries.beside(left.stamps_ns, [alone[n] for n in view], log) for view in further)
+        depths = {
+            n: _images(roles[f"{described[n]}_depth"], f"depth images of cam{n}", log)
+            for (n, *_) in further
+            if calibration.cameras[n].has_depth and f"{described[n]}_depth" in roles
+        }
+        views = tuple(
+            ViewSeries.beside(left.stamps_ns, [alone[n] for n in view], log, depths.get(view[0])) for view in further
+        )
         numbers = [number for view in further for number in view]
     if depth is not None:
         _note_unregistered(streams, roles, calibration.cameras[0], log)
@@ -261,6 +270,11 @@ def _parts(
         priors=priors,
         ground_truth=ground_truth,
     )
+
+
+def _marked(calibration: RigCalibration, has_depth: Sequence[bool]) -> RigCalibration:
+    cameras = zip(calibration.cameras, has_depth, strict=False)
+    return replace(calibration, cameras=tuple(replace(camera, has_depth=mark) for camera, mark in cameras))
 
 
 def _views_of(calibration: RigCalibration, present: list[int]) -> list[tuple[int, ...]]:

@@ -6,7 +6,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings.bags.container import Channel
 from fleetmap.recordings.ordering import ReadLog
 from fleetmap.sensors.samples import DataIssue
-from fleetmap.sensors.source_settings import CAMERA_ROLES, Topics
+from fleetmap.sensors.source_settings import CAMERA_ROLES, DEPTH_ROLES, Topics
 
 INFO_TYPES = ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
 IMAGE_TYPES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage")
@@ -14,7 +14,7 @@ _TYPES = {
     "left": IMAGE_TYPES,
     "right": IMAGE_TYPES,
     **dict.fromkeys(CAMERA_ROLES[2:], IMAGE_TYPES),
-    "depth": IMAGE_TYPES,
+    **dict.fromkeys(DEPTH_ROLES, IMAGE_TYPES),
     "left_info": INFO_TYPES,
     "right_info": INFO_TYPES,
     "imu": ("sensor_msgs/Imu", "foxglove.Imu", "foxglove.IMU", "fleetmap.Imu"),
@@ -38,9 +38,9 @@ _LEFT_HINTS, _RIGHT_HINTS, _DEPTH_HINTS = ("left", "cam0", "infra1"), ("right", 
 
 def transports(topic: str, role: str) -> tuple[str, ...]:
     """Topics on which ROS's image_transport may send the images of `topic`; only `topic` for other roles."""
-    if role not in (*CAMERA_ROLES, "depth") or not topic:
+    if role not in (*CAMERA_ROLES, *DEPTH_ROLES) or not topic:
         return (topic,)
-    return (topic, *(topic + packed for packed in _PACKED[: 2 if role == "depth" else 1]))
+    return (topic, *(topic + packed for packed in _PACKED[: 2 if role in DEPTH_ROLES else 1]))
 
 
 def video_issues(channels: Iterable[Channel]) -> list[DataIssue]:
@@ -120,7 +120,7 @@ def _choose_images(by_topic: Mapping[str, list[Channel]], chosen: dict[str, str]
         depth = _of_one_camera(depths)
         if depth and "right" not in chosen:
             chosen.setdefault("depth", depth)
-    used = [chosen[role] for role in (*CAMERA_ROLES, "depth") if role in chosen]
+    used = [chosen[role] for role in (*CAMERA_ROLES, *DEPTH_ROLES) if role in chosen]
     unused = [topic for topic in images if topic not in used]
     if unused:
         detail = f"{', '.join(unused)}; {', '.join(used)} {'are' if len(used) > 1 else 'is'} used"

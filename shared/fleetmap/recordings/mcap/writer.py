@@ -102,6 +102,9 @@ class McapRecordingWriter:
                     topic = topics.camera(number)
                     self._write_image(topic, view.stamp_ns, f"cam{number}", image)
                     self._write_camera_info(f"{topic.rpartition('/')[0]}/camera_info", view.stamp_ns, number)
+            if view.depth is not None:
+                topic = topics.depth_of(numbers[0])
+                self._write_image(topic, view.stamp_ns, f"cam{numbers[0]}", view.depth, is_depth=True)
 
     def write_imu(self, samples: ImuSamples) -> None:
         for stamp_ns, gyro, accel in zip(

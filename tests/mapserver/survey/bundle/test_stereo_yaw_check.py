@@ -60,7 +60,7 @@ def test_the_shift_grows_towards_the_rim_as_a_turn_makes_it() -> None:
 
 def test_depth_cameras_and_single_cameras_have_no_pair() -> None:
     state = adjusted(6, 0.0)
-    assert estimate_stereo_yaw(replace(state, is_depth_camera=True), SETTINGS) == NO_YAW
+    assert estimate_stereo_yaw(replace(state, depth_views=frozenset({0})), SETTINGS) == NO_YAW
     blind = state.landmarks.obs_pixels.copy()
     blind[:, 2] = np.nan
     assert estimate_stereo_yaw(replace(state, landmarks=replace(state.landmarks, obs_pixels=blind)), SETTINGS) == NO_YAW

@@ -1,0 +1,167 @@
+"""A depth camera as one view of a rig beside a stereo pair: recordings, calibration files, topics and rectification."""
+
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import CalibrationError, RecordingError
+from fleetmap.recordings import OpenOptions, Recording, Topics, format_calibration, open_recording, read_calibration
+from fleetmap.recordings.images import decode_depth, decode_frame, store_frame
+from fleetmap.recordings.mcap import writer
+from fleetmap.recordings.mcap.writer import McapRecordingWriter, copy_to_mcap
+from fleetmap.recordings.ros2 import messages
+from fleetmap.recordings.ros2.graph import RmwZenohKeys
+from fleetmap.recordings.ros2.keys import ros_key
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import RGBD_BASELINE_M, Rectifier
+from fleetmap.sensors.samples import CameraFrame, SensorSet
+from fleetmap.sources.intake import Intake
+from fleetmap.sources.ros2 import RigFrames, Ros2Source
+from fleetsim.recorder import Order, prepare
+from support.fleet.memory_bus import MemoryBus, MemoryHub
+
+
+@lru_cache(maxsize=1)
+def simulated() -> tuple[RigCalibration, tuple[CameraFrame, ...]]:
+    """Three frames of a robot with a pair in front and a depth camera that looks back, without an IMU."""
+    session = prepare(Order("clip", frames=3, size_px=(96, 72), rig="front-depth"))
+    try:
+        return replace(session.nominal, imu=None), tuple(session.frames())
+    finally:
+        session.renderer.close()
+
+
+def rear(frame: CameraFrame) -> CameraFrame:
+    (other,) = frame.others
+    assert other is not None and other.depth_m is not None
+    return other
+
+
+def written(
+    file: Path, frames: tuple[CameraFrame, ...] | None = None, calibration: RigCalibration | None = None
+) -> Path:
+    with McapRecordingWriter(file, calibration or simulated()[0]) as target:
+        for frame in frames or simulated()[1]:
+            target.write_frame(frame)
+    return file
+
+
+def check(recording: Recording) -> None:
+    assert recording.calibration.views == ((0, 1), (2,)) and not recording.issues
+    assert recording.sensor_set is SensorSet.STEREO
+    for index, frame in enumerate(simulated()[1]):
+        found = rear(recording.read_frame(index))
+        np.testing.assert_array_equal(found.left, rear(frame).left)
+        np.testing.assert_array_equal(found.depth_m, rear(frame).depth_m)
+
+
+def test_depth_beside_a_pair_is_written_read_and_copied(tmp_path: Path) -> None:
+    with open_recording(written(tmp_path / "a.mcap")) as recording:
+        check(recording)
+        copy_to_mcap(recording, tmp_path / "b.mcap")
+        alone = recording.view(1)
+        assert alone.sensor_set is SensorSet.RGBD and alone.content_hash() != ""
+        np.testing.assert_array_equal(alone.read_frame(2).depth_m, rear(simulated()[1][2]).depth_m)
+        np.testing.assert_array_equal(
+            rear(recording.part(np.array([2])).read_frame(0)).depth_m, alone.read_frame(2).depth_m
+        )
+        assert recording.view(0).read_frame(0).others == ()
+    with open_recording(tmp_path / "b.mcap") as copy:
+        check(copy)
+
+
+def test_without_a_calibration_file_the_topic_says_that_a_camera_has_depth(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(writer, "CALIBRATION_ATTACHMENT", "something else.yaml")
+    with open_recording(written(tmp_path / "a.mcap")) as recording:
+        check(recording)
+        assert [camera.has_depth for camera in recording.calibration.cameras] == [False, False, True]
+
+
+def test_a_depth_camera_is_no_half_of_a_pair() -> None:
+    """Two that look the same way are two views; the depth is that of the pixels, as a pair's disparity over RGBD_BASELINE_M."""
+    calibration, frames = simulated()
+    both = replace(calibration, cameras=(*calibration.cameras, calibration.cameras[2]))
+    assert both.views == ((0, 1), (2,), (3,))
+    assert replace(both, cameras=tuple(replace(c, has_depth=False) for c in both.cameras)).views == ((0, 1), (2, 3))
+    rectifier = Rectifier(calibration)
+    assert [each.camera.baseline_m for each in rectifier.mounted] == pytest.approx([0.12, RGBD_BASELINE_M])
+    seen = rectifier.rectify(frames[0]).view(1)
+    assert seen is not None and seen.disparity_px is not None and seen.right is None
+    depth_m = rear(frames[0]).depth_m
+    assert depth_m is not None
+    known = depth_m > 0
+    assert known.mean() > 0.2 and np.isnan(seen.disparity_px[~known]).all()
+    focal_px = rectifier.mounted[1].camera.focal_px
+    np.testing.assert_allclose(focal_px * RGBD_BASELINE_M / seen.disparity_px[known], depth_m[known], rtol=1e-5)
+    small = replace(rear(frames[0]), depth_m=depth_m[::2, ::2])
+    assert rectifier.rectify(replace(frames[0], others=(small,))).view(1) is None
+
+
+def test_the_calibration_file_keeps_it_and_refusals_name_the_camera(tmp_path: Path) -> None:
+    calibration, frames = simulated()
+    file = tmp_path / "camchain.yaml"
+    file.write_text(format_calibration(calibration))
+    assert read_calibration(file).cameras[2].has_depth
+    file.write_text(format_calibration(calibration).replace("has_depth: true", "has_depth: z16"))
+    with pytest.raises(CalibrationError, match="cam2: has_depth is 'z16'; write true or false"):
+        read_calibration(file)
+    first = replace(calibration, cameras=(replace(calibration.cameras[0], has_depth=True), *calibration.cameras[1:]))
+    file.write_text(format_calibration(first))
+    with pytest.raises(CalibrationError, match=r"cam0: has_depth is .* number a stereo pair cam0 and cam1"):
+        read_calibration(file)
+    grey = tuple(replace(f, others=(replace(rear(f), depth_m=None),)) for f in frames)
+    with pytest.raises(CalibrationError, match=r"has_depth of cam2 \(--topic cam2_depth=/NAME\)"):
+        open_recording(written(tmp_path / "grey.mcap", grey))
+    plain = replace(calibration, cameras=tuple(replace(c, has_depth=False) for c in calibration.cameras))
+    file.write_text(format_calibration(plain))
+    with open_recording(written(tmp_path / "a.mcap"), OpenOptions(calibration_file=file)) as recording:
+        (other,) = recording.read_frame(0).others
+        assert other is not None and other.depth_m is None
+    large = replace(rear(frames[0]), depth_m=np.ones((20, 20), np.float32))
+    with pytest.raises(RecordingError, match=r"the depth image at .* is 20x20 px, the colour image 96x72"):
+        open_recording(written(tmp_path / "large.mcap", (replace(frames[0], others=(large,)),)))
+
+
+def test_live_images_and_depth_make_one_view() -> None:
+    frames, stored = RigFrames(simulated()[0]), store_frame(simulated()[1][0])
+    (back,) = stored.others
+    assert back is not None and back.depth is not None and stored.right is not None
+    done = []
+    for k in range(4):
+        stamp_ns = 1_000_000_000 + k * 50_000_000
+        done += frames.add(2, stamp_ns, back.left)
+        done += frames.add(2, stamp_ns, back.depth, is_depth=True)
+        done += frames.add(0, stamp_ns, stored.left) + frames.add(1, stamp_ns, stored.right)
+    assert len(done) == 4
+    for frame in done:
+        (other,) = frame.others
+        assert other is not None and other.right is None and other.depth is back.depth and frame.depth is None
+
+
+def test_a_live_source_takes_the_topic_of_a_cameras_depth() -> None:
+    calibration, frames = simulated()
+    hub, queue = MemoryHub(), Intake(frames=9, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
+    topics, stored = Topics(cam2_depth="/back/aligned_depth"), store_frame(frames[0])
+    (back,) = stored.others
+    assert back is not None
+    with MemoryBus(hub) as driver, MemoryBus(hub) as robot:
+        Ros2Source(robot, RmwZenohKeys(0), topics, calibration).subscribe(queue)
+        for topic, image in (
+            (topics.cam2, back.left),
+            ("/back/aligned_depth", back.depth),
+            (topics.left, stored.left),
+            (topics.right, stored.right),
+        ):
+            assert image is not None
+            payload = messages.encode_image(stored.stamp_ns, "cam", image)
+            driver.publish(ros_key(0, topic, "sensor_msgs/Image"), payload)
+    frame = queue.take(1.0).frame
+    assert frame is not None
+    decoded = decode_frame(frame)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(rear(decoded).depth_m, rear(frames[0]).depth_m)
+    assert decode_depth(back.depth).shape == (72, 96)  # type: ignore[arg-type]
