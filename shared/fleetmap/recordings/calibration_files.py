@@ -120,6 +120,13 @@ def read_calibration(path: Path) -> RigCalibration:
     return load_calibration(path).calibration
 
 
+def calibration_files(path: Path) -> list[Path]:
+    """Return a file of calibration and the images of its masks, for a recording's hash. Errors as of `read_yaml`."""
+    values = read_yaml(path)
+    masks = [part.get("mask") for part in (values, *values.values()) if isinstance(part, dict)]
+    return [path, *(path.parent / mask for mask in masks if isinstance(mask, str))]
+
+
 def parse_calibration(text: str, where: str, folder: Path | None = None) -> CalibrationFile:
     """Parse the text of a camchain; `where` names it in error messages. folder: of images of masks, None for a text without files."""
     values = _parse_yaml(text, where)

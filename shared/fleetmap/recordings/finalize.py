@@ -7,7 +7,7 @@ import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array
-from fleetmap.recordings.calibration_files import CalibrationFile, load_calibration
+from fleetmap.recordings.calibration_files import CalibrationFile, calibration_files, load_calibration
 from fleetmap.recordings.image_series import SeriesFrames
 from fleetmap.recordings.images import grey_bits, grey_peak, is_mosaic, is_wide
 from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS, ReadLog, check_together
@@ -46,7 +46,7 @@ def calibration_of_options(options: OpenOptions, log: ReadLog) -> CalibrationFil
     """The calibration chosen by the caller, None to use the recording's own."""
     if options.calibration_file is None:
         return None
-    log.files.append(options.calibration_file)
+    log.files += calibration_files(options.calibration_file)
     return load_calibration(options.calibration_file)
 
 

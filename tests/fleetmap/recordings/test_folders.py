@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import se3, se3_inverse, so3_exp, transform_points
-from fleetmap.recordings import OpenOptions, open_recording
+from fleetmap.recordings import OpenOptions, format_calibration, open_recording
 from fleetmap.recordings.folders.seven_scenes import DepthRegistration
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import SensorSet
@@ -46,6 +46,29 @@ def test_euroc_by_the_mav0_folder_itself(tmp_path: Path) -> None:
     recording = open_recording(folder / "mav0")
     assert recording.name == "flight"
     assert recording.content_hash() == open_recording(folder).content_hash()
+
+
+@pytest.mark.parametrize("place", ["sensor.yaml", "camchain.yaml", "--calibration"])
+def test_a_recording_with_another_mask_is_another_recording(tmp_path: Path, place: str) -> None:
+    """A night knows recordings by their hash: one whose mask was edited must not count as one that it has."""
+    folder = write_euroc(tmp_path / "r", SAMPLE)
+    sensor, chain = folder / "mav0/cam0/sensor.yaml", folder / "camchain.yaml"
+    if place == "sensor.yaml":
+        sensor.write_text(sensor.read_text() + "\nmask: robot.png\n")
+    else:
+        sensor.unlink()
+        key = "  timeshift_cam_imu"
+        chain.write_text(format_calibration(calibration()).replace(key, f"  mask: robot.png\n{key}", 1))
+    options = OpenOptions(calibration_file=chain if place == "--calibration" else None)
+    picture = (sensor if place == "sensor.yaml" else chain).with_name("robot.png")
+    hashes = set()
+    for row in (0, 5):
+        camera = calibration().cameras[0]
+        shown = np.zeros((camera.height_px, camera.width_px), np.uint8)
+        shown[row : row + 20] = 255
+        cv2.imwrite(str(picture), shown)
+        hashes.add(open_recording(folder, options).content_hash())
+    assert len(hashes) == 2
 
 
 def test_euroc_without_second_camera_or_imu(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.recordings.calibration_files import (
+    calibration_files,
     load_calibration,
     matrix_4x4,
     read_euroc_camera,
@@ -79,7 +80,8 @@ def _calibration(root: Path, count: int, options: OpenOptions, log: ReadLog) -> 
     camera_files = [root / f"mav0/cam{i}/sensor.yaml" for i in range(count)]
     missing = next((file for file in camera_files if not file.is_file()), None)
     if missing is None:
-        log.files += camera_files + ([imu_file] if noise is not None else [])
+        log.files += [part for file in camera_files for part in calibration_files(file)]
+        log.files += [imu_file] if noise is not None else []
         cameras = [read_euroc_camera(file) for file in camera_files]
         if not np.array_equal(euroc_from_imu, np.eye(4)):
             imu_from_euroc = se3_inverse(euroc_from_imu)
@@ -87,7 +89,7 @@ def _calibration(root: Path, count: int, options: OpenOptions, log: ReadLog) -> 
         return RigCalibration(tuple(cameras), noise), euroc_from_imu
     for name in _CAMCHAINS:
         if (root / name).is_file():
-            log.files.append(root / name)
+            log.files += calibration_files(root / name)
             return load_calibration(root / name).calibration, euroc_from_imu
     raise CalibrationError(
         f"{missing} is missing and there is no camchain.yaml; pass a calibration with --calibration FILE"

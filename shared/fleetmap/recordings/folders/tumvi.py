@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
-from fleetmap.recordings.calibration_files import load_calibration
+from fleetmap.recordings.calibration_files import calibration_files, load_calibration
 from fleetmap.recordings.files import natural_key
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.folders.layout import (
@@ -38,7 +38,7 @@ def open_tumvi(path: Path, options: OpenOptions) -> Recording:
         camchain = path / "camchain.yaml"
         if not camchain.is_file():
             raise CalibrationError(f"{camchain} is missing; pass a calibration with --calibration FILE")
-        log.files.append(camchain)
+        log.files += calibration_files(camchain)
         given = load_calibration(camchain)
     frames = rig_frames(path, log, cameras, given.calibration)
     parts = RecordingParts(
