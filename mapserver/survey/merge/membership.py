@@ -99,15 +99,16 @@ class SessionPlace:
 class SessionKeyframes:
     """Input of the test: a session.
 
-    keyframes (K) with their features and depths; survey_from_body (K, 4, 4) and the edges of its motion; camera on a body.
-    map_from_survey: pose by position priors, None without any.
+    views (K * V) with their features and depths, those of the first keyframe, those of the second one, and so on; survey_from_body
+    (K, 4, 4) and the edges of its motion; camera, body_from_cams (V, 4, 4): of each view. map_from_survey: pose by position priors,
+    None without any.
     """
 
-    keyframes: Sequence[FrameFeatures]
+    views: Sequence[FrameFeatures]
     survey_from_body: Array
     chain: Sequence[PoseEdge]
     camera: StereoCamera
-    body_from_cam: Array
+    body_from_cams: Array
     map_from_survey: Array | None = None
 
     @property
@@ -129,13 +130,14 @@ class MembershipTest:
     def locate(self) -> SessionPlace | Membership:
         """Return the session's pose if fixes give one and no other is similar. The map's confirmation there is judged later."""
         session, settings, by_priors = self._session, self._settings, self._session.by_priors
-        ks = _spread(range(len(session.keyframes)), settings.fix_keyframes)
+        ks = _spread(range(len(session.survey_from_body)), settings.fix_keyframes)
         if by_priors is not None:  # plus as many that priors put near a place of the map
-            ks = sorted({*ks, *_spread(self._beside_the_map(by_priors), settings.fix_keyframes)})
-        fixes = find_fixes(self._relocalizer, session.keyframes, ks, session.body_from_cam)
+            beside = np.flatnonzero(self._beside_the_map(by_priors).any(axis=1)).tolist()
+            ks = sorted({*ks, *_spread(beside, settings.fix_keyframes)})
+        fixes = find_fixes(self._relocalizer, session.views, ks, session.body_from_cams)
         if by_priors is not None:
             expected = {k: by_priors[k] for k in ks}
-            fixes += fixes_around(self._relocalizer, session.keyframes, expected, session.body_from_cam)
+            fixes += fixes_around(self._relocalizer, session.views, expected, session.body_from_cams)
         self.tried = len(ks)
         found = alignments(fixes, session.survey_from_body, GraphMarginals(session.survey_from_body, session.chain))
         enough = [p for p in found if len(p.fixes) >= settings.min_fixes and p.places >= settings.min_places]
@@ -157,11 +159,11 @@ class MembershipTest:
             places.append(SessionPlace(map_from_body, placed, believed, seen, priors_off_m))
         return self._chosen(places)
 
-    def _beside_the_map(self, map_from_body: Array) -> list[int]:
-        """Return keyframes at map_from_body (K, 4, 4) near a place of the map, with a similar heading."""
-        places = self._relocalizer.view.map_from_cam
-        looking = map_from_body @ self._session.body_from_cam
-        return [k for k, at in enumerate(looking) if places_around(places, at, _BESIDE_M, _BESIDE_COSINE).any()]
+    def _beside_the_map(self, map_from_body: Array) -> NDArray[np.bool_]:
+        """Return which views (K, V) of keyframes at map_from_body (K, 4, 4) are near a place of the map, with a similar heading."""
+        places, looking = self._relocalizer.view.map_from_cam, map_from_body[:, None] @ self._session.body_from_cams
+        beside = [places_around(places, at, _BESIDE_M, _BESIDE_COSINE).any() for at in looking.reshape(-1, 4, 4)]
+        return np.reshape(beside, looking.shape[:2])
 
     def _priors_off_m(self, placed: Alignment, map_from_body: Array) -> float | None:
         """Return the distance of the keyframes with fixes from their priors, at map_from_body (K, 4, 4); None without priors."""
@@ -177,12 +179,18 @@ class MembershipTest:
     def confirmation(self, map_from_body: Array) -> Confirmation:
         """Return the share of the map seen by the session with its keyframes at map_from_body (K, 4, 4).
 
-        Only keyframes near places of the map are used: parts of the next aisle that a survey saw through gaps in the racks
+        Only views near places of the map are used: parts of the next aisle that a survey saw through gaps in the racks
         may be hidden by other goods from within that aisle. Without any near ones all are used, with few expected landmarks.
         """
         session, view = self._session, self._relocalizer.view
-        ks = _spread(self._beside_the_map(map_from_body) or range(len(session.keyframes)), _MOST_LOOKS)
-        looks = [look(view, session.camera, session.keyframes[k], map_from_body[k] @ session.body_from_cam) for k in ks]
+        beside = self._beside_the_map(map_from_body)
+        beside |= not beside.any()
+        count = beside.shape[1]
+        looks = [
+            look(view, session.camera, session.views[k * count + v], map_from_body[k] @ session.body_from_cams[v])
+            for k in _spread(np.flatnonzero(beside.any(axis=1)).tolist(), _MOST_LOOKS // count)
+            for v in np.flatnonzero(beside[k])
+        ]
         return confirmation(view.points_map, looks, self._firm, self._settings.join_error_rate)
 
     def evidence(self, located: SessionPlace, seen: Confirmation) -> MembershipEvidence:

@@ -82,12 +82,13 @@ def extend(
         )
     base = BaseMap(base_map, state.camera, state.body_from_cam)
     relocalizer = session_relocalizer(base, survey.vocabulary, settings)
+    views = guess.views(state.view_count)
     session = SessionKeyframes(
-        keyframes=[keyframe_features(keyframe) for keyframe in guess.keyframes],
+        views=[keyframe_features(view) for view in views],
         survey_from_body=state.map_from_body,  # the survey's own frame, called `map` in a single survey
         chain=[*chain_edges(guess, state), *survey.loops.edges],
         camera=state.camera,
-        body_from_cam=state.body_from_cam,
+        body_from_cams=state.body_from_view @ state.body_from_cam,
         map_from_survey=map_from_survey,
     )
     firm = firm_landmarks(len(base.points_map), base.map.obs_landmark)
@@ -98,7 +99,7 @@ def extend(
     refused = test.judged(located, located.seen)
     if refused is not None and contradicts(located.seen):
         return refused
-    map_from_body, views = located.map_from_body, guess.views(state.view_count)
+    map_from_body = located.map_from_body
     for radius_px in (settings.sessions.search_px, settings.sessions.guided_px):
         sightings = [
             match_keyframe(base, relocalizer, keyframe, place @ state.body_from_cam, radius_px, settings)

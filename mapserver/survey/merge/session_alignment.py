@@ -41,10 +41,19 @@ class Alignment:
 
 
 def find_fixes(
-    relocalizer: Relocalizer, keyframes: Sequence[FrameFeatures], ks: Sequence[int], body_from_cam: Array
+    relocalizer: Relocalizer, views: Sequence[FrameFeatures], ks: Sequence[int], body_from_cams: Array
 ) -> list[SessionFix]:
-    """Return all fixes of keyframes ks, several for one keyframe if places of the map look alike."""
-    return [_at_body(k, fix, body_from_cam) for k in ks for fix in finished(relocalizer.anywhere(keyframes[k]))]
+    """Return all fixes of keyframes ks by each of their views, several for one view if places of the map look alike.
+
+    views (K * V): those of the first keyframe, those of the second one, and so on; body_from_cams (V, 4, 4).
+    """
+    count = len(body_from_cams)
+    return [
+        _at_body(k, fix, body_from_cam)
+        for k in ks
+        for view, body_from_cam in zip(views[k * count :], body_from_cams, strict=False)
+        for fix in finished(relocalizer.anywhere(view))
+    ]
 
 
 def _at_body(k: int, fix: Fix, body_from_cam: Array) -> SessionFix:
@@ -58,13 +67,16 @@ def _at_body(k: int, fix: Fix, body_from_cam: Array) -> SessionFix:
 
 
 def fixes_around(
-    relocalizer: Relocalizer, keyframes: Sequence[FrameFeatures], places: dict[int, Array], body_from_cam: Array
+    relocalizer: Relocalizer, views: Sequence[FrameFeatures], places: dict[int, Array], body_from_cams: Array
 ) -> list[SessionFix]:
-    """Return fixes of keyframes near their expected poses, map_from_body (4, 4) by keyframe."""
+    """Return fixes of keyframes near their expected poses, map_from_body (4, 4) by keyframe. Views as of `find_fixes`."""
+    count = len(body_from_cams)
     found = (
-        (k, relocalizer.by_projection(keyframes[k], place @ body_from_cam, _WIDEST_PX)) for k, place in places.items()
+        (k, body_from_cam, relocalizer.by_projection(view, place @ body_from_cam, _WIDEST_PX))
+        for k, place in places.items()
+        for view, body_from_cam in zip(views[k * count :], body_from_cams, strict=False)
     )
-    return [_at_body(k, fix, body_from_cam) for k, fix in found if fix is not None]
+    return [_at_body(k, fix, body_from_cam) for k, body_from_cam, fix in found if fix is not None]
 
 
 def alignments(fixes: Sequence[SessionFix], survey_from_body: Array, chain: GraphMarginals) -> list[Alignment]:

@@ -154,7 +154,7 @@ def drive(run: EstimatorSession) -> Drive:
     )
     state: Any = SimpleNamespace(map_from_body=placed[frames])
     keyframes = [seen(run, frame) for frame in frames]
-    visit = SessionKeyframes(keyframes, placed[frames], chain_edges(guess, state), run.camera, run.body_from_cam)
+    visit = SessionKeyframes(keyframes, placed[frames], chain_edges(guess, state), run.camera, run.body_from_cam[None])
     return Drive(visit, run.map_from_body[frames])
 
 

@@ -25,6 +25,7 @@ CAMERA = StereoCamera(400.0, 320.0, 240.0, 0.12, 640, 480)
 BODY_FROM_CAM = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 SETTINGS = SurveySettings()
 STEP_M = 0.4
+_ONE_VIEW = np.eye(4)[None]
 _STEP_COV = np.diag([0.003**2] * 3 + [0.015**2] * 3)
 
 
@@ -108,10 +109,11 @@ def membership(
     map_from_body: Array,
     docks_map_from_survey: Array | None,
     seed: int = 0,
+    body_from_views: Array = _ONE_VIEW,
 ) -> MembershipTest:
     """The test of a session along these places in an aisle; its own frame begins at its first keyframe, and drifts.
 
-    seen: what each place shows, where it is not the same from all.
+    seen: what each place shows, where it is not the same from all. body_from_views (V, 4, 4): of the rig.
     """
     rng = np.random.default_rng([7, seed])
     survey_from_body, chain = [np.eye(4)], []
@@ -121,6 +123,11 @@ def membership(
         survey_from_body.append(survey_from_body[-1] @ step)
         chain.append(PoseEdge(k, k + 1, step, _STEP_COV, is_loop=False))
     shown = repeat(seen) if isinstance(seen, Aisle) else seen
-    frames = [frame(one, place, rng) for one, place in zip(shown, map_from_body, strict=False)]
-    visit = SessionKeyframes(frames, np.stack(survey_from_body), chain, CAMERA, BODY_FROM_CAM, docks_map_from_survey)
+    frames = [
+        frame(one, place @ body_from_view, rng)
+        for one, place in zip(shown, map_from_body, strict=False)
+        for body_from_view in body_from_views
+    ]
+    cameras = CAMERA, body_from_views @ BODY_FROM_CAM
+    visit = SessionKeyframes(frames, np.stack(survey_from_body), chain, *cameras, docks_map_from_survey)
     return MembershipTest(*known, visit, SETTINGS.sessions)

@@ -96,6 +96,16 @@ def test_against_the_surveys_direction_nothing_is_decided() -> None:
     refused(membership(KNOWN, HOME, PLACES[::-1] @ around, PLACES[-1] @ around))
 
 
+@pytest.mark.parametrize("given", [False, True])
+def test_against_the_surveys_direction_a_rear_pair_tells_the_place(given: bool) -> None:
+    around = se3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    places, pairs = drive(20, start_m=4.0)[::-1] @ around, np.stack([np.eye(4), around])
+    located = joined(membership(KNOWN, HOME, places, places[0] if given else None, body_from_views=pairs))
+    assert np.linalg.norm((located.map_from_body - places)[:, :3, 3], axis=1).max() < 0.03
+    elsewhere = membership(KNOWN, shared_above(0.8), places[:12], None, body_from_views=pairs)
+    assert verdict(elsewhere)[0] is not MembershipVerdict.JOINED
+
+
 def test_a_session_between_both_is_held_with_its_figures() -> None:
     held = refused(membership(KNOWN, restocked(0.65, 4), PLACES, None))
     assert held.evidence.share_low < 0.5 < held.evidence.share_high
