@@ -9,14 +9,14 @@ import pickle
 import secrets
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
 import cv2
 from threadpoolctl import threadpool_limits
 
-from fleetmap.errors import UsageError
+from fleetmap.errors import LinkError, UsageError
 from mapserver.survey.executor import SERIAL, Batch, Executor, Result, Shared
 
 Item = TypeVar("Item")
@@ -49,16 +49,35 @@ class Cluster:
     def map(
         self, function: Callable[[Shared, Batch], Result], shared: Shared, batches: Iterable[Batch]
     ) -> Iterator[Result]:
-        if self._shared[0] is not shared:
-            packed = (secrets.token_hex(8), pickle.dumps(shared, protocol=5))
-            self._shared = (shared, self._client.scatter([packed], broadcast=True, hash=False)[0])
-        there = self._shared[1]
-        ahead = _AHEAD * max(1, sum(self._client.nthreads().values()))
+        with _cluster_errors():
+            if self._shared[0] is not shared:
+                packed = (secrets.token_hex(8), pickle.dumps(shared, protocol=5))
+                self._shared = (shared, self._client.scatter([packed], broadcast=True, hash=False)[0])
+            there = self._shared[1]
+            ahead = _AHEAD * max(1, sum(self._client.nthreads().values()))
 
         def submit(batch: Batch) -> Any:
-            return self._client.submit(_do, function, there, pickle.dumps(batch, protocol=5), pure=False)
+            with _cluster_errors():
+                return self._client.submit(_do, function, there, pickle.dumps(batch, protocol=5), pure=False)
 
-        return _in_order(submit, lambda future: pickle.loads(future.result()), batches, ahead)
+        def result(future: Any) -> Result:
+            with _cluster_errors():
+                return pickle.loads(future.result())  # type: ignore[no-any-return]
+
+        return _in_order(submit, result, batches, ahead)
+
+
+@contextmanager
+def _cluster_errors() -> Iterator[None]:
+    """Raise LinkError for a cluster that is lost: a night ends, and blames no recording. dask itself replaces single workers."""
+    from distributed import KilledWorker
+
+    try:
+        yield
+    except (CancelledError, OSError, ImportError, KilledWorker) as error:
+        raise LinkError(
+            f"the dask cluster has lost the build ({error}); see the logs of its scheduler and workers, then run it again"
+        ) from error
 
 
 _unpacked: dict[str, Any] = {}  # in a process of the cluster: the shared value, by its name
@@ -92,7 +111,7 @@ def _in_order(
 def open_executor(threads: int | None, scheduler: str | None) -> Iterator[Executor]:
     """Open threads (one per core by default), or the cluster of a scheduler.
 
-    Raises UsageError for a scheduler without TLS, or one that does not answer.
+    Raises UsageError for a scheduler without TLS or workers, or one that does not answer; the executor LinkError for a lost cluster.
     """
     count = threads or len(os.sched_getaffinity(0))
     if scheduler is not None:
@@ -137,6 +156,10 @@ def _client(scheduler: str) -> Iterator[Any]:
             f"--scheduler {scheduler} does not answer ({error}); start it with `dask scheduler --tls-...`, or leave it out"
         ) from error
     with client:
+        try:
+            client.wait_for_workers(1, timeout=_CONNECT_WITHIN_S)
+        except TimeoutError as error:
+            raise UsageError(f"--scheduler {scheduler} has no workers; start `dask worker {scheduler}`") from error
         yield client
 
 

@@ -4,16 +4,18 @@ import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import lru_cache
 from pathlib import Path
 
+import dask
 import pytest
-from distributed import Client, LocalCluster
+from distributed import Client, LocalCluster, Security
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from fleetmap.bow import decode_vocabulary
 from fleetmap.bow.shipped_vocabulary import default_vocabulary_bytes
-from fleetmap.errors import UsageError
+from fleetmap.errors import LinkError, UsageError
 from fleetmap.mapformat import encode_tile
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples
@@ -89,6 +91,52 @@ def test_a_scheduler_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatc
     for address in ("tls://127.0.0.1:9", "tls://nonsense"):
         with pytest.raises(UsageError, match="does not answer"), open_executor(1, address):
             pass
+
+
+@contextmanager
+def tls_cluster(workers: int) -> Iterator[LocalCluster]:
+    """With certificates in dask's configuration."""
+    made = Security.temporary()
+    config = {"ca-file": made.tls_ca_file} | {
+        f"{name}.{part}": getattr(made, f"tls_{name}_{part}")
+        for name in ("client", "scheduler", "worker")
+        for part in ("cert", "key")
+    }
+    with (
+        dask.config.set({f"distributed.comm.tls.{name}": value for name, value in config.items()}),
+        LocalCluster(
+            n_workers=workers,
+            threads_per_worker=1,
+            processes=False,
+            dashboard_address=":0",
+            protocol="tls",
+            security=made,
+        ) as there,
+    ):
+        yield there
+
+
+def _added(shared: int, batch: int) -> int:
+    return shared + batch
+
+
+def test_a_cluster_that_is_lost_is_told() -> None:
+    with tls_cluster(1) as there, open_executor(1, there.scheduler_address) as executor:
+        found = executor.map(_added, 100, range(30))
+        assert next(found) == 100
+        there.close()
+        with pytest.raises(LinkError, match="lost the build"):
+            list(found)
+
+
+def test_a_cluster_without_workers_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "_CONNECT_WITHIN_S", "2s")
+    with (
+        tls_cluster(0) as there,
+        pytest.raises(UsageError, match="has no workers"),
+        open_executor(1, there.scheduler_address),
+    ):
+        pass
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "127.0.0.1:9", "ws://127.0.0.1:9", "nonsense", "", "local"])
