@@ -1,5 +1,6 @@
 """What is particular to single folder formats."""
 
+import os
 import shutil
 from pathlib import Path
 
@@ -7,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from fleetmap.encoding import to_json
 from fleetmap.geometry import se3, se3_inverse, so3_exp, transform_points
 from fleetmap.recordings import OpenOptions, format_calibration, open_recording
 from fleetmap.recordings.folders.seven_scenes import DepthRegistration
@@ -27,6 +29,13 @@ from support.recordings.recording_samples import (
 )
 
 SAMPLE = make_sample(4)
+
+
+def test_a_name_that_is_no_utf_8_can_be_written_into_a_report(tmp_path: Path) -> None:
+    path = write_euroc(tmp_path / "ride", SAMPLE).rename(tmp_path / os.fsdecode(b"ride-\xff"))
+    with open_recording(path) as recording:
+        assert recording.name == r"ride-\udcff"
+        assert to_json({"name": recording.name})
 
 
 @pytest.mark.parametrize("yaml_line", [True, False])
