@@ -268,13 +268,16 @@ class PoseTracker:
         self._unmatched.clear()
 
     def earlier_frames(self) -> list[EarlierFrame]:
-        """Return the kept frames of other viewpoints or cameras than those of the running query, if their lenses are alike."""
+        """Return the kept frames of other viewpoints or cameras than those of the running query, if their pinholes are alike; of another
+        baseline by their bearings alone."""
         found, lens = [], self._mounted[self._view].camera
         for each in self._unmatched:
-            if self._is_aside(each) and self._mounted[each.view].camera == lens:
+            own = self._mounted[each.view].camera
+            if self._is_aside(each) and replace(own, baseline_m=lens.baseline_m) == lens:
                 earlier_from_query = each.frame.query_map_from_body
                 cam_from_query = se3_inverse(each.body_from_cam) @ earlier_from_query @ self.body_from_cam
-                found.append(EarlierFrame(each.features, cam_from_query, each.frame.query_cov))
+                features = each.features if own == lens else each.features.without_depth()
+                found.append(EarlierFrame(features, cam_from_query, each.frame.query_cov))
         return found
 
     def _is_aside(self, earlier: _Unmatched) -> bool:
