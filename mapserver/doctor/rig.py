@@ -67,7 +67,18 @@ def further_findings(recording: Recording, on_frame: Callable[[], None] = lambda
         if _measures_depth(recording, number) and len(recording.view(number)):
             beside = run_checks(recording.view(number), on_frame).findings
             found += [replace(f, name=f"{f.name} of {names[number]}") for f in beside if f.name in _OF_CAMERAS]
-    return found + (check_mountings(recording, on_frame) if len(names) > 1 else [])
+    return found + (_unlike_lenses(recording) + check_mountings(recording, on_frame) if len(names) > 1 else [])
+
+
+def _unlike_lenses(recording: Recording) -> list[Finding]:
+    """Return a warning for each view whose images are not rectified to the first one's pinhole."""
+    first, *others = (mounted.camera for mounted in Rectifier(recording.calibration).mounted)
+    words = "its focal length is more than 1.5 times from the first view's, so that a survey leaves its images out; use a lens alike"
+    return [
+        Finding(f"lens of {name}", Verdict.WARN, camera.focal_px, f"the first view has {first.focal_px:.0f} px", words)
+        for name, camera in zip(_names(recording)[1:], others, strict=True)
+        if camera.focal_px != first.focal_px
+    ]
 
 
 def _measures_depth(recording: Recording, view: int) -> bool:

@@ -17,7 +17,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from mapserver.cli import app
 from mapserver.doctor.findings import Finding, Verdict
-from mapserver.doctor.rig import check_mountings, check_rig, judge_mounting, mounting_error
+from mapserver.doctor.rig import check_mountings, check_rig, further_findings, judge_mounting, mounting_error
 from support.recordings.painted_room import FRAME_NS, Ride, frame_at, rig
 
 REAR = se3(so3_exp(np.array([0.0, 0.0, np.pi])), np.array([-0.1, 0.0, 0.0]))  # body_from_turned
@@ -141,6 +141,18 @@ def test_a_depth_camera_behind_is_checked_and_its_mounting_named(tmp_path: Path,
     assert found["depth of cam2"].verdict is Verdict.OK, found["depth of cam2"].sentence
     mounting = found["cam2 against cam0 and cam1"]
     assert mounting.verdict is (Verdict.WARN if turned else Verdict.OK), mounting.sentence
+
+
+def test_a_view_with_another_lens_is_named(recorded: Path, tmp_path: Path) -> None:
+    calibration = ride()[0]
+    wide = [replace(c, intrinsics_px=c.intrinsics_px * [0.5, 0.5, 1, 1]) for c in calibration.cameras[2:]]
+    (tmp_path / "cams.yaml").write_text(
+        format_calibration(replace(calibration, cameras=(*calibration.cameras[:2], *wide)))
+    )
+    with open_recording(recorded, OpenOptions(tmp_path / "cams.yaml")) as recording:
+        found = {finding.name: finding for finding in further_findings(recording)}
+    assert found["lens of cam2 and cam3"].verdict is Verdict.WARN
+    assert "use a lens alike" in found["lens of cam2 and cam3"].sentence
 
 
 def test_the_doctor_names_the_pair_whose_images_are_exchanged(tmp_path: Path) -> None:
