@@ -115,7 +115,7 @@ def _read(
             frame = rectifier.rectify(recording.read_frame(int(selected[number])))
         except RecordingError:
             continue
-        for view in (0, *(view for view, _ in other_views(rectifier))):
+        for view in (0, *(view for view, camera in other_views(rectifier) if camera.baseline_m > 0)):
             if (seen := frame_of_view(frame, view)) is not None:
                 camera, body_from_cam = rectifier.mounted[view]
                 features = probe_features(seen, camera, orb)

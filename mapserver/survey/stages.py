@@ -11,7 +11,8 @@
 
 For a long recording, the first two run segment by segment. `mapserver build` calls `begin_survey`, measures the calibration from its
 result, and calls `finish_survey` (drafting/survey_recordings.py); drafting/draft.py continues with the map: the site's current map, tiles.
-Every stage receives the settings; depths of a single camera come from tracks/mono_depths.py, and replace those of stereo in each stage.
+Every stage receives the settings; depths of a single camera come from tracks/mono_depths.py, and replace those of stereo in each stage;
+those of single cameras beside a pair are triangulated once, before loop closure.
 """
 
 from collections.abc import Callable
@@ -59,7 +60,7 @@ from mapserver.survey.state import Landmarks, OdometryPass, PosedKeyframes, Surv
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.survey.tracks.matching import PairFinder, drift_allowance_m, fixed_allowance_m
-from mapserver.survey.tracks.mono_depths import MonoDepths
+from mapserver.survey.tracks.mono_depths import MonoDepths, with_single_views
 from mapserver.survey.tracks.tracks import Tracks, build_landmarks, refine_observations, tracks_of
 
 _MIN_KEYFRAMES = 2
@@ -114,6 +115,7 @@ def _whole(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -
 def finish_survey(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools) -> Survey:
     """Run the stages after `begin_survey`. The caller must drop its reference to the chain, or a long survey is in memory twice."""
     settings, depths = config.settings, chain.depths
+    chain = replace(chain, odometry=with_single_views(chain.odometry, chain.state, inputs.rectifier, settings))
     state, loops = close_loops(chain, inputs, config, tools)
     # Neighbours need not be matched again, except for one camera: the depths used for matching have changed.
     matched, tracks = (chain.matched, Tracks.of(state.landmarks)) if depths is None else (set(), None)

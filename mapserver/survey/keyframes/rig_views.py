@@ -13,12 +13,12 @@ OtherViews = list[tuple[int, StereoCamera]]
 
 
 def other_views(rectifier: Rectifier) -> OtherViews:
-    """Return numbers and cameras of the further views that measure depth and have the first one's pinhole; none beside a single camera."""
+    """Return numbers and cameras of the further views that have the first one's pinhole; none beside a single camera."""
     first, *others = (mounted.camera for mounted in rectifier.mounted)
     return [
         (number, camera)
         for number, camera in enumerate(others, 1)
-        if first.baseline_m > 0 and camera.baseline_m > 0 and replace(camera, baseline_m=first.baseline_m) == first
+        if first.baseline_m > 0 and replace(camera, baseline_m=first.baseline_m) == first
     ]
 
 

@@ -1,4 +1,4 @@
-"""Depths of one camera's features, triangulated from neighbouring keyframes in place of a second camera."""
+"""Depths of a single camera's features, triangulated from neighbouring keyframes in place of a second camera."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.odometry.mono.two_view import triangulate_pair
-from fleetmap.sensors.rectification import StereoCamera
+from fleetmap.sensors.rectification import Rectifier, StereoCamera
+from mapserver.survey.keyframes.rig_views import body_from_views, other_views
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import Keyframe
+from mapserver.survey.state import Keyframe, OdometryPass, SurveyState
 
 
 class MonoDepths:
@@ -74,6 +75,24 @@ class MonoDepths:
         disparities = focal_base * fused
         points = self._camera.point_from_pixel(keyframe.features.pixels, disparities[:, 0])
         return replace(keyframe, disparities=disparities, points_cam=points, from_views=True)
+
+
+def with_single_views(
+    odometry: OdometryPass, state: SurveyState, rectifier: Rectifier, settings: SurveySettings
+) -> OdometryPass:
+    """Return the keyframes with depths in those of a rig's other views that are single cameras, by the poses of `state`."""
+    keyframes = odometry.keyframes
+    body_from_view = body_from_views(rectifier)[1:]
+    for k, (_, camera) in enumerate(other_views(rectifier)):
+        if camera.baseline_m > 0:
+            continue
+        depths = MonoDepths([keyframe.others[k] for keyframe in keyframes], state.camera, settings)
+        seen = depths.keyframes_at(state.map_from_body @ body_from_view[k], state.body_from_cam)
+        keyframes = [
+            replace(keyframe, others=(*keyframe.others[:k], view, *keyframe.others[k + 1 :]))
+            for keyframe, view in zip(keyframes, seen, strict=True)
+        ]
+    return odometry if keyframes is odometry.keyframes else replace(odometry, keyframes=keyframes)
 
 
 def fuse_inverse_depths(rows: Array, count: int, max_sigma_share: float) -> Array:

@@ -74,14 +74,21 @@ def test_a_corrected_clock_is_that_of_all_views() -> None:
     assert with_other_views(first, replace(whole, cameras=whole.cameras[:2])) is first
 
 
-def test_a_keyframe_has_the_views_that_measure_depth() -> None:
+def test_a_keyframe_has_the_views_of_its_pinhole() -> None:
     calibration, frames = simulated()
     rectifier = Rectifier(calibration)
     frame = rectifier.rectify(frames[0])
     others = other_views(rectifier)
     assert [number for number, _ in others] == [1] and body_from_views(rectifier).shape == (2, 4, 4)
     sides = replace(calibration, cameras=(*calibration.cameras[:2], calibration.cameras[2]))
-    assert other_views(Rectifier(sides)) == []
+    assert [camera.baseline_m for _, camera in other_views(Rectifier(sides))] == [0.0]
+    single = Rectifier(sides)
+    (seen,) = next(
+        make_keyframes([(0, single.rectify(frames[0]))], single.camera, SurveySettings(), others=other_views(single))
+    ).others
+    assert len(seen.features) > 0 and np.isnan(seen.disparities).all()
+    alone = replace(calibration, cameras=calibration.cameras[1:])
+    assert other_views(Rectifier(alone)) == []
     rows = [(0, frame), (1, replace(frame, others=(None,)))]
     first, alone = make_keyframes(rows, rectifier.camera, SurveySettings(), others=others)
     assert [len(view.features) > 0 for view in first.others] == [True]

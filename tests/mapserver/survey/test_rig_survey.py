@@ -33,7 +33,7 @@ _BACK = "back"  # and back on the other side of the aisle
 
 
 def driven(name: str, day: int = 0, rig: str = "front-rear") -> list[EstimatorSession]:
-    """Both views of a drive in an aisle."""
+    """All views of a drive in an aisle."""
     base = find_scenario("clip")
     y = base.layout.aisle_y_m(0)
     way = ((4.5, y - 0.4), (8.5, y - 0.4)) + (((8.5, y + 0.4), (4.5, y + 0.4)) if name == _BACK else ())
@@ -42,7 +42,7 @@ def driven(name: str, day: int = 0, rig: str = "front-rear") -> list[EstimatorSe
         session = prepare(Order("clip", seed=4, day=day, robot=name, rig=rig))
     session.renderer.close()
     field = LandmarkField(session.world)
-    return [EstimatorSession(session, field=field, view=view) for view in (0, 1)]
+    return [EstimatorSession(session, field=field, view=view) for view in range(len(session.nominal.views))]
 
 
 @lru_cache(maxsize=6)
@@ -97,6 +97,26 @@ def test_views_share_the_pose_of_their_keyframe(rig: str) -> None:
     assert len(places) == 2 * len(made.odometry.keyframes) == 2 * len(done.state.map_from_body)
     np.testing.assert_allclose(places[1::2], places[0::2] @ rear, atol=1e-12)
     assert set(np.unique(done.map.obs_keyframe % 2)) == {0, 1}
+    assert steps_off_m(made, done) <= steps_off_m(*surveyed(_ALONG, 1))
+
+
+def test_single_cameras_at_the_sides_observe_landmarks_that_their_own_keyframes_triangulate() -> None:
+    """Without a disparity in the adjustment; another day's robot finds itself by them where one pair left nothing to look at."""
+    side = driven(_ALONG, day=1, rig="front-sides")[1]
+    fixed = {}
+    for views in (1, 3):
+        made, done = surveyed(_ALONG, views, "front-sides")
+        relocalizer = SessionRelocalizer(robots_view(made, done), side, ROBOT)
+        fixed[views] = 0
+        for number in range(0, len(side), 4):
+            fixes = finished(relocalizer.anywhere(finished(relocalizer.extract(blank(side, number)))))
+            truth = side.map_from_body[number] @ side.body_from_cam
+            assert all(np.linalg.norm(fix.map_from_cam[:3, 3] - truth[:3, 3]) < 0.05 for fix in fixes)
+            fixed[views] += len(fixes) > 0
+    assert fixed[1] == 0 and fixed[3] >= 5, fixed
+    seen = done.map.obs_keyframe % 3
+    assert min(np.bincount(seen, minlength=3)) > 1000
+    assert np.isnan(done.map.obs_pixels[seen > 0, 2]).all() and np.isfinite(done.map.obs_pixels[seen == 0, 2]).any()
     assert steps_off_m(made, done) <= steps_off_m(*surveyed(_ALONG, 1))
 
 
