@@ -68,6 +68,8 @@ class FloorMaps:
                 loaded = (
                     self._newest(source, asks=asks) if key else None
                 )  # first: it reads the signed list, which names the files
+                if key and source.site_file(FLOORS, MAX_FLOORS_BYTES) != data:
+                    raise MapFormatError(f"site {key} does not name this building's floors; set the building again")
                 floors[key] = _floor(entry, source, files)
                 maps += [] if loaded is None else [loaded]
                 self._note(entry.site, "")

@@ -6,9 +6,14 @@ from pathlib import Path
 
 import pytest
 
+from fleetmap.encoding import to_json
+from fleetmap.mapformat import current_path
+from fleetmap.mapformat.building import FLOORS
+from fleetmap.mapformat.floors import Building, FloorEntry
 from fleetmap.trust import TrustedMap, ask_over
 from locclient.maps.floor_maps import FloorMaps
 from locclient.maps.map_client import MapClient
+from locclient.maps.map_source import LocalMapSource
 from locclient.maps.tile_cache import TileCache
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
@@ -71,6 +76,42 @@ def test_a_version_that_is_not_signed_is_not_taken(network: Network) -> None:
     update_lists(network.store)
     floors.refresh()
     assert [loaded.version for loaded in floors.changes[-1].maps] == [2]
+
+
+@pytest.mark.parametrize("record", [None, "tower of others", "annex"])
+def test_a_site_that_is_no_floor_of_this_building_is_none(network: Network, record: str | None) -> None:
+    """Its own signed list says where it belongs: a building that one of its sites alone names is half a change."""
+    floors = (FloorEntry(site="high", level="L1", height_m=0.0), FloorEntry(site="third", level="L9", height_m=4.0))
+    data = None if record is None else to_json(Building(name=record, floors=floors))
+    network.store.keep_site_files("high", {FLOORS: data}, "")
+    update_lists(network.store)
+    floor_maps = network.floors()
+    floor_maps.refresh()
+    (change,) = floor_maps.changes
+    assert (list(change.floors), change.maps) == (["", "high"], []), "where it may be, without a map"
+    network.store.keep_site_files("high", {FLOORS: network.store.site_file("low", FLOORS)}, "")
+    update_lists(network.store)
+    floor_maps.refresh()
+    assert [loaded.wanted.site for loaded in floor_maps.changes[-1].maps] == ["high"]
+
+
+def test_a_building_without_the_robots_own_site_is_not_taken(network: Network) -> None:
+    floors = (FloorEntry(site="high", level="L1", height_m=0.0), FloorEntry(site="third", level="L9", height_m=4.0))
+    floor_maps = network.floors()
+    network.store.keep_site_files("low", {FLOORS: to_json(Building(name="tower", floors=floors))}, "")
+    update_lists(network.store)
+    floor_maps.refresh()
+    assert not floor_maps.changes
+
+
+def test_another_sites_map_is_not_taken_for_a_floors(network: Network) -> None:
+    """A folder, whose files nobody signs: the upper floor's present version is the manifest of the lower one."""
+    folder = network.store.folder
+    (folder / current_path("high")).write_text((folder / current_path("low")).read_text())
+    floor_maps = FloorMaps(LocalMapSource(folder, "low"), lambda site: LocalMapSource(folder, site))
+    floor_maps.refresh()
+    (change,) = floor_maps.changes
+    assert (list(change.floors), change.maps) == (["", "high"], [])
 
 
 def test_without_a_server_the_disk_has_them(network: Network) -> None:
