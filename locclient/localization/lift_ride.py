@@ -39,12 +39,15 @@ PLAN_SIGMA_M = 0.3  # of one floor's map above another one's
 
 
 class Ride(NamedTuple):
-    """Rise since the last `reset` with its sigma, infinite if unknown; is_moving: the robot rides. rest_s: since its wheels rest."""
+    """Rise since the last `reset` with its sigma, infinite if unknown; is_moving: the robot rides. rest_s: since its wheels rest.
+    is_cut: until this frame, in which its wheels roll or are silent: the rest of the ride is not measured.
+    """
 
     is_moving: bool
     rise_m: float
     sigma_m: float
     rest_s: float
+    is_cut: bool = False
 
 
 class LiftVisit(NamedTuple):
@@ -121,10 +124,11 @@ class RideGauge:
         has_wheels = self._wheel_ns is not None and stamp_ns - self._wheel_ns <= _SILENT_NS
         self._rest_s = 0.0 if is_rolling else self._rest_s + dt_s
         imu, self._imu = self._imu, []
+        is_cut = (is_rolling or not has_wheels) and self._fastest_mps > 0.0 and not self._may_stand
         if not has_wheels:  # it may drive: its accelerations are no lift's
             self._stop()
             self._last_ns, self._is_known = None, False
-            return Ride(False, 0.0, np.inf, self._rest_s)
+            return Ride(False, 0.0, np.inf, self._rest_s, is_cut)
         if not imu and self._last_ns is not None and stamp_ns - self._last_ns > _GAP_NS:
             self._is_known = False
         for samples in imu:
@@ -141,12 +145,16 @@ class RideGauge:
         if self._riding_s > _LONGEST_S:
             self._stop()
             self._is_known, self._cov[2, 2] = False, _BIAS_SIGMA_MPS2**2
-        speed_mps, sigma_mps = abs(self._state[1]), float(np.sqrt(self._cov[1, 1]))
-        if not is_rolling and speed_mps > _MIN_MPS + _GATE * sigma_mps:
-            self._fastest_mps = max(self._fastest_mps, float(speed_mps))
+        if not is_rolling and not self._may_stand:
+            self._fastest_mps = max(self._fastest_mps, abs(float(self._state[1])))
         rise_m = float(self._state[0])
         sigma_m = float(np.hypot(np.sqrt(self._cov[0, 0]), _SCALE_SIGMA * rise_m)) if self._is_known else np.inf
-        return Ride(self._fastest_mps > 0.0, rise_m, sigma_m, self._rest_s)
+        return Ride(self._fastest_mps > 0.0, rise_m, sigma_m, self._rest_s, is_cut)
+
+    @property
+    def _may_stand(self) -> bool:
+        """True if the speed may be zero."""
+        return bool(abs(self._state[1]) <= _MIN_MPS + _GATE * np.sqrt(self._cov[1, 1]))
 
     def _integrate(self, samples: ImuSamples, *, is_rolling: bool) -> None:
         last_ns, self._last_ns = self._last_ns, int(samples.stamps_ns[-1])
@@ -175,7 +183,7 @@ class RideGauge:
         speed_mps, sigma_mps = abs(self._state[1]), float(np.sqrt(self._cov[1, 1]))
         change_mps = np.ptp([speed for _, speed in self._speeds])
         bias_mps = float(np.sqrt(self._cov[2, 2])) * _STEADY_S
-        if speed_mps > _MIN_MPS + _GATE * sigma_mps or change_mps > _MIN_MPS + _GATE * bias_mps:
+        if not self._may_stand or change_mps > _MIN_MPS + _GATE * bias_mps:
             return
         if self._fastest_mps:
             if speed_mps > _SLOWED_SHARE * self._fastest_mps:
@@ -187,7 +195,7 @@ class RideGauge:
         """The wheels roll: the cabin stands, and has stood for a while."""
         if self._fastest_mps or self._still_s:
             sigma_mps = float(np.sqrt(self._cov[1, 1]))
-            self._is_known &= abs(self._state[1]) <= _MIN_MPS + _GATE * sigma_mps
+            self._is_known &= self._may_stand
             self._is_known &= not self._fastest_mps or sigma_mps <= _KNOWN_SHARE * self._fastest_mps
             self._stand()
         self._state[1] = 0.0

@@ -225,7 +225,8 @@ class Localizer:
         if tracker.confirmed is None and ride.is_moving:
             tracker.candidates.reset()
             return True
-        if abs(ride.rise_m) > max(CARRIED_M, LIFT_SIGMAS * ride.sigma_m):  # a lift that is in no map, or a fork
+        is_carried = ride.is_cut or abs(ride.rise_m) > max(CARRIED_M, LIFT_SIGMAS * ride.sigma_m)
+        if is_carried:  # by a lift that is in no map, or a fork
             tracker.forget(is_carried=True)
             self._query.forget()
             self._calibration.give_up()

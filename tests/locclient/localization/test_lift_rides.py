@@ -86,11 +86,34 @@ def test_two_rides_without_a_look_between_add_up(monkeypatch: pytest.MonkeyPatch
     assert world.is_right(out[-1])
 
 
-def test_a_lift_that_is_in_no_map_ends_the_pose(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = world_of(monkeypatch, 6, **ALIKE)
-    said = [*world.drive(3.0), *world.stand(4.0), *world.ride(1), *world.stand(3.0), *world.drive(4.0)]
+@pytest.mark.parametrize("drawn_on", [(), (1, 2)])
+@pytest.mark.parametrize("fastest_mps", [1.6, 0.4, 0.15])
+@pytest.mark.parametrize("rolls_at", [None, 6])
+def test_a_lift_that_is_in_no_map_ends_the_pose(
+    monkeypatch: pytest.MonkeyPatch, drawn_on: tuple[int, ...], fastest_mps: float, rolls_at: int | None
+) -> None:
+    """Also one that the other floors alone have, and of a robot that makes room in it while it moves."""
+    world = world_of(monkeypatch, 6, floors=3, likeness=0.97)
+    for number in {0, 1, 2} - {*drawn_on}:
+        world.redraw(number, {})
+    said = [*world.stand(2.0, sees=True), *world.drive(9.5), *world.stand(2.0)]
+    for number, estimate in enumerate(world.ride(2, fastest_mps=fastest_mps, accel_mps2=0.5)):
+        said += [estimate, *([world.step(0.1, np.zeros(20), sees=False)] if number == rolls_at else [])]
+    said += [*world.stand(1.0), *world.drive(-6.0)]
     assert not world.wrong
     assert Cause.CARRIED in {e.cause for e in said}
+
+
+def test_a_robot_in_a_lift_that_is_in_no_map_takes_no_place_seen_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It wakes up there, and sees the same at the end of the ride."""
+    world = LiftWorld(monkeypatch, seed=7, **ALIKE)  # type: ignore[arg-type]
+    for number in (0, 1):
+        world.redraw(number, {})
+    list(world.stand(2.0, sees=True))
+    list(world.ride(1))
+    said = [*world.stand(2.0, sees=True), *world.drive(-6.0)]
+    assert not world.wrong
+    assert {h.floor for h in said[-1].hypotheses} == {"", "floor-1"}
 
 
 def test_a_robot_that_finds_its_place_in_a_ride_does_not_take_it(monkeypatch: pytest.MonkeyPatch) -> None:
