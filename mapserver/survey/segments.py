@@ -150,15 +150,19 @@ def _in_parallel(
 
 
 def _stored(survey: SegmentSurvey, images: ImageStore) -> SegmentSurvey:
-    keyframes = [_kept(keyframe, images) for keyframe in survey.odometry.keyframes]
+    numbers = dict[int, int]()  # of pictures that views share: black ones
+    keyframes = [_kept(keyframe, images, numbers) for keyframe in survey.odometry.keyframes]
     return replace(survey, odometry=replace(survey.odometry, keyframes=keyframes))
 
 
-def _kept(keyframe: Keyframe, images: ImageStore) -> Keyframe:
+def _kept(keyframe: Keyframe, images: ImageStore, numbers: dict[int, int]) -> Keyframe:
     if keyframe.images is images:
         return keyframe
-    others = tuple(_kept(other, images) for other in keyframe.others)
-    kept = replace(keyframe, images=images, image_number=images.put(keyframe.pictures), others=others)
+    others = tuple(_kept(other, images, numbers) for other in keyframe.others)
+    number = numbers.get(keyframe.image_number)
+    if number is None:
+        number = numbers[keyframe.image_number] = images.put(keyframe.pictures)
+    kept = replace(keyframe, images=images, image_number=number, others=others)
     return set_aside(kept, images)
 
 

@@ -39,41 +39,37 @@ def make_keyframes(
     images: store for the pictures; by default memory. others: see rig_views.
     """
     kept = MemoryImageStore() if images is None else images
-    waiting: deque[tuple[int, list[RectifiedFrame]]] = deque()
-    cameras = [camera, *(other for _, other in others)]
+    waiting: deque[tuple[int, list[RectifiedFrame | None]]] = deque()
+    cameras, black = [camera, *(other for _, other in others)], list[int]()
     scales = [_disparity_scale(camera, each) for each in cameras]
 
-    def batches() -> Iterator[list[list[RectifiedFrame]]]:
+    def batches() -> Iterator[list[list[RectifiedFrame | None]]]:
         source = iter(frames)
         while batch := list(islice(source, _BATCH)):
-            views = [
-                [frame, *(frame_of_view(frame, view) or _black(frame) for view, _ in others)] for _, frame in batch
-            ]
+            views = [[frame, *(frame_of_view(frame, view) for view, _ in others)] for _, frame in batch]
             waiting.extend((number, seen) for (number, _), seen in zip(batch, views, strict=True))
             yield views
+
+    def stored(frame: RectifiedFrame | None) -> int:
+        """Return the number of its pictures; one for all views without images."""
+        if frame is None and black:
+            return black[0]
+        left = np.zeros((camera.height_px, camera.width_px), np.uint8) if frame is None else frame.left
+        pictured = RectifiedFrame(0, left, left, None) if frame is None else replace(frame, others=())
+        number = kept.put(Pictures(pictured, patch_align.half_pyramid(left)))
+        black.extend([number] if frame is None else [])
+        return number
 
     for found in executor.map(_extract, (cameras, settings), batches()):
         for each in found:
             number, views = waiting.popleft()
-            first, *rest = (
-                replace(_keyframe(number, frame, camera, features, kept), disparity_scale=scale)
-                for frame, features, scale in zip(views, each, scales, strict=True)
-            )
-            yield replace(first, others=tuple(rest)) if rest else first
-
-
-def _keyframe(
-    number: int, frame: RectifiedFrame, camera: StereoCamera, found: tuple[orb.Features, Array], kept: ImageStore
-) -> Keyframe:
-    features, disparities = found
-    points = camera.point_from_pixel(features.pixels, disparities[:, 0])
-    pictures = Pictures(replace(frame, others=()) if frame.others else frame, patch_align.half_pyramid(frame.left))
-    return set_aside(Keyframe(number, frame.stamp_ns, features, disparities, points, kept, kept.put(pictures)), kept)
-
-
-def _black(frame: RectifiedFrame) -> RectifiedFrame:
-    black = np.zeros_like(frame.left)
-    return RectifiedFrame(frame.stamp_ns, black, black, None)
+            assert views[0] is not None
+            about, keyframes = (number, views[0].stamp_ns), []
+            for frame, (features, disparities), scale in zip(views, each, scales, strict=True):
+                points = camera.point_from_pixel(features.pixels, disparities[:, 0])
+                own = Keyframe(*about, features, disparities, points, kept, stored(frame), disparity_scale=scale)
+                keyframes.append(set_aside(own, kept))
+            yield replace(keyframes[0], others=tuple(keyframes[1:]))
 
 
 def _disparity_scale(first: StereoCamera, camera: StereoCamera) -> float:
@@ -82,7 +78,7 @@ def _disparity_scale(first: StereoCamera, camera: StereoCamera) -> float:
 
 
 def _extract(
-    shared: tuple[list[StereoCamera], SurveySettings], frames: list[list[RectifiedFrame]]
+    shared: tuple[list[StereoCamera], SurveySettings], frames: list[list[RectifiedFrame | None]]
 ) -> list[list[tuple[orb.Features, Array]]]:
     """Return features and disparities of the views of some frames; disparities are those of the first view's baseline."""
     cameras, settings = shared
@@ -90,6 +86,9 @@ def _extract(
     for views in frames:
         found.append(list[tuple[orb.Features, Array]]())
         for frame, camera in zip(views, cameras, strict=True):
+            if frame is None:
+                found[-1].append((orb.Features.empty(), np.zeros((0, 2))))
+                continue
             features = extract(frame.left, settings.orb, camera.clearance_px)
             disparities = stereo.disparities(frame, camera, features.pixels, settings.stereo)
             found[-1].append((features, disparities * _disparity_scale(cameras[0], camera)))

@@ -87,10 +87,12 @@ def test_a_keyframe_has_the_views_of_its_pinhole() -> None:
         make_keyframes([(0, single.rectify(frames[0]))], single.camera, SurveySettings(), others=other_views(single))
     ).others
     assert len(seen.features) > 0 and np.isnan(seen.disparities).all()
-    alone = replace(calibration, cameras=calibration.cameras[1:])
-    assert other_views(Rectifier(alone)) == []
-    rows = [(0, frame), (1, replace(frame, others=(None,)))]
-    first, alone = make_keyframes(rows, rectifier.camera, SurveySettings(), others=others)
+    one = replace(calibration, cameras=calibration.cameras[1:])
+    assert other_views(Rectifier(one)) == []
+    rows = [(0, frame), *((n, replace(frame, others=(None,))) for n in (1, 2))]
+    first, alone, again = make_keyframes(rows, rectifier.camera, SurveySettings(), others=others)
+    assert alone.others[0].image_number == again.others[0].image_number, "one picture of nothing is enough"
+    assert alone.image_number != again.image_number and alone.others[0].stamp_ns == frame.stamp_ns
     assert [len(view.features) > 0 for view in first.others] == [True]
     assert [len(view.features) for view in alone.others] == [0]
     assert first.others[0].frame.left.tobytes() != first.frame.left.tobytes() and not first.frame.others
