@@ -26,6 +26,7 @@ from locclient.localization.settings import LocalizerSettings
 _OWN_FIX_M = 0.3  # between a fix and the hypothesis that it supports
 _EARLIER = 3  # frames that a query may pool with its own: of a metre of a drive
 NO_AGREEMENT = QueryResult(refused="nothing in the map matches this frame")
+ONE_OF_FLOORS = "another floor may look the same from here: drive a metre, pass a dock, or send a pose with its floor"
 OUTSIDE_PRIOR = QueryResult(refused="what the map matches lies outside the given initial pose")
 
 
@@ -399,5 +400,6 @@ class PoseTracker:
         for fix, hypothesis in self.observations(fixes):
             off_m = np.linalg.norm(hypothesis.now_map_from_body[:3, 3] - best_m)
             if off_m < _OWN_FIX_M and hypothesis.floor == best.floor:
-                return QueryResult(fix, moved_m=moved_m)
+                waits = self.confirmed is None and floors > 1
+                return QueryResult(fix, ONE_OF_FLOORS if waits else "", moved_m=moved_m)
         return QueryResult(None, "the fix does not agree with those before", moved_m=moved_m)

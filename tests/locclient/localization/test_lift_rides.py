@@ -9,6 +9,7 @@ from fleetmap.messages import Cause, Status
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from locclient.localization.lift_ride import Ride, RideGauge
+from locclient.localization.pose_tracker import ONE_OF_FLOORS
 from locclient.robot.failure_monitor import FailureMonitor
 from support.worlds.lift_world import FRAME_S, LiftWorld, RideResult, ride
 
@@ -149,6 +150,16 @@ def test_a_dock_that_names_no_floor_is_one_of_any(monkeypatch: pytest.MonkeyPatc
     world.localizer.handle_prior(PositionPrior(stamp_ns, world.map_from_body, covariance))
     list(world.drive(-4.0))
     assert not world.wrong
+
+
+def test_a_robot_that_stands_in_a_building_says_what_it_waits_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures of one viewpoint have the same misses: they do not exclude the other floors, however many there are."""
+    world = LiftWorld(monkeypatch, seed=17, **OTHER)  # type: ignore[arg-type]
+    said = list(world.stand(20.0, sees=True))
+    assert {e.status for e in said} == {Status.INITIALISING}
+    assert {e.refused for e in said if e.fix is not None} == {ONE_OF_FLOORS}
+    out = list(world.drive(2.0))
+    assert world.is_right(out[-1]) and not out[-1].refused
 
 
 def test_a_ride_ends_for_a_robot_that_waits_for_its_place() -> None:
