@@ -1,6 +1,5 @@
 """The vocabulary against twins in numpy, and its bytes against damage."""
 
-import math
 import struct
 import zlib
 from typing import Any
@@ -10,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleetmap.bow import Vocabulary, decode_vocabulary, encode_vocabulary, vocabulary_hash
+from fleetmap.bow import Vocabulary, decode_vocabulary, encode_vocabulary
 from fleetmap.errors import MapFormatError, NewerFormatError
 from support.worlds.vocabulary_training import train_vocabulary
 
@@ -55,53 +54,6 @@ def test_branches_are_the_two_nearest_children_of_the_root() -> None:
     np.testing.assert_array_equal(vocabulary.branches(descriptors), np.argsort(distances, axis=1, kind="stable")[:, :2])
     single = train_vocabulary(np.zeros((0, 32), np.uint8), 4, 3, np.random.default_rng(0))
     assert (single.branches(descriptors) == 0).all()
-
-
-def test_centres_above_the_leaves_are_majorities_of_what_lies_below() -> None:
-    """Well separated clusters, as many as the branching: each child is the bit-wise median of one of them."""
-    rng = np.random.default_rng(5)
-    descriptors = _clustered(rng, 6, 41, noise=0.02)
-    vocabulary = train_vocabulary(descriptors, 6, 1, rng)
-    assert vocabulary.word_count == 6
-    words = vocabulary.words(descriptors).reshape(6, 41)
-    assert (words == words[:, :1]).all()
-    for cluster, word in enumerate(words[:, 0]):
-        bits = np.unpackbits(descriptors[41 * cluster : 41 * (cluster + 1)], axis=1)
-        median = np.packbits(bits.sum(0) * 2 > 41)
-        np.testing.assert_array_equal(vocabulary.centres[1 + word : 2 + word].view(np.uint8).ravel(), median)
-
-
-def test_rarer_words_weigh_more() -> None:
-    vocabulary, descriptors, images = _trained()
-    words = vocabulary.words(descriptors)
-    for word in range(vocabulary.word_count):
-        holding = max(len(set(images[words == word].tolist())), 1)
-        assert vocabulary.idf[word] == pytest.approx(math.log(1 + 12 / holding), rel=1e-6)
-    assert vocabulary.idf.std() > 0
-
-
-@pytest.mark.parametrize("count", [0, 1, 4, 5, 9])
-def test_few_descriptors_stop_early(count: int) -> None:
-    rng = np.random.default_rng(count)
-    descriptors = rng.integers(0, 256, (count, 32), dtype=np.uint8)
-    vocabulary = train_vocabulary(descriptors, 4, 5, rng, np.zeros(count, np.int64))
-    assert vocabulary.word_count == 1 if count <= 4 else 1 < vocabulary.word_count <= count
-    words = vocabulary.words(rng.integers(0, 256, (20, 32), dtype=np.uint8))
-    assert words.min() >= 0
-    assert words.max() < vocabulary.word_count
-    assert (vocabulary.idf == 1.0).all()
-
-
-def test_equal_descriptors_make_one_word() -> None:
-    same = np.tile(np.arange(32, dtype=np.uint8), (500, 1))
-    assert train_vocabulary(same, 10, 4, np.random.default_rng(0)).word_count == 1
-
-
-def test_training_repeats_itself() -> None:
-    first, second = _trained()[0], _trained()[0]
-    assert encode_vocabulary(first) == encode_vocabulary(second)
-    assert vocabulary_hash(first) == vocabulary_hash(second)
-    assert vocabulary_hash(first) != vocabulary_hash(_trained(seed=1)[0])
 
 
 def test_bow_vector_is_normalised_tf_idf() -> None:

@@ -7,13 +7,9 @@ import pytest
 from playwright.sync_api import Locator, Page, expect
 
 from mapserver.dashboard.console import PAGES
-from mapserver.store import MapStore
 from support.fleet.dashboard_scene import (
-    SITE,
     Served,
-    change,
     fill_store,
-    marks,
     opened,
     overlapping,
     serving,
@@ -96,29 +92,3 @@ def test_each_robot_is_in_reach_on_a_phone_held_sideways(phone: Page, served: Se
     opened(phone, served, "")
     phone.get_by_role("list", name="Robots, problems first").get_by_role("link", name="tug-7", exact=True).tap()
     expect(phone.locator("h1")).to_have_text("tug-7")
-
-
-def test_all_acts_on_a_phone(phone: Page, served: Served) -> None:
-    seen = opened(phone, served, "robots/tug-5")
-    phone.locator(".site-map").tap(position={"x": 150, "y": 150})
-    expect(phone.get_by_label("x (m)")).not_to_have_value("")
-    change(phone, "tug-5 is here")
-    expect(phone.get_by_role("dialog")).to_have_count(0)
-
-    opened(phone, served, "map")
-    phone.get_by_text("Draw an area or a survey on the map").tap()
-    phone.get_by_label("Draw: each click").tap()
-    drawing = phone.locator(".site-map").first
-    for x, y in ((150, 150), (200, 150), (200, 200)):
-        drawing.tap(position={"x": x, "y": y})
-    assert len(marks(phone, 3)) == 3
-    change(phone, "Request a survey here")
-    expect(phone.get_by_text(re.compile("asked by ada at "))).to_have_count(1)
-
-    for act, current in (("Publish draft 3", 3), ("Roll back to version 2", 2), ("Promote version 3", 3)):
-        change(phone, act)
-        expect(phone.get_by_role("status")).to_have_text(f"Robots should use version {current}.")
-        with MapStore.open(served.folder) as store:
-            assert store.current(SITE).version == current
-    assert phone.evaluate("document.documentElement.scrollWidth <= innerWidth")
-    assert seen.faults == []
