@@ -1,6 +1,6 @@
 """Accepted loops of simulated surveys without pictures against the truth, in units of their covariance and of the gate's.
 
-    PYTHONPATH=tests python tests/benchmarks/back_end/bench_loops.py [--first 40100] [--loops 1500] [--out FILE.json]
+    PYTHONPATH=tests python tests/benchmarks/back_end/bench_loops.py [--seed 40100] [--loops 1500] [--out FILE.json]
 
 Surveys of many seeds until there are so many loops. A loop's error has six degrees of freedom: `beyond` counts those outside the ellipsoid
 that holds 0.9973 of a normal error, as three sigmas of one axis do; NEES is the squared error in sigmas by degree of freedom. The gate's
@@ -10,18 +10,15 @@ is that of the pose graph's prediction before the loop, which loops are tested a
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
-import argparse
-import json
-import time
 from collections.abc import Iterator
 from itertools import count
-from pathlib import Path
 from typing import Any, NamedTuple
 from unittest.mock import patch
 
 import numpy as np
 from scipy.stats import chi2
 
+from benchmarks.common.recorded_runs import parsed, write_results
 from benchmarks.common.simulated_survey import SimulatedSurvey, drawn_alignment, session_of, simulated_survey
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.geometry import Array, se3_inverse, se3_log
@@ -80,12 +77,11 @@ def _squared(off: Array, covariance: Array) -> float:
     return float(off @ np.linalg.solve(covariance, off))
 
 
-def surveys(first: int) -> Iterator[tuple[str, int, list[Loop]]]:
+def surveys(first: int) -> Iterator[list[Loop]]:
     """Each site in turn with a seed of its own."""
     for n in count():
         site, robot = SITES[n % len(SITES)]
-        survey = simulated_survey(session_of(site, [robot], seed=first + n), SETTINGS)
-        yield site, first + n, accepted(survey)
+        yield accepted(simulated_survey(session_of(site, [robot], seed=first + n), SETTINGS))
 
 
 def summary(loops: list[Loop]) -> dict[str, Any]:
@@ -104,23 +100,13 @@ def summary(loops: list[Loop]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Print a line for each survey, then the figures; write them as JSON if wanted."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--first", type=int, default=40100, help="seed of the first survey")
-    parser.add_argument("--loops", type=int, default=1500)
-    parser.add_argument("--out", type=Path)
-    given = parser.parse_args()
-    every = list[Loop]()
-    for site, seed, loops in surveys(given.first):
+    """Print the figures; write them as JSON where asked."""
+    given, every = parsed(__doc__, seed=40100, loops=1500), list[Loop]()
+    for loops in surveys(given.seed):
         every += loops
-        own = summary(loops) if loops else {"loops": 0}
-        print(json.dumps({"site": site, "seed": seed, "cpu_s": round(time.process_time(), 1), **own}), flush=True)
         if len(every) >= given.loops:
             break
-    figures = summary(every)
-    print(json.dumps(figures))
-    if given.out is not None:
-        given.out.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    write_results(given.out, summary(every))
 
 
 if __name__ == "__main__":

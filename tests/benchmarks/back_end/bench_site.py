@@ -1,6 +1,6 @@
 """What the back end of a survey costs as its site grows: the fulfilment centre without pictures, its first so many keyframes.
 
-CPU seconds and peak memory by stage and keyframes, the slopes of their growth (log-log fits), the error against the truth, and loops
+CPU seconds and peak memory by keyframes, the slopes of their growth (log-log fits), the error against the truth, and loops
 that are wrong. Everything after the odometry is the survey's own; sub-pixel alignment is drawn (see `common/simulated_survey.py`), so
 that its cost, which goes with the observations, is not in the figures. Each size runs in a process of its own.
 
@@ -23,6 +23,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.common.recorded_runs import write_results
 from benchmarks.common.simulated_survey import SimulatedSurvey, drawn_alignment, session_of, simulated_survey
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.geometry import Array, se3_inverse
@@ -40,25 +41,6 @@ SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
 _WRONG_M = 0.5 * Layout.bay_m  # half of the smallest step by which the site repeats
 
 
-class Stages:
-    """CPU and peak memory by stage, said on standard error as each ends."""
-
-    def __init__(self) -> None:
-        self.cpu_s: dict[str, float] = {}
-        self.peak_mb: dict[str, float] = {}
-        self._last, self._since_s = "start", time.process_time()
-
-    def __call__(self, stage: str, done: int, total: int) -> None:
-        if stage == self._last:
-            return
-        last, now_s = self._last, time.process_time()
-        self.cpu_s[last] = round(self.cpu_s.get(last, 0.0) + now_s - self._since_s, 2)
-        self.peak_mb[last] = round(max(self.peak_mb.get(last, 0.0), _peak_mb()))
-        print(f"{last}: {self.cpu_s[last]} s of CPU, peak {self.peak_mb[last]} MB", file=sys.stderr, flush=True)
-        self._last, self._since_s = stage, now_s
-        Path("/proc/self/clear_refs").write_text("5")  # the peak from now on
-
-
 def measure(drive: Path, keyframes: int) -> dict[str, Any]:
     """One survey's figures."""
     with MappedImageStore(drive.parent) as store:
@@ -67,32 +49,19 @@ def measure(drive: Path, keyframes: int) -> dict[str, Any]:
 
 
 def _measure(survey: SimulatedSurvey, store: ImageStore) -> dict[str, Any]:
-    stages, before_mb = Stages(), _peak_mb()
-    begun_s = time.process_time()
-    options = SurveyConfig(SETTINGS, default_vocabulary())
+    Path("/proc/self/clear_refs").write_text("5")  # the peak from now on
+    begun_s, options = time.process_time(), SurveyConfig(SETTINGS, default_vocabulary())
     with drawn_alignment(survey), open_executor(1, None) as executor:
-        made = survey_from(survey.odometry, survey.inputs, options, SurveyTools(stages, store, executor))
-    stages("end", 0, 0)
-    count = len(survey.odometry.keyframes)
+        made = survey_from(survey.odometry, survey.inputs, options, SurveyTools(images=store, executor=executor))
+    cpu_s, peak_mb = time.process_time() - begun_s, _peak_mb()
     truth = survey.map_from_body[[k.frame_index for k in made.odometry.keyframes]]
-    cpu_s = time.process_time() - begun_s
     return {
-        "keyframes": count,
-        "frames": len(survey.odometry.estimates),
-        "driving_s": 1e-9 * (survey.odometry.estimates[-1].stamp_ns - survey.odometry.estimates[0].stamp_ns),
-        "path_m": float(np.linalg.norm(np.diff(survey.map_from_body[:, :3, 3], axis=0), axis=1).sum()),
+        "keyframes": len(survey.odometry.keyframes),
         "cpu_s": cpu_s,
-        "cpu_ms_per_keyframe": 1e3 * cpu_s / count,
-        "stages_s": stages.cpu_s,
-        "stages_mb": stages.peak_mb,
-        "peak_mb": max(stages.peak_mb.values()),
-        "input_mb": before_mb,
-        "observations": len(made.state.landmarks.obs_keyframe),
+        "peak_mb": peak_mb,
         "loops": len(made.loops.edges),
         "wrong_loops": wrong_loops(made.loops.edges, survey),
-        "kept": len(made.odometry.keyframes),
         "ate_m": ate_m(made.state.map_from_body, truth),
-        "odometry_ate_m": ate_m(survey.odometry.odom_from_body, survey.map_from_body),
     }
 
 
@@ -134,7 +103,7 @@ def _peak_mb() -> float:
 
 
 def main() -> None:
-    """Prints one line of JSON for each size, then the slopes."""
+    """Print the figures; write them as JSON where asked."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--keyframes", default="250,1000", help="sizes, comma separated")
     parser.add_argument("--frames", type=int, default=None, help="at most so many frames of it, at 7.5 Hz")
@@ -152,16 +121,9 @@ def main() -> None:
     if not given.drive.exists():
         given.drive.parent.mkdir(parents=True, exist_ok=True)
         simulated_survey(session_of("fulfilment-centre", ["survey"], frames=given.frames), SETTINGS).write(given.drive)
-    rows = []
-    for row in measured(sorted(int(size) for size in given.keyframes.split(",")), given.drive):
-        rows.append(row)
-        print(json.dumps(row), flush=True)
-    slopes = {}
-    if len(rows) > 1:
-        slopes = {"cpu": slope(rows, "cpu_s"), "memory": slope(rows, "peak_mb")}
-        print(json.dumps(slopes))
-    if given.out is not None:
-        given.out.write_text(json.dumps({"sizes": rows, "slopes": slopes}, indent=2) + "\n", encoding="utf-8")
+    rows = list(measured(sorted(int(size) for size in given.keyframes.split(",")), given.drive))
+    slopes = {"cpu": slope(rows, "cpu_s"), "memory": slope(rows, "peak_mb")}
+    write_results(given.out, {"sizes": rows, "slopes": slopes})
 
 
 if __name__ == "__main__":

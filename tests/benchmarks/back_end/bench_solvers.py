@@ -1,26 +1,22 @@
 """Solvers in one run: pose graphs with and without wrong loops; local and global bundle adjustment beside gtsam's.
 
 `PYTHONPATH=tests python tests/benchmarks/back_end/bench_solvers.py [--only NAME ...] [--out FILE.json]`; without --only a quarter of an
-hour. The reference problems lie beside the project, in `../shared/data`; without them their sections are left out, loudly.
+hour. The reference problems lie beside the project, in `../shared/data`.
 """
 
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
-import argparse
-import json
-import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
-from importlib import metadata
-from pathlib import Path
 from typing import TypeVar
 
 import gtsam
 import numpy as np
 from scipy.stats import chi2
 
+from benchmarks.common.recorded_runs import parsed, write_results
 from fleetmap.geometry import Array, align_points, se3, se3_inverse, se3_log, so3_exp, transform_points
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.problem import BundleProblem
@@ -45,7 +41,7 @@ def timed(work: Callable[[], T]) -> tuple[float, T]:
     return time.process_time() - begun, result
 
 
-def pose_graphs(names: Sequence[str] = GRAPHS) -> dict[str, Figures]:
+def pose_graphs() -> dict[str, Figures]:
     """Cost from the file's own start against the best of several starts; then with a tenth of random wrong loops.
 
     off_clean: root mean square distance of the keyframes from where they are without wrong loops, after SE(3) alignment as
@@ -53,7 +49,7 @@ def pose_graphs(names: Sequence[str] = GRAPHS) -> dict[str, Figures]:
     box around all of them) and of the way that joins them in order.
     """
     found = {}
-    for name in names:
+    for name in GRAPHS:
         map_from_body, edges = parse_g2o((DATA / "pose_graphs" / f"{name}.g2o").read_text())
         seconds, own = timed(lambda: optimize_pose_graph(map_from_body, edges, robust=False))  # noqa: B023
         starts = {"odometry": _chained(map_from_body, edges), "shaken": _shaken(own.map_from_body)}
@@ -191,28 +187,9 @@ SECTIONS: dict[str, Callable[[], object]] = {
 
 
 def main() -> None:
-    """Prints the figures; writes them as JSON where asked."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", nargs="*", choices=list(SECTIONS))
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
-    found: dict[str, object] = {
-        "machine": platform.machine(),
-        "python": platform.python_version(),
-        "gtsam": metadata.version("gtsam"),
-    }
-    for name in options.only or SECTIONS:
-        if name == "pose graphs" and not (DATA / "pose_graphs").exists():
-            print(f"SKIPPED {name}: no reference problems at {DATA / 'pose_graphs'}", flush=True)
-            continue
-        found[name] = SECTIONS[name]()
-        rows = found[name] if name == "pose graphs" else {name: found[name]}
-        for title, figures in rows.items():
-            print(f"\n{title}", flush=True)
-            for key, value in figures.items():
-                print(f"  {key:28s} {value:14.6g}", flush=True)
-    if options.out is not None:
-        options.out.write_text(json.dumps(found, indent=2) + "\n")
+    """Print the figures; write them as JSON where asked."""
+    options = parsed(__doc__, SECTIONS)
+    write_results(options.out, {name: SECTIONS[name]() for name in options.only or SECTIONS})
 
 
 if __name__ == "__main__":

@@ -3,12 +3,10 @@
 import argparse
 import json
 import os
-import platform
 import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable
-from importlib.metadata import version as version_of
 from pathlib import Path
 from typing import Any
 
@@ -21,13 +19,14 @@ from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.run_result import ReplayResult
 
 SITE = "hall"
-LIBRARIES = ("numpy", "opencv-python-headless")
 
 
-def parsed(description: str | None, names: Iterable[str]) -> argparse.Namespace:
-    """The options that these benchmarks share: `only` some of the names, the `work` folder, made where it is not there, and `out`."""
-    parser = argparse.ArgumentParser(description=description)
+def parsed(description: str | None, names: Iterable[str] = (), **numbers: int) -> argparse.Namespace:
+    """The options of benchmarks: `only` some of the names, numbers with these defaults, the `work` folder, made if missing, and `out`."""
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", action="append", default=[], choices=list(names))
+    for name, default in numbers.items():
+        parser.add_argument(f"--{name.replace('_', '-')}", type=int, default=default)
     parser.add_argument("--work", type=Path, default=kept_folder())
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
@@ -47,26 +46,12 @@ def resident_mb() -> dict[str, float]:
     return {wanted[row[0][:-1]]: float(row[1]) * 1.024e-3 for row in rows if row and row[0][:-1] in wanted}
 
 
-def show(name: str, figures: dict[str, Any]) -> None:
-    """A table of figures."""
-    print(f"\n{name}")
-    for key, value in figures.items():
-        if isinstance(value, dict):
-            shown = "  ".join(f"{k} {v:.3g}" for k, v in value.items())
-        else:
-            shown = "-" if value is None else f"{value:.4g}"
-        print(f"  {key:22} {shown:>12}", flush=True)
-
-
 def write_results(path: Path | None, results: dict[str, Any]) -> None:
-    """The results as JSON beside machine, versions and command, where a file is asked for."""
-    if path is None:
-        return
-    about = {
-        "command": " ".join(sys.argv), "machine": platform.processor() or platform.machine(), "cores": os.cpu_count(),
-        "python": platform.python_version(), **{name: version_of(name) for name in LIBRARIES},
-    }  # fmt: skip
-    path.write_text(json.dumps(about | results, indent=2) + "\n")
+    """Print the results as JSON, and write them where a file is asked for."""
+    text = json.dumps(results, indent=2) + "\n"
+    print(text)
+    if path is not None:
+        path.write_text(text, encoding="utf-8")
 
 
 def tool(name: str) -> list[str]:

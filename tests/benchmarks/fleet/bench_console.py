@@ -6,8 +6,6 @@ Server, robots and browser share the machine: on two cores the browser's times a
 by the yardstick.
 """
 
-import argparse
-import json
 import tempfile
 import threading
 import time
@@ -18,6 +16,7 @@ from typing import Any
 
 from playwright.sync_api import Page, sync_playwright
 
+from benchmarks.common.recorded_runs import parsed, write_results
 from benchmarks.common.yardstick import slowness
 from benchmarks.fleet.server_process import cpu_s, resident_mb, serving
 from support.fleet.dashboard_scene import SITE, fill_store, talking
@@ -96,11 +95,8 @@ def measure(http: str, zenoh: str, server: int, robots: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Runs it and prints the figures, or writes them."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--robots", type=int, default=300)
-    parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
+    """Print the figures; write them as JSON where asked."""
+    asked = parsed(__doc__, robots=300)
     with tempfile.TemporaryDirectory() as folder:
         fill_store(Path(folder))
         slow = slowness()
@@ -110,10 +106,7 @@ def main() -> None:
     figures["ready_cpu_s"] = ready_s
     if slow is not None:
         figures["ready_cpu_s_at_reference"] = ready_s / slow
-    told = json.dumps({f"{asked.robots} robots": figures}, indent=1)
-    print(told)
-    if asked.out is not None:
-        asked.out.write_text(told)
+    write_results(asked.out, {f"{asked.robots} robots": figures})
 
 
 if __name__ == "__main__":

@@ -5,8 +5,6 @@
 Of a flood the server, the robot that floods and the others are three processes on loopback. Row 8 of docs/security.md.
 """
 
-import argparse
-import json
 import multiprocessing
 import os
 import tempfile
@@ -21,6 +19,7 @@ import msgspec
 import numpy as np
 import zenoh
 
+from benchmarks.common.recorded_runs import parsed, write_results
 from benchmarks.fleet.server_process import resident_mb, serving
 from fleetmap.access import ALIVE, ORDERS, QUESTIONS, REPORTS, Holder
 from fleetmap.bus import Bus, TlsFiles
@@ -261,24 +260,17 @@ def flooded(folder: Path, seconds: float = 60.0, others: int = 50) -> dict[str, 
                 "memory_mb": max(memory_mb) - before_mb, "disk_mb": _disk_mb(folder / "store") - before_disk_mb,
                 "load": os.getloadavg()[0],
             }  # fmt: skip
-            print(kind, json.dumps(found[kind]), flush=True)
         orders.put(0)
         process.join()
     return found
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=60.0)
-    parser.add_argument("--others", type=int, default=50)
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
+    options = parsed(__doc__, seconds=60, others=50)
     with tempfile.TemporaryDirectory() as name:
         found: dict[str, Any] = {"thousand": opening_and_revoking(Path(name) / "many", 1000, 12)}
-        print(json.dumps(found["thousand"], indent=1), flush=True)
         found["floods"] = flooded(Path(name) / "flood", options.seconds, options.others)
-    if options.out is not None:
-        options.out.write_text(json.dumps(found, indent=2) + "\n", encoding="utf-8")
+    write_results(options.out, found)
 
 
 if __name__ == "__main__":

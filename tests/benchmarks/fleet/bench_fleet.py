@@ -1,14 +1,12 @@
 """A fleet that reports: health at 1 Hz, estimates at 2 Hz and failures of many robots to one server on loopback, counted at both ends.
 
-    PYTHONPATH=tests python -m benchmarks.fleet.bench_fleet [--robots 300] [--seconds 120] [--month] [--out FILE.json]
+    PYTHONPATH=tests python -m benchmarks.fleet.bench_fleet [--robots 300] [--seconds 120] [--out FILE.json]
 
 Robots have a zenoh session each and clocks that are wrong by seconds. Meanwhile lists and figures are asked for over HTTP. Every count is
-compared with what the robots know: reports, failures by site, robot, tile and cause, hours driven. --month fills a store with 30 days of
-sums of so many robots and measures its size.
+compared with what the robots know: reports, failures by site, robot, tile and cause, hours driven. A store is filled with 30 days of
+sums of so many robots, and its size is measured.
 """
 
-import argparse
-import json
 import multiprocessing
 import tempfile
 import time
@@ -21,6 +19,7 @@ import httpx
 import numpy as np
 from prometheus_client.parser import text_string_to_metric_families
 
+from benchmarks.common.recorded_runs import parsed, write_results
 from benchmarks.fleet.server_process import SITE, measured, serving
 from fleetmap.bus import Bus
 from fleetmap.errors import FleetmapError
@@ -197,13 +196,8 @@ def measure_month(folder: Path, robots: int) -> dict[str, float]:
 
 
 def main() -> None:
-    """The command."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--robots", type=int, default=300)
-    parser.add_argument("--seconds", type=int, default=120)
-    parser.add_argument("--month", action="store_true")
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
+    """Print the figures; write them as JSON where asked."""
+    options = parsed(__doc__, robots=300, seconds=120)
     with tempfile.TemporaryDirectory() as name:
         store = Path(name) / "store"
         rng = np.random.default_rng(0)
@@ -213,11 +207,8 @@ def main() -> None:
             maps.save(SITE, content)
             releases.publish(maps, SITE)
         found = {"load": measure_load(store, options.robots, options.seconds)}
-        if options.month:
-            found["month"] = measure_month(Path(name) / "month", options.robots)
-    print(json.dumps(found, indent=1))
-    if options.out is not None:
-        options.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+        found["month"] = measure_month(Path(name) / "month", options.robots)
+    write_results(options.out, found)
 
 
 if __name__ == "__main__":

@@ -6,8 +6,6 @@ Robots are threads of a few processes, each with its own zenoh session, and run 
 is hashed. Meanwhile operators ask the HTTP list endpoints. The last round shows whether the server's memory grows once its caches are full.
 """
 
-import argparse
-import json
 import multiprocessing
 import tempfile
 import threading
@@ -21,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.common.recorded_runs import parsed, write_results
 from benchmarks.fleet.server_process import SITE, measured, serving
 from fleetmap.bus import Bus
 from fleetmap.mapformat import Manifest, Tile, decode_manifest, decode_tile, verified
@@ -164,7 +163,6 @@ def bench(folder: Path, clients: int, site_mb: float) -> dict[str, dict[str, flo
                 "http_p99_ms": float(np.percentile(http_ms, 99)),
             }  # fmt: skip
             rows[name]["share_of_whole"] = sizes[0] / rows["whole"]["bytes_per_robot"]
-            print(name, json.dumps(rows[name]), flush=True)
         for queue in orders:
             queue.put("end")
         for fleet in fleets:
@@ -173,16 +171,10 @@ def bench(folder: Path, clients: int, site_mb: float) -> dict[str, dict[str, flo
 
 
 def main() -> None:
-    """The command."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--clients", type=int, default=300)
-    parser.add_argument("--site-mb", type=float, default=50.0)
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
+    """Print the figures; write them as JSON where asked."""
+    options = parsed(__doc__, clients=300, site_mb=50)
     with tempfile.TemporaryDirectory() as name:
-        rows = bench(Path(name) / "store", options.clients, options.site_mb)
-    if options.out is not None:
-        options.out.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
+        write_results(options.out, bench(Path(name) / "store", options.clients, options.site_mb))
 
 
 if __name__ == "__main__":

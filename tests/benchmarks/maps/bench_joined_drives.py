@@ -1,6 +1,6 @@
 """Four rendered drives of one hall joined into one map, and two halves of each real recording.
 
-    PYTHONPATH=tests python tests/benchmarks/maps/bench_joined_drives.py [--seed 60817] [--work FOLDER] [--out FILE.json] [NAME...]
+    PYTHONPATH=tests python tests/benchmarks/maps/bench_joined_drives.py [--only NAME...] [--seed 60817] [--work FOLDER] [--out FILE.json]
 
 Each drive maps three of nine aisles and shares the last with the next drive. The halves of a real recording are its even and its odd pairs.
 Joined as in one night: all sessions are adjusted together. Joined to a published map: the first session is published, the others extend
@@ -10,9 +10,6 @@ it. Errors are those of all frames after rigid alignment; moved: the distance by
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
-import argparse
-import json
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,6 +20,7 @@ import msgspec
 import numpy as np
 from rich.console import Console
 
+from benchmarks.common.recorded_runs import parsed, write_results
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import StereoCamera
@@ -141,7 +139,6 @@ def joined(surveys: Sequence[Surveyed]) -> dict[str, Any]:
     alone = [ate_m([each.survey.map.trajectory], [each]) for each in surveys]
     shares = [float(each.survey.map.trajectory_estimated.mean()) for each in surveys]
     row: dict[str, Any] = {"alone_m": alone, "mean_alone_m": float(np.mean(alone)), "estimated_share": shares}
-    print(json.dumps(row), flush=True)
     night = added(None, surveys)
     published = added(None, surveys[:1]).map
     trajectories, changed = [published.trajectory], 0
@@ -163,24 +160,16 @@ def joined(surveys: Sequence[Surveyed]) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Print the figures of each part; write them as JSON if wanted."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("names", nargs="*", help=f"drives, {', '.join(REAL)}; all of them by default")
-    parser.add_argument("--seed", type=int, default=60817)
-    parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "fleetmap-bench")
-    parser.add_argument("--out", type=Path)
-    given = parser.parse_args()
-    given.work.mkdir(parents=True, exist_ok=True)
+    """Print the figures; write them as JSON where asked."""
+    given = parsed(__doc__, ("drives", *REAL), seed=60817)
     figures = {}
-    for name in given.names or ("drives", *REAL):
+    for name in given.only or ("drives", *REAL):
         surveys = list[Surveyed]()
         parts = [(recorded(given.seed, n, given.work), "::") for n in range(DRIVES)] if name == "drives" else []
         for path, frames in parts or [(DATA / name, f"{half}::2") for half in range(2)]:
             surveys.append(surveyed(path, frames, surveys[0].survey.state.camera if surveys else None))
         figures[name] = joined(surveys)
-        print(json.dumps({name: figures[name]}), flush=True)
-    if given.out is not None:
-        given.out.write_text(json.dumps(figures, indent=2) + "\n", encoding="utf-8")
+    write_results(given.out, figures)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Joining as a test: foreign sessions and true ones, rendered and without pictures, through the decision that builds take.
 
-    PYTHONPATH=tests python tests/benchmarks/maps/bench_joining.py [--parts foreign ...] [--sites 15] [--true-sites 34] [--rendered 7]
+    PYTHONPATH=tests python tests/benchmarks/maps/bench_joining.py [--only PART...] [--sites 15] [--true-sites 34] [--rendered 7]
         [--seed 500] [--work FOLDER] [--out FILE.json]
 
 A site is a building of its own seed. Foreign: every site's session in the map of every other site, without docks, with the docks of its
@@ -11,14 +11,11 @@ pose graph of fixes. With pictures they are those beside the map's own frames: a
 """
 
 import argparse
-import json
-import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 from rich.console import Console
 from scipy.stats import beta
@@ -35,6 +32,7 @@ from benchmarks.common.joining_sites import (
     session,
     site_map,
 )
+from benchmarks.common.recorded_runs import parsed, write_results
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.geometry import Array, se3, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
@@ -59,6 +57,7 @@ _LENGTHS_M = (10.0, 20.0, 40.0, 80.0)
 _DOCKS = ("none", "own", "wrong")
 _MISPLACED_M = 0.05
 _FRAMES = 60
+PARTS = "pictures", "foreign", "true"
 
 
 class Shot(NamedTuple):
@@ -243,33 +242,17 @@ def measured(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
         "foreign": foreign(sites(options.sites, options.seed + 50)),
         "true": true(plain),
     }
-    for part in options.parts:
+    for part in options.only or PARTS:
         for row in parts[part]:
             yield row | {name: f"{row[name].scenario} {row[name].seed}" for name in ("map", "session")} | {"part": part}
 
 
 def main() -> None:
-    """Prints a line for each session and the rates; writes JSON where asked."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--sites", type=int, default=15, help="buildings without pictures: 210 foreign pairs")
-    parser.add_argument("--true-sites", type=int, default=34, help="buildings with six true sessions each")
-    parser.add_argument("--rendered", type=int, default=7, help="buildings with pictures: 42 foreign pairs")
-    parser.add_argument("--parts", nargs="+", default=["pictures", "foreign", "true"])
-    parser.add_argument("--seed", type=int, default=500)
-    parser.add_argument("--work", type=Path, default=Path(tempfile.gettempdir()) / "fleetmap-bench")
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
-    options.work.mkdir(parents=True, exist_ok=True)
-    rows = []
-    for row in measured(options):
-        rows.append(row)
-        print(json.dumps(row), flush=True)
-    figures = {part: summary([row for row in rows if row["part"] == part]) for part in options.parts}
-    figures["all"] = summary(rows)
-    print(json.dumps(figures, indent=1))
-    if options.out is not None:
-        content = msgspec.json.encode({"rates": figures, "sessions": rows})
-        options.out.write_bytes(msgspec.json.format(content, indent=2) + b"\n")
+    """Print the rates; write them as JSON where asked."""
+    options = parsed(__doc__, PARTS, sites=15, true_sites=34, rendered=7, seed=500)
+    rows = list(measured(options))
+    figures = {part: summary([row for row in rows if row["part"] == part]) for part in options.only or PARTS}
+    write_results(options.out, {"rates": figures | {"all": summary(rows)}, "sessions": rows})
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import SITE, parsed, show, surveyed, write_results
+from benchmarks.common.recorded_runs import SITE, parsed, surveyed, write_results
 from benchmarks.robot.bench_real_robots import mapped
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.errors import UsageError
@@ -140,13 +140,12 @@ def bench(name: str, work: Path) -> dict[str, Any]:
     else:
         view, survey = published(mapped(work, DATA / name))
         probes = left_out(DATA / name, survey)
-    keyframes, fixed, wrong, errors_m, missed = [], [], 0, [], []
+    keyframes, fixed, wrong, errors_m = [], [], 0, []
     for keyframe, probe in probes:
         fix = relocalized(view, probe, probe.map_from_cam)
         keyframes.append(keyframe)
         fixed.append(fix is not None)
         if fix is None:
-            missed.append([keyframe, *probe.map_from_cam[:2, 3].round(2).tolist()])
             continue
         off = se3_inverse(probe.map_from_cam) @ fix.map_from_cam
         errors_m.append(float(np.linalg.norm(off[:3, 3])))
@@ -160,23 +159,14 @@ def bench(name: str, work: Path) -> dict[str, Any]:
         "views_without_fix": len(set(keyframes)) - len({k for k, hit in zip(keyframes, fixed, strict=True) if hit}),
         "wrong": wrong,
         "median_mm": 1e3 * float(np.median(errors_m)),
-        "landmarks": len(view),
-        "missed": missed,
     }
 
 
 def main() -> None:
-    """Prints the tables; writes them as JSON where asked."""
+    """Print the figures; write them as JSON where asked."""
     names = (*SIMULATED, *RECORDED)
-    arguments, found = parsed(__doc__, names), {}
-    for name in arguments.only or names:
-        if name in RECORDED and not (DATA / name).is_dir():
-            print(f"\n{name}: REAL DATA MISSING, nothing is shown")
-            continue
-        found[name] = bench(name, arguments.work)
-        show(name, {key: value for key, value in found[name].items() if key != "missed"})
-        print("  missed:", found[name]["missed"])
-    write_results(arguments.out, {"cases": found})
+    arguments = parsed(__doc__, names)
+    write_results(arguments.out, {"cases": {name: bench(name, arguments.work) for name in arguments.only or names}})
 
 
 if __name__ == "__main__":

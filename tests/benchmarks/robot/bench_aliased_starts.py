@@ -1,8 +1,8 @@
 """What the localizer says where aisles are truly identical: starts at the estimator's level.
 
-`PYTHONPATH=tests python tests/benchmarks/robot/bench_aliased_starts.py [--starts N] [--seeds N...] [--only NAME...] [--out FILE.json]`.
+`PYTHONPATH=tests python tests/benchmarks/robot/bench_aliased_starts.py [--starts N] [--seed N] [--only NAME...] [--out FILE.json]`.
 Six aisles 5 m apart that were surveyed both ways, so that each has five twins; N starts (200) of each kind, shared among the sites
-of the seeds. With signs at the aisles' ends the starts are followed out of the racks. "surveyed one way": every aisle in one direction,
+of two seeds. With signs at the aisles' ends the starts are followed out of the racks. "surveyed one way": every aisle in one direction,
 with look-alikes measured as a build does it. "along the aisle": N/10 drives of 22 m on the day after a survey of day 2, when stock was
 moved in every aisle, so that each has some slots of its own. "whole site": the robot may take it that its own aisle is in the map. Where
 it may not, it must not be misled by signs out of an aisle that is not in the map, nor where two of five twins are not; from the only twin
@@ -12,14 +12,11 @@ of an aisle that is not in the map nothing protects.
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
-import argparse
-import time
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import show, write_results
+from benchmarks.common.recorded_runs import parsed, write_results
 from benchmarks.robot.aliased_starts import (
     WHOLE_SITE,
     Site,
@@ -107,31 +104,15 @@ def judged(name: str, found: list[Start]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Prints the tables; writes them as JSON where asked."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--starts", type=int, default=200)
-    parser.add_argument("--seeds", type=int, nargs="+", default=[11, 12])
-    parser.add_argument("--only", action="append", default=[], choices=KINDS)
-    parser.add_argument("--out", type=Path)
-    arguments = parser.parse_args()
+    """Print the figures; write them as JSON where asked."""
+    arguments = parsed(__doc__, KINDS, starts=200, seed=11)
+    seeds = arguments.seed, arguments.seed + 1
     found: dict[str, list[Start]] = {name: [] for name in arguments.only or KINDS}
-    for seed in arguments.seeds:
-        begun_s = time.process_time()
+    for seed in seeds:
         sites = {of: surveyed_site(of[0], seed, *of[1:]) for of in {_site_of(name) for name in found}}
-        print(f"seed {seed}: sites in {time.process_time() - begun_s:.0f} s", flush=True)
-        for of, site in sites.items():
-            print(f"  {of}: look-alikes {site.lookalikes}", flush=True)
         for name, starts in found.items():
-            begun_s = time.process_time()
-            share = starts_of(name, sites[_site_of(name)], max(1, arguments.starts // len(arguments.seeds)), seed)
-            starts.extend(share)
-            print(f"seed {seed}, {name}: {len(share)} starts in {time.process_time() - begun_s:.0f} s", flush=True)
-            for start in share:
-                if start.wrong_frames:
-                    print("  wrong:", start, flush=True)
+            starts.extend(starts_of(name, sites[_site_of(name)], max(1, arguments.starts // len(seeds)), seed))
     figures = {name: judged(name, starts) for name, starts in found.items()}
-    for name, row in figures.items():
-        show(name, row)
     outcomes = {name: [asdict(start) for start in starts] for name, starts in found.items()}
     write_results(arguments.out, {"figures": figures, "starts": outcomes})
 

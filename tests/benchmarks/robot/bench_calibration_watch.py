@@ -1,6 +1,6 @@
 """Robots with a wrong calibration in a map: what the watch finds within 30 s, what it costs until then, and false alarms.
 
-`PYTHONPATH=tests python tests/benchmarks/robot/bench_calibration_watch.py [--only FAULT...] [--good N] [--work FOLDER] [--out FILE.json]`.
+`PYTHONPATH=tests python tests/benchmarks/robot/bench_calibration_watch.py [--good N] [--work FOLDER] [--out FILE.json]`.
 A tote robot of a site that no development saw, in the map of its survey. `--good N` starts a good robot at N places of its drive, for 15 s
 each, instead of spoiling its calibration; each start is told its place as by a dock.
 """
@@ -8,7 +8,6 @@ each, instead of spoiling its calibration; each start is told its place as by a 
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
-import argparse
 import json
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.common.recorded_runs import SITE, kept_folder, recorded, surveyed, write_results
+from benchmarks.common.recorded_runs import SITE, parsed, recorded, surveyed, write_results
 from fleetmap.geometry import se3_inverse
 from fleetmap.messages import Status
 from fleetmap.recordings import FrameSelection, Recording, open_recording
@@ -153,14 +152,8 @@ def good_starts(
 
 
 def main() -> None:
-    """Prints the outcomes; writes them as JSON where asked."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--only", action="append", default=[])
-    parser.add_argument("--good", type=int, default=0)
-    parser.add_argument("--work", type=Path, default=kept_folder())
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
-    options.work.mkdir(parents=True, exist_ok=True)
+    """Print the outcomes; write them as JSON where asked."""
+    options = parsed(__doc__, good=0)
     store = surveyed(options.work, int(_SEED))
     path = recorded(options.work, ("--seed", _SEED, "--robot", _ROBOT, "--frames", "450"))
     told: list[dict[str, Any]] = []
@@ -171,7 +164,7 @@ def main() -> None:
             runs = [(GOOD, *start, _GOOD_S) for start in good_starts(recording, indices, options.good)]
         else:
             every = faults(recording).items()
-            runs = [(n, r, indices, _WATCHED_S) for n, r in every if not options.only or n in (GOOD, *options.only)]
+            runs = [(name, spoiled, indices, _WATCHED_S) for name, spoiled in every]
         for name, drive, chosen, watched_s in runs:
             found = outcome(name, played(drive, store, chosen, watched_s))
             good = good or found

@@ -101,22 +101,13 @@ def outcome(fault: str, result: ReplayResult) -> Outcome:
     )
 
 
-def show(found: Outcome) -> None:
-    """One line."""
-    figures = (found.said_s, found.recovered_s, found.recovered_m, found.truth_outside_share)
-    shown = " ".join(f"{'-' if value is None else format(value, '.2f'):>9}" for value in figures)
-    print(f"{found.fault:10} {'yes' if found.is_right else 'NO':5} {shown} {found.silent_failures!s:>7}")
-
-
 def main() -> None:
-    """Prints the table; writes JSON where asked."""
+    """Print the outcomes; write JSON where asked."""
     arguments = parsed(__doc__, EXPECTED)
     store, found = surveyed(arguments.work), []
-    print(f"{'fault':10} {'right':5} {'said s':>9} {'back s':>9} {'back m':>9} {'outside':>9} {'silent':>7}")
     for name in arguments.only or EXPECTED:
         recording = recorded(arguments.work, ("--robot", name, "--day", "1"), "faults")
         found.append(outcome(name, played(recording, store, LocalizerSettings())))
-        show(found[-1])
     write_results(arguments.out, {"faults": {o.fault: asdict(o) | {"is_right": o.is_right} for o in found}})
 
 

@@ -8,11 +8,9 @@ first five are left out.
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
-import argparse
-from pathlib import Path
 
 from benchmarks.common.laps import repeated
-from benchmarks.common.recorded_runs import SITE, kept_folder, recorded, resident_mb, show, surveyed, write_results
+from benchmarks.common.recorded_runs import SITE, parsed, recorded, resident_mb, surveyed, write_results
 from fleetmap.free_memory import give_back_free_memory
 from fleetmap.messages import Status
 from fleetmap.recordings import FrameSelection, open_recording
@@ -31,12 +29,7 @@ _SETTLED_MINUTES = 5
 
 def main() -> None:
     """Drives, and writes the figures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=int, default=60)
-    parser.add_argument("--work", type=Path, default=kept_folder())
-    parser.add_argument("--out", type=Path)
-    arguments = parser.parse_args()
-    arguments.work.mkdir(parents=True, exist_ok=True)
+    arguments = parsed(__doc__, minutes=60)
     store, path = surveyed(arguments.work), recorded(arguments.work, ())
     address, resident, tracking = MapAddress(site=SITE, robot="bench", store=str(store)), [], 0
     with open_recording(path) as once, connected(address) as link:
@@ -68,7 +61,6 @@ def main() -> None:
         "last_mb": settled[-1],
         "growth_share": max(settled) / settled[0] - 1.0,
     }
-    show("laps", found)
     write_results(arguments.out, found)
 
 

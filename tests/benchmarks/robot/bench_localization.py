@@ -20,7 +20,6 @@ from benchmarks.common.recorded_runs import (
     played,
     recorded,
     resident_mb,
-    show,
     surveyed,
     warmed_up,
     write_results,
@@ -92,7 +91,7 @@ def figures(result: ReplayResult) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Prints the tables; writes them as JSON where asked."""
+    """Print the figures; write them as JSON where asked."""
     arguments = parsed(__doc__, CASES)
     store, settings, found = surveyed(arguments.work), LocalizerSettings(), {}
     for name in arguments.only or CASES:
@@ -111,8 +110,6 @@ def main() -> None:
             "cpu_mean_ms_at_reference": at_reference(found[name]["cpu_mean_ms"], slow),
             "cpu_p99_ms_at_reference": at_reference(found[name]["cpu_p99_ms"], slow),
         }
-        title = f"{name} (fleetsim record small-loop {' '.join(CASES[name])})"
-        show(title, found[name])
     survey = json.loads((arguments.work / "survey.json").read_text("utf-8"))
     write_results(arguments.out, {"cases": found, "map_bytes_per_m": survey["map_bytes"] / survey["path_m"]})
 

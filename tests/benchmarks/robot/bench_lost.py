@@ -9,7 +9,6 @@ are of pictures. Half of these drop frames at random, half in bursts of up to a 
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
-import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -21,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common import estimator_loop
-from benchmarks.common.recorded_runs import SITE, kept_folder, recorded, show, surveyed, write_results
+from benchmarks.common.recorded_runs import SITE, parsed, recorded, surveyed, write_results
 from benchmarks.robot.aliased_starts import within_budget
 from fleetmap.messages import Status
 from fleetmap.recordings import open_recording
@@ -193,24 +192,16 @@ def _figures(found: list[Outcome]) -> dict[str, float]:
 
 
 def main() -> None:
-    """Prints the table; writes it as JSON where asked."""
+    """Print the figures; write them as JSON where asked."""
     cases = {"carried": _carried, "dark for 2 to 300 s": _dark, "pushed": _pushed}
     names = [*cases, *(f"{share:.0%} {_DROPPED}" for share in _SHARES)]
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=50)
-    parser.add_argument("--seed", type=int, default=900)
-    parser.add_argument("--only", action="append", default=[], choices=names)
-    parser.add_argument("--work", type=Path, default=kept_folder())
-    parser.add_argument("--out", type=Path)
-    arguments = parser.parse_args()
-    arguments.work.mkdir(parents=True, exist_ok=True)
+    arguments = parsed(__doc__, names, runs=50, seed=900)
     cases |= {f"{share:.0%} {_DROPPED}": _dropped(arguments.work, share) for share in _SHARES}
     figures = {}
     for name in arguments.only or names:
         found = [cases[name](arguments.seed, number) for number in range(arguments.runs)]
         for half, aids in enumerate(_AIDS.get(name, ("IMU", "no IMU"))):
             figures[f"{name}, {aids}"] = _figures(found[half::2])
-            show(f"{name}, {aids}", figures[f"{name}, {aids}"])
     dropped = {name: row for name, row in figures.items() if _DROPPED in name}
     write_results(arguments.out, {"figures": figures, "dropped": dropped})
 

@@ -17,14 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import (
-    SITE,
-    parsed,
-    played,
-    show,
-    tool,
-    write_results,
-)
+from benchmarks.common.recorded_runs import SITE, parsed, played, tool, write_results
 from benchmarks.common.yardstick import at_reference, mean_of, slowness
 from fleetmap.recordings import open_recording
 from locclient.localization.settings import LocalizerSettings
@@ -113,23 +106,12 @@ def mapped(work: Path, path: Path, frames: str = MAPPED) -> Path:
     return store
 
 
-def bench(name: str, work: Path) -> dict[str, Any] | None:
-    """The figures of a case, None where its recording is not there."""
-    folder = DATA / CASES[name].recording
-    return CASES[name].how(folder, mapped(work, folder)) if folder.is_dir() else None
-
-
 def main() -> None:
-    """Prints the tables; writes them as JSON where asked."""
-    arguments = parsed(__doc__, CASES)
-    found = {}
+    """Print the figures; write them as JSON where asked."""
+    arguments, found = parsed(__doc__, CASES), {}
     for name in arguments.only or CASES:
-        figures = bench(name, arguments.work)
-        if figures is None:
-            print(f"\n{name}: REAL DATA MISSING, nothing is shown")
-            continue
-        found[name] = figures
-        show(name, figures)
+        folder = DATA / CASES[name].recording
+        found[name] = CASES[name].how(folder, mapped(arguments.work, folder))
     write_results(arguments.out, {"cases": found})
 
 

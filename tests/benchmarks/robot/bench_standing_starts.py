@@ -1,7 +1,8 @@
 """Robots that are switched on where they stand, by night and without a prior: how soon each finds itself.
 
-`PYTHONPATH=tests python tests/benchmarks/robot/bench_standing_starts.py [--seed N] [--starts N] [--pipeline NAME...] [--work FOLDER]
-[--out FILE.json]`. The map is that of `small-loop`'s survey by day; three days later, at places spread over another robot's drive, each
+`PYTHONPATH=tests python tests/benchmarks/robot/bench_standing_starts.py [--seed N] [--starts N] [--only PIPELINE...]
+[--work FOLDER] [--out FILE.json]`. The map is that of `small-loop`'s survey by day;
+three days later, at places spread over another robot's drive, each
 robot stands and sees every frame with noise of its own. Every start is repeated with all within ELSEWHERE_M of it taken out of the map:
 what names a place then is wrong.
 """
@@ -9,21 +10,13 @@ what names a place then is wrong.
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 
-from benchmarks.common.recorded_runs import (
-    SITE,
-    kept_folder,
-    show,
-    surveyed,
-    write_results,
-)
+from benchmarks.common.recorded_runs import SITE, parsed, surveyed, write_results
 from benchmarks.robot.aliased_starts import WRONG_M, part_of
 from benchmarks.robot.standing_robot import standing
 from fleetmap.geometry import Array
@@ -118,21 +111,14 @@ def figures(found: Sequence[Start], unmapped: Sequence[Start]) -> dict[str, floa
 
 
 def main() -> None:
-    """Prints the tables; writes them as JSON where asked."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seed", type=int, default=500)
-    parser.add_argument("--starts", type=int, default=30)
-    parser.add_argument("--pipeline", action="append", default=[], choices=PIPELINES)
-    parser.add_argument("--work", type=Path, default=kept_folder())
-    parser.add_argument("--out", type=Path)
-    arguments = parser.parse_args()
-    arguments.work.mkdir(parents=True, exist_ok=True)
+    """Print the figures; write them as JSON where asked."""
+    arguments = parsed(__doc__, PIPELINES, seed=500, starts=30)
     cv2.setNumThreads(1)
     store = str(surveyed(arguments.work, arguments.seed))
     with connected(MapAddress(site=SITE, robot="bench", store=store)) as link:
         loaded = load_map(link.source)[0]
     drive = prepare(Order("small-loop", seed=arguments.seed, day=_DAY, light=_LIGHT, robot=_ROBOT))
-    found: dict[str, tuple[list[Start], list[Start]]] = {name: ([], []) for name in arguments.pipeline or PIPELINES}
+    found: dict[str, tuple[list[Start], list[Start]]] = {name: ([], []) for name in arguments.only or PIPELINES}
     for number, time_s in enumerate(np.linspace(0.5, drive.motion.duration_s - 0.5, arguments.starts).tolist()):
         session = standing(drive, time_s, number, _FOLLOWED_S)
         frames = list(session.frames())
@@ -144,10 +130,7 @@ def main() -> None:
             unmapped.append(start(session, shown, rest))
             print(f"{time_s:5.1f} s, {name:10} {mapped[-1]} {unmapped[-1].is_wrong}", flush=True)
     drive.renderer.close()
-    results = {name: figures(*starts) for name, starts in found.items()}
-    for name, row in results.items():
-        show(f"{name}, seed {arguments.seed}", row)
-    write_results(arguments.out, {"figures": results})
+    write_results(arguments.out, {"figures": {name: figures(*starts) for name, starts in found.items()}})
 
 
 if __name__ == "__main__":
