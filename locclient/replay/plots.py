@@ -197,8 +197,9 @@ class _Axes:
         _text(self.picture, label, (self.low[0], self.high[1] + 42), _INK)
 
 
-def ticks(low: float, high: float, about: int = 8) -> list[float]:
-    """Return about `about` round values between two limits, in steps of 1, 2 or 5 times a power of ten."""
+def ticks(low: float, high: float) -> list[float]:
+    """Return about eight round values between two limits, in steps of 1, 2 or 5 times a power of ten."""
+    about = 8
     power = 10.0 ** np.floor(np.log10((high - low) / about))
     step = float(next(power * k for k in (1, 2, 5, 10) if power * k * about >= high - low))
     return [round(k * step, 9) for k in range(int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9)) + 1)]

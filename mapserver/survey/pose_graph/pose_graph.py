@@ -56,14 +56,8 @@ def adjoint(target_from_source: Array) -> Array:
     return carried
 
 
-def optimize_pose_graph(
-    map_from_body: Array,
-    edges: Sequence[PoseEdge],
-    fixed: int = 0,
-    *,
-    robust: bool = True,
-) -> PoseGraphResult:
-    """Return the poses of K keyframes with the best fit to the edges, from a start map_from_body (K, 4, 4); `fixed` is unchanged.
+def optimize_pose_graph(map_from_body: Array, edges: Sequence[PoseEdge], *, robust: bool = True) -> PoseGraphResult:
+    """Return the poses of K keyframes with the best fit to the edges, from a start map_from_body (K, 4, 4); the first is unchanged.
 
     robust: loops that contradict the rest are rejected, by graduated non-convexity with truncated least squares in which all other edges
     are assumed true; a loop is consistent while its squared residual stays within the 0.999 of chi-square. If the
@@ -77,7 +71,7 @@ def optimize_pose_graph(
     weights = np.ones(len(loops))
     try:
         if robust and loops:
-            graph = _graph(map_from_body, edges, fixed)
+            graph = _graph(map_from_body, edges)
             doubtful, certain = [_with_noise(graph.at(n)) for n in loops], gtsam.NonlinearFactorGraph()
             for n in sorted(set(range(graph.size())) - set(loops)):
                 certain.push_back(graph.at(n))
@@ -86,7 +80,7 @@ def optimize_pose_graph(
             weights, begin = loop_weights(certain, doubtful, start, bound)
         believed = dict(zip(loops, weights >= 0.5, strict=True))
         kept = [edge for index, edge in enumerate(edges) if believed.get(index, True)]
-        graph = _graph(map_from_body, kept, fixed)
+        graph = _graph(map_from_body, kept)
         optimum, iterations = _optimum(graph, begin, 6 * (len(kept) - len(map_from_body) + 1))
     except RuntimeError as error:
         raise SurveyError(
@@ -94,8 +88,8 @@ def optimize_pose_graph(
             f"({str(error).strip().splitlines()[0]}); look for keyframes connected only by a wrong loop"
         ) from error
     solved = np.array([optimum.atPose3(k).matrix() for k in range(len(map_from_body))])
-    solved = map_from_body[fixed] @ se3_inverse(solved[fixed]) @ solved  # the prior allows a deviation of 1e-6
-    solved[fixed] = map_from_body[fixed]
+    solved = map_from_body[0] @ se3_inverse(solved[0]) @ solved  # the prior allows a deviation of 1e-6
+    solved[0] = map_from_body[0]
     return PoseGraphResult(solved, weights, graph.error(start), graph.error(optimum), iterations)
 
 
@@ -147,8 +141,8 @@ def _values(map_from_body: Array) -> gtsam.Values:
     return values
 
 
-def _graph(map_from_body: Array, edges: Sequence[PoseEdge], fixed: int) -> gtsam.NonlinearFactorGraph:
-    """Return the edges as factors, in order, then the factor that fixes one keyframe."""
+def _graph(map_from_body: Array, edges: Sequence[PoseEdge]) -> gtsam.NonlinearFactorGraph:
+    """Return the edges as factors, in order, then the factor that fixes the first keyframe."""
     graph = gtsam.NonlinearFactorGraph()
     for edge in edges:
         j_from_i = adjoint(se3_inverse(edge.i_from_j))  # gtsam perturbs on the right, in the axes of j
@@ -156,7 +150,7 @@ def _graph(map_from_body: Array, edges: Sequence[PoseEdge], fixed: int) -> gtsam
         noise = gtsam.noiseModel.Gaussian.Covariance(0.5 * (cov + cov.T))
         graph.add(gtsam.BetweenFactorPose3(edge.i, edge.j, gtsam.Pose3(edge.i_from_j), noise))
     anchor = gtsam.noiseModel.Isotropic.Sigma(6, _FIXED_SIGMA)
-    graph.add(gtsam.PriorFactorPose3(fixed, gtsam.Pose3(map_from_body[fixed]), anchor))
+    graph.add(gtsam.PriorFactorPose3(0, gtsam.Pose3(map_from_body[0]), anchor))
     return graph
 
 

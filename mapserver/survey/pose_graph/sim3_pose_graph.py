@@ -43,9 +43,9 @@ class SimilarityResult:
     loop_weights: Array
 
 
-def optimize_similarities(map_from_body: Array, edges: Sequence[SimilarityEdge], fixed: int = 0) -> SimilarityResult:
-    """Return the similarities with the best fit to the edges, from a start map_from_body (K, 4, 4) of scale 1; keyframe `fixed` and
-    its scale are unchanged.
+def optimize_similarities(map_from_body: Array, edges: Sequence[SimilarityEdge]) -> SimilarityResult:
+    """Return the similarities with the best fit to the edges, from a start map_from_body (K, 4, 4) of scale 1; the first
+    keyframe and its scale are unchanged.
 
     Loops that contradict the rest are rejected, all other edges assumed true: by graduated non-convexity with Geman and McClure's
     cost, which accepts all loops at first; one with a squared residual within 0.999 of chi-square counts in full.
@@ -56,7 +56,7 @@ def optimize_similarities(map_from_body: Array, edges: Sequence[SimilarityEdge],
     for k, placed in enumerate(map_from_body):
         state.insert(k, gtsam.Similarity3(gtsam.Rot3(placed[:3, :3]), placed[:3, 3], 1.0))
     anchor = gtsam.noiseModel.Isotropic.Sigma(7, _FIXED_SIGMA)
-    certain.add(gtsam.PriorFactorSimilarity3(fixed, state.atSimilarity3(fixed), anchor))
+    certain.add(gtsam.PriorFactorSimilarity3(0, state.atSimilarity3(0), anchor))
     for edge in edges:
         factor = _factor(edge)
         if edge.is_loop:

@@ -7,7 +7,6 @@ from fleetmap.bow.vocabulary_codec import (
     VOCABULARY_FORMAT,
     decode_vocabulary,
     encode_vocabulary,
-    vocabulary_hash,
 )
 
 __all__ = [
@@ -18,5 +17,4 @@ __all__ = [
     "Vocabulary",
     "decode_vocabulary",
     "encode_vocabulary",
-    "vocabulary_hash",
 ]

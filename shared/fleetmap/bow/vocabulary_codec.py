@@ -14,7 +14,6 @@
 Little-endian. Not compressed: centres are close to random bits. The index of a node's first child follows from the counts.
 """
 
-import hashlib
 import struct
 import zlib
 
@@ -41,11 +40,6 @@ def encode_vocabulary(vocabulary: Vocabulary) -> bytes:
         + np.ascontiguousarray(vocabulary.idf, "<f4").tobytes()
     )
     return _HEADER.pack(_MAGIC, VOCABULARY_FORMAT, 0, nodes, vocabulary.word_count, zlib.crc32(body)) + body
-
-
-def vocabulary_hash(vocabulary: Vocabulary) -> str:
-    """SHA-256 of the encoded vocabulary, 64 hexadecimal digits; maps refer to their vocabulary by it."""
-    return hashlib.sha256(encode_vocabulary(vocabulary)).hexdigest()
 
 
 def decode_vocabulary(data: bytes) -> Vocabulary:

@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import Vocabulary, encode_vocabulary, vocabulary_hash
+from fleetmap.bow import Vocabulary, encode_vocabulary
 from fleetmap.features.orb import detect
 from fleetmap.features.settings import OrbSettings
+from fleetmap.mapformat import sha256_hex
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
 from fleetsim.recorder import Order, prepare
@@ -83,7 +84,7 @@ def main() -> None:
     data = encode_vocabulary(vocabulary)
     arguments.out.write_bytes(data)
     print(f"{len(given.descriptors)} features, {vocabulary.word_count} words, {len(data)} bytes")
-    print(vocabulary_hash(vocabulary))
+    print(sha256_hex(data))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@ from hashlib import sha256
 
 import numpy as np
 
-from fleetmap.bow import vocabulary_hash
+from fleetmap.bow import encode_vocabulary
 from fleetmap.bow.shipped_vocabulary import (
     DEFAULT_VOCABULARY_SHA256,
     default_vocabulary,
@@ -15,7 +15,7 @@ from fleetmap.bow.shipped_vocabulary import (
 
 def test_it_is_what_its_hash_says() -> None:
     assert sha256(default_vocabulary_bytes()).hexdigest() == DEFAULT_VOCABULARY_SHA256
-    assert vocabulary_hash(default_vocabulary()) == DEFAULT_VOCABULARY_SHA256
+    assert encode_vocabulary(default_vocabulary()) == default_vocabulary_bytes()
     assert shipped_vocabulary(DEFAULT_VOCABULARY_SHA256) == default_vocabulary_bytes()
     assert shipped_vocabulary("0" * 64) is None
 
