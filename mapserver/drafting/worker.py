@@ -21,7 +21,7 @@ from mapserver.survey.executor import SERIAL, Batch, Executor, Result, Shared
 
 Item = TypeVar("Item")
 _AHEAD = 2  # waiting batches per thread or process; a limit, so that long surveys are not in memory twice
-_CONNECT_WITHIN_S = "20s"
+_CONNECT_WITHIN_S = 20.0
 
 
 class Threads:

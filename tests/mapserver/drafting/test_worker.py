@@ -87,7 +87,7 @@ def test_a_cluster_makes_the_same_map(cluster: Client) -> None:
 
 
 def test_a_scheduler_that_does_not_answer_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "_CONNECT_WITHIN_S", "1s")
+    monkeypatch.setattr(workers, "_CONNECT_WITHIN_S", 1.0)
     for address in ("tls://127.0.0.1:9", "tls://nonsense"):
         with pytest.raises(UsageError, match="does not answer"), open_executor(1, address):
             pass
@@ -130,7 +130,7 @@ def test_a_cluster_that_is_lost_is_told() -> None:
 
 
 def test_a_cluster_without_workers_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "_CONNECT_WITHIN_S", "2s")
+    monkeypatch.setattr(workers, "_CONNECT_WITHIN_S", 2.0)
     with (
         tls_cluster(0) as there,
         pytest.raises(UsageError, match="has no workers"),
