@@ -75,7 +75,13 @@ def _unlike_lenses(recording: Recording) -> list[Finding]:
     first, *others = (mounted.camera for mounted in Rectifier(recording.calibration).mounted)
     words = "its focal length is more than 1.5 times from the first view's, so that a survey leaves its images out; use a lens alike"
     return [
-        Finding(f"lens of {name}", Verdict.WARN, camera.focal_px, f"the first view has {first.focal_px:.0f} px", words)
+        Finding(
+            f"field of view of {name}",
+            Verdict.WARN,
+            camera.focal_px,
+            f"the first view has {first.focal_px:.0f} px",
+            words,
+        )
         for name, camera in zip(_names(recording)[1:], others, strict=True)
         if camera.focal_px != first.focal_px
     ]

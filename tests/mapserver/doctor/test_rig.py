@@ -151,8 +151,8 @@ def test_a_view_with_another_lens_is_named(recorded: Path, tmp_path: Path) -> No
     )
     with open_recording(recorded, OpenOptions(tmp_path / "cams.yaml")) as recording:
         found = {finding.name: finding for finding in further_findings(recording)}
-    assert found["lens of cam2 and cam3"].verdict is Verdict.WARN
-    assert "use a lens alike" in found["lens of cam2 and cam3"].sentence
+    assert found["field of view of cam2 and cam3"].verdict is Verdict.WARN
+    assert "use a lens alike" in found["field of view of cam2 and cam3"].sentence
 
 
 def test_the_doctor_names_the_pair_whose_images_are_exchanged(tmp_path: Path) -> None:
