@@ -127,6 +127,18 @@ def test_the_calibration_file_keeps_it_and_refusals_name_the_camera(tmp_path: Pa
         open_recording(written(tmp_path / "large.mcap", (replace(frames[0], others=(large,)),)))
 
 
+def test_cameras_beside_a_depth_camera_in_front_are_named_with_what_to_do(tmp_path: Path) -> None:
+    calibration, frames = simulated()
+    two = replace(calibration, cameras=(replace(calibration.cameras[2], has_depth=False), calibration.cameras[0]))
+    with McapRecordingWriter(tmp_path / "a.mcap", two, topics=Topics(right="/cam2/image_raw")) as target:
+        for frame in frames:
+            target.write_frame(replace(rear(frame), others=(CameraFrame(frame.stamp_ns, frame.left),)))
+    with open_recording(tmp_path / "a.mcap") as recording:
+        assert recording.sensor_set is SensorSet.RGBD
+        (issue,) = recording.issues
+        assert issue.what == "images not used" and "let a stereo pair be left and right" in issue.detail
+
+
 def test_live_images_and_depth_make_one_view() -> None:
     frames, stored = RigFrames(simulated()[0]), store_frame(simulated()[1][0])
     (back,) = stored.others

@@ -247,6 +247,12 @@ def _parts(
         )
         numbers = [number for view in further for number in view]
     if depth is not None:
+        beside = [role for role in CAMERA_ROLES[2:] if role in roles]
+        if beside:
+            how = "let a stereo pair be left and right, and the depth camera cam2, with its depth on cam2_depth"
+            log.note(
+                "images not used", f"{', '.join(beside)}: beside a depth camera as first view no other is used; {how}"
+            )
         _note_unregistered(streams, roles, calibration.cameras[0], log)
     wheel = _samples([v for s in roles.get("wheel", ()) for v in s.values(s.decoder.wheel)], "wheel odometry", log)
     priors = _samples([v for s in roles.get("prior", ()) for v in s.values(s.decoder.prior)], "position priors", log)
