@@ -24,7 +24,7 @@ class SourceSection(Section, frozen=True):
 
 
 CAMERA_ROLES = ("left", "right", "cam2", "cam3", "cam4", "cam5", "cam6", "cam7")
-DEPTH_ROLES = ("depth", *(f"{role}_depth" for role in CAMERA_ROLES[2:]))
+DEPTH_ROLES = ("depth", "cam2_depth", "cam3_depth", "cam4_depth", "cam5_depth", "cam6_depth", "cam7_depth")
 
 
 class Topics(Section, frozen=True):
