@@ -23,7 +23,7 @@ from locclient.localization.percept import QueryInput
 MAX_ROWS = 10_000  # of an array, and members of a list
 _MAX_INT, _MAX_SETTING, _MAX_SIDE_PX = 1 << 62, 1_000_000, 10_000
 _ANGLE_TOLERANCE, _COVARIANCE_TOLERANCE = 1e-3, 1e-6
-_MAY_BE_INFINITE = ("imu_minus_cam_sigma_s", "scene_depth_m")
+_MAY_BE_INFINITE = ("imu_minus_cam_sigma_s", "scene_depth_m", "sigma_m")  # the last one of a ride
 
 
 class Kind(NamedTuple):

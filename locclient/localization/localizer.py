@@ -104,7 +104,7 @@ class Localizer:
         """Use a prior at this moment until a pose is confirmed, with a covariance that grows with the distance since. A prior with finite
         covariance is published, DEGRADED and propagated by odometry, until the map gives a pose. An operator's prior replaces a confirmed
         pose that it contradicts, until fixes outweigh it."""
-        if prior.floor and prior.floor not in self._floors:
+        if prior.floor and prior.floor not in self._floors.keys() | self._maps.keys():
             return  # a floor that the building had a moment ago
         if prior.is_revisable and self._tracker.confirmed is not None:
             if not self._tracker.is_contradicted_by(prior):

@@ -37,7 +37,7 @@ class Start:
     map_from_body (4, 4), cov_rot_trans (6, 6): the pose at frame `frame_index` of the odometry, None without one. is_confirmed: by fixes,
     with their stamp_ns and support; else by a prior, with its is_revisable, is_told and travelled_m, the distance since its arrival.
     has_broken: tracks were lost since. was_tracking: the robot knew its pose before; is_carried: it was lifted since.
-    failed_queries: number of failed map queries in a row.
+    failed_queries: number of failed map queries in a row. floor: whose map the pose is in, empty for the robot's own site.
     """
 
     frame_index: int = 0
@@ -53,6 +53,7 @@ class Start:
     was_tracking: bool = False
     is_carried: bool = False
     failed_queries: int = 0
+    floor: str = ""
 
 
 class _Unmatched(NamedTuple):
@@ -151,6 +152,7 @@ class PoseTracker:
             is_told=prior is None or prior.is_told,
             travelled_m=0.0 if prior is None else prior.travelled_m,
             has_broken=known.has_broken,
+            floor=known.floor,
         )
 
     def begin(self, start: Start) -> None:
@@ -161,7 +163,7 @@ class PoseTracker:
             return
         at_frame = start.map_from_body, start.cov_rot_trans
         known = PoseHypothesis(start.frame_index, start.stamp_ns, *at_frame, *at_frame, support=start.support)
-        known.has_broken = start.has_broken
+        known.has_broken, known.floor, self.floor = start.has_broken, start.floor, start.floor
         if start.is_confirmed:
             self.confirmed = known
         else:

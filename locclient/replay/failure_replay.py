@@ -37,12 +37,12 @@ def replay_failure(record: LocalizerRecord, load: Load) -> list[Moment]:
     rig = RigCalibration((), None, record.base_from_body)
     localizer = Localizer(rig, record.camera, record.body_from_cam, 0.0, record.settings, others=record.others)
     if record.used is not None:
-        _use(localizer, load(record.used))
+        _use(localizer, load(record.used), record.used.floor)
     localizer.begin(record.start)
     said = []
     for commands, percept in record.frames:
         if commands.used is not None:
-            _use(localizer, load(commands.used))
+            _use(localizer, load(commands.used), commands.used.floor)
         if commands.forgets:
             localizer.forget_pose()
         for prior in commands.priors:
@@ -51,9 +51,10 @@ def replay_failure(record: LocalizerRecord, load: Load) -> list[Moment]:
     return said
 
 
-def _use(localizer: Localizer, loaded: LoadedMap) -> None:
+def _use(localizer: Localizer, loaded: LoadedMap, floor: str) -> None:
     tiles, focal_px = loaded.tiles.values(), loaded.manifest.camera.focal_px
-    localizer.handle_version(loaded.version, tiles, loaded.vocabulary, focal_px, loaded.lookalikes, loaded.alias_step_m)
+    like = loaded.lookalikes, loaded.alias_step_m
+    localizer.handle_version(loaded.version, tiles, loaded.vocabulary, focal_px, *like, floor=floor)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,14 +124,15 @@ def compare_failure(
 ) -> Comparison:
     """Compare then and now, in the robot's map or in the version with that manifest; LinkError if a tile is not available.
 
-    Of another version, tiles within the bounds of those in the robot's memory are used.
+    source: of the site whose map the robot used, in a building that of its floor; the other floors are not searched. Of another version,
+    tiles within the bounds of those in the robot's memory are used.
     """
     summary, record = failure
     maps: dict[UsedMap, LoadedMap] = {}
 
     def load(used: UsedMap) -> LoadedMap:
         if used not in maps:
-            maps[used] = _loaded(source, summary.site, used, manifest_sha256)
+            maps[used] = _loaded(source, used.floor or summary.site, used, manifest_sha256)
         return maps[used]
 
     now = replay_failure(record, load)

@@ -34,11 +34,12 @@ _NO_TRACKS = np.zeros(0, np.int64)
 
 @dataclass(frozen=True, slots=True)
 class UsedMap:
-    """Map of the localizer: its version, and the cells of its tiles in order."""
+    """Map of the localizer: its version, and the cells of its tiles in order. floor: as of `Estimate`, the site whose map it is."""
 
     version: int
     manifest_sha256: str
     cells: tuple[tuple[int, int], ...]
+    floor: str = ""
 
 
 @dataclass(slots=True, eq=False)
@@ -110,8 +111,8 @@ class FailureRing:
         self._query: QueryInput | None = None  # of the last map query
         self._pictured_ns = -(2**62)
 
-    def use(self, loaded: LoadedMap) -> None:
-        used = UsedMap(loaded.version, loaded.wanted.manifest_sha256 or "", tuple(loaded.tiles))
+    def use(self, loaded: LoadedMap, floor: str = "") -> None:
+        used = UsedMap(loaded.version, loaded.wanted.manifest_sha256 or "", tuple(loaded.tiles), floor)
         self._used = self._commands.used = used
 
     def handle_samples(self, bundle: SensorBundle) -> None:

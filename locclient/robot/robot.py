@@ -253,7 +253,7 @@ class Robot:
             return
         self._floor = floor
         if self.ring is not None and self.running is not None:
-            self.ring.use(self.running)
+            self.ring.use(self.running, floor)
 
     def _building_from_map(self) -> Array | None:
         if self.floors:

@@ -25,6 +25,7 @@ from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.samples import PositionPrior
 from locclient import cli
 from locclient.delivery.failure_file import failure_file, read_failure_file
+from locclient.maps.floor_maps import FloorMaps
 from locclient.maps.map_source import LocalMapSource
 from locclient.replay.failure_replay import SAME_M, Comparison, compare_failure
 from locclient.replay.replay import load_map
@@ -36,6 +37,7 @@ from mapserver.store import MapStore
 from support.fleet.failed_robot import failed, profile, send_replay
 from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
+from support.worlds.building import house, strange
 
 
 @dataclass
@@ -122,6 +124,27 @@ def test_another_version_is_asked_for_its_own_places(carried: Carried) -> None:
     then, now = (next(m for m in moments[::-1] if m.position_map_m) for moments in (found.summary.moments, found.now))
     assert now.position_map_m[2] - then.position_map_m[2] == pytest.approx(0.5, abs=0.05)
     assert "version 2" in found.answer
+
+
+def test_a_failure_on_another_floor_is_replayed_in_that_floors_map(carried: Carried, tmp_path: Path) -> None:
+    """A robot of the lower floor that knows its place on the upper one when the recording begins."""
+    robot = Robot(calibration(), robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
+    with house(tmp_path, strange(robot_world.tiles()), robot_world.tiles(), x_m=3.0):
+        floors = FloorMaps(LocalMapSource(tmp_path, "low"), lambda site: LocalMapSource(tmp_path, site))
+        floors.refresh()
+        robot.use(load_map(LocalMapSource(tmp_path, "low"))[0])
+        robot.use_floors(*floors.changes.popleft())
+    bundles = list(robot_world.bundles(120))
+    for bundle in bundles:
+        robot.handle(bundle)
+    cut = robot.ring.cut(bundles[0].frame.stamp_ns + 10_500_000_000)
+    robot.ring.finish()
+    (tmp_path / "failure.mcap").write_bytes(failure_file(cut, carried.report, profile(robot), "full"))
+    summary, record = read_failure_file(tmp_path / "failure.mcap")
+    assert record.start.is_confirmed and record.start.floor == "high" and record.used.floor == "high"
+    found = compare_failure((summary, record), LocalMapSource(tmp_path, "high"))
+    assert {moment.status for moment in found.now} == {"TRACKING"}
+    assert found.first_difference_ns is None
 
 
 def test_it_is_a_recording_with_reduced_pictures(carried: Carried) -> None:
