@@ -175,7 +175,7 @@ def report_details(
 
     loop_records: every candidate, keyframe i against the older j of one recording. stage_s: wall seconds of each stage; reading
     and decoding images are part of odometry. frames_seen_in_map: frames located by points of the map; the others by odometry or the
-    IMU. pair_turn: see survey/bundle/stereo_yaw_check.py. parts: the connected
+    IMU. pair_turn, of the first view, and pair_turn_of_views: see survey/bundle/stereo_yaw_check.py. parts: the connected
     components of each survey; the kept one is in the map.
     """
     survey_map, first = joined.map, surveyed[0]
@@ -192,6 +192,7 @@ def report_details(
         "ate_max_m": None if found.rigid is None else found.rigid.max_m,
         "sim3_scale": None if found.similarity is None else found.similarity.scale,
         "pair_turn": [to_plain(s.survey.stereo_yaw) for s in surveyed],
+        "pair_turn_of_views": [to_plain(s.survey.stereo_yaws) for s in surveyed],
         "stage_s": {stage: round(seconds, 3) for stage, seconds in stage_s.items()},
         "parts": [to_plain(s.survey.components) for s in surveyed],
         "loop_records": [

@@ -42,6 +42,7 @@ from mapserver.drafting.sensor_subset import reduced, with_other_views
 from mapserver.drafting.trajectory import GivenPoses, OtherTrajectory, given_poses, with_depths
 from mapserver.drafting.worker import read_ahead
 from mapserver.quality.figures import RigEvidence
+from mapserver.survey.bundle.stereo_yaw_check import StereoYaw
 from mapserver.survey.finish.dock_alignment import aligned_by_priors
 from mapserver.survey.finish.map_transform import scaled, scaled_state
 from mapserver.survey.loops.zones import Zones, zones_of
@@ -77,16 +78,17 @@ class Surveyed:
 
     def remarks(self) -> list[str]:
         """Shortcomings of the recording, corrections and left-out parts, as text."""
-        yaw = self.survey.stereo_yaw
         turned = [
-            f"corrected: disparities by {-yaw.shift_px:+.2f} px, sigma {yaw.sigma_px:.2f}, by the adjusted survey"
+            f"corrected: disparities{of_view} by {-yaw.shift_px:+.2f} px, sigma {yaw.sigma_px:.2f}, by the adjusted survey"
+            for of_view, yaw in self._yaws()
+            if yaw.corrected
         ]
         apart = [c for c in self.survey.odometry.cuts if c.refused is not None]
         whole = [f"not cut after {c.after_s:.0f} s, surveyed as one with the part before: {c.refused}" for c in apart]
         left_out = [component.remark() for component in self.survey.components if not component.kept]
         return [
             *self.findings,
-            *(turned if yaw.corrected else ()),
+            *turned,
             *whole,
             *left_out,
             *_contradictions(self.survey.state),
@@ -94,12 +96,17 @@ class Surveyed:
 
     def evidence(self) -> RigEvidence:
         """Evidence on its calibration: the pair is doubted if the survey's disparities contradict the angle accepted by the doctor."""
-        yaw, limit = self.survey.stereo_yaw, TOLERANCES[CalibrationParameter.PAIR_YAW]
-        angle_rad = abs(yaw.correction_px) / self.survey.state.camera.focal_px
-        if angle_rad <= limit.warn_above + SURE_SIGMAS * limit.floor:
+        limit, focal_px = TOLERANCES[CalibrationParameter.PAIR_YAW], self.survey.state.camera.focal_px
+        most_px = focal_px * (limit.warn_above + SURE_SIGMAS * limit.floor)
+        off = [f"{-yaw.shift_px:+.2f} px{of_view}" for of_view, yaw in self._yaws() if abs(yaw.correction_px) > most_px]
+        if not off:
             return self.calibration
-        words = f"the survey's disparities are {-yaw.shift_px:+.2f} px off by its motion; the doctor did not find this"
+        words = f"the survey's disparities are {' and '.join(off)} off by its motion; the doctor did not find this"
         return msgspec.structs.replace(self.calibration, doubted=self.calibration.doubted | {"pair geometry": words})
+
+    def _yaws(self) -> list[tuple[str, StereoYaw]]:
+        """Return the error of yaw of the pair of each view, with the view's name; that of the first one is empty."""
+        return [(f" of view {n}" if n else "", yaw) for n, yaw in enumerate(self.survey.stereo_yaws)]
 
 
 def _contradictions(state: SurveyState) -> list[str]:

@@ -5,7 +5,7 @@
 | `follow` | frames, IMU, wheels, or given poses | `OdometryPass`: odometry of all frames, keyframes with their features |
 | `adjust_chain` | that | `AdjustedChain`: keyframes matched with their neighbours, landmarks, both adjusted |
 | `close_loops` | the chain, vocabulary, zones, position priors | `SurveyState` after the pose graph, in `map` by priors, and the `Loops` |
-| `adjust_globally` | keyframes after loops, matched pairs | all views matched again and adjusted; the pair's error of yaw |
+| `adjust_globally` | keyframes after loops, matched pairs | all views matched again and adjusted; each pair's error of yaw |
 | `keep_largest` | the adjusted state, odometry, loops | their part in the connected component that becomes the map |
 | `place_frames`, `assemble` | the kept state | all frames, and the map; inconsistent observations are culled |
 
@@ -73,8 +73,8 @@ class Survey:
     """The result of a survey.
 
     odometry: the initial trajectory. state: the adjusted variables, which still name the feature of each observation. landmarks_in_map:
-    rows of the state's landmarks in the map. components: the connected components, of which one is the map. stereo_yaw: the extrinsic yaw
-    error of the pair. seen (F,): frames located by points of the map; the others by odometry or the IMU.
+    rows of the state's landmarks in the map. components: the connected components, of which one is the map. stereo_yaws: the extrinsic yaw
+    error of the pair of each view. seen (F,): frames located by points of the map; the others by odometry or the IMU.
     """
 
     map: SurveyMap
@@ -84,9 +84,14 @@ class Survey:
     odometry: OdometryPass
     state: SurveyState
     culled: Culled
-    stereo_yaw: StereoYaw
+    stereo_yaws: tuple[StereoYaw, ...]
     components: list[Component]
     seen: NDArray[np.bool_]
+
+    @property
+    def stereo_yaw(self) -> StereoYaw:
+        """Return that of the first view."""
+        return self.stereo_yaws[0]
 
 
 def survey(inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools | None = None) -> Survey:
@@ -128,16 +133,16 @@ def finish_survey(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConf
         body_from_view=body_from_views(inputs.rectifier),
         depth_views=depth_views(inputs.rectifier),
     )
-    odometry, state, stereo_yaw = adjust_globally(odometry, state, depths, matched, tracks, settings, tools)
+    odometry, state, stereo_yaws = adjust_globally(odometry, state, depths, matched, tracks, settings, tools)
     tools.at("global adjustment", 2, 2)
     frames_of = np.array(odometry.keyframe_frames, np.int64)
     state, odometry, loops, components = keep_largest(state, odometry, loops, settings)
-    placed = place_frames(odometry, state, settings, stereo_yaw.correction_px, tools.executor)
+    placed = place_frames(odometry, state, settings, stereo_yaws[0].correction_px, tools.executor)
     survey_map, rows, culled = assemble(state, odometry, placed, settings)
     between = between_kept(len(survey_map.trajectory), frames_of, components.kept)
     survey_map = replace(survey_map, trajectory_estimated=survey_map.trajectory_estimated & between)
     every = [*components.components, *components.stray]
-    return Survey(survey_map, rows, config.vocabulary, loops, odometry, state, culled, stereo_yaw, every, placed.seen)
+    return Survey(survey_map, rows, config.vocabulary, loops, odometry, state, culled, stereo_yaws, every, placed.seen)
 
 
 def follow(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> OdometryPass:
@@ -257,8 +262,9 @@ def adjust_globally(
     tracks: Tracks | None,
     settings: SurveySettings,
     tools: SurveyTools,
-) -> tuple[OdometryPass, SurveyState, StereoYaw]:
-    """Match all views at the poses after loop closure and adjust them together, twice: the first result gives the stereo yaw error.
+) -> tuple[OdometryPass, SurveyState, tuple[StereoYaw, ...]]:
+    """Match all views at the poses after loop closure and adjust them together, twice: the first result gives the
+    stereo yaw error of each view.
 
     matched: pairs of the first view that need not be matched again, and their tracks.
     """
@@ -306,7 +312,7 @@ def adjust_globally(
             part = without_redundant(state, redundant)
             yaws = [estimate_stereo_yaw(part, settings, view) for view in range(views)]
             del part
-    return odometry, state, yaws[0]
+    return odometry, state, tuple(yaws)
 
 
 def keep_largest(

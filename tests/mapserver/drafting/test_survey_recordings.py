@@ -22,13 +22,16 @@ from mapserver.drafting.survey_recordings import (
     BegunSurvey,
     OpenRecordings,
     RecordingOptions,
+    Surveyed,
     survey_recording,
 )
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey import stages
+from mapserver.survey.bundle.stereo_yaw_check import StereoYaw
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 from support.recordings.recording_samples import make_sample, write_euroc
+from support.worlds.pinhole_pair import CAMERA
 
 
 @pytest.fixture(scope="module")
@@ -137,6 +140,23 @@ def test_nobody_holds_what_was_begun_once_its_loops_are_closed(euroc: Path, monk
     config = SurveyConfig(SurveySettings(), default_vocabulary())
     with pytest.raises(SurveyError, match="let go of"):
         survey_recording(euroc, admitted.pop(), RecordingOptions(), None, config, SurveyTools())
+
+
+def test_the_turn_within_each_pair_of_a_rig_is_told_and_judged() -> None:
+    """Robots measure depth with the same error by every view."""
+    straight, turned = StereoYaw(0.01, 0.05, corrected=False), StereoYaw(-2.0, 0.05, corrected=True)
+    state: Any = SimpleNamespace(camera=CAMERA, priors=())
+    for yaws, words in (
+        ((straight, turned), "+2.00 px of view 1"),
+        ((turned, turned), "+2.00 px and +2.00 px of view 1"),
+    ):
+        survey: Any = SimpleNamespace(stereo_yaws=yaws, odometry=SimpleNamespace(cuts=()), components=(), state=state)
+        nothing: Any = None
+        rest = nothing, RigEvidence("", [], {}, {}), {}, []
+        surveyed = Surveyed(nothing, nothing, nothing, (), nothing, survey, nothing, (), *rest)
+        assert len(surveyed.remarks()) == sum(yaw.corrected for yaw in yaws)
+        assert "disparities of view 1 by +2.00 px" in surveyed.remarks()[-1]
+        assert words in surveyed.evidence().doubted["pair geometry"]
 
 
 @pytest.mark.parametrize(
