@@ -60,7 +60,7 @@ def list_(*, store: StoreFolder, json: Json = False) -> None:
             return
         for building in found:
             _print(maps, building)
-    typer.echo(f"{len(found)} buildings")
+    typer.echo(f"buildings: {len(found)}")
 
 
 def _entry(text: str) -> "FloorEntry":

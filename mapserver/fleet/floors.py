@@ -1,5 +1,6 @@
 """The floors of a building, kept as a file of each of its sites, which robots get with the site's signed list."""
 
+import shlex
 from collections.abc import Sequence
 
 from fleetmap.encoding import to_json
@@ -12,8 +13,14 @@ from mapserver.store import Actor, MapStore
 def keep_building(store: MapStore, building: Building, actor: Actor) -> Building:
     """Make the sites the floors of a building, and return it, from below; sites that it had before leave it.
 
-    Raises UsageError for an unknown site, one without a version or pose, one of another building, and repeated levels or heights.
+    Raises UsageError for an unknown site, one without a version or pose, one of another building, for repeated levels or heights, for names
+    that cannot be printed in a line, and for a single floor.
     """
+    for text in (building.name, *(floor.level for floor in building.floors)):
+        if not (0 < len(text) <= 64 and text.isprintable() and text == text.strip()):
+            raise UsageError(f"name {text[:80]!r} of a building or level: use 1 to 64 characters of one line")
+    if len(building.floors) < 2:
+        raise UsageError(f"building {building.name!r}: two floors or more make a building; name each with --floor")
     try:
         building = read_building(to_json(building))
     except MapFormatError as error:
@@ -21,10 +28,12 @@ def keep_building(store: MapStore, building: Building, actor: Actor) -> Building
     sites = [floor.site for floor in building.floors]
     for site in sites:
         if store.current(site) is None:  # it raises for an unknown site
-            raise UsageError(f"site {site} has no published version; robots need the maps of all floors")
+            how = f"publish one with `mapserver publish --site {site}`"
+            raise UsageError(f"site {site} has no published version, and robots need the maps of all floors; {how}")
         known = store.building(site)
         if known is not None and known.name != building.name:
-            raise UsageError(f"site {site} is a floor of {known.name!r}; remove that building first")
+            how = f"`mapserver building remove {shlex.quote(known.name)}` first, or set that one"
+            raise UsageError(f"site {site} is a floor of {known.name!r}; {how}")
         if store.alignment(site) is None:
             raise UsageError(f"site {site} has no pose in the building; run `mapserver align --site {site} --pin ...`")
     for known in buildings(store):

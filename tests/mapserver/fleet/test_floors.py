@@ -43,6 +43,7 @@ def house(tmp_path: Path) -> Path:
                 aligned = Alignment(frame=frame, metres_per_unit=1.0, method="pins", plan=None, off_m={})
                 store.keep_site_files(site, {"alignment": encode_alignment(aligned)}, "")
                 keep_areas(store, site, areas(lift="A"), "", NOBODY)
+        save_sample_draft(store, site="draft")
     return tmp_path
 
 
@@ -60,38 +61,41 @@ def test_one_command_makes_floors_that_robots_get_signed(house: Path) -> None:
             forget_alignment(store, "hall-1", NOBODY)
         assert store.verify().faults == []
     assert "hall-1, hall-2" in run(app, "building", "remove", "tower", "--store", house)
-    assert run(app, "building", "list", "--store", house) == "0 buildings\n"
+    assert run(app, "building", "list", "--store", house) == "buildings: 0\n"
 
 
 @pytest.mark.parametrize(
     ("floors", "words"),
     [
         (("hall-1=L1@0", "yard=L2@4"), "site yard has no pose"),
-        (("hall-1=L1@0", "hall-2=L1@4"), "the same level"),
-        (("hall-1=L1@0", "hall-2=L2@0"), "the same height_m"),
-        (("hall-1=L1@0", "hall-1=L2@4"), "the same site"),
+        (("hall-1=L1@0", "hall-2=L1@4"), "the same level, L1"),
+        (("hall-1=L1@0", "hall-2=L2@0"), "the same height, 0.0"),
+        (("hall-1=L1@0", "hall-1=L2@4"), "the same site, hall-1"),
+        (("hall-1=L1@0", "nowhere=L2@4"), "no site nowhere; it has: draft, hall-1"),
+        (("hall-1=L1@0", "draft=L2@4"), "publish one with `mapserver publish --site draft`"),
+        (("hall-1=L1@0", "hall-2=L2\n@4"), "characters of one line"),
         (("hall-1=L1", "hall-2=L2@4"), "SITE=LEVEL@HEIGHT"),
-        (("hall-1=L1@0",), "length >= 2"),
+        (("hall-1=L1@0",), "two floors or more"),
     ],
 )
 def test_floors_that_cannot_be(house: Path, floors: tuple[str, ...], words: str) -> None:
     with pytest.raises(UsageError, match=words):
-        run(
-            app,
-            "building",
-            "set",
-            "tower",
-            *(word for floor in floors for word in ("--floor", floor)),
-            "--store",
-            house,
-        )
+        run(app, "building", "set", "tower", *(f"--floor={floor}" for floor in floors), "--store", house)
+
+
+@pytest.mark.parametrize("name", ["", " ", "t" * 65, "a\nb"])
+def test_a_building_has_a_name_of_one_line(house: Path, name: str) -> None:
+    with pytest.raises(UsageError, match="characters of one line"):
+        run(app, "building", "set", name, "--floor=hall-1=L1@0", "--floor=hall-2=L2@4", "--store", house)
+    said = run(app, "building", "set", "Türme 塔", "--floor=hall-1=U1@-4", "--floor=hall-2=二階@4.5", "--store", house)
+    assert said.startswith("Türme 塔:\n  二階  hall-2  4.5 m")
 
 
 def test_a_site_is_a_floor_of_one_building_and_leaves_it(house: Path) -> None:
     one, two = (FloorEntry(site=f"hall-{n}", level=f"L{n}", height_m=4.0 * n) for n in (1, 2))
     with MapStore.open(house) as store:
         keep_building(store, Building(name="tower", floors=(one, two)), NOBODY)
-        with pytest.raises(UsageError, match="is a floor of 'tower'"):
+        with pytest.raises(UsageError, match="is a floor of 'tower'; `mapserver building remove tower`"):
             keep_building(store, Building(name="annex", floors=(one, two)), NOBODY)
         low, high = floors_of(store, Building(name="tower", floors=(one, two)))
         assert high.building_from_map[:3, 3].tolist() == [10.0, 0.0, 8.0]
