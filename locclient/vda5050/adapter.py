@@ -351,14 +351,10 @@ class FleetAdapter:
             found: dict[str, Any] = {**_EMPTY, "driving": now.is_driving, **self._robots_own()}
             if self._last_node is not None and found["lastNodeId"] == self._last_node[1]:
                 found["lastNodeId"] = self._last_node[0]
+            others = [(site, number, True) for site, number in self._floor_versions.items() if site != self.map_id]
             found["maps"] = [
-                {"mapId": self.map_id, "mapVersion": str(number), "mapStatus": "ENABLED" if on else "DISABLED"}
-                for number, on in self._versions
-            ]
-            found["maps"] += [
-                {"mapId": site, "mapVersion": str(number), "mapStatus": "ENABLED"}
-                for site, number in self._floor_versions.items()
-                if site != self.map_id
+                {"mapId": map_id, "mapVersion": str(number), "mapStatus": "ENABLED" if on else "DISABLED"}
+                for map_id, number, on in [*((self.map_id, *own) for own in self._versions), *others]
             ]
             place = now.mobile_robot_position(self.map_id, self._lost_radius_m)
             if place is not None:

@@ -78,7 +78,7 @@ def test_a_stay_without_a_ride_keeps_the_place(monkeypatch: pytest.MonkeyPatch) 
 
 def test_two_rides_without_a_look_between_add_up(monkeypatch: pytest.MonkeyPatch) -> None:
     world = world_of(monkeypatch, 5, floors=3, likeness=0.97)
-    said = [*world.drive(9.5), *world.stand(4.0), *world.ride(1), *world.stand(4.0), *world.ride(2), *world.stand(3.0)]
+    said = [*world.board_and_ride(1), *world.stand(4.0), *world.ride(2), *world.stand(3.0)]
     assert [h.floor for h in said[-1].hypotheses] == ["floor-2"]
     assert said[-1].status is Status.AMBIGUOUS, "until the pictures say so"
     assert said[-1].map_from_body is None
@@ -129,8 +129,7 @@ def test_a_robot_that_finds_its_place_in_a_ride_does_not_take_it(monkeypatch: py
 def test_a_lift_that_shakes_the_robot_loses_no_floor(monkeypatch: pytest.MonkeyPatch) -> None:
     """The odometry says that it is lifted, in the moment in which the cabin starts."""
     world = world_of(monkeypatch, 8, **ALIKE)
-    list(world.drive(9.5))
-    list(world.stand(4.0))
+    world.board()
     world.odometry.lifts = True
     said = [*world.ride(1), *world.stand(2.0)]
     assert {e.cause for e in said} == {Cause.RIDING}
@@ -142,9 +141,7 @@ def test_a_lift_that_shakes_the_robot_loses_no_floor(monkeypatch: pytest.MonkeyP
 def test_a_dock_that_names_no_floor_is_one_of_any(monkeypatch: pytest.MonkeyPatch) -> None:
     """After a ride of unknown height: it is not taken for a dock of the floor where the robot was."""
     world = world_of(monkeypatch, 10, **ALIKE, has_imu=False)
-    list(world.drive(9.5))
-    list(world.stand(4.0))
-    list(world.ride(1))
+    world.board_and_ride(1)
     list(world.drive(-3.0, sees=False))
     covariance, stamp_ns = np.diag([0.02**2] * 3 + [0.1**2] * 3), int(world.frames * FRAME_S * 1e9) + 1
     world.localizer.handle_prior(PositionPrior(stamp_ns, world.map_from_body, covariance))
@@ -178,7 +175,7 @@ def test_a_ride_ends_for_a_robot_that_waits_for_its_place() -> None:
 
 def test_a_ride_is_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     world, monitor = world_of(monkeypatch, 9, **ALIKE), FailureMonitor()
-    said = [*world.drive(9.5), *world.stand(4.0), *world.ride(1, fastest_mps=0.3), *world.stand(2.0)]
+    said = [*world.board_and_ride(1, fastest_mps=0.3), *world.stand(2.0)]
     failures = [monitor.handle(e, 0.0) for e in said]
     assert next(e.cause for e in said if e.status is Status.AMBIGUOUS) is Cause.RIDING
     assert not any(failures)
@@ -187,9 +184,7 @@ def test_a_ride_is_no_failure(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_robot_that_comes_back_into_the_lift_keeps_its_floor_open(monkeypatch: pytest.MonkeyPatch) -> None:
     """No picture has told the floor: it has not come back to the floor where it first went in."""
     world = world_of(monkeypatch, 11, **ALIKE)
-    list(world.drive(9.5))
-    list(world.stand(4.0))
-    list(world.ride(1))
+    world.board_and_ride(1)
     list(world.stand(2.0))
     list(world.drive(-5.0, sees=False))
     said = [*world.drive(5.0, sees=False), *world.stand(4.0)]
@@ -201,8 +196,7 @@ def test_a_robot_that_comes_back_into_the_lift_keeps_its_floor_open(monkeypatch:
 def test_a_change_of_the_building_in_a_ride_ends_the_ride(monkeypatch: pytest.MonkeyPatch) -> None:
     """What rises after it is not the whole rise."""
     world = world_of(monkeypatch, 12, floors=3, likeness=0.97)
-    list(world.drive(9.5))
-    list(world.stand(4.0))
+    world.board()
     for number, _ in enumerate(world.ride(2)):
         if number == 20:
             world.localizer.handle_floors(dict(world.localizer._floors))
@@ -215,9 +209,7 @@ def test_a_change_of_the_building_in_a_ride_ends_the_ride(monkeypatch: pytest.Mo
 def test_a_lift_that_one_floor_alone_has_leads_to_any(monkeypatch: pytest.MonkeyPatch) -> None:
     world = world_of(monkeypatch, 13, **ALIKE)
     world.redraw(1, {})
-    list(world.drive(9.5))
-    list(world.stand(4.0))
-    list(world.ride(1))
+    world.board_and_ride(1)
     list(world.stand(2.0))
     list(world.drive(-6.0))
     assert not world.wrong
@@ -232,17 +224,14 @@ def test_of_two_lifts_side_by_side_it_may_ride_either(monkeypatch: pytest.Monkey
         turn = world.map_from_plan[number][:2, :2]
         beside = {"0": (ring + turn @ np.array([0.0, 2.1]),)} if number < 2 else {}
         world.redraw(number, {"A": (ring,)} | beside)
-    list(world.drive(9.5))
-    list(world.stand(4.0))
+    world.board()
     said = [*world.ride(2), *world.stand(2.0)]
     assert {h.floor for h in said[-1].hypotheses} == {"", "floor-1", "floor-2"}
 
 
 def test_an_operator_without_a_floor_names_none_after_a_ride(monkeypatch: pytest.MonkeyPatch) -> None:
     world = world_of(monkeypatch, 15, **ALIKE, has_imu=False)
-    list(world.drive(9.5))
-    list(world.stand(4.0))
-    list(world.ride(1))
+    world.board_and_ride(1)
     list(world.drive(-3.0, sees=False))
     covariance, stamp_ns = np.diag([0.02**2] * 3 + [0.2**2] * 3), int(world.frames * FRAME_S * 1e9) + 1
     before = world.map_from_plan[0] @ world.plan_from_body  # as RViz shows it, on the floor before

@@ -214,6 +214,13 @@ class LiftWorld:
         for _ in range(round(seconds / FRAME_S)):
             yield self.step(0.0, sees=sees)
 
+    def board(self) -> list[Estimate]:
+        """Drive into the cabin, and wait there."""
+        return [*self.drive(STAND_M), *self.stand(4.0)]
+
+    def board_and_ride(self, level: int, **how: float) -> list[Estimate]:
+        return [*self.board(), *self.ride(level, **how)]
+
     def ride(self, level: int, fastest_mps: float = 1.0, accel_mps2: float = 0.8) -> Iterator[Estimate]:
         """The cabin's ride to another floor; the doors are closed."""
         height_m = STOREY_M * (level - self.level)
