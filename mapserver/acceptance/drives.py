@@ -117,13 +117,12 @@ class Picture:
 
 @dataclass(frozen=True)
 class Drive:
-    """An examined drive; unplaced: number of its frames without a known place."""
+    """An examined drive."""
 
     figures: DriveFigures
     starts: list[Start]
     pictures: list[Picture]
     places_m: Array
-    unplaced: int
 
 
 class Reference(NamedTuple):
@@ -202,7 +201,7 @@ def examined(
             remarks=[f"{f.name}: {f.sentence}" for f in findings if f.verdict in (Verdict.WARN, Verdict.FAIL)],
         )
     places = np.array([truth[:2, 3] for truth in truths if truth is not None]).reshape(-1, 2)
-    return Drive(figures, starts, pictures, places, int((~known).sum()))
+    return Drive(figures, starts, pictures, places)
 
 
 def _reference(

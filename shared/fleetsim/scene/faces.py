@@ -14,7 +14,7 @@ from fleetsim.textures.atlas import TEXEL_M
 
 MATERIAL_PLAIN, MATERIAL_FLOOR, MATERIAL_LAMP = 0, 1, 2
 FACE_NAMES = "xXyYzZ"  # lower case: the negative side
-ALL_SIDES, NO_TOP, NO_BOTTOM = "xXyYzZ", "xXyYz", "xXyYZ"
+ALL_SIDES, NO_BOTTOM = "xXyYzZ", "xXyYZ"
 LIGHT_GRID_M = 0.6
 Vector = tuple[float, float, float]
 

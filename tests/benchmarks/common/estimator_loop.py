@@ -312,8 +312,9 @@ def map_view(session: EstimatorSession, tiles: list[Tile], vocabulary: Vocabular
     return MapView(tiles, vocabulary, session.camera.focal_px)
 
 
-def relative_errors_m(estimates: list[OdometryEstimate], map_from_body: Array, step: int = 15) -> Array:
-    """(N,) errors of the motion over `step` frames, of estimates that know gravity."""
+def relative_errors_m(estimates: list[OdometryEstimate], map_from_body: Array) -> Array:
+    """(N,) errors of the motion over 15 frames, of estimates that know gravity."""
+    step = 15
     known = [k for k in range(len(estimates) - step) if estimates[k].inertial]
     errors = []
     for k in known:

@@ -43,11 +43,11 @@ CASES: dict[str, tuple[str, ...]] = {
 }
 
 
-def odometry_ms(path: Path, settings: LocalizerSettings, frames: str = ":") -> list[float]:
+def odometry_ms(path: Path, settings: LocalizerSettings) -> list[float]:
     """CPU milliseconds of each frame by odometry alone, rectification included."""
     out = []
     with open_recording(path) as recording:
-        source = ReplaySource.of(recording, FrameSelection.parse(frames), reverse=False)
+        source = ReplaySource.of(recording, FrameSelection.parse(":"), reverse=False)
         rectifier = Rectifier(source.calibration)
         odometry = Odometry(
             source.calibration, rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s, settings.odometry,

@@ -1,19 +1,18 @@
 """Makes the vocabulary that ships with fleetmap, from pictures of simulated warehouses and nothing else.
 
-    PYTHONPATH=tests python tests/benchmarks/survey/default_vocabulary.py FILE.fmvb [--features FILE.npz]
+    PYTHONPATH=tests python tests/benchmarks/survey/default_vocabulary.py FILE.fmvb
 
 It writes the same bytes every time, in some minutes. The warehouses are others than those that tests, demo and benches use, so
 that these measure how the vocabulary fares elsewhere.
 """
 
 import argparse
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import Vocabulary, encode_vocabulary
+from fleetmap.bow import encode_vocabulary
 from fleetmap.features.orb import detect
 from fleetmap.features.settings import OrbSettings
 from fleetmap.mapformat import sha256_hex
@@ -22,7 +21,6 @@ from fleetmap.sensors.samples import CameraFrame
 from fleetsim.recorder import Order, prepare
 from support.worlds.vocabulary_training import train_vocabulary
 
-BRANCHING, LEVELS, SEED = 10, 4, 0
 PICTURES = 60  # of each run, evenly spread
 RUNS = (
     Order("small-loop", 101),
@@ -38,52 +36,32 @@ RUNS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Examples:
-    """Descriptors (N, 32) and which picture each is from (N,)."""
-
-    descriptors: NDArray[np.uint8]
-    images: NDArray[np.int64]
-
-
-def examples(runs: tuple[Order, ...] = RUNS, pictures: int = PICTURES) -> Examples:
-    """Features of pictures of all runs, as a survey finds them in its keyframes."""
+def features() -> list[NDArray[np.uint8]]:
+    """Features (N, 32) of each picture of all runs, as a survey finds them in its keyframes."""
     found: list[NDArray[np.uint8]] = []
-    for order in runs:
+    for order in RUNS:
         session = prepare(order)
         rectifier, times = Rectifier(session.nominal), session.frame_times_s
-        for number in np.unique(np.linspace(0, len(times) - 1, pictures).round().astype(int)):
+        for number in np.unique(np.linspace(0, len(times) - 1, PICTURES).round().astype(int)):
             shot = session.renderer.shoot(times[number])
             frame = rectifier.rectify(CameraFrame(0, shot.left, shot.right))
             found.append(detect(frame.left, OrbSettings()).descriptors)
         session.renderer.close()
         print(f"{order.scenario} seed {order.seed}: {len(found)} pictures so far", flush=True)
-    images = np.repeat(np.arange(len(found)), [len(rows) for rows in found])
-    return Examples(np.concatenate(found), images)
-
-
-def train(given: Examples, branching: int = BRANCHING, levels: int = LEVELS) -> Vocabulary:
-    """The vocabulary of these examples."""
-    return train_vocabulary(given.descriptors, branching, levels, np.random.default_rng(SEED), given.images)
+    return found
 
 
 def main() -> None:
     """Makes the file."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--features", type=Path, help="keep the features here, or take them from here")
-    arguments = parser.parse_args()
-    if arguments.features is not None and arguments.features.is_file():
-        held = np.load(arguments.features)
-        given = Examples(held["descriptors"], held["images"])
-    else:
-        given = examples()
-        if arguments.features is not None:
-            np.savez(arguments.features, descriptors=given.descriptors, images=given.images)
-    vocabulary = train(given)
+    out = parser.parse_args().out
+    found = features()
+    images = np.repeat(np.arange(len(found)), [len(rows) for rows in found])
+    vocabulary = train_vocabulary(np.concatenate(found), 10, 4, np.random.default_rng(0), images)
     data = encode_vocabulary(vocabulary)
-    arguments.out.write_bytes(data)
-    print(f"{len(given.descriptors)} features, {vocabulary.word_count} words, {len(data)} bytes")
+    out.write_bytes(data)
+    print(f"{len(images)} features, {vocabulary.word_count} words, {len(data)} bytes")
     print(sha256_hex(data))
 
 

@@ -70,7 +70,7 @@ def report(seen: Aisle, surveyed: Array, driven: Array, *, dark: str = "") -> Re
     figures = DriveFigures(
         "drive", "00", len(driven), 0.01, "ground truth", False, 1.0, 0, 0, None, [20.0], CALIBRATION, []
     )
-    ride = Drive(figures, starts, pictures, driven[:, :2, 3], 0)
+    ride = Drive(figures, starts, pictures, driven[:, :2, 3])
     return Report(
         site="hall", version=3, manifest_sha256="ab" * 32, created="2026-11-28", promises=[], areas=areas_of(view, where, [ride]),
         drives=[figures], similar=similar(view, where, [picture.probe for picture in pictures]), similar_of=len(pictures),

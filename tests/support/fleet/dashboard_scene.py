@@ -194,43 +194,26 @@ def place_of(number: int) -> tuple[float, float]:
     return 4.0 + (number * 7.3) % (LENGTH_M - 8), 6.0 + AISLE_M * (number % 3)
 
 
-def speak(
-    bus: Bus,
-    robot: str,
-    stamp_ns: int,
-    place_m: tuple[float, float],
-    status: str = "TRACKING",
-    *,
-    with_health: bool = True,
-) -> None:
+def speak(bus: Bus, robot: str, stamp_ns: int, place_m: tuple[float, float], status: str = "TRACKING") -> None:
     """One robot's pose and health."""
     map_from_base = se3(np.eye(3), np.array([*place_m, 0.0]))
     estimate = PoseMessage.of(stamp_ns, map_from_base, np.eye(6) * 1e-4, status, 2)
     bus.publish(robot_key(SITE, robot, "pose"), encode_message(estimate))
-    if not with_health:
-        return
     health = RobotHealth(
         site=SITE, robot=robot, stamp_ns=stamp_ns, version=2, status=status, metrics={"speed_mps": 0.8}
     )
     bus.publish(robot_key(SITE, robot, "health"), encode_message(health))
 
 
-def speak_all(
-    bus: Bus,
-    count: int,
-    stamp_ns: int,
-    *,
-    with_health: bool = True,
-    moved: Mapping[str, tuple[float, float]] | None = None,
-) -> None:
+def speak_all(bus: Bus, count: int, stamp_ns: int, moved: Mapping[str, tuple[float, float]]) -> None:
     """`count` robots, most of them well; those that moved are lost where they went."""
     for number in range(count):
         robot, status = f"tug-{number}", _STATUSES[number % len(_STATUSES)]
-        place_m = (moved or {}).get(robot)
+        place_m = moved.get(robot)
         if place_m is None:
-            speak(bus, robot, stamp_ns, place_of(number), status, with_health=with_health)
+            speak(bus, robot, stamp_ns, place_of(number), status)
         else:
-            speak(bus, robot, stamp_ns, place_m, "LOST", with_health=with_health)
+            speak(bus, robot, stamp_ns, place_m, "LOST")
 
 
 @contextmanager
@@ -243,7 +226,7 @@ def talking(endpoint: str, count: int) -> Iterator[dict[str, tuple[float, float]
         def talk() -> None:
             stamp_ns = time.time_ns()
             while not ended.is_set():
-                speak_all(bus, count, stamp_ns, moved=dict(moved))
+                speak_all(bus, count, stamp_ns, dict(moved))
                 stamp_ns += 1_000_000_000
                 ended.wait(1.0)
 

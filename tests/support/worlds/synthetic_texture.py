@@ -10,10 +10,9 @@ from fleetmap.geometry import Array
 Texture = Callable[[Array, Array], Array]
 
 
-def smooth_texture(
-    rng: np.random.Generator, *, waves: int = 60, shortest_px: float = 7.0, longest_px: float = 60.0
-) -> Texture:
+def smooth_texture(rng: np.random.Generator, *, shortest_px: float = 7.0, longest_px: float = 60.0) -> Texture:
     """A sum of plane waves: grey value (as given, 0 to 255) of real-valued pixel coordinates u, v of any shape."""
+    waves = 60
     lengths = np.exp(rng.uniform(np.log(shortest_px), np.log(longest_px), waves))
     angles, phases = rng.uniform(0, 2 * np.pi, waves), rng.uniform(0, 2 * np.pi, waves)
     waves_u, waves_v = 2 * np.pi * np.cos(angles) / lengths, 2 * np.pi * np.sin(angles) / lengths
