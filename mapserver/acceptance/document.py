@@ -32,13 +32,8 @@ def sections(report: Report) -> list[Section]:
     found = [Section("Reasons against it", items=report.reasons)] if report.reasons else []
     if report.compared_with is not None:
         words = f"Against {report.compared_with}, beyond chance (5 % for all comparisons together)."
-        found.append(
-            Section(
-                "Better and worse",
-                [words],
-                [*(f"worse: {w}" for w in report.worse), *(f"better: {b}" for b in report.better)],
-            )
-        )
+        items = [*(f"worse: {w}" for w in report.worse), *(f"better: {b}" for b in report.better)]
+        found.append(Section("Better and worse", [words] if items else [words, "Nothing."], items))
     found.append(Section("Survey again", [] if report.survey_again else ["Nothing."], report.survey_again))
     return [
         *found,

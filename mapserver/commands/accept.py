@@ -86,6 +86,8 @@ def accept(
     typer.echo(report.verdict)
     for words in (*report.worse, *report.better):
         typer.echo(f"{'worse' if words in report.worse else 'better'}: {words}")
+    if report.compared_with is not None and not report.worse and not report.better:
+        typer.echo(f"nothing is better or worse than in {report.compared_with}, beyond chance")
     typer.echo(str(options.out / "acceptance.html"))
     if signature is None:
         typer.echo(

@@ -24,6 +24,7 @@ def test_a_room_is_accepted_signed_and_equal_to_itself(site: RoomSite, tmp_path:
         first = told.output.splitlines()[0]
         report = json.loads((out / "acceptance.json").read_text())
         assert first == report["verdict"]
+        assert ("nothing is better or worse than in version 1 of lab" in told.output) == bool(more)
         assert first.startswith("ACCEPTED" if told.exit_code == 0 else "NOT ACCEPTED")
         assert first in (out / "acceptance.html").read_text()
         assert (out / "acceptance.pdf").read_bytes().startswith(b"%PDF")

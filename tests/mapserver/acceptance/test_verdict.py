@@ -218,6 +218,7 @@ def test_documents_begin_with_the_verdict_and_are_the_same_each_time(good: Repor
     found = judged(good, GateSettings(), views, ["tile 1,2: three failures a day"])
     assert found.survey_again == ["tile 1,2: three failures a day"]
     shown = sections(compared(found, found))
+    assert next(part for part in shown if part.title == "Better and worse").words[-1] == "Nothing."
     picture = drawn(np.zeros((3, 2)), [(np.zeros(2), "found")])
     page = html_page(found, shown, picture)
     assert page.index("ACCEPTED: hall") < page.index("<h1>")
