@@ -61,13 +61,11 @@ def check_building(building: Building) -> Building:
     """Return the building with its floors from below; MapFormatError for repeated sites, levels or heights."""
     for floor in building.floors:
         check_name(floor.site, "site")
-    for what, values in (
-        ("site", [floor.site for floor in building.floors]),
-        ("level", [floor.level for floor in building.floors]),
-        ("height", [floor.height_m for floor in building.floors]),
-    ):
+    for what in ("site", "level", "height_m"):
+        values = [getattr(floor, what) for floor in building.floors]
         if twice := [value for value in values if values.count(value) > 1]:
-            raise MapFormatError(f"building {building.name!r}: two floors have the same {what}, {twice[0]}")
+            words = f"two floors have the same {what.removesuffix('_m')}, {twice[0]}"
+            raise MapFormatError(f"building {building.name!r}: {words}")
     return msgspec.structs.replace(building, floors=tuple(sorted(building.floors, key=lambda floor: floor.height_m)))
 
 
