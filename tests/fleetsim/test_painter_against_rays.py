@@ -102,10 +102,10 @@ def test_a_fisheye_shows_what_pinholes_show_there(yaw: float, pitch: float) -> N
     turn = np.eye(4)
     turn[:3, :3] = so3_exp(np.array([0.0, yaw, 0.0])) @ so3_exp(np.array([pitch, 0.0, 0.0]))
     seen = []
-    for camera, pose in ((fisheye, placed), (pinhole, placed @ turn)):
+    for camera, map_from_own in ((fisheye, placed), (pinhole, placed @ turn)):
         optics = make_optics(camera)
         shot = Painter(world, optics, Look(has_noise=False), 0).shoot(
-            scene, np.ones(3), lambda _, pose=pose: pose, 0.0, exposure, 1
+            scene, np.ones(3), lambda _, held=map_from_own: held, 0.0, exposure, 1
         )
         with np.errstate(divide="ignore", invalid="ignore"):
             seen.append(np.where(optics.vignetting > 0.05, shot.image / optics.vignetting, np.nan))

@@ -29,7 +29,7 @@ from mapserver.quality.figures import RigEvidence
 from mapserver.survey import stages
 from mapserver.survey.bundle.stereo_yaw_check import StereoYaw
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
+from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyTools
 from support.recordings.recording_samples import make_sample, write_euroc
 from support.worlds.pinhole_pair import CAMERA
 
@@ -125,16 +125,19 @@ def test_nobody_holds_what_was_begun_once_its_loops_are_closed(euroc: Path, monk
         camera: StereoCamera
         landmarks: object = None
         body_from_view: object = None
+        depth_views: object = None
 
     def adjust(*_: object) -> None:
         raise SurveyError("held" if begun() else "let go of")
 
     with open_recording(euroc) as recording:
         rig, camera = recording.calibration, Rectifier(recording.calibration).camera
-    chain: Any = SimpleNamespace(state=State(camera), odometry=None, depths=object())
+    state: Any = State(camera)
+    parts: Any = SimpleNamespace(keyframes=[]), state, set(), object()
+    chain = AdjustedChain(*parts)
     admitted = [Admission(CheckedRecording(rig, [], RigEvidence("", [], {}, {}), {}), begun=chain)]
-    begun = weakref.ref(chain.state)
-    del chain
+    begun = weakref.ref(state)
+    del chain, parts, state
     monkeypatch.setattr(stages, "close_loops", lambda *_: (State(camera), None))
     monkeypatch.setattr(stages, "adjust_globally", adjust)
     config = SurveyConfig(SurveySettings(), default_vocabulary())
