@@ -12,7 +12,7 @@ import numpy as np
 
 from fleetmap.geometry import Array, so3_exp
 from fleetmap.sensors.calibration import ImuNoise
-from mapserver.calibration.image_rows import Fixed, Observations, image_rows
+from mapserver.calibration.image_rows import Fixed, Measured, Observations, image_rows
 from mapserver.calibration.motion_rows import body_rates, inertial_edges, wheel_edges
 from mapserver.calibration.parameters import COLUMNS, INDEX, RANGES, UNKNOWNS, CalibrationParameter
 from mapserver.calibration.problem import CalibrationData, MotionState
@@ -126,7 +126,7 @@ class Problem:
             np.zeros(UNKNOWNS),
             self.seen.measured(np.zeros(UNKNOWNS)),
         )  # the last theta, and its pixels
-        self.slopes = np.zeros((len(data.obs_keyframe), 4, UNKNOWNS))  # derivatives of the pixels by the calibration
+        self.slopes: Measured | None = None  # derivatives by the calibration
         # Weak priors fix the gauge.
         first = _FIRST_SIGMAS if data.is_inertial else 1e-3 * _FIRST_SIGMAS
         self.priors = [
@@ -151,7 +151,7 @@ class Problem:
             map_from_body[:, :3, 3] += late_s * motions[:, :3]
             map_from_body[:, :3, :3] = turns @ map_from_body[:, :3, :3]
         state = MotionState(map_from_body, motions if self.data.is_inertial else self.data.start.motions, points)
-        fixed = Fixed(self.rates_map, self.slopes) if derivatives else None
+        fixed = Fixed(self.rates_map, self.slopes) if derivatives and self.slopes is not None else None
         if not np.array_equal(theta, self.measured[0]):
             self.measured = theta, self.seen.measured(theta)
         return image_rows(self.seen, self.data, state, *self.measured, self.scales.images, fixed)

@@ -1,11 +1,12 @@
 """Image rows of the adjustment: each observation against its landmark, as a function of the calibration.
 
 Measured pixels are mapped back to the raw images once; their rectified positions follow from the lenses, so a changed calibration moves
-the measurements and needs no new images. Rows are compared at the scale of the raw pixels, whose noise is known: at a fixed
-scale a longer focal length would shrink the errors, and so seem more likely than it is.
+the measurements and needs no new images. Rows are compared at the scale of the raw pixels, whose noise is known: at that of the rectified
+image a longer focal length would shrink the errors, and so seem more likely than it is; the more so, the wider the lens.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +29,15 @@ from mapserver.survey.bundle.problem import ImageRows
 
 P = CalibrationParameter
 _MIN_DEPTH_M = 0.05
+_STEP_PX = 0.1  # of the numerical derivative of rectified by raw pixels
 _BEHIND_SIGMAS = 1000.0  # residual of a landmark behind the camera: beyond every cutoff, with zero slope
+# Columns that move what the left lens measures
+_LEFT_LENS = {
+    INDEX[P.FOCAL],
+    INDEX[P.PRINCIPAL_X],
+    INDEX[P.PRINCIPAL_Y],
+    *range(len(COLUMNS), len(COLUMNS) + 2 * DISTORTION),
+}
 # Step sizes of the numerical derivatives of the measurements: lenses in shares and pixels, the pair's angles, distortion
 _LENS_STEPS = dict.fromkeys((INDEX[P.FOCAL], INDEX[P.FOCAL_RATIO]), 1e-5)
 _LENS_STEPS |= dict.fromkeys((INDEX[P.PRINCIPAL_X], INDEX[P.PRINCIPAL_Y]), 0.01)
@@ -40,11 +49,22 @@ _TURN = slice(INDEX[P.CAMERA_IMU_X], INDEX[P.CAMERA_IMU_Z] + 1)
 _SHIFT = slice(INDEX[P.CAMERA_POSITION_X], INDEX[P.CAMERA_POSITION_Z] + 1)
 
 
+class Measured(NamedTuple):
+    """Observations at a calibration, or their derivatives by it, with the columns last.
+
+    rows (M, 4): left pixel, disparity, row difference in the image rectified by it. as_given (M, 2, 2): turns errors of pixels
+    there into those in the image rectified by the given calibration, in which their sigmas are known.
+    """
+
+    rows: Array
+    as_given: Array
+
+
 class Fixed(NamedTuple):
-    """Nearly constant values near a state: rates_map (K, 3), angular rate of the body, and `Observations.measured_slopes` (M, 4, C)."""
+    """Nearly constant values near a state: rates_map (K, 3), angular rate of the body, and `Observations.measured_slopes`."""
 
     rates_map: Array
-    slopes: Array
+    slopes: Measured
 
 
 @dataclass(frozen=True)
@@ -73,16 +93,40 @@ class Observations:
         sigmas[~np.isfinite(right).all(axis=1), 2:] = np.inf
         return cls(rig, axes, camera, left, right, np.where(np.isfinite(sigmas), sigmas, np.inf))
 
-    def measured(self, theta: Array, views: tuple[StereoCamera, StereoCamera] | None = None) -> Array:
-        """Return (M, 4) rows: left pixel, disparity, row difference in the image rectified by theta, at the scale of `views`."""
-        rig = corrected_rig(self.calibration, self.axes, theta)
+    def measured(self, theta: Array, views: tuple[StereoCamera, StereoCamera] | None = None) -> Measured:
+        """Return what is seen in the image rectified by theta, at the scale of `views`."""
         views = views or self.views(theta)
-        left = _pixels(rig.cameras[0].ray_from_pixel(self.left_px) @ self.axes.rect_from_cam[0].T, views[0])
+        left = self._left_by_raw(theta, views)
+        return Measured(self._rows(theta, left, views), self._as_given(left))
+
+    def _rows(self, theta: Array, left: Array, views: tuple[StereoCamera, StereoCamera]) -> Array:
+        """Return (M, 4) rows from those of `_left_by_raw`."""
         if self.axes.baseline_m == 0:
-            return np.column_stack([left, np.zeros_like(left)])
-        rect_from_right, _ = right_camera(self.axes, theta)
+            return np.column_stack([left[..., 0], np.zeros_like(left[..., 0])])
+        rig, (rect_from_right, _) = corrected_rig(self.calibration, self.axes, theta), right_camera(self.axes, theta)
         right = _pixels(rig.cameras[1].ray_from_pixel(self.right_px) @ rect_from_right.T, views[1])
-        return np.column_stack([left, left - right])
+        return np.column_stack([left[..., 0], left[..., 0] - right])
+
+    def _left_by_raw(self, theta: Array, views: tuple[StereoCamera, StereoCamera]) -> Array:
+        """Return (M, 2, 3) the left image's rectified pixels, and their derivatives by the raw pixel's x and y."""
+        camera = corrected_rig(self.calibration, self.axes, theta).cameras[0]
+        steps = _STEP_PX * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+        rays = [camera.ray_from_pixel(self.left_px + step) @ self.axes.rect_from_cam[0].T for step in steps]
+        here, *beside = (_pixels(each, views[0]) for each in rays)
+        return np.stack([here, *((each - here) / _STEP_PX for each in beside)], axis=2)
+
+    def _as_given(self, left: Array) -> Array:
+        now, given = left[..., 1:], self._given_by_raw
+        apart = now[:, 0, 0] * now[:, 1, 1] - now[:, 0, 1] * now[:, 1, 0]
+        usable = np.isfinite(apart) & (apart != 0.0) & np.isfinite(given).all(axis=(1, 2))
+        found = np.tile(np.eye(2), (len(now), 1, 1))
+        found[usable] = given[usable] @ np.linalg.inv(now[usable])
+        return found
+
+    @cached_property
+    def _given_by_raw(self) -> Array:
+        none = np.zeros(UNKNOWNS)
+        return self._left_by_raw(none, self.views(none))[..., 1:]
 
     def views(self, theta: Array) -> tuple[StereoCamera, StereoCamera]:
         """Return the left and right pinholes, each with the focal length of its lens."""
@@ -90,13 +134,22 @@ class Observations:
         right = left * (1.0 + float(theta[INDEX[P.FOCAL_RATIO]]))
         return replace(self.camera, focal_px=left), replace(self.camera, focal_px=right)
 
-    def measured_slopes(self, theta: Array) -> Array:
-        """Return (M, 4, C) derivatives of `measured` by central differences at a fixed scale of the pinholes; zero if absent."""
-        views, slopes = self.views(theta), np.zeros((len(self.left_px), 4, UNKNOWNS))
+    def measured_slopes(self, theta: Array) -> Measured:
+        """Return derivatives of `measured` by central differences at a fixed scale of the pinholes; zero if absent."""
+        views, count = self.views(theta), len(self.left_px)
+        slopes, left = (
+            Measured(np.zeros((count, 4, UNKNOWNS)), np.zeros((count, 2, 2, UNKNOWNS))),
+            self._left_by_raw(theta, views),
+        )
         for column, size in _LENS_STEPS.items():
             step = size * (np.arange(UNKNOWNS) == column)
-            change = self.measured(theta + step, views) - self.measured(theta - step, views)
-            slopes[:, :, column] = np.where(np.isfinite(change), change / (2.0 * size), 0.0)
+            if column in _LEFT_LENS:
+                more, less = self.measured(theta + step, views), self.measured(theta - step, views)
+                change = more.rows - less.rows
+                slopes.as_given[..., column] = (more.as_given - less.as_given) / (2.0 * size)
+            else:
+                change = self._rows(theta + step, left, views) - self._rows(theta - step, left, views)
+            slopes.rows[..., column] = np.where(np.isfinite(change), change / (2.0 * size), 0.0)
         return slopes
 
 
@@ -135,7 +188,7 @@ def image_rows(
     data: CalibrationData,
     state: MotionState,
     theta: Array,
-    measured: Array,
+    measured: Measured,
     scales: Array,
     fixed: Fixed | None,
 ) -> ImageRows:
@@ -148,14 +201,18 @@ def image_rows(
     view, views, positions = _view(seen, data, state, theta), seen.views(theta), state.map_from_body[:, :3, 3]
     is_ahead, is_seen = view.in_left[:, 2] > _MIN_DEPTH_M, np.isfinite(seen.row_sigmas)
     usable = is_ahead[:, None] & is_seen
-    off = np.where(usable, measured - _predicted(view, views), 0.0)
+    off = np.where(usable, measured.rows - _predicted(view, views), 0.0).reshape(
+        -1, 2, 2
+    )  # of the pixel, of the pair's difference
+    back = measured.as_given
+    errors = np.einsum("mij,mkj->mki", back, off).reshape(-1, 4)
     factor = np.where(usable, 1.0 / (seen.row_sigmas * scales), 0.0)
-    residuals = np.where(is_ahead[:, None] | ~is_seen, off * factor, _BEHIND_SIGMAS)
+    residuals = np.where(is_ahead[:, None] | ~is_seen, errors * factor, _BEHIND_SIGMAS)
     if fixed is None:
         return ImageRows(residuals, np.zeros((0, 4, 3)), np.zeros((0, 4, UNKNOWNS)), positions)
     by_left = _projection_slopes(view.in_left, views[0])
     by_cam = np.concatenate([by_left, np.zeros_like(by_left)], axis=1)
-    by_calibration = fixed.slopes.copy()
+    by_calibration = fixed.slopes.rows.copy()
     if seen.axes.baseline_m > 0:
         by_right = _projection_slopes(view.in_left - view.right_m, views[1])
         by_cam[:, 2:] = by_left - by_right
@@ -166,9 +223,10 @@ def image_rows(
     by_calibration[:, :, _SHIFT] = -np.einsum("mij,mjk->mik", by_point, state.map_from_body[data.obs_keyframe, :3, :3])
     flow = np.cross(view.from_body, fixed.rates_map[data.obs_keyframe]) - state.motions[data.obs_keyframe, :3]
     by_calibration[:, :, INDEX[P.TIME_OFFSET]] = np.einsum("mij,mj->mi", by_point, flow)
-    by_calibration[:, :, INDEX[P.FOCAL]] += off / (1.0 + theta[INDEX[P.FOCAL]])
-    by_calibration[:, 2:, INDEX[P.FOCAL_RATIO]] += (off[:, 2:] - off[:, :2]) / (1.0 + theta[INDEX[P.FOCAL_RATIO]])
-    by_point *= factor[:, :, None]
+    by_calibration[:, 2:, INDEX[P.FOCAL_RATIO]] += (off[:, 1] - off[:, 0]) / (1.0 + theta[INDEX[P.FOCAL_RATIO]])
+    by_point = (back[:, None] @ by_point.reshape(-1, 2, 2, 3)).reshape(-1, 4, 3) * factor[:, :, None]
+    by_calibration = (back[:, None] @ by_calibration.reshape(-1, 2, 2, UNKNOWNS)).reshape(-1, 4, UNKNOWNS)
+    by_calibration += np.einsum("mijc,mkj->mkic", fixed.slopes.as_given, off).reshape(-1, 4, UNKNOWNS)
     by_calibration *= factor[:, :, None]
     return ImageRows(residuals, by_point, by_calibration, positions)
 

@@ -97,9 +97,18 @@ def test_lenses_of_any_number_of_coefficients_can_be_adjusted(straight: Stretch,
     theta = np.zeros(UNKNOWNS)
     corrected = corrected_rig(rig, seen.axes, theta)
     assert corrected.cameras[0].distortion.tolist() == [*distortion, *[0.0] * (4 - len(distortion))]
-    slopes = seen.measured_slopes(theta)[:, :, len(COLUMNS) : len(COLUMNS) + 2 * DISTORTION]
+    slopes = seen.measured_slopes(theta).rows[:, :, len(COLUMNS) : len(COLUMNS) + 2 * DISTORTION]
     assert np.isfinite(slopes).all()
     assert (np.abs(slopes).max(axis=(0, 1)) > 0.1).all()
+
+
+def test_a_wide_fisheye_is_not_judged_by_how_its_edges_are_stretched() -> None:
+    """An error of a raw pixel is several times as large at the rectified image's edge, and less so by a longer focal length."""
+    scene = make_stretch(Order("small-loop", seed=1, lens="fisheye"), 0.5, 7.0, step_s=0.15, per_frame=60)
+    found = estimated(scene, {})
+    for parameter in (found.get(P.FOCAL), found.get(P.BASELINE)):
+        assert parameter.is_judged
+        assert abs(parameter.estimate) < 3.0 * parameter.sigma, "3 % were seen, ten times the sigma"
 
 
 def test_a_short_stretch_says_nothing() -> None:
