@@ -98,3 +98,14 @@ def test_a_robot_that_is_carried_is_lost_when_it_is_lifted() -> None:
         if in_air_s[0] + 0.4 < time_s < in_air_s[0] + LIFT_S:
             assert estimate.status is Status.LOST
     assert next(e for t, e in by_time.items() if t > in_air_s[-1] + 0.7).status is Status.TRACKING
+
+
+def test_a_robot_without_wheels_knows_from_its_drive_what_a_lift_is() -> None:
+    session = prepare(Order("faults", robot="kidnapped"))
+    session.renderer.close()
+    run = EstimatorSession(replace(session, wheel=()))
+    heights_m, stamps_s = run.map_from_body[:, 2, 3], np.array(run.stamps_ns) * 1e-9
+    in_air_s = stamps_s[heights_m > heights_m[:30].max() + 0.005]
+    told_s = [e.stamp_ns * 1e-9 for e in estimator_loop.run_odometry(run) if e.is_lifted]
+    assert in_air_s[0] < told_s[0] < in_air_s[0] + 0.4
+    assert told_s[-1] < in_air_s[-1] + 0.5

@@ -1,4 +1,4 @@
-"""Detection of a wheeled robot that is lifted off its floor, by hands, fork or hoist, from the motion of IMU and images."""
+"""Detection of a robot that is lifted off its floor, by hands, fork or hoist, from the motion of IMU and images, and of its wheels."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fleetmap.geometry import Array, length, se3_inverse
+from fleetmap.odometry.floor_motion import FloorMotion
 from fleetmap.sensors.samples import WheelSample
 
 _WINDOW_NS = 400_000_000
@@ -29,10 +30,11 @@ class _Step(NamedTuple):
 
 
 class LiftCheck:
-    """Follows a robot frame by frame. Never reports a lift without wheel odometry: such a robot may fly."""
+    """Follows a robot frame by frame; by `FloorMotion` without wheel odometry."""
 
     def __init__(self, base_from_body: Array) -> None:
         self._base_from_body, self._body_from_base = base_from_body, se3_inverse(base_from_body)
+        self._floor_motion = FloorMotion()
         self._wheel: WheelSample | None = None
         self._steps = deque[_Step]()
         self._floor_up: Array | None = None  # (3,) in the base's axes
@@ -48,7 +50,9 @@ class LiftCheck:
         climb_sigma_mps: of the speed upwards.
         """
         self._wheel = wheel[-1] if wheel else self._wheel
-        if self._wheel is None or stamp_ns - self._wheel.stamp_ns > _WINDOW_NS or earlier_from_body is None:
+        if self._wheel is None:
+            return self._floor_motion.is_lifted(stamp_ns, odom_from_body[2, :3], earlier_from_body, climb_sigma_mps)
+        if stamp_ns - self._wheel.stamp_ns > _WINDOW_NS or earlier_from_body is None:
             self._steps.clear()
             return False
         up_body = odom_from_body[2, :3]
