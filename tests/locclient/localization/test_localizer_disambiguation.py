@@ -109,8 +109,8 @@ def test_who_is_believed_at_once(sure_robot: Robot, is_revisable: bool, places: 
 
 @pytest.mark.parametrize("is_whole", [True, False])
 def test_a_robot_that_can_tell_places_apart_looks_more_often(monkeypatch: pytest.MonkeyPatch, is_whole: bool) -> None:
-    """Seen: one of ten robots that woke among identical aisles knew its aisle only after 20 s of driving; it looked at the map once in a
-    metre and a half. Elsewhere more views decide nothing, and cost the time of a frame."""
+    """Seen: one of ten robots that woke among identical aisles knew its aisle only after 20 s of driving.
+    Elsewhere more views decide nothing, and cost the time of a frame."""
     monkeypatch.setattr(scripted_robot, "FRAME_NS", 66_666_667)
     robot, taken = Robot(monkeypatch, is_whole_site_mapped=is_whole).load(), [0]
 
