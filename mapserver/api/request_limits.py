@@ -19,12 +19,14 @@ _FILE_BYTES = {"areas": MAX_AREAS_BYTES, "alignment": MAX_PLAN_BYTES, "inbox": U
 _FILE = re.compile(r"/v1/sites/[^/]+/(areas|alignment|inbox)(/[^/]+)?")
 SIGN_IN_BYTES = 4 << 10  # accepted without authentication
 BODY_S, SIGN_IN_S = 30.0, 10.0  # until the body is complete
+LINGER_BYTES, LINGER_S = 16 << 20, 5.0  # of a refused body that are read, and discarded, after the answer
 UPLOAD_BYTES_IN_BODY_S = 300_000  # least of an upload: 64 GB by the slowest radio would hold its place for months
 
 
 class RequestLimits:
     """Answer 431 to large headers, 413 to a large body (declared or not), 408 to a slow one, and close the connection.
 
+    Clients receive such an answer, and any other one that closes the connection, although they still send: see `_Closing`.
     A client that disconnects before the body is complete is not logged.
     """
 
@@ -34,6 +36,8 @@ class RequestLimits:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             return await self._app(scope, receive, send)
+        closing = _Closing(receive, send)
+        receive, send = closing.receive, closing.send
         if "://" in scope["path"][:8]:  # the absolute form of a URL, which h11 does not change
             scope["path"] = "/" + "".join(scope["path"].split("/", 3)[3:])
             scope["raw_path"] = b"/" + b"".join(scope["raw_path"].split(b"/", 3)[3:])
@@ -92,6 +96,38 @@ class RequestLimits:
         with suppress(ClientDisconnect):
             await self._app(scope, limited, answered)
         return None
+
+
+class _Closing:
+    """A request's `receive` and `send`. Before an answer closes the connection, the rest of the body is read, within limits.
+
+    The kernel resets a connection that is closed with unread bytes, and a client whose connection is reset loses the answer.
+    """
+
+    def __init__(self, receive: Receive, send: Send) -> None:
+        self._receive, self._send = receive, send
+        self._is_whole = self._closes = False
+
+    async def receive(self) -> Message:
+        message = await self._receive()
+        self._is_whole = self._is_whole or not message.get("more_body", False)
+        return message
+
+    async def send(self, message: Message) -> None:
+        if message["type"] == "http.response.start":
+            self._closes = (b"connection", b"close") in message.get("headers", ())
+        elif self._closes and not self._is_whole and not message.get("more_body", False):
+            await self._send({**message, "more_body": True})
+            await self._discard()
+            message = {"type": "http.response.body"}
+        await self._send(message)
+
+    async def _discard(self) -> None:
+        left = LINGER_BYTES
+        with suppress(TimeoutError):
+            async with asyncio.timeout(LINGER_S):
+                while left > 0 and not self._is_whole:
+                    left -= len((await self.receive()).get("body", b""))
 
 
 async def _refuse(scope: Scope, receive: Receive, send: Send, status: int, words: str) -> None:
