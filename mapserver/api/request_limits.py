@@ -19,7 +19,7 @@ _FILE_BYTES = {"areas": MAX_AREAS_BYTES, "alignment": MAX_PLAN_BYTES, "inbox": U
 _FILE = re.compile(r"/v1/sites/[^/]+/(areas|alignment|inbox)(/[^/]+)?")
 SIGN_IN_BYTES = 4 << 10  # accepted without authentication
 BODY_S, SIGN_IN_S = 30.0, 10.0  # until the body is complete
-LINGER_BYTES, LINGER_S = 16 << 20, 5.0  # of a refused body that are read, and discarded, after the answer
+LINGER_BYTES, LINGER_S = 16 << 20, 2.0  # of a refused body that are read, and discarded, after the answer
 UPLOAD_BYTES_IN_BODY_S = 300_000  # least of an upload: 64 GB by the slowest radio would hold its place for months
 
 

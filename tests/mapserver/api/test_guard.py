@@ -287,6 +287,7 @@ def test_a_slow_or_large_sign_in_is_refused_and_one_that_leaves_is_no_error(
     server: Server, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(request_limits, "SIGN_IN_S", 0.1)
+    monkeypatch.setattr(request_limits, "LINGER_S", 0.1)
     headers = [(b"host", b"127.0.0.1"), (b"content-type", b"application/x-www-form-urlencoded")]
     scope = {"type": "http", "method": "POST", "path": "/sign-in", "raw_path": b"/sign-in", "query_string": b""}
     scope |= {"headers": headers, "client": ("10.0.0.1", 1), "scheme": "http", "http_version": "1.1", "root_path": ""}

@@ -106,6 +106,7 @@ def test_an_upload_that_hardly_goes_on_loses_its_place(
     server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(request_limits, "BODY_S", 0.5)
+    monkeypatch.setattr(request_limits, "LINGER_S", 0.1)
     dripping = [0.05, MIDDLE | {"body": b"x"}] * 200
     enough = [0.05, MIDDLE | {"body": bytes(100_000)}] * 19 + [END | {"body": bytes(100_000)}]
     assert anyio.run(put, server, "slow.mcap", *dripping) == [408]
