@@ -60,8 +60,8 @@ class NoiseSettings(Section, frozen=True):
     descriptor_sigma_px: float = 0.9  # of one that it could not refine, at the finest image scale
     disparity_sigma_px: float = 0.2
     cut_sigmas: float = 4.0  # observations farther off are removed between adjustments
-    # Of the estimated stereo yaw with an exact calibration: depth edges of long aisles cause 0.06 px, most scenes 0.01
-    turn_floor_px: float = 0.04
+    # Of the estimated stereo yaw with an exact calibration: depth edges of long aisles cause 0.03 px, most scenes 0.01
+    turn_floor_px: float = 0.03
     turn_sigmas: float = 3.0  # significance at which that yaw is corrected
     accel_noise_scale: float = 5.0  # factor on the calibration's noise, for vibration above the IMU's bandwidth
     gyro_noise_scale: float = 2.0  # factor on the calibration's noise, for vibration above the IMU's bandwidth

@@ -2,15 +2,19 @@
 
 #include <algorithm>
 #include <cmath>
+#include <cstring>
 #include <numbers>
+
+#include "dense.h"
 
 namespace fleetmap {
 namespace {
 
 constexpr int kMostSide = 2 * kMostPatchHalf + 1, kMostCount = kMostSide * kMostSide;
-constexpr int kMostIterations = 15;
+constexpr int kMostIterations = 30;
 constexpr double kScale = 1.2;  // from octave to octave
 constexpr double kNearM = 1e-6;
+constexpr double kSlantSigma = 3.0;  // see align_patch
 
 // The level of the pyramid nearest to the scale of an octave.
 int halvings(int octave) { return int(std::clamp(std::nearbyint(octave * std::log2(kScale)), 0.0, 2.0)); }
@@ -22,25 +26,31 @@ double sample(GreyImage image, double x, double y) {
   return (1.0 - b) * ((1.0 - a) * upper[0] + a * upper[1]) + b * ((1.0 - a) * lower[0] + a * lower[1]);
 }
 
-// Pixels around (x, y), whole steps apart, and their sum. All must lie inside.
-double sample_upright(GreyImage image, double x, double y, int half, double* samples) {
-  const ptrdiff_t column = ptrdiff_t(x), row = ptrdiff_t(y);
-  const Bilinear<double> at(x - double(column), y - double(row));
-  const int side = 2 * half + 1;
-  for (int v = 0; v < side; ++v) {
-    const uint8_t *upper = image.row(row - half + v) + column - half, *lower = upper + image.width;
-    double* __restrict out = samples + v * side;
-    for (int u = 0; u < side; ++u) out[u] = at(upper + u, lower + u);
+// Where a patch lies in the current image, with the slants of its surface.
+struct Place {
+  double x, y, s = 0.0, t = 0.0;
+  double reach(const Warp& warp, int half) const {
+    return half * (1.0 + std::max(std::abs(warp.slant_x), std::abs(warp.slant_y)) * (std::abs(s) + std::abs(t)));
   }
+};
+
+// Brightness at a patch's pixels, and its sum. All must lie inside.
+double sample(GreyImage image, const Place& place, const Warp& warp, int half, double* __restrict samples) {
   double total = 0.0;
-  for (int n = 0; n < side * side; ++n) total += samples[n];
+  for (int v = -half; v <= half; ++v)
+    for (int u = -half; u <= half; ++u, ++samples) {
+      const double aside = place.s * u + place.t * v;
+      *samples = sample(image, place.x + u + warp.slant_x * aside, place.y + v + warp.slant_y * aside);
+      total += *samples;
+    }
   return total;
 }
 
-// The reference's window less its mean, its slopes, and their sums.
+// The reference's window less its mean, and its slopes by place and slants without what offset and gain explain.
 struct Template {
-  double grey[kMostCount], right[kMostCount], down[kMostCount];
-  double xx = 0.0, xy = 0.0, yy = 0.0, energy = 0.0;
+  double grey[kMostCount], slopes[kMostCount][4];
+  double products[4][4] = {};       // of the slopes, lower triangle
+  double weak = 0.0, energy = 0.0;  // smaller eigenvalue of the gradients' matrix; variance of grey
 
   Template(GreyImage reference, double rx, double ry, const Warp& warp, int half) {
     const int side = 2 * half + 1, stride = side + 2;
@@ -54,19 +64,24 @@ struct Template {
     for (int v = 1; v <= side; ++v)
       for (int u = 1; u <= side; ++u) mean += wide[v * stride + u];
     mean /= side * side;
-    for (int v = 0; v < side; ++v)
-      for (int u = 0; u < side; ++u) {
+    double sums[4] = {}, along[4] = {}, xx = 0.0, xy = 0.0, yy = 0.0;
+    for (int v = 0, n = 0; v < side; ++v)
+      for (int u = 0; u < side; ++u, ++n) {
         const double* at = wide + (v + 1) * stride + u + 1;
-        const int n = v * side + u;
-        right[n] = 0.5 * (at[1] - at[-1]);
-        down[n] = 0.5 * (at[stride] - at[-stride]);
+        const double right = 0.5 * (at[1] - at[-1]), down = 0.5 * (at[stride] - at[-stride]);
+        const double aside = warp.slant_x * right + warp.slant_y * down;
+        const double slope[4] = {right, down, aside * (u - half), aside * (v - half)};
+        std::copy_n(slope, 4, slopes[n]);
+        xx += right * right, xy += right * down, yy += down * down;
         grey[n] = at[0] - mean;
+        energy += grey[n] * grey[n];
+        for (int i = 0; i < 4; ++i) sums[i] += slope[i], along[i] += slope[i] * grey[n];
       }
+    weak = 0.5 * (xx + yy) - std::hypot(0.5 * (xx - yy), xy);
     for (int n = 0; n < side * side; ++n) {
-      xx += right[n] * right[n];
-      xy += right[n] * down[n];
-      yy += down[n] * down[n];
-      energy += grey[n] * grey[n];
+      for (int i = 0; i < 4; ++i) slopes[n][i] -= sums[i] / (side * side) + along[i] / std::max(energy, 1e-9) * grey[n];
+      for (int i = 0; i < 4; ++i)
+        for (int k = 0; k <= i; ++k) products[i][k] += slopes[n][i] * slopes[n][k];
     }
   }
 };
@@ -77,18 +92,18 @@ Alignment align_patch(GreyImage reference, GreyImage current, double rx, double 
                       const PatchLimits& limits) {
   const int half = limits.half, count = (2 * half + 1) * (2 * half + 1);
   const double across = std::abs(warp.xx) + std::abs(warp.xy), down = std::abs(warp.yx) + std::abs(warp.yy);
-  const double reach = (half + 1) * std::max(across, down) + 1.0;
-  if (!(reach < rx && rx < double(reference.width) - reach - 2.0 && reach < ry && ry < double(reference.height) - reach - 2.0)) return {};
-  if (!std::isfinite(across + down)) return {};
+  const double rim = (half + 1) * std::max(across, down) + 1.0;
+  if (!(rim < rx && rx < double(reference.width) - rim - 2.0 && rim < ry && ry < double(reference.height) - rim - 2.0)) return {};
+  if (!std::isfinite(across + down + warp.slant_x + warp.slant_y)) return {};
   const Template patch(reference, rx, ry, warp, half);
-  const double determinant = patch.xx * patch.yy - patch.xy * patch.xy, trace = patch.xx + patch.yy;
-  const double weak = 0.5 * trace - std::sqrt(std::max(0.25 * trace * trace - determinant, 0.0));
-  if (weak < 5.0 * count || patch.energy < 1.0) return {};
-  const double start_x = x, start_y = y;
+  if (patch.weak < 5.0 * count || patch.energy < 1.0) return {};
+  Place place{x, y};
   double seen[kMostCount];
   for (int iteration = 0; iteration < kMostIterations; ++iteration) {
-    if (!(half + 1 < x && x < double(current.width - half - 3) && half + 1 < y && y < double(current.height - half - 3))) return {};
-    const double mean = sample_upright(current, x, y, half, seen) / count;
+    const double reach = place.reach(warp, half);
+    if (!(reach + 1 < place.x && place.x < double(current.width) - reach - 3)) return {};
+    if (!(reach + 1 < place.y && place.y < double(current.height) - reach - 3)) return {};
+    const double mean = sample(current, place, warp, half, seen) / count;
     double cross = 0.0, power = 0.0;
     for (int n = 0; n < count; ++n) {
       seen[n] -= mean;
@@ -97,17 +112,24 @@ Alignment align_patch(GreyImage reference, GreyImage current, double rx, double 
     }
     if (power < 1.0 || cross <= 0.0) return {};
     const double gain = cross / power;
-    double bx = 0.0, by = 0.0, squared = 0.0;
+    double step[4] = {}, squared = 0.0;
     for (int n = 0; n < count; ++n) {
       const double off = gain * seen[n] - patch.grey[n];
-      bx += patch.right[n] * off;
-      by += patch.down[n] * off;
+      for (int i = 0; i < 4; ++i) step[i] += patch.slopes[n][i] * off;
       squared += off * off;
     }
-    const double dx = (patch.yy * bx - patch.xy * by) / determinant, dy = (patch.xx * by - patch.xy * bx) / determinant;
-    x -= dx, y -= dy;
-    if (std::abs(x - start_x) > limits.max_shift_px || std::abs(y - start_y) > limits.max_shift_px) return {};
-    if (dx * dx + dy * dy < 1e-4) return {x, y, std::sqrt((squared / count + 4.0) / weak), cross / std::sqrt(power * patch.energy)};
+    const double noise = squared / count + 4.0, prior = noise / (kSlantSigma * kSlantSigma);
+    double lower[4][4];
+    std::memcpy(lower, patch.products, sizeof lower);
+    lower[2][2] += prior, lower[3][3] += prior;
+    step[2] += prior * place.s, step[3] += prior * place.t;
+    if (!cholesky_in_place(lower[0], 4, 4)) return {};
+    forward_substitute(lower[0], step, 4, 4);
+    back_substitute(lower[0], step, 4, 4);
+    place = {place.x - step[0], place.y - step[1], place.s - step[2], place.t - step[3]};
+    if (!(std::abs(place.x - x) <= limits.max_shift_px && std::abs(place.y - y) <= limits.max_shift_px)) return {};
+    if (step[0] * step[0] + step[1] * step[1] < 1e-4)
+      return {place.x, place.y, std::sqrt(noise / patch.weak), cross / std::sqrt(power * patch.energy)};
   }
   return {};
 }
@@ -116,7 +138,7 @@ Alignment align_feature(const PatchFeatures& reference, int64_t i, const PatchFe
                         const PatchLimits& limits) {
   const int level = halvings(reference.octaves[i]), current_level = halvings(current.octaves[j]);
   const double size = 1 << level, current_size = 1 << current_level, ratio = current_size / size;
-  warp = {ratio * warp.xx, ratio * warp.xy, ratio * warp.yx, ratio * warp.yy};
+  warp = {ratio * warp.xx, ratio * warp.xy, ratio * warp.yx, ratio * warp.yy, warp.slant_x, warp.slant_y};
   const double *a = reference.pixels + 2 * i, *b = current.pixels + 2 * j;
   const Alignment found = align_patch(reference.pyramid[level], current.pyramid[current_level], a[0] / size, a[1] / size,
                                       b[0] / current_size, b[1] / current_size, warp, limits);
@@ -136,11 +158,14 @@ std::optional<Warp> warp_from_motion(Vec3 point, const SE3& current_from_referen
     seen[k][0] = moved[0] / moved[2], seen[k][1] = moved[1] / moved[2];
   }
   // current_from_reference of offsets, whose inverse is sought
+  const Vec3 origin = current_from_reference.translation;
+  const double depth = (current_from_reference * point)[2];
+  const double slant_x = (origin[0] - seen[0][0] * origin[2]) / depth, slant_y = (origin[1] - seen[0][1] * origin[2]) / depth;
   const double a = (seen[1][0] - seen[0][0]) / kStep, b = (seen[2][0] - seen[0][0]) / kStep;
   const double c = (seen[1][1] - seen[0][1]) / kStep, d = (seen[2][1] - seen[0][1]) / kStep;
   const double determinant = a * d - b * c;
   if (!(0.02 < std::abs(determinant) && std::abs(determinant) < 50.0)) return {};
-  return Warp{d / determinant, -b / determinant, -c / determinant, a / determinant};
+  return Warp{d / determinant, -b / determinant, -c / determinant, a / determinant, slant_x, slant_y};
 }
 
 Warp warp_from_features(int octave_reference, double angle_reference_deg, int octave_current, double angle_current_deg) {

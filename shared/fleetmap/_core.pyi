@@ -592,12 +592,12 @@ def align_patches(
     current: _Pyramid,
     pixels: _Reals,
     octaves: _Octaves,
-    reference_from_current: _Reals,
+    warps: _Reals,
     half: int,
     max_shift_px: float,
     min_correlation: float,
 ) -> _Reals:
-    """(N, 3) x, y, sigma_px at which patches, warped (N, 2, 2), from pixels (N, 2) on match the reference's; NaN without agreement."""
+    """(N, 3) x, y, sigma_px at which patches, warped (N, 2, 3), from pixels (N, 2) on match the reference's; NaN without agreement."""
 
 def align_observations(
     reference: tuple[_Pyramid, _Reals, _Octaves, _Pixels, _Indices],
@@ -611,7 +611,7 @@ def align_observations(
     """As align_patches, of chosen features (N,) of pyramid, pixels, octaves, angles, with warps from the motion if available."""
 
 def warps_from_motion(points_reference: _Reals, current_from_reference: _Reals) -> _Reals:
-    """(N, 2, 2) reference_from_current of pixel offsets, NaN where degenerate."""
+    """(N, 2, 3) warps of pixel offsets for align_patches, NaN where degenerate."""
 
 def match_guided(
     a: _Features,

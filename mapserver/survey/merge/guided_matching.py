@@ -124,13 +124,13 @@ def _aligned(
 
 
 def _warps(base: BaseMap, rows: Rows, cam_from_map: Array) -> Array:
-    """Return (P, 2, 2) reference_from_current for pixel offsets; NaN if degenerate."""
+    """Return (P, 2, 3) warps for `patch_align.refine_matches`; NaN if degenerate."""
     cameras = base.reference_cameras(rows)
-    warps = np.empty((len(rows), 2, 2))
+    warps = np.empty((len(rows), 2, 3))
     order = base.map.obs_keyframe[base.references[rows]]
     for k in np.unique(order):
         own = np.flatnonzero(order == k)
         reference_from_map = se3_inverse(cameras[own[0]])
         points = transform_points(reference_from_map, base.points_map[rows[own]])
-        warps[own] = patch_align.similarity_from_motion(points, cam_from_map @ cameras[own[0]])
+        warps[own] = patch_align.warps_from_motion(points, cam_from_map @ cameras[own[0]])
     return warps

@@ -25,18 +25,18 @@ PatchLimits limits_of(int half, double max_shift_px, double min_correlation) {
 void store(const Alignment& found, double* row) { row[0] = found.x, row[1] = found.y, row[2] = found.sigma_px; }
 
 auto align_patches_of(const Pyramid& reference, const Places& reference_pixels, const Octaves& reference_octaves, const Pyramid& current,
-                      const Places& pixels, const Octaves& octaves, const Array<double, -1, 2, 2>& reference_from_current, int half,
-                      double max_shift_px, double min_correlation) {
+                      const Places& pixels, const Octaves& octaves, const Array<double, -1, 2, 3>& warps, int half, double max_shift_px,
+                      double min_correlation) {
   const PatchLimits limits = limits_of(half, max_shift_px, min_correlation);
   const PatchFeatures a = features_of(reference, reference_pixels, reference_octaves), b = features_of(current, pixels, octaves);
   const size_t count = pixels.shape(0);
-  if (reference_pixels.shape(0) != count || reference_from_current.shape(0) != count)
-    throw nb::value_error("reference_pixels, reference_from_current: one for each pixel");
+  if (reference_pixels.shape(0) != count || warps.shape(0) != count) throw nb::value_error("reference_pixels, warps: one for each pixel");
   std::vector<double> found(3 * count);
   unlocked([&] {
     for (size_t n = 0; n < count; ++n) {
-      const double* warp = reference_from_current.data() + 4 * n;
-      store(align_feature(a, int64_t(n), b, int64_t(n), {warp[0], warp[1], warp[2], warp[3]}, limits), found.data() + 3 * n);
+      const double* row = warps.data() + 6 * n;
+      const Warp warp{row[0], row[1], row[3], row[4], row[2], row[5]};
+      store(align_feature(a, int64_t(n), b, int64_t(n), warp, limits), found.data() + 3 * n);
     }
   });
   return as_numpy<double, 2>(std::move(found), {count, 3});
@@ -71,15 +71,15 @@ auto align_observations_of(const Features& reference, const Features& own, const
 
 auto warps_from_motion_of(const Points& points_reference, const Array<double, 4, 4>& current_from_reference) {
   const size_t count = points_reference.shape(0);
-  std::vector<double> warps(4 * count, Alignment::kNaN);
+  std::vector<double> warps(6 * count, Alignment::kNaN);
   unlocked([&] {
     for (size_t n = 0; n < count; ++n)
       if (const auto warp = warp_from_motion(vec3(points_reference.data() + 3 * n), se3(current_from_reference.data()))) {
-        double* row = warps.data() + 4 * n;
-        row[0] = warp->xx, row[1] = warp->xy, row[2] = warp->yx, row[3] = warp->yy;
+        double* row = warps.data() + 6 * n;
+        row[0] = warp->xx, row[1] = warp->xy, row[2] = warp->slant_x, row[3] = warp->yx, row[4] = warp->yy, row[5] = warp->slant_y;
       }
   });
-  return as_numpy<double, 3>(std::move(warps), {count, 2, 2});
+  return as_numpy<double, 3>(std::move(warps), {count, 2, 3});
 }
 
 }  // namespace
@@ -87,8 +87,8 @@ auto warps_from_motion_of(const Points& points_reference, const Array<double, 4,
 void bind_patch_align(nb::module_& module) {
   const auto reference = "reference"_a.noconvert();
   module.def("align_patches", &align_patches_of, reference, "reference_pixels"_a.noconvert(), "reference_octaves"_a.noconvert(),
-             "current"_a.noconvert(), "pixels"_a.noconvert(), "octaves"_a.noconvert(), "reference_from_current"_a.noconvert(), "half"_a,
-             "max_shift_px"_a, "min_correlation"_a);
+             "current"_a.noconvert(), "pixels"_a.noconvert(), "octaves"_a.noconvert(), "warps"_a.noconvert(), "half"_a, "max_shift_px"_a,
+             "min_correlation"_a);
   module.def("align_observations", &align_observations_of, reference, "own"_a.noconvert(), "points_reference"_a.noconvert(),
              "own_from_reference"_a.noconvert(), "half"_a, "max_shift_px"_a, "min_correlation"_a);
   module.def("warps_from_motion", &warps_from_motion_of, "points_reference"_a.noconvert(), "current_from_reference"_a.noconvert());

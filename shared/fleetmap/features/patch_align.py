@@ -20,24 +20,21 @@ def half_pyramid(image: Image) -> Pyramid:
     return image, half, quarter
 
 
-def similarity_from_features(
+def warps_from_features(
     octaves_reference: NDArray[np.int8],
     angles_reference_deg: NDArray[np.floating],
     octaves_current: NDArray[np.int8],
     angles_current_deg: NDArray[np.floating],
 ) -> Array:
-    """(N, 2, 2) reference_from_current for level-0 offsets, from two features' octaves and orientations."""
+    """(N, 2, 3) warps for `refine_matches`, from two features' octaves and orientations; the surface's slant is unknown."""
     scale = SCALE_FACTOR ** (octaves_reference.astype(np.float64) - octaves_current)
     angle = np.radians(angles_reference_deg.astype(np.float64) - angles_current_deg)
-    cosine, sine = scale * np.cos(angle), scale * np.sin(angle)
-    return np.stack([np.stack([cosine, -sine], -1), np.stack([sine, cosine], -1)], 1)
+    cosine, sine, none = scale * np.cos(angle), scale * np.sin(angle), np.zeros(len(scale))
+    return np.stack([np.stack([cosine, -sine, none], -1), np.stack([sine, cosine, none], -1)], 1)
 
 
-def similarity_from_motion(points_reference: Array, current_from_reference: Array) -> Array:
-    """(N, 2, 2) reference_from_current for pixel offsets around points (N, 3) of the reference camera.
-
-    Each point lies on a plane that faces that camera. NaN where the warp is degenerate.
-    """
+def warps_from_motion(points_reference: Array, current_from_reference: Array) -> Array:
+    """(N, 2, 3) warps for `refine_matches` around points (N, 3) of the reference camera. NaN where degenerate."""
     return core.warps_from_motion(
         np.ascontiguousarray(points_reference, np.float64), np.ascontiguousarray(current_from_reference, np.float64)
     )
@@ -51,17 +48,17 @@ class Patches(NamedTuple):
     octaves: NDArray[np.int8]
 
 
-def refine_matches(
-    reference: Patches, current: Patches, reference_from_current: Array, settings: AlignSettings
-) -> Array:
+def refine_matches(reference: Patches, current: Patches, warps: Array, settings: AlignSettings) -> Array:
     """(N, 3) x, y, sigma_px in level-0 pixels of the current image; NaN where the patches do not agree.
 
-    reference_from_current (N, 2, 2) warps offsets. Each feature is aligned on the halving of the pyramid nearest to the
-    scale at which it was found.
+    warps (N, 2, 3): the first two columns are reference_from_current of offsets on a surface that faces the camera, the third one is
+    the way of a pixel, for a slant of 1 and an offset of 1 (shared/core/patch_align.h). Each feature is aligned on the halving of the
+    pyramid nearest to the scale at which it was found.
     """
-    warps = np.ascontiguousarray(reference_from_current, np.float64)
     limits = settings.half_window_px, settings.max_shift_px, settings.min_correlation
-    return core.align_patches(*_as_core(reference), *_as_core(current), warps, *limits)
+    return core.align_patches(
+        *_as_core(reference), *_as_core(current), np.ascontiguousarray(warps, np.float64), *limits
+    )
 
 
 def _as_core(patches: Patches) -> tuple[Pyramid, Array, NDArray[np.int8]]:

@@ -35,6 +35,11 @@ def similarity(scale: float, angle_deg: float) -> Array:
     return scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
 
 
+def facing(reference_from_current: Array) -> Array:
+    """(N, 2, 3) warps of offsets (N, 2, 2) on surfaces whose slant is not known."""
+    return np.concatenate([reference_from_current, np.zeros((len(reference_from_current), 2, 1))], axis=2)
+
+
 @pytest.mark.parametrize(
     "current_from_reference",
     [np.eye(2), similarity(1.0, 30.0), similarity(1.15, -10.0), np.array([[1.1, 0.1], [-0.05, 0.9]])],
@@ -47,7 +52,7 @@ def test_known_warps_are_recovered(texture: Texture, current_from_reference: Arr
     expected = (pixels - CENTRE) @ current_from_reference.T + CENTRE
     start = expected + np.random.default_rng(1).uniform(-1.0, 1.0, expected.shape)
     level0 = np.zeros(len(pixels), np.int8)
-    warp = np.repeat(np.linalg.inv(current_from_reference)[None], len(pixels), axis=0)
+    warp = facing(np.repeat(np.linalg.inv(current_from_reference)[None], len(pixels), axis=0))
     found = patch_align.refine_matches(
         Patches(half_pyramid(reference), pixels, level0),
         Patches(half_pyramid(current), start, level0),
@@ -68,7 +73,7 @@ def test_features_of_different_octaves_meet_across_scales() -> None:
     pixels = core.spread_corners(reference, 60, 8.0, 12, 75, NOTHING)[0].astype(np.float64)
     expected = (pixels - CENTRE) * 1.9 + CENTRE
     count = len(pixels)
-    warp = np.repeat(similarity(1 / 1.9, 0.0)[None], count, axis=0)
+    warp = facing(np.repeat(similarity(1 / 1.9, 0.0)[None], count, axis=0))
     found = patch_align.refine_matches(
         Patches(half_pyramid(reference), pixels, np.zeros(count, np.int8)),
         Patches(half_pyramid(current), expected + 0.7, np.full(count, 4, np.int8)),
@@ -84,7 +89,7 @@ def test_patches_that_do_not_agree_are_refused(texture: Texture) -> None:
     u, v = pixel_grid(WIDTH, HEIGHT)
     reference, other = picture(texture, u, v), picture(smooth_texture(np.random.default_rng(77)), u, v)
     pixels = core.spread_corners(reference, 120, 10.0, 12, 30, NOTHING)[0].astype(np.float64)
-    level0, warp = np.zeros(len(pixels), np.int8), np.repeat(np.eye(2)[None], len(pixels), axis=0)
+    level0, warp = np.zeros(len(pixels), np.int8), facing(np.repeat(np.eye(2)[None], len(pixels), axis=0))
     for current in (other, np.full_like(reference, 90)):
         found = patch_align.refine_matches(
             Patches(half_pyramid(reference), pixels, level0),
@@ -98,7 +103,7 @@ def test_patches_that_do_not_agree_are_refused(texture: Texture) -> None:
 def test_border_pixels_are_refused(texture: Texture) -> None:
     reference, _ = warped_pair(texture, np.eye(2))
     pixels = np.array([[0.0, 0.0], [2.0, 100.0], [WIDTH - 1.0, 50.0], [100.0, HEIGHT - 2.0]])
-    level0, warp = np.zeros(4, np.int8), np.repeat(np.eye(2)[None], 4, axis=0)
+    level0, warp = np.zeros(4, np.int8), facing(np.repeat(np.eye(2)[None], 4, axis=0))
     pyramid = half_pyramid(reference)
     found = patch_align.refine_matches(
         Patches(pyramid, pixels, level0), Patches(pyramid, pixels, level0), warp, SETTINGS
@@ -108,22 +113,67 @@ def test_border_pixels_are_refused(texture: Texture) -> None:
 
 def test_warp_from_octaves_and_angles() -> None:
     """A feature found larger and turned clockwise: offsets there map back smaller and turned back."""
-    warp = patch_align.similarity_from_features(
+    warp = patch_align.warps_from_features(
         np.array([1], np.int8), np.array([20.0]), np.array([3], np.int8), np.array([50.0])
     )
-    np.testing.assert_allclose(warp[0], np.linalg.inv(similarity(orb.SCALE_FACTOR**2, 30.0)), atol=1e-12)
+    np.testing.assert_allclose(warp, facing(np.linalg.inv(similarity(orb.SCALE_FACTOR**2, 30.0))[None]), atol=1e-12)
 
 
 def test_warp_from_motion_is_the_derivative_of_the_reprojection() -> None:
     camera = StereoCamera(300.0, 160.0, 120.0, 0.1, WIDTH, HEIGHT)
     points = np.array([[0.2, -0.1, 2.0], [-1.0, 0.5, 4.0]])
     current_from_reference = se3_exp(np.array([0.05, -0.1, 0.2, 0.1, 0.05, -0.3]))
-    warp = patch_align.similarity_from_motion(points, current_from_reference)
+    warp = patch_align.warps_from_motion(points, current_from_reference)
     for k, point in enumerate(points):
         shifts = 1e-4 * point[2] / camera.focal_px * np.eye(3)[:2]
         moved = np.concatenate([point + shifts, point - shifts])
         pixels = camera.pixel_from_point(transform_points(current_from_reference, moved))[:, :2]
         current_from_reference_px = ((pixels[:2] - pixels[2:]) / 2e-4).T
-        np.testing.assert_allclose(warp[k] @ current_from_reference_px, np.eye(2), atol=0.02)
-    behind = patch_align.similarity_from_motion(np.array([[0.0, 0.0, -1.0]]), current_from_reference)
+        np.testing.assert_allclose(warp[k, :, :2] @ current_from_reference_px, np.eye(2), atol=0.02)
+    behind = patch_align.warps_from_motion(np.array([[0.0, 0.0, -1.0]]), current_from_reference)
     assert np.isnan(behind).all()
+
+
+CAMERA = StereoCamera(300.0, 160.0, 120.0, 0.1, WIDTH, HEIGHT)
+WALL = (
+    np.array([0.0, 0.0, 4.0]),
+    np.array([np.sin(np.radians(25.0)), 0.0, np.cos(np.radians(25.0))]),
+)  # a point of it, its direction
+
+
+def places_on_wall(pixels: Array, reference_from_cam: Array) -> tuple[Array, Array]:
+    """Points (..., 3) of the wall in the reference camera, and their metres along and across it (..., 2), that pixels (..., 2) show."""
+    ahead = (pixels - [CAMERA.cx_px, CAMERA.cy_px]) / CAMERA.focal_px
+    rays = np.concatenate([ahead, np.ones((*ahead.shape[:-1], 1))], -1) @ reference_from_cam[:3, :3].T
+    start, along = WALL
+    normal = np.cross(along, [0.0, 1.0, 0.0])
+    centre = reference_from_cam[:3, 3]
+    points = centre + rays * (((start - centre) @ normal) / (rays @ normal))[..., None]
+    return points, np.stack([(points - start) @ along, points[..., 1]], -1)
+
+
+def test_a_wall_along_the_way_does_not_draw_patches_back() -> None:
+    """A robot drives 1.2 m towards what it sees of a wall, at 25 degrees. Taken to face it, its patches lay up to a pixel behind."""
+    texture = smooth_texture(np.random.default_rng(13), shortest_px=12.0)
+    u, v = pixel_grid(WIDTH, HEIGHT)
+    reference_from_current = np.eye(4)
+    reference_from_current[2, 3] = 1.2
+    grey = []
+    for reference_from_cam in (np.eye(4), reference_from_current):
+        places = places_on_wall(np.stack([u, v], -1), reference_from_cam)[1]
+        grey.append(picture(texture, 32.0 * places[..., 0], 75.0 * places[..., 1]))
+    pixels = core.spread_corners(grey[0], 300, 8.0, 12, 60, NOTHING)[0].astype(np.float64)
+    pixels = pixels[(np.abs(pixels - CENTRE) < 60).all(axis=1)]
+    points = places_on_wall(pixels, np.eye(4))[0]
+    current_from_reference = np.linalg.inv(reference_from_current)
+    expected = CAMERA.pixel_from_point(transform_points(current_from_reference, points))[:, :2]
+    seen = [Patches(half_pyramid(grey[0]), pixels, np.zeros(len(pixels), np.int8))]
+    seen.append(Patches(half_pyramid(grey[1]), expected + 0.5, np.zeros(len(pixels), np.int8)))
+    warps = patch_align.warps_from_motion(points, current_from_reference)
+    found = patch_align.refine_matches(seen[0], seen[1], warps, SETTINGS)
+    error = np.linalg.norm(found[:, :2] - expected, axis=1)
+    assert np.isfinite(error).mean() > 0.7
+    assert np.nanmedian(error) < 0.05
+    assert np.nanpercentile(error, 90) < 0.2
+    flat = patch_align.refine_matches(seen[0], seen[1], facing(warps[..., :2]), SETTINGS)
+    assert np.nanmedian(np.linalg.norm(flat[:, :2] - expected, axis=1)) > 3 * np.nanmedian(error)

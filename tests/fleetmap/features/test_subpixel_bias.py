@@ -80,7 +80,10 @@ def test_patches_and_flow_are_right_whatever_the_camera_makes_of_it(name: str) -
     left, right = _processed(name)
     there = np.column_stack([PIXELS[:, 0] - np.rint(TRUE), PIXELS[:, 1]])
     plane = np.array([[1.0 - 0.012, -0.006], [0.0, 1.0]])
-    warps, octaves = np.tile(np.linalg.inv(plane), (len(PIXELS), 1, 1)), np.zeros(len(PIXELS), np.int8)
+    warps, octaves = (
+        np.tile(np.column_stack([np.linalg.inv(plane), np.zeros(2)]), (len(PIXELS), 1, 1)),
+        np.zeros(len(PIXELS), np.int8),
+    )
     seen = Patches(half_pyramid(left), PIXELS, octaves), Patches(half_pyramid(right), there, octaves)
     aligned = refine_matches(*seen, warps, AlignSettings(min_correlation=0.0))
     _check(PIXELS[:, 0] - aligned[:, 0])

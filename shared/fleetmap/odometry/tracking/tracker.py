@@ -202,7 +202,7 @@ class Tracker:
             return None
         a, b = a[found.inliers], b[found.inliers]
         before, now = old.features.take(a), current.features.take(b)
-        warp = patch_align.similarity_from_features(before.octaves, before.angles_deg, now.octaves, now.angles_deg)
+        warp = patch_align.warps_from_features(before.octaves, before.angles_deg, now.octaves, now.angles_deg)
         reference = patch_align.Patches(old.pyramid, before.pixels, before.octaves)
         patches = patch_align.Patches(current.pyramid, now.pixels, now.octaves)
         refined = patch_align.refine_matches(reference, patches, warp, AlignSettings())
