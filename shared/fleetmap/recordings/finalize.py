@@ -8,7 +8,7 @@ import numpy as np
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array
 from fleetmap.recordings.calibration_files import CalibrationFile, calibration_files, load_calibration
-from fleetmap.recordings.image_series import SeriesFrames
+from fleetmap.recordings.image_series import SeriesFrames, T
 from fleetmap.recordings.images import grey_bits, grey_peak, is_mosaic, is_wide
 from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS, ReadLog, check_together
 from fleetmap.recordings.recording import FrameSource, OpenOptions, Recording
@@ -40,6 +40,12 @@ class RecordingParts:
     wheel: tuple[WheelSample, ...] = ()
     priors: tuple[PositionPrior, ...] = ()
     ground_truth: Trajectory | None = None
+
+
+def image_parts(path: Path, format_: str, calibration: RigCalibration, frames: SeriesFrames[T]) -> RecordingParts:
+    """The parts of a format that pairs series of images, without other sensors."""
+    parts = RecordingParts(path, format_, calibration, frames.left.stamps_ns, frames, others=frames.other_numbers)
+    return replace(parts, has_right=frames.right is not None, has_depth=frames.depth is not None)
 
 
 def calibration_of_options(options: OpenOptions, log: ReadLog) -> CalibrationFile | None:

@@ -10,6 +10,7 @@ import hashlib
 import re
 import struct
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
@@ -17,7 +18,7 @@ import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings.files import file_head, hash_file
-from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
+from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
 from fleetmap.recordings.image_series import ImageSeries, SeriesFrames
 from fleetmap.recordings.images import StoredImage, grey_image
 from fleetmap.recordings.limits import MAX_PIXELS, MAX_VIDEO_TABLE_BYTES
@@ -53,15 +54,8 @@ def open_video(path: Path, options: OpenOptions) -> Recording:
     try:
         if rotation := reader.rotation(series.sources[0], int(series.stamps_ns[0])):
             log.note("video turned", f"players turn it by {rotation} degrees; images are used as the sensor gave them")
-        parts = RecordingParts(
-            path=path,
-            name=path.stem,
-            format="video",
-            calibration=given.calibration,
-            frame_stamps_ns=series.stamps_ns,
-            frames=SeriesFrames(reader, series),
-        )
-        return finalize(parts, log)
+        parts = image_parts(path, "video", given.calibration, SeriesFrames(reader, series))
+        return finalize(replace(parts, name=path.stem), log)
     except BaseException:
         reader.close()
         raise

@@ -15,7 +15,7 @@ from fleetmap.recordings.calibration_files import (
     read_euroc_imu,
     read_yaml,
 )
-from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
+from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
 from fleetmap.recordings.folders.layout import (
     existing_images,
     read_ground_truth,
@@ -55,16 +55,9 @@ def open_euroc(path: Path, options: OpenOptions) -> Recording:
             images = [folder / "data" / name.relative_to(folder) for name in names]
             cameras.append(existing_images(stamps_ns, images, folder.name, log))
     calibration, euroc_from_imu = _calibration(root, len(cameras), options, log)
-    frames = rig_frames(root, log, cameras, calibration)
-    parts = RecordingParts(
-        path=path,
+    parts = replace(
+        image_parts(path, "euroc", calibration, rig_frames(root, log, cameras, calibration)),
         name=root.resolve().name,
-        format="euroc",
-        calibration=calibration,
-        frame_stamps_ns=frames.left.stamps_ns,
-        frames=frames,
-        has_right=frames.right is not None,
-        others=frames.other_numbers,
         imu=read_imu(root / "mav0/imu0/data.csv", log),
         ground_truth=_ground_truth(root, euroc_from_imu, log),
     )

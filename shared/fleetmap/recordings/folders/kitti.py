@@ -3,6 +3,7 @@ each with its images in data and their timestamps.txt; calib_cam_to_cam.txt is t
 """
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,18 +11,18 @@ import numpy as np
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse
 from fleetmap.recordings.files import natural_key
-from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
+from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
 from fleetmap.recordings.folders.layout import (
+    FileReader,
     ImageFiles,
     existing_images,
-    file_frames,
     optional_truth,
     read_image,
     read_numbers,
     read_table,
     rig_frames,
 )
-from fleetmap.recordings.image_series import pair_images
+from fleetmap.recordings.image_series import SeriesFrames, pair_images
 from fleetmap.recordings.images import decode_grey
 from fleetmap.recordings.ordering import ReadLog, check_seconds
 from fleetmap.recordings.recording import OpenOptions, Recording
@@ -62,17 +63,7 @@ def open_kitti_raw(path: Path, options: OpenOptions) -> Recording:
             )
         )
         log.files.append(file)
-    frames = rig_frames(path, log, cameras, calibration)
-    parts = RecordingParts(
-        path=path,
-        format="kitti-raw",
-        calibration=calibration,
-        frame_stamps_ns=frames.left.stamps_ns,
-        frames=frames,
-        has_right=frames.right is not None,
-        others=frames.other_numbers,
-    )
-    return finalize(parts, log)
+    return finalize(image_parts(path, "kitti-raw", calibration, rig_frames(path, log, cameras, calibration)), log)
 
 
 def _raw_stamps(file: Path, log: ReadLog) -> Stamps:
@@ -135,16 +126,9 @@ def open_kitti(path: Path, options: OpenOptions) -> Recording:
         calibration = _calibration(path / "calib.txt", left.sources[0], (left_row, right_row))
         log.files.append(path / "calib.txt")
     left, right = pair_images(left, right, log, tolerance_ns=0)
-    parts = RecordingParts(
-        path=path,
-        format="kitti",
-        calibration=calibration,
-        frame_stamps_ns=left.stamps_ns,
-        frames=file_frames(path, log, left, right),
-        has_right=True,
-        ground_truth=optional_truth(path / "poses.txt", log, lambda file: _ground_truth(file, stamps_of_number)),
-    )
-    return finalize(parts, log)
+    truth = optional_truth(path / "poses.txt", log, lambda file: _ground_truth(file, stamps_of_number))
+    parts = image_parts(path, "kitti", calibration, SeriesFrames(FileReader(path, log.files), left, right))
+    return finalize(replace(parts, ground_truth=truth), log)
 
 
 def _images(folder: Path, stamps_of_number: Stamps | None, log: ReadLog) -> ImageFiles:

@@ -15,7 +15,7 @@ import numpy as np
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.recordings.files import hash_file, read_text, what_instead
-from fleetmap.recordings.image_series import DepthRegistration, ImageSeries, SeriesFrames, ViewSeries, pair_images
+from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, ViewSeries, pair_images
 from fleetmap.recordings.images import StoredImage, file_kind, image_size, is_cut, is_damaged_png
 from fleetmap.recordings.limits import MAX_IMAGE_BYTES
 from fleetmap.recordings.ordering import ReadLog, clean_imu, trajectory_of_rows, usual_size, wrong_unit
@@ -59,18 +59,6 @@ class FileReader:
         return path.relative_to(self.root).as_posix() if path.is_relative_to(self.root) else f"outside/{path.name}"
 
 
-def file_frames(
-    root: Path,
-    log: ReadLog,
-    left: ImageFiles,
-    right: ImageFiles | None = None,
-    depth: ImageFiles | None = None,
-    registration: DepthRegistration | None = None,
-) -> SeriesFrames[Path]:
-    """Frames of paired image files."""
-    return SeriesFrames(FileReader(root, log.files), left, right, depth, registration)
-
-
 def rig_frames(
     root: Path, log: ReadLog, cameras: Sequence[ImageFiles], calibration: RigCalibration
 ) -> SeriesFrames[Path]:
@@ -84,8 +72,8 @@ def rig_frames(
     recorded = replace(calibration, cameras=calibration.cameras[: len(cameras)])
     first, *others = ([cameras[number] for number in numbers] for numbers in recorded.views)
     left, right = (first[0], None) if len(first) == 1 else pair_images(first[0], first[1], log)
-    frames = file_frames(root, log, left, right)
-    return replace(frames, others=tuple(ViewSeries.beside(left.stamps_ns, each, log) for each in others))
+    views = tuple(ViewSeries.beside(left.stamps_ns, each, log) for each in others)
+    return SeriesFrames(FileReader(root, log.files), left, right, others=views)
 
 
 def read_image(path: Path) -> StoredImage:

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse
-from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
-from fleetmap.recordings.folders.layout import ImageFiles, existing_images, file_frames, read_image, read_table
-from fleetmap.recordings.image_series import pair_images
+from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
+from fleetmap.recordings.folders.layout import FileReader, ImageFiles, existing_images, read_image, read_table
+from fleetmap.recordings.image_series import SeriesFrames, pair_images
 from fleetmap.recordings.images import decode_depth, decode_grey
 from fleetmap.recordings.ordering import ReadLog
 from fleetmap.recordings.recording import OpenOptions, Recording
@@ -48,16 +48,10 @@ def open_seven_scenes(path: Path, options: OpenOptions) -> Recording:
     calibration = given.calibration if given else _default_calibration(colour.sources[0], depth.sources[0])
     colour_camera, depth_camera = calibration.cameras[0], calibration.cameras[min(1, len(calibration.cameras) - 1)]
     registration = DepthRegistration(colour_camera, depth_camera)
-    parts = RecordingParts(
-        path=path,
-        format="7scenes",
-        calibration=RigCalibration((colour_camera,), None, calibration.base_from_body),
-        frame_stamps_ns=colour.stamps_ns,
-        frames=file_frames(path, log, colour, depth=depth, registration=registration),
-        has_depth=True,
-        ground_truth=_ground_truth(colour, se3_inverse(depth_camera.body_from_cam), log),
-    )
-    return finalize(parts, log)
+    calibration = RigCalibration((colour_camera,), None, calibration.base_from_body)
+    truth = _ground_truth(colour, se3_inverse(depth_camera.body_from_cam), log)
+    frames = SeriesFrames(FileReader(path, log.files), colour, depth=depth, registration=registration)
+    return finalize(replace(image_parts(path, "7scenes", calibration, frames), ground_truth=truth), log)
 
 
 class DepthRegistration:

@@ -4,6 +4,7 @@ Without a calibration file, folders whose name says freiburg1, 2 or 3 get the co
 layout itself holds none. Source: Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems", and its page of file formats.
 """
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,15 +12,15 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import se3_inverse
-from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
+from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
 from fleetmap.recordings.folders.layout import (
+    FileReader,
     ImageFiles,
     existing_images,
-    file_frames,
     optional_truth,
     read_image_list,
 )
-from fleetmap.recordings.image_series import pair_images
+from fleetmap.recordings.image_series import SeriesFrames, pair_images
 from fleetmap.recordings.ordering import DEPTH_TOLERANCE_NS, ReadLog, pair_stamps
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.recordings.tum import read_tum
@@ -62,16 +63,10 @@ def open_tum_rgbd(path: Path, options: OpenOptions) -> Recording:
         frame_from_body = [frame_from_cam @ cam_from_body for frame_from_cam in written.frame_from_body]
         return Trajectory(written.stamps_ns, np.array(frame_from_body).reshape(-1, 4, 4))
 
-    parts = RecordingParts(
-        path=path,
-        format="tum-rgbd",
-        calibration=RigCalibration(calibration.cameras[:1], None, calibration.base_from_body),
-        frame_stamps_ns=colour.stamps_ns,
-        frames=file_frames(path, log, colour, depth=depth, registration=_Scaled()),
-        has_depth=True,
-        ground_truth=optional_truth(path / "groundtruth.txt", log, read_truth),
-    )
-    return finalize(parts, log)
+    calibration = RigCalibration(calibration.cameras[:1], None, calibration.base_from_body)
+    truth = optional_truth(path / "groundtruth.txt", log, read_truth)
+    frames = SeriesFrames(FileReader(path, log.files), colour, depth=depth, registration=_Scaled())
+    return finalize(replace(image_parts(path, "tum-rgbd", calibration, frames), ground_truth=truth), log)
 
 
 class _Scaled:

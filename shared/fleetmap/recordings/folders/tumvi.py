@@ -1,5 +1,6 @@
 """TUM-VI folders with cam0/images, cam1/images, times.txt, a Kalibr camchain.yaml, imu.txt and gt_imu.csv."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings.calibration_files import calibration_files, load_calibration
 from fleetmap.recordings.files import natural_key
-from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
+from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
 from fleetmap.recordings.folders.layout import (
     ImageFiles,
     existing_images,
@@ -40,15 +41,8 @@ def open_tumvi(path: Path, options: OpenOptions) -> Recording:
             raise CalibrationError(f"{camchain} is missing; pass a calibration with --calibration FILE")
         log.files += calibration_files(camchain)
         given = load_calibration(camchain)
-    frames = rig_frames(path, log, cameras, given.calibration)
-    parts = RecordingParts(
-        path=path,
-        format="tumvi",
-        calibration=given.calibration,
-        frame_stamps_ns=frames.left.stamps_ns,
-        frames=frames,
-        has_right=frames.right is not None,
-        others=frames.other_numbers,
+    parts = replace(
+        image_parts(path, "tumvi", given.calibration, rig_frames(path, log, cameras, given.calibration)),
         imu=read_imu(path / "imu.txt", log),
         ground_truth=read_ground_truth(path / "gt_imu.csv", log),
     )
