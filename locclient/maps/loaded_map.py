@@ -11,6 +11,7 @@ from fleetmap.mapformat import Manifest, Tile
 from fleetmap.messages import Status, WantedVersion
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes
 from locclient.localization.estimate import Estimate
+from locclient.localization.localizer import Localizer
 
 Cell = tuple[int, int]
 _RADIUS_STEP_M = 10.0  # so that tiles are not selected again with every frame
@@ -104,6 +105,11 @@ class LoadedMap:
     @property
     def version(self) -> int:
         return self.manifest.version
+
+    def show(self, localizer: Localizer, floor: str = "") -> None:
+        """Let a localizer use it as the map of a floor; empty: of the robot's own site."""
+        shown = (self.version, self.tiles.values(), self.vocabulary, self.manifest.camera.focal_px)
+        localizer.handle_version(*shown, self.lookalikes, self.alias_step_m, floor=floor)
 
     @property
     def alias_step_m(self) -> float:

@@ -7,7 +7,6 @@ from contextlib import suppress
 
 import msgspec
 
-from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
 from fleetmap.bus import Bus, Handle
 from fleetmap.errors import LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
 from fleetmap.failure_summary import ReplayPart
@@ -38,10 +37,12 @@ from fleetmap.messages import (
 from fleetmap.trust import TrustedMap
 from fleetmap.version_grid import grid_blobs, grid_index
 from locclient.maps.map_source import (
+    CachedMap,
     FetchedTiles,
     MapSource,
     ReadyVersion,
     address_of,
+    addresses_of,
     checked_manifest,
     checked_tile,
 )
@@ -254,7 +255,7 @@ class MapClient(MapSource):
         """
         self._begun = ""
         manifest = self.manifest(wanted)
-        self._cache.reserve(self._site, _addresses(manifest, wanted))
+        self._cache.reserve(self._site, addresses_of(manifest, wanted.manifest_sha256 or ""))
         self.vocabulary(manifest)
         for entry in manifest.tiles:
             # Decode to validate, do not keep: a large site exceeds a robot's memory.
@@ -265,7 +266,7 @@ class MapClient(MapSource):
 
     def activate(self, manifest: Manifest, wanted: WantedVersion) -> None:
         """Make a fetched version the one that the robot starts with; StoreError if a piece of it is missing."""
-        addresses = [*_addresses(manifest, wanted), *self._grid_addresses(manifest)]
+        addresses = [*addresses_of(manifest, wanted.manifest_sha256 or ""), *self._grid_addresses(manifest)]
         self._cache.activate(self._site, manifest.version, addresses)
 
     # --- contents of a version ----------------------------------------------------------------------------------------
@@ -314,17 +315,11 @@ class MapClient(MapSource):
     def _grid_addresses(self, manifest: Manifest) -> list[str]:
         """Return the addresses of a grid that is complete in the cache; otherwise none."""
         with suppress(LinkError, MapFormatError):
-            found = [entry.sha256 for entry in grid_blobs(manifest, self._cached)]
+            found = [entry.sha256 for entry in grid_blobs(manifest, CachedMap(self._cache, self._site).blob)]
             index = grid_index(manifest)
             if index is not None and all(sha256 in self._cache for sha256 in found):
                 return [index, *found]
         return []
-
-    def _cached(self, sha256: str, _: int) -> bytes:
-        data = self._cache.get(sha256)
-        if data is None:
-            raise LinkError(f"{sha256} is not in the cache")
-        return data
 
     def _admitted_bytes(self, wanted: WantedVersion, sha256: str) -> int:
         """Return the manifest's size by the signed list. The manifest defines all else of a version, by hash and size.
@@ -397,10 +392,3 @@ class MapClient(MapSource):
 
     def _key(self, name: str) -> str:
         return robot_key(self._site, self._robot, name)
-
-
-def _addresses(manifest: Manifest, wanted: WantedVersion) -> list[str]:
-    """Return all blobs of a version, its manifest first, except a vocabulary that ships with the program."""
-    vocabulary = manifest.vocabulary.sha256
-    words = [] if shipped_vocabulary(vocabulary) else [vocabulary]
-    return [wanted.manifest_sha256 or "", *words, *(tile.sha256 for tile in manifest.tiles)]

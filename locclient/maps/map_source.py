@@ -197,6 +197,13 @@ def address_of(wanted: WantedVersion) -> tuple[int, str]:
     return wanted.version, check_sha256(wanted.manifest_sha256)
 
 
+def addresses_of(manifest: Manifest, sha256: str) -> list[str]:
+    """Return all blobs of a version, its manifest's address first, except a vocabulary that ships with the program."""
+    vocabulary = manifest.vocabulary.sha256
+    words = [] if shipped_vocabulary(vocabulary) else [vocabulary]
+    return [sha256, *words, *(tile.sha256 for tile in manifest.tiles)]
+
+
 def checked_manifest(data: bytes, wanted: WantedVersion) -> Manifest:
     """Decode the manifest; MapFormatError if it is not the wanted version's."""
     manifest = decode_manifest(data)

@@ -37,24 +37,18 @@ def replay_failure(record: LocalizerRecord, load: Load) -> list[Moment]:
     rig = RigCalibration((), None, record.base_from_body)
     localizer = Localizer(rig, record.camera, record.body_from_cam, 0.0, record.settings, others=record.others)
     if record.used is not None:
-        _use(localizer, load(record.used), record.used.floor)
+        load(record.used).show(localizer, record.used.floor)
     localizer.begin(record.start)
     said = []
     for commands, percept in record.frames:
         if commands.used is not None:
-            _use(localizer, load(commands.used), commands.used.floor)
+            load(commands.used).show(localizer, commands.used.floor)
         if commands.forgets:
             localizer.forget_pose()
         for prior in commands.priors:
             localizer.handle_prior(prior)
         said.append(moment_of(localizer.localize(percept)))
     return said
-
-
-def _use(localizer: Localizer, loaded: LoadedMap, floor: str) -> None:
-    tiles, focal_px = loaded.tiles.values(), loaded.manifest.camera.focal_px
-    like = loaded.lookalikes, loaded.alias_step_m
-    localizer.handle_version(loaded.version, tiles, loaded.vocabulary, focal_px, *like, floor=floor)
 
 
 @dataclass(frozen=True, slots=True)

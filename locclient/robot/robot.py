@@ -146,7 +146,7 @@ class Robot:
             self.localizer.handle_floors(floors)
         for loaded in maps:
             self._visited[loaded.wanted.site] = loaded
-            self._give(loaded, loaded.wanted.site)
+            loaded.show(self.localizer, loaded.wanted.site)
 
     def align(self, frame: BuildingFrame | None) -> None:
         """Set the pose of the site's map in its building, which overrides that of versions; None: each version defines it."""
@@ -240,12 +240,7 @@ class Robot:
         if self.ring is not None and not self._floor:
             self.ring.use(loaded)
         self._of_version = building_frame(loaded.manifest)
-        self._give(loaded, "")
-
-    def _give(self, loaded: LoadedMap, floor: str) -> None:
-        focal_px, tiles, like = loaded.manifest.camera.focal_px, loaded.tiles.values(), loaded.lookalikes
-        shown = (loaded.version, tiles, loaded.vocabulary, focal_px, like, loaded.alias_step_m)
-        self.localizer.handle_version(*shown, floor=floor)
+        loaded.show(self.localizer)
 
     def _enter(self, floor: str) -> None:
         """Note the floor where the robot is; recordings of failures need its map."""

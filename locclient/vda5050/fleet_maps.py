@@ -5,10 +5,10 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
 from fleetmap.errors import LinkError, MapFormatError, StateError, StoreError, disk_errors
 from fleetmap.mapformat.version_file import ExportReader, open_export
 from fleetmap.messages import WantedVersion
+from locclient.maps.map_source import addresses_of
 from locclient.maps.tile_cache import ActiveVersion, TileCache
 from locclient.maps.version_download import Origins, TooLargeError, download
 
@@ -100,9 +100,7 @@ class FleetMaps:
         for number, blob in enumerate(head.blobs):
             if blob in new:
                 self._cache.put(blob.sha256, reader.data(number))
-        vocabulary = manifest.vocabulary.sha256
-        words = [] if shipped_vocabulary(vocabulary) else [vocabulary]
-        self._cache.keep(self._site, version, [head.blobs[0].sha256, *words, *(tile.sha256 for tile in manifest.tiles)])
+        self._cache.keep(self._site, version, addresses_of(manifest, head.blobs[0].sha256))
 
     def wanted(self, version: int) -> WantedVersion:
         """Return a version for use now; StateError if it is not on the disk, UntrustedError if it was withdrawn."""
