@@ -10,14 +10,14 @@ from collections import deque
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from fleetmap.errors import FleetmapError, LinkError, disk_errors
 from fleetmap.failure_summary import MAX_DRIVE_BYTES, ReplayPart
 from fleetmap.geometry import Array, inside_rings
+from fleetmap.mapformat.floors import edge_distance_m
 from fleetmap.messages import PART_BYTES, Status, SurveyArea
-from fleetmap.recordings.images import StoredFrame, StoredImage, decode_grey, store_frame
+from fleetmap.recordings.images import StoredFrame, StoredImage, decode_grey, jpeg_image, store_frame
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame
@@ -171,11 +171,7 @@ class SurveyDrives:
 def _off_m(area: SurveyArea, place: Array) -> float:
     """Return the distance of a place (2,) from an area, 0 inside."""
     ring = np.array(area.corners_map_m)
-    if inside_rings(place[None], [ring])[0]:
-        return 0.0
-    sides, to = np.roll(ring, -1, axis=0) - ring, place - ring
-    along = np.clip((to * sides).sum(axis=1) / np.maximum((sides**2).sum(axis=1), 1e-12), 0.0, 1.0)
-    return float(np.linalg.norm(to - along[:, None] * sides, axis=1).min())
+    return 0.0 if inside_rings(place[None], [ring])[0] else edge_distance_m(place, [ring])
 
 
 def _stored(frame: CameraFrame | StoredFrame) -> StoredFrame:
@@ -187,8 +183,4 @@ def _stored(frame: CameraFrame | StoredFrame) -> StoredFrame:
 
 
 def _file(image: StoredImage) -> StoredImage:
-    if image.encoding == "file":
-        return image
-    return StoredImage(
-        "file", cv2.imencode(".jpg", decode_grey(image), [cv2.IMWRITE_JPEG_QUALITY, _QUALITY])[1].tobytes()
-    )
+    return image if image.encoding == "file" else jpeg_image(decode_grey(image), _QUALITY)

@@ -1,6 +1,6 @@
 """A building of several floors: every floor is a site with its own map, versions and areas. Lifts are areas of the floors."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
@@ -53,7 +53,7 @@ class Floor:
         return frozenset(
             name
             for name, rings in self.lifts.items()
-            if inside_rings(position_m[None], rings)[0] or _distance_m(position_m, rings) <= reach_m
+            if inside_rings(position_m[None], rings)[0] or edge_distance_m(position_m, rings) <= reach_m
         )
 
 
@@ -125,12 +125,11 @@ def read_lifts(areas: bytes | None, frame: BuildingFrame) -> dict[str, tuple[Arr
     return lifts
 
 
-def _distance_m(position_m: Array, rings: tuple[Array, ...]) -> float:
-    """Return the distance of a position (2,) from the nearest edge of the rings."""
+def edge_distance_m(position_m: Array, rings: Iterable[Array]) -> float:
+    """Return the distance of a position (2,) from the nearest edge of the rings, as of `inside_rings`."""
     nearest_m = np.inf
     for ring in rings:
-        edges = np.roll(ring, -1, axis=0) - ring
-        along = np.einsum("ij,ij->i", position_m - ring, edges) / np.maximum(np.einsum("ij,ij->i", edges, edges), 1e-12)
-        feet = ring + np.clip(along, 0.0, 1.0)[:, None] * edges
-        nearest_m = min(nearest_m, float(np.linalg.norm(position_m - feet, axis=1).min()))
+        edges, to = np.roll(ring, -1, axis=0) - ring, position_m - ring
+        along = np.clip((to * edges).sum(axis=1) / np.maximum((edges**2).sum(axis=1), 1e-12), 0.0, 1.0)
+        nearest_m = min(nearest_m, float(np.linalg.norm(to - along[:, None] * edges, axis=1).min()))
     return nearest_m
