@@ -2,21 +2,15 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError, UsageError
 from fleetmap.recordings import OpenOptions, Recording, open_recording
+from fleetmap.recordings.recording import WrappedFrames
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet
-
-if TYPE_CHECKING:
-    import hashlib
-
-    from fleetmap.recordings.images import StoredFrame
-    from fleetmap.recordings.recording import FrameSource
 
 # Sensor sets to which each set can be reduced, itself included.
 REDUCTIONS: dict[SensorSet, tuple[SensorSet, ...]] = {
@@ -78,14 +72,10 @@ def with_other_views(rig: RigCalibration, whole: RigCalibration) -> RigCalibrati
 
 
 @dataclass(frozen=True)
-class _Reduced:
+class _Reduced(WrappedFrames):
     """Frames of another source, of one camera if `single`. Stored data and hashes are unchanged and complete."""
 
-    source: "FrameSource"
     single: bool
-
-    def stored(self, index: int) -> "StoredFrame":
-        return self.source.stored(index)
 
     def frame(self, index: int) -> CameraFrame:
         frame = self.source.frame(index)
@@ -93,9 +83,3 @@ class _Reduced:
 
     def part(self, indices: NDArray[np.int64]) -> "_Reduced":
         return replace(self, source=self.source.part(indices))
-
-    def hash_into(self, digest: "hashlib._Hash") -> None:
-        self.source.hash_into(digest)
-
-    def close(self) -> None:
-        self.source.close()

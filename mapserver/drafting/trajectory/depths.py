@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -12,16 +11,11 @@ from numpy.typing import NDArray
 from fleetmap.errors import RecordingError, UsageError
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.recordings import Recording
+from fleetmap.recordings.recording import WrappedFrames
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps
 from mapserver.drafting.trajectory.formats import array_in, read_poses
 from mapserver.drafting.trajectory.given import NEAR_NS, OtherTrajectory, check_span, stamps_on_clock
-
-if TYPE_CHECKING:
-    import hashlib
-
-    from fleetmap.recordings.images import StoredFrame
-    from fleetmap.recordings.recording import FrameSource
 
 _MOST_SIDE = 8192
 _EDGE_RATIO = 1.25  # between neighbouring depths: depths between them belong to neither surface
@@ -156,16 +150,12 @@ class DispImages:
 
 
 @dataclass(frozen=True)
-class _DepthFrames:
+class _DepthFrames(WrappedFrames):
     """Frames of `source` with depth images; numbers (F,): their numbers in `images`. Hashes cover only the recorded data."""
 
-    source: "FrameSource"
     images: DispImages
     numbers: NDArray[np.int64]
     camera: CameraCalibration
-
-    def stored(self, index: int) -> "StoredFrame":
-        return self.source.stored(index)
 
     def frame(self, index: int) -> CameraFrame:
         frame, inverse = self.source.frame(index), self.images.inverse(int(self.numbers[index]))
@@ -174,12 +164,6 @@ class _DepthFrames:
 
     def part(self, indices: NDArray[np.int64]) -> "_DepthFrames":
         return replace(self, source=self.source.part(indices), numbers=self.numbers[indices])
-
-    def hash_into(self, digest: "hashlib._Hash") -> None:
-        self.source.hash_into(digest)
-
-    def close(self) -> None:
-        self.source.close()
 
     def _depth_m(self, inverse: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return metres at recorded pixels: inverse depth is linear on planes, so it is interpolated between neighbours of one surface."""

@@ -68,10 +68,25 @@ class FrameSource(Protocol):
 
 
 @dataclass(frozen=True)
-class _SomeFrames:
-    """The frames of a source at indices (K,), renumbered, closed together with it."""
+class WrappedFrames:
+    """Base of a FrameSource over another one: the same stored frames and content, closed together with it."""
 
     source: FrameSource
+
+    def stored(self, index: int) -> StoredFrame:
+        return self.source.stored(index)
+
+    def hash_into(self, digest: "hashlib._Hash") -> None:
+        self.source.hash_into(digest)
+
+    def close(self) -> None:
+        self.source.close()
+
+
+@dataclass(frozen=True)
+class _SomeFrames(WrappedFrames):
+    """The frames of a source at indices (K,), renumbered."""
+
     indices: NDArray[np.int64]
 
     def stored(self, index: int) -> StoredFrame:
@@ -82,12 +97,6 @@ class _SomeFrames:
 
     def part(self, indices: NDArray[np.int64]) -> FrameSource:
         return self.source.part(self.indices[indices])
-
-    def hash_into(self, digest: "hashlib._Hash") -> None:
-        self.source.hash_into(digest)
-
-    def close(self) -> None:
-        self.source.close()
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,5 @@
 """Recordings with one thing wrong, made from good ones; `copy_to_mcap` writes them as files."""
 
-import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -9,15 +8,14 @@ from numpy.typing import NDArray
 
 from fleetmap.recordings import Recording
 from fleetmap.recordings.images import StoredFrame, decode_frame, decode_grey, png_image
-from fleetmap.recordings.recording import FrameSource
+from fleetmap.recordings.recording import WrappedFrames
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet
 
 
 @dataclass(frozen=True)
-class _Frames:
+class _Frames(WrappedFrames):
     """Some frames of another source, each spoiled."""
 
-    source: FrameSource
     indices: NDArray[np.int64]
     spoil: Callable[[StoredFrame], StoredFrame]
 
@@ -29,12 +27,6 @@ class _Frames:
 
     def part(self, indices: NDArray[np.int64]) -> "_Frames":
         return _Frames(self.source.part(self.indices[indices]), np.arange(len(indices)), self.spoil)
-
-    def hash_into(self, digest: "hashlib._Hash") -> None:
-        self.source.hash_into(digest)
-
-    def close(self) -> None:
-        self.source.close()
 
 
 def with_frames(
