@@ -17,7 +17,7 @@ from fleetmap.sensors.samples import PositionPrior, Stamps, WheelSample
 
 # Assumed for odometry without a covariance
 UNKNOWN_WHEEL_SIGMA_MPS, UNKNOWN_WHEEL_SIGMA_RADPS = 0.05, 0.05
-_ROT_TRANS_FROM_TRANS_ROT = [3, 4, 5, 0, 1, 2]
+HALVES_SWAPPED = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])  # of a covariance (6, 6): translation or rotation first
 _IMU_DOUBLES = 37
 _SLIGHTLY_OFF_UNIT, _MOST_OFF_UNIT = 1e-3, 0.1  # of a quaternion's length: rounded by hand; not a rotation
 
@@ -194,7 +194,7 @@ def encode_odometry(sample: WheelSample, frame_id: str, child_frame_id: str) -> 
     twist = np.concatenate([sample.velocity_base_mps, [0.0, 0.0, sample.yaw_rate_radps]])
     variances = np.diag([sample.sigma_mps**2] * 3 + [sample.sigma_radps**2] * 3)
     writer = CdrWriter().header(sample.stamp_ns, frame_id).text(child_frame_id)
-    writer.doubles(_position_quat_xyzw(np.eye(4))).doubles(np.diag(np.full(6, np.inf))).doubles(twist)
+    writer.doubles(position_quat_xyzw(np.eye(4))).doubles(np.diag(np.full(6, np.inf))).doubles(twist)
     return writer.doubles(variances).message()
 
 
@@ -203,15 +203,13 @@ def decode_prior(data: bytes) -> PositionPrior:
     reader = CdrReader(data)
     stamp_ns, _ = reader.stamp_ns(), reader.text()
     map_from_base = _target_from_source(reader.doubles(7))
-    order = _ROT_TRANS_FROM_TRANS_ROT
-    return PositionPrior(stamp_ns, map_from_base, reader.doubles(36).reshape(6, 6)[np.ix_(order, order)])
+    return PositionPrior(stamp_ns, map_from_base, reader.doubles(36).reshape(6, 6)[HALVES_SWAPPED])
 
 
 def encode_prior(prior: PositionPrior, frame_id: str) -> bytes:
     """geometry_msgs/PoseWithCovarianceStamped."""
-    order = _ROT_TRANS_FROM_TRANS_ROT  # swapping the halves is its own inverse
-    writer = CdrWriter().header(prior.stamp_ns, frame_id).doubles(_position_quat_xyzw(prior.map_from_base))
-    return writer.doubles(prior.cov_rot_trans[np.ix_(order, order)]).message()
+    writer = CdrWriter().header(prior.stamp_ns, frame_id).doubles(position_quat_xyzw(prior.map_from_base))
+    return writer.doubles(prior.cov_rot_trans[HALVES_SWAPPED]).message()
 
 
 def decode_pose(data: bytes) -> tuple[int, Array]:
@@ -223,7 +221,7 @@ def decode_pose(data: bytes) -> tuple[int, Array]:
 
 def encode_pose(stamp_ns: int, frame_id: str, frame_from_body: Array) -> bytes:
     """geometry_msgs/PoseStamped."""
-    return CdrWriter().header(stamp_ns, frame_id).doubles(_position_quat_xyzw(frame_from_body)).message()
+    return CdrWriter().header(stamp_ns, frame_id).doubles(position_quat_xyzw(frame_from_body)).message()
 
 
 def decode_frame_links(data: bytes) -> list[FrameLink]:
@@ -256,7 +254,7 @@ def encode_frame_links(stamp_ns: int, links: Sequence[FrameLink]) -> bytes:
     """tf2_msgs/TFMessage."""
     writer = CdrWriter().unsigned(len(links))
     for link in links:
-        writer.header(stamp_ns, link.parent).text(link.child).doubles(_position_quat_xyzw(link.parent_from_child))
+        writer.header(stamp_ns, link.parent).text(link.child).doubles(position_quat_xyzw(link.parent_from_child))
     return writer.message()
 
 
@@ -272,6 +270,7 @@ def _target_from_source(position_quat_xyzw: Array) -> Array:
     return se3(rotation_from_quat_wxyz(position_quat_xyzw[[6, 3, 4, 5]]), position_quat_xyzw[:3])
 
 
-def _position_quat_xyzw(target_from_source: Array) -> Array:
+def position_quat_xyzw(target_from_source: Array) -> Array:
+    """x y z qx qy qz qw (7,), the numbers of a geometry_msgs/Pose."""
     quat_wxyz = quat_wxyz_from_rotation(target_from_source[:3, :3])
     return np.concatenate([target_from_source[:3, 3], quat_wxyz[1:], quat_wxyz[:1]])

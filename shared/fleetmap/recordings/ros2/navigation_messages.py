@@ -9,14 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import Array, quat_wxyz_from_rotation
+from fleetmap.geometry import Array
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.recordings.ros2.cdr import CdrReader, CdrWriter
-from fleetmap.recordings.ros2.messages import decode_prior, header_of
+from fleetmap.recordings.ros2.messages import HALVES_SWAPPED, decode_prior, header_of, position_quat_xyzw
 from fleetmap.sensors.samples import UNSAID_SIGMAS, PositionPrior
 
 EMPTY = CdrWriter().byte(0).message()  # a message without fields
-_TRANS_ROT_FROM_ROT_TRANS = [3, 4, 5, 0, 1, 2]
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,11 +81,8 @@ def decode_initial_pose(data: bytes, map_frame: str) -> PositionPrior:
 
 def encode_motion(stamp_ns: int, frame_id: str, child_frame_id: str, motion: Motion) -> bytes:
     """nav_msgs/Odometry."""
-    order = _TRANS_ROT_FROM_ROT_TRANS
-    quat_wxyz = quat_wxyz_from_rotation(motion.odom_from_base[:3, :3])
-    placement = np.concatenate([motion.odom_from_base[:3, 3], quat_wxyz[1:], quat_wxyz[:1]])
-    writer = CdrWriter().header(stamp_ns, frame_id).text(child_frame_id).doubles(placement)
-    writer.doubles(motion.cov_rot_trans[np.ix_(order, order)])
+    writer = CdrWriter().header(stamp_ns, frame_id).text(child_frame_id)
+    writer.doubles(position_quat_xyzw(motion.odom_from_base)).doubles(motion.cov_rot_trans[HALVES_SWAPPED])
     return writer.doubles(motion.twist_base).doubles(motion.twist_cov).message()
 
 
@@ -116,9 +112,11 @@ def decode_bond(data: bytes) -> BondStatus:
 def encode_grid(stamp_ns: int, frame_id: str, grid: OccupancyGrid) -> bytes:
     """nav_msgs/OccupancyGrid."""
     height, width = grid.cells.shape
-    quat_wxyz = quat_wxyz_from_rotation(grid.map_from_grid[:3, :3])
     writer = (
         CdrWriter().header(stamp_ns, frame_id).time(stamp_ns).single(grid.resolution_m).unsigned(width).unsigned(height)
     )
-    writer.doubles(np.concatenate([grid.map_from_grid[:3, 3], quat_wxyz[1:], quat_wxyz[:1]]))
-    return writer.blob(np.ascontiguousarray(grid.cells, np.int8).tobytes()).message()
+    return (
+        writer.doubles(position_quat_xyzw(grid.map_from_grid))
+        .blob(np.ascontiguousarray(grid.cells, np.int8).tobytes())
+        .message()
+    )
