@@ -16,7 +16,6 @@ from fleetmap.recordings import Recording, StoredFrame, open_recording
 from fleetmap.recordings.images import decode_frame
 from fleetmap.recordings.mcap.writer import copy_to_mcap
 from fleetmap.recordings.ros2.graph import RmwZenohKeys
-from fleetmap.recordings.ros2.keys import ros_key
 from fleetmap.sensors.source_settings import Topics
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.ros2 import Ros2Source
@@ -64,7 +63,7 @@ def live_depth(form: str, data: bytes) -> np.ndarray:
             (f"{topics.left}/compressed", compressed(50, "mono8; png compressed", png(SAMPLE.left[0]))),
             (f"{topics.depth}/compressedDepth", compressed(50, form, data)),
         ):
-            driver.publish(ros_key(0, topic, "sensor_msgs/CompressedImage"), payload)
+            driver.publish(RmwZenohKeys(0).key(topic, "sensor_msgs/CompressedImage"), payload)
     frame = queue.take(1.0).frame
     assert isinstance(frame, StoredFrame)
     depth_m = decode_frame(frame).depth_m

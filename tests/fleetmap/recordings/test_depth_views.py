@@ -14,7 +14,6 @@ from fleetmap.recordings.mcap import writer
 from fleetmap.recordings.mcap.writer import McapRecordingWriter, copy_to_mcap
 from fleetmap.recordings.ros2 import messages
 from fleetmap.recordings.ros2.graph import RmwZenohKeys
-from fleetmap.recordings.ros2.keys import ros_key
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RGBD_BASELINE_M, Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
@@ -171,7 +170,7 @@ def test_a_live_source_takes_the_topic_of_a_cameras_depth() -> None:
         ):
             assert image is not None
             payload = messages.encode_image(stored.stamp_ns, "cam", image)
-            driver.publish(ros_key(0, topic, "sensor_msgs/Image"), payload)
+            driver.publish(RmwZenohKeys(0).key(topic, "sensor_msgs/Image"), payload)
     frame = queue.take(1.0).frame
     assert frame is not None
     decoded = decode_frame(frame)  # type: ignore[arg-type]

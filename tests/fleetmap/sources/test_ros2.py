@@ -12,7 +12,7 @@ from fleetmap.errors import UsageError
 from fleetmap.recordings import StoredFrame, Topics
 from fleetmap.recordings.images import decode_frame, depth_image, grey_image, png_image
 from fleetmap.recordings.ros2.graph import RmwZenohKeys
-from fleetmap.recordings.ros2.keys import attachment, ros_key
+from fleetmap.recordings.ros2.keys import attachment
 from fleetmap.recordings.ros2.messages import (
     encode_compressed_image,
     encode_image,
@@ -52,7 +52,7 @@ def test_topics_of_a_driver_become_moments(buses: tuple[Bus, Bus]) -> None:
     def send(topic: str, type_name: str, payload: bytes) -> None:
         nonlocal sent
         sent += 1
-        driver.publish(ros_key(7, topic, type_name), payload, attachment=attachment(sent, sent, GID))
+        driver.publish(RmwZenohKeys(7).key(topic, type_name), payload, attachment=attachment(sent, sent, GID))
 
     source = Ros2Source(robot, RmwZenohKeys(7), TOPICS, calibration())
     handles = source.subscribe(queue)
@@ -112,12 +112,12 @@ def test_running_ends_when_it_is_told_and_hears_nothing_more() -> None:
         payload = encode_imu(5, "imu", np.ones(3), np.ones(3))
 
         def publish_and_stop(_: float) -> bool:
-            driver.publish(ros_key(0, TOPICS.imu, "sensor_msgs/Imu"), payload)
+            driver.publish(RmwZenohKeys(0).key(TOPICS.imu, "sensor_msgs/Imu"), payload)
             return True
 
         source.run(queue, publish_and_stop)
         assert queue.counts.imu_samples == 1
-        driver.publish(ros_key(0, TOPICS.imu, "sensor_msgs/Imu"), encode_imu(6, "imu", np.ones(3), np.ones(3)))
+        driver.publish(RmwZenohKeys(0).key(TOPICS.imu, "sensor_msgs/Imu"), encode_imu(6, "imu", np.ones(3), np.ones(3)))
         assert queue.counts.imu_samples == 1
         source.close()
 
@@ -145,7 +145,7 @@ def test_one_camera_needs_no_right_image(has_depth: bool) -> None:
         source.subscribe(queue)
         for topic, image in (("left", grey_image(LEFT)), ("right", grey_image(RIGHT)), ("depth", depth_image(depth_m))):
             name = {"left": TOPICS.left, "right": TOPICS.right, "depth": TOPICS.depth}[topic]
-            driver.publish(ros_key(7, name, "sensor_msgs/Image"), encode_image(50, "cam0", image))
+            driver.publish(RmwZenohKeys(7).key(name, "sensor_msgs/Image"), encode_image(50, "cam0", image))
         queue.put_imu(ImuSamples(np.array([10**9]), np.zeros((1, 3)), np.zeros((1, 3))))
         found = queue.take(1.0).frame
     assert isinstance(found, StoredFrame)

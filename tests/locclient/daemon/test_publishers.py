@@ -9,7 +9,7 @@ from fleetmap.errors import UsageError
 from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.messages import Cause, EstimateMessage, Status, decode_message
 from fleetmap.recordings.ros2.cdr import CdrReader
-from fleetmap.recordings.ros2.keys import ros_key
+from fleetmap.recordings.ros2.graph import RmwZenohKeys
 from fleetmap.recordings.ros2.messages import decode_frame_links, decode_prior
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sources.intake import Intake
@@ -60,16 +60,20 @@ def test_ros_topics_hold_the_same() -> None:
     tracked = estimate(5.0, x_m=2.0, sigma_m=0.1)
     told = published(OutputSection(format="ros2", domain=3), tracked, estimate(6.0, Status.LOST, known=False))
     expected = tracked.map_from_body @ se3_inverse(BASE_FROM_BODY)
-    stamped = told[ros_key(3, "/amcl_pose", "geometry_msgs/PoseWithCovarianceStamped")]
+    stamped = told[RmwZenohKeys(3).key("/amcl_pose", "geometry_msgs/PoseWithCovarianceStamped")]
     assert len(stamped) == 1
     prior = decode_prior(stamped[0])
     np.testing.assert_allclose(prior.map_from_base, expected, atol=1e-12)
     levers_m2 = np.array([0.2**2 + 0.5**2, 0.5**2, 0.2**2])  # of the base about the body, which is turned by 90 degrees
     np.testing.assert_allclose(np.diag(prior.cov_rot_trans), [*[1e-4] * 3, *(0.01 + 1e-4 * levers_m2)])
-    links = [link for payload in told[ros_key(3, "/tf", "tf2_msgs/TFMessage")] for link in decode_frame_links(payload)]
+    links = [
+        link
+        for payload in told[RmwZenohKeys(3).key("/tf", "tf2_msgs/TFMessage")]
+        for link in decode_frame_links(payload)
+    ]
     assert [(link.parent, link.child) for link in links] == [("map", "odom"), *[("odom", "base_link")] * 2]
     np.testing.assert_allclose(links[0].parent_from_child @ links[1].parent_from_child, expected, atol=1e-12)
-    states = told[ros_key(3, "/localization/status", "std_msgs/String")]
+    states = told[RmwZenohKeys(3).key("/localization/status", "std_msgs/String")]
     assert [CdrReader(state).text() for state in states] == ["TRACKING", "LOST"]
 
 
@@ -77,7 +81,7 @@ def test_the_building_is_told_once_the_map_says_it() -> None:
     """Beside the cameras' frames, in one message: late subscribers get the last one alone. Not again with every frame."""
     building_from_map = se3(so3_exp(np.array([0.0, 0.0, 0.5])), np.array([3.0, -4.0, 0.0]))
     hub, heard = MemoryHub(), []
-    key = ros_key(0, "/tf_static", "tf2_msgs/TFMessage")
+    key = RmwZenohKeys(0).key("/tf_static", "tf2_msgs/TFMessage")
     with MemoryBus(hub) as bus, MemoryBus(hub) as other:
         other.subscribe(key, lambda _, payload: heard.append(decode_frame_links(payload)))
         publisher = open_publisher(OutputSection(format="ros2", building_frame="building"), *inputs(bus))

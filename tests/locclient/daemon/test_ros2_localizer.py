@@ -13,7 +13,7 @@ from fleetmap.errors import UsageError
 from fleetmap.geometry import se3
 from fleetmap.messages import Status
 from fleetmap.occupancy_grid import OccupancyGrid
-from fleetmap.recordings.ros2.keys import ros_key
+from fleetmap.recordings.ros2.graph import RmwZenohKeys
 from fleetmap.sources.intake import Intake
 from locclient.daemon.output_section import OutputSection
 from locclient.daemon.publishers import open_publisher
@@ -316,7 +316,7 @@ def test_diagnostics_say_status_and_cause(
     with MemoryBus(hub) as bus, MemoryBus(hub) as other:
         inputs = (bus, "hall", "r1", calibration(), Intake(frames=1, imu_minus_cam_s=0, has_imu=False, imu_wait_s=0))
         other.subscribe(
-            ros_key(0, "/diagnostics", "diagnostic_msgs/DiagnosticArray"), lambda _, data: heard.append(data)
+            RmwZenohKeys(0).key("/diagnostics", "diagnostic_msgs/DiagnosticArray"), lambda _, data: heard.append(data)
         )
         localizer = open_publisher(OutputSection(format="ros2"), *inputs)
         odom = ContinuousOdom(np.eye(4))

@@ -22,7 +22,7 @@ from fleetmap.geometry import (
     so3_exp,
     so3_log,
 )
-from fleetmap.recordings.ros2.keys import ros_key
+from fleetmap.recordings.ros2.graph import RmwZenohKeys
 from fleetmap.sources.intake import Intake
 from locclient.config import read_config
 from locclient.daemon.driver_odometry import Missing, PoseHistory
@@ -131,7 +131,7 @@ class World:
         self.restart(0)
 
     def key(self, suffix: str) -> str:
-        return ros_key(0, f"/{self.section.tf_topic.lstrip('/')}{suffix}", "tf2_msgs/TFMessage")
+        return RmwZenohKeys(0).key(f"/{self.section.tf_topic.lstrip('/')}{suffix}", "tf2_msgs/TFMessage")
 
     def _hear(self, data: bytes, *, is_static: bool) -> None:
         message = STORE.deserialize_cdr(data, "tf2_msgs/msg/TFMessage")
@@ -241,7 +241,7 @@ def heard(world: World) -> tuple[int, str]:
     """Level and words of the diagnosis of now."""
     told: list[bytes] = []
     handle = world.bus.subscribe(
-        ros_key(0, "/diagnostics", "diagnostic_msgs/DiagnosticArray"), lambda _, data: told.append(data)
+        RmwZenohKeys(0).key("/diagnostics", "diagnostic_msgs/DiagnosticArray"), lambda _, data: told.append(data)
     )
     assert world.localizer is not None
     world.localizer.alive(False)
@@ -335,7 +335,7 @@ def test_the_covariance_is_that_of_the_base() -> None:
     """A thousand poses of the body, drawn by its covariance, have bases with the covariance that is sent."""
     told: list[bytes] = []
     world = World(Case(publish_odom=True))
-    key = ros_key(0, "/amcl_pose", "geometry_msgs/PoseWithCovarianceStamped")
+    key = RmwZenohKeys(0).key("/amcl_pose", "geometry_msgs/PoseWithCovarianceStamped")
     world.bus.subscribe(key, lambda _, data: told.append(data))
     covariance = np.diag([1e-4, 4e-4, 9e-4, 1e-6, 4e-6, 9e-6])
     world.frame(700, cov_rot_trans=covariance)

@@ -7,7 +7,7 @@ and services of DDS under their bare names.
 from dataclasses import dataclass
 
 from fleetmap.errors import UsageError
-from fleetmap.recordings.ros2.keys import dds_type, ros_key, ros_key_expr, topic_chunks, type_hash, type_of_key
+from fleetmap.recordings.ros2.keys import dds_type, topic_chunks, type_hash
 
 PUBLISHER, SUBSCRIPTION, SERVICE = "MP", "MS", "SS"
 
@@ -50,15 +50,18 @@ class RmwZenohKeys:
         self._domain = domain
 
     def key(self, name: str, type_name: str) -> str:
-        return ros_key(self._domain, name, type_name)
+        """The key of a topic with messages of `type_name` (sensor_msgs/Imu), or of a service (std_srvs/srv/Empty)."""
+        return f"{self._domain}/{topic_chunks(name)}/{dds_type(type_name)}/RIHS01_{type_hash(type_name)}"
 
     def subscription(self, topic: str) -> str:
         """Key expression for a topic of any type."""
-        return ros_key_expr(self._domain, topic)
+        return f"{self._domain}/{topic_chunks(topic)}/*/*"
 
     def type_of(self, key: str) -> str:
-        """The message type of a key; empty if it has none."""
-        return type_of_key(key)
+        """The message type, such as sensor_msgs/Imu, of a key; empty if it has none."""
+        chunks = key.split("/")
+        parts = chunks[-2].split("::") if len(chunks) >= 4 else []
+        return f"{parts[0]}/{parts[3].removesuffix('_')}" if len(parts) == 4 and parts[1:3] == ["msg", "dds_"] else ""
 
     def node_token(self, node: NodeName) -> str:
         return f"@ros2_lv/{self._domain}/{node.session}/0/0/NN/{self._place(node)}"

@@ -1,4 +1,4 @@
-"""Keys under which rmw_zenoh carries ROS 2 topics, `<domain>/<topic>/<type>/<hash of the type>`, and its attachments.
+"""Names and hashes of types in the keys of rmw_zenoh, `<domain>/<topic>/<type>/<hash of the type>`, and its attachments.
 
 Sources: rmw_zenoh's design document; REP 2011 and REP 2016 for the hash, RIHS01, of a type's description.
 """
@@ -22,27 +22,10 @@ _GID_BYTES = 16
 _ATTACHMENT = struct.Struct("<qqB")
 
 
-def ros_key(domain: int, topic: str, type_name: str) -> str:
-    """The key of a topic with messages of `type_name` (sensor_msgs/Imu), or of a service (std_srvs/srv/Empty)."""
-    return f"{domain}/{topic_chunks(topic)}/{dds_type(type_name)}/RIHS01_{type_hash(type_name)}"
-
-
 def dds_type(type_name: str) -> str:
     """DDS name of a type, such as sensor_msgs::msg::dds_::Imu_."""
     package, kind, name = _long(type_name).split("/")
     return f"{package}::{kind}::dds_::{name}_"
-
-
-def ros_key_expr(domain: int, topic: str) -> str:
-    """Key expression for a topic of any type."""
-    return f"{domain}/{topic_chunks(topic)}/*/*"
-
-
-def type_of_key(key: str) -> str:
-    """The message type, such as sensor_msgs/Imu, of a key; empty if it has none."""
-    chunks = key.split("/")
-    parts = chunks[-2].split("::") if len(chunks) >= 4 else []
-    return f"{parts[0]}/{parts[3].removesuffix('_')}" if len(parts) == 4 and parts[1:3] == ["msg", "dds_"] else ""
 
 
 def attachment(sequence: int, source_ns: int, gid: bytes) -> bytes:

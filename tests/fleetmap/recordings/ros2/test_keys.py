@@ -4,22 +4,23 @@ import pytest
 from zenoh.ext import Int64, z_deserialize
 
 from fleetmap.errors import UsageError
-from fleetmap.recordings.ros2.keys import attachment, ros_key, ros_key_expr, type_of_key
+from fleetmap.recordings.ros2.graph import RmwZenohKeys
+from fleetmap.recordings.ros2.keys import attachment
 
 
 def test_keys_name_domain_topic_and_type() -> None:
-    key = ros_key(3, "/robot/imu0", "sensor_msgs/Imu")
+    key = RmwZenohKeys(3).key("/robot/imu0", "sensor_msgs/Imu")
     assert key.startswith("3/robot/imu0/sensor_msgs::msg::dds_::Imu_/RIHS01_7d9a00ff")
-    assert type_of_key(key) == "sensor_msgs/Imu"
-    assert ros_key_expr(3, "/robot/imu0") == "3/robot/imu0/*/*"
-    assert type_of_key("3/robot/imu0/nonsense/x") == ""
-    assert type_of_key("short") == ""
+    assert RmwZenohKeys(0).type_of(key) == "sensor_msgs/Imu"
+    assert RmwZenohKeys(3).subscription("/robot/imu0") == "3/robot/imu0/*/*"
+    assert RmwZenohKeys(0).type_of("3/robot/imu0/nonsense/x") == ""
+    assert RmwZenohKeys(0).type_of("short") == ""
 
 
 @pytest.mark.parametrize("topic", ["", "/", "/a b", "a//b", "/a/*", "/0a"])
 def test_what_is_no_topic_is_refused(topic: str) -> None:
     with pytest.raises(UsageError, match="topic"):
-        ros_key_expr(0, topic)
+        RmwZenohKeys(0).subscription(topic)
 
 
 def test_attachments_are_read_by_zenohs_own_deserializer() -> None:
