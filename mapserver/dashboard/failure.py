@@ -11,6 +11,7 @@ from mapserver.dashboard import failure_story as story
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.failures import ADVICE, failure_marks, tone_of
 from mapserver.dashboard.fleet_health import MANY_FAILURES
+from mapserver.dashboard.live import words_of
 from mapserver.dashboard.map_layers import Layer, Line, Mark
 from mapserver.store import FailureFilter, FailureRow
 
@@ -47,7 +48,7 @@ def page(services: Services, context: PageContext, failure: str) -> dict[str, ob
         "nearby_words": words,
         "nearby_pictures": services.maps.store.fleet.first_pictures(other.number for other in near[:_LISTED]),
         "facts": _facts(context, row, report),
-        "status_words": story.status_words,
+        "words_of": words_of,
         "matches": [picture.place for picture in detail.pictures if picture.kind == "matches"],
     }
 
@@ -110,7 +111,7 @@ def _facts(context: PageContext, row: FailureRow, report: FailureReport) -> list
         ("Began", context.moment(row.happened_ns)),
         ("Received", context.moment(row.received_ns)),
         ("Duration when reported", f"{row.duration_s:.1f} s"),
-        ("State of the robot", story.status_words(row.status)),
+        ("State of the robot", words_of(row.status)[0]),
         ("Tile", row.tile),
         ("Believed uncertainty when it began (95 % radius)", figure(report.radius_95_m, " m")),
         ("Believed position was wrong by", figure(report.wrong_by_m, " m")),

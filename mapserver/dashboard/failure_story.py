@@ -13,7 +13,7 @@ from fleetmap.failure_definition import is_blind, is_usable
 from fleetmap.failure_summary import FailureSummary, Moment
 from fleetmap.messages import Cause, Status
 from mapserver.api.moments import clock_text
-from mapserver.dashboard.live import STATUSES
+from mapserver.dashboard.live import words_of
 from mapserver.dashboard.map_layers import Line
 from mapserver.store import FailureDetail, PictureRow
 
@@ -107,7 +107,7 @@ def answer(detail: FailureDetail, moments: Sequence[Moment], clock: FailureClock
         off = f"; its later fixes put it {report.wrong_by_m:.1f} m from where it believed to be"
     blind = blind_time(moments, report.stamp_ns)
     if blind is None:
-        return f"{cause}, {status_words(row.status)} for {row.duration_s:.1f} s when it reported{off}"
+        return f"{cause}, {words_of(row.status)[0]} for {row.duration_s:.1f} s when it reported{off}"
     ends = f"not found again until the recording ends at {clock.at(blind.until_ns)}"
     if blind.found_ns is not None:
         ends = f"found again after {(blind.found_ns - report.stamp_ns) * 1e-9:.1f} s"
@@ -122,11 +122,6 @@ def answer(detail: FailureDetail, moments: Sequence[Moment], clock: FailureClock
     elif blind.before_ns is None:
         since = f"since before {clock.at(blind.since_ns)}"
     return f"{cause}, no position to rely upon {since}, {ends}{off}"
-
-
-def status_words(status: str) -> str:
-    """A status as people know it; one that this version does not know as it is."""
-    return STATUSES.get(status, (status.lower(), ""))[0]
 
 
 def steps(moments: Sequence[Moment], began_ns: int) -> dict[str, int]:
@@ -164,9 +159,9 @@ def instants(moments: Sequence[Moment], pictures: Sequence[PictureRow], clock: F
     for each in moments:
         while picture + 1 < len(pictures) and pictures[picture + 1].stamp_ns <= each.stamp_ns:
             picture += 1
-        words = ", ".join(filter(None, (status_words(each.status), each.cause.replace("_", " "))))
+        status, tone = words_of(each.status)
+        words = ", ".join(filter(None, (status, each.cause.replace("_", " "))))
         x, y = _place(each) or (None, None)
-        tone = STATUSES.get(each.status, ("", "warn"))[1]
         belief = "no position" if x is None else f"at {x:.2f}, {y:.2f} m"
         belief += "" if each.radius_95_m is None else f", within {each.radius_95_m:.2f} m with 95 %"
         times = clock.at(each.stamp_ns), clock.since(each.stamp_ns)
@@ -193,7 +188,7 @@ def path(moments: Sequence[Moment], clock: FailureClock) -> list[Line]:
             words = f"its position was corrected by {step_m:.1f} m at {clock.at(each.stamp_ns)}"
             found.append(Line([there, here], "quiet", words, 1.2))
             continue
-        words, tone = status_words(each.status), STATUSES.get(each.status, ("", "warn"))[1]
+        words, tone = words_of(each.status)
         if found and found[-1].words == words and found[-1].points[-1] == there:
             found[-1].points.append(here)
         else:

@@ -7,7 +7,7 @@ import numpy as np
 from fleetmap.geometry import Array
 from fleetmap.live_survey import COVERAGE_CELL_M, LiveSurveyState
 from mapserver.dashboard.console import PageContext, Services
-from mapserver.dashboard.live import STATUSES
+from mapserver.dashboard.live import words_of
 from mapserver.dashboard.map_layers import Dots, Layer, Line, Mark, Square, trail
 from mapserver.dashboard.space.loops import VERDICTS
 
@@ -91,7 +91,7 @@ def _placed(state: LiveSurveyState) -> tuple[str, str]:
     if estimate.cov_rot_trans is not None:
         variances = np.diag(np.reshape(estimate.cov_rot_trans, (6, 6)))
         found.append(f"σ {np.sqrt(variances[3:5].max()):.2f} {units}, {np.degrees(np.sqrt(variances[2])):.1f}°")
-    return STATUSES.get(estimate.status, (estimate.status.lower(), ""))[0], "; ".join(found) or "place unknown"
+    return words_of(estimate.status)[0], "; ".join(found) or "place unknown"
 
 
 def _units(state: LiveSurveyState) -> str:
