@@ -36,11 +36,6 @@ class Plan:
     png: bytes
     directions: tuple[TileDirections, ...]
 
-    @property
-    def size_m(self) -> tuple[float, float]:
-        """Width and height."""
-        return self.high_m[0] - self.low_m[0], self.high_m[1] - self.low_m[1]
-
 
 def make_plan(manifest: Manifest, read_tile: Callable[[TileEntry], Tile]) -> Plan:
     """The plan of a version; an empty one shows 10 m around the origin."""

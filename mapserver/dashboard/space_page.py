@@ -19,8 +19,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         raise StateError(f"site {site} has no published version; publish one, or name a draft")
     camera = maps.store.manifest(site, version).camera  # a version that is not there is named here
     lacks, lacks_pictures = maps.lacks_surfels(site, version), maps.lacks_pictures(site, version)
-    loops, views = maps.loops(site, version), services.health.cameras(site)
-    cameras = {name: [*view.tangents, *view.base_from_cam] for name, view in robot_views(views).items()}
+    loops, cameras = maps.loops(site, version), robot_views(services.health.cameras(site))
     return {
         "version": version,
         "scene": {

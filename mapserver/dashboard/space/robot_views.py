@@ -1,7 +1,6 @@
 """What a robot's own camera sees, as its failure reports tell it: its angles and where it is mounted. Pure."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -11,22 +10,14 @@ from mapserver.serving.expected_views import is_camera
 _FARTHEST_M = 20.0  # from the middle of a robot to its camera
 
 
-@dataclass(frozen=True, slots=True)
-class RobotView:
-    """A camera on its robot. tangents: of the angles to the left, right, upper and lower edge, in its own axes (x right, y down);
-    base_from_cam: the upper three rows of the transform, row by row."""
-
-    tangents: tuple[float, float, float, float]
-    base_from_cam: tuple[float, ...]
-
-
-def robot_views(cameras: Mapping[str, CameraNote]) -> dict[str, RobotView]:
-    """By robot; those that tell what no camera is, or one that is not on the robot, are left out."""
+def robot_views(cameras: Mapping[str, CameraNote]) -> dict[str, list[float]]:
+    """By robot the tangents of the angles to the left, right, upper and lower edge in the camera's axes (x right, y down), and the upper
+    three rows of base_from_cam, row by row. Robots that tell what no camera is, or one that is not on the robot, are left out."""
     found = {robot: _view(camera) for robot, camera in cameras.items()}
     return {robot: view for robot, view in found.items() if view is not None}
 
 
-def _view(camera: CameraNote) -> RobotView | None:
+def _view(camera: CameraNote) -> list[float] | None:
     if not is_camera(camera):
         return None
     base_from_cam = camera.base_from_cam.target_from_source
@@ -34,5 +25,4 @@ def _view(camera: CameraNote) -> RobotView | None:
         return None
     (width_px, height_px), (x_px, y_px), focal_px = camera.size_px, camera.centre_px, camera.focal_px
     edges_px = -x_px, width_px - x_px, -y_px, height_px - y_px
-    left, right, upper, lower = (round(edge / focal_px, 4) for edge in edges_px)
-    return RobotView((left, right, upper, lower), tuple(base_from_cam[:3].ravel().round(4).tolist()))
+    return [*(round(edge / focal_px, 4) for edge in edges_px), *base_from_cam[:3].ravel().round(4).tolist()]

@@ -91,8 +91,8 @@ def test_a_plan_shows_landmarks_where_they_are(store: MapStore) -> None:
     data = MapData(store, GateSettings(), 0.05)
     plan = data.plan(SITE, 2)
     picture = cv2.imdecode(np.frombuffer(plan.png, np.uint8), cv2.IMREAD_UNCHANGED)
-    scale_m = plan.size_m[0] / picture.shape[1]
-    assert plan.size_m[1] / picture.shape[0] == pytest.approx(scale_m, rel=0.01)
+    scale_m = (plan.high_m[0] - plan.low_m[0]) / picture.shape[1]
+    assert (plan.high_m[1] - plan.low_m[1]) / picture.shape[0] == pytest.approx(scale_m, rel=0.01)
 
     def alpha(x_m: float, y_m: float) -> int:
         row, column = int((plan.high_m[1] - y_m) / scale_m), int((x_m - plan.low_m[0]) / scale_m)
@@ -118,7 +118,7 @@ def test_the_map_page_names_the_way_that_nobody_drove(store: MapStore) -> None:
 def test_a_plan_without_tiles_and_one_without_places(store: MapStore) -> None:
     manifest = store.manifest(SITE, 2)
     empty = make_plan(_with_tiles(manifest, ()), lambda _: pytest.fail("there is none"))
-    assert empty.size_m == (10.0, 10.0)
+    assert (empty.low_m, empty.high_m) == ((-5.0, -5.0), (5.0, 5.0))
     (tile,) = (tile for tile in hall_tiles(1) if (tile.tile_x, tile.tile_y) == (0, 0))
     bare = replace(tile, place_ids=tile.place_ids[:0], map_from_cam=tile.map_from_cam[:0], place_landmark_ids=())
     entry = next(entry for entry in manifest.tiles if (entry.x, entry.y) == (0, 0))

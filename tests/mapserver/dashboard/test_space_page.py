@@ -216,8 +216,7 @@ def test_what_is_no_camera_of_a_robot_is_left_out(changes: dict[str, object]) ->
 
 def test_a_robots_view_has_the_angles_and_the_mounting_of_its_own_camera() -> None:
     view = robot_views({"tug-1": told_camera()})["tug-1"]
-    assert view.tangents == (-1.0, 1.0, -0.5, 1.0)
-    assert view.base_from_cam == (0, 0, 1, 0.3, -1, 0, 0, 0, 0, -1, 0, 0.6)
+    assert view == [-1.0, 1.0, -0.5, 1.0, *(0, 0, 1, 0.3, -1, 0, 0, 0, 0, -1, 0, 0.6)]
 
 
 def test_a_robot_that_told_its_camera_is_drawn_with_it(page: Page, served: Served) -> None:
