@@ -144,17 +144,8 @@ class SurfelTiles:
         return [to_json(index, order="deterministic"), *blobs] if blobs else []
 
 
-def encode_surfels(surfels: Surfels) -> list[bytes]:
-    """Return the index and then each tile; empty for no surfels. The bytes do not depend on the order of the surfels."""
-    places = np.floor(surfels.points_map[:, :2] / TILE_SIZE_M).astype(np.int64)
-    tiles = {}
-    for x, y in np.unique(places, axis=0).tolist():
-        tiles[x, y] = encode_tile((x, y), surfels[(places == (x, y)).all(axis=1)])
-    return SurfelTiles(tiles, surfels.falloff, surfels.exposures).blobs()
-
-
 def surfel_report(blobs: list[bytes], surfels: int, without: dict[str, str]) -> SurfelReport:
-    """Return the report of blobs from `encode_surfels`."""
+    """Return the report of blobs from `SurfelTiles.blobs`."""
     sha256 = sha256_hex(blobs[0]) if blobs else None
     return SurfelReport(sha256=sha256, bytes=sum(map(len, blobs)), surfels=surfels, without=without)
 

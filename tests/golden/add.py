@@ -21,8 +21,8 @@ from mapserver.fleet.fleet import Fleet  # noqa: E402
 from mapserver.quality.figures import Compared, Evidence, ProbeFigures, TrajectoryBreaks  # noqa: E402
 from mapserver.store import DraftContent, MapStore  # noqa: E402
 from mapserver.store.archive import ARCHIVE_FORMAT, encode_archive  # noqa: E402
-from mapserver.surfels.surfel_map import encode_surfels, surfel_report  # noqa: E402
-from support.storage.map_samples import draft_details, random_survey, random_tile, wall  # noqa: E402
+from mapserver.surfels.surfel_map import surfel_report  # noqa: E402
+from support.storage.map_samples import draft_details, encode_surfels, random_survey, random_tile, wall  # noqa: E402
 
 _LOOKS = ProbeFigures(40, 0.975, 0.0, 0.001, 0.004, 290.0, 1.77)
 EVIDENCE = Evidence(held_out=Compared(_LOOKS, _LOOKS, 1.0), motion=TrajectoryBreaks(100, 0, 0.01))

@@ -10,8 +10,8 @@ import pytest
 from fleetmap.errors import MapFormatError, NewerFormatError, StateError
 from mapserver import releases
 from mapserver.store import MapStore, Retention
-from mapserver.surfels.surfel_map import LEVELS, TILE_SIZE_M, Surfels, encode_surfels, known_surfels, surfels_of
-from support.storage.map_samples import save_sample_draft, save_surfel_draft, wall
+from mapserver.surfels.surfel_map import LEVELS, TILE_SIZE_M, Surfels, known_surfels, surfels_of
+from support.storage.map_samples import encode_surfels, save_sample_draft, save_surfel_draft, wall
 
 
 def scattered(count: int = 4000) -> Surfels:

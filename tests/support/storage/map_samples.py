@@ -15,9 +15,17 @@ from fleetmap.version_grid import encode_grid, grid_report
 from mapserver import releases
 from mapserver.grid.survey_grid import GridSession
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
-from mapserver.surfels.surfel_map import EDGE_M, Surfels, encode_surfels, surfel_report
+from mapserver.surfels.surfel_map import EDGE_M, TILE_SIZE_M, Surfels, SurfelTiles, encode_tile, surfel_report
 from mapserver.surfels.survey_pictures import kept_pictures
 from mapserver.survey.survey_map import SurveyMap
+
+
+def encode_surfels(surfels: Surfels) -> list[bytes]:
+    """All surfels of a version as blobs, cut into tiles."""
+    places = np.floor(surfels.points_map[:, :2] / TILE_SIZE_M).astype(np.int64)
+    every = np.unique(places, axis=0).tolist()
+    tiles = {(x, y): encode_tile((x, y), surfels[(places == (x, y)).all(axis=1)]) for x, y in every}
+    return SurfelTiles(tiles, surfels.falloff, surfels.exposures).blobs()
 
 
 def random_tile(

@@ -16,7 +16,7 @@ from mapserver.fleet_statistics.kpis import Counters, hour_of
 from mapserver.store import Actor, DraftContent, MapStore
 from mapserver.store.fleet_queries import FleetBatch
 from mapserver.store.rows import TraceRow
-from mapserver.surfels.surfel_map import Surfels, encode_surfels, surfel_report
+from mapserver.surfels.surfel_map import Surfels, surfel_report
 from support.fleet.dashboard_scene import (
     AISLE_M,
     LENGTH_M,
@@ -28,7 +28,7 @@ from support.fleet.dashboard_scene import (
     picture,
 )
 from support.fleet.failed_robot import send_replay, small_file
-from support.storage.map_samples import draft_details
+from support.storage.map_samples import draft_details, encode_surfels
 
 BEGAN_NS = 50_000_000_000
 WORSE = "aisle 2"
