@@ -4,7 +4,6 @@ import os
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -38,15 +37,6 @@ _ASSUMPTIONS = [
 
 Where = Callable[[Array], str]
 """Names the area of a place (2,) in `map`."""
-
-
-@dataclass(frozen=True)
-class _Square:
-    """The places of an area, for `tile_directions`."""
-
-    tile_x: int
-    tile_y: int
-    map_from_cam: Array
 
 
 def examine(
@@ -119,7 +109,7 @@ def areas_of(view: MapView, where: Where, drives: Sequence[Drive]) -> list[AreaF
     figures: dict[str, AreaFigures] = {}
     for place in view.map_from_cam:
         places[where(place[:2, 3])].append(place)
-    squares = [_Square(n, 0, np.array(of_area)) for n, of_area in enumerate(places.values())]
+    squares = {(n, 0): np.array(of_area) for n, of_area in enumerate(places.values())}
     seen = {found.tile[0]: found for found in tile_directions(squares)}
     for n, (name, of_area) in enumerate(places.items()):
         directions = seen.get(n)

@@ -50,7 +50,7 @@ def make_plan(manifest: Manifest, read_tile: Callable[[TileEntry], Tile]) -> Pla
         manifest.tiles,
         len(places),
         _picture(landmarks, places, low, high),
-        tuple(tile_directions(tiles)),
+        tuple(tile_directions({(tile.tile_x, tile.tile_y): tile.map_from_cam for tile in tiles})),
     )
 
 

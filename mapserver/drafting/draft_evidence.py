@@ -243,9 +243,8 @@ def examine_draft(
         lambda: examine(draft, current, probes, _breaks(sessions), None if before is None else before.removed_ids),
     ]
     starts, repeated, evidence = executor.map(lambda _, task: task(), None, tasks)
-    found: Evidence = msgspec.structs.replace(
-        evidence, directions=tile_directions(stored), starts=starts, repetition=repeated
-    )
+    directions = tile_directions({(tile.tile_x, tile.tile_y): tile.map_from_cam for tile in stored})
+    found: Evidence = msgspec.structs.replace(evidence, directions=directions, starts=starts, repetition=repeated)
     return found
 
 

@@ -251,25 +251,13 @@ def thinning(count: int, most: int) -> NDArray[np.int64]:
     return np.arange(count - 1, -1, -step)[::-1].astype(np.int64)
 
 
-class _Cell(NamedTuple):
-    """Keyframes of a square, in the form of a tile for `tile_directions`."""
-
-    tile_x: int
-    tile_y: int
-    map_from_cam: Array
-
-
 def missing_directions(map_from_cam: Array) -> list[LiveMissing]:
     """Return headings without views, although keyframes (K, 4, 4) passed the other way; by square, as in `quality.directions`."""
     cells_of = np.floor(map_from_cam[:, :2, 3] / COVERAGE_CELL_M).astype(np.int64)
-    cells = [
-        _Cell(int(x), int(y), map_from_cam[(cells_of == (x, y)).all(axis=1)])
-        for x, y in np.unique(cells_of, axis=0).tolist()
-    ]
-    middles = {(cell.tile_x, cell.tile_y): cell.map_from_cam[:, :2, 3].mean(axis=0).tolist() for cell in cells}
+    cells = {(x, y): map_from_cam[(cells_of == (x, y)).all(axis=1)] for x, y in np.unique(cells_of, axis=0).tolist()}
     found = []
     for directions in tile_directions(cells):
-        x_m, y_m = middles[directions.tile]
+        x_m, y_m = cells[directions.tile][:, :2, 3].mean(axis=0).tolist()
         for heading, count in directions.missing.items():
             found.append(LiveMissing(x_m=x_m, y_m=y_m, heading=heading, places=count))
     return sorted(found, key=lambda each: -each.places)[:_MOST_MISSING]

@@ -1,8 +1,7 @@
 """Headings of the places of a map, and missing ones: a robot that drives the other way cannot localize there. Pure."""
 
 from collections import Counter
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import scipy
@@ -19,30 +18,13 @@ _LEAST_M = 3.0  # one-way places within a smaller extent are a turn, not an aisl
 _NAMED = 2
 
 
-class Places(Protocol):
-    """A square with the places in it; a Tile is one."""
-
-    @property
-    def tile_x(self) -> int:
-        """Number along x."""
-
-    @property
-    def tile_y(self) -> int:
-        """Number along y."""
-
-    @property
-    def map_from_cam(self) -> Array:
-        """(K, 4, 4)."""
-
-
-def tile_directions(tiles: Sequence[Places]) -> list[TileDirections]:
-    """Return the seen headings of each tile with places, in the order of the tiles; places that look up or down are left out.
+def tile_directions(places: Mapping[tuple[int, int], Array]) -> list[TileDirections]:
+    """Return the seen headings of each tile with places, map_from_cam (K, 4, 4), in their order; places that look up or down are left out.
 
     One-way is judged for every place by its neighbours, across the borders of tiles: in a tile with two aisles, driven in
     opposite directions, both are one-way.
     """
-    counts = [len(tile.map_from_cam) for tile in tiles]
-    map_from_cam = np.concatenate([np.zeros((0, 4, 4)), *(tile.map_from_cam for tile in tiles)])
+    map_from_cam = np.concatenate([np.zeros((0, 4, 4)), *places.values()])
     axes_map = map_from_cam[:, :2, 2]
     lengths = np.linalg.norm(axes_map, axis=1)
     level = lengths > _UPRIGHT
@@ -50,9 +32,9 @@ def tile_directions(tiles: Sequence[Places]) -> list[TileDirections]:
     sectors = np.round(np.arctan2(headings[:, 1], headings[:, 0]) / (np.pi / 4)).astype(int) % len(HEADINGS)
     positions_map = map_from_cam[:, :3, 3]
     one_way = level & ~_met(positions_map, headings, level)
-    owners = np.repeat(np.arange(len(tiles)), counts)
+    owners = np.repeat(np.arange(len(places)), [len(of_tile) for of_tile in places.values()])
     found = []
-    for number, tile in enumerate(tiles):
+    for number, tile in enumerate(places):
         mine = owners == number
         seen = Counter(sectors[mine & level].tolist())
         if not seen:
@@ -63,7 +45,7 @@ def tile_directions(tiles: Sequence[Places]) -> list[TileDirections]:
             if _extent_m(positions_map[alone]) >= _LEAST_M:
                 missing[HEADINGS[(sector + 4) % len(HEADINGS)]] = int(alone.sum())
         by_heading = {HEADINGS[sector]: seen[sector] for sector in sorted(seen)}
-        found.append(TileDirections((tile.tile_x, tile.tile_y), by_heading, missing))
+        found.append(TileDirections(tile, by_heading, missing))
     return found
 
 
