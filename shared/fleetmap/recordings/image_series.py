@@ -1,7 +1,7 @@
 """Images of each camera by stamp, paired to frames and read one frame at a time."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Generic, Protocol, TypeVar
 
@@ -116,18 +116,15 @@ class ImageReader(Protocol[T]):
         """Close open files."""
 
 
-class DepthRegistration(Protocol):
-    """Reprojects depth images into the pixels of the left image."""
-
-    def registered(self, depth_m: NDArray[np.float32], where: str) -> NDArray[np.float32]:
-        """(H, W) metres, 0 where unknown."""
+Register = Callable[[NDArray[np.float32], str], NDArray[np.float32]]
+"""Reprojects depth in metres, named for messages, into the pixels of the left image: (H, W) metres, 0 where unknown."""
 
 
 @dataclass
 class SeriesFrames(Generic[T]):
     """A FrameSource over paired series of equal length.
 
-    grey_bits: used bits of left and right 16-bit images. registration: for depth that is stored unregistered. others: the rig's other
+    grey_bits: used bits of left and right 16-bit images. register: for depth that is stored unregistered. others: the rig's other
     views, left out of frames unless has_others.
     """
 
@@ -135,7 +132,7 @@ class SeriesFrames(Generic[T]):
     left: ImageSeries[T]
     right: ImageSeries[T] | None = None
     depth: ImageSeries[T] | None = None
-    registration: DepthRegistration | None = None
+    register: Register | None = None
     grey_bits: int = 16
     others: tuple[ViewSeries[T], ...] = ()
     has_others: bool = True
@@ -143,7 +140,7 @@ class SeriesFrames(Generic[T]):
     def stored(self, index: int) -> StoredFrame:
         """Frame `index` with its images as stored; registered depth as PNG in whole mm."""
         stored = self._stored(index)
-        if stored.depth is None or self.registration is None:
+        if stored.depth is None or self.register is None:
             return stored
         depth_mm = self._registered_mm(decode_depth(stored.depth), stored.depth.where)
         _, png = cv2.imencode(".png", depth_mm.astype(np.uint16))
@@ -153,7 +150,7 @@ class SeriesFrames(Generic[T]):
         """Frame `index`, decoded; registered depth to one mm, as stored."""
         stored = self._stored(index)
         frame = decode_frame(stored)
-        if stored.depth is None or frame.depth_m is None or self.registration is None:
+        if stored.depth is None or frame.depth_m is None or self.register is None:
             return frame
         depth_mm = self._registered_mm(frame.depth_m, stored.depth.where)
         return replace(frame, depth_m=depth_mm.astype(np.float32) / np.float32(1000.0))
@@ -206,5 +203,5 @@ class SeriesFrames(Generic[T]):
         return StoredFrame(int(left.stamps_ns[row]), first, second, third)
 
     def _registered_mm(self, depth_m: NDArray[np.float32], where: str) -> NDArray[np.float32]:
-        assert self.registration is not None
-        return np.round(self.registration.registered(depth_m, where) * 1000)
+        assert self.register is not None
+        return np.round(self.register(depth_m, where) * 1000)

@@ -47,10 +47,10 @@ def open_seven_scenes(path: Path, options: OpenOptions) -> Recording:
     given = calibration_of_options(options, log)
     calibration = given.calibration if given else _default_calibration(colour.sources[0], depth.sources[0])
     colour_camera, depth_camera = calibration.cameras[0], calibration.cameras[min(1, len(calibration.cameras) - 1)]
-    registration = DepthRegistration(colour_camera, depth_camera)
+    register = DepthRegistration(colour_camera, depth_camera).registered
     calibration = RigCalibration((colour_camera,), None, calibration.base_from_body)
     truth = _ground_truth(colour, se3_inverse(depth_camera.body_from_cam), log)
-    frames = SeriesFrames(FileReader(path, log.files), colour, depth=depth, registration=registration)
+    frames = SeriesFrames(FileReader(path, log.files), colour, depth=depth, register=register)
     return finalize(replace(image_parts(path, "7scenes", calibration, frames), ground_truth=truth), log)
 
 

@@ -65,16 +65,13 @@ def open_tum_rgbd(path: Path, options: OpenOptions) -> Recording:
 
     calibration = RigCalibration(calibration.cameras[:1], None, calibration.base_from_body)
     truth = optional_truth(path / "groundtruth.txt", log, read_truth)
-    frames = SeriesFrames(FileReader(path, log.files), colour, depth=depth, registration=_Scaled())
+    frames = SeriesFrames(FileReader(path, log.files), colour, depth=depth, register=_metres)
     return finalize(replace(image_parts(path, "tum-rgbd", calibration, frames), ground_truth=truth), log)
 
 
-class _Scaled:
-    """Depth that is already registered, in its own unit."""
-
-    def registered(self, depth_m: NDArray[np.float32], where: str) -> NDArray[np.float32]:
-        """Metres, from whole mm."""
-        return depth_m / np.float32(_UNITS_PER_MM)
+def _metres(depth: NDArray[np.float32], _: str) -> NDArray[np.float32]:
+    """Metres of depth that is registered already, and was read as if its unit were a mm."""
+    return depth / np.float32(_UNITS_PER_MM)
 
 
 def _images(table: Path, log: ReadLog) -> ImageFiles:
