@@ -16,7 +16,7 @@ from fleetmap.mapformat import Tile
 from fleetmap.messages import CameraNote, FailureAck, Placement, decode_message, encode_message, robot_key
 from mapserver.dashboard.space import points
 from mapserver.dashboard.space.points import space_bytes, surfel_bytes
-from mapserver.dashboard.space.robot_views import robot_views
+from mapserver.dashboard.space_page import robot_views
 from mapserver.store import MapStore
 from mapserver.surfels.surfel_map import EDGE_M
 from support.fleet.dashboard_scene import ROBOTS, SITE, Served, failure, opened, serving, talking, wait_until

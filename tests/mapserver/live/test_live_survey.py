@@ -17,7 +17,7 @@ from fleetmap.messages import MAX_MESSAGE_BYTES, encode_message
 from fleetmap.recordings import Topics, open_recording
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.samples import SensorSet
-from fleetmap.sources.playback import RecordingSource
+from fleetmap.sources.source import RecordingSource
 from mapserver.cli import app
 from mapserver.config import survey_settings
 from mapserver.drafting.draft import BuildOptions
