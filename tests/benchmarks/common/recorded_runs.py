@@ -85,12 +85,6 @@ def surveyed(work: Path, seed: int | None = None, scenario: str = "small-loop") 
     return store
 
 
-def warmed_up(path: Path, store: Path) -> None:
-    """Kernels are compiled and kept by another process: who compiles takes twice a robot's memory."""
-    short = ["--store", str(store), "--site", SITE, "--frames", ":60"]
-    subprocess.run([*tool("locclient"), "replay", str(path), *short], check=True, stdout=subprocess.DEVNULL)
-
-
 def played(
     path: Path, store: Path, settings: LocalizerSettings, frames: str = ":", *, reverse: bool = False
 ) -> ReplayResult:

@@ -15,15 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import (
-    parsed,
-    played,
-    recorded,
-    resident_mb,
-    surveyed,
-    warmed_up,
-    write_results,
-)
+from benchmarks.common.recorded_runs import parsed, played, recorded, resident_mb, surveyed, write_results
 from benchmarks.common.yardstick import at_reference, mean_of, slowness
 from fleetmap.free_memory import give_back_free_memory
 from fleetmap.odometry import Odometry
@@ -96,7 +88,6 @@ def main() -> None:
     store, settings, found = surveyed(arguments.work), LocalizerSettings(), {}
     for name in arguments.only or CASES:
         recording = recorded(arguments.work, CASES[name])
-        warmed_up(recording, store)
         played(recording, store, settings, ":60")
         give_back_free_memory()
         slow = [slowness()]
