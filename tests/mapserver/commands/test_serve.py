@@ -5,8 +5,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 
@@ -16,6 +15,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from benchmarks.fleet.server_process import serving
 from fleetmap.bus import Bus
 from fleetmap.cli_options import Program
 from fleetmap.errors import StoreError, UnreachableError, UsageError
@@ -28,27 +28,6 @@ from mapserver.config import MapserverConfig
 from mapserver.store import DraftContent, MapStore
 from support.fleet.dashboard_scene import serving as scene_serving
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
-
-PROGRAM = ("-m", "mapserver.cli", "serve")
-
-
-@contextmanager
-def serving(store: Path, endpoint: str = "tcp/127.0.0.1:0") -> Iterator[tuple[subprocess.Popen[str], str, str]]:
-    """A running server and its HTTP and zenoh addresses."""
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    arguments = ["--store", str(store), "--http", "127.0.0.1:0", "--zenoh", endpoint]
-    process = subprocess.Popen(
-        [sys.executable, *PROGRAM, *arguments], env=environment, stdout=subprocess.PIPE, text=True
-    )
-    try:
-        addresses = dict(process.stdout.readline().strip().split(": ", 1) for _ in range(2))
-        assert process.stdout.readline() == "ready\n"
-        yield process, addresses["http"], addresses["zenoh"]
-    finally:
-        if process.poll() is None:
-            process.kill()
-        process.wait(timeout=30)
-        process.stdout.close()
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])

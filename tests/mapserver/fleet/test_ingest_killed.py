@@ -1,13 +1,11 @@
 """A server that is killed while failures come in has all that it acknowledged, and has it once, when it is back."""
 
-import os
-import signal
-import subprocess
-import sys
 import threading
 import time
+from contextlib import ExitStack
 from pathlib import Path
 
+from benchmarks.fleet.server_process import serving
 from fleetmap.bus import Bus
 from fleetmap.errors import FleetmapError
 from fleetmap.messages import FailureAck, FailureReport, Thumbnail, decode_message, encode_message, robot_key
@@ -16,24 +14,6 @@ from mapserver.store import FailureFilter, MapStore
 from support.storage.map_samples import save_sample_draft
 
 ROBOTS, FAILURES = 4, 20
-_REPOSITORY = Path(__file__).resolve().parents[3]
-_SOURCES = os.pathsep.join(str(_REPOSITORY / folder) for folder in ("shared", ""))
-
-
-def serve(folder: Path, endpoint: str) -> tuple[subprocess.Popen[str], str]:
-    """A running server and its endpoint."""
-    program = "import sys; from mapserver.cli import main; main()"
-    words = ["serve", "--store", str(folder), "--http", "127.0.0.1:0", "--zenoh", endpoint]
-    process = subprocess.Popen(
-        [sys.executable, "-c", program, *words],
-        env=os.environ | {"PYTHONPATH": _SOURCES},
-        stdout=subprocess.PIPE,
-        text=True,
-    )
-    assert process.stdout is not None
-    lines = [process.stdout.readline().strip() for _ in range(3)]
-    assert lines[2] == "ready", lines
-    return process, lines[1].removeprefix("zenoh: ")
 
 
 class Robot(threading.Thread):
@@ -67,32 +47,28 @@ def test_nothing_acknowledged_is_lost_and_nothing_is_counted_twice(tmp_path: Pat
         save_sample_draft(store)
         releases.publish(store, "lab")
     acknowledged: set[tuple[str, str]] = set()
-    process, endpoint = serve(tmp_path, "tcp/127.0.0.1:0")
-    robots = [Robot(endpoint, f"r{n}", acknowledged) for n in range(ROBOTS)]
-    for robot in robots:
-        robot.start()
-    kills = 0
-    try:
+    with ExitStack() as servers:
+        process, _, endpoint = servers.enter_context(serving(tmp_path))
+        robots = [Robot(endpoint, f"r{n}", acknowledged) for n in range(ROBOTS)]
+        for robot in robots:
+            robot.start()
         for goal in (10, 40):
             deadline = time.monotonic() + 60
             while len(acknowledged) < goal and time.monotonic() < deadline:
                 time.sleep(0.002)
-            process.send_signal(signal.SIGKILL)
+            process.kill()
             process.wait()
-            kills += 1
             before = set(acknowledged)
             with MapStore.open(tmp_path) as store:
                 kept = [(row.robot, row.failure_id) for row in store.fleet.failures(FailureFilter())]
                 assert len(kept) == len(set(kept))
                 assert before <= set(kept)
                 assert store.verify().faults == []
-            process, _ = serve(tmp_path, endpoint)
+            process, *_ = servers.enter_context(serving(tmp_path, endpoint))
         for robot in robots:
             robot.join(timeout=60)
-    finally:
         process.kill()
         process.wait()
-    assert kills == 2
     assert len(acknowledged) == ROBOTS * FAILURES
     with MapStore.open(tmp_path) as store:
         kept = [(row.robot, row.failure_id) for row in store.fleet.failures(FailureFilter())]
