@@ -2,7 +2,6 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -145,13 +144,6 @@ def reported(bundles: Iterable[SensorBundle], store: MapStore) -> list[FailureRe
     profile = RobotProfile("room", "r1", np.eye(4), rig.body_from_cam, rig.camera, robot_world.SETTINGS)
     profile = replace(profile, pictures="full")
     return [failure_report(context, profile, report_id="ab" * 16, wall_ns=7) for context in contexts]
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterable[MapStore]:
-    with MapStore.open(tmp_path / "store", create=True) as maps:
-        robot_world.save(maps)
-        yield maps
 
 
 def test_a_carried_robot_says_what_it_believed_and_that_this_was_wrong(store: MapStore) -> None:

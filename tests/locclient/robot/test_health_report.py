@@ -1,8 +1,6 @@
 """The figures of a health report: what the server counts with, and since when."""
 
-from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -60,13 +58,6 @@ def test_a_robot_that_is_found_elsewhere_than_it_said_tells_how_far() -> None:
     figures.handle(estimate(0.0, Status.LOST), None)
     figures.handle(replace(look(0.2, 3.0, 0.8, 10, 5), moved_m=0.6), None)
     assert figures.take()["fix_innovation_m"] == 0.6
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[MapStore]:
-    with MapStore.open(tmp_path / "store", create=True) as maps:
-        robot_world.save(maps)
-        yield maps
 
 
 def test_a_robot_tells_all_that_the_server_counts_with(store: MapStore) -> None:

@@ -2,13 +2,11 @@
 
 import gc
 import resource
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import msgspec
 import numpy as np
-import pytest
 
 from fleetmap.free_memory import give_back_free_memory
 from fleetmap.geometry import se3, so3_exp
@@ -20,13 +18,6 @@ from mapserver.store import MapStore
 from support.worlds import robot_world
 
 LAPS, LAP_FRAMES = 20, 70
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[MapStore]:
-    with MapStore.open(tmp_path / "store", create=True) as maps:
-        robot_world.save(maps)
-        yield maps
 
 
 def drive(robot: Robot, numbers: range, bundles: list) -> list[float]:  # type: ignore[type-arg]

@@ -18,14 +18,8 @@ from mapserver.quality.figures import Evidence, RigEvidence
 from mapserver.store import DraftContent
 from mapserver.trust import init_here
 from mapserver.trust.enrolment import RobotRegister
-from support.fleet.served_api import Server, check_problem, served_api
+from support.fleet.served_api import Server, check_problem
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
-
-
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
-    with served_api(tmp_path) as made:
-        yield made
 
 
 def test_lists(server: Server) -> None:

@@ -1,8 +1,6 @@
 """Areas and alignment over HTTP, with the commands as the other side."""
 
 import json
-from collections.abc import Iterator
-from pathlib import Path
 
 import anyio
 import cv2
@@ -14,19 +12,13 @@ from typer.testing import CliRunner
 from mapserver.cli import app
 from mapserver.operators.operators import Operators
 from mapserver.store import Actor
-from support.fleet.served_api import Server, check_problem, raw_put, served_api
+from support.fleet.served_api import Server, check_problem, raw_put
 
 AREAS, ALIGNMENT = "/v1/sites/lab/areas", "/v1/sites/lab/alignment"
 END = {"type": "http.request", "body": b"x"}
 ADA = {"actor": "ada", "reason": "racks were moved"}
 # The map's x axis points up in the picture, 0.05 m a pixel, its origin at 10, -20 m.
 PINS = ["a=200,400:0,0", "b=200,0:20,0", "c=0,400:0,10"]
-
-
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
-    with served_api(tmp_path) as made:
-        yield made
 
 
 def drawn(*names: str, frame: str = "map", **properties: object) -> bytes:

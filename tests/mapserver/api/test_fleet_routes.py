@@ -1,9 +1,7 @@
 """The fleet over HTTP: failures, figures, canaries, the re-survey list, metrics."""
 
 import time
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 from urllib.parse import quote
 
 import msgspec
@@ -12,13 +10,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from fleetmap.messages import FailureReport, RobotAck, RobotHealth, Thumbnail
 from mapserver.store import FailureReplay
-from support.fleet.served_api import Server, check_problem, served_api
-
-
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
-    with served_api(tmp_path) as made:
-        yield made
+from support.fleet.served_api import Server, check_problem
 
 
 def failure(number: int, **changes: object) -> FailureReport:

@@ -20,18 +20,12 @@ from mapserver.commands.serve import HttpOptions
 from mapserver.operators.operators import Operators
 from mapserver.store import Actor, MapStore
 from support.fleet.dashboard_scene import fill_store, serving
-from support.fleet.served_api import Server, check_problem, served_api
+from support.fleet.served_api import Server, check_problem
 
 PROXY, GROUPS = "10.0.0.5", ("map-people=operator", "map-admins=admin", "everybody=viewer")
 ADA = {"X-Forwarded-User": "ada@example.com", "X-Forwarded-Groups": "everybody,map-people"}
 PUBLISH = "/v1/sites/lab/versions/2/publish"
 ACT = {"reason": "monday"}
-
-
-@pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
-    with served_api(tmp_path) as made:
-        yield made
 
 
 class Clock:

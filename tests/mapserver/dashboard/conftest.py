@@ -34,6 +34,15 @@ def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Itera
     assert [line for line in server.log if "ERROR" in line or "Traceback" in line] == []
 
 
+@pytest.fixture(scope="module")
+def small_fleet(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A server with eight robots, which the keyboard gets through."""
+    folder = tmp_path_factory.mktemp("store")
+    fill_store(folder)
+    with serving(folder) as server, talking(server.zenoh, 8):
+        yield server
+
+
 @pytest.fixture
 def page(browser: Chromium) -> Iterator[Page]:
     with browser.context(viewport={"width": 1280, "height": 900}) as context:

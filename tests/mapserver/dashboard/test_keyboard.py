@@ -1,13 +1,10 @@
 """The console without a pointer: Tab, Enter, Escape and arrow keys reach every page and act, and one always sees where one is."""
 
 import re
-from collections.abc import Iterator
 
-import pytest
 from playwright.sync_api import Page, expect
 
-from support.fleet.dashboard_scene import Served, fill_store, marks, opened, serving, talking
-from support.pages.browser import Chromium
+from support.fleet.dashboard_scene import Served, marks, opened
 
 _MOST_TABS = 120
 _FOCUS = """() => {
@@ -16,14 +13,6 @@ _FOCUS = """() => {
   return [at === document.body ? '' : name || at.className, width > 0 && outlineStyle !== 'none' && parseFloat(outlineWidth) >= 2,
           Boolean(at.closest('dialog'))];
 }"""
-
-
-@pytest.fixture(scope="module")
-def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    folder = tmp_path_factory.mktemp("store")
-    fill_store(folder)
-    with serving(folder) as server, talking(server.zenoh, 8):
-        yield server
 
 
 def tab_to(page: Page, name: str) -> None:
@@ -46,8 +35,8 @@ def enter(page: Page, name: str, title: str) -> None:
     expect(page.locator("h1")).to_have_text(title)
 
 
-def test_everything_is_reached_with_the_keyboard_alone(page: Page, served: Served) -> None:
-    seen = opened(page, served, "")
+def test_everything_is_reached_with_the_keyboard_alone(page: Page, small_fleet: Served) -> None:
+    seen = opened(page, small_fleet, "")
     page.keyboard.press("Tab")
     assert page.evaluate(_FOCUS)[:2] == ["Skip to the page", True]
     page.keyboard.press("Enter")

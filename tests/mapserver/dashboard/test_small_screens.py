@@ -7,14 +7,7 @@ import pytest
 from playwright.sync_api import Locator, Page, expect
 
 from mapserver.dashboard.console import PAGES
-from support.fleet.dashboard_scene import (
-    Served,
-    fill_store,
-    opened,
-    overlapping,
-    serving,
-    talking,
-)
+from support.fleet.dashboard_scene import Served, opened, overlapping
 from support.pages.browser import Chromium, box_of
 from support.pages.whole_page import SIZES, WEAKEST_CONTRAST
 
@@ -24,14 +17,6 @@ ACTS = {
     "administration/people": ("Add an operator",),
 }
 _LEAST_PX = 32  # of a thing to tap; WCAG 2.2 asks for 24
-
-
-@pytest.fixture(scope="module")
-def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    folder = tmp_path_factory.mktemp("store")
-    fill_store(folder)
-    with serving(folder) as server, talking(server.zenoh, 8):
-        yield server
 
 
 @pytest.fixture
@@ -49,9 +34,9 @@ def assert_in_reach(page: Page, thing: Locator) -> None:
     assert min(box["width"], box["height"]) >= _LEAST_PX, (thing, box)
 
 
-def test_every_act_is_in_reach_in_every_size_and_look(page: Page, served: Served) -> None:
+def test_every_act_is_in_reach_in_every_size_and_look(page: Page, small_fleet: Served) -> None:
     for path, names in ACTS.items():
-        seen = opened(page, served, path)
+        seen = opened(page, small_fleet, path)
         for field in page.get_by_role("spinbutton").all():
             field.fill("6")  # the place of a robot, without which there is nothing to say yes to
         for look in ("light", "dark"):
@@ -77,8 +62,8 @@ def test_every_act_is_in_reach_in_every_size_and_look(page: Page, served: Served
         assert seen.faults == []
 
 
-def test_every_page_is_in_reach_of_a_thumb(phone: Page, served: Served) -> None:
-    opened(phone, served, "robots")
+def test_every_page_is_in_reach_of_a_thumb(phone: Page, small_fleet: Served) -> None:
+    opened(phone, small_fleet, "robots")
     links = phone.get_by_role("navigation", name="Pages").get_by_role("link").all()
     assert len(links) == len(PAGES)
     for link in links:
@@ -87,8 +72,8 @@ def test_every_page_is_in_reach_of_a_thumb(phone: Page, served: Served) -> None:
     assert overlapping(boxes) == []
 
 
-def test_each_robot_is_in_reach_on_a_phone_held_sideways(phone: Page, served: Served) -> None:
+def test_each_robot_is_in_reach_on_a_phone_held_sideways(phone: Page, small_fleet: Served) -> None:
     phone.set_viewport_size({"width": 844, "height": 390})
-    opened(phone, served, "")
+    opened(phone, small_fleet, "")
     phone.get_by_role("list", name="Robots, problems first").get_by_role("link", name="tug-7", exact=True).tap()
     expect(phone.locator("h1")).to_have_text("tug-7")
