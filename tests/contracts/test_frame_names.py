@@ -28,14 +28,14 @@ Offence = tuple[int, str]
 
 def offences(source: str, allowed: frozenset[str] = frozenset()) -> list[Offence]:
     """Line and complaint for each offence in a module's text."""
-    tree = ast.parse(source)
-    found = [(line, f"{name}: name it target_from_source") for line, name in _vague(tree) if name not in allowed]
-    return sorted(found + list(_mismatches(tree)))
+    nodes = list(ast.walk(ast.parse(source)))
+    found = [(line, f"{name}: name it target_from_source") for line, name in _vague(nodes) if name not in allowed]
+    return sorted(found + list(_mismatches(nodes)))
 
 
-def _vague(tree: ast.Module) -> Iterator[Offence]:
-    other = {target for target, value in _assigned(tree) if _is_no_matrix(value)}
-    for node in ast.walk(tree):
+def _vague(nodes: list[ast.AST]) -> Iterator[Offence]:
+    other = {target for target, value in _assigned(nodes) if _is_no_matrix(value)}
+    for node in nodes:
         match node:
             case ast.Name(id=name, ctx=ast.Store()) if node not in other:
                 pass
@@ -51,9 +51,9 @@ def _vague(tree: ast.Module) -> Iterator[Offence]:
             yield node.lineno, name
 
 
-def _assigned(tree: ast.Module) -> Iterator[tuple[ast.expr, ast.expr]]:
+def _assigned(nodes: list[ast.AST]) -> Iterator[tuple[ast.expr, ast.expr]]:
     """Targets with their values, those of tuples one by one."""
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.Assign):
             for target in node.targets:
                 if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
@@ -72,8 +72,8 @@ def _is_no_matrix(value: ast.expr) -> bool:
     return False
 
 
-def _mismatches(tree: ast.Module) -> Iterator[Offence]:
-    for node in ast.walk(tree):
+def _mismatches(nodes: list[ast.AST]) -> Iterator[Offence]:
+    for node in nodes:
         if isinstance(node, ast.BinOp) and isinstance(node.op, ast.MatMult):
             left, right = _frames(node.left), _frames(node.right)
             if left and right and not _same(left[1], right[0]):
