@@ -156,36 +156,19 @@ def failure(
     robot: str, failure_id: str, *, cause: str = "dark", kind: str = "blind", wall_ns: int | None = None
 ) -> FailureReport:
     """A failure with every field that a robot can report."""
-    at = np.array([20.0, 6.0, 0.0])
+    place = Placement.of(se3(np.eye(3), np.array([20.0, 6.0, 0.0])))
+    fixes = tuple(
+        FixNote(
+            stamp_ns=40_000_000_000 + n * 1_000_000_000, status="TRACKING", position_map_m=(15.0 + n, 6.0, 0.0), inliers=40 - n,
+            innovation=4.0 + n, refused="" if n < 4 else "too few matches",
+        )
+        for n in range(5)
+    )  # fmt: skip
+    pictures = tuple(Thumbnail(stamp_ns=49_900_000_000, kind=of, jpeg=picture(of)) for of in ("frame", "matches"))
     return FailureReport(
-        site=SITE,
-        robot=robot,
-        id=failure_id,
-        stamp_ns=50_000_000_000,
-        wall_ns=time.time_ns() if wall_ns is None else wall_ns,
-        duration_s=3.5,
-        kind=kind,
-        status="LOST",
-        cause=cause,
-        version=2,
-        tile=(1, 0),
-        map_from_base=Placement.of(se3(np.eye(3), at)),
-        radius_95_m=0.4,
-        innovation=31.0,
-        inliers=9,
-        exposure=0.05,
-        sharpness=0.8,
-        fixes=tuple(
-            FixNote(
-                stamp_ns=40_000_000_000 + n * 1_000_000_000, status="TRACKING", position_map_m=(15.0 + n, 6.0, 0.0), inliers=40 - n,
-                innovation=4.0 + n, refused="" if n < 4 else "too few matches",
-            )
-            for n in range(5)
-        ),
-        thumbnails=(
-            Thumbnail(stamp_ns=49_900_000_000, kind="frame", jpeg=picture("frame")),
-            Thumbnail(stamp_ns=49_900_000_000, kind="matches", jpeg=picture("matches")),
-        ),
+        site=SITE, robot=robot, id=failure_id, stamp_ns=50_000_000_000, wall_ns=time.time_ns() if wall_ns is None else wall_ns,
+        duration_s=3.5, kind=kind, status="LOST", cause=cause, version=2, tile=(1, 0), map_from_base=place, radius_95_m=0.4,
+        innovation=31.0, inliers=9, exposure=0.05, sharpness=0.8, fixes=fixes, thumbnails=pictures,
     )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ import base64
 import json
 import struct
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import ExitStack
 from typing import Any, Self
 
@@ -54,10 +54,6 @@ class FoxgloveClient:
         """The first `count` messages of a topic, each with its time."""
         self._until(lambda: len(self.messages.get(topic, [])) >= count, f"{count} of {topic}")
         return self.messages[topic][:count]
-
-    def wait_for_one(self, topic: str, is_it: Callable[[Any], bool]) -> None:
-        """Until a message of a topic is the one that is meant."""
-        self._until(lambda: any(is_it(message) for _, message in self.messages.get(topic, [])), topic)
 
     def wait_until(self, topic: str, stamp_ns: int) -> Any:
         """The last message of a topic, once it is that of a time."""

@@ -43,25 +43,16 @@ def session_scene(seed: int, *, landmarks: int = 300, history: History | None = 
     order = np.lexsort((problem.obs_keyframe[old], problem.obs_landmark[old]))
     keyframe, landmark = problem.obs_keyframe[old][order] // 2, problem.obs_landmark[old][order]
     count = len(problem.points_map)
+    stamps_ns, map_from_body = np.arange(6, dtype=np.int64), problem.map_from_body[::2]
     survey_map = SurveyMap(
-        camera=CAMERA,
-        body_from_cam=BODY_FROM_CAM,
-        keyframe_stamps_ns=np.arange(6, dtype=np.int64),
-        map_from_body=problem.map_from_body[::2],
-        landmark_ids=np.arange(count, dtype=np.uint32),
-        points_map=problem.points_map,
-        descriptors=np.zeros((count, 32), np.uint8),
-        point_sigma_m=np.full(count, 0.01),
-        obs_keyframe=keyframe.astype(np.int32),
-        obs_landmark=landmark.astype(np.int32),
-        obs_pixels=problem.obs_pixels[old][order],
-        obs_octave=np.zeros(len(order), np.int8),
-        obs_sigma_px=problem.obs_sigma_px[old][order],
-        trajectory=Trajectory(np.arange(6, dtype=np.int64), problem.map_from_body[::2]),
-        trajectory_estimated=np.ones(6, bool),
-        patches=np.zeros((count, 21, 21), np.uint8),
-        history=history,
-    )
+        camera=CAMERA, body_from_cam=BODY_FROM_CAM, keyframe_stamps_ns=stamps_ns, map_from_body=map_from_body,
+        landmark_ids=np.arange(count, dtype=np.uint32), points_map=problem.points_map,
+        descriptors=np.zeros((count, 32), np.uint8), point_sigma_m=np.full(count, 0.01),
+        obs_keyframe=keyframe.astype(np.int32), obs_landmark=landmark.astype(np.int32),
+        obs_pixels=problem.obs_pixels[old][order], obs_octave=np.zeros(len(order), np.int8),
+        obs_sigma_px=problem.obs_sigma_px[old][order], trajectory=Trajectory(stamps_ns, map_from_body),
+        trajectory_estimated=np.ones(6, bool), patches=np.zeros((count, 21, 21), np.uint8), history=history,
+    )  # fmt: skip
     in_map = np.unique(landmark)
     visible = [
         np.intersect1d(problem.obs_landmark[problem.obs_keyframe == k], in_map).astype(np.int64)
