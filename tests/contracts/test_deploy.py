@@ -16,14 +16,13 @@ import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
 import fleetmap
-from mapserver import releases
 from mapserver.api.metrics import Metrics
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore
 from mapserver.trust import init_here
 from mapserver.trust.status import _ENDS_SOON, _SITE_ENDS_SOON
 from support.fleet.contracts_documents import REPOSITORY, click_command, text
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import publish_samples
 
 DEPLOY = REPOSITORY / "deploy"
 UNITS = sorted(DEPLOY.glob("*.service"))
@@ -180,8 +179,7 @@ def test_units_have_few_rights(unit: Path) -> None:
 
 def test_rules_and_board_ask_for_what_the_server_exports(tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "store", create=True) as store:
-        save_sample_draft(store)
-        releases.publish(store, "lab")
+        publish_samples(store, 1)
         init_here(store)
         metrics = Metrics(store, Fleet(store))
         metrics.count_bus("health", "ok", 1)

@@ -15,10 +15,9 @@ from fleetmap.sensors.samples import CameraFrame
 from locclient import cli
 from locclient.config import LocclientConfig
 from locclient.daemon.preflight import _clock, _pair
-from mapserver import releases
 from mapserver.store import MapStore
 from support.recordings.recording_samples import make_sample, write_euroc
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import publish_samples
 
 Said = pytest.CaptureFixture[str]
 
@@ -36,8 +35,7 @@ def config(tmp_path: Path) -> Path:
     """A robot that lacks nothing."""
     write_euroc(tmp_path / "walk", make_sample(12))
     with MapStore.open(tmp_path / "store", create=True) as maps:
-        save_sample_draft(maps)
-        releases.publish(maps, "lab")
+        publish_samples(maps, 1)
     path = tmp_path / "robot.toml"
     path.write_text(
         f'[run]\nstore = "{tmp_path}/store"\nsite = "lab"\nrobot = "r1"\noutbox = "{tmp_path}/spool"\n'

@@ -32,7 +32,7 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import publish_samples, save_sample_draft
 
 
 @dataclass
@@ -89,8 +89,7 @@ class World:
 def world(tmp_path: Path) -> Iterator[World]:
     hub, clock = MemoryHub(), {"s": 1000.0}
     with MapStore.open(tmp_path / "store", create=True) as store, MemoryBus(hub) as bus, MemoryBus(hub) as robot_bus:
-        save_sample_draft(store)
-        releases.publish(store, "lab")
+        publish_samples(store, 1)
         fleet = Fleet(store)
         made_late: list[World] = []
 
@@ -198,8 +197,7 @@ def test_a_version_with_a_bad_tile_is_refused_and_the_good_one_goes_on(world: Wo
 def test_a_manifest_of_another_site_is_refused(world: World) -> None:
     world.step()
     adopt(world)
-    save_sample_draft(world.store, site="elsewhere", seed=3)
-    releases.publish(world.store, "elsewhere")
+    publish_samples(world.store, 1, first=3, site="elsewhere")
     foreign = world.store.current("elsewhere")
     told = WantedVersion(site="lab", version=7, manifest_sha256=foreign.manifest_sha256)
     with MemoryBus(world.hub) as server:

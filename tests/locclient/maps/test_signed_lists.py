@@ -86,9 +86,7 @@ class World:
     def attacker(self, versions: int = 3) -> BusService:
         """Answers first, with maps and lists of its own; its version 3 is not the honest one."""
         store = self.stack.enter_context(MapStore.open(self.folder / "evil", create=True))
-        for seed in range(100, 100 + versions):
-            save_sample_draft(store, seed=seed)
-            releases.publish(store, SITE)
+        publish_samples(store, versions, first=100)
         init_here(store)
         before = list(self.hub.queryables)
         made = BusService(store, Fleet(store), self.bus(), lambda *_: None)
@@ -141,9 +139,7 @@ def test_row_1_a_forged_wanted_alone(world: World) -> None:
     forged = world.folder / "forged"
     with MapStore.open(forged, create=True) as other:
         publish_samples(other, 1)
-        for seed in (7, 8):
-            save_sample_draft(other, seed=seed)
-            releases.publish(other, SITE)
+        publish_samples(other, 2, first=7)
         want(world, 2, other.version(SITE, 2).manifest_sha256)
     client = world.client()
     with pytest.raises(UntrustedError, match=r"^signature: version 2 "):

@@ -14,10 +14,9 @@ from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from locclient import cli
 from locclient.maps.map_source import LocalMapSource
 from locclient.prior_option import parse_prior
-from mapserver import releases
 from mapserver.store import MapStore
 from support.recordings.recording_samples import calibration, make_sample, write_euroc
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import publish_samples, save_sample_draft
 from support.worlds import robot_world
 
 Said = pytest.CaptureFixture[str]
@@ -40,8 +39,7 @@ def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("store") / "store"
     with MapStore.open(folder, create=True) as maps:
-        save_sample_draft(maps)
-        releases.publish(maps, "lab")
+        publish_samples(maps, 1)
         save_sample_draft(maps, seed=2)
         save_sample_draft(maps, site="draft-only")
     return folder

@@ -37,7 +37,7 @@ from mapserver.trust import init_here
 from mapserver.trust.enrolment import RobotRegister
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.fleet.quick_passwords import use_quick_passwords
-from support.storage.map_samples import save_grid_draft, save_picture_draft, save_sample_draft, wall
+from support.storage.map_samples import publish_samples, save_grid_draft, save_picture_draft, wall
 from support.storage.room_sessions import session_at
 
 EXAMPLES = int(os.environ.get("FLEETMAP_API_EXAMPLES", "8"))  # of each operation
@@ -115,9 +115,7 @@ def test_no_question_breaks_the_server(tmp_path: Path, monkeypatch: pytest.Monke
     use_quick_passwords(monkeypatch)
     now_ns = time.time_ns()
     with MapStore.open(tmp_path, create=True) as store, MemoryBus(MemoryHub()) as bus:
-        for seed in range(2):
-            save_sample_draft(store, site="hall", seed=seed)
-            releases.publish(store, "hall")
+        publish_samples(store, 2, site="hall")
         save_grid_draft(store, site="hall", surfels=wall())
         save_picture_draft(store, [session_at([np.eye(4)], has_depth=True)], site="hall")
         store.update_job(store.begin_job("hall", "nightly"), "done", "version 2 is published", {})

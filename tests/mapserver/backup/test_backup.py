@@ -17,7 +17,6 @@ from fleetmap.errors import FleetmapError, MapFormatError, StoreError, UsageErro
 from fleetmap.mapformat import blob_path, sha256_hex
 from fleetmap.messages import WantedVersion
 from fleetmap.trust import TrustedMap
-from mapserver import releases
 from mapserver.backup.backup import back_up, recipient_of
 from mapserver.backup.restore import identities_of, restore, verify
 from mapserver.backup.snapshots import BackupTarget
@@ -282,8 +281,7 @@ def test_robots_accept_lists_older_than_a_site_or_a_key_that_they_know(
     target, identity = BackupTarget(str(tmp_path / "backups"), create=True), pyrage.x25519.Identity.generate()
     back_up(store, target, recipient=identity.to_public())
     if change != "the online key":
-        save_sample_draft(store, seed=3, site="other")
-        releases.publish(store, "other")
+        publish_samples(store, 1, first=3, site="other")
     if change != "a site":
         rotate_online(store, KeyFolder(store.folder / "keys").signer("root"))
     trusted = TrustedMap(
@@ -362,8 +360,7 @@ def test_a_served_store_is_backed_up_after_releases_too(store: MapStore, tmp_pat
     identity = pyrage.x25519.Identity.generate()
     target = BackupTarget(str(tmp_path / "backups"), create=True)
     back_up(store, target, recipient=identity.to_public())
-    save_sample_draft(store, seed=9)
-    releases.publish(store, "lab")
+    publish_samples(store, 1, first=9)
     clock.now_ns += DAY_NS
     back_up(store, target, recipient=identity.to_public())
     restore(target, tmp_path / "new", ADA, identities=[identity])

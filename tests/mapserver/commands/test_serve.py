@@ -27,14 +27,13 @@ from mapserver.commands.serve import HttpOptions, serve
 from mapserver.config import MapserverConfig
 from mapserver.store import DraftContent, MapStore
 from support.fleet.dashboard_scene import serving as scene_serving
-from support.storage.map_samples import draft_details, random_tile, save_sample_draft
+from support.storage.map_samples import draft_details, publish_samples, random_tile
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_a_robot_gets_its_map_and_is_seen(tmp_path: Path, number: signal.Signals) -> None:
     with MapStore.open(tmp_path / "store", create=True) as store:
-        save_sample_draft(store)
-        releases.publish(store, "lab")
+        publish_samples(store, 1)
     with serving(tmp_path / "store") as (process, http, zenoh), Bus.connect(zenoh) as bus:
         link = MapClient(bus, TileCache(tmp_path / "cache"), "lab", "r1")
         heard: list[WantedVersion] = []
@@ -52,8 +51,7 @@ def test_a_robot_gets_its_map_and_is_seen(tmp_path: Path, number: signal.Signals
         assert [(robot["robot"], robot["version"]) for robot in robots] == [("r1", 1)]
         # Another process publishes while the server runs.
         with MapStore.open(tmp_path / "store") as store:
-            save_sample_draft(store, seed=5)
-            releases.publish(store, "lab")
+            publish_samples(store, 1, first=5)
         while time.monotonic() < deadline and not any(wanted.version == 2 for wanted in heard):
             time.sleep(0.02)
         assert any(wanted.version == 2 for wanted in heard)

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 
 from fleetmap.mapformat import blob_path
-from mapserver import releases
 from mapserver.store import MapStore
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import publish_samples, save_sample_draft
 from support.storage.postgres_server import PostgresServer
 
 
@@ -95,8 +94,7 @@ def test_gc_leaves_a_store_that_it_refuses_as_it_is(run, tmp_path: Path) -> None
 
 def test_the_gate_takes_its_limits_from_the_file(run, tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "store", create=True) as store:
-        save_sample_draft(store, seed=1)
-        releases.publish(store, "lab")
+        publish_samples(store, 1, first=1)
         save_sample_draft(store, seed=2)
     strict = tmp_path / "strict.toml"
     strict.write_text("[gate]\nmin_landmarks_share = 1.5\n")

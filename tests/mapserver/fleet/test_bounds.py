@@ -9,7 +9,6 @@ import pytest
 
 from fleetmap.errors import LinkError, UsageError
 from fleetmap.messages import FailureReport, PoseMessage, RobotHealth, Thumbnail, decode_message, encode_message
-from mapserver import releases
 from mapserver.fleet import fleet as fleet_module
 from mapserver.fleet.fleet import MAX_FAILURE_BYTES, Fleet
 from mapserver.fleet.ingest import IngestSettings
@@ -18,7 +17,7 @@ from mapserver.serving.bus_service import BusService
 from mapserver.store import Actor, FailureFilter, FleetRetention, MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.clock import Clock
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import publish_samples
 
 SECOND_NS = 10**9
 
@@ -31,8 +30,7 @@ def clock() -> Clock:
 @pytest.fixture
 def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
     with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as made:
-        save_sample_draft(made)
-        releases.publish(made, "lab")
+        publish_samples(made, 1)
         yield made
 
 
@@ -240,8 +238,7 @@ def test_the_database_shrinks_again(tmp_path: Path, clock: Clock) -> None:
         return sum(path.stat().st_size for path in root.glob("store.sqlite3")) // 4096
 
     with MapStore.open(root, create=True, clock_ns=clock) as store:
-        save_sample_draft(store)
-        releases.publish(store, "lab")
+        publish_samples(store, 1)
         fleet = Fleet(store, clock_ns=clock, settings=IngestSettings(failure_days=1.0))
         for number in range(50):
             assert send(fleet, clock, number, jpeg=picture)

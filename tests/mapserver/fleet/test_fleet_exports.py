@@ -23,7 +23,7 @@ from mapserver.fleet.shift_summary import summarise
 from mapserver.fleet_statistics.kpis import driven_words
 from mapserver.store import FailureFilter, MapStore
 from support.fleet.made_fleet import NS, Known, MadeRobot, drive
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import publish_samples, save_sample_draft
 
 
 def run_made_site(folder: Path, *, start_ns: int, seconds: int = 200, cause: str = "dark") -> Known:
@@ -138,8 +138,7 @@ def test_a_file_sets_options_of_grouped_commands(folder: tuple[Path, Known], tmp
 
 def test_a_canary_from_the_command_line(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
-        save_sample_draft(store)
-        releases.publish(store, "lab")
+        publish_samples(store, 1)
         save_sample_draft(store, seed=3)
     done = CliRunner().invoke(
         app, ["promote", "2", "--site", "lab", "--store", str(tmp_path), "--canary", "5%", "--reason", "new racks"]

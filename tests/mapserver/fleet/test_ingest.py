@@ -14,7 +14,6 @@ from msgspec.structs import replace as replace_struct
 
 from fleetmap.errors import LinkError, StoreError, UnknownOutcomeError
 from fleetmap.messages import FailureReport, Placement, PoseMessage, RobotHealth
-from mapserver import releases
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.ingest import IngestSettings
@@ -23,7 +22,7 @@ from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, kpis
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.store import FailureFilter, FleetRetention, MapStore
 from support.fleet.made_fleet import NS, SPEED_MPS, Known, MadeRobot, drive
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import publish_samples
 
 START_NS = 490_000 * HOUR_NS + 1700 * NS  # an hour ends in the middle
 
@@ -55,8 +54,7 @@ class Site:
 def site(metadata_folder: Path) -> Iterator[Site]:
     clock = {"ns": START_NS}
     with MapStore.open(metadata_folder, create=True, clock_ns=lambda: clock["ns"]) as store:
-        save_sample_draft(store)
-        releases.publish(store, "lab")
+        publish_samples(store, 1)
         fleet = Fleet(store, clock_ns=lambda: clock["ns"])
         yield Site(store, fleet, lambda ns: clock.update(ns=ns))
 

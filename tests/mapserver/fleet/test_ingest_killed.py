@@ -9,9 +9,8 @@ from benchmarks.fleet.server_process import serving
 from fleetmap.bus import Bus
 from fleetmap.errors import FleetmapError
 from fleetmap.messages import FailureAck, FailureReport, Thumbnail, decode_message, encode_message, robot_key
-from mapserver import releases
 from mapserver.store import FailureFilter, MapStore
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import publish_samples
 
 ROBOTS, FAILURES = 4, 20
 
@@ -44,8 +43,7 @@ class Robot(threading.Thread):
 
 def test_nothing_acknowledged_is_lost_and_nothing_is_counted_twice(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
-        save_sample_draft(store)
-        releases.publish(store, "lab")
+        publish_samples(store, 1)
     acknowledged: set[tuple[str, str]] = set()
     with ExitStack() as servers:
         process, _, endpoint = servers.enter_context(serving(tmp_path))

@@ -9,14 +9,13 @@ import pytest
 from fleetmap.errors import LinkError, UsageError
 from fleetmap.failure_summary import ReplayPart
 from fleetmap.messages import FailureAck, FailureReport, encode_message
-from mapserver import releases
 from mapserver.fleet import replay_intake
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.ingest import IngestSettings
 from mapserver.store import MapStore
 from support.fleet.failed_robot import small_file
 from support.storage.clock import Clock
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import publish_samples
 
 
 @dataclass
@@ -47,8 +46,7 @@ class Server:
 def server(tmp_path: Path) -> Iterator[Server]:
     clock = Clock()
     with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as store:
-        save_sample_draft(store)
-        releases.publish(store, "lab")
+        publish_samples(store, 1)
         yield Server(store, Fleet(store, clock_ns=clock), clock)
 
 
@@ -141,8 +139,7 @@ def test_the_oldest_recordings_go(tmp_path: Path) -> None:
     data = small_file(tmp_path / "f.mcap")
     clock = Clock()
     with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as store:
-        save_sample_draft(store)
-        releases.publish(store, "lab")
+        publish_samples(store, 1)
         settings = IngestSettings(replay_bytes=2 * len(data) + 100)
         server = Server(store, Fleet(store, settings=settings, clock_ns=clock), clock)
         for number in range(3):

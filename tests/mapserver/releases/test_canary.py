@@ -22,7 +22,7 @@ from mapserver.serving.bus_service import BusService
 from mapserver.store import Actor, DraftContent, MapStore, Retention
 from support.fleet.made_fleet import NS, Known, MadeRobot, drive
 from support.fleet.memory_bus import MemoryBus, MemoryHub
-from support.storage.map_samples import draft_details, random_tile, save_sample_draft
+from support.storage.map_samples import draft_details, publish_samples, random_tile, save_sample_draft
 
 SETTINGS = CanarySettings()
 
@@ -69,8 +69,7 @@ def world(tmp_path: Path) -> Iterator[World]:
         MapStore.open(tmp_path / "store", create=True, clock_ns=lambda: clock["ns"]) as store,
         MemoryBus(MemoryHub()) as bus,
     ):
-        save_sample_draft(store)
-        releases.publish(store, "lab")
+        publish_samples(store, 1)
         save_sample_draft(store, seed=7)
         fleet = Fleet(store, clock_ns=lambda: clock["ns"])
         service = BusService(store, fleet, bus, lambda *_: None)
@@ -150,8 +149,7 @@ def test_people_may_end_it_in_both_ways(world: World) -> None:
     assert [row.state for row in world.store.canaries("lab")] == ["promoted", "rolled_back"]
     assert world.store.canaries("lab", running=True) == []
     releases.start_canary(world.store, "lab", 1, 0.1)
-    save_sample_draft(world.store, seed=8)
-    releases.publish(world.store, "lab")
+    publish_samples(world.store, 1, first=8)
     assert world.store.canaries("lab")[0].state == "stopped"
     assert world.store.current("lab").version == 3
 

@@ -15,7 +15,7 @@ from mapserver.serving.background_tasks import BackgroundTask, run_background_ta
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import publish_samples, save_sample_draft
 
 NS = 1_000_000_000
 
@@ -57,8 +57,7 @@ def test_the_server_takes_a_bad_version_back_by_itself(tmp_path: Path, monkeypat
     for name in ("_FLUSH_EVERY_S", "_PRESENCE_EVERY_S", "_CANARIES_EVERY_S"):
         monkeypatch.setattr(background_tasks, name, 0.05)
     with MapStore.open(tmp_path, create=True) as store, MemoryBus(MemoryHub()) as bus:
-        save_sample_draft(store)
-        releases.publish(store, "lab")
+        publish_samples(store, 1)
         save_sample_draft(store, seed=3)
         fleet = Fleet(store)
         service = BusService(store, fleet, bus, lambda *_: None)

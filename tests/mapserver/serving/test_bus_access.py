@@ -15,7 +15,6 @@ from fleetmap.bus import Bus, TlsFiles
 from fleetmap.errors import LinkError, StateError, UnreachableError, UsageError
 from fleetmap.messages import RobotHealth, decode_message, encode_message, robot_key
 from fleetmap.trust import enrolment
-from mapserver import releases
 from mapserver.fleet import fleet as fleet_module
 from mapserver.fleet.alerts import AlertSettings, active_alerts
 from mapserver.fleet.fleet import Fleet
@@ -26,7 +25,7 @@ from mapserver.trust import init_here
 from mapserver.trust.authorities import Authorities, Authority
 from mapserver.trust.enrolment import Enrolled, RobotRegister
 from support.fleet.memory_bus import MemoryBus, MemoryHub
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import publish_samples
 
 DAY_NS = 86_400_000_000_000
 
@@ -57,8 +56,7 @@ def test_which_endpoints_are_allowed(endpoint: str, insecure: bool, is_allowed: 
 @pytest.fixture
 def register(tmp_path: Path) -> Iterator[RobotRegister]:
     with MapStore.open(tmp_path / "store", create=True) as store:
-        save_sample_draft(store)
-        releases.publish(store, "lab")
+        publish_samples(store, 1)
         init_here(store)
         RobotRegister(store).authorities.init(["127.0.0.1"], None, None)
         yield RobotRegister(store)
@@ -202,8 +200,7 @@ def test_a_renewed_certificate_ends_within_a_day_and_its_robot_goes_on(tmp_path:
     """Over TLS: who copied the key before is silenced, and the robot's session takes the new files by itself."""
     clock = {"ns": int(time.time() * 1e9)}
     with MapStore.open(tmp_path / "store", create=True, clock_ns=lambda: clock["ns"]) as store, ExitStack() as stack:
-        save_sample_draft(store)
-        releases.publish(store, "lab")
+        publish_samples(store, 1)
         init_here(store)
         register = RobotRegister(store)
         register.authorities.init(["127.0.0.1"], None, None)

@@ -32,7 +32,7 @@ from mapserver.serving import bus_service
 from mapserver.store import Actor, FailureFilter, MapStore
 from support.fleet.memory_bus import MemoryBus
 from support.fleet.served_world import World, served_world
-from support.storage.map_samples import save_grid_draft, save_sample_draft
+from support.storage.map_samples import publish_samples, save_grid_draft, save_sample_draft
 
 FOREIGN_VOCABULARY = b"other" * 50
 
@@ -213,8 +213,7 @@ def test_new_versions_are_announced_to_known_robots(world: World) -> None:
     assert [message.version for message in heard] == [1]
     assert world.service.announce_changes() == []
     with MapStore.open(world.folder) as other_process:
-        save_sample_draft(other_process, seed=9)
-        releases.publish(other_process, "lab")
+        publish_samples(other_process, 1, first=9)
     assert world.service.announce_changes() == ["lab"]
     assert [message.version for message in heard] == [1, 2]
     assert world.link.manifest(heard[-1]).version == 2

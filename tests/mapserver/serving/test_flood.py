@@ -31,10 +31,9 @@ from fleetmap.messages import (
     encode_message,
     robot_key,
 )
-from mapserver import releases
 from mapserver.store import Actor, FailureFilter, MapStore, TokenRow
 from support.fleet.dashboard_scene import Served, serving
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import publish_samples
 
 SECONDS = float(os.environ.get("FLOOD_SECONDS", "1.5"))
 PICTURE = Thumbnail(stamp_ns=1, kind="frame", jpeg=b"\xff\xd8" + bytes(60_000) + b"\xff\xd9")
@@ -65,8 +64,7 @@ def disk_mb(folder: Path) -> float:
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     folder = tmp_path_factory.mktemp("flood") / "store"
     with MapStore.open(folder, create=True) as store:
-        save_sample_draft(store)
-        releases.publish(store, "lab")
+        publish_samples(store, 1)
         row = TokenRow("ci", "", "read metrics change", 1 << 62)
         store.operators.add_token(sha256_hex(TOKEN.encode()), row, Actor("root"))
     with serving(folder) as made:

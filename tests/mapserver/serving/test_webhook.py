@@ -31,7 +31,7 @@ from mapserver.store import DiskSpace, MapStore
 from support.fleet.contracts_documents import REPOSITORY
 from support.fleet.webhook_receiver import receiver
 from support.storage.clock import Clock
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import publish_samples
 
 HOUR_NS = 3_600_000_000_000
 RULES = REPOSITORY / "deploy" / "prometheus-alerts.yml"
@@ -52,9 +52,7 @@ def clock() -> Clock:
 @pytest.fixture
 def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
     with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as opened:
-        for seed in range(2):
-            save_sample_draft(opened, seed=seed)
-            releases.publish(opened, "lab")
+        publish_samples(opened, 2)
         yield opened
 
 

@@ -147,8 +147,7 @@ def test_two_open_stores_share_one_folder(store: MapStore, tmp_path: Path) -> No
 
 
 def test_readers_see_whole_versions_while_another_process_publishes(store: MapStore, tmp_path: Path) -> None:
-    save_sample_draft(store)
-    releases.publish(store, "lab")
+    publish_samples(store, 1)
     stop = threading.Event()
 
     def read() -> int:
@@ -163,9 +162,7 @@ def test_readers_see_whole_versions_while_another_process_publishes(store: MapSt
 
     with ThreadPoolExecutor(3) as readers, MapStore.open(tmp_path / "store") as writer:
         reading = [readers.submit(read) for _ in range(3)]
-        for seed in range(5):
-            save_sample_draft(writer, seed=seed)
-            releases.publish(writer, "lab")
+        publish_samples(writer, 5)
         stop.set()
         assert all(future.result(timeout=30) >= 1 for future in reading)
     assert store.current("lab").version == 6
@@ -196,8 +193,7 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_crash_before_the_transaction_leaves_no_version(store: MapStore, tmp_path: Path, monkeypatch) -> None:
-    save_sample_draft(store, seed=1)
-    releases.publish(store, "lab")
+    publish_samples(store, 1, first=1)
 
     def crash(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
@@ -214,8 +210,7 @@ def test_a_crash_before_the_transaction_leaves_no_version(store: MapStore, tmp_p
 
 def test_a_kill_between_the_transaction_and_the_derived_file_is_repaired(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
-        save_sample_draft(store, seed=1)
-        releases.publish(store, "lab")
+        publish_samples(store, 1, first=1)
         save_sample_draft(store, seed=2)
         wanted = store.version("lab", 2).manifest_sha256
     program = (

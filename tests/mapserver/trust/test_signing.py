@@ -25,7 +25,7 @@ from mapserver.trust.repository import ListRepository
 from mapserver.trust.signing import check_base
 from mapserver.trust.status import trust_status
 from support.storage.clock import Clock
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import publish_samples, save_sample_draft
 
 HOUR_NS = 3_600_000_000_000
 
@@ -282,8 +282,7 @@ def test_nothing_but_the_sites_own_lists_is_given_out(store: MapStore, name: str
 
 def test_beyond_loopback_a_store_must_be_signed_first(tmp_path: Path, clock: Clock) -> None:
     with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as store:
-        save_sample_draft(store, seed=1)
-        releases.publish(store, "lab")
+        publish_samples(store, 1, first=1)
         with pytest.raises(UsageError, match="trust init --here"):
             prepare_lists(store, "tls/0.0.0.0:7447")
         prepare_lists(store, "tcp/127.0.0.1:7447")
@@ -294,8 +293,7 @@ def test_beyond_loopback_a_store_must_be_signed_first(tmp_path: Path, clock: Clo
 
 
 def test_a_new_site_is_signed_for_by_itself_where_the_root_is_here(store: MapStore) -> None:
-    save_sample_draft(store, site="yard", seed=5)
-    releases.publish(store, "yard")
+    publish_samples(store, 1, first=5, site="yard")
     found = SignedLists(store.folder).served("yard")
     assert found is not None
     assert found.state("current").about.version == 1
@@ -341,8 +339,7 @@ def test_damaged_lists_do_not_undo_a_release(store: MapStore, caplog: pytest.Log
 
 def test_one_sites_fault_does_not_stop_the_others(store: MapStore, clock: Clock) -> None:
     """Somebody wrote into the database: the other sites' lists and the timestamp are signed all the same."""
-    save_sample_draft(store, site="yard", seed=5)
-    releases.publish(store, "yard")
+    publish_samples(store, 1, first=5, site="yard")
     lists = SignedLists(store.folder)
     with store._transactions.write() as connection:
         connection.execute("UPDATE versions SET vocabulary_sha256 = ? WHERE site = 'lab'", ("0" * 64,))

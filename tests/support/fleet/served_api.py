@@ -10,7 +10,6 @@ import httpx
 from fastapi.testclient import TestClient
 from starlette.types import Message
 
-from mapserver import releases
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
 from mapserver.api.version_routes import ApiSettings
@@ -18,7 +17,7 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.serving.night_runs import NightRuns
 from mapserver.store import MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
-from support.storage.map_samples import save_sample_draft
+from support.storage.map_samples import publish_samples, save_sample_draft
 
 
 @dataclass
@@ -37,8 +36,7 @@ class Server:
 @contextmanager
 def served_api(folder: Path, inbox: Path | None = None) -> Iterator[Server]:
     with MapStore.open(folder, create=True) as store, MemoryBus(MemoryHub()) as bus:
-        save_sample_draft(store)
-        releases.publish(store, "lab")
+        publish_samples(store, 1)
         save_sample_draft(store, seed=2)
         fleet = Fleet(store)
         settings = ApiSettings(nights=None if inbox is None else NightRuns(store, inbox))

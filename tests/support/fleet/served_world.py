@@ -16,7 +16,7 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.store import DraftContent, MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
-from support.storage.map_samples import draft_details, save_sample_draft
+from support.storage.map_samples import draft_details, publish_samples
 
 
 @dataclass
@@ -52,8 +52,7 @@ def served_world(folder: Path) -> Iterator[World]:
     clock = {"ns": 10**18}
     counts: list[tuple[str, str, int]] = []
     with MapStore.open(folder / "store", create=True, clock_ns=lambda: clock["ns"]) as store, MemoryBus(hub) as bus:
-        save_sample_draft(store)
-        releases.publish(store, "lab")
+        publish_samples(store, 1)
         fleet = Fleet(store, clock_ns=lambda: clock["ns"])
         service = BusService(store, fleet, bus, lambda *event: counts.append(event))
         with MemoryBus(hub) as robot_bus:

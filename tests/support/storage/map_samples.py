@@ -169,8 +169,8 @@ def save_picture_draft(store: MapStore, sessions: Sequence[GridSession], *, site
     return store.save(site, content).version
 
 
-def publish_samples(store: MapStore, count: int) -> None:
-    """That many versions of site `lab`, the last one current."""
-    for seed in range(count):
-        save_sample_draft(store, seed=seed)
-        releases.publish(store, "lab")
+def publish_samples(store: MapStore, count: int, *, first: int = 0, site: str = "lab") -> None:
+    """That many versions of a site, of seeds from `first` on, the last one current."""
+    for seed in range(first, first + count):
+        save_sample_draft(store, site=site, seed=seed)
+        releases.publish(store, site)
