@@ -16,10 +16,10 @@ def version(number: int, state: str) -> VersionInfo:
     return VersionInfo("lab", number, state, None, "", None, sha256, 100, *sizes, sha256, 5, None, 0, None)
 
 
-def rows(*states: str, target: int | None = None, canary: CanaryRow | None = None) -> SiteReleases:
+def rows(*states: str, canary: CanaryRow | None = None) -> SiteReleases:
     """Versions from 1 on with these states."""
     versions = {number: version(number, state) for number, state in enumerate(states, start=1)}
-    return SiteReleases("lab", versions, target, None if target is None else 3, canary)
+    return SiteReleases("lab", versions, None, None, canary)
 
 
 def test_the_newest_draft_is_chosen() -> None:
@@ -51,13 +51,6 @@ def test_what_becomes_current_ends_the_canary() -> None:
     assert other.ended_canary == (7, "stopped", "version 3 became current")
     assert [entry.kind for entry in other.log] == ["canary_stopped", "promoted"]
     assert rules.promotion(rows("current"), 1, ADA).states == ()
-
-
-def test_a_rollback_takes_the_last_row_of_the_record_away() -> None:
-    changes = rules.rollback(rows("published", "current", target=1), ADA)
-    assert (changes.states, changes.drop_currents_after) == (((2, "retired"), (1, "current")), 3)
-    with pytest.raises(StateError, match="no earlier current version"):
-        rules.rollback(rows("current"), ADA)
 
 
 def test_a_canary_begins_only_beside_the_version_that_it_was_judged_against() -> None:
