@@ -189,7 +189,10 @@ def test_rules_and_board_ask_for_what_the_server_exports(tmp_path: Path) -> None
     board = json.loads(text("deploy/grafana-dashboard.json"))["panels"]
     asked = [target["expr"] for panel in board for target in panel["targets"]]
     assert len({panel["id"] for panel in board}) == len(board)
-    asked += [rule["expr"] for rule in yaml.safe_load(RULES.read_text("utf-8"))["groups"][0]["rules"]]
+    (group,) = yaml.safe_load(RULES.read_text("utf-8"))["groups"]
+    assert all(rule["annotations"]["summary"] and rule["labels"]["severity"] for rule in group["rules"])
+    asked += [rule["expr"] for rule in group["rules"]]
+    assert len(asked) >= 10
     for name, given in re.findall(r"\b((?:fleetmap|process)_\w+)(?:\{(.*?)\})?", " ".join(asked)):
         assert name in names
         assert set(re.findall(r"(\w+)[=!]", given)) <= labels.get(

@@ -1,7 +1,6 @@
 """What leaves the server about the fleet: the page, JSON lines, MCAP, the commands that write them."""
 
 import json
-import re
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -9,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from typer.testing import CliRunner
@@ -196,21 +194,3 @@ def test_mcap_holds_the_channels_of_viewers(folder: tuple[Path, Known], tmp_path
         assert report["id"] == each.failure.failure_id
         assert (placed.pose.position.x, placed.pose.position.y) == (each.failure.x_map_m, each.failure.y_map_m)
         assert frame.data.startswith(b"\xff\xd8")
-
-
-def test_what_is_deployed_asks_for_metrics_that_exist(tmp_path: Path) -> None:
-    from mapserver.api.metrics import Metrics
-
-    deploy = Path(__file__).parents[3] / "deploy"
-    panels = json.loads((deploy / "grafana-dashboard.json").read_text())["panels"]
-    (group,) = yaml.safe_load((deploy / "prometheus-alerts.yml").read_text())["groups"]
-    assert all(rule["annotations"]["summary"] and rule["labels"]["severity"] for rule in group["rules"])
-    queries = [target["expr"] for panel in panels for target in panel["targets"]]
-    queries += [rule["expr"] for rule in group["rules"]]
-    run_made_site(tmp_path, start_ns=10**18, seconds=30)
-    with MapStore.open(tmp_path) as store:
-        text = Metrics(store, Fleet(store)).text().decode()
-    names = set(re.findall(r"^# TYPE (\w+)", text, re.MULTILINE)) | set(re.findall(r"^(\w+)", text, re.MULTILINE))
-    asked = {name for query in queries for name in re.findall(r"\b(?:fleetmap|process)_\w+", query)}
-    assert len(queries) >= 10
-    assert asked - names == set()
