@@ -150,7 +150,8 @@ def test_a_view_with_another_lens_is_named(recorded: Path, tmp_path: Path) -> No
         format_calibration(replace(calibration, cameras=(*calibration.cameras[:2], *wide)))
     )
     with open_recording(recorded, OpenOptions(tmp_path / "cams.yaml")) as recording:
-        found = {finding.name: finding for finding in further_findings(recording)}
+        few = recording.part(np.arange(0, len(recording), 8))
+        found = {finding.name: finding for finding in further_findings(few)}
     assert found["field of view of cam2 and cam3"].verdict is Verdict.WARN
     assert "use a lens alike" in found["field of view of cam2 and cam3"].sentence
 
