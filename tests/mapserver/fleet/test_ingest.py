@@ -86,6 +86,7 @@ def test_a_clock_that_is_set_back_freezes_no_robot(site: Site) -> None:
     assert site.store.fleet.trace("lab", "r1", since_hour=START_NS // HOUR_NS)
 
 
+@pytest.mark.parametrize("metadata_folder", ["sqlite"], indirect=True)  # nothing of it is kept
 @pytest.mark.parametrize("ahead_s", [0.0, 0.02, 0.5, 0.97, -3600.0, 0.3 * 86400])
 def test_two_robots_of_one_name_are_told(site: Site, caplog: pytest.LogCaptureFixture, ahead_s: float) -> None:
     """Whatever the other one's clock says; one alone is not, with a late network, restarts and a clock that is set."""
