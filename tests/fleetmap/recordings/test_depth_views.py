@@ -1,7 +1,6 @@
 """A depth camera as one view of a rig beside a stereo pair: recordings, calibration files, topics and rectification."""
 
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -19,18 +18,8 @@ from fleetmap.sensors.rectification import RGBD_BASELINE_M, Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.ros2 import RigFrames, Ros2Source
-from fleetsim.recorder import Order, prepare
 from support.fleet.memory_bus import MemoryBus, MemoryHub
-
-
-@lru_cache(maxsize=1)
-def simulated() -> tuple[RigCalibration, tuple[CameraFrame, ...]]:
-    """Three frames of a robot with a pair in front and a depth camera that looks back, without an IMU."""
-    session = prepare(Order("clip", frames=3, size_px=(96, 72), rig="front-depth"))
-    try:
-        return replace(session.nominal, imu=None), tuple(session.frames())
-    finally:
-        session.renderer.close()
+from support.recordings.rig_samples import simulated, write_rig
 
 
 def rear(frame: CameraFrame) -> CameraFrame:
@@ -42,16 +31,13 @@ def rear(frame: CameraFrame) -> CameraFrame:
 def written(
     file: Path, frames: tuple[CameraFrame, ...] | None = None, calibration: RigCalibration | None = None
 ) -> Path:
-    with McapRecordingWriter(file, calibration or simulated()[0]) as target:
-        for frame in frames or simulated()[1]:
-            target.write_frame(frame)
-    return file
+    return write_rig(file, calibration or simulated("front-depth")[0], frames or simulated("front-depth")[1])
 
 
 def check(recording: Recording) -> None:
     assert recording.calibration.views == ((0, 1), (2,)) and not recording.issues
     assert recording.sensor_set is SensorSet.STEREO
-    for index, frame in enumerate(simulated()[1]):
+    for index, frame in enumerate(simulated("front-depth")[1]):
         found = rear(recording.read_frame(index))
         np.testing.assert_array_equal(found.left, rear(frame).left)
         np.testing.assert_array_equal(found.depth_m, rear(frame).depth_m)
@@ -63,7 +49,7 @@ def test_depth_beside_a_pair_is_written_read_and_copied(tmp_path: Path) -> None:
         copy_to_mcap(recording, tmp_path / "b.mcap")
         alone = recording.view(1)
         assert alone.sensor_set is SensorSet.RGBD and alone.content_hash() != ""
-        np.testing.assert_array_equal(alone.read_frame(2).depth_m, rear(simulated()[1][2]).depth_m)
+        np.testing.assert_array_equal(alone.read_frame(2).depth_m, rear(simulated("front-depth")[1][2]).depth_m)
         np.testing.assert_array_equal(
             rear(recording.part(np.array([2])).read_frame(0)).depth_m, alone.read_frame(2).depth_m
         )
@@ -83,7 +69,7 @@ def test_without_a_calibration_file_the_topic_says_that_a_camera_has_depth(
 
 def test_a_depth_camera_is_no_half_of_a_pair() -> None:
     """Two that look the same way are two views; the depth is that of the pixels, as a pair's disparity over RGBD_BASELINE_M."""
-    calibration, frames = simulated()
+    calibration, frames = simulated("front-depth")
     both = replace(calibration, cameras=(*calibration.cameras, calibration.cameras[2]))
     assert both.views == ((0, 1), (2,), (3,))
     assert replace(both, cameras=tuple(replace(c, has_depth=False) for c in both.cameras)).views == ((0, 1), (2, 3))
@@ -102,7 +88,7 @@ def test_a_depth_camera_is_no_half_of_a_pair() -> None:
 
 
 def test_the_calibration_file_keeps_it_and_refusals_name_the_camera(tmp_path: Path) -> None:
-    calibration, frames = simulated()
+    calibration, frames = simulated("front-depth")
     file = tmp_path / "camchain.yaml"
     file.write_text(format_calibration(calibration))
     assert read_calibration(file).cameras[2].has_depth
@@ -127,7 +113,7 @@ def test_the_calibration_file_keeps_it_and_refusals_name_the_camera(tmp_path: Pa
 
 
 def test_cameras_beside_a_depth_camera_in_front_are_named_with_what_to_do(tmp_path: Path) -> None:
-    calibration, frames = simulated()
+    calibration, frames = simulated("front-depth")
     two = replace(calibration, cameras=(replace(calibration.cameras[2], has_depth=False), calibration.cameras[0]))
     with McapRecordingWriter(tmp_path / "a.mcap", two, topics=Topics(right="/cam2/image_raw")) as target:
         for frame in frames:
@@ -139,7 +125,7 @@ def test_cameras_beside_a_depth_camera_in_front_are_named_with_what_to_do(tmp_pa
 
 
 def test_live_images_and_depth_make_one_view() -> None:
-    frames, stored = RigFrames(simulated()[0]), store_frame(simulated()[1][0])
+    frames, stored = RigFrames(simulated("front-depth")[0]), store_frame(simulated("front-depth")[1][0])
     (back,) = stored.others
     assert back is not None and back.depth is not None and stored.right is not None
     done = []
@@ -155,7 +141,7 @@ def test_live_images_and_depth_make_one_view() -> None:
 
 
 def test_a_live_source_takes_the_topic_of_a_cameras_depth() -> None:
-    calibration, frames = simulated()
+    calibration, frames = simulated("front-depth")
     hub, queue = MemoryHub(), Intake(frames=9, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
     topics, stored = Topics(cam2_depth="/back/aligned_depth"), store_frame(frames[0])
     (back,) = stored.others

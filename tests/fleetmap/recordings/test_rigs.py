@@ -2,7 +2,6 @@
 
 import shutil
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -15,30 +14,15 @@ from fleetmap.recordings.images import StoredImage, decode_frame, store_frame
 from fleetmap.recordings.mcap import writer
 from fleetmap.recordings.mcap.writer import McapRecordingWriter, copy_to_mcap
 from fleetmap.recordings.ros2 import messages
-from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
-from fleetsim.recorder import Order, prepare
 from support.recordings.recording_samples import make_sample, write_euroc
-from support.recordings.rig_samples import images_of, write_kitti_raw
-
-
-@lru_cache(maxsize=2)
-def simulated(rig: str) -> tuple[RigCalibration, tuple[CameraFrame, ...]]:
-    """Four frames of a robot in the simulator, which has no IMU here."""
-    session = prepare(Order("clip", frames=4, size_px=(96, 72), rig=rig))
-    try:
-        return replace(session.nominal, imu=None), tuple(session.frames())
-    finally:
-        session.renderer.close()
+from support.recordings.rig_samples import images_of, simulated, write_kitti_raw, write_rig
 
 
 def written(file: Path, rig: str, frames: tuple[CameraFrame, ...] | None = None) -> Recording:
     calibration, recorded = simulated(rig)
-    with McapRecordingWriter(file, calibration) as writer:
-        for frame in frames or recorded:
-            writer.write_frame(frame)
-    return open_recording(file)
+    return open_recording(write_rig(file, calibration, frames or recorded))
 
 
 def shows_the_same(one: CameraFrame, other: CameraFrame) -> bool:

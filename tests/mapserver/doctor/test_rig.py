@@ -19,6 +19,7 @@ from mapserver.cli import app
 from mapserver.doctor.findings import Finding, Verdict
 from mapserver.doctor.rig import check_mountings, check_rig, further_findings, judge_mounting, mounting_error
 from support.recordings.painted_room import FRAME_NS, Ride, frame_at, rig
+from support.recordings.rig_samples import write_rig
 
 REAR = se3(so3_exp(np.array([0.0, 0.0, np.pi])), np.array([-0.1, 0.0, 0.0]))  # body_from_turned
 HALF_DEGREE = np.radians(0.5)
@@ -97,12 +98,7 @@ def ride() -> tuple[RigCalibration, list[CameraFrame]]:
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    calibration, frames = ride()
-    path = tmp_path_factory.mktemp("rig") / "ride.mcap"
-    with McapRecordingWriter(path, calibration) as writer:
-        for frame in frames:
-            writer.write_frame(frame)
-    return path
+    return write_rig(tmp_path_factory.mktemp("rig") / "ride.mcap", *ride())
 
 
 def with_turned(calibration: RigCalibration, numbers: tuple[int, ...]) -> RigCalibration:

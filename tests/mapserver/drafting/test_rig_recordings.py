@@ -1,7 +1,6 @@
 """A build reads all views of a rig: its checks take the first one, its survey and the frames that judge it all."""
 
 from dataclasses import replace
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +10,9 @@ from rich.console import Console
 
 from fleetmap.geometry import se3_exp
 from fleetmap.recordings import Recording
-from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RGBD_BASELINE_M, Rectifier
-from fleetmap.sensors.samples import CameraFrame, SensorSet
-from fleetsim.recorder import Order, prepare
+from fleetmap.sensors.samples import SensorSet
 from mapserver.doctor import Finding
 from mapserver.drafting.admission import CheckedRecording
 from mapserver.drafting.draft_evidence import JudgedSession, ProbedFrame
@@ -26,25 +23,14 @@ from mapserver.survey.keyframes.keyframes import make_keyframes
 from mapserver.survey.keyframes.rig_views import body_from_views, depth_views, other_views
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyTools
-from support.recordings.rig_samples import images_of
+from support.recordings.rig_samples import images_of, simulated, write_rig
 
-
-@lru_cache(maxsize=2)
-def simulated(rig: str = "front-rear") -> tuple[RigCalibration, tuple[CameraFrame, ...]]:
-    session = prepare(Order("clip", frames=3, size_px=(160, 120), rig=rig))
-    try:
-        return session.nominal, tuple(session.frames())
-    finally:
-        session.renderer.close()
+SIZE_PX = (160, 120)
 
 
 @pytest.fixture
 def recorded(tmp_path: Path) -> Path:
-    calibration, frames = simulated()
-    with McapRecordingWriter(tmp_path / "rig.mcap", replace(calibration, imu=None)) as writer:
-        for frame in frames:
-            writer.write_frame(frame)
-    return tmp_path / "rig.mcap"
+    return write_rig(tmp_path / "rig.mcap", *simulated("front-rear", SIZE_PX))
 
 
 def test_frames_keep_all_views_when_they_are_read_again(recorded: Path, tmp_path: Path) -> None:
@@ -52,7 +38,7 @@ def test_frames_keep_all_views_when_they_are_read_again(recorded: Path, tmp_path
         for _ in range(2):
             with reading.open(recorded) as (recording, _indices):
                 images = images_of(recording.read_frame(1))
-                expected = images_of(simulated()[1][1])
+                expected = images_of(simulated("front-rear", SIZE_PX)[1][1])
                 assert len(recording.calibration.cameras) == 4
                 assert all(np.array_equal(a, b) for a, b in zip(images, expected, strict=True))
                 assert len(recording.view(0).calibration.cameras) == 2
@@ -65,7 +51,7 @@ def test_a_smaller_set_of_sensors_is_that_of_the_first_view(recorded: Path) -> N
 
 
 def test_a_corrected_clock_is_that_of_all_views() -> None:
-    whole = simulated()[0]
+    whole = simulated("front-rear", SIZE_PX)[0]
     first = replace(
         whole, cameras=tuple(replace(c, imu_minus_cam_s=c.imu_minus_cam_s + 0.01) for c in whole.cameras[:2])
     )
@@ -75,7 +61,7 @@ def test_a_corrected_clock_is_that_of_all_views() -> None:
 
 
 def test_a_keyframe_has_the_views_of_its_pinhole() -> None:
-    calibration, frames = simulated()
+    calibration, frames = simulated("front-rear", SIZE_PX)
     rectifier = Rectifier(calibration)
     frame = rectifier.rectify(frames[0])
     others = other_views(rectifier)
@@ -100,7 +86,7 @@ def test_a_keyframe_has_the_views_of_its_pinhole() -> None:
 
 def test_a_shorter_baseline_of_another_view_is_converted_to_the_first_one() -> None:
     """What the view measures is as far away as before."""
-    calibration, frames = simulated()
+    calibration, frames = simulated("front-rear", SIZE_PX)
     rectifier = Rectifier(calibration)
     frame, others = rectifier.rectify(frames[0]), other_views(rectifier)
     short = [(number, replace(camera, baseline_m=camera.baseline_m / 2)) for number, camera in others]
@@ -114,7 +100,7 @@ def test_a_shorter_baseline_of_another_view_is_converted_to_the_first_one() -> N
 
 def test_depth_of_another_view_is_read_as_disparities_of_the_first_baseline() -> None:
     """As far away as the sensor says, with the sensor's noise; also where an adjustment reads its picture again."""
-    calibration, frames = simulated("front-depth")
+    calibration, frames = simulated("front-depth", SIZE_PX)
     rectifier, settings = Rectifier(calibration), SurveySettings()
     assert depth_views(rectifier) == {1}
     rows = [(0, rectifier.rectify(frames[0]))]

@@ -1,14 +1,35 @@
-"""Folders of rigs with any number of cameras, written from frames."""
+"""Frames of rigs with any number of cameras, and recordings of them."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
 import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse
+from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, Image
+from fleetsim.recorder import Order, prepare
+
+
+@lru_cache(maxsize=3)
+def simulated(rig: str, size_px: tuple[int, int] = (96, 72)) -> tuple[RigCalibration, tuple[CameraFrame, ...]]:
+    """Four frames of a robot in the simulator, which has no IMU here."""
+    session = prepare(Order("clip", frames=4, size_px=size_px, rig=rig))
+    try:
+        return replace(session.nominal, imu=None), tuple(session.frames())
+    finally:
+        session.renderer.close()
+
+
+def write_rig(file: Path, calibration: RigCalibration, frames: Iterable[CameraFrame]) -> Path:
+    with McapRecordingWriter(file, calibration) as writer:
+        for frame in frames:
+            writer.write_frame(frame)
+    return file
 
 
 def images_of(frame: CameraFrame) -> list[Image]:
