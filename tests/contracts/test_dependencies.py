@@ -4,6 +4,7 @@ import ast
 import re
 import sys
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,7 @@ def declared(extra: str | None) -> set[str]:
     return {re.split(r"[^\w.-]", line, maxsplit=1)[0].lower() for line in lines}
 
 
+@cache
 def imported(folder: Path) -> set[str]:
     """Distributions whose modules the folder's files import, inside of functions too, but not for types alone."""
     found = set()
