@@ -1,7 +1,6 @@
 """Files of every format that are cut, empty, flipped or something else: a message with the file's name, of no library, and no traceback."""
 
 import re
-import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -14,7 +13,7 @@ from fleetmap.errors import FleetmapError, RecordingError
 from fleetmap.recordings import OpenOptions, open_recording
 from fleetmap.recordings.ros2 import messages as ros_messages
 from fleetmap.recordings.tum import parse_tum, read_tum
-from mapserver import cli
+from support.command_line import status
 from support.recordings.bag_samples import write_rosbag1
 from support.recordings.mcap_samples import SAMPLE, foreign_messages, write_foreign
 from support.recordings.recording_samples import HEIGHT, WIDTH, kalibr_text, make_sample, write_euroc
@@ -48,9 +47,7 @@ OF_A_LIBRARY = re.compile(
 
 
 @pytest.mark.parametrize("name", list(WRITERS))
-def test_damaged_files_of_every_format(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_damaged_files_of_every_format(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "rig.yaml").write_text(kalibr_text().partition("cam1:")[0])
     rig = tmp_path / "rig.yaml" if name in WITHOUT_CALIBRATION else None
     options, calibration = OpenOptions(rig), [] if rig is None else ["--calibration", str(rig)]
@@ -73,9 +70,7 @@ def test_damaged_files_of_every_format(
                 told = str(error)
                 assert path.name in told, (file.name, damage, told)
                 if damage == "text":  # as the command tells it
-                    monkeypatch.setattr(sys, "argv", ["mapserver", "doctor", str(path), *calibration])
-                    with pytest.raises(SystemExit):
-                        cli.main()
+                    status("mapserver", "doctor", path, *calibration)
                     assert capsys.readouterr().err == f"error: {told}\n"
             assert not OF_A_LIBRARY.search(told), (file.name, damage, told)
             if damage in ("page", "pointer") and file.name not in ("metadata.yaml", "frame-000000.pose.txt"):

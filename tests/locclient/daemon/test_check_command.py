@@ -1,6 +1,5 @@
 """`locclient check` and `locclient run`: what is wrong is told with the next step, before any work."""
 
-import sys
 from pathlib import Path
 from types import SimpleNamespace
 from typing import cast
@@ -16,18 +15,11 @@ from locclient import cli
 from locclient.config import LocclientConfig
 from locclient.daemon.preflight import _clock, _pair
 from mapserver.store import MapStore
+from support.command_line import status
 from support.recordings.recording_samples import make_sample, write_euroc
 from support.storage.map_samples import publish_samples
 
 Said = pytest.CaptureFixture[str]
-
-
-def status(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """What the process would end with."""
-    monkeypatch.setattr(sys, "argv", ["locclient", *(str(a) for a in arguments)])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    return int(end.value.code or 0)
 
 
 @pytest.fixture
@@ -63,8 +55,8 @@ def test_site_and_server_are_said_once_and_old_keys_are_refused(tmp_path: Path) 
             _read(file)
 
 
-def test_a_good_robot_passes(monkeypatch: pytest.MonkeyPatch, config: Path, capsys: Said) -> None:
-    assert status(monkeypatch, "check", "--config", config, "--seconds", "0.5") == 0
+def test_a_good_robot_passes(config: Path, capsys: Said) -> None:
+    assert status("locclient", "check", "--config", config, "--seconds", "0.5") == 0
     lines = dict(line.split(":", 1) for line in capsys.readouterr().out.splitlines())
     assert set(lines) >= {"ok    configuration", "ok    calibration", "ok    frames", "ok    spool", "ok    store"}
     assert "20.0 Hz" in lines["ok    frames"]
@@ -88,12 +80,12 @@ def test_what_is_wrong_is_told(
 ) -> None:
     monkeypatch.setattr("locclient.daemon.preflight._ANSWER_S", 0.3)
     config.write_text(config.read_text().replace(old, new))
-    assert status(monkeypatch, "check", "--config", config, "--seconds", "0") == 3
+    assert status("locclient", "check", "--config", config, "--seconds", "0") == 3
     out = capsys.readouterr().out
     assert any(found.startswith(line) and said in found for found in out.splitlines()), out
 
 
-def test_a_robot_that_cannot_run_says_so_at_once(monkeypatch: pytest.MonkeyPatch, config: Path, capsys: Said) -> None:
+def test_a_robot_that_cannot_run_says_so_at_once(config: Path, capsys: Said) -> None:
     good = config.read_text()
     for old, new, code, said in (
         ('robot = "r1"', "", 2, "[run] robot is missing"),
@@ -104,7 +96,7 @@ def test_a_robot_that_cannot_run_says_so_at_once(monkeypatch: pytest.MonkeyPatch
         ("[source]", '[output]\nformat = "xml"\nendpoint = "tcp/127.0.0.1:1"\n[source]', 2, "xml"),
     ):
         config.write_text(good.replace(old, new))
-        assert status(monkeypatch, "run", "--config", config) == code, said
+        assert status("locclient", "run", "--config", config) == code, said
         told = capsys.readouterr()
         assert said in told.err, told.err
         assert "Traceback" not in told.err

@@ -2,14 +2,13 @@
 
 import re
 import socket
-import sys
 import time
 from pathlib import Path
 
 import pytest
 
-from locclient import cli
 from locclient.daemon.service_manager import ServiceManager
+from support.command_line import status
 
 
 @pytest.mark.parametrize("abstract", [False, True])
@@ -40,33 +39,30 @@ def test_without_a_manager_nothing_happens(tmp_path: Path, monkeypatch: pytest.M
     ServiceManager(str(tmp_path / "gone")).alive("x")
 
 
-def status(monkeypatch: pytest.MonkeyPatch, folder: Path) -> int:
+def asked(monkeypatch: pytest.MonkeyPatch, folder: Path) -> int:
     monkeypatch.setenv("RUNTIME_DIRECTORY", f"{folder}:/somewhere/else")
-    monkeypatch.setattr(sys, "argv", ["locclient", "status"])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    return int(end.value.code or 0)
+    return status("locclient", "status")
 
 
 def test_what_the_daemon_says_can_be_asked_for(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert status(monkeypatch, tmp_path) == 3
+    assert asked(monkeypatch, tmp_path) == 3
     assert re.search(r"no daemon has written .*; start `locclient run`", capsys.readouterr().err)
     manager = ServiceManager()
     manager.alive("AMBIGUOUS")
     manager.alive("TRACKING")
-    assert status(monkeypatch, tmp_path) == 0
+    assert asked(monkeypatch, tmp_path) == 0
     assert re.fullmatch(r"TRACKING, 0\.\d s ago\n", capsys.readouterr().out)
     manager.stopping()
-    assert status(monkeypatch, tmp_path) == 3, "a daemon that was stopped says nothing any more"
+    assert asked(monkeypatch, tmp_path) == 3, "a daemon that was stopped says nothing any more"
 
 
 @pytest.mark.parametrize("now_s", [100.06, 100.04, 62485.199999])
 def test_a_status_can_be_read_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, now_s: float) -> None:
     monkeypatch.setattr(time, "monotonic", lambda: now_s)
     ServiceManager(folder=tmp_path).alive("TRACKING")
-    assert status(monkeypatch, tmp_path) == 0
+    assert asked(monkeypatch, tmp_path) == 0
 
 
 @pytest.mark.parametrize(
@@ -91,7 +87,7 @@ def test_an_old_or_broken_status_is_none(
     content = text.format(now=now_s).encode("utf-8", "surrogateescape")
     (tmp_path / "status").write_bytes(content)
     monkeypatch.setattr(time, "monotonic", lambda: now_s + later_s)
-    assert status(monkeypatch, tmp_path) == 3
+    assert asked(monkeypatch, tmp_path) == 3
     assert words in capsys.readouterr().err
 
 

@@ -23,17 +23,16 @@ from fleetmap.recordings import open_recording
 from fleetmap.recordings.failure_recording import LOCALIZER, SUMMARY, attachments_of
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.samples import PositionPrior
-from locclient import cli
 from locclient.delivery.failure_file import failure_file, read_failure_file
 from locclient.maps.floor_maps import FloorMaps
 from locclient.maps.map_source import LocalMapSource
 from locclient.replay.failure_replay import SAME_M, Comparison, compare_failure
 from locclient.replay.replay import load_map
 from locclient.robot.robot import Robot
-from mapserver import cli as server_cli
 from mapserver.fleet import bounded_process
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore
+from support.command_line import status
 from support.fleet.failed_robot import failed, profile, send_replay
 from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
@@ -355,25 +354,18 @@ def test_damaged_and_other_recordings_are_refused(carried: Carried, tmp_path: Pa
         read_failure_file(tmp_path / "other.mcap")
 
 
-def _replayed(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    monkeypatch.setattr(sys, "argv", ["locclient", "replay", *(str(each) for each in arguments)])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    return int(end.value.code or 0)
-
-
 def test_the_command_answers(
     carried: Carried, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = (carried.file, "--store", carried.folder / "store")
     for version, is_same in (((), True), (("--version", 1), True), (("--version", 2), False)):
-        status = _replayed(monkeypatch, *given, *version, "--report", tmp_path / "report.json")
+        ended = status("locclient", "replay", *given, *version, "--report", tmp_path / "report.json")
         said = capsys.readouterr()
-        assert status == 0, said.err
+        assert ended == 0, said.err
         assert "then:" in said.out
         assert ("this client gives the same result for every frame" in said.out) == is_same
         assert json.loads((tmp_path / "report.json").read_text())["is_same"] == is_same
-    assert _replayed(monkeypatch, *given, "--frames", "1:20") == 2
+    assert status("locclient", "replay", *given, "--frames", "1:20") == 2
     assert "--frames is not for a failure's recording" in capsys.readouterr().err
 
 
@@ -385,21 +377,12 @@ def test_the_server_replays_it_in_a_process_with_limits(
         fleet = Fleet(maps)
         assert fleet.take_failure("room", "r1", carried.report).refused == ""
         send_replay(fleet, "room", "r1", carried.report.id, carried.file.read_bytes())
-    monkeypatch.setattr(sys, "argv", ["mapserver", "fleet", "replay", "1", "--store", str(store)])
-
-    def run() -> tuple[int, str]:
-        with pytest.raises(SystemExit) as end:
-            server_cli.main()
-        said = capfd.readouterr()
-        return int(end.value.code or 0), said.out + said.err
-
-    status, said = run()
-    assert status == 0, said
-    assert "gives the same result for every frame" in said
-    monkeypatch.setattr(sys, "argv", [*sys.argv, "--json"])
-    status, said = run()
-    assert (status, json.loads(said[: said.rindex("}") + 1])["is_same"]) == (0, True)
-    monkeypatch.setattr(bounded_process, "ProcessLimits", partial(bounded_process.ProcessLimits, wall_s=0.1))
-    status, said = run()
-    assert status == 3
-    assert "the replay of failure 1 was ended after 0 s" in said
+    command = ("mapserver", "fleet", "replay", "1", "--store", store)
+    assert status(*command) == 0
+    assert "gives the same result for every frame" in capfd.readouterr().out
+    assert status(*command, "--json") == 0
+    said = capfd.readouterr().out
+    assert json.loads(said[: said.rindex("}") + 1])["is_same"]
+    monkeypatch.setattr(bounded_process, "ProcessLimits", partial(bounded_process.ProcessLimits, cpu_s=1))
+    assert status(*command) == 3
+    assert "the replay of failure 1 was ended by SIG" in capfd.readouterr().err

@@ -1,7 +1,6 @@
 """`locclient replay`: wrong orders end with 2, bad input with 3, each with what to do next, and before any work."""
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,23 +10,15 @@ import pytest
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
-from locclient import cli
 from locclient.maps.map_source import LocalMapSource
 from locclient.prior_option import parse_prior
 from mapserver.store import MapStore
+from support.command_line import status
 from support.recordings.recording_samples import calibration, make_sample, write_euroc
 from support.storage.map_samples import publish_samples, save_sample_draft
 from support.worlds import robot_world
 
 Said = pytest.CaptureFixture[str]
-
-
-def status(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """What the process would end with."""
-    monkeypatch.setattr(sys, "argv", ["locclient", *(str(a) for a in arguments)])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    return int(end.value.code or 0)
 
 
 @pytest.fixture(scope="module")
@@ -63,11 +54,9 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["--site", "lab", "--server", "tcp/127.0.0.1:1", "--version", "1"], "--store"),
     ],
 )
-def test_wrong_orders_end_with_2(
-    monkeypatch: pytest.MonkeyPatch, walk: Path, store: Path, capsys: Said, arguments: list[str], said: str
-) -> None:
+def test_wrong_orders_end_with_2(walk: Path, store: Path, capsys: Said, arguments: list[str], said: str) -> None:
     given = [str(store) if argument == "STORE" else argument for argument in arguments]
-    assert status(monkeypatch, "replay", walk, *given) == 2
+    assert status("locclient", "replay", walk, *given) == 2
     told = capsys.readouterr()
     assert said in told.err
     assert "Traceback" not in told.err + told.out
@@ -80,9 +69,7 @@ def test_any_version_of_a_store_can_be_replayed_in(store: Path) -> None:
             assert wanted.manifest_sha256 == maps.version(site, sha256).manifest_sha256
 
 
-def test_bad_input_ends_with_3(
-    monkeypatch: pytest.MonkeyPatch, walk: Path, store: Path, tmp_path: Path, capsys: Said
-) -> None:
+def test_bad_input_ends_with_3(walk: Path, store: Path, tmp_path: Path, capsys: Said) -> None:
     (tmp_path / "empty").mkdir()
     (tmp_path / "zero.mcap").write_bytes(b"")
     (tmp_path / "calibration.yaml").write_text("cam0: 7\n")
@@ -99,23 +86,21 @@ def test_bad_input_ends_with_3(
             "is the server running",
         ),
     ):
-        assert status(monkeypatch, "replay", *arguments) == 3, arguments
+        assert status("locclient", "replay", *arguments) == 3, arguments
         told = capsys.readouterr()
         assert said in told.err, told.err
         assert "Traceback" not in told.err + told.out
 
 
-def test_the_file_gives_defaults_and_knows_its_keys(
-    monkeypatch: pytest.MonkeyPatch, walk: Path, store: Path, tmp_path: Path, capsys: Said
-) -> None:
+def test_the_file_gives_defaults_and_knows_its_keys(walk: Path, store: Path, tmp_path: Path, capsys: Said) -> None:
     file = tmp_path / "robot.toml"
     file.write_text(f'[replay]\nsite = "elsewhere"\nstore = "{store}"\n')
-    assert status(monkeypatch, "replay", walk, "--config", file) == 3
+    assert status("locclient", "replay", walk, "--config", file) == 3
     assert "elsewhere" in capsys.readouterr().err
-    assert status(monkeypatch, "replay", walk, "--config", file, "--site", "other") == 3
+    assert status("locclient", "replay", walk, "--config", file, "--site", "other") == 3
     assert "other" in capsys.readouterr().err
     file.write_text('[replay]\nsight = "lab"\n')
-    assert status(monkeypatch, "replay", walk, "--config", file) == 2
+    assert status("locclient", "replay", walk, "--config", file) == 2
     assert "sight" in capsys.readouterr().err
 
 
@@ -136,24 +121,22 @@ def test_numbers_that_are_no_place_are_refused(text: str) -> None:
 
 @pytest.mark.parametrize("option", ["--report", "--trajectory", "--picture"])
 def test_files_that_cannot_be_written_are_told_before_the_work(
-    monkeypatch: pytest.MonkeyPatch, walk: Path, store: Path, tmp_path: Path, capsys: Said, option: str
+    walk: Path, store: Path, tmp_path: Path, capsys: Said, option: str
 ) -> None:
     to_store = ("--site", "lab", "--store", store)
-    assert status(monkeypatch, "replay", walk, *to_store, option, tmp_path / "missing/file.png") == 2
+    assert status("locclient", "replay", walk, *to_store, option, tmp_path / "missing/file.png") == 2
     assert option in capsys.readouterr().err
     if option == "--picture":
-        assert status(monkeypatch, "replay", walk, *to_store, option, tmp_path / "picture.txt") == 2
+        assert status("locclient", "replay", walk, *to_store, option, tmp_path / "picture.txt") == 2
         assert option in capsys.readouterr().err
 
 
-def test_a_robot_of_another_building_says_so_and_ends_with_6(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Said
-) -> None:
+def test_a_robot_of_another_building_says_so_and_ends_with_6(tmp_path: Path, capsys: Said) -> None:
     ride, report = robot_world.write(tmp_path / "ride", robot_world.bundles(120)), tmp_path / "report.json"
     store = tmp_path / "store"
     with MapStore.open(store, create=True) as maps:
         robot_world.save(maps, of=tuple(replace(tile, descriptors=~tile.descriptors) for tile in robot_world.tiles()))
-    assert status(monkeypatch, "replay", ride, "--store", store, "--site", "room", "--report", report) == 6
+    assert status("locclient", "replay", ride, "--store", store, "--site", "room", "--report", report) == 6
     words = "nothing in the map agrees with the pictures"
     assert words in capsys.readouterr().err
     found = json.loads(report.read_text())
@@ -162,9 +145,7 @@ def test_a_robot_of_another_building_says_so_and_ends_with_6(
     assert [note for note in found["notes"] if words in note]
 
 
-def test_frames_that_cannot_be_decoded_are_left_out(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: Said
-) -> None:
+def test_frames_that_cannot_be_decoded_are_left_out(tmp_path: Path, capsys: Said) -> None:
     """The Huffman tables of JPEG files are destroyed, which no reader notices before decoding."""
     store, report = tmp_path / "store", tmp_path / "report.json"
     with MapStore.open(store, create=True) as maps:
@@ -176,7 +157,7 @@ def test_frames_that_cannot_be_decoded_are_left_out(
         at = data.index(b"\xff\xc4") + 5
         data[at : at + 16] = b"\xff" * 16
         files[number].write_bytes(data)
-        ended = status(monkeypatch, "replay", walk, "--site", "room", "--store", store, "--report", report)
+        ended = status("locclient", "replay", walk, "--site", "room", "--store", store, "--report", report)
         told = capsys.readouterr()
         if count < 2:
             assert ended == 0, told.err
@@ -188,9 +169,7 @@ def test_frames_that_cannot_be_decoded_are_left_out(
             assert "image0.jpg: " in told.err
 
 
-def test_a_rig_whose_covered_front_is_faster_than_its_rear_is_replayed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_rig_whose_covered_front_is_faster_than_its_rear_is_replayed(tmp_path: Path) -> None:
     """Frames in which the followed view has no image are left out."""
     known, turned = calibration(), se3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     front = tuple(replace(camera, body_from_cam=turned @ camera.body_from_cam) for camera in known.cameras)
@@ -203,7 +182,7 @@ def test_a_rig_whose_covered_front_is_faster_than_its_rear_is_replayed(
             writer.write_imu(bundle.imu)
             writer.write_frame(seen)
     arguments = "--site", "room", "--store", tmp_path / "store", "--report", tmp_path / "report.json"
-    assert status(monkeypatch, "replay", tmp_path / "rig.mcap", *arguments) == 0
+    assert status("locclient", "replay", tmp_path / "rig.mcap", *arguments) == 0
     report = json.loads((tmp_path / "report.json").read_text())
     assert 20 <= report["frames"] <= 30
     assert report["localised_share_of_all"] > 0.5

@@ -1,20 +1,16 @@
 """The command line in this process."""
 
-import sys
-
 import pytest
 
-from mapserver import cli
+from support.command_line import status as status_of
 
 
 @pytest.fixture
-def run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+def run(capsys: pytest.CaptureFixture[str]):
     def run(*arguments: object, status: int = 0) -> str:
-        monkeypatch.setattr(sys, "argv", ["mapserver", *(str(a) for a in arguments)])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
+        found = status_of("mapserver", *arguments)
         told = capsys.readouterr()
-        assert int(end.value.code or 0) == status, told.err
+        assert found == status, told.err
         return told.out + told.err
 
     return run

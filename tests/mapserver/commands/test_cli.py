@@ -22,19 +22,12 @@ from mapserver.drafting.draft import BuildRequest, Draft
 from mapserver.quality.figures import Evidence, TileDirections
 from mapserver.store import DraftContent, MapStore
 from mapserver.survey.settings import SurveySettings
+from support.command_line import status
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
 REPOSITORY = Path(__file__).resolve().parents[3]
 HEAVY = ("numpy", "cv2", "scipy", "gtsam", "matplotlib", "zenoh", "fastapi", "rich.progress", "msgspec")
 HEAVY += ("jinja2", "starlette", "pydantic", "distributed", "dask", "mcap", "sqlite_utils", "tuf", "securesystemslib")
-
-
-def status(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> int:
-    """What the process would end with."""
-    monkeypatch.setattr(sys, "argv", ["mapserver", *(str(a) for a in arguments)])
-    with pytest.raises(SystemExit) as end:
-        cli.main()
-    return int(end.value.code or 0)
 
 
 @pytest.mark.parametrize("package", ["mapserver", "locclient"])
@@ -57,33 +50,31 @@ sys.argv = ["{package}", "--help"]
     assert done.stdout.splitlines()[-1] == "[]"
 
 
-def test_exit_statuses(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_exit_statuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with MapStore.open(tmp_path / "store", create=True) as maps:
         save_sample_draft(maps)
         maps.save("empty", DraftContent(tiles=[], vocabulary=b"w", details=draft_details()))
     to_store = ("--store", tmp_path / "store")
-    assert status(monkeypatch, "versions", "--site", "lab", *to_store) == 0
-    assert status(monkeypatch, "--help") == 0
-    assert status(monkeypatch, "build", "--site", "lab") == 2
-    assert status(monkeypatch, "calibrate") == 2
-    assert status(monkeypatch, "calibrate", tmp_path / "none.mcap") == 3
-    assert status(monkeypatch, "calibrate", tmp_path / "none.mcap", "--out", tmp_path / "no" / "o.yaml") == 2
-    assert status(monkeypatch, "calibrate", tmp_path / "none.mcap", "--guess", "752:0.1") == 2
-    assert status(monkeypatch, "no-such-command") == 2
-    assert status(monkeypatch, "versions", "--site", "unknown", *to_store) == 2
+    assert status("mapserver", "versions", "--site", "lab", *to_store) == 0
+    assert status("mapserver", "--help") == 0
+    assert status("mapserver", "build", "--site", "lab") == 2
+    assert status("mapserver", "calibrate") == 2
+    assert status("mapserver", "calibrate", tmp_path / "none.mcap") == 3
+    assert status("mapserver", "calibrate", tmp_path / "none.mcap", "--out", tmp_path / "no" / "o.yaml") == 2
+    assert status("mapserver", "calibrate", tmp_path / "none.mcap", "--guess", "752:0.1") == 2
+    assert status("mapserver", "no-such-command") == 2
+    assert status("mapserver", "versions", "--site", "unknown", *to_store) == 2
     capsys.readouterr()
-    assert status(monkeypatch, "build", tmp_path / "missing", "--site", "lab", *to_store) == 3
+    assert status("mapserver", "build", tmp_path / "missing", "--site", "lab", *to_store) == 3
     told = capsys.readouterr()
     assert told.out == ""
     assert told.err.startswith(f"error: {tmp_path / 'missing'} does not exist")
     assert "Traceback" not in told.err
-    assert status(monkeypatch, "publish", "--site", "empty", *to_store) == 4
-    assert status(monkeypatch, "publish", "--site", "lab", *to_store) == 0
+    assert status("mapserver", "publish", "--site", "empty", *to_store) == 4
+    assert status("mapserver", "publish", "--site", "lab", *to_store) == 0
 
 
-def test_publishing_says_which_way_nobody_drove(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_publishing_says_which_way_nobody_drove(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "store", create=True) as maps:
         tiles = [random_tile(np.random.default_rng(0), cell=(3, -1))]
         seen = Evidence(directions=[TileDirections((3, -1), {"E": 12}, {"W": 12})])
@@ -91,7 +82,7 @@ def test_publishing_says_which_way_nobody_drove(
             "lab",
             DraftContent(tiles=tiles, vocabulary=b"words", details=draft_details(), archive=b"archive", evidence=seen),
         )
-    assert status(monkeypatch, "publish", "--site", "lab", "--store", tmp_path / "store") == 0
+    assert status("mapserver", "publish", "--site", "lab", "--store", tmp_path / "store") == 0
     assert "tile 3,-1: 12 places face E and none near them W" in capsys.readouterr().out
 
 
@@ -100,10 +91,10 @@ def test_interruption_is_130(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli, "app", interrupted)
-    assert status(monkeypatch, "build") == 130
+    assert status("mapserver", "build") == 130
     monkeypatch.undo()
     monkeypatch.setattr("mapserver.store.MapStore.open", lambda *_, **__: interrupted())
-    assert status(monkeypatch, "versions", "--site", "lab", "--store", "s") == 130
+    assert status("mapserver", "versions", "--site", "lab", "--store", "s") == 130
     assert "Traceback" not in capsys.readouterr().err
 
 
@@ -129,9 +120,7 @@ def _keys(section: Section) -> dict[str, object]:
     return {field.encode_name: getattr(section, field.name) for field in msgspec.structs.fields(section)}
 
 
-def test_the_file_gives_defaults_and_the_command_line_wins(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_file_gives_defaults_and_the_command_line_wins(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Site and store are said once for all commands; a section of a command comes before them."""
     with MapStore.open(tmp_path / "store", create=True) as maps:
         for site in ("lab", "hall", "hall"):
@@ -140,9 +129,9 @@ def test_the_file_gives_defaults_and_the_command_line_wins(
     common = f'site = "lab"\nstore = "{tmp_path / "store"}"\n'
     file.write_text(f'{common}[versions]\njson = true\n[inspect]\nsite = "hall"\nversion = 2\n')
     for more, sites in (((), ["lab"]), (("--site", "hall"), ["hall", "hall"])):
-        assert status(monkeypatch, "--config", file, "versions", *more) == 0
+        assert status("mapserver", "--config", file, "versions", *more) == 0
         assert [info["site"] for info in json.loads(capsys.readouterr().out)] == sites
-    assert status(monkeypatch, "--config", file, "inspect") == 0
+    assert status("mapserver", "--config", file, "inspect") == 0
     assert "site hall version 2" in capsys.readouterr().out
 
 
@@ -162,8 +151,8 @@ def test_build_takes_its_settings_from_the_file(
         f'[build]\nsite = "lab"\nstore = "{tmp_path}"\nframes = "::3"\nframe_from_ground_truth = true\n'
         "[survey]\nseed = 7\n[survey.keyframes]\nmin_overlap = 0.5\n"
     )
-    assert status(monkeypatch, "build", "r", "--config", file) == 0
-    assert status(monkeypatch, "--config", file, "build", "r", "--frames", "::2") == 0
+    assert status("mapserver", "build", "r", "--config", file) == 0
+    assert status("mapserver", "--config", file, "build", "r", "--frames", "::2") == 0
     (order, settings), (second, _) = seen
     assert (order.site, order.store, order.options.frames) == ("lab", tmp_path, "::3")
     assert order.options.frame_from_ground_truth
@@ -183,13 +172,13 @@ def test_build_takes_its_settings_from_the_file(
     ],
 )
 def test_a_wrong_file_is_a_usage_error(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str, said: str
 ) -> None:
     file = tmp_path / "site.toml"
     file.write_text(text)
     with pytest.raises(UsageError, match=said):
         read_config(file, cli.COMMANDS)
-    assert status(monkeypatch, "build", "r", "--site", "lab", "--store", "s", "--config", file) == 2
+    assert status("mapserver", "build", "r", "--site", "lab", "--store", "s", "--config", file) == 2
     assert said in capsys.readouterr().err
 
 
@@ -197,9 +186,7 @@ def test_no_file_sets_nothing() -> None:
     assert read_config(None, cli.COMMANDS) == (MapserverConfig(), {})
 
 
-def test_evaluate_prints_the_errors(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_evaluate_prints_the_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """An estimate in another frame, one position of ten off by 0.1 m: errors follow by hand."""
     rng = np.random.default_rng(5)
     stamps = np.arange(10, dtype=np.int64) * 50_000_000
@@ -208,11 +195,11 @@ def test_evaluate_prints_the_errors(
     write_tum(tmp_path / "truth.tum", Trajectory(stamps, true))
     write_tum(tmp_path / "estimate.tum", Trajectory(stamps, shift @ true))
     both = ("evaluate", tmp_path / "estimate.tum", "--ground-truth", tmp_path / "truth.tum")
-    assert status(monkeypatch, *both, "--json") == 0
+    assert status("mapserver", *both, "--json") == 0
     found = json.loads(capsys.readouterr().out)
     assert found["ate_rmse_m"] < 1e-6
     assert found["unaligned_median_m"] == pytest.approx(5.0, abs=1e-6)
     assert (found["stamps"], found["matched"], found["evaluated_share"]) == (10, 10, 1.0)
-    assert status(monkeypatch, *both) == 0
+    assert status("mapserver", *both) == 0
     assert "ate_rmse_m" in capsys.readouterr().out
-    assert status(monkeypatch, "evaluate", tmp_path / "no.tum", "--ground-truth", tmp_path / "truth.tum") == 3
+    assert status("mapserver", "evaluate", tmp_path / "no.tum", "--ground-truth", tmp_path / "truth.tum") == 3

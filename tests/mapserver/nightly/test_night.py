@@ -10,7 +10,6 @@ import re
 import resource
 import signal
 import socket
-import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -35,7 +34,7 @@ from fleetmap.errors import (
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import OpenOptions, open_recording
 from fleetmap.sensors.samples import SensorSet
-from mapserver import cli, releases
+from mapserver import releases
 from mapserver.config import survey_settings
 from mapserver.drafting.draft import BuildOptions, BuildRequest, Draft
 from mapserver.drafting.survey_recordings import RecordingOptions, admit_recordings, survey_all
@@ -46,6 +45,7 @@ from mapserver.nightly.night import NightRequest, last_report, run_night
 from mapserver.quality.gate import GateSettings
 from mapserver.store import DraftContent, FleetRetention, MapStore
 from mapserver.survey.settings import SurveySettings
+from support.command_line import status
 from support.recordings.recording_samples import make_sample, write_euroc
 from support.storage.faulty_disk import Disk, install
 from support.storage.map_samples import draft_details, random_tile
@@ -574,11 +574,8 @@ def test_the_command_says_how_it_ended(
     hall: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     def run(*more: str) -> int:
-        words = ["nightly", "--site", "hall", "--inbox", str(hall / "inbox"), "--store", str(hall / "store")]
-        monkeypatch.setattr(sys, "argv", ["mapserver", *words, "--settle-s", "0", *more])
-        with pytest.raises(SystemExit) as end:
-            cli.main()
-        return int(end.value.code or 0)
+        words = ["nightly", "--site", "hall", "--inbox", hall / "inbox", "--store", hall / "store"]
+        return status("mapserver", *words, "--settle-s", "0", *more)
 
     assert run("--report", str(hall / "night.json")) == 0
     assert "version 1 published" in capsys.readouterr().out

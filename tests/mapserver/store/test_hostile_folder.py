@@ -14,9 +14,9 @@ import pytest
 
 from fleetmap.errors import StoreError
 from fleetmap.mapformat import blob_path, current_path
-from mapserver import cli
 from mapserver.store import MapStore, Retention
 from mapserver.store.files import keep_reserve, locked
+from support.command_line import status
 from support.storage.map_samples import publish_samples, save_sample_draft
 
 TESTS = Path(__file__).resolve().parents[2]
@@ -28,12 +28,6 @@ def root(tmp_path: Path) -> Path:
     with MapStore.open(tmp_path / "store", create=True) as store:
         publish_samples(store, 2)
     return tmp_path / "store"
-
-
-def run(*arguments: object) -> None:
-    """A command in this process; SystemExit with its status."""
-    sys.argv = ["mapserver", *(str(argument) for argument in arguments)]
-    cli.main()
 
 
 # ------------------------------------------------------------------------------------------------------------------- links
@@ -134,18 +128,15 @@ def test_a_store_is_for_its_owner_alone(tmp_path: Path, capsys: pytest.CaptureFi
             store.export_version("lab", 2, tmp_path / "lab.fmex")
             assert modes(tmp_path / "store") == {"0o600", "0o700"}, "with the database's log beside it"
         for command in (("verify",), ("gc",), ("versions", "--site", "lab")):
-            with pytest.raises(SystemExit):
-                run(*command, "--store", tmp_path / "store")
-        with pytest.raises(SystemExit):
-            run("import", tmp_path / "lab.fmex", "--store", tmp_path / "other")
+            status("mapserver", *command, "--store", tmp_path / "store")
+        status("mapserver", "import", tmp_path / "lab.fmex", "--store", tmp_path / "other")
     finally:
         os.umask(before)
     assert modes(tmp_path / "store") == modes(tmp_path / "other") == {"0o600", "0o700"}
     assert stat.S_IMODE(plain.stat().st_mode) & 0o044, "the control: others may read what is written without care"
     assert "other users" not in capsys.readouterr().out
     (tmp_path / "store" / "store.sqlite3").chmod(0o644)
-    with pytest.raises(SystemExit):
-        run("verify", "--store", tmp_path / "store")
+    status("mapserver", "verify", "--store", tmp_path / "store")
     assert "other users of this machine can read the store" in capsys.readouterr().out
 
 
@@ -190,10 +181,10 @@ def test_commands_that_read_work_where_nothing_may_be_written(
     read_only_root: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for command in READING:
-        with as_somebody_else(), pytest.raises(SystemExit) as end:
-            run(*command, "--store", read_only_root)
+        with as_somebody_else():
+            ended = status("mapserver", *command, "--store", read_only_root)
         told = capsys.readouterr()
-        assert not end.value.code, told.err
+        assert ended == 0, told.err
         assert told.out, command
     with as_somebody_else(), pytest.raises(StoreError, match="cannot be opened"):
         MapStore.open(read_only_root)  # the control
