@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -14,8 +15,8 @@ from fleetmap.sensors.samples import Trajectory
 from fleetmap.version_grid import encode_grid, grid_report
 from mapserver import releases
 from mapserver.grid.survey_grid import GridSession
-from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
-from mapserver.surfels.surfel_map import EDGE_M, TILE_SIZE_M, Surfels, SurfelTiles, encode_tile, surfel_report
+from mapserver.store import DraftContent, DraftDetails, MapStore
+from mapserver.surfels.surfel_map import EDGE_M, Surfels, encode_surfels, surfel_report
 from mapserver.surfels.survey_pictures import kept_pictures
 from mapserver.survey.survey_map import SurveyMap
 
@@ -104,14 +105,19 @@ def draft_details(**report: object) -> DraftDetails:
     )
 
 
-def save_sample_draft(
-    store: MapStore, *, site: str = "lab", seed: int = 0, vocabulary: bytes = b"words" * 50, actor: Actor = NOBODY
-) -> int:
+def save_sample_draft(store: MapStore, *, site: str = "lab", seed: int = 0, vocabulary: bytes = b"words" * 50) -> int:
     """A draft of two tiles."""
     rng = np.random.default_rng(seed)
     tiles = [random_tile(rng, cell=(1, 0)), random_tile(rng, cell=(0, 0))]
     content = DraftContent(tiles=tiles, vocabulary=vocabulary, details=draft_details(path_m=12.5), archive=b"archive")
-    return store.save(site, content, actor=actor).version
+    return store.save(site, content).version
+
+
+def _save_tile(store: MapStore, site: str, report: dict[str, object], **parts: Any) -> int:
+    """A draft of one tile, with these parts and what is reported of them."""
+    tiles, details = [random_tile(np.random.default_rng(0), cell=(0, 0))], draft_details(path_m=12.5, **report)
+    content = DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive", **parts)
+    return store.save(site, content).version
 
 
 def save_grid_draft(store: MapStore, seed: int = 0, *, site: str = "lab", surfels: Surfels | None = None) -> int:
@@ -125,12 +131,7 @@ def save_grid_draft(store: MapStore, seed: int = 0, *, site: str = "lab", surfel
     if surfels is not None:
         blobs = encode_surfels(surfels)
         said["surfels"] = msgspec.to_builtins(surfel_report(blobs, len(surfels), {}))
-    details = draft_details(path_m=12.5, **said)
-    tiles = [random_tile(np.random.default_rng(0), cell=(0, 0))]
-    content = DraftContent(
-        tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive", grid=grid, surfels=blobs
-    )
-    return store.save(site, content).version
+    return _save_tile(store, site, said, grid=grid, surfels=blobs)
 
 
 def wall(distance_m: float = 2.0, *, grey: int = 120, edge_level: int = 1) -> Surfels:
@@ -154,19 +155,14 @@ def seen_wall(*, with_board: bool = False) -> Surfels:
 def save_surfel_draft(store: MapStore, surfels: Surfels, *, site: str = "lab") -> int:
     """A draft with these surfels."""
     blobs = encode_surfels(surfels)
-    details = draft_details(path_m=12.5, surfels=msgspec.to_builtins(surfel_report(blobs, len(surfels), {})))
-    tiles = [random_tile(np.random.default_rng(0), cell=(0, 0))]
-    content = DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive", surfels=blobs)
-    return store.save(site, content).version
+    said = {"surfels": msgspec.to_builtins(surfel_report(blobs, len(surfels), {}))}
+    return _save_tile(store, site, said, surfels=blobs)
 
 
 def save_picture_draft(store: MapStore, sessions: Sequence[GridSession], *, site: str = "lab") -> int:
     """A draft with the pictures of these sessions."""
     blobs, said = kept_pictures(sessions, (), {}.__getitem__)
-    details = draft_details(path_m=12.5, pictures=msgspec.to_builtins(said))
-    tiles = [random_tile(np.random.default_rng(0), cell=(0, 0))]
-    content = DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive", pictures=blobs)
-    return store.save(site, content).version
+    return _save_tile(store, site, {"pictures": msgspec.to_builtins(said)}, pictures=blobs)
 
 
 def publish_samples(store: MapStore, count: int, *, first: int = 0, site: str = "lab") -> None:
