@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleetmap.encoding import to_json
 from fleetmap.geometry import se3_inverse
 from fleetmap.messages import Status
 from locclient.localization.estimate import Estimate
@@ -16,6 +15,7 @@ from locclient.maps.map_source import LocalMapSource
 from locclient.robot.robot import Robot
 from mapserver.fleet.building import keep_areas
 from mapserver.store import NOBODY, MapStore
+from support.drawn_areas import geojson
 from support.worlds import robot_world
 from support.worlds.building import SITES, house, strange
 
@@ -82,15 +82,7 @@ def test_a_site_without_a_building_is_as_before(folder: Path) -> None:
 
 
 def test_changes_of_floors_reach_the_robot_once(folder: Path) -> None:
-    cabin = [[1.0, 1.0], [3.0, 1.0], [3.0, 3.0], [1.0, 3.0], [1.0, 1.0]]
-    feature = {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [cabin]}}
-    lift = to_json(
-        {
-            "type": "FeatureCollection",
-            "frame": "map",
-            "features": [feature | {"properties": {"name": "a", "lift": "A"}}],
-        }
-    )
+    lift = geojson({"name": "a", "box": (1.0, 1.0, 3.0, 3.0), "lift": "A"})
     with house(folder, robot_world.tiles(), robot_world.tiles()) as store:
         floors = FloorMaps(LocalMapSource(folder, "low"), lambda other: LocalMapSource(folder, other))
         floors.refresh()

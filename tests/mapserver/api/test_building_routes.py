@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from mapserver.cli import app
 from mapserver.operators.operators import Operators
 from mapserver.store import Actor
+from support.drawn_areas import geojson
 from support.fleet.served_api import Server, check_problem, raw_put
 
 AREAS, ALIGNMENT = "/v1/sites/lab/areas", "/v1/sites/lab/alignment"
@@ -22,10 +23,7 @@ PINS = ["a=200,400:0,0", "b=200,0:20,0", "c=0,400:0,10"]
 
 
 def drawn(*names: str, frame: str = "map", **properties: object) -> bytes:
-    ring = [[0, 0], [4, 0], [4, 3], [0, 3], [0, 0]]
-    shape = {"type": "Polygon", "coordinates": [ring]}
-    features = [{"type": "Feature", "geometry": shape, "properties": {"name": name} | properties} for name in names]
-    return json.dumps({"type": "FeatureCollection", "frame": frame, "features": features}).encode()
+    return geojson(*({"name": name, "box": (0, 0, 4, 3)} | properties for name in names), frame=frame)
 
 
 def put(server: Server, content: bytes, **headers: str) -> httpx.Response:

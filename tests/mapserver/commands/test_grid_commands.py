@@ -1,6 +1,5 @@
 """The grid of a version: on its way through the store, written for planners, and refused where there is none."""
 
-import json
 import re
 from pathlib import Path
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from fleetmap.mapformat.grid_tile import TILE_CELLS
 from mapserver import releases
 from mapserver.store import MapStore, Retention
+from support.drawn_areas import geojson
 from support.storage.map_samples import save_grid_draft, save_sample_draft
 
 
@@ -86,25 +86,13 @@ def test_a_grid_travels_with_the_archive_and_goes_with_its_version(run, site, tm
     assert "damaged" in run("grid", "export", *site, tmp_path / "b.yaml", "--version", 4, status=3)
 
 
-def geojson(*features: dict[str, object], frame: str = "map") -> str:
-    """Rectangles: name, corners (low x, low y, high x, high y), further properties."""
-
-    def feature(name: str, box: tuple[float, ...], **more: object) -> dict[str, object]:
-        x0, y0, x1, y1 = box
-        ring = [[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]
-        geometry = {"type": "Polygon", "coordinates": [ring]}
-        return {"type": "Feature", "geometry": geometry, "properties": {"name": name} | more}
-
-    return json.dumps({"type": "FeatureCollection", "frame": frame, "features": [feature(**f) for f in features]})
-
-
 DOCK = {"name": "dock", "box": (1.0, 2.0, 2.0, 3.0), "mask": "keep-out"}
 SLOW = {"name": "crossing", "box": (4.0, 2.0, 6.0, 3.0), "mask": "speed", "percent": 30}
 SLOWER = {"name": "door", "box": (5.0, 2.0, 7.0, 3.0), "mask": "speed", "percent": 10}
 
 
 def test_masks_stay_with_the_site_and_are_written_for_costmap_filters(run, site, tmp_path: Path) -> None:
-    (tmp_path / "masks.json").write_text(geojson(DOCK, SLOW, SLOWER))
+    (tmp_path / "masks.json").write_bytes(geojson(DOCK, SLOW, SLOWER))
     assert "3 areas" in run("areas", "import", tmp_path / "masks.json", *site)
     with MapStore.open(tmp_path / "store") as store:
         save_grid_draft(store, 1)
@@ -125,7 +113,7 @@ def test_masks_stay_with_the_site_and_are_written_for_costmap_filters(run, site,
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("data", "words"),
     [
         (geojson(DOCK | {"box": (900.0, 2.0, 901.0, 3.0)}), "'dock' from .* outside of version 1"),
         (geojson(DOCK | {"mask": "slow"}), "slow.*keep-out"),
@@ -133,19 +121,19 @@ def test_masks_stay_with_the_site_and_are_written_for_costmap_filters(run, site,
         (geojson(SLOW | {"percent": None}), "mask speed with percent None"),
         (geojson(SLOW | {"percent": 100}), "percent"),
         (geojson(DOCK, frame="building"), "mapserver align"),
-        ("{}", "FeatureCollection"),
+        (b"{}", "FeatureCollection"),
     ],
 )
-def test_wrong_masks_are_refused_and_the_old_ones_stay(run, site, tmp_path: Path, text: str, words: str) -> None:
-    (tmp_path / "good.json").write_text(geojson(DOCK))
+def test_wrong_masks_are_refused_and_the_old_ones_stay(run, site, tmp_path: Path, data: bytes, words: str) -> None:
+    (tmp_path / "good.json").write_bytes(geojson(DOCK))
     run("areas", "import", tmp_path / "good.json", *site)
-    (tmp_path / "masks.json").write_text(text)
+    (tmp_path / "masks.json").write_bytes(data)
     assert re.search(words, run("areas", "import", tmp_path / "masks.json", *site, status=2))
     assert "1 areas" in run("areas", "list", *site)
 
 
 def test_masks_over_half_a_country_are_refused(run, site, tmp_path: Path) -> None:
     far = DOCK | {"name": "far", "box": (0.0, 0.0, 5000.0, 5000.0)}
-    (tmp_path / "masks.json").write_text(geojson(DOCK, far))
+    (tmp_path / "masks.json").write_bytes(geojson(DOCK, far))
     run("areas", "import", tmp_path / "masks.json", *site)
     assert "100001 x 100001 cells" in run("areas", "export", *site, "--keep-out", tmp_path / "k.yaml", status=2)

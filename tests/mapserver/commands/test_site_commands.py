@@ -15,6 +15,7 @@ from mapserver import releases
 from mapserver.api.metrics import Metrics
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import FailureFilter, MapStore, Retention
+from support.drawn_areas import geojson
 from support.storage.map_samples import publish_samples, save_sample_draft
 
 # The map's x axis points up in the picture, 0.05 m a pixel, its origin at 10, -20 m.
@@ -100,13 +101,8 @@ def test_what_gives_no_alignment_is_refused_and_changes_nothing(run, site, tmp_p
     assert run("align", *site, "--show") == before
 
 
-def aisle(name: str, x0: float, y0: float, x1: float, y1: float) -> dict[str, object]:
-    ring = [[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]
-    return {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [ring]}, "properties": {"name": name}}
-
-
-def write_areas(path: Path, frame: str, *features: object) -> Path:
-    path.write_text(json.dumps({"type": "FeatureCollection", "frame": frame, "features": features}))
+def write_areas(path: Path, frame: str, *areas: tuple[object, ...]) -> Path:
+    path.write_bytes(geojson(*({"name": name, "box": box} for name, *box in areas), frame=frame))
     return path
 
 
@@ -115,7 +111,7 @@ def test_failures_and_figures_are_named_by_areas(run, site, tmp_path: Path) -> N
     with MapStore.open(tmp_path / "store") as store:
         fleet = Fleet(store)
         fleet.take_failure("lab", "r1", placed_failure("f1", 3.0, 4.0))
-    aisles = write_areas(tmp_path / "map.json", "map", aisle("aisle 5", 0, 0, 8, 8), aisle("gate", 20, 0, 24, 8))
+    aisles = write_areas(tmp_path / "map.json", "map", ("aisle 5", 0, 0, 8, 8), ("gate", 20, 0, 24, 8))
     assert "2 areas (aisle 5, gate)" in run("areas", "import", aisles, *site)
     with MapStore.open(tmp_path / "store") as store:
         fleet = Fleet(store)
@@ -135,7 +131,7 @@ def test_failures_and_figures_are_named_by_areas(run, site, tmp_path: Path) -> N
     run("fleet", "report", tmp_path / "shift.html", *site)
     assert "gate" in (tmp_path / "shift.html").read_text()
     run("align", *site, *pins(*PINS))
-    drawn = write_areas(tmp_path / "building.json", "building", aisle("hall", 0, -25, 12, -10))
+    drawn = write_areas(tmp_path / "building.json", "building", ("hall", 0, -25, 12, -10))
     run("areas", "import", drawn, *site)
     with MapStore.open(tmp_path / "store") as store:
         assert [row.area for row in store.fleet.failures(FailureFilter())] == [None, None, "hall"]
@@ -150,9 +146,9 @@ def test_failures_and_figures_are_named_by_areas(run, site, tmp_path: Path) -> N
 
 
 def test_areas_that_are_none_change_nothing(run, site, tmp_path: Path) -> None:
-    run("areas", "import", write_areas(tmp_path / "good.json", "map", aisle("aisle 5", 0, 0, 8, 8)), *site)
-    degrees = write_areas(tmp_path / "wgs84.json", "wgs84", aisle("aisle 5", 13.4, 52.5, 13.5, 52.6))
-    crossed = write_areas(tmp_path / "crossed.json", "map", aisle("a", 0, 0, 1, 1), aisle("a", 0, 0, 1, 1))
+    run("areas", "import", write_areas(tmp_path / "good.json", "map", ("aisle 5", 0, 0, 8, 8)), *site)
+    degrees = write_areas(tmp_path / "wgs84.json", "wgs84", ("aisle 5", 13.4, 52.5, 13.5, 52.6))
+    crossed = write_areas(tmp_path / "crossed.json", "map", ("a", 0, 0, 1, 1), ("a", 0, 0, 1, 1))
     for file, words in ((degrees, "frame"), (crossed, "twice"), (tmp_path / "none.json", "cannot be read")):
         assert words in run("areas", "import", file, *site, status=2)
     assert run("areas", "list", *site) == "aisle 5: 64.0 m2\n1 areas\n"

@@ -18,17 +18,14 @@ from mapserver.floor_plan.alignment import Alignment, encode_alignment
 from mapserver.releases import publish
 from mapserver.store import NOBODY, MapStore
 from mapserver.trust.signing import admitted_versions
+from support.drawn_areas import geojson
 from support.fleet.dashboard_scene import serving
 from support.room_site import run
 from support.storage.map_samples import save_sample_draft
 
-CABIN = [[1.0, 1.0], [3.0, 1.0], [3.0, 3.0], [1.0, 3.0], [1.0, 1.0]]
 
-
-def areas(**properties: str) -> bytes:
-    feature = {"type": "Feature", "geometry": {"type": "Polygon", "coordinates": [CABIN]}}
-    named = feature | {"properties": {"name": "cabin", **properties}}
-    return to_json({"type": "FeatureCollection", "frame": "map", "features": [named]})
+def areas(lift: str, frame: str = "map") -> bytes:
+    return geojson({"name": "cabin", "box": (1.0, 1.0, 3.0, 3.0), "lift": lift}, frame=frame)
 
 
 @pytest.fixture
@@ -42,7 +39,7 @@ def house(tmp_path: Path) -> Path:
                 frame = BuildingFrame(x_m=10.0 * number, y_m=0.0, yaw_rad=0.0)
                 aligned = Alignment(frame=frame, metres_per_unit=1.0, method="pins", plan=None, off_m={})
                 store.keep_site_files(site, {"alignment": encode_alignment(aligned)}, "")
-                keep_areas(store, site, areas(lift="A"), "", NOBODY)
+                keep_areas(store, site, areas("A"), "", NOBODY)
         save_sample_draft(store, site="draft")
     return tmp_path
 
@@ -118,8 +115,7 @@ def test_the_page_of_maps_leads_to_the_other_floors(house: Path) -> None:
 
 def test_lifts_drawn_in_the_building_come_back_in_the_map(house: Path) -> None:
     with MapStore.open(house) as store:
-        data = areas(lift="B").replace(b'"frame":"map"', b'"frame":"building"')
-        keep_areas(store, "hall-2", data, "", NOBODY)
+        keep_areas(store, "hall-2", areas("B", "building"), "", NOBODY)
         alignment = store.alignment("hall-2")
         assert alignment is not None
         (ring,) = read_lifts(store.site_file("hall-2", AREAS), alignment.frame)["B"]

@@ -1,6 +1,5 @@
 """A hall as an operator finds it: two weeks of driving in four named aisles, one of which got worse, and what failed yesterday at 14:03."""
 
-import json
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -16,7 +15,8 @@ from mapserver.fleet_statistics.kpis import Counters, hour_of
 from mapserver.store import Actor, DraftContent, MapStore
 from mapserver.store.fleet_queries import FleetBatch
 from mapserver.store.rows import TraceRow
-from mapserver.surfels.surfel_map import Surfels, surfel_report
+from mapserver.surfels.surfel_map import Surfels, encode_surfels, surfel_report
+from support.drawn_areas import geojson
 from support.fleet.dashboard_scene import (
     AISLE_M,
     LENGTH_M,
@@ -43,20 +43,11 @@ def yesterday(hour: int, minute: int) -> int:
 
 def aisles() -> bytes:
     """Three aisles and the dock as GeoJSON; the rest of the hall has no name."""
-    boxes = {
-        f"aisle {n + 1}": (8.0, 2.0 + AISLE_M * n, LENGTH_M - 3, 2.0 + AISLE_M * (n + 1) - 0.1)
+    aisles = [
+        {"name": f"aisle {n + 1}", "box": (8.0, 2.0 + AISLE_M * n, LENGTH_M - 3, 2.0 + AISLE_M * (n + 1) - 0.1)}
         for n in range(int(WIDTH_M / AISLE_M) - 1)
-    }
-    boxes["dock"] = (0.0, 0.0, 7.9, WIDTH_M)
-    features = [
-        {
-            "type": "Feature",
-            "properties": {"name": name},
-            "geometry": {"type": "Polygon", "coordinates": [[[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]]},
-        }
-        for name, (x0, y0, x1, y1) in boxes.items()
     ]
-    return json.dumps({"type": "FeatureCollection", "frame": "map", "features": features}).encode()
+    return geojson(*aisles, {"name": "dock", "box": (0.0, 0.0, 7.9, WIDTH_M)})
 
 
 def rack_surfels(level: int = 3) -> Surfels:
