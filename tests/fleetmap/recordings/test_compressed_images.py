@@ -49,8 +49,8 @@ def compressed(stamp_ns: int, form: str, data: bytes) -> bytes:
     return bytes(STORE.serialize_cdr(message, TYPE))
 
 
-def with_images(topic: str, form: str, data: bytes, kept: str = "/cam0/") -> list[Message]:
-    messages = [m for m in foreign_messages() if m[0].startswith((kept, "/imu0", "/tf")) and m[0] != topic]
+def with_images(topic: str, form: str, data: bytes) -> list[Message]:
+    messages = [m for m in foreign_messages() if m[0].startswith(("/cam0/", "/imu0", "/tf")) and m[0] != topic]
     return messages + [(topic, "sensor_msgs/CompressedImage", s, compressed(s, form, data)) for s in STAMPS_NS]
 
 

@@ -30,12 +30,12 @@ def frame(
     return FrameRecord(round(t_s * 1e9), status, fix, covariance, error, angle, cpu_s, wall_s, stages, *about)
 
 
-def sequence(*stretches: tuple[float, dict[str, object]], step_s: float = 0.1) -> list[FrameRecord]:
+def sequence(*stretches: tuple[float, dict[str, object]]) -> list[FrameRecord]:
     """Frames at 10 Hz, so many seconds of each kind; what is not said is good tracking."""
     frames: list[FrameRecord] = []
     for seconds, kind in stretches:
-        for _ in range(round(seconds / step_s)):
-            frames.append(frame(len(frames) * step_s, **kind))  # type: ignore[arg-type]
+        for _ in range(round(seconds / 0.1)):
+            frames.append(frame(len(frames) * 0.1, **kind))  # type: ignore[arg-type]
     return frames
 
 

@@ -36,9 +36,9 @@ class Clock:
 
 
 @contextmanager
-def asking(server: Server, address: str, clock: Clock | None = None, later_s: float = 0.0) -> Iterator[TestClient]:
+def asking(server: Server, address: str, later_s: float = 0.0) -> Iterator[TestClient]:
     """A client at an address, of a server as `serve` makes it. later_s: passes between the proxy's word and the question."""
-    clock = clock or Clock()
+    clock = Clock()
     proxy = SignInProxy(SignInProxy.of([PROXY], GROUPS).addresses, SignInProxy.of([PROXY], GROUPS).roles, clock)
     guard = GuardSettings(operators=Operators(server.store), must_sign_in=True, proxy=proxy)
     app = create_app(server.store, server.fleet, Metrics(server.store, server.fleet), None, None, ApiSettings(guard))

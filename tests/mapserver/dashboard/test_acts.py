@@ -324,7 +324,7 @@ def test_publish_promote_and_roll_back_ask_first(page: Page, tmp_path: Path) -> 
 def test_what_the_gate_refuses_is_told_and_can_be_forced(page: Page, tmp_path: Path) -> None:
     fill_store(tmp_path)
     with MapStore.open(tmp_path) as store:
-        thin = [tile for tile in hall_tiles(1) if (tile.tile_x, tile.tile_y) == (0, 0)]
+        thin = [tile for tile in hall_tiles() if (tile.tile_x, tile.tile_y) == (0, 0)]
         store.save(SITE, DraftContent(tiles=thin, vocabulary=b"words" * 50, details=draft_details()))
     with serving(tmp_path) as served:
         opened(page, served, "map", version=4)

@@ -98,7 +98,7 @@ def test_a_plan_shows_landmarks_where_they_are(store: MapStore) -> None:
         row, column = int((plan.high_m[1] - y_m) / scale_m), int((x_m - plan.low_m[0]) / scale_m)
         return int(picture[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3, 3].max())
 
-    points = np.concatenate([tile.points_map for tile in hall_tiles(1, shifted_m=0.2)])
+    points = np.concatenate([tile.points_map for tile in hall_tiles(shifted_m=0.2)])
     assert all(alpha(x, y) > 100 for x, y, _ in points[::50])
     assert alpha(LENGTH_M / 2, 4.0) == 0, "between rack and aisle nothing was seen"
     assert data.plan(SITE, 2) is plan, "made once"
@@ -118,8 +118,8 @@ def test_the_map_page_names_the_way_that_nobody_drove(store: MapStore) -> None:
 def test_a_plan_without_tiles_and_one_without_places(store: MapStore) -> None:
     manifest = store.manifest(SITE, 2)
     empty = make_plan(_with_tiles(manifest, ()), lambda _: pytest.fail("there is none"))
-    assert (empty.low_m, empty.high_m) == ((-5.0, -5.0), (5.0, 5.0))
-    (tile,) = (tile for tile in hall_tiles(1) if (tile.tile_x, tile.tile_y) == (0, 0))
+    assert empty.size_m == (10.0, 10.0)
+    (tile,) = (tile for tile in hall_tiles() if (tile.tile_x, tile.tile_y) == (0, 0))
     bare = replace(tile, place_ids=tile.place_ids[:0], map_from_cam=tile.map_from_cam[:0], place_landmark_ids=())
     entry = next(entry for entry in manifest.tiles if (entry.x, entry.y) == (0, 0))
     alone = make_plan(_with_tiles(manifest, (entry,)), lambda _: bare)

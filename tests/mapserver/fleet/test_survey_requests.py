@@ -89,7 +89,7 @@ def test_a_published_survey_of_it_ends_it(store: MapStore) -> None:
     half, whole = (ask_for_survey(store, SITE, [(x, 2.0), (x + 6, 2.0), (x, 9.0)], ADA).id for x in (10.0, 30.0))
     said = {half: 0.6, whole: 0.95, "ffffffff": 1.0, "x": "1"}
     details = draft_details(path_m=213.0, surveyed_requests=said)
-    content = DraftContent(tiles=hall_tiles(1), vocabulary=b"words" * 50, details=details)
+    content = DraftContent(tiles=hall_tiles(), vocabulary=b"words" * 50, details=details)
     version = store.save(SITE, content).version
     assert {request.id for request in store.survey_requests(SITE)} == {half, whole}
     releases.publish(store, SITE, version)

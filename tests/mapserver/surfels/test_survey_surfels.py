@@ -38,12 +38,12 @@ def test_a_room_is_shown_as_a_frame_that_was_left_out_saw_it(has_depth: bool) ->
     assert tiles.blobs() == grown(session_at(kept, has_depth=has_depth)).blobs()
 
 
-def with_box(session: GridSession, shown: range, depth_m: float = 1.2) -> GridSession:
+def with_box(session: GridSession, shown: range) -> GridSession:
     """The session of a depth camera before which something stands, in some of the frames."""
     for number in shown:
         seen = session.survey.odometry.keyframes[number]
         left, disparity = seen.frame.left.copy(), seen.frame.disparity_px.copy()
-        left[80:160, 120:200], disparity[80:160, 120:200] = 255, FOCAL * BASELINE_M / depth_m
+        left[80:160, 120:200], disparity[80:160, 120:200] = 255, FOCAL * BASELINE_M / 1.2
         session.survey.odometry.keyframes[number] = Seen(RectifiedFrame(number, left, None, disparity), number)
     return session
 

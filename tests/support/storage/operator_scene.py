@@ -81,7 +81,7 @@ def fill_shift(folder: Path) -> None:
             if blobs:
                 report["surfels"] = msgspec.to_builtins(surfel_report(blobs, len(surfels), {}))
             content = DraftContent(
-                tiles=hall_tiles(1, shifted_m=0.2 * (number - 1)), vocabulary=b"words" * 50,
+                tiles=hall_tiles(shifted_m=0.2 * (number - 1)), vocabulary=b"words" * 50,
                 details=draft_details(**report), surfels=blobs,
             )  # fmt: skip
             store.save(SITE, content, actor=ada)
