@@ -12,6 +12,7 @@ from fleetmap.errors import FleetmapError
 from fleetmap.messages import Status
 from fleetmap.recordings import open_recording
 from locclient import LocalizeOptions, LocalizerSettings, MapView, Relocalizer, fetch_map, finished, localize
+from locclient.maps.map_client import MapClient
 from mapserver.store import MapStore
 from support.recordings.recording_samples import write_euroc
 from support.worlds import robot_world
@@ -63,7 +64,8 @@ def test_a_recording_is_localized_in_a_store(drive: Path, store: Path, tmp_path:
     np.testing.assert_array_equal(again.map_from_body, result.map_from_body)
 
 
-def test_what_cannot_be_had_is_said(drive: Path, store: Path, tmp_path: Path) -> None:
+def test_what_cannot_be_had_is_said(drive: Path, store: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(MapClient.__init__.__kwdefaults__, "timeout_s", 0.3)
     for recording, maps, site, words in (
         (tmp_path / "nowhere", store, robot_world.SITE, "nowhere"),
         (drive, tmp_path / "nostore", robot_world.SITE, "nostore"),

@@ -10,6 +10,7 @@ import pytest
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
+from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import LocalMapSource
 from locclient.prior_option import parse_prior
 from mapserver.store import MapStore
@@ -69,7 +70,10 @@ def test_any_version_of_a_store_can_be_replayed_in(store: Path) -> None:
             assert wanted.manifest_sha256 == maps.version(site, sha256).manifest_sha256
 
 
-def test_bad_input_ends_with_3(walk: Path, store: Path, tmp_path: Path, capsys: Said) -> None:
+def test_bad_input_ends_with_3(
+    walk: Path, store: Path, tmp_path: Path, capsys: Said, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(MapClient.__init__.__kwdefaults__, "timeout_s", 0.3)
     (tmp_path / "empty").mkdir()
     (tmp_path / "zero.mcap").write_bytes(b"")
     (tmp_path / "calibration.yaml").write_text("cam0: 7\n")
