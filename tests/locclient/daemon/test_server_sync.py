@@ -32,6 +32,7 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
+from support.fleet.reports import blindness
 from support.storage.map_samples import publish_samples, save_sample_draft
 
 
@@ -113,10 +114,7 @@ def world(tmp_path: Path) -> Iterator[World]:
 
 
 def report(name: str) -> QueuedReport:
-    message = FailureReport(
-        site="lab", robot="r1", id=name, stamp_ns=1, wall_ns=1, duration_s=2.0, kind="blind", status="LOST", cause="dark", version=1
-    )  # fmt: skip
-    return QueuedReport(name, encode_message(message))
+    return QueuedReport(name, encode_message(blindness(name)))
 
 
 def adopt(world: World) -> WantedVersion:

@@ -11,13 +11,14 @@ import pytest
 
 from fleetmap.errors import StoreError
 from fleetmap.mapformat import TILE_FORMAT, blob_path, decode_manifest, decode_tile, sha256_hex
-from fleetmap.messages import FailureReport, RobotAck, RobotHealth, Thumbnail
+from fleetmap.messages import RobotAck, RobotHealth, Thumbnail
 from mapserver.api import app as app_module
 from mapserver.api import request_limits
 from mapserver.quality.figures import Evidence, RigEvidence
 from mapserver.store import DraftContent
 from mapserver.trust import init_here
 from mapserver.trust.enrolment import RobotRegister
+from support.fleet.reports import blindness
 from support.fleet.served_api import Server, check_problem
 from support.storage.map_samples import draft_details, random_tile, save_sample_draft
 
@@ -164,10 +165,7 @@ def test_the_server_says_how_it_is(server: Server, monkeypatch: pytest.MonkeyPat
     init_here(server.store)
     RobotRegister(server.store).authorities.init(["localhost"], None, None)
     jpeg = b"\xff\xd8" + bytes(3000) + b"\xff\xd9"
-    failure = FailureReport(
-        site="lab", robot="r1", id="f1", stamp_ns=5, wall_ns=6, duration_s=2.5, kind="blind", status="LOST", cause="dark",
-        version=1, thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=jpeg),),
-    )  # fmt: skip
+    failure = blindness(thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=jpeg),))
     assert not server.fleet.take_failure("lab", "r1", failure).refused
     found = server.client.get("/v1/server").json()
     used = found["store"]

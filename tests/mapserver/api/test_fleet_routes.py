@@ -4,24 +4,18 @@ import time
 from datetime import UTC, datetime, timedelta
 from urllib.parse import quote
 
-import msgspec
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from fleetmap.messages import FailureReport, RobotAck, RobotHealth, Thumbnail
 from mapserver.store import FailureReplay
+from support.fleet.reports import blindness
 from support.fleet.served_api import Server, check_problem
 
 
 def failure(number: int, **changes: object) -> FailureReport:
-    return msgspec.structs.replace(
-        FailureReport(
-            site="lab", robot="r1", id=f"f{number}", stamp_ns=5, wall_ns=time.time_ns(), duration_s=2.5, kind="blind",
-            status="LOST", cause="dark", version=1, tile=(0, 0),
-            thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=b"\xff\xd8picture\xff\xd9"),),
-        ),
-        **changes,
-    )  # fmt: skip
+    seen = (Thumbnail(stamp_ns=5, kind="frame", jpeg=b"\xff\xd8picture\xff\xd9"),)
+    return blindness(f"f{number}", **{"wall_ns": time.time_ns(), "tile": (0, 0), "thumbnails": seen} | changes)
 
 
 def test_failures_are_found_by_what_they_are(server: Server) -> None:

@@ -17,7 +17,7 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from fleetmap.messages import CameraNote, FailureReport, Placement, RobotHealth, Thumbnail
+from fleetmap.messages import CameraNote, Placement, RobotHealth, Thumbnail
 from mapserver import releases
 from mapserver.api.app import create_app
 from mapserver.api.guard import GuardSettings
@@ -37,6 +37,7 @@ from mapserver.trust import init_here
 from mapserver.trust.enrolment import RobotRegister
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.fleet.quick_passwords import use_quick_passwords
+from support.fleet.reports import blindness
 from support.storage.map_samples import publish_samples, save_grid_draft, save_picture_draft, wall
 from support.storage.room_sessions import session_at
 
@@ -49,9 +50,8 @@ AREAS = (
     b'"geometry":{"type":"Polygon","coordinates":[[[0,0],[1,0],[1,1],[0,0]]]}}]}'
 )
 POLYGON = [(1.0, 1.0), (3.0, 1.0), (3.0, 3.0)]
-FAILURE = FailureReport(
-    site="hall", robot="r1", id="f1", stamp_ns=5, wall_ns=6, duration_s=2.5, kind="blind", status="LOST", cause="dark",
-    version=1, tile=(0, 0), innovation=float("nan"), radius_95_m=float("inf"),
+FAILURE = blindness(
+    site="hall", tile=(0, 0), innovation=float("nan"), radius_95_m=float("inf"),
     map_from_base=Placement(position_m=(float("nan"), 1.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0)),
     thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=b"\xff\xd8\xff\xd9"),),
 )  # fmt: skip

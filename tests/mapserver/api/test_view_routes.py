@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import se3
-from fleetmap.messages import CameraNote, FailureReport, Placement
+from fleetmap.messages import CameraNote, Placement
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import FailureFilter
+from support.fleet.reports import blindness
 from support.fleet.served_api import Server, check_problem, served_api
 from support.storage.map_samples import (
     save_grid_draft,
@@ -130,10 +131,7 @@ def reported(server: Server, version: int | None, **changes: object) -> str:
     camera = CameraNote(size_px=(640, 480), focal_px=600.0, centre_px=(319.5, 239.5), base_from_cam=mounted)
     given = {"camera": camera, "map_from_base": Placement.of(se3(np.eye(3), np.array([-0.3, -1.0, -0.2])))} | changes
     number = len(server.store.fleet.failures(FailureFilter())) + 1
-    report = FailureReport(
-        site="lab", robot="r1", id=f"f{number}", stamp_ns=1, wall_ns=1, duration_s=3.0, kind="blind", status="LOST", cause="dark",
-        version=version, **given,
-    )  # fmt: skip
+    report = blindness(f"f{number}", version=version, **given)
     assert not Fleet(server.store).take_failure("lab", "r1", report).refused
     return f"/v1/failures/{number}/expected.png"
 

@@ -16,6 +16,7 @@ from mapserver.api.metrics import Metrics
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import FailureFilter, MapStore, Retention
 from support.drawn_areas import geojson
+from support.fleet.reports import blindness
 from support.storage.map_samples import publish_samples, save_sample_draft
 
 # The map's x axis points up in the picture, 0.05 m a pixel, its origin at 10, -20 m.
@@ -31,10 +32,8 @@ def site(tmp_path: Path) -> tuple[str, ...]:
 
 
 def placed_failure(failure_id: str, x_m: float, y_m: float) -> FailureReport:
-    return FailureReport(
-        site="lab", robot="r1", id=failure_id, stamp_ns=5, wall_ns=6, duration_s=2.5, kind="blind", status="LOST",
-        cause="dark", version=1, map_from_base=Placement(position_m=(x_m, y_m, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0)),
-    )  # fmt: skip
+    place = Placement(position_m=(x_m, y_m, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0))
+    return blindness(failure_id, map_from_base=place)
 
 
 def pins(*chosen: str) -> list[str]:

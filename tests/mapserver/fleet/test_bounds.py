@@ -16,6 +16,7 @@ from mapserver.fleet.rate_limit import RateLimit
 from mapserver.serving.bus_service import BusService
 from mapserver.store import Actor, FailureFilter, FleetRetention, MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
+from support.fleet.reports import blindness
 from support.storage.clock import Clock
 from support.storage.map_samples import publish_samples
 
@@ -40,10 +41,8 @@ def fleet(store: MapStore, clock: Clock) -> Fleet:
 
 
 def failure(clock: Clock, number: int, robot: str = "r1", jpeg: bytes = b"") -> FailureReport:
-    return FailureReport(
-        site="lab", robot=robot, id=f"f{number}", stamp_ns=1, wall_ns=clock.now_ns, duration_s=1.0, kind="blind", status="LOST",
-        cause="dark", version=1, thumbnails=(Thumbnail(stamp_ns=1, kind="frame", jpeg=jpeg),) if jpeg else (),
-    )  # fmt: skip
+    pictures = (Thumbnail(stamp_ns=1, kind="frame", jpeg=jpeg),) if jpeg else ()
+    return blindness(f"f{number}", robot, wall_ns=clock.now_ns, thumbnails=pictures)
 
 
 def send(fleet: Fleet, clock: Clock, number: int, robot: str = "r1", jpeg: bytes = b"") -> bool:

@@ -22,6 +22,7 @@ from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, kpis
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.store import FailureFilter, FleetRetention, MapStore
 from support.fleet.made_fleet import NS, SPEED_MPS, Known, MadeRobot, drive
+from support.fleet.reports import blindness
 from support.storage.map_samples import publish_samples
 
 START_NS = 490_000 * HOUR_NS + 1700 * NS  # an hour ends in the middle
@@ -369,10 +370,7 @@ def test_settings_reach_the_retention() -> None:
 
 def test_a_place_that_is_no_number_is_none(site: Site) -> None:
     nowhere = Placement(position_m=(float("nan"), 1.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0))
-    report = FailureReport(
-        site="lab", robot="r1", id="f1", stamp_ns=1, wall_ns=START_NS, duration_s=1.0, kind="blind", status="LOST", cause="dark",
-        version=1, tile=None, map_from_base=nowhere,
-    )  # fmt: skip
+    report = blindness(wall_ns=START_NS, tile=None, map_from_base=nowhere)
     assert site.fleet.take_failure("lab", "r1", report).refused == ""
     (row,) = site.store.fleet.failures(FailureFilter())
     assert row.x_map_m is None

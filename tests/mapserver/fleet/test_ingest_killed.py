@@ -8,8 +8,9 @@ from pathlib import Path
 from benchmarks.fleet.server_process import serving
 from fleetmap.bus import Bus
 from fleetmap.errors import FleetmapError
-from fleetmap.messages import FailureAck, FailureReport, Thumbnail, decode_message, encode_message, robot_key
+from fleetmap.messages import FailureAck, Thumbnail, decode_message, encode_message, robot_key
 from mapserver.store import FailureFilter, MapStore
+from support.fleet.reports import blindness
 from support.storage.map_samples import publish_samples
 
 ROBOTS, FAILURES = 4, 20
@@ -25,11 +26,8 @@ class Robot(threading.Thread):
     def run(self) -> None:
         with Bus.connect(self._endpoint) as bus:
             for number in range(FAILURES):
-                report = FailureReport(
-                    site="lab", robot=self._name, id=f"f{number}", stamp_ns=number, wall_ns=time.time_ns(), duration_s=3.0,
-                    kind="blind", status="LOST", cause="dark", version=1, tile=(0, 0),
-                    thumbnails=(Thumbnail(stamp_ns=number, kind="frame", jpeg=b"\xff\xd8" + bytes(20_000) + b"\xff\xd9"),),
-                )  # fmt: skip
+                seen = (Thumbnail(stamp_ns=number, kind="frame", jpeg=b"\xff\xd8" + bytes(20_000) + b"\xff\xd9"),)
+                report = blindness(f"f{number}", self._name, wall_ns=time.time_ns(), tile=(0, 0), thumbnails=seen)
                 while (self._name, report.id) not in self._acknowledged:
                     try:
                         answer = bus.get(

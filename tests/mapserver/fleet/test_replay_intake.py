@@ -8,12 +8,13 @@ import pytest
 
 from fleetmap.errors import LinkError, UsageError
 from fleetmap.failure_summary import ReplayPart
-from fleetmap.messages import FailureAck, FailureReport, encode_message
+from fleetmap.messages import FailureAck, encode_message
 from mapserver.fleet import replay_intake
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.ingest import IngestSettings
 from mapserver.store import MapStore
 from support.fleet.failed_robot import small_file
+from support.fleet.reports import blindness
 from support.storage.clock import Clock
 from support.storage.map_samples import publish_samples
 
@@ -25,10 +26,7 @@ class Server:
     clock: Clock
 
     def report(self, name: str = "f1", robot: str = "r1") -> None:
-        report = FailureReport(
-            site="lab", robot=robot, id=name, stamp_ns=1, wall_ns=self.clock.now_ns, duration_s=1.0, kind="blind", status="LOST",
-            cause="dark", version=1,
-        )  # fmt: skip
+        report = blindness(name, robot, wall_ns=self.clock.now_ns)
         assert self.fleet.take_failure("lab", robot, report).refused == ""
 
     def send(self, data: bytes, name: str = "f1", robot: str = "r1", part_bytes: int = 50_000) -> FailureAck:

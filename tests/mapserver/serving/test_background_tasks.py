@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from fleetmap.errors import StoreError
-from fleetmap.messages import FailureReport, RobotHealth
+from fleetmap.messages import RobotHealth
 from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet_statistics.canary_decision import CanarySettings
@@ -15,6 +15,7 @@ from mapserver.serving.background_tasks import BackgroundTask, run_background_ta
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
+from support.fleet.reports import blindness
 from support.storage.map_samples import publish_samples, save_sample_draft
 
 NS = 1_000_000_000
@@ -70,11 +71,8 @@ def test_the_server_takes_a_bad_version_back_by_itself(tmp_path: Path, monkeypat
                 )  # fmt: skip
                 fleet.take_health("lab", robot, health)
         for number in range(8):
-            report = FailureReport(
-                site="lab", robot="r1", id=f"f{number}", stamp_ns=number * NS, wall_ns=store.canaries()[0].started_ns + NS,
-                duration_s=3.0, kind="blind", status="LOST", cause="changed", version=2,
-            )  # fmt: skip
-            fleet.take_failure("lab", "r1", report)
+            at_ns = store.canaries()[0].started_ns + NS
+            fleet.take_failure("lab", "r1", blindness(f"f{number}", wall_ns=at_ns, cause="changed", version=2))
         run_for(server_tasks(store, fleet, service, CanarySettings()), 2.0)
         (canary,) = store.canaries("lab")
         assert canary.state == "rolled_back", canary

@@ -11,7 +11,6 @@ from fleetmap.errors import LinkError, MapFormatError, UnreachableError
 from fleetmap.mapformat import blob_path, sha256_hex
 from fleetmap.messages import (
     FailureAck,
-    FailureReport,
     PoseMessage,
     RobotAck,
     RobotHealth,
@@ -31,6 +30,7 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.serving import bus_service
 from mapserver.store import Actor, FailureFilter, MapStore
 from support.fleet.memory_bus import MemoryBus
+from support.fleet.reports import blindness
 from support.fleet.served_world import World, served_world
 from support.storage.map_samples import publish_samples, save_grid_draft, save_sample_draft
 
@@ -272,10 +272,7 @@ def test_presence_is_what_the_bus_shows(world: World) -> None:
 
 
 def test_a_failure_is_acknowledged_when_it_is_on_the_disk(world: World) -> None:
-    report = FailureReport(
-        site="lab", robot="r1", id="f-1", stamp_ns=5, wall_ns=10**18 - 1, duration_s=2.5, kind="blind", status="LOST",
-        cause="dark", version=1, tile=(0, 0),
-    )  # fmt: skip
+    report = blindness("f-1", wall_ns=10**18 - 1, tile=(0, 0))
     key = robot_key("lab", "r1", "failures")
     for _ in range(2):
         ack = decode_message(world.robot_bus.get(key, encode_message(report)), FailureAck)

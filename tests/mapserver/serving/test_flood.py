@@ -21,7 +21,6 @@ from fleetmap.errors import LinkError
 from fleetmap.mapformat import sha256_hex
 from fleetmap.messages import (
     FailureAck,
-    FailureReport,
     Part,
     RobotAck,
     RobotHealth,
@@ -33,22 +32,12 @@ from fleetmap.messages import (
 )
 from mapserver.store import Actor, FailureFilter, MapStore, TokenRow
 from support.fleet.dashboard_scene import Served, serving
+from support.fleet.reports import blindness
 from support.storage.map_samples import publish_samples
 
 SECONDS = float(os.environ.get("FLOOD_SECONDS", "1.5"))
 PICTURE = Thumbnail(stamp_ns=1, kind="frame", jpeg=b"\xff\xd8" + bytes(60_000) + b"\xff\xd9")
-FAILURE = FailureReport(
-    site="lab",
-    robot="flood",
-    id="f",
-    stamp_ns=1,
-    wall_ns=1,
-    duration_s=1.0,
-    kind="blind",
-    status="LOST",
-    cause="",
-    version=1,
-)
+FAILURE = blindness("f", "flood", cause="")
 
 
 def memory_mb(served: Served, name: str = "VmRSS") -> float:

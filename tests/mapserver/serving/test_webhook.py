@@ -18,7 +18,7 @@ import yaml
 from fastapi.testclient import TestClient
 
 from fleetmap.errors import UsageError
-from fleetmap.messages import FailureReport, RobotHealth
+from fleetmap.messages import RobotHealth
 from mapserver import releases
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
@@ -29,6 +29,7 @@ from mapserver.serving import webhook
 from mapserver.serving.webhook import AlertWatch, Webhook, check_address
 from mapserver.store import DiskSpace, MapStore
 from support.fleet.contracts_documents import REPOSITORY
+from support.fleet.reports import blindness
 from support.fleet.webhook_receiver import receiver
 from support.storage.clock import Clock
 from support.storage.map_samples import publish_samples
@@ -99,11 +100,7 @@ def test_a_rate_is_too_high_only_when_chance_does_not_explain_it(store: MapStore
         clock.now_ns += 10**9
         fleet.take_health("lab", "r1", health("TRACKING", number))
     for number, wanted in enumerate([0, 0, 0, 1]):
-        report = FailureReport(
-            site="lab", robot="r1", id=f"f{number}", stamp_ns=5, wall_ns=clock(), duration_s=2.5, kind="blind",
-            status="LOST", cause="dark", version=1,
-        )  # fmt: skip
-        assert not fleet.take_failure("lab", "r1", report).refused
+        assert not fleet.take_failure("lab", "r1", blindness(f"f{number}", wall_ns=clock())).refused
         fleet.flush()
         found = active_alerts(store, fleet, AlertSettings(), clock())
         assert len(found) == wanted, f"after {number + 1} failures in two hours"

@@ -30,7 +30,6 @@ from fleetmap.bus.endpoints import with_free_port  # noqa: E402
 from fleetmap.errors import FleetmapError  # noqa: E402
 from fleetmap.messages import (  # noqa: E402
     FailureAck,
-    FailureReport,
     WantedVersion,
     decode_message,
     encode_message,
@@ -39,6 +38,7 @@ from fleetmap.messages import (  # noqa: E402
 from mapserver.store import FailureFilter, MapStore, chain_faults  # noqa: E402
 from mapserver.store.places import Places  # noqa: E402
 from mapserver.trust import init_here  # noqa: E402
+from support.fleet.reports import blindness  # noqa: E402
 from support.storage.map_samples import publish_samples  # noqa: E402
 from support.storage.postgres_server import postgres_server  # noqa: E402
 from support.storage.s3_server import KEYS, s3_server  # noqa: E402
@@ -130,10 +130,7 @@ class Robot(threading.Thread):
                     self._ask(bus)
 
     def _report(self, bus: Bus, number: str) -> None:
-        report = FailureReport(
-            site="lab", robot=self.robot, id=number, stamp_ns=1, wall_ns=time.time_ns(), duration_s=3.0, kind="blind",
-            status="LOST", cause="dark", version=1, tile=(0, 0),
-        )  # fmt: skip
+        report = blindness(number, self.robot, wall_ns=time.time_ns(), tile=(0, 0))
         answer = self._answer(bus, "failures", encode_message(report), 60.0)[0]
         if answer is not None and decode_message(answer, FailureAck) == FailureAck(id=report.id):
             self.acknowledged.add(report.id)
