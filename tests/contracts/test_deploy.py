@@ -257,7 +257,7 @@ def test_rules_fire_when_they_should(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_the_kernel_takes_the_rules_of_the_firewall(tmp_path: Path) -> None:
+def test_the_kernel_takes_the_rules_of_the_firewall() -> None:
     """Twice, in a network of its own."""
     nft, unshare = shutil.which("nft"), shutil.which("unshare")
     alone = [str(unshare), "--map-root-user", "--net"]

@@ -334,7 +334,7 @@ def learned(client: MapClient) -> float | None:
     return None if frame is None else frame.x_m
 
 
-def test_a_robot_learns_an_alignment_without_another_version(world: World, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_robot_learns_an_alignment_without_another_version(world: World) -> None:
     client = world.client()
     client.ready()
     assert learned(client) is None

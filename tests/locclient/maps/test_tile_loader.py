@@ -96,7 +96,7 @@ def test_a_place_on_another_floor_bounds_no_tiles_of_its_own_site() -> None:
     assert tracker.handle(estimate(2.0, Status.LOST, known=False)).position_map_m is None
 
 
-def test_bad_tiles_are_left_out(row: tuple[Path, MapStore], tmp_path: Path) -> None:
+def test_bad_tiles_are_left_out(row: tuple[Path, MapStore]) -> None:
     folder, store = row
     manifest = store.manifest("row", 1)
     victim = folder / blob_path(manifest.tiles[4].sha256)

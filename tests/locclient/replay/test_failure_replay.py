@@ -354,9 +354,7 @@ def test_damaged_and_other_recordings_are_refused(carried: Carried, tmp_path: Pa
         read_failure_file(tmp_path / "other.mcap")
 
 
-def test_the_command_answers(
-    carried: Carried, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_answers(carried: Carried, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     given = (carried.file, "--store", carried.folder / "store")
     for version, is_same in (((), True), (("--version", 1), True), (("--version", 2), False)):
         ended = status("locclient", "replay", *given, *version, "--report", tmp_path / "report.json")

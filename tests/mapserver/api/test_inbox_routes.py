@@ -284,7 +284,7 @@ with MapStore.open(folder / "store", create=True) as store:
         assert [job.state for job in store.jobs("lab")] in ([], ["failed"], ["running"]), "it did not come to its end"
 
 
-def test_a_server_without_an_inbox_says_how_to_get_one(server: Server, tmp_path: Path) -> None:
+def test_a_server_without_an_inbox_says_how_to_get_one(tmp_path: Path) -> None:
     with served_api(tmp_path / "other") as bare:
         for answer in (
             bare.client.get(INBOX),

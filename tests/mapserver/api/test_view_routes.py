@@ -83,7 +83,7 @@ def test_wrong_poses_are_told(server: Server, address: str, wrong: dict[str, obj
     assert server.client.get(address, params=asked).status_code == 422
 
 
-def test_a_version_without_surfels_and_one_that_is_not_there_are_told(server: Server, address: str) -> None:
+def test_a_version_without_surfels_and_one_that_is_not_there_are_told(server: Server) -> None:
     bare = save_sample_draft(server.store)
     answer = server.client.get(f"/v1/sites/lab/versions/{bare}/view.png", params=POSE)
     assert answer.status_code == 409

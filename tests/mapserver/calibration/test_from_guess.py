@@ -65,7 +65,7 @@ def test_lenses_are_found_from_a_focal_length_of_the_image_width(loop: Stretch) 
     assert np.linalg.norm(right.body_from_cam[:3, 3] - left.body_from_cam[:3, 3]) == pytest.approx(0.12)
 
 
-def test_a_drive_without_turns_shows_no_focal_length(loop: Stretch) -> None:
+def test_a_drive_without_turns_shows_no_focal_length() -> None:
     straight = make_stretch(Order("small-loop", seed=1), 3.0, 2.0, step_s=0.3, per_frame=80)
     seen = matches(straight, straight.session.true, range(0, 6), 1)
     with pytest.raises(RecordingError, match="turns"):

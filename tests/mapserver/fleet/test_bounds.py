@@ -138,7 +138,7 @@ def test_a_failure_has_a_size(store: MapStore, fleet: Fleet, clock: Clock, monke
     assert fleet.take_failure_bytes("lab", "r1", large).refused == "", "the control"
 
 
-def test_text_that_a_database_cannot_hold_is_refused(store: MapStore, fleet: Fleet, clock: Clock) -> None:
+def test_text_that_a_database_cannot_hold_is_refused(fleet: Fleet, clock: Clock) -> None:
     """One robot's report would keep those of all others from the database."""
     nul = msgspec.structs.replace(failure(clock, 1), cause="dark\0")
     assert "matching regex" in fleet.take_failure_bytes("lab", "r1", encode_message(nul)).refused

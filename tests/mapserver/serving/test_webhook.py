@@ -179,9 +179,7 @@ def test_a_hostile_receiver_is_left_after_its_time(
         thread.join()
 
 
-def test_a_dead_receiver_costs_a_bounded_queue(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_dead_receiver_costs_a_bounded_queue(caplog: pytest.LogCaptureFixture) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
     sender = Webhook(AlertSettings(webhook=f"http://127.0.0.1:{port}/"))

@@ -74,7 +74,7 @@ def test_verify_names_what_is_wrong(store: MapStore, tmp_path: Path) -> None:
     assert (found.leftovers, found.orphans) == (int(is_folder), 2)
 
 
-def test_garbage_goes_in_steps_and_nothing_that_is_used(store: MapStore, tmp_path: Path, clock: Clock) -> None:
+def test_garbage_goes_in_steps_and_nothing_that_is_used(store: MapStore, clock: Clock) -> None:
     publish_samples(store, 5)
     for seed in range(10, 14):
         save_sample_draft(store, seed=seed)

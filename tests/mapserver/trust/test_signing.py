@@ -215,7 +215,7 @@ RETIRED = {
 
 @pytest.mark.parametrize(("what", "change", "words"), RETIRED.values(), ids=RETIRED)
 def test_what_earlier_fleetmaps_made_is_refused_by_name(
-    store: MapStore, caplog: pytest.LogCaptureFixture, what: str, change: dict[str, int], words: str
+    store: MapStore, what: str, change: dict[str, int], words: str
 ) -> None:
     """Several keys, tokens, a signing account: a server would be weaker than its owner set up, or could never sign again."""
     lists, root_key = SignedLists(store.folder), KeyFolder(store.folder / "keys").signer("root")
