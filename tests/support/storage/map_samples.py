@@ -16,7 +16,7 @@ from fleetmap.version_grid import encode_grid, grid_report
 from mapserver import releases
 from mapserver.grid.survey_grid import GridSession
 from mapserver.store import DraftContent, DraftDetails, MapStore
-from mapserver.surfels.surfel_map import EDGE_M, Surfels, encode_surfels, surfel_report
+from mapserver.surfels.surfel_map import EDGE_M, TILE_SIZE_M, Surfels, SurfelTiles, encode_tile, surfel_report
 from mapserver.surfels.survey_pictures import kept_pictures
 from mapserver.survey.survey_map import SurveyMap
 

@@ -15,7 +15,7 @@ from mapserver.fleet_statistics.kpis import Counters, hour_of
 from mapserver.store import Actor, DraftContent, MapStore
 from mapserver.store.fleet_queries import FleetBatch
 from mapserver.store.rows import TraceRow
-from mapserver.surfels.surfel_map import Surfels, encode_surfels, surfel_report
+from mapserver.surfels.surfel_map import Surfels, surfel_report
 from support.drawn_areas import geojson
 from support.fleet.dashboard_scene import (
     AISLE_M,
