@@ -192,6 +192,8 @@ class McapFile(KeptBytes):
             if len(content) < _MESSAGE_HEAD.size:
                 raise ValueError("it ends too early")
             channel_id, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content)
+            if channel_id not in self._channels:
+                self._read_index()  # its own record may be in a damaged chunk
             channel = self._channels.get(channel_id)
             if channel is None:
                 raise ValueError(f"message of an unknown channel {channel_id}")
@@ -232,10 +234,15 @@ class McapFile(KeptBytes):
 
     def _next_indexed_chunk(self, after: int) -> int | None:
         """Start of the first chunk after `after`, by the index at the file's end; None without one."""
+        chunk_starts = self._read_index()
+        behind = bisect_right(chunk_starts, after)
+        return chunk_starts[behind] if behind < len(chunk_starts) else None
+
+    def _read_index(self) -> list[int]:
+        """Starts of the chunks by the index at the file's end, empty without one; schemas and channels there are kept."""
         if self._chunk_starts is None:
             self._chunk_starts = sorted(self._indexed_chunks())
-        behind = bisect_right(self._chunk_starts, after)
-        return self._chunk_starts[behind] if behind < len(self._chunk_starts) else None
+        return self._chunk_starts
 
     def _indexed_chunks(self) -> Iterator[int]:
         tail_bytes = _RECORD_HEAD.size + 20 + len(MAGIC)  # footer and end mark
@@ -247,14 +254,17 @@ class McapFile(KeptBytes):
         while 0 < at <= self.size - _RECORD_HEAD.size:
             self._file.seek(at)
             opcode, length = _RECORD_HEAD.unpack(self._file.read(_RECORD_HEAD.size))
-            if opcode == Opcode.CHUNK_INDEX and length <= _MAX_RECORD_BYTES:
-                self.keep(0)
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX) and length <= _MAX_RECORD_BYTES:
+                content = memoryview(self._file.read(length))
                 try:
-                    chunk_at = _parsed(opcode, self._file.read(length)).chunk_start_offset
+                    record = _parsed(opcode, content)
                 except ValueError:
                     return
-                if chunk_at < summary_at:
-                    yield chunk_at
+                if opcode != Opcode.CHUNK_INDEX:
+                    self._keep_record(record, content)
+                elif record.chunk_start_offset < summary_at:
+                    self.keep(0)
+                    yield record.chunk_start_offset
             at += _RECORD_HEAD.size + length
 
     def _note(self, what: str, detail: str) -> None:

@@ -116,6 +116,18 @@ def test_one_bad_chunk_costs_itself_alone(whole: bytes, tmp_path: Path) -> None:
         assert_nothing_is_invented(recording)
 
 
+@pytest.mark.parametrize("offset", [6, 20_000])  # in the length of its record, in its content
+def test_a_bad_first_chunk_costs_itself_alone(whole: bytes, tmp_path: Path, offset: int) -> None:
+    """The channels of all messages are described in it, and again in the index."""
+    data = bytearray(whole)
+    data[_chunk_positions(whole)[0] + offset] ^= 0x40
+    with open_recording(write_bytes(tmp_path, bytes(data))) as recording:
+        assert 5 <= len(recording) < len(SAMPLE.left)
+        assert recording.frame_stamps_ns[-1] == SAMPLE.stamps_ns[-1]
+        assert not any(issue.what == "a damaged record" for issue in recording.issues)
+        assert_nothing_is_invented(recording)
+
+
 def test_a_bad_record_length_is_stepped_over_by_the_index(whole: bytes, tmp_path: Path) -> None:
     """The length of the second chunk becomes absurd; the third is found by the index at the file's end."""
     data = bytearray(whole)
