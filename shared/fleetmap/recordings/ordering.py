@@ -89,7 +89,7 @@ def _note_dropped(stamps_ns: Stamps, kept: NDArray[np.bool_], what: str, log: Re
     if not len(dropped):
         return
     steps = np.diff(stamps_ns)
-    share, first = f"{len(dropped)} of {len(kept)}", int(dropped[0])
+    share = f"{len(dropped)} of {len(kept)}"
     if (steps >= 0).all():
         first_ns = stamps_ns[np.flatnonzero(steps == 0)[0]]
         log.note(
@@ -100,10 +100,10 @@ def _note_dropped(stamps_ns: Stamps, kept: NDArray[np.bool_], what: str, log: Re
             "let it stamp each one when it is measured"
         )
     else:
-        step_s = float(stamps_ns[first] - stamps_ns[max(first - 1, 0)]) * 1e-9
+        back = int(np.flatnonzero(steps < 0)[0])
         log.note(
             f"{what}: stamps not increasing",
-            f"{share} left out; the first is {stamps_ns[first]}, {step_s:+.3f} s from the one before",
+            f"{share} left out; the first step back is {steps[back] * 1e-9:.3f} s, from {stamps_ns[back]} to {stamps_ns[back + 1]}",
         )
         fault = f"stamps go backwards, {share} do not fit; the sensor's clock is broken, record again"
     if len(dropped) > len(kept) // 2:

@@ -152,6 +152,15 @@ def test_one_stamp_far_away_costs_itself(what: str, row: int, shift_ns: int) -> 
     assert re.search(r" [(]?[-+]\d+\.\d+ s", issue.detail)
 
 
+def test_a_clock_set_back_is_named_where_it_was() -> None:
+    """A second is driven twice; whichever of the two is left out, the step back lies between them."""
+    stamps_ns = 10**18 + 50_000_000 * np.r_[0:40, 20:70]
+    log = ReadLog()
+    assert forward_only(stamps_ns, "imu", log).sum() == 70
+    (issue,) = log.issues
+    assert issue.detail.endswith(f"the first step back is -0.950 s, from {stamps_ns[39]} to {stamps_ns[40]}")
+
+
 @pytest.mark.parametrize(
     "stamps_s",
     [
