@@ -100,7 +100,9 @@ def test_every_fault_can_be_asked_for(name: str) -> None:
     assert parse_fault(f"{name}@8+2.5") == Fault(name, 8.0, 10.5)
 
 
-@pytest.mark.parametrize("text", ["rain@1+2", "imu-gap", "imu-gap@x+1", "imu-gap@-1+1", "imu-gap@1+0"])
+@pytest.mark.parametrize(
+    "text", ["rain@1+2", "imu-gap", "imu-gap@x+1", "imu-gap@-1+1", "imu-gap@1+0", "imu-gap@nan+1", "imu-gap@1+inf"]
+)
 def test_nonsense_faults_are_refused(text: str) -> None:
     with pytest.raises(UsageError, match="fault"):
         parse_fault(text)

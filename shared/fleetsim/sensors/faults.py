@@ -1,5 +1,6 @@
 """Faults, by name and time. To add one: a line in FAULTS and its effect below."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,8 +47,8 @@ def parse_fault(text: str) -> Fault:
     except ValueError as error:
         wanted = "NAME@START+DURATION in seconds, such as camera-dark@8+2"
         raise UsageError(f"fault {text!r} should read {wanted}") from error
-    if start_s < 0 or duration_s <= 0:
-        raise UsageError(f"fault {text!r} has a negative start or no duration")
+    if not (0 <= start_s < math.inf and 0 < duration_s < math.inf):
+        raise UsageError(f"fault {text!r} needs a start of 0 s or later and a duration above 0 s")
     return Fault(name, start_s, start_s + duration_s)
 
 
