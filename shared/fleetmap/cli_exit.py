@@ -5,6 +5,7 @@ import shlex
 import sys
 from collections.abc import Callable
 from itertools import pairwise
+from pathlib import Path
 
 from fleetmap.errors import FleetmapError, UsageError
 
@@ -44,9 +45,14 @@ def run_cli(app: Callable[[], object]) -> None:
 
 
 def runnable(text: str, arguments: list[str]) -> str:
-    """Add site and store, or the settings file, of this command line to the `mapserver` commands in a text: they run as printed."""
+    """Add site and store, or the settings file, of this command line to the `mapserver` commands in a text: they run as printed.
+
+    The settings file of a robot is none of theirs.
+    """
     given = dict(pair for pair in pairwise(arguments) if pair[0].startswith("--"))
     given |= dict(word.split("=", 1) for word in arguments if word.startswith("--") and "=" in word)
+    if "locclient" in Path(arguments[0]).parts[-2:]:  # the program, or `python -m locclient`
+        given.pop("--config", None)
 
     def completed(printed: re.Match[str]) -> str:
         command = printed[1]

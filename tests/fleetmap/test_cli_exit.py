@@ -52,6 +52,12 @@ def test_commands_in_an_error_run_as_printed(arguments: str, told: str) -> None:
     assert runnable(text, ["mapserver", *shlex.split(arguments)]) == text.replace("mapserver versions", told)
 
 
+@pytest.mark.parametrize("program", ["/opt/mapserver/bin/locclient", "/src/locclient/__main__.py"])
+def test_a_robots_settings_are_not_told_to_the_server(program: str) -> None:
+    text = "`mapserver robots list`"
+    assert runnable(text, [program, "run", "--config", "robot.toml"]) == text
+
+
 def distribution(*requires: str) -> SimpleNamespace:
     return SimpleNamespace(requires=list(requires), version="9.9", read_text={"WHEEL": "Tag: cp399-any\n"}.get)
 
