@@ -157,12 +157,12 @@ def occupancy(tiles: Mapping[tuple[int, int], Counts], robot_height_m: float) ->
     A cell is occupied if anything is between the floor and the robot's top, free if all of that was seen empty, else unknown.
     Raises UsageError for a height outside the grid, and for a grid with more cells than a planner's map may have.
     """
-    levels = int(np.ceil((robot_height_m - FLOOR_M) / SLICE_M - 1e-9))
+    levels = np.ceil((robot_height_m - FLOOR_M) / SLICE_M - 1e-9)
     if not 1 <= levels <= SLICES:
         raise UsageError(
             f"a robot of {robot_height_m} m; the grid covers heights above {FLOOR_M} m and up to {TOP_M:.2f} m"
         )
-    below = np.uint8((1 << levels) - 1)
+    below = np.uint8((1 << int(levels)) - 1)
 
     def states(cells: Counts) -> NDArray[np.int8]:
         is_free = (cells[..., 1] & below) == below

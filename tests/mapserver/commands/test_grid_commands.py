@@ -51,6 +51,7 @@ def test_wrong_orders_are_told(run, site, tmp_path: Path) -> None:
     assert "has no version 7" in run("grid", "export", *site, tmp_path / "a.yaml", "--version", 7, status=2)
     assert "up to 2.10 m" in run("grid", "export", *site, tmp_path / "a.yaml", "--robot-height", "3", status=2)
     assert "above 0.1 m" in run("grid", "export", *site, tmp_path / "a.yaml", "--robot-height", "0.1", status=2)
+    assert "a robot of nan m" in run("grid", "export", *site, tmp_path / "a.yaml", "--robot-height", "nan", status=2)
     assert "must end in .yaml" in run("grid", "export", *site, tmp_path / "a.pgm", status=2)
     assert "folder that exists" in run("grid", "export", *site, tmp_path / "no" / "a.yaml", status=2)
     with MapStore.open(tmp_path / "store") as store:
