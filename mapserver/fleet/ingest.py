@@ -18,6 +18,7 @@ from mapserver.floor_plan.areas import OUTSIDE, Areas
 from mapserver.store import CanaryRow, CounterKey, FleetBatch, FleetRetention, MapStore, TraceRow, tile_key
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
+Days = Annotated[float, msgspec.Meta(gt=0, le=36_500)]  # a century: 64 bits of nanoseconds hold three
 PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
 _CANARIES_KEPT_NS = _AREAS_KEPT_NS = 1_000_000_000
 _LEAST_BETWEEN_TRACES_NS = 900_000_000
@@ -39,13 +40,13 @@ class IngestSettings(Section, frozen=True):
     """
 
     trace_every_s: Positive = 10.0
-    trace_days: Positive = 2.0
-    tally_days: Positive = 400.0
-    failure_days: Positive = 400.0
-    picture_days: Positive = 30.0
-    replay_days: Positive = 30.0
-    survey_picture_days: Positive = 400.0
-    recording_days: Positive = 400.0
+    trace_days: Days = 2.0
+    tally_days: Days = 400.0
+    failure_days: Days = 400.0
+    picture_days: Days = 30.0
+    replay_days: Days = 30.0
+    survey_picture_days: Days = 400.0
+    recording_days: Days = 400.0
     picture_bytes: PositiveInt = 1_000_000_000  # above, the oldest pictures are deleted
     replay_bytes: PositiveInt = 2_000_000_000  # above, the oldest recordings are deleted
 

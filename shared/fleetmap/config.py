@@ -4,6 +4,7 @@ Settings come in three tiers. A file may set user and tuning settings; each prog
 field of a section is an internal constant: it has its reason beside it in the code, and no key in a file.
 """
 
+import math
 import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -83,10 +84,20 @@ def load_toml(path: Path, section_type: type[S]) -> S:
 
 
 def read_given(path: Path, file_type: type[Section]) -> dict[str, Any]:
-    """Return the keys that the file at `path` sets, checked against `file_type`; UsageError as `load_toml`."""
+    """Return the keys that the file at `path` sets, checked against `file_type`; UsageError as `load_toml`, and for impossible numbers."""
     _decoded(path, file_type)
     given: dict[str, Any] = _decoded(path, dict[str, Any])
+    _check_numbers(path, given)
     return given
+
+
+def _check_numbers(path: Path, given: Mapping[str, Any], section: str = "") -> None:
+    """Raise UsageError for a negative or endless number: no setting has one, and NaN passes every comparison with a limit."""
+    for key, value in given.items():
+        if isinstance(value, dict):
+            _check_numbers(path, value, f"{section}{key}.")
+        elif isinstance(value, int | float) and not 0 <= value < math.inf:
+            raise UsageError(f"configuration file {path}: {section}{key} = {value}: give a finite number, 0 or more")
 
 
 def _decoded(path: Path, kind: Any) -> Any:

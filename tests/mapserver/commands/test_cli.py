@@ -169,6 +169,11 @@ def test_build_takes_its_settings_from_the_file(
         ("[biuld]", "biuld"),
         ("[survey.bundle]\nlambda_start = 1e-3", "survey.bundle.lambda_start is an internal constant now"),
         ("[build", "site.toml"),
+        ("[source]\nspeed = -1.0", "source.speed = -1.0: give a finite number, 0 or more"),
+        ("[survey.keyframes]\nmin_overlap = nan", "survey.keyframes.min_overlap = nan"),
+        ("[alerts]\nlost_s = inf", "alerts.lost_s = inf"),
+        ("[ingest]\nfailure_days = 1e6", "ingest.failure_days"),
+        ("[build]\nthreads = -1", "build.threads = -1"),
     ],
 )
 def test_a_wrong_file_is_a_usage_error(
