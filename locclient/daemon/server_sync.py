@@ -21,6 +21,7 @@ from locclient.robot.version_trial import Change, VersionChange
 _ASK_EVERY_S = 60.0
 _UPKEEP_EVERY_S = 3600.0
 _BACKOFF_S, _MAX_BACKOFF_S = 1.0, 30.0
+_AWAY_S = 10.0  # without a connection before the log says so: shorter gaps of a radio network are usual
 _REPLAY_PART_EVERY_S = 1.0  # a quarter of a megabyte: two megabits a second
 _log = logging.getLogger(__name__)
 
@@ -67,6 +68,7 @@ class ServerSync:
             self._offered.add(self._running.manifest_sha256 or "")
         self._not_before_s: dict[str, float] = {}
         self._ask_at_s, self._silent_until_s, self._backoff_s = 0.0, 0.0, _BACKOFF_S
+        self._connected_s, self._is_away_told = clock_s(), False
         self._announced: deque[WantedVersion] = deque(maxlen=1)
         self._last_ack: tuple[int | None, str] | None = None
         self.priors: deque[PositionPrior] = deque(maxlen=4)  # poses set by operators
@@ -80,7 +82,7 @@ class ServerSync:
         """Do all due work. Return early if the server does not answer, then wait with exponential backoff."""
         self._handle_changes()
         now_s = self._clock_s()
-        if now_s < self._silent_until_s or not self.client.connected():
+        if not self._is_connected(now_s) or now_s < self._silent_until_s:
             return
         try:
             # First: after a renewal whose response was lost, the server admits no other request.
@@ -102,6 +104,20 @@ class ServerSync:
             self._ask_at_s = max(self._ask_at_s, now_s + _MAX_BACKOFF_S)
         else:
             self._backoff_s = _BACKOFF_S
+
+    def _is_connected(self, now_s: float) -> bool:
+        """True if a peer is reachable. The log says once that none is, and when one is again."""
+        if self.client.connected():
+            if self._is_away_told:
+                self._refusals.warning("connected again", "connected to the map server again")
+            self._connected_s, self._is_away_told = now_s, False
+            return True
+        if not self._is_away_told and now_s - self._connected_s >= _AWAY_S:
+            self._is_away_told = True
+            running = "no map until then" if self._running is None else f"version {self._running.version} goes on"
+            words = "no connection to the map server for %.0f s: is it running, and is %s its zenoh endpoint? %s"
+            self._refusals.warning("no connection", words, now_s - self._connected_s, self.client.endpoint, running)
+        return False
 
     def close(self) -> None:
         for handle in self._handles:

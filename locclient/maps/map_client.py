@@ -163,6 +163,11 @@ class MapClient(MapSource):
         """Return the number of map bytes received over the bus so far."""
         return self._chunks.received_bytes
 
+    @property
+    def endpoint(self) -> str:
+        """Return the endpoint of the map server."""
+        return self._bus.endpoint
+
     def connected(self) -> bool:
         """Return True if a peer is reachable now."""
         return self._bus.connected()

@@ -233,7 +233,7 @@ class Bus:
             if refusals:
                 raise query_refused(key, refusals[0])
             time.sleep(min(_RETRY_S, max(0.0, deadline - time.monotonic())))
-        raise no_answer(key, timeout_s, is_silenced=self._tls is not None and self.connected())
+        raise no_answer(key, self.endpoint, timeout_s, is_silenced=self._tls is not None and self.connected())
 
     def publish(self, key: str, payload: bytes, *, may_drop: bool = False, attachment: bytes = b"") -> None:
         """Publish to all subscribers; having none is not an error. `may_drop`: drop the message instead of waiting for a congested network.
@@ -405,7 +405,7 @@ def deliver(listen: Listen, key: str, payload: bytes) -> None:
         _log.exception("the subscriber for %r failed", key[:200])
 
 
-def no_answer(key: str, timeout_s: float, *, is_silenced: bool = False) -> UnreachableError:
+def no_answer(key: str, endpoint: str, timeout_s: float, *, is_silenced: bool = False) -> UnreachableError:
     """Error of a query without a reply. is_silenced: a server is there, and it knows the client's certificate."""
     why = "is the server running and reachable?"
     if is_silenced:
@@ -413,7 +413,7 @@ def no_answer(key: str, timeout_s: float, *, is_silenced: bool = False) -> Unrea
             "the server is there and lets this certificate say nothing: revoked, enrolled anew, or of another site? "
             "`mapserver robots list` shows it"
         )
-    return UnreachableError(f"no reply for {key} within {timeout_s:g} s; {why}")
+    return UnreachableError(f"no reply for {key} from {endpoint} within {timeout_s:g} s; {why}")
 
 
 def query_refused(key: str, reason: str) -> LinkError:

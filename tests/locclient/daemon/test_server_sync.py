@@ -254,6 +254,23 @@ def test_ten_minutes_without_a_network_cost_no_report_and_double_none(world: Wor
     assert world.outbox.counts() == {"waiting": 0, "delivered": 12, "dropped": 0, "refused": 0}
 
 
+def test_a_server_that_is_not_there_is_named_once_an_outage(world: World, caplog: pytest.LogCaptureFixture) -> None:
+    """Without `--verbose`: a wrong [run] server left an empty log, and a warning that pointed to it."""
+    world.hub.reachable = False
+    for _ in range(300):
+        world.step(1.0)
+    world.hub.reachable = True
+    world.step()
+    assert [record.getMessage() for record in caplog.records if record.levelname == "WARNING"] == [
+        "no connection to the map server for 10 s: is it running, and is tls/0.0.0.0:7447 its zenoh endpoint? no map until then",
+        "connected to the map server again",
+    ]
+    adopt(world)
+    world.hub.reachable = False
+    world.step(1.0)
+    assert len(caplog.records) == 2, "a short gap is no news"
+
+
 def test_a_report_that_the_server_refuses_does_not_hold_up_the_others(world: World) -> None:
     world.refuse = "the disk is full"
     world.outbox.put(report("a"))

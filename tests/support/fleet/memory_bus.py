@@ -76,7 +76,7 @@ class MemoryBus(Bus):
             ]
         may_ask = hub.passes(own, Direction.IN, Act.QUERY, key) and hub.passes(own, Direction.OUT, Act.REPLY, key)
         if not hub.reachable or not answers or not may_ask:
-            raise no_answer(key, timeout_s, is_silenced=hub.access is not None and own is not None)
+            raise no_answer(key, self.endpoint, timeout_s, is_silenced=hub.access is not None and own is not None)
         data, reason = answer_query(answers[0], key, payload)
         if data is None:
             raise query_refused(key, reason)
