@@ -272,7 +272,8 @@ class FrameSelection:
                 f"--frames {text!r}: invalid slice of frame numbers; write A:B:C, for example 0:600:2, 100: or ::2"
             )
         if step is not None and step < 1:
-            raise UsageError(f"--frames {text!r}: the step {step} must be 1 or more; use --reverse to play backwards")
+            backwards = "`locclient replay --reverse` plays backwards"
+            raise UsageError(f"--frames {text!r}: the step {step} must be 1 or more; {backwards}")
         return cls(start, stop, step or 1)
 
     def apply(self, recording: Recording) -> NDArray[np.int64]:
