@@ -204,7 +204,7 @@ def _run(
         connection = stack.enter_context(connected(address, map_options.cache, map_options.cache_bytes))
         with Progress(console=console, disable=not console.is_terminal) as bar:
             for issue in recording.issues:
-                console.print(f"note: {issue.what} {issue.detail}".rstrip())
+                console.print(f"note: {issue.what}: {issue.detail}".rstrip(": "))
             task = bar.add_task("replay", total=len(source))
             options = ReplayOptions(settings.localizer, playback.realtime, lambda _: bar.advance(task), export)
             result = play(source, connection, options, prior)

@@ -114,7 +114,9 @@ def identify(path: Path, options: OpenOptions) -> Recorded | str | None:
     try:
         before, seconds = _state(path)
         with _limited(seconds), open_recording(path, options) as recording:
-            issues = "; ".join(f"{issue.what} {issue.detail}".rstrip() for issue in recording.issues[:_MOST_ISSUES])
+            issues = "; ".join(
+                f"{issue.what}: {issue.detail}".rstrip(": ") for issue in recording.issues[:_MOST_ISSUES]
+            )
             found = Recorded(path, recording.content_hash(), issues)
     except _TooSlowError:
         found = f"{path} was not read within {seconds:.0f} s; is it whole? Copy it again"

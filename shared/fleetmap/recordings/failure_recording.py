@@ -30,7 +30,7 @@ def attachments_of(path: Path) -> dict[str, bytes]:
         raise RecordingError(f"{path} has {size} bytes; a failure's recording has at most {MAX_FILE_BYTES}")
     scanned = _scanned(path)
     if scanned.issues:
-        raise RecordingError(f"{path} is damaged: {scanned.issues[0].what} {scanned.issues[0].detail}; fetch it again")
+        raise RecordingError(f"{path} is damaged: {scanned.issues[0].what}: {scanned.issues[0].detail}; fetch it again")
     missing = [name for name in (SUMMARY, LOCALIZER) if name not in scanned.attachments]
     if missing:
         raise RecordingError(
