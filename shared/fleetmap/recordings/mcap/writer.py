@@ -8,11 +8,12 @@ calls make equal bytes.
 
 from collections import Counter
 from collections.abc import Callable, Iterable
+from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 
 from mcap.writer import CompressionType, Writer
 
-from fleetmap.errors import RecordingError
+from fleetmap.errors import RecordingError, disk_errors
 from fleetmap.recordings.bags.container import CALIBRATION_ATTACHMENT
 from fleetmap.recordings.calibration_files import format_calibration
 from fleetmap.recordings.images import (
@@ -44,7 +45,8 @@ class McapRecordingWriter:
     Samples of one kind must be written in the order of their stamps; kinds may interleave in any way, ROS tools prefer them
     roughly in order. name: name of the recording when opened, the file's stem unless given.
     in_place: for live sensors: the file exists from the beginning, and can be read up to the last write even
-    if it was never closed. has_uncertain_stamps: noted as an issue when the file is opened.
+    if it was never closed. has_uncertain_stamps: noted as an issue when the file is opened. RecordingError wherever the disk
+    takes no more.
     """
 
     def __init__(
@@ -65,10 +67,9 @@ class McapRecordingWriter:
         self._schemas: dict[str, int] = {}
         self._counts: Counter[str] = Counter()
         self._links_are_written = False
-        try:
+        self._advice = "make space, or choose another place" + ("; it holds what came before" if in_place else "")
+        with self._disk_errors():
             self._file = self._part.open("wb")
-        except OSError as error:
-            raise RecordingError(f"{self._part} cannot be written ({error.strerror}); choose another place") from error
         self._writer = Writer(self._file, chunk_size=_CHUNK_BYTES, compression=CompressionType.NONE)
         self._writer.start(profile="ros2", library="fleetmap")
         stamps = {"stamps": "uncertain"} if has_uncertain_stamps else {}
@@ -133,13 +134,20 @@ class McapRecordingWriter:
         """Finish the file and give it its name. Closing twice does nothing."""
         if self._file.closed:
             return
-        self._writer.finish()  # type: ignore[no-untyped-call]
-        self._file.close()
+        try:
+            with self._disk_errors():
+                self._writer.finish()  # type: ignore[no-untyped-call]
+                self._file.close()
+        except RecordingError:
+            if self._part != self._path:
+                self.discard()
+            raise
         self._part.replace(self._path)
 
     def discard(self) -> None:
         """Discard the written file."""
-        self._file.close()
+        with suppress(OSError):  # of a full disk, by what is still in the file's buffer
+            self._file.close()
         self._part.unlink(missing_ok=True)
 
     def __enter__(self) -> "McapRecordingWriter":
@@ -150,6 +158,9 @@ class McapRecordingWriter:
             self.close()
         else:
             self.discard()
+
+    def _disk_errors(self) -> AbstractContextManager[None]:
+        return disk_errors(f"{self._part} cannot be written", self._advice, RecordingError)
 
     def _write_image(
         self, topic: str, stamp_ns: int, frame_id: str, image: StoredImage, *, is_depth: bool = False
@@ -186,7 +197,8 @@ class McapRecordingWriter:
             tf_data = messages.encode_frame_links(stamp_ns, links)
             self._write(self._topics.tf_static, "tf2_msgs/TFMessage", stamp_ns, tf_data)
         channel = self._channel(topic, type_name)
-        self._writer.add_message(channel, stamp_ns, data, stamp_ns, self._counts[topic])
+        with self._disk_errors():
+            self._writer.add_message(channel, stamp_ns, data, stamp_ns, self._counts[topic])
         self._counts[topic] += 1
 
     def _channel(self, topic: str, type_name: str) -> int:

@@ -1,5 +1,6 @@
 """MCAP: what other people's readers see in our files, and what ours sees in theirs."""
 
+import resource
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -78,6 +79,29 @@ def test_nothing_is_left_of_a_recording_that_was_not_finished(tmp_path: Path) ->
 def test_a_place_that_cannot_be_written(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="cannot be written"):
         McapRecordingWriter(tmp_path / "no" / "a.mcap", calibration())
+
+
+@pytest.mark.parametrize("count", [1, 4])  # the disk is full at the end, or before
+def test_a_full_disk_is_named_and_leaves_no_part(tmp_path: Path, count: int) -> None:
+    path, in_place = tmp_path / "a.mcap", tmp_path / "b.mcap"
+    _, hard = limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    frame = CameraFrame(1, np.zeros((700, 1000), np.uint8), np.zeros((700, 1000), np.uint8))
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, hard))
+    try:
+        with (
+            pytest.raises(RecordingError, match=r"a\.mcap\.part cannot be written .*make space"),
+            McapRecordingWriter(path, calibration()) as writer,
+        ):
+            for _ in range(count):
+                writer.write_frame(frame)
+        with pytest.raises(RecordingError, match=r"b\.mcap cannot be written .*it holds what came before"):
+            kept = McapRecordingWriter(in_place, calibration(), in_place=True)
+            for _ in range(count):
+                kept.write_frame(frame)
+            kept.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == [in_place]
 
 
 def test_encoded_images_keep_their_bytes(tmp_path: Path) -> None:
