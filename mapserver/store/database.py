@@ -11,7 +11,7 @@ from urllib.parse import quote
 
 from sqlite_utils import Database
 
-from fleetmap.errors import NewerFormatError, StoreError
+from fleetmap.errors import NewerFormatError, StoreError, UsageError
 from fleetmap.files import sync_path
 from mapserver.store.files import locked
 from mapserver.store.schema import FORMAT, LAST_UNNAMED, MIGRATIONS, TABLES
@@ -72,6 +72,8 @@ class SqliteTransactions(Transactions):
                 return list(self._database.query(sql, values))
             with self._reading:
                 return list(self._reader.query(sql, values))
+        except OverflowError as error:
+            raise UsageError("a number of more than 64 bits; nothing in a store has one") from error
         except sqlite3.Error as error:
             raise StoreError(f"the store {self._path} cannot be read ({error}); check its disk") from error
 

@@ -64,6 +64,7 @@ def test_exit_statuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert status("mapserver", "calibrate", tmp_path / "none.mcap", "--guess", "752:0.1") == 2
     assert status("mapserver", "no-such-command") == 2
     assert status("mapserver", "versions", "--site", "unknown", *to_store) == 2
+    assert status("mapserver", "fleet", "replay", 10**20, *to_store) == 2
     capsys.readouterr()
     assert status("mapserver", "build", tmp_path / "missing", "--site", "lab", *to_store) == 3
     told = capsys.readouterr()
