@@ -53,6 +53,9 @@ def build(
     """Survey the recordings, join them to the site's current version, and store the map as a draft."""
     check_output("--trajectory-out", options.trajectory_out)
     check_output("--picture", options.picture, ".png")
+    for path in options.replay or ():  # it is read behind the survey, which may take hours
+        if not path.exists():
+            raise UsageError(f"--replay {path} does not exist; name a recording of the current version")
     options.check()
     from mapserver import build_map
     from mapserver.drafting.sensor_subset import named_sensor_set

@@ -71,6 +71,9 @@ def test_exit_statuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert told.out == ""
     assert told.err.startswith(f"error: {tmp_path / 'missing'} does not exist")
     assert "Traceback" not in told.err
+    build = ("build", tmp_path, "--site", "lab", *to_store)
+    assert status("mapserver", *build, "--replay", tmp_path / "gone.mcap") == 2, "before the survey, not behind it"
+    assert "gone.mcap does not exist" in capsys.readouterr().err
     assert status("mapserver", "publish", "--site", "empty", *to_store) == 4
     assert status("mapserver", "publish", "--site", "lab", *to_store) == 0
 
