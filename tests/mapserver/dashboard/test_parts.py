@@ -118,7 +118,7 @@ def test_the_map_page_names_the_way_that_nobody_drove(store: MapStore) -> None:
 def test_a_plan_without_tiles_and_one_without_places(store: MapStore) -> None:
     manifest = store.manifest(SITE, 2)
     empty = make_plan(_with_tiles(manifest, ()), lambda _: pytest.fail("there is none"))
-    assert empty.size_m == (10.0, 10.0)
+    assert (empty.low_m, empty.high_m) == ((-5.0, -5.0), (5.0, 5.0))
     (tile,) = (tile for tile in hall_tiles() if (tile.tile_x, tile.tile_y) == (0, 0))
     bare = replace(tile, place_ids=tile.place_ids[:0], map_from_cam=tile.map_from_cam[:0], place_landmark_ids=())
     entry = next(entry for entry in manifest.tiles if (entry.x, entry.y) == (0, 0))
