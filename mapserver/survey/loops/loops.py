@@ -31,6 +31,7 @@ _WORTH_LEARNING = 1.0  # variance against the measurement's: below, a loop impro
 # loops, as their memory grows with the square; skipped loops leave the gate wider, and the next loop can still be learned.
 _WELL_KNOWN = np.repeat([0.005, 0.05], 3)  # rad, m
 _LEARNED_PER_DOUBLING = 64
+_PLACE_M = 0.3  # between the places that two matches give one keyframe if both are right
 _SAME_SHARE = 0.25  # of its length by which two equal steps may differ
 _ENOUGH = 3  # keyframes that must see a step: one match may be wrong
 CONTRADICTED = "contradicts the other loops in the pose graph"
@@ -211,7 +212,7 @@ class LoopCloser:
                 self.loops.records.append(LoopRecord(i, j, score, LoopVerdict.REJECTED, reason))
                 continue
             edge = None if match is None else self._edge(match)
-            aliases = bodies[found.scores >= _ALIAS_SCORE * score]
+            aliases = found.ids[found.scores >= _ALIAS_SCORE * score]
             verdict, reason = self._examined(match, edge, aliases)
             record = LoopRecord(i, j, score, verdict, reason, 0 if match is None else len(match.features))
             if edge is not None and verdict is LoopVerdict.ACCEPTED:
@@ -223,7 +224,7 @@ class LoopCloser:
     def _examined(
         self, match: PairMatch | None, edge: PoseEdge | None, aliases: NDArray[np.int64]
     ) -> tuple[LoopVerdict, str]:
-        """Return the verdict on one candidate alone, and its reason. aliases: old keyframes as similar to the new one."""
+        """Return the verdict on one candidate alone, and its reason. aliases: old views as similar to the new one."""
         if match is None or edge is None:
             return LoopVerdict.REJECTED, "too few features agree on one motion"
         count, settings = len(match.features), self._settings
@@ -238,7 +239,7 @@ class LoopCloser:
         supported = self._neighbours_agree(match)
         if supported is False or (supported is None and count < settings.alone_inliers):
             return LoopVerdict.REJECTED, "neighbouring keyframes do not confirm it"
-        shift_m = self._unseen_alias(edge, aliases)
+        shift_m = self._unseen_alias(match, edge, aliases)
         if shift_m is not None:
             alike = f"places {shift_m:.2f} m apart look the same here"
             return LoopVerdict.AMBIGUOUS, f"{alike}, and another such step is equally possible"
@@ -250,7 +251,7 @@ class LoopCloser:
         spread = max((float(np.linalg.norm(a[:3, 3] - b[:3, 3])) for a in places for b in places), default=0.0)
         js = np.array([edge.j for edge, _ in verified], np.int64)
         between = [np.trace(self._marginals.relative_covs(j, js[js != j])[:, 3:, 3:], axis1=1, axis2=2) for j in js]
-        tolerance = 0.3 + 3.0 * float(np.sqrt(max((traces.max(initial=0.0) for traces in between), default=0.0)))
+        tolerance = _PLACE_M + 3.0 * float(np.sqrt(max((traces.max(initial=0.0) for traces in between), default=0.0)))
         records = self.loops.records
         for edge, record in verified:
             if spread > tolerance:
@@ -283,24 +284,39 @@ class LoopCloser:
         reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[j], self._depths_m[others])
         return np.asarray(~self._marginals.reachable(j, others, reach_m) & (others != j))
 
-    def _unseen_alias(self, edge: PoseEdge, aliases: NDArray[np.int64]) -> float | None:
+    def _unseen_alias(self, match: PairMatch, edge: PoseEdge, aliases: NDArray[np.int64]) -> float | None:
         """Return the possible position error if the site repeats as seen or configured; None if no alias is possible.
 
-        Aliases resemble the old keyframe; those at other places count. The offset to each of them is a step of repetition of the site,
-        perhaps also to a place without keyframes so far: a first visit must not be taken for a return. So are the steps shown
-        by aliases anywhere in the site.
+        Aliases are similar to the new view; those count that are at other places than the old one and match the new one too, as if
+        it were somewhere else. The offset to each of them is a step of repetition of the site, perhaps also to a place without
+        keyframes so far: a first visit must not be taken for a return. So are the steps shown by aliases anywhere in the site.
         """
-        ways = np.zeros((0, 3))
-        if len(aliases):
-            aliases = aliases[self._are_apart(edge.j, aliases)]
-            ways = self._map_from_body[aliases, :3, 3] - self._map_from_body[edge.j, :3, 3]
         learnt = self._repetition.steps_m if self._is_of_one_group(edge) else np.zeros((0, 3))
-        steps = np.concatenate([ways, -ways, learnt, _around(self._settings.repeats_every_m)])
+        steps = np.concatenate([learnt, _around(self._settings.repeats_every_m)])
+        lengths_m = np.linalg.norm(steps[self._is_possible(edge, steps)], axis=1)
+        if len(lengths_m):
+            return float(lengths_m.min())
+        bodies = aliases // self._views
+        apart = self._are_apart(edge.j, bodies)
+        ways = self._map_from_body[bodies[apart], :3, 3] - self._map_from_body[edge.j, :3, 3]
+        possible = self._is_possible(edge, ways) | self._is_possible(edge, -ways)
+        for alias, way in zip(aliases[apart][possible].tolist(), ways[possible], strict=True):
+            other = match_pair(alias, match.j, self._inputs, self._predict(match.j, alias)[2])
+            if other is not None and self._is_elsewhere(edge, self._edge(other)):
+                return float(np.linalg.norm(way))
+        return None
+
+    def _is_possible(self, edge: PoseEdge, steps: Array) -> NDArray[np.bool_]:
+        """Return (M,) True where the new keyframe may be a step (M, 3) beside the place that the edge gives it."""
         if not len(steps):
-            return None
-        possible = self._marginals.innovations_squared_beside(edge, steps) <= self._settings.max_innovation
-        lengths_m = np.linalg.norm(steps[possible], axis=1)
-        return float(lengths_m.min()) if len(lengths_m) else None
+            return np.zeros(0, np.bool_)
+        return np.asarray(self._marginals.innovations_squared_beside(edge, steps) <= self._settings.max_innovation)
+
+    def _is_elsewhere(self, one: PoseEdge, other: PoseEdge) -> bool:
+        """True if two edges to the same new keyframe put it at different places, given how well the old ones are known."""
+        places = [self._map_from_body[e.j] @ se3_inverse(e.i_from_j) for e in (one, other)]
+        between = float(np.trace(self._marginals.relative_cov(one.j, other.j)[3:, 3:]))
+        return bool(np.linalg.norm(places[0][:3, 3] - places[1][:3, 3]) > _PLACE_M + 3.0 * np.sqrt(between))
 
     def _learn_repetition(self, edge: PoseEdge, count: int, innovation: float) -> None:
         """Learn a step of the site: a match from an impossible position is an alias, and its offset a step.
