@@ -36,6 +36,7 @@ _SAME_SHARE = 0.25  # of its length by which two equal steps may differ
 _ENOUGH = 3  # keyframes that must see a step: one match may be wrong
 CONTRADICTED = "contradicts the other loops in the pose graph"
 _WAITING = "it would join two parts of the survey, and too few keyframes over a metre agree with it yet"
+_KNOWN_BETTER = "it adds nothing: the relative pose is known better"
 _FAR = "too far apart to see the same, given the accuracy of the relative pose"
 
 
@@ -236,6 +237,8 @@ class LoopCloser:
             self._learn_repetition(edge, count, innovation)
             reason = f"matches, but from an impossible position (innovation {innovation:.0f})"
             return LoopVerdict.GATED_OUT, reason
+        if self._marginals.gain(edge, np.diag(_WELL_KNOWN**2)) < _WORTH_LEARNING:
+            return LoopVerdict.REJECTED, _KNOWN_BETTER
         supported = self._neighbours_agree(match)
         if supported is False or (supported is None and count < settings.alone_inliers):
             return LoopVerdict.REJECTED, "neighbouring keyframes do not confirm it"

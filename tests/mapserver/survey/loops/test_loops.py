@@ -241,6 +241,17 @@ def test_what_gives_a_keyframe_the_same_place_is_no_alias() -> None:
     assert {(e.i, e.j) for e in loops.edges} >= {(9, 0), (9, 1)}
 
 
+@pytest.mark.parametrize(("sigma_m", "is_loop"), [(0.01, False), (0.2, True)])
+def test_what_odometry_knows_better_is_no_loop(sigma_m: float, is_loop: bool) -> None:
+    """Far matches measure a relative pose to decimetres along the view, and in aisles they are wrong by more: many would add up."""
+    _, places, _, _ = seen()
+    path = places[[*range(10), 1]]
+    far_enough = replace_loops(SETTINGS, view_range_depths=0.2)
+    loops = looked([*range(10), 1], path, [0.001] * 9 + [sigma_m], 11, settings=far_enough)
+    assert bool(loops.edges) is is_loop
+    assert is_loop or "known better" in " ".join(r.reason for r in loops.records)
+
+
 @pytest.mark.parametrize(("twins", "verdict"), [(4, LoopVerdict.AMBIGUOUS), (2, LoopVerdict.ACCEPTED)])
 def test_a_step_of_the_site_is_learnt_where_it_is_seen_and_counts_everywhere(twins: int, verdict: LoopVerdict) -> None:
     """The wall is met again 1.9 m aside, where it cannot be; then other things, which nobody saw there, by a way that is not known well.
