@@ -1,6 +1,7 @@
 """Recordings of the simulator and the map of one of them, kept in a work folder for all benchmarks that replay robots in it."""
 
 import argparse
+import hashlib
 import json
 import os
 import subprocess
@@ -19,6 +20,7 @@ from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.run_result import ReplayResult
 
 SITE = "hall"
+_CODE = {".py", ".cpp", ".h", ".fmvb"}
 
 
 def parsed(description: str | None, names: Iterable[str] = (), **numbers: int) -> argparse.Namespace:
@@ -35,8 +37,11 @@ def parsed(description: str | None, names: Iterable[str] = (), **numbers: int) -
 
 
 def kept_folder() -> Path:
-    """Where recordings and map are kept unless another folder is named."""
-    return Path(os.environ.get("FLEETMAP_BENCH_WORK", tempfile.gettempdir())) / "localization"
+    """Where recordings and maps of this code are kept unless another folder is named: other code may make others."""
+    root, code = Path(__file__).parents[3], hashlib.sha256()
+    for path in sorted(p for room in ("shared", "mapserver") for p in (root / room).rglob("*") if p.suffix in _CODE):
+        code.update(path.read_bytes())
+    return Path(os.environ.get("FLEETMAP_BENCH_WORK", tempfile.gettempdir())) / "localization" / code.hexdigest()[:12]
 
 
 def resident_mb() -> dict[str, float]:
