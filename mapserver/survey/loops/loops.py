@@ -36,7 +36,6 @@ _SAME_SHARE = 0.25  # of its length by which two equal steps may differ
 _ENOUGH = 3  # keyframes that must see a step: one match may be wrong
 CONTRADICTED = "contradicts the other loops in the pose graph"
 _WAITING = "it would join two parts of the survey, and too few keyframes over a metre agree with it yet"
-_KNOWN_BETTER = "it adds nothing: the relative pose is known better"
 _FAR = "too far apart to see the same, given the accuracy of the relative pose"
 
 
@@ -199,7 +198,7 @@ class LoopCloser:
         return found
 
     def _verify(self, i: int, found: "_Candidates") -> list[tuple[PoseEdge, LoopRecord]]:
-        """Return the candidates that pass every single test, with their edges; record the others."""
+        """Return the candidates that pass every single test, with their edges; record the others, but not those that add nothing."""
         verified: list[tuple[PoseEdge, LoopRecord]] = []
         tasks = [PairTask.of([self._predict(i, int(found.ids[n]))], self._inputs) for n in found.chosen]
         matches = self._executor.map(match_task, self._shared, tasks)
@@ -214,7 +213,9 @@ class LoopCloser:
                 continue
             edge = None if match is None else self._edge(match)
             aliases = found.ids[found.scores >= _ALIAS_SCORE * score]
-            verdict, reason = self._examined(match, edge, aliases)
+            if (examined := self._examined(match, edge, aliases)) is None:
+                continue
+            verdict, reason = examined
             record = LoopRecord(i, j, score, verdict, reason, 0 if match is None else len(match.features))
             if edge is not None and verdict is LoopVerdict.ACCEPTED:
                 verified.append((edge, record))
@@ -224,8 +225,11 @@ class LoopCloser:
 
     def _examined(
         self, match: PairMatch | None, edge: PoseEdge | None, aliases: NDArray[np.int64]
-    ) -> tuple[LoopVerdict, str]:
-        """Return the verdict on one candidate alone, and its reason. aliases: old views as similar to the new one."""
+    ) -> tuple[LoopVerdict, str] | None:
+        """Return the verdict on one candidate alone, and its reason; None if it adds nothing to what is known.
+
+        aliases: old views as similar to the new one.
+        """
         if match is None or edge is None:
             return LoopVerdict.REJECTED, "too few features agree on one motion"
         count, settings = len(match.features), self._settings
@@ -238,7 +242,7 @@ class LoopCloser:
             reason = f"matches, but from an impossible position (innovation {innovation:.0f})"
             return LoopVerdict.GATED_OUT, reason
         if self._marginals.gain(edge, np.diag(_WELL_KNOWN**2)) < _WORTH_LEARNING:
-            return LoopVerdict.REJECTED, _KNOWN_BETTER
+            return None
         supported = self._neighbours_agree(match)
         if supported is False or (supported is None and count < settings.alone_inliers):
             return LoopVerdict.REJECTED, "neighbouring keyframes do not confirm it"
