@@ -101,7 +101,8 @@ class LiveMap:
             )
             for _, r in sorted(best.items())[-_NEWEST:]
         )
-        ends = np.array([(edge.i, edge.j) for edge in found.edges], np.int64).reshape(-1, 2)
+        accepted = [(r.i, r.j) for r in found.records if r.verdict is LoopVerdict.ACCEPTED]
+        ends = np.array(accepted, np.int64).reshape(-1, 2)
         return LiveLoops(ends, refused, newest)
 
     def _loops(self) -> Loops:

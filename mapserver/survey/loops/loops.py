@@ -66,7 +66,7 @@ class LoopRecord:
 
 @dataclass(frozen=True)
 class Loops:
-    """All candidates, and the edges (i_from_j of bodies) of the accepted ones."""
+    """All candidates, and the edges (i_from_j of bodies) of the accepted ones that tell more than is known without them."""
 
     records: list[LoopRecord] = field(default_factory=list)
     edges: list[PoseEdge] = field(default_factory=list)
@@ -198,7 +198,7 @@ class LoopCloser:
         return found
 
     def _verify(self, i: int, found: "_Candidates") -> list[tuple[PoseEdge, LoopRecord]]:
-        """Return the candidates that pass every single test, with their edges; record the others, but not those that add nothing."""
+        """Return the candidates that pass every single test, with their edges; record the others."""
         verified: list[tuple[PoseEdge, LoopRecord]] = []
         tasks = [PairTask.of([self._predict(i, int(found.ids[n]))], self._inputs) for n in found.chosen]
         matches = self._executor.map(match_task, self._shared, tasks)
@@ -213,9 +213,7 @@ class LoopCloser:
                 continue
             edge = None if match is None else self._edge(match)
             aliases = found.ids[found.scores >= _ALIAS_SCORE * score]
-            if (examined := self._examined(match, edge, aliases)) is None:
-                continue
-            verdict, reason = examined
+            verdict, reason = self._examined(match, edge, aliases)
             record = LoopRecord(i, j, score, verdict, reason, 0 if match is None else len(match.features))
             if edge is not None and verdict is LoopVerdict.ACCEPTED:
                 verified.append((edge, record))
@@ -225,11 +223,8 @@ class LoopCloser:
 
     def _examined(
         self, match: PairMatch | None, edge: PoseEdge | None, aliases: NDArray[np.int64]
-    ) -> tuple[LoopVerdict, str] | None:
-        """Return the verdict on one candidate alone, and its reason; None if it adds nothing to what is known.
-
-        aliases: old views as similar to the new one.
-        """
+    ) -> tuple[LoopVerdict, str]:
+        """Return the verdict on one candidate alone, and its reason. aliases: old views as similar to the new one."""
         if match is None or edge is None:
             return LoopVerdict.REJECTED, "too few features agree on one motion"
         count, settings = len(match.features), self._settings
@@ -241,8 +236,6 @@ class LoopCloser:
             self._learn_repetition(edge, count, innovation)
             reason = f"matches, but from an impossible position (innovation {innovation:.0f})"
             return LoopVerdict.GATED_OUT, reason
-        if self._marginals.gain(edge, np.diag(_WELL_KNOWN**2)) < _WORTH_LEARNING:
-            return None
         supported = self._neighbours_agree(match)
         if supported is False or (supported is None and count < settings.alone_inliers):
             return LoopVerdict.REJECTED, "neighbouring keyframes do not confirm it"
@@ -279,6 +272,8 @@ class LoopCloser:
                     self._accept(each.edge)
 
     def _accept(self, edge: PoseEdge) -> None:
+        if self._marginals.gain(edge, np.diag(_WELL_KNOWN**2)) < _WORTH_LEARNING:
+            return  # matches of far features in aisles are wrong by more than this, and many would add up
         self.loops.edges.append(edge)
         well_known = np.diag(_WELL_KNOWN**2) * 2.0 ** (self._marginals.learned / _LEARNED_PER_DOUBLING)
         if self._marginals.gain(edge, well_known) > _WORTH_LEARNING:
