@@ -124,7 +124,7 @@ class GraphMarginals:
         cov = self.relative_cov(edge.i, edge.j) + edge.cov_rot_trans
         return np.asarray(np.einsum("ma,am->m", beside, np.linalg.solve(cov, beside.T)))
 
-    def gain(self, edge: PoseEdge, enough: Array | float = 0.0) -> float:
+    def gain(self, edge: PoseEdge, enough: Array) -> float:
         """Return the largest variance ratio of the graph's prediction to the edge, counting from a cov_rot_trans (6, 6) that
         is accurate `enough`: below 1 the edge adds little.
         """

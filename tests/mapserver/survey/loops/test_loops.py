@@ -241,14 +241,14 @@ def test_what_gives_a_keyframe_the_same_place_is_no_alias() -> None:
     assert {(r.i, r.j) for r in loops.records if r.verdict is LoopVerdict.ACCEPTED} >= {(9, 0), (9, 1)}
 
 
-@pytest.mark.parametrize(("sigma_m", "is_loop"), [(0.01, False), (0.2, True)])
-def test_what_odometry_knows_better_is_a_loop_without_an_edge(sigma_m: float, is_loop: bool) -> None:
+@pytest.mark.parametrize(("sigma_m", "has_edge"), [(0.01, False), (0.2, True)])
+def test_what_odometry_knows_better_is_a_loop_without_an_edge(sigma_m: float, has_edge: bool) -> None:
     """Far matches measure a relative pose to decimetres along the view, and in aisles they are wrong by more: many would add up."""
     _, places, _, _ = seen()
     path = places[[*range(10), 1]]
     far_enough = replace_loops(SETTINGS, view_range_depths=0.2)
     loops = looked([*range(10), 1], path, [0.001] * 9 + [sigma_m], 11, settings=far_enough)
-    assert bool(loops.edges) is is_loop
+    assert bool(loops.edges) is has_edge
     assert loops.counts()["accepted"]
 
 
