@@ -81,7 +81,9 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     changes, compares = _changes(maps, context, rows, before, after or shown), "after" in context.query
     forgets, now_ns = _waiting(maps, site), time.time_ns()
     lately = maps.store.events(site, (now_ns - _COURSES_NS, now_ns))
-    drawn = [area.rings[0].round(2).tolist() for area in forgets]  # requests of their own, which hide nothing
+    drawn = [
+        ring.round(2).tolist() for area in forgets for ring in area.outlines
+    ]  # requests of their own, which hide nothing
     others = [one for one in requests if one.corners_map_m not in drawn]
     asked_for = [Outline([[(x, y) for x, y in one.corners_map_m]], f"survey {one.id}") for one in others]
     over = [

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from fleetmap.encoding import to_json
-from fleetmap.geometry import AnyArray, Array
+from fleetmap.geometry import AnyArray, Array, Rings, inside_any
 from fleetmap.mapformat import Manifest
 from fleetmap.mapformat.grid_tile import CELL_M, TILE_CELLS, TILE_SIZE_M
 from fleetmap.version_grid import Tiles as Grid
@@ -22,7 +22,7 @@ from mapserver.floor_plan.areas import Area, Areas, CorrectionKind, read_areas
 from mapserver.floor_plan.survey_requests import COVERED_SHARE, near_drives
 from mapserver.surfels.surfel_map import Surfels, SurfelTile, SurfelTiles, encode_tile
 from mapserver.surfels.survey_pictures import SurveyPicture
-from mapserver.survey.merge.area_corrections import Mask, SurveyLimits, inside_any, is_before
+from mapserver.survey.merge.area_corrections import Mask, SurveyLimits, is_before
 from mapserver.survey.merge.merge import kept
 from mapserver.survey.merge.multi_session import MapMerger, MergedMap, Session
 from mapserver.survey.settings import SurveySettings
@@ -49,6 +49,10 @@ def waiting(areas: Areas, manifest: Manifest) -> list[Area]:
 
 def _of(areas: Iterable[Area], kind: CorrectionKind) -> list[Area]:
     return [area for area in areas if area.correction is not None and area.correction.kind is kind]
+
+
+def _polygons(areas: Iterable[Area]) -> tuple[Rings, ...]:
+    return tuple(polygon for area in areas for polygon in area.polygons)
 
 
 @dataclass(frozen=True)
@@ -136,11 +140,11 @@ class AreaCorrections:
         frozen, unused, forget = (
             _of(self.areas, kind) for kind in (CorrectionKind.FREEZE, CorrectionKind.NEVER_USE, CorrectionKind.FORGET)
         )
-        since = [(area.rings, area.correction.since_ns or 0) for area in forget if area.correction]
-        return SurveyLimits(tuple(a.rings for a in frozen), tuple(a.rings for a in unused), tuple(since))
+        since = [(p, area.correction.since_ns or 0) for area in forget if area.correction for p in area.polygons]
+        return SurveyLimits(_polygons(frozen), _polygons(unused), tuple(since))
 
     def _is_due(self, points_map: AnyArray) -> Mask:
-        return inside_any(points_map, [area.rings for area in self.due])
+        return inside_any(points_map, _polygons(self.due))
 
     def _is_gone(self, points_map: AnyArray) -> Mask:
         return self._is_due(points_map) | self._is_unused(points_map)
@@ -149,7 +153,7 @@ class AreaCorrections:
         return self._is_in(CorrectionKind.NEVER_USE, points_map)
 
     def _is_in(self, kind: CorrectionKind, points_map: AnyArray) -> Mask:
-        return inside_any(points_map, [area.rings for area in _of(self.areas, kind)])
+        return inside_any(points_map, _polygons(_of(self.areas, kind)))
 
 
 def driven_since(found: MergedMap, since_ns: int) -> Array:
@@ -161,7 +165,7 @@ def driven_since(found: MergedMap, since_ns: int) -> Array:
 
 def _is_covered(area: Area, base: SurveyMap, found: MergedMap) -> bool:
     """True if recordings later than the correction passed a place of most of its landmarks, or it has none."""
-    inside = inside_any(base.points_map, [area.rings])
+    inside = inside_any(base.points_map, area.polygons)
     since_ns = area.correction.since_ns or 0 if area.correction else 0
     passed = near_drives(base.map_from_body[:, :2, 3], driven_since(found, since_ns))
     seen = np.bincount(base.obs_landmark[passed[base.obs_keyframe]], minlength=len(inside)) > 0

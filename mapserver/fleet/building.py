@@ -105,9 +105,9 @@ def _is_same(before: Area, after: Area) -> bool:
     """True if two areas correct the map alike, whatever their names: to a millimetre, for areas that were sent in another frame."""
     if before.correction is None or after.correction is None or before.correction.kind is not after.correction.kind:
         return False
-    rings = list(zip(before.rings, after.rings, strict=False))
-    return len(before.rings) == len(after.rings) and all(
-        len(a) == len(b) and bool(np.allclose(a, b, rtol=0, atol=1e-3)) for a, b in rings
+    corners = [[[len(ring) for ring in polygon] for polygon in area.polygons] for area in (before, after)]
+    return corners[0] == corners[1] and all(
+        np.allclose(a, b, rtol=0, atol=1e-3) for a, b in zip(before.rings, after.rings, strict=True)
     )
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from fleetmap.encoding import to_plain
 from fleetmap.errors import UsageError
-from fleetmap.geometry import Array, inside_rings, se3_inverse, transform_points
+from fleetmap.geometry import Array, Rings, inside_any, inside_rings, se3_inverse, transform_points
 from fleetmap.mapformat.building import BuildingFrame
 
 OUTSIDE = "outside"
@@ -87,14 +87,14 @@ class _Collection(msgspec.Struct):
 
 @dataclass(frozen=True, slots=True)
 class Area:
-    """rings: (V, 2) corners in `map`, metres, not repeated at the end; inside by the even-odd rule over all rings.
+    """polygons: in `map`; each by itself, so that what two of them share is inside.
 
     mask: effect on planners, None if absent. percent: of the robot's largest speed, in an area of the kind SPEED.
     correction: effect on maps, None if absent. lift: name of the lift whose cabin stands here, the same on every floor of a building.
     """
 
     name: str
-    rings: tuple[Array, ...]
+    polygons: tuple[Rings, ...]
     mask: MaskKind | None = None
     percent: int | None = None
     correction: Correction | None = None
@@ -111,29 +111,38 @@ class Area:
         )
 
     @property
+    def rings(self) -> Rings:
+        """All outlines and holes."""
+        return tuple(ring for polygon in self.polygons for ring in polygon)
+
+    @property
     def size_m2(self) -> float:
-        """Sum over the outlines; holes are neglected."""
+        """Of the largest outline; holes are neglected."""
         return max(abs(_doubled_area(ring)) for ring in self.rings) / 2
 
     @property
     def outlines(self) -> list[Array]:
-        """Its rings but for holes: those within no other ring."""
+        """Its rings but for holes: those within no other ring of their polygon."""
         return [
-            ring for ring in self.rings if not any(inside_rings(ring[:1], [o])[0] for o in self.rings if o is not ring)
+            ring
+            for polygon in self.polygons
+            for ring in polygon
+            if not any(inside_rings(ring, [other]).mean() >= 0.5 for other in polygon if other is not ring)
         ]
 
     def holds(self, points_m: Array) -> NDArray[np.bool_]:
         """Return a mask (N,) of the points (N, 2) inside."""
-        return inside_rings(points_m, self.rings)
+        return inside_any(points_m, self.polygons)
 
     def feature(self, target_from_map: Array) -> dict[str, Any]:
-        """Return it as a feature of GeoJSON in another frame; its rings are one polygon, holes included."""
+        """Return it as a feature of GeoJSON in another frame."""
         effects = {"mask": self.mask, "percent": self.percent} if self.mask else {}
         corrects = {"correction": to_plain(self.correction)} if self.correction else {}
-        coordinates = [_closed(_moved(ring, target_from_map)) for ring in self.rings]
+        polygons = [[_closed(_moved(ring, target_from_map)) for ring in polygon] for polygon in self.polygons]
+        geometry = {"type": "MultiPolygon", "coordinates": polygons}
         return {
             "type": "Feature",
-            "geometry": {"type": "Polygon", "coordinates": coordinates},
+            "geometry": {"type": "Polygon", "coordinates": polygons[0]} if len(polygons) == 1 else geometry,
             "properties": {"name": self.name} | effects | corrects | ({"lift": self.lift} if self.lift else {}),
         }
 
@@ -271,13 +280,12 @@ def _area(feature: _Feature, map_from_building: Array | None) -> Area:
     if (percent is None) == (mask is MaskKind.SPEED):
         raise UsageError(f"area {name!r}: mask {mask and mask.value} with percent {percent}; give {_MASK_WORDS}")
     geometry = feature.geometry
-    polygons = [geometry.coordinates] if isinstance(geometry, _Polygon) else geometry.coordinates
-    rings = [_ring(ring, f"area {name!r}") for polygon in polygons for ring in polygon]
-    if not rings:
+    drawn = [geometry.coordinates] if isinstance(geometry, _Polygon) else geometry.coordinates
+    map_from_drawn = np.eye(4) if map_from_building is None else map_from_building
+    polygons = [tuple(_moved(_ring(ring, f"area {name!r}"), map_from_drawn) for ring in rings) for rings in drawn]
+    if not polygons or not all(polygons):
         raise UsageError(f"area {name!r} has no corners; draw it as a polygon")
-    if map_from_building is not None:
-        rings = [_moved(ring, map_from_building) for ring in rings]
-    return Area(name, tuple(rings), mask, percent, correction, feature.properties.lift)
+    return Area(name, tuple(polygons), mask, percent, correction, feature.properties.lift)
 
 
 def _ring(positions: list[list[float]], where: str) -> Array:

@@ -13,6 +13,10 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 AnyArray = NDArray[Any]
+Rings = tuple[Array, ...]
+"""A polygon, the outline first, then holes: (V, 2) corners in metres, the first not repeated; inside by the even-odd rule over them."""
+
+_MOST_AT_ONCE = 1 << 22  # points times corners
 _IDENTITY = np.eye(4)
 
 
@@ -191,4 +195,15 @@ def inside_rings(points: Array, rings: Iterable[Array]) -> NDArray[np.bool_]:
         crosses = (y0 > y) != (y1 > y)
         left = x < x0 + (y - y0) / np.where(y1 == y0, 1.0, y1 - y0) * (x1 - x0)
         inside ^= (np.count_nonzero(crosses & left, axis=1) % 2).astype(bool)
+    return inside
+
+
+def inside_any(points: AnyArray, polygons: Iterable[Rings]) -> NDArray[np.bool_]:
+    """(N,) True for points (N, 2) or (N, 3) inside one polygon or more, at any height; each has its own holes."""
+    flat, inside = points[:, :2].astype(np.float64), np.zeros(len(points), bool)
+    for rings in polygons:
+        corners = np.concatenate(rings)
+        near = np.flatnonzero(((flat >= corners.min(axis=0)) & (flat <= corners.max(axis=0))).all(axis=1))
+        for rows in np.array_split(near, 1 + len(near) * len(corners) // _MOST_AT_ONCE):
+            inside[rows] |= inside_rings(flat[rows], rings)
     return inside

@@ -1,24 +1,19 @@
 """Areas of a published map in which operators limit what surveys change."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import AnyArray, Array, inside_rings
+from fleetmap.geometry import Array, Rings, inside_any
 
 Mask = NDArray[np.bool_]
-Rings = tuple[Array, ...]
-"""An area: (V, 2) corners of its outlines in `map`, inside by the even-odd rule over all of them."""
-
-_MOST_AT_ONCE = 1 << 22  # points times corners
 CLOCKS_BEGIN_NS = 946_684_800_000_000_000  # the year 2000: earlier stamps count from a start, not from 1970
 
 
 @dataclass(frozen=True, slots=True)
 class SurveyLimits:
-    """Areas by what surveys must not do there.
+    """Polygons by what surveys must not do there.
 
     frozen: neither add, move nor remove landmarks, nor move or add places. unused: add no landmarks. since: add no landmarks if the
     survey ended before a time, in nanoseconds since 1970.
@@ -29,7 +24,7 @@ class SurveyLimits:
     since: tuple[tuple[Rings, int], ...] = ()
 
     def freezes(self, points_map: Array) -> Mask:
-        """Return (N,) which points (N, 3) lie in a frozen area."""
+        """Return (N,) which points (N, 3) lie in a frozen polygon."""
         return inside_any(points_map, self.frozen)
 
     def closes(self, points_map: Array, end_ns: int) -> Mask:
@@ -41,14 +36,3 @@ class SurveyLimits:
 def is_before(end_ns: int, since_ns: int) -> bool:
     """True if a recording's last stamp precedes a time; a clock that does not count from 1970 cannot tell."""
     return CLOCKS_BEGIN_NS < end_ns < since_ns
-
-
-def inside_any(points_map: AnyArray, areas: Sequence[Rings]) -> Mask:
-    """Return (N,) which points (N, 2) or (N, 3) lie in one of the areas, at any height."""
-    flat, inside = points_map[:, :2].astype(np.float64), np.zeros(len(points_map), bool)
-    for rings in areas:
-        corners = np.concatenate(rings)
-        near = np.flatnonzero(((flat >= corners.min(axis=0)) & (flat <= corners.max(axis=0))).all(axis=1))
-        for rows in np.array_split(near, 1 + len(near) * len(corners) // _MOST_AT_ONCE):
-            inside[rows] |= inside_rings(flat[rows], rings)
-    return inside

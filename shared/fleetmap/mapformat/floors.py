@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 
 from fleetmap.errors import FleetmapError, MapFormatError
-from fleetmap.geometry import Array, inside_rings, se3_inverse, transform_points
+from fleetmap.geometry import Array, Rings, inside_any, se3_inverse, transform_points
 from fleetmap.mapformat.building import BuildingFrame, Coordinate
 from fleetmap.mapformat.names import check_name
 
@@ -35,11 +35,11 @@ class Building(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=
 
 @dataclass(frozen=True)
 class Floor:
-    """A floor with the pose of its map in the building, and the outlines of its lifts: rings (V, 2) in its `map`, by the lift's name."""
+    """A floor with the pose of its map in the building, and the polygons of its lifts in its `map`, by the lift's name."""
 
     entry: FloorEntry
     frame: BuildingFrame
-    lifts: Mapping[str, tuple[Array, ...]] = field(default_factory=dict)
+    lifts: Mapping[str, tuple[Rings, ...]] = field(default_factory=dict)
 
     @property
     def building_from_map(self) -> Array:
@@ -52,8 +52,9 @@ class Floor:
         """Return the lifts whose outlines hold a position (2,) or are at most reach_m from it: several of a bank of lifts."""
         return frozenset(
             name
-            for name, rings in self.lifts.items()
-            if inside_rings(position_m[None], rings)[0] or edge_distance_m(position_m, rings) <= reach_m
+            for name, polygons in self.lifts.items()
+            if inside_any(position_m[None], polygons)[0]
+            or min(edge_distance_m(position_m, rings) for rings in polygons) <= reach_m
         )
 
 
@@ -98,12 +99,12 @@ class _Areas(msgspec.Struct):
     frame: Literal["map", "building"] | None = None
 
 
-def read_lifts(areas: bytes | None, frame: BuildingFrame) -> dict[str, tuple[Array, ...]]:
+def read_lifts(areas: bytes | None, frame: BuildingFrame) -> dict[str, tuple[Rings, ...]]:
     """Return the lifts in a site's file of areas, as `Floor.lifts`; areas of one lift are joined. MapFormatError for an invalid file.
 
     frame: the site's alignment, for areas that were drawn in the building.
     """
-    lifts: dict[str, tuple[Array, ...]] = {}
+    lifts: dict[str, tuple[Rings, ...]] = {}
     try:
         read = _Areas([]) if areas is None else msgspec.json.decode(areas, type=_Areas)
         for feature in read.features:
@@ -113,13 +114,14 @@ def read_lifts(areas: bytes | None, frame: BuildingFrame) -> dict[str, tuple[Arr
                 polygons = [msgspec.json.decode(feature.geometry.coordinates, type=list[list[list[float]]])]
             else:
                 polygons = msgspec.json.decode(feature.geometry.coordinates, type=list[list[list[list[float]]]])
-            rings = [np.array([corner[:2] for corner in ring[:-1]], float) for polygon in polygons for ring in polygon]
-            if not all(ring.ndim == 2 and ring.shape[1] == 2 and len(ring) >= 3 for ring in rings):
-                raise ValueError(f"lift {feature.properties.lift[:64]!r} has no outline")
-            if read.frame == "building":
-                map_from_building = se3_inverse(frame.building_from_map)
-                rings = [transform_points(map_from_building, np.c_[r, np.zeros(len(r))])[:, :2] for r in rings]
-            lifts[feature.properties.lift] = (*lifts.get(feature.properties.lift, ()), *rings)
+            for polygon in polygons:
+                rings = [np.array([corner[:2] for corner in ring[:-1]], float) for ring in polygon]
+                if not rings or not all(r.ndim == 2 and r.shape[1] == 2 and len(r) >= 3 for r in rings):
+                    raise ValueError(f"lift {feature.properties.lift[:64]!r} has no outline")
+                if read.frame == "building":
+                    map_from_building = se3_inverse(frame.building_from_map)
+                    rings = [transform_points(map_from_building, np.c_[r, np.zeros(len(r))])[:, :2] for r in rings]
+                lifts[feature.properties.lift] = (*lifts.get(feature.properties.lift, ()), tuple(rings))
     except (msgspec.MsgspecError, ValueError, IndexError) as error:
         raise MapFormatError(f"the site's areas cannot be read ({error}); import them again") from error
     return lifts

@@ -220,10 +220,10 @@ def test_of_two_lifts_side_by_side_it_may_ride_either(monkeypatch: pytest.Monkey
     world = world_of(monkeypatch, 14, floors=3, likeness=0.97, has_imu=False)
     for number in range(3):
         lifts = world.localizer._floors[world.keys[number]].lifts
-        (ring,) = lifts["A"]
+        ((ring,),) = lifts["A"]
         turn = world.map_from_plan[number][:2, :2]
-        beside = {"0": (ring + turn @ np.array([0.0, 2.1]),)} if number < 2 else {}
-        world.redraw(number, {"A": (ring,)} | beside)
+        beside = {"0": ((ring + turn @ np.array([0.0, 2.1]),),)} if number < 2 else {}
+        world.redraw(number, {"A": ((ring,),)} | beside)
     world.board()
     said = [*world.ride(2), *world.stand(2.0)]
     assert {h.floor for h in said[-1].hypotheses} == {"", "floor-1", "floor-2"}

@@ -30,7 +30,7 @@ LANE_M = 12.0
 BACK = se3(so3_exp(np.array([0.0, 0.0, np.pi])), np.zeros(3))
 DARK = 12.0
 CALIBRATION = RigEvidence("rig", ["metric scale"])
-HALVES = Areas.of([Area(name, (box,)) for name, box in (
+HALVES = Areas.of([Area(name, ((box,),)) for name, box in (
     ("aisle 1", np.array([[-9.0, -2.0], [40.0, -2.0], [40.0, 6.0], [-9.0, 6.0]])),
     ("aisle 2", np.array([[-9.0, 6.0], [40.0, 6.0], [40.0, 18.0], [-9.0, 18.0]])),
 )])  # fmt: skip

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, inside_any
 from fleetmap.mapformat import sha256_hex
 from fleetmap.sensors.samples import Trajectory
 from mapserver.drafting.area_corrections import AreaCorrections, corrections_of, waiting
@@ -16,7 +16,7 @@ from mapserver.quality.gate import GateSettings, judge
 from mapserver.surfels.surfel_map import Surfels, SurfelTiles, encode_tile
 from mapserver.surfels.survey_pictures import SurveyPicture
 from mapserver.survey.merge import multi_session
-from mapserver.survey.merge.area_corrections import SurveyLimits, inside_any, is_before
+from mapserver.survey.merge.area_corrections import SurveyLimits, is_before
 from mapserver.survey.merge.merge import kept
 from mapserver.survey.merge.multi_session import MergedMap
 from mapserver.survey.settings import SurveySettings
@@ -29,7 +29,7 @@ NOW_NS = 1_700_000_000 * 10**9
 
 def area(kind: CorrectionKind, low: tuple[float, float], high: tuple[float, float], since_ns: int = NOW_NS) -> Area:
     ring = np.array([low, (high[0], low[1]), high, (low[0], high[1])])
-    return Area(f"{kind} {low}", (ring,), correction=Correction(kind, "moved", since_ns))
+    return Area(f"{kind} {low}", ((ring,),), correction=Correction(kind, "moved", since_ns))
 
 
 def manifest(**configuration: object) -> Any:
@@ -57,8 +57,8 @@ def test_a_map_without_some_landmarks_is_otherwise_the_same(survey: SurveyMap) -
 
 
 def test_what_surveys_may_add_depends_on_when_they_ended() -> None:
-    rings = area(FORGET, (0, 0), (4, 4)).rings
-    limits = SurveyLimits(frozen=(area(FREEZE, (10, 0), (14, 4)).rings,), since=((rings, NOW_NS),))
+    (rings,) = area(FORGET, (0, 0), (4, 4)).polygons
+    limits = SurveyLimits(frozen=area(FREEZE, (10, 0), (14, 4)).polygons, since=((rings, NOW_NS),))
     points = np.array([[1.0, 1.0, 7.0], [12.0, 1.0, -3.0], [20.0, 1.0, 0.0], [np.nan, 0.0, 0.0]])
     assert limits.closes(points, NOW_NS + 1).tolist() == [False, True, False, False]
     assert limits.closes(points, NOW_NS - 1).tolist() == [True, True, False, False]

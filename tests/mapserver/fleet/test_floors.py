@@ -118,7 +118,7 @@ def test_lifts_drawn_in_the_building_come_back_in_the_map(house: Path) -> None:
         keep_areas(store, "hall-2", areas("B", "building"), "", NOBODY)
         alignment = store.alignment("hall-2")
         assert alignment is not None
-        (ring,) = read_lifts(store.site_file("hall-2", AREAS), alignment.frame)["B"]
+        ((ring,),) = read_lifts(store.site_file("hall-2", AREAS), alignment.frame)["B"]
     assert ring[0].tolist() == [-9.0, 1.0]
 
 

@@ -2,20 +2,24 @@
 
 import json
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import pytest
 
 from fleetmap.errors import UsageError
 from fleetmap.mapformat.building import BuildingFrame
-from mapserver.floor_plan.areas import Areas, read_areas
+from fleetmap.mapformat.floors import Floor, FloorEntry, read_lifts
+from mapserver.drafting.area_corrections import AreaCorrections
+from mapserver.floor_plan.areas import Areas, MaskKind, read_areas
+from mapserver.grid.masks import mask_grid
 
 
 def box(x0: float, y0: float, x1: float, y1: float) -> list[list[float]]:
     return [[x0, y0], [x1, y0], [x1, y1], [x0, y1], [x0, y0]]
 
 
-def feature(name: object, *rings: Sequence[Sequence[float]], kind: str = "Polygon") -> dict[str, object]:
+def feature(name: object, *rings: Sequence[Sequence[float]], kind: str = "Polygon") -> dict[str, Any]:
     coordinates = list(rings) if kind == "Polygon" else [[ring] for ring in rings]
     return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": {"name": name}}
 
@@ -109,3 +113,37 @@ def test_areas_of_the_building_come_into_the_map() -> None:
 def test_what_is_no_area_is_refused(data: bytes, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         read_areas(data, None)
+
+
+@pytest.mark.parametrize("turned", [1, -1])
+def test_what_two_polygons_of_an_area_share_is_inside(turned: int) -> None:
+    """In planners' masks, corrections of maps and lifts, also once written and read again; a hole is one of its own polygon alone."""
+    parts = [
+        [box(0, 0, 4, 4), box(1, 1, 2, 2)[::turned]],
+        [box(3, 0, 8, 4)[::turned]],
+        [box(3, 0, 8, 4)],
+        [box(8, 4, 9, 5)],
+    ]
+    drawn: dict[str, Any] = feature("keep", kind="MultiPolygon")
+    drawn["geometry"]["coordinates"] = parts
+    drawn["properties"] |= {"mask": "keep-out", "lift": "A", "correction": {"kind": "forget"}}
+    beside = feature("beside", box(1, 0, 3, 1), box(1.5, 0.25, 2, 0.5))
+    beside["properties"] = drawn["properties"] | {"name": "beside"}
+    read = read_areas(collection(drawn, beside), None)
+    for areas in (read, read_areas(json.dumps(read.geojson("hall")).encode(), None)):
+        x, y = np.meshgrid(np.arange(0.025, 10, 0.05), np.arange(0.025, 6, 0.05))
+        hole = (x > 1) & (x < 2) & (y > 1) & (y < 2)
+        inside = (x < 8) & (y < 4) & ~hole | (x > 8) & (x < 9) & (y > 4) & (y < 5)
+        mask = mask_grid(areas, MaskKind.KEEP_OUT)
+        cells = np.pad(mask.cells, ((0, 120 - mask.cells.shape[0]), (0, 200 - mask.cells.shape[1])))
+        assert ((cells == 100) >= inside).all()
+        assert (cells[22:38, 22:38] == 0).all(), "but for cells at its edge the hole is free"
+        points = np.c_[x.ravel(), y.ravel(), np.full(x.size, 7.0)]
+        np.testing.assert_array_equal(AreaCorrections(areas.areas, areas.areas)._is_due(points), inside.ravel())
+        lifts = read_lifts(json.dumps(areas.geojson("hall")).encode(), BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0))
+        floor = Floor(
+            FloorEntry(site="hall", level="0", height_m=0.0), BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0), lifts
+        )
+        assert floor.lifts_at(np.array([2.5, 0.5]), 0.0) == floor.lifts_at(np.array([3.5, 2.0]), 0.0) == {"A"}
+        assert not floor.lifts_at(np.array([1.5, 1.5]), 0.3)
+        assert len({area.name: area for area in areas.areas}["keep"].outlines) == 4

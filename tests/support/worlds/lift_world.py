@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fleetmap.bow import Vocabulary
-from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
+from fleetmap.geometry import Array, Rings, se3, se3_inverse, so3_exp
 from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.mapformat.floors import Floor, FloorEntry
 from fleetmap.messages import Status
@@ -131,7 +131,7 @@ class LiftWorld:
         for n, (key, frame) in enumerate(zip(self.keys, frames, strict=True)):
             ring = (self.map_from_plan[n] @ np.c_[CABIN, np.zeros(4), np.ones(4)].T).T[:, :2]
             held[key] = Floor(
-                FloorEntry(site=key or "own", level=f"L{n}", height_m=STOREY_M * n), frame, {"A": (ring,)}
+                FloorEntry(site=key or "own", level=f"L{n}", height_m=STOREY_M * n), frame, {"A": ((ring,),)}
             )
         self.localizer.handle_floors(held)
         for key in self.keys:
@@ -143,7 +143,7 @@ class LiftWorld:
         self._looks = np.random.default_rng(7).integers(0, 256, (*self._stock.shape[:2], 32), np.uint8)
         self._bias_mps2 = self.rng.normal(0.0, 0.1)
 
-    def redraw(self, number: int, lifts: dict[str, tuple[Array, ...]]) -> None:
+    def redraw(self, number: int, lifts: dict[str, tuple[Rings, ...]]) -> None:
         """Draw other lifts on a floor."""
         floors = dict(self.localizer._floors)
         floors[self.keys[number]] = replace(floors[self.keys[number]], lifts=lifts)
