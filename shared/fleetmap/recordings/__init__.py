@@ -59,7 +59,7 @@ RECORDING_FORMATS = {
     "tum-rgbd": RecordingFormat(
         "a folder with rgb.txt, depth.txt and their images", tum_rgbd.recognises, tum_rgbd.open_tum_rgbd
     ),
-    "mcap": RecordingFormat("an .mcap file, or a folder with one in it", reader.recognises, reader.open_mcap),
+    "mcap": RecordingFormat("an .mcap file, or a folder with the parts of one", reader.recognises, reader.open_mcap),
     "rosbag2-sqlite": RecordingFormat("a rosbag2 .db3 file, or its folder", sqlite.recognises, sqlite.open_sqlite),
     "rosbag1": RecordingFormat("a ROS 1 .bag file", ros1.recognises, ros1.open_bag),
     "video": RecordingFormat("an .mp4 video of one camera", video.recognises, video.open_video),

@@ -57,6 +57,15 @@ def with_log_times(stamps_ns: Stamps, log_times_ns: Stamps, what: str, log: Read
     return np.where(unset, log_times_ns - delay_ns, stamps_ns)
 
 
+def arrival_order(stamps_ns: Stamps, log_times_ns: Stamps) -> NDArray[np.int64]:
+    """(N,) indices of values as they were logged: a file holds chunks, parts and channels one after the other.
+
+    The order of the file is kept where more stamps (N,) increase in it: the recorder's clock may have been set.
+    """
+    orders = np.argsort(log_times_ns, kind="stable"), np.arange(len(stamps_ns))
+    return max(orders, key=lambda order: int(_longest_increasing(stamps_ns[order]).sum()))
+
+
 def usual_size(sizes_px: Sequence[tuple[int, int] | None], what: str, log: ReadLog) -> NDArray[np.bool_]:
     """(N,) mask of the images with the most frequent size (width, height) or an unknown one; the others are noted in `log`."""
     counts = Counter(size for size in sizes_px if size is not None)

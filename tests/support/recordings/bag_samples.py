@@ -36,20 +36,23 @@ def write_rosbag2(
 
 
 def write_rosbag1(
-    path: Path, messages: Iterable[Message], compression: Writer1.CompressionFormat | None = None
+    path: Path,
+    messages: Iterable[Message],
+    compression: Writer1.CompressionFormat | None = None,
+    publishers: int = 1,
 ) -> Path:
-    """A ROS 1 bag, in chunks of 20 kB."""
+    """A ROS 1 bag, in chunks of 20 kB; publishers take turns, each with a connection of its own."""
     writer = Writer1(path)
     writer.chunk_threshold = 20_000
     if compression is not None:
         writer.set_compression(compression)
     with writer:
         connections = {}
-        for topic, name, stamp_ns, data in messages:
-            kind = name.replace("/", "/msg/")
-            if topic not in connections:
-                connections[topic] = writer.add_connection(topic, kind, typestore=_STORE1)
-            writer.write(connections[topic], stamp_ns, _STORE.cdr_to_ros1(data, kind))
+        for number, (topic, name, stamp_ns, data) in enumerate(messages):
+            kind, of = name.replace("/", "/msg/"), (topic, number % publishers)
+            if of not in connections:
+                connections[of] = writer.add_connection(topic, kind, typestore=_STORE1, callerid=f"/n{of[1]}")
+            writer.write(connections[of], stamp_ns, _STORE.cdr_to_ros1(data, kind))
     return path
 
 

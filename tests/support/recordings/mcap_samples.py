@@ -1,5 +1,7 @@
 """MCAP files as other recorders write them, with the content of the synthetic sample."""
 
+from collections import Counter
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +20,27 @@ IMU = ImuSamples(SAMPLE.imu_stamps_ns, SAMPLE.gyro_radps, SAMPLE.accel_mps2)
 Message = tuple[str, str, int, bytes]
 
 
-def write_foreign(path: Path, messages: list[Message], **options: Any) -> Path:
-    """ROS 2 messages (topic, type, stamp, bytes) by mcap's own writer."""
+def write_foreign(
+    path: Path,
+    messages: list[Message],
+    publishers: int = 1,
+    log_delay_ns: Callable[[int], int] = lambda _: 0,
+    **options: Any,
+) -> Path:
+    """ROS 2 messages (topic, type, stamp, bytes) by mcap's own writer; publishers take turns, each with channels of its own and a
+    definition of its own. log_delay_ns: by stamp."""
     writer = Writer(str(path), **{"chunk_size": 20_000, "compression": CompressionType.NONE, **options})
     writer.start(profile="ros2", library="test")
-    channels: dict[tuple[str, str], int] = {}
+    channels: dict[tuple[str, str, int], int] = {}
+    turns = Counter[str]()
     for topic, name, stamp, data in messages:
-        if (topic, name) not in channels:
-            schema = writer.register_schema(name.replace("/", "/msg/"), "ros2msg", ros2msg(name).encode())
-            channels[topic, name] = writer.register_channel(topic, "cdr", schema)
-        writer.add_message(channels[topic, name], stamp, data, stamp)
+        turns[topic] += 1
+        publisher = turns[topic] % publishers
+        if (topic, name, publisher) not in channels:
+            definition = f"{ros2msg(name)}\n{'# of a later release' * publisher}".encode()
+            schema = writer.register_schema(name.replace("/", "/msg/"), "ros2msg", definition)
+            channels[topic, name, publisher] = writer.register_channel(topic, "cdr", schema)
+        writer.add_message(channels[topic, name, publisher], stamp + log_delay_ns(stamp), data, stamp)
     writer.finish()
     return path
 

@@ -8,7 +8,7 @@ from typing import Protocol
 from fleetmap.sensors.samples import DataIssue
 
 CALIBRATION_ATTACHMENT = "calibration.yaml"
-Place = tuple[int, int, int]  # position of a message in its file, as numbered by its container
+Place = tuple[int, ...]  # position of a message in its file, as numbered by its container
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,6 +41,7 @@ from fleetmap.recordings.images import StoredImage, check_image
 from fleetmap.recordings.ordering import (
     DEPTH_TOLERANCE_NS,
     ReadLog,
+    arrival_order,
     clean_imu,
     trajectory_of_rows,
     usual_size,
@@ -412,10 +413,11 @@ def _images(streams: Sequence[_Stream], what: str, log: ReadLog, lenses: _Lenses
         log.note(f"{what} left out", f"{damaged} of {damaged + len(stamps_ns)}; the first: {why}")
     sources = tuple((stream.decoder, place) for stream in streams for place in stream.places)
     images = ImageSeries(with_log_times(stamps_ns, log_times_ns, what, log), sources)
+    order = arrival_order(images.stamps_ns, log_times_ns)
     kept = usual_size([size for stream in streams for size in stream.sizes_px], what, log)
     if lenses is not None:
         kept &= _of_usual_lens(lenses, what, log)
-    return images.take(np.flatnonzero(kept)).forward(what, log)
+    return images.take(order[kept[order]]).forward(what, log)
 
 
 def _of_usual_lens(lenses: _Lenses, what: str, log: ReadLog) -> NDArray[np.bool_]:
@@ -432,11 +434,13 @@ def _of_usual_lens(lenses: _Lenses, what: str, log: ReadLog) -> NDArray[np.bool_
 
 
 def _samples(samples: Sequence[tuple[int, Sample]], what: str, log: ReadLog) -> tuple[Sample, ...]:
-    """The samples, with their log times, whose stamps increase."""
+    """The samples, with their log times, whose stamps increase as they arrived."""
     stamps_ns = np.array([sample.stamp_ns for _, sample in samples], np.int64)
-    stamps_ns = with_log_times(stamps_ns, np.array([at for at, _ in samples], np.int64), what, log)
-    stamped = [replace(sample, stamp_ns=int(s)) for (_, sample), s in zip(samples, stamps_ns, strict=True)]
-    return values_forward(stamped, stamps_ns.tolist(), what, log)
+    log_times_ns = np.array([at for at, _ in samples], np.int64)
+    stamps_ns = with_log_times(stamps_ns, log_times_ns, what, log)
+    order = arrival_order(stamps_ns, log_times_ns).tolist()
+    stamped = [replace(samples[k][1], stamp_ns=int(stamps_ns[k])) for k in order]
+    return values_forward(stamped, [sample.stamp_ns for sample in stamped], what, log)
 
 
 def _imu(streams: Sequence[_Stream], log: ReadLog) -> tuple[ImuSamples, str | None]:
@@ -454,8 +458,10 @@ def _imu(streams: Sequence[_Stream], log: ReadLog) -> tuple[ImuSamples, str | No
     if not parts:
         return ImuSamples.empty(), None
     stamps_ns, gyro, accel = (np.concatenate([part[i] for part in parts]) for i in range(3))
-    stamps_ns = with_log_times(stamps_ns.astype(np.int64), np.array(log_times_ns, np.int64), "imu", log)
-    return clean_imu(stamps_ns, gyro, accel, log), parts[0][3]
+    logged_ns = np.array(log_times_ns, np.int64)
+    stamps_ns = with_log_times(stamps_ns.astype(np.int64), logged_ns, "imu", log)
+    order = arrival_order(stamps_ns, logged_ns)
+    return clean_imu(stamps_ns[order], gyro[order], accel[order], log), parts[0][3]
 
 
 def _ground_truth(streams: Sequence[_Stream], log: ReadLog) -> Trajectory | None:
@@ -465,7 +471,9 @@ def _ground_truth(streams: Sequence[_Stream], log: ReadLog) -> Trajectory | None
     stamps_ns = np.array([stamp_ns for _, (stamp_ns, _) in values], np.int64)
     log_times_ns = np.array([at for at, _ in values], np.int64)
     rows = np.stack([row for _, (_, row) in values])
-    return trajectory_of_rows(with_log_times(stamps_ns, log_times_ns, "ground truth", log), rows, log)
+    stamps_ns = with_log_times(stamps_ns, log_times_ns, "ground truth", log)
+    order = arrival_order(stamps_ns, log_times_ns)
+    return trajectory_of_rows(stamps_ns[order], rows[order], log)
 
 
 def _note_unregistered(streams: Iterable[_Stream], roles: _Roles, camera: CameraCalibration, log: ReadLog) -> None:

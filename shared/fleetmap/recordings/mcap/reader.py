@@ -5,10 +5,12 @@ lose a chunk truncated by a power failure. Here damage is noted as a DataIssue, 
 still has its index, and sizes are compared with limits before anything is read or unpacked.
 """
 
+import re
 import struct
 import zlib
 from bisect import bisect_right
 from collections.abc import Generator, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from io import BytesIO
 from pathlib import Path
@@ -22,7 +24,7 @@ from mcap.opcode import Opcode
 from fleetmap.errors import RecordingError
 from fleetmap.recordings.bags.container import Channel, Message, Place
 from fleetmap.recordings.bags.streams import open_messages
-from fleetmap.recordings.files import file_head, what_file_instead
+from fleetmap.recordings.files import file_head, natural_key, what_file_instead
 from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, KeptBytes, unpack
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS
 from fleetmap.recordings.recording import OpenOptions, Recording
@@ -47,25 +49,55 @@ _PARSED: dict[int, Any] = {
 
 
 def recognises(path: Path) -> bool:
-    """True for a file with MCAP's magic bytes or named .mcap, or a rosbag2 folder with one such file."""
-    return _mcap_file(path) is not None
+    """True for a file with MCAP's magic bytes or named .mcap, or a rosbag2 folder with such files."""
+    if path.is_dir():
+        return any(path.glob("*.mcap"))
+    return path.is_file() and (path.suffix == ".mcap" or file_head(path, len(MAGIC)) == MAGIC)
 
 
 def open_mcap(path: Path, options: OpenOptions) -> Recording:
-    """Open the recording in an MCAP file (or the one in a rosbag2 folder); its issues list damaged and missing parts."""
-    file_path = _mcap_file(path)
-    assert file_path is not None
-    pieces = len(list(path.glob("*.mcap"))) if path.is_dir() else 1
-    if pieces > 1:
-        raise RecordingError(f"{path} holds {pieces} .mcap files; choose one of them, or merge them with `mcap merge`")
-    return open_messages(path, "mcap", partial(McapFile, file_path), options)
+    """Open the recording in an MCAP file, or in a rosbag2 folder of its parts; its issues list damaged and missing data."""
+    files = sorted(path.glob("*.mcap"), key=lambda file: natural_key(file.name)) if path.is_dir() else [path]
+    names = {re.sub(r"_\d+$", "", file.stem) for file in files}
+    if len(names) > 1:
+        raise RecordingError(
+            f"{path} holds {len(files)} .mcap files of several recordings ({', '.join(sorted(names)[:5])}); choose one of them, or "
+            "name the parts of one NAME_0.mcap, NAME_1.mcap"
+        )
+    return open_messages(path, "mcap", partial(McapFiles, tuple(files)), options)
 
 
-def _mcap_file(path: Path) -> Path | None:
-    if path.is_dir():
-        return min(path.glob("*.mcap"), default=None)
-    is_one = path.is_file() and (path.suffix == ".mcap" or file_head(path, len(MAGIC)) == MAGIC)
-    return path if is_one else None
+class McapFiles(KeptBytes):
+    """The parts of one recording, in the order of their names, as a Container. A place: number of the part, then as in McapFile."""
+
+    def __init__(self, files: Sequence[Path]) -> None:
+        super().__init__(files[0], sum(file.stat().st_size for file in files))
+        self.files = files
+        self.name = ""
+        self.attachments: dict[str, bytes] = {}
+        self.issues: list[DataIssue] = []
+        self._parts = [McapFile(file) for file in files]
+
+    def messages(self) -> Iterator[Message]:
+        """See Container: part by part, in the order of each file. Equal channels of several parts are one."""
+        alike: dict[Channel, Channel] = {}
+        for number, part in enumerate(self._parts):
+            channels: dict[int, Channel] = {}
+            for channel, log_time_ns, place, data in part.messages():
+                if channel.id not in channels:
+                    channels[channel.id] = alike.setdefault(replace(channel, id=0), replace(channel, id=len(alike)))
+                yield channels[channel.id], log_time_ns, (number, *place), data
+            self.name = self.name or part.name
+            self.attachments = part.attachments | self.attachments
+            where = f"{part.path.name}: " if len(self._parts) > 1 else ""
+            self.issues += [replace(issue, detail=where + issue.detail) for issue in part.issues]
+
+    def read(self, place: Place) -> bytes:
+        return self._parts[place[0]].read(place[1:])
+
+    def close(self) -> None:
+        for part in self._parts:
+            part.close()
 
 
 class McapFile(KeptBytes):

@@ -329,6 +329,6 @@ def test_a_rosbag2_folder(tmp_path: Path) -> None:
     write_foreign(bag / "bag_0.mcap", foreign_messages())
     with open_recording(bag) as recording:
         assert_is_the_sample(recording)
-    write_foreign(bag / "bag_1.mcap", foreign_messages())
-    with pytest.raises(RecordingError, match=r"holds 2 \.mcap files"):
+    write_foreign(bag / "other_1.mcap", foreign_messages())
+    with pytest.raises(RecordingError, match=r"holds 2 \.mcap files of several recordings \(bag, other\)"):
         open_recording(bag)
