@@ -109,6 +109,7 @@ class ServerSync:
         """True if a peer is reachable. The log says once that none is, and when one is again."""
         if self.client.connected():
             if self._is_away_told:
+                self._ask_at_s = 0.0  # it may have been restored from a backup
                 self._refusals.warning("connected again", "connected to the map server again")
             self._connected_s, self._is_away_told = now_s, False
             return True

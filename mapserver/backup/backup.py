@@ -18,7 +18,7 @@ import pyrage
 
 from fleetmap.errors import StateError, UsageError, disk_errors
 from fleetmap.mapformat import sha256_hex
-from mapserver.backup.snapshots import PIECE_BYTES, BackupTarget, Snapshot
+from mapserver.backup.snapshots import LEFT_OUT, NAMED, PIECE_BYTES, BackupTarget, Snapshot
 from mapserver.store import MapStore
 from mapserver.store.database import format_of
 from mapserver.store.files import is_plain_file
@@ -131,11 +131,21 @@ class _Upload:
 def _trusted(
     store: MapStore, upload: _Upload, recipient: "pyrage.x25519.Recipient | None"
 ) -> tuple[dict[str, list[str]], str]:
-    """Upload signed lists and, for a recipient, keys. They are older than the database then: the restored store signs what is missing."""
-    folder, lists = store.folder, store.folder / "trust"
-    with store.locked("trust/lock") if lists.is_dir() else nullcontext():  # keys and lists change under it
-        keys = "" if recipient is None else upload.put(pyrage.encrypt(_packed(folder / "keys"), [recipient]))
-        return {f"trust/{path.name}": [upload.put(path.read_bytes())] for path in _plain_files(lists, ".json")}, keys
+    """Upload signed lists, enrolled robots and, for a recipient, keys.
+
+    They are older than the database then: the restored store signs what is missing.
+    """
+    folder, files, secrets = store.folder, dict[str, list[str]](), list[Path]()
+    with store.locked("trust/lock") if (folder / "trust").is_dir() else nullcontext():  # keys and lists change under it
+        for path in sorted([*folder.glob("trust/*"), *folder.glob("keys/*")]):
+            name = path.relative_to(folder).as_posix()
+            if LEFT_OUT.fullmatch(name) or not is_plain_file(path):
+                continue
+            if NAMED.fullmatch(name):
+                files[name] = [upload.put(piece) for piece in _pieces(path)]
+            elif path.parent.name == "keys":
+                secrets.append(path)
+        return files, "" if recipient is None else upload.put(_packed(secrets, recipient))
 
 
 def _pieces(path: Path) -> Iterator[bytes]:
@@ -144,15 +154,14 @@ def _pieces(path: Path) -> Iterator[bytes]:
             yield piece
 
 
-def _plain_files(folder: Path, *suffixes: str) -> list[Path]:
-    found = folder.iterdir() if folder.is_dir() else ()
-    return sorted(path for path in found if is_plain_file(path) and path.suffix in suffixes)
-
-
-def _packed(folder: Path) -> bytes:
-    """Return the files of a folder of keys as a tar archive."""
+def _packed(paths: list[Path], recipient: "pyrage.x25519.Recipient") -> bytes:
+    """Return files of a folder of keys as an encrypted tar archive; StateError for more than a restoration reads."""
     packed = io.BytesIO()
     with tarfile.open(fileobj=packed, mode="w") as archive:
-        for path in _plain_files(folder, ".pem", ".crt", ".old"):
+        for path in paths:
             archive.add(path, path.name)
-    return packed.getvalue()
+    encrypted: bytes = pyrage.encrypt(packed.getvalue(), [recipient])
+    if len(encrypted) > PIECE_BYTES:
+        largest = max(paths, key=lambda path: path.stat().st_size)
+        raise StateError(f"the keys have more than {PIECE_BYTES} bytes; move {largest} elsewhere, if it is no key")
+    return encrypted

@@ -15,9 +15,11 @@ from fleetmap.errors import FleetmapError, MapFormatError, StoreError, UsageErro
 from fleetmap.files import sync_path, write_atomically
 from fleetmap.mapformat import blob_path
 from mapserver.backup.snapshots import PIECE_BYTES, BackupTarget, Snapshot
+from mapserver.operators.operators import Operators
 from mapserver.store import Actor, MapStore
 from mapserver.store.files import locked, make_folder
 from mapserver.trust import SignedLists
+from mapserver.trust.enrolment import RobotRegister
 from mapserver.trust.signing import sign_ahead
 
 _NO_STORE = {"lock", "lost+found", _PART := ".restore"}
@@ -30,7 +32,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, slots=True)
 class RestoreReport:
-    """Result of a restoration. keys: names of the restored ones.
+    """Result of a restoration. keys: names of the restored ones. robots: enrolled ones; people: operators, and programs with a token.
 
     lists: "none" without signed ones; "new": signed by new keys, all robots accept them; "ahead": robots accept them unless sites or keys
     were added after the backup; "old": signed by nobody, for lack of a key.
@@ -38,6 +40,9 @@ class RestoreReport:
 
     snapshot: str
     versions: int
+    sites: int
+    robots: int
+    people: int
     keys: tuple[str, ...]
     lists: Literal["none", "new", "ahead", "old"]
     missing: tuple[str, ...]
@@ -100,13 +105,14 @@ def restore(
                     words = f"snapshot {name}, of {snapshot.versions} versions"
                     store.note_restored(words, number * _VERSIONS_AHEAD, actor)
                     lists = _sign(store, number, target)
+                    counts = len(store.sites()), _robots(store), len(Operators(store).all())
                 # The database last: until it is there, the folder is no store.
                 for path in sorted(part.iterdir(), key=lambda path: path.name.startswith("store.sqlite3")):
                     path.replace(folder / path.name)
             finally:
                 shutil.rmtree(part, ignore_errors=True)
             sync_path(folder)
-    return RestoreReport(name, snapshot.versions, tuple(sorted(keys)), lists, tuple(snapshot.missing))
+    return RestoreReport(name, snapshot.versions, *counts, tuple(sorted(keys)), lists, tuple(snapshot.missing))
 
 
 def _check_room(folder: Path, needed: int) -> None:
@@ -115,6 +121,14 @@ def _check_room(folder: Path, needed: int) -> None:
         raise StoreError(
             f"the snapshot has up to {needed} bytes, the disk of {folder} {free}; name a folder with more room"
         )
+
+
+def _robots(store: MapStore) -> int:
+    try:
+        return len(RobotRegister(store).robots())
+    except StoreError as error:  # damaged before the backup; everything else is worth having
+        _log.warning("no robot is enrolled: %s", error)
+        return 0
 
 
 def _sign(store: MapStore, number: int, target: BackupTarget) -> Literal["none", "new", "ahead", "old"]:

@@ -1,6 +1,6 @@
 """The target of backups: objects by their SHA-256, and snapshots that name them.
 
-    URL/objects/ab/<sha256>      blobs of the store; pieces of its database, signed lists and encrypted keys
+    URL/objects/ab/<sha256>      blobs of the store; pieces of its database, signed lists, robots and encrypted keys
     URL/snapshots/<UTC>.json     what a store consisted of at that time; written last, so that each one there is complete
     URL/restores/<number>        one for each restoration, which counts them
 
@@ -26,12 +26,18 @@ from fleetmap.files import sync_path
 from fleetmap.mapformat import check_sha256, sha256_hex
 from mapserver.store.object_store import object_errors, open_objects
 
-FORMAT = 1
+FORMAT = 2  # 1 has no enrolled robots
 PIECE_BYTES = 4 << 20
 """Size of a database's pieces, whose unchanged pages stay where they are, and the limit of other files'."""
 _OBJECTS, _SNAPSHOTS, _RESTORES = "objects", "snapshots", "restores"
 _NAME, _NAME_FORMAT = re.compile(r"[0-9]{8}T[0-9]{6}Z"), "%Y%m%dT%H%M%SZ"
-_PATH = re.compile(r"store\.sqlite3|trust/[a-z0-9][a-z0-9._-]{0,120}\.json")
+NAMED = re.compile(r"store\.sqlite3|keys/robots\.json|trust/[a-z0-9][a-z0-9._-]{0,120}\.json")
+"""Files of a store that a snapshot names by their paths; all others in `keys` are encrypted."""
+LEFT_OUT = re.compile(
+    r"(.*/)?(lock|\..*)|[^/]*\.lock|store\.sqlite3-(wal|shm)|store-format-[0-9]+\.sqlite3|reserve|places\.json|job-[0-9]+\.log|"
+    r"(blobs|sites|refused)/.*"
+)
+"""Files that no snapshot names: the database names the blobs, `sites` is made of it, the others are locks, logs, refused messages."""
 _LONGEST_BACKUP = timedelta(days=1)
 _MOST_BYTES = 1 << 30  # of a snapshot
 _MOST_RESTORES = 50_000  # signed lists count in ten digits
@@ -205,6 +211,6 @@ def _decoded(name: str, data: bytes) -> Snapshot:
         raise MapFormatError(f"snapshot {name} is damaged ({error}); take an earlier one with --snapshot") from error
     if found.format > FORMAT:
         raise NewerFormatError(f"snapshot {name} has format {found.format}, this fleetmap reads {FORMAT}; update it")
-    if unknown := [path for path in found.files if not _PATH.fullmatch(path)]:
+    if unknown := [path for path in found.files if not NAMED.fullmatch(path)]:
         raise MapFormatError(f"snapshot {name} names the file {unknown[0][:200]!r}, which no store has")
     return found

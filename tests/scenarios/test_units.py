@@ -15,6 +15,7 @@ from support.fleet.contracts_documents import REPOSITORY
 from support.fleet.tls_site import START_S, TlsSite
 from support.fleet.unit_filter import filtered
 from support.recordings.recording_samples import calibration, write_euroc
+from support.storage.store_files import forgotten_files
 from support.worlds import robot_world
 from support.worlds.box_room import out_and_back, ride_sample
 
@@ -73,5 +74,6 @@ def test_the_programs_do_their_work_under_the_filters_of_their_units(tmp_path: P
     write_euroc(tmp_path / "inbox" / "ride", ride_sample(out_and_back(4.0), 38, 0.1, seed=1))
     words = f"nightly --site lab --inbox {tmp_path}/inbox --store {tmp_path}/lab --settle-s 0"
     site.run("mapserver", *shlex.split(words))
+    assert forgotten_files(tmp_path / "lab") == []
     with MapStore.open(tmp_path / "lab") as store:
         assert [info.version for info in store.versions("lab")] == [1]

@@ -176,7 +176,8 @@ def test_a_hostile_target_writes_nowhere_else(store: MapStore, tmp_path: Path) -
         msgspec.structs.replace(found, blobs={"0" * 64: 1 << 60}),
         msgspec.structs.replace(found, blobs=dict.fromkeys(found.blobs, 1)),
         msgspec.structs.replace(found, keys=sha256_hex(stolen)),
-        msgspec.structs.replace(found, format=2),
+        msgspec.structs.replace(found, files={**found.files, "keys/online.pem": found.files["store.sqlite3"]}),
+        msgspec.structs.replace(found, format=3),
     ]
     for bad in [to_json(snapshot) for snapshot in hostile] + [b"{", b"[]", b"\xff"]:
         (tmp_path / "backups" / "snapshots" / f"{name}.json").write_bytes(bad)

@@ -13,6 +13,7 @@ import httpx
 
 from locclient.identity import RobotIdentity
 from locclient.maps.connection import outbox_path
+from support.storage.store_files import forgotten_files
 
 START_S = 120.0  # on a machine that may be busy
 
@@ -53,13 +54,14 @@ class TlsSite:
         self.http, self.endpoint = said["http"], said["zenoh"]
 
     def stop(self, number: int = signal.SIGTERM) -> int:
-        """The status with which the server ends."""
+        """The status with which the server ends. Whatever it wrote is in a backup, or need not be."""
         if self.server is None:
             return 0
         self.server.send_signal(number)
         status = self.server.wait(timeout=60)
         self.server.stdout.close()
         self.server = None
+        assert forgotten_files(self.store) == []
         return status
 
     @contextmanager
