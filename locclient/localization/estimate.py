@@ -138,9 +138,8 @@ def _of_confirmed(
     radius_m = radius_95_m(confirmed.now_cov) if is_known else float("inf")
     age_s = (estimate.odometry.stamp_ns - confirmed.stamp_ns) * 1e-9
     cause = _cause(estimate, has_failed=has_failed)
-    is_doubted = (
-        confirmed.has_broken and has_failed
-    )  # its tracks were lost, and the map has not confirmed its place since
+    # Its tracks or its IMU were lost, and the map has not confirmed its place since.
+    is_doubted = (confirmed.has_broken and has_failed) or confirmed.lost_imu
     if radius_m > settings.lost_radius_m:
         status = Status.LOST
     elif (

@@ -35,7 +35,8 @@ class PoseHypothesis:
     agreeing fixes. inlier_sum, recall_sum, queries: sums of inliers, of landmark recall, and of map queries, older ones
     decayed. query_inliers, query_recall: of this query's fix, 0 without. recall_total, looks: landmark recall of all queries, 0
     for those without a fix, and their number. misses: queries since the last fix. told_log_odds: log odds that an operator who chose
-    this place is right, 0 without one. has_broken: tracks were lost since the last fix. floor: whose `map` it is, empty for the
+    this place is right, 0 without one. has_broken: tracks were lost since the last fix, lost_imu: so was
+    the IMU. is_by_vision: it moved without an IMU since its frame. floor: whose `map` it is, empty for the
     robot's own.
     """
 
@@ -59,6 +60,8 @@ class PoseHypothesis:
     travelled_m: float = 0.0
     told_log_odds: float = 0.0
     has_broken: bool = False
+    lost_imu: bool = False
+    is_by_vision: bool = False
     floor: str = ""
     history: ObservationHistory = field(default_factory=ObservationHistory)
 
@@ -76,7 +79,8 @@ class PoseHypothesis:
         """Propagate a pose at the frame of a map query to the present. query: the identity at that frame, propagated to the present."""
         then = compose_end_cov(map_from_body, cov_rot_trans, query.map_from_body, query.cov_rot_trans)
         now = compose_end_cov(map_from_body, cov_rot_trans, query.now_map_from_body, query.now_cov)
-        return cls(query.frame_index, query.stamp_ns, *then, *now, has_broken=query.has_broken, floor=floor)
+        since = {"has_broken": query.has_broken, "lost_imu": query.lost_imu, "is_by_vision": query.is_by_vision}
+        return cls(query.frame_index, query.stamp_ns, *then, *now, **since, floor=floor)
 
     @property
     def evidence(self) -> str:
@@ -125,6 +129,7 @@ class PoseHypothesis:
         self.frame_index, self.stamp_ns = other.frame_index, other.stamp_ns
         self.map_from_body, self.cov_rot_trans = other.map_from_body, other.cov_rot_trans
         self.now_map_from_body, self.now_cov = other.now_map_from_body, other.now_cov
+        self.is_by_vision = other.is_by_vision
 
     def propagate(
         self, motions: Mapping[int, Motion], odometry: OdometryEstimate, step: Array, settings: TrackSettings
@@ -135,6 +140,7 @@ class PoseHypothesis:
         """
         step_m = length(step[:3, 3])
         self.travelled_m += step_m
+        self.is_by_vision |= odometry.is_bridged or not odometry.inertial
         motion = motions.get(self.frame_index)
         if motion is None:
             # The odometry dropped the start frame in a long standstill, or restarted: one step by its estimates alone.
@@ -143,12 +149,12 @@ class PoseHypothesis:
             self.now_map_from_body, self.now_cov = compose_cov(self.now_map_from_body, self.now_cov, step, cov_step)
         else:
             distance_m = length(motion.body_from_now[:3, 3])
-            drift = (0.0, settings.drift_floor_m, settings.drift_share) if odometry.inertial else _VISION_ONLY
+            drift = _VISION_ONLY if self.is_by_vision else (0.0, settings.drift_floor_m, settings.drift_share)
             cov_motion = motion.cov_rot_trans + _step_cov(drift, distance_m)
             now = compose_cov(self.map_from_body, self.cov_rot_trans, motion.body_from_now, cov_motion)
             self.now_map_from_body, self.now_cov = now
         if motion is None or motion.is_last:
-            self.frame_index = odometry.frame_index
+            self.frame_index, self.is_by_vision = odometry.frame_index, False
             self.map_from_body, self.cov_rot_trans = self.now_map_from_body, bounded_turn(self.now_cov)
 
 

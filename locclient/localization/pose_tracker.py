@@ -95,6 +95,7 @@ class PoseTracker:
         self.lookalikes: LookAlikes | None = None
         self.alias_step_m = ALIAS_STEP_M
         self.odom_from_body: Array | None = None  # of the last frame
+        self._had_imu = False  # in the last frame
         self._query_frame: PoseHypothesis | None = None  # of the running map query, as the identity
         self._query_index: int | None = None  # of the last map query's frame
         self.floor = ""  # of the last confirmed pose
@@ -185,6 +186,8 @@ class PoseTracker:
     def propagate(self, odometry: OdometryEstimate, motions: Mapping[int, Motion], *, has_broken: bool) -> None:
         """Propagate every hypothesis to the present frame. has_broken: tracks are lost in a good image."""
         change, last = odometry.new_odom_from_old_odom, self.odom_from_body
+        had_imu, self._had_imu = self._had_imu, odometry.inertial and not odometry.is_bridged
+        lost_imu = had_imu and not self._had_imu
         if last is not None and change is not None:
             last = change @ last
         step = np.eye(4) if last is None else se3_inverse(last) @ odometry.odom_from_body
@@ -193,6 +196,7 @@ class PoseTracker:
         for hypothesis in self._tracked():
             hypothesis.propagate(motions, odometry, step, self._track)
             hypothesis.has_broken |= has_broken
+            hypothesis.lost_imu |= lost_imu
             if change is not None:
                 hypothesis.history.redefine_odom(change)
         if change is not None:

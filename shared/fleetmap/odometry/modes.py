@@ -32,6 +32,8 @@ _NEAR_REST_MPS = 0.2  # a fifth of the tolerated error of the first speed: the f
 _STEP_SIGMAS, _STEP_M, _ACCEL_OFF_MPS2 = 4.0, 0.02, 0.3  # largest step by images off the prediction
 _MAX_ELSEWHERE = 2  # consecutive frames whose descriptor matches contradict the IMU, until the matches are trusted
 _EXTRAPOLATED_NS = 1_000_000_000  # during which a robot without visual tracking continues at its last speed
+# Of the motion that all points show, where samples are missing: a ninth of what the tracks say once more by themselves.
+_BRIDGED_SIGMAS = 3.0
 _BY_IMU_NS = 1_000_000_000  # during which an IMU alone carries the speed of one camera
 # Largest acceleration without an IMU to measure it: friction holds wheels and shoes to at most about their weight.
 _MAX_ACCEL_MPS2 = GRAVITY_MPS2
@@ -127,6 +129,7 @@ class WindowMode(Mode):
     """A mode that estimates over a sliding window."""
 
     waits_for_gravity = False
+    is_bridged = False  # the last step, without the samples of the IMU that a mode needs
 
     def __init__(self, window: SlidingWindow) -> None:
         self.window = window
@@ -184,7 +187,38 @@ class WindowMode(Mode):
             track_pixels=tracked.pixels,
             previous_from_body=self.window.body_since(frame_index - 1) if frame_index else None,
             is_lifted=step.is_lifted,
+            is_bridged=self.is_bridged,
         )
+
+    def _body_from_next(self, cam_from_previous: Array) -> Array:
+        """Return the body's motion (4, 4) for one of the camera."""
+        return np.asarray(self._rig.body_from_cam @ se3_inverse(cam_from_previous) @ self._rig.cam_from_body)
+
+    def _seen_motion(self, tracked: Tracked, guess: Array) -> Array:
+        """Return cam_from_previous (4, 4) by the images, before the state is moved from the last frame; `guess` without them."""
+        if tracked.cam_from_previous is not None:
+            return tracked.cam_from_previous
+        seen = self.window.matched_body(tracked)
+        if seen is None:
+            return guess
+        cam_from_odom = self._rig.cam_from_body @ se3_inverse(seen[1])
+        return np.asarray(cam_from_odom @ self.window.filter.odom_from_body() @ self._rig.body_from_cam)
+
+    def _measured_motion_cov(self, tracked: Tracked, sigmas: float) -> Array | None:
+        """Covariance (6, 6), in body axes, that ties the state to the motion of all points of the last two frames.
+
+        An update uses the few tracks that are due or ended. If they cluster or slip together, the state must not
+        follow them further than all the others allow; it is so loose that it adds hardly any information.
+        """
+        if tracked.information is None:
+            return None
+        body_from_cam = np.zeros((6, 6))
+        rotation = self._rig.body_from_cam[:3, :3]
+        body_from_cam[:3, :3] = body_from_cam[3:, 3:] = rotation
+        body_from_cam[3:, :3] = skew(self._rig.body_from_cam[:3, 3]) @ rotation
+        cov_rot_trans = np.linalg.inv(tracked.information + 1e-9 * np.eye(6))
+        wide = sigmas**2 * cov_rot_trans
+        return np.asarray(body_from_cam @ wide @ body_from_cam.T)
 
 
 def _with_matches(tracked: Tracked, kept: Iterable[Earlier]) -> Tracked:
@@ -241,16 +275,12 @@ class VisualMode(WindowMode):
         return Step(self, used, change, is_lost=tracked.lost)
 
     def _predict_random_walk(self, tracked: Tracked) -> None:
-        rig, settings, window = self._rig, self._rig.settings.filter, self.window
-        if tracked.cam_from_previous is not None:
-            self._cam_from_previous = tracked.cam_from_previous
-        elif (seen := window.matched_body(tracked)) is not None:
-            cam_from_odom = rig.cam_from_body @ se3_inverse(seen[1])
-            self._cam_from_previous = cam_from_odom @ window.filter.odom_from_body() @ rig.body_from_cam
-        body_from_next = rig.body_from_cam @ se3_inverse(self._cam_from_previous) @ rig.cam_from_body
+        settings, window = self._rig.settings.filter, self.window
+        self._cam_from_previous = self._seen_motion(tracked, self._cam_from_previous)
+        body_from_next = self._body_from_next(self._cam_from_previous)
         duration_s = window.seconds_since(window.filter.clone_ids[-1])
         sigmas = self._rotation_sigma_rad(body_from_next, duration_s), self._translation_sigma_m()
-        measured = self._measured_motion_cov(tracked)
+        measured = self._measured_motion_cov(tracked, settings.seen_motion_scale)
         window.filter.predict_random_walk(body_from_next, *sigmas, duration_s, measured)
         if not tracked.lost:
             self._seen_ns, self._seen_step_ns, self._seen_var_m2 = self.stamp_ns, self._step_ns, 0.0
@@ -283,22 +313,6 @@ class VisualMode(WindowMode):
     def _rotation_sigma_rad(self, body_from_next: Array, duration_s: float) -> float:
         """Rotation sigma of a predicted motion (4, 4), without the images."""
         return self._rig.settings.filter.free_rotation_sigma_rad
-
-    def _measured_motion_cov(self, tracked: Tracked) -> Array | None:
-        """Covariance (6, 6), in body axes, that ties the state to the motion of all points of the last two frames.
-
-        An update uses the few tracks that are due or ended. If they cluster or slip together, the state must not
-        follow them further than all the others allow; it is so loose that it adds hardly any information.
-        """
-        if tracked.information is None:
-            return None
-        body_from_cam = np.zeros((6, 6))
-        rotation = self._rig.body_from_cam[:3, :3]
-        body_from_cam[:3, :3] = body_from_cam[3:, 3:] = rotation
-        body_from_cam[3:, :3] = skew(self._rig.body_from_cam[:3, 3]) @ rotation
-        cov_rot_trans = np.linalg.inv(tracked.information + 1e-9 * np.eye(6))
-        wide = self._rig.settings.filter.seen_motion_scale**2 * cov_rot_trans
-        return np.asarray(body_from_cam @ wide @ body_from_cam.T)
 
 
 class GyroMode(VisualMode):
@@ -440,11 +454,13 @@ class InertialMode(WindowMode):
         self._zero_velocity = ZeroVelocityDetector(settings.still_window_s, settings.still_flow_px)
         self._frame_ns = window.stamp_ns
         self._last_odom_from_body = window.filter.odom_from_body()  # at the frame before
-        self._seen: Array | None = None  # the last motion by images
+        self._seen: Array | None = None  # the last motion by images, of this duration
+        self._step_s = 0.0
         self._lift = LiftCheck(self._rig.base_from_body)
         self._measured_ns = window.stamp_ns  # of the last frame with motion in the images, or at rest
         self._elsewhere_frames = 0  # consecutive frames whose descriptor matches contradicted the prediction
         self._is_pause = False
+        self._guess: Array | None = None  # cam_from_previous of a bridged step until the state is moved
 
     @classmethod
     def started(cls, old: SlidingWindow, imu: ImuInputs, start: InitialState) -> "InertialMode":
@@ -464,16 +480,23 @@ class InertialMode(WindowMode):
             window.stamp_ns = end_ns
             return
         gap_ns = longest_gap_ns(imu.samples.imu.stamps_ns, window.stamp_ns, end_ns)
-        if gap_ns > IMU_GAP_NS and len(window.filter.clone_ids) > 1:
-            self._bridge_gap(end_ns)
+        self.is_bridged = gap_ns > IMU_GAP_NS and len(window.filter.clone_ids) > 1
+        self.rotation_sigma_rad = None if self.is_bridged else _ROTATION_SIGMA_RAD
+        if self.is_bridged:
+            self._guess, window.rate_body_radps = self._last_motion(end_ns), np.zeros(3)
         else:
             window.rate_body_radps = window.filter.propagate(
                 imu.samples.imu, window.stamp_ns, end_ns, imu.weighing_noise, imu.noise
             )
+        self._step_s = max(end_ns - window.stamp_ns, 0) * 1e-9
         window.stamp_ns = max(end_ns, window.stamp_ns)
 
     def cam_from_earlier(self, frame_index: int) -> Array | None:
-        return self.window.cam_from_earlier(frame_index)
+        since = self.window.cam_from_earlier(frame_index)
+        if since is None or self._guess is None:
+            return since
+        # Not times the identity for the last frame, which would be a rotation but for rounding: that would grow from frame to frame.
+        return self._guess if frame_index == self.window.filter.clone_ids[-1] else self._guess @ since
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
         """See Mode; abandons a gyro or accelerometer that contradicts the images, restarts a diverged filter."""
@@ -482,7 +505,9 @@ class InertialMode(WindowMode):
             return Step(self._begin_again(frame_index, tracked), np.zeros(0, np.int8), np.eye(4))
         tracked = self._without_lookalikes(tracked)
         self._seen = seen = tracked.cam_from_previous
-        if seen is not None and monitor.is_wrong_imu(self.cam_from_earlier(frame_index - 1), seen):
+        if self._guess is not None:
+            self._bridge_gap(tracked, self._guess)
+        elif seen is not None and monitor.is_wrong_imu(self.cam_from_earlier(frame_index - 1), seen):
             window.filter.return_to_clone(frame_index - 1)  # vision moves the state from there, not once more
             return VisualMode(window, seen).process(frame_index, tracked)
         if self._show(self._imu, self._frame_ns, tracked):
@@ -497,13 +522,15 @@ class InertialMode(WindowMode):
         wheel = self._imu.samples.take_wheel(window.stamp_ns)
         if wheel is not None:
             window.filter.correct_by_wheel_sample(*wheel, self._rig.base_from_body, _GATE_4)
-        used = window.update(frame_index, tracked, self._rig.settings.filter.chunk_frames, 1)
+        settings = self._rig.settings.filter
+        effort = (settings.chunk_frames_without_imu, 4) if self.is_bridged else (settings.chunk_frames, 1)
+        used = window.update(frame_index, tracked, *effort)
         off_mps = 0.0 if seen is None else self._off_mps(frame_index - 1, seen)
         if monitor.is_wrong_start(window.filter.imu_minus_cam_s, off_mps):
             return Step(self._begin_again(frame_index, tracked), used, np.eye(4))
         moved = (
             window.filter.odom_from_body(),
-            window.body_since(frame_index - 1),
+            None if self.is_bridged else window.body_since(frame_index - 1),
             float(np.sqrt(window.filter.covariance[5, 5])),
         )
         is_lifted = self._lift.is_lifted(window.stamp_ns, rolled, *moved)
@@ -535,23 +562,29 @@ class InertialMode(WindowMode):
         self._elsewhere_frames = 0 if possible else self._elsewhere_frames + 1
         return tracked if self._elsewhere_frames > _MAX_ELSEWHERE else _with_matches(tracked, possible)
 
-    def _bridge_gap(self, end_ns: int) -> None:
-        """Move the state over a gap in the samples by the motion of all points of the last two frames, as uncertain as without an IMU.
+    def _last_motion(self, end_ns: int) -> Array:
+        """Return cam_from_previous (4, 4) to a moment, at the last speed."""
+        window = self.window
+        held = window.filter.clone_ids[-2:]
+        seen, between_s = self._seen, self._step_s
+        if seen is None:
+            seen = self._rig.cam_from_body @ se3_inverse(window.filter.motion_between(*held)) @ self._rig.body_from_cam
+            between_s = window.seconds_between(*held)
+        return interpolate_se3(np.eye(4), seen, max(end_ns - window.stamp_ns, 0) * 1e-9 / max(between_s, 1e-3))
+
+    def _bridge_gap(self, tracked: Tracked, guess: Array) -> None:
+        """Move the state over a gap in the samples as without an IMU: by the motion of all points of the last two frames.
 
         Not by the difference of their estimates: the shift of an update would count as a speed, and grow from frame to frame.
         """
         window, settings = self.window, self._rig.settings.filter
-        held = window.filter.clone_ids[-2:]
-        body_from_next = window.filter.motion_between(*held)
-        if self._seen is not None:
-            body_from_next = self._rig.body_from_cam @ se3_inverse(self._seen) @ self._rig.cam_from_body
-        duration_s = max(end_ns - window.stamp_ns, 0) * 1e-9
-        between_s = window.seconds_between(*held)
-        motion = interpolate_se3(np.eye(4), body_from_next, duration_s / max(between_s, 1e-3))
+        body_from_next = self._body_from_next(self._seen_motion(tracked, guess))
         sigmas = settings.free_rotation_sigma_rad, settings.free_translation_sigma_m
-        window.filter.predict_random_walk(motion, *sigmas, duration_s)
+        duration_s = window.seconds_since(window.filter.clone_ids[-1])
+        measured = self._measured_motion_cov(tracked, _BRIDGED_SIGMAS)
+        window.filter.predict_random_walk(body_from_next, *sigmas, duration_s, measured)
         window.filter.inflate_velocity(settings.initial_velocity_sigma_mps)
-        window.rate_body_radps = np.zeros(3)
+        self._guess = None
 
     def _update_zero_velocity(self, tracked: Tracked) -> None:
         """Apply zero velocity and rotation if neither images nor IMU moved for a while. Still images of one camera alone show no length:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from benchmarks.common import consistency, estimator_loop
-from fleetmap.geometry import se3
+from fleetmap.geometry import se3, se3_inverse
 from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
 from fleetmap.odometry.modes import InertialMode
 from fleetmap.odometry.settings import FilterSettings
@@ -77,6 +77,23 @@ def test_a_short_fault_leaves_the_speed_alone(site: consistency.Site, fault: str
     estimates = estimator_loop.run_odometry(session, 136, settings=WITHOUT_WHEELS)
     assert speed_error_mps(session, estimates, 6.0, 9.0) < 0.15
     assert consistency.figures(session, estimates, inertial=True).position_rms_m < 0.1
+
+
+@pytest.mark.parametrize("settings", [OdometrySettings(), WITHOUT_WHEELS], ids=["wheels", "no wheels"])
+def test_an_imu_that_falls_silent_again_and_again_leaves_an_honest_motion(
+    site: consistency.Site, settings: OdometrySettings
+) -> None:
+    """Half of the time without samples, straight on and in a turn: each step is as exact as it is said to be, up to the last."""
+    faults = tuple(Fault("imu-gap", start_s, start_s + 0.5) for start_s in np.arange(6.0, 12.0))
+    session = site.session(2032, "tote-1", faults=faults)
+    estimates = estimator_loop.run_odometry(session, 182, settings=settings)
+    first = next(k for k, e in enumerate(estimates) if e.inertial) + 1
+    steps = np.array([e.previous_from_body for e in estimates[first:]])
+    truth = se3_inverse(session.map_from_body[first - 1 : 181]) @ session.map_from_body[first:182]
+    off_m = np.linalg.norm((se3_inverse(truth) @ steps)[:, :3, 3], axis=1)
+    assert sum(e.is_bridged for e in estimates) > 45
+    assert off_m.max() < 0.013
+    assert consistency.figures(session, estimates, inertial=True).position_nees < 4
 
 
 def test_over_a_gap_of_the_imu_a_corrected_estimate_is_no_speed(site: consistency.Site) -> None:

@@ -210,6 +210,21 @@ def test_where_tracks_break_the_map_decides_at_once(tracking: Robot, seen: list[
     assert tracking.go(0.0, NO_FIX).status is Status.TRACKING, "the break is forgotten with the fix after it"
 
 
+def test_without_its_imu_a_pose_is_less_exact_and_doubted_until_the_map_confirms_it(tracking: Robot) -> None:
+    """A fix ends the doubt, not the wider covariance of a motion by images alone."""
+    before = radius_95_m(tracking.go(0.1).cov_rot_trans)
+    tracking.odometry.lacks_imu = True
+    doubted = [tracking.go(0.1, NO_FIX), tracking.go(0.1)]
+    assert [e.status for e in doubted] == [Status.DEGRADED, Status.TRACKING]
+    assert radius_95_m(doubted[0].cov_rot_trans) > 1.5 * before
+    said = [tracking.go(0.1, NO_FIX) for _ in range(2)]
+    tracking.odometry.lacks_imu = False
+    said += [tracking.go(0.1, NO_FIX), tracking.go(0.1)]
+    radii_m = [radius_95_m(e.cov_rot_trans) for e in said]
+    assert {e.status for e in said} == {Status.TRACKING}
+    assert radii_m[2] > radii_m[1] > 1.5 * radii_m[3]
+
+
 def test_a_robot_carried_in_the_dark_is_doubted_as_before(tracking: Robot) -> None:
     """No picture, no look: the odometry goes on by the IMU, and what it says then is worth as much as after any gap."""
     tracking.is_dark = tracking.odometry.breaks = True
@@ -457,6 +472,7 @@ def test_a_pose_of_nan_is_none(broken: str) -> None:
         "now_map_from_body": np.eye(4),
         "stamp_ns": 0,
         "has_broken": False,
+        "lost_imu": False,
     }
     values[broken] = values[broken] * np.nan
     hypothesis: Any = SimpleNamespace(**values)

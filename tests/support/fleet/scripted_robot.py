@@ -44,6 +44,7 @@ class ScriptedOdometry:
         self.redefine: Array | None = None
         self.drift_share = 0.0
         self.breaks = self.lifts = False  # at the next frame
+        self.lacks_imu = False
 
     def handle_stereo(self, frame: RectifiedFrame) -> OdometryEstimate:
         (change, self.redefine), (is_lifted, self.lifts) = (self.redefine, None), (self.lifts, False)
@@ -55,6 +56,7 @@ class ScriptedOdometry:
         return OdometryEstimate(
             frame.stamp_ns, len(self.odom_from_body) - 1, self.odom_from_body[-1], 1e-6 * np.eye(6), np.zeros(3),
             np.zeros(3), np.zeros(3), status, np.arange(50), 5.0, 1.0, False, True, change, is_lifted=is_lifted,
+            is_bridged=self.lacks_imu,
         )  # fmt: skip
 
     def will_forget(self, frame_index: int) -> bool:
