@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from fleetmap.bus import Bus
 from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.messages import EstimateMessage, Placement, encode_message, robot_key
+from fleetmap.messages import EstimateMessage, Placement, covariance_entries, encode_message, robot_key
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sources.intake import Intake
@@ -53,9 +53,7 @@ class MessagePackPublisher(Publisher):
             map_version=estimate.map_version,
             odom_from_base=Placement.of(published.odom_from_base),
             map_from_odom=None if published.map_from_odom is None else Placement.of(published.map_from_odom),
-            cov_rot_trans=None
-            if published.cov_rot_trans is None
-            else tuple(float(v) for v in published.cov_rot_trans.ravel()),
+            cov_rot_trans=None if published.cov_rot_trans is None else covariance_entries(published.cov_rot_trans),
             hypotheses=tuple(Placement.of(h.map_from_body @ body_from_base) for h in hypotheses),
             floor=estimate.floor,
             hypothesis_floors=tuple(h.floor for h in hypotheses) if published.level else (),

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
+from fleetmap.encoding import bounded
 from fleetmap.errors import LinkError
 
 MAX_PAYLOAD_BYTES = 256 << 10
@@ -164,8 +165,8 @@ def decode(payload: bytes, kind: type[T]) -> T:
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise LinkError(f"{len(payload)} bytes, the limit is {MAX_PAYLOAD_BYTES}")
     try:
-        return msgspec.json.decode(payload, type=kind)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        return bounded(msgspec.json.decode(payload, type=kind))
+    except (ValueError, RecursionError) as error:
         raise LinkError(str(error)[:300]) from error
 
 

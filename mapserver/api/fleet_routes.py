@@ -6,7 +6,7 @@ from typing import Annotated, Any, NamedTuple
 from fastapi import Depends, FastAPI, Query, Request, Response
 
 from fleetmap.mapformat import sha256_hex
-from fleetmap.messages import InitialPoseMessage, finite, report_dict
+from fleetmap.messages import InitialPoseMessage, report_dict
 from mapserver.api import parameters as p
 from mapserver.api import views
 from mapserver.api.bytes_response import PICTURE_HEADERS, bytes_response
@@ -97,7 +97,7 @@ def install_fleet_routes(app: FastAPI, store: MapStore, settings: ResurveySettin
     def failure(number: p.Number) -> views.FailureView:
         """One failure with the robot's report."""
         found = store.fleet.failure(number)
-        return views.FailureView(found.failure, finite(report_dict(found.report)), found.pictures)
+        return views.FailureView(found.failure, report_dict(found.report), found.pictures)
 
     @app.get("/v1/failures/{number}/pictures/{place}", response_class=Response)
     def picture(number: p.Number, place: p.PictureNumber) -> Response:

@@ -5,6 +5,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
 
+from fleetmap.encoding import MOST
 from fleetmap.mapformat.names import NAME_PATTERN
 from mapserver.fleet.alerts import Alert
 from mapserver.fleet.fleet import RobotStatus
@@ -268,7 +269,7 @@ class EnrolledList:
     next: str | None
 
 
-Metres = Annotated[float, Field(allow_inf_nan=False)]
+Decimal = Annotated[float, Field(ge=-MOST, le=MOST)]
 
 
 def _body(**example: JsonValue) -> ConfigDict:
@@ -322,9 +323,9 @@ class PlaceAct(Act):
     """An operator's pose for a robot: metres in `map`, heading from x towards y, and its uncertainty (one sigma)."""
 
     model_config = _body(actor="ada", x_map_m=12.5, y_map_m=3.0, heading_rad=1.57, sigma_m=0.5)
-    x_map_m: Metres
-    y_map_m: Metres
-    heading_rad: Annotated[float | None, Field(allow_inf_nan=False)] = None
+    x_map_m: Decimal
+    y_map_m: Decimal
+    heading_rad: Decimal | None = None
     sigma_m: Annotated[float, Field(gt=0, le=MOST_SIGMA_M)] = 0.5
 
 
@@ -333,7 +334,7 @@ class SurveyAct(Act):
 
     model_config = _body(actor="ada", reason="racks were moved", corners_map_m=[[0, 0], [4, 0], [4, 3]])
     corners_map_m: Annotated[
-        list[tuple[Metres, Metres]],
+        list[tuple[Decimal, Decimal]],
         Field(min_length=3, max_length=MOST_CORNERS),
     ]
 

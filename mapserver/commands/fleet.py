@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, Group, settings_of
+from fleetmap.cli_options import ConfigFile, Group, expand_options, settings_of
 from fleetmap.errors import StateError, UsageError
 from fleetmap.log_lines import printable
-from mapserver.commands.options import Json, SiteName, StoreFolder, open_store, print_json, write_output
+from mapserver.commands.options import ActorOptions, Json, SiteName, StoreFolder, open_store, print_json, write_output
 
 if TYPE_CHECKING:
     from mapserver.fleet.resurvey_list import ResurveyList
@@ -146,7 +146,21 @@ def replay(
         raise typer.Exit(done.status)
 
 
+@expand_options
+def remove(
+    failure: Annotated[int, typer.Argument(metavar="FAILURE", help="Number of the failure, as its page shows it.")],
+    store: StoreFolder,
+    by: ActorOptions,
+) -> None:
+    """Remove a failure with its pictures and its recording, such as one whose report cannot be read. The counts keep it."""
+    with open_store(store) as maps:
+        row = maps.fleet.failure(failure).failure
+        maps.fleet.remove_failure(failure)
+        maps.log_event(row.site, "failure removed", f"{failure} of {row.robot}", actor=by.named())
+    typer.echo(f"failure {failure} of {row.robot} is removed")
+
+
 FLEET = Group(
-    "Fleet health: a page, files, tiles to survey again, failures replayed.",
-    {"report": report, "export": export, "resurvey": resurvey, "replay": replay},
+    "Fleet health: a page, files, tiles to survey again, failures replayed or removed.",
+    {"report": report, "export": export, "resurvey": resurvey, "replay": replay, "remove": remove},
 )

@@ -11,7 +11,7 @@ from fleetmap.encoding import to_json
 from fleetmap.files import appearing_file
 from fleetmap.foxglove import require_foxglove
 from fleetmap.mapformat import decode_tile
-from fleetmap.messages import finite, report_dict
+from fleetmap.messages import report_dict
 from mapserver.store import FailureDetail, FailureFilter, MapStore
 
 if TYPE_CHECKING:
@@ -35,8 +35,7 @@ def as_plain(found: FailureDetail) -> dict[str, Any]:
     report = report_dict(found.report)
     report.pop("thumbnails")
     pictures = [asdict(picture) for picture in found.pictures]
-    plain: dict[str, Any] = finite({**asdict(found.failure), "report": report, "pictures": pictures})
-    return plain
+    return {**asdict(found.failure), "report": report, "pictures": pictures}
 
 
 def write_json_lines(store: MapStore, wanted: FailureFilter, path: Path) -> int:

@@ -21,7 +21,6 @@ from fleetmap.messages import (
     Status,
     WantedVersion,
     decode_message,
-    finite,
     report_dict,
 )
 from mapserver.fleet.ingest import Ingest, IngestSettings
@@ -196,7 +195,7 @@ class Fleet:
                     _log.warning(
                         "two programs report as robot %s of site %s: give each robot its own name", robot, site
                     )
-            entry.report["health"] = finite(report_dict(health))
+            entry.report["health"] = report_dict(health)
             self._ingest.take_health(health, entry.last_estimate, now_ns, dict(entry.report), entry.version)
 
     def take_pose(self, site: str, robot: str, message: PoseMessage) -> None:
@@ -340,7 +339,7 @@ def _status(key: tuple[str, str], robot: _Robot, assignment: _Assignment, now_ns
         state_since_ns=robot.report.get("state_since_ns"),
         last_ack=robot.report.get("ack"),
         last_health=robot.report.get("health"),
-        last_pose=None if robot.last_estimate is None else finite(report_dict(robot.last_estimate)),
+        last_pose=None if robot.last_estimate is None else report_dict(robot.last_estimate),
     )
 
 

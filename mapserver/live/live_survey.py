@@ -16,7 +16,7 @@ from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import se3_inverse, skew
 from fleetmap.live_survey import MAX_ARRAY_BYTES, LiveSurveyState
-from fleetmap.messages import EstimateMessage, Placement
+from fleetmap.messages import EstimateMessage, Placement, covariance_entries
 from fleetmap.recordings.images import jpeg_image
 from fleetmap.sensors.samples import Image
 from mapserver.drafting.draft import BuildOptions
@@ -279,7 +279,7 @@ class _Survey:
             map_version=None,
             odom_from_base=Placement.of(odom_from_body @ body_from_base),
             map_from_odom=None if placed is None else Placement.of(placed @ se3_inverse(odom_from_body)),
-            cov_rot_trans=None if cov is None else tuple(cov.ravel().tolist()),
+            cov_rot_trans=None if cov is None else covariance_entries(cov),
         )
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 import msgspec
 
-from fleetmap.encoding import to_json, to_msgpack
-from fleetmap.errors import UsageError
-from fleetmap.messages import FailureReport
+from fleetmap.encoding import MOST, to_json, to_msgpack
+from fleetmap.errors import LinkError, UsageError
+from fleetmap.messages import FailureReport, decode_message
 from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters, hour_of
 from mapserver.floor_plan.areas import Areas
 from mapserver.store.rows import (
@@ -44,10 +44,15 @@ _ADD = f"""INSERT INTO tallies (key_id, hour, {", ".join(COUNTER_COLUMNS)})
     ON CONFLICT (key_id, hour)
     DO UPDATE SET {", ".join(f"{name} = tallies.{name} + excluded.{name}" for name in COUNTER_COLUMNS)}"""
 _KEYS_AT_ONCE = 100
+_NO_FAILURE = "failure {} does not exist; the list of failures shows the stored ones"
 _REPORT_COLUMNS = ("site", "robot", "duration_s", "kind", "cause", "status", "version")
 _TRACED = tuple(TraceRow.__dataclass_fields__)[2:]
 _TRACE_COLUMNS = ", ".join(_TRACED)
-_FAILURE_COLUMNS = ", ".join(FailureRow.__dataclass_fields__)
+# Earlier versions stored what robots sent: a row with a number that none can mean is shown without it.
+_FAILURE_COLUMNS = ", ".join(
+    f"CASE WHEN abs({name}) <= {MOST} THEN {name} END {name}" if name in {"x_map_m", "y_map_m"} else name
+    for name in FailureRow.__dataclass_fields__
+)
 
 
 @dataclass(slots=True)
@@ -153,14 +158,24 @@ class FleetQueries:
         )
 
     def failure(self, number: int) -> FailureDetail:
-        """Return one failure with its context; raises UsageError if it does not exist."""
+        """Return one failure with its context; raises UsageError if it does not exist. An unreadable report has its row's columns only."""
         rows = self._transactions.query(f"SELECT {_FAILURE_COLUMNS}, report FROM failures WHERE number = ?", (number,))
         if not rows:
-            raise UsageError(f"failure {number} does not exist; the list of failures shows the stored ones")
-        report = msgspec.msgpack.decode(rows[0].pop("report"), type=FailureReport)
+            raise UsageError(_NO_FAILURE.format(number))
+        data = rows[0].pop("report")
+        try:
+            report = decode_message(data, FailureReport)
+        except LinkError as error:
+            report = _bare_report(FailureRow(**rows[0]), error)
         query = "SELECT place, kind, stamp_ns, length(jpeg) bytes FROM failure_pictures WHERE number = ? ORDER BY place"
         pictures = self._transactions.rows(PictureRow, query, (number,))
         return FailureDetail(FailureRow(**rows[0]), report, pictures)
+
+    def remove_failure(self, number: int) -> None:
+        """Remove a failure with its pictures and recording; the counts keep it. UsageError if it does not exist."""
+        with self._transactions.write() as connection:
+            if not connection.execute("DELETE FROM failures WHERE number = ?", (number,)).rowcount:
+                raise UsageError(_NO_FAILURE.format(number))
 
     def picture(self, number: int, place: int) -> bytes:
         """Return the JPEG of a failure; raises UsageError if it does not exist or was deleted."""
@@ -302,6 +317,14 @@ def keep_last_reports(connection: Connection, reports: LastReports) -> None:
             (site, robot, version, seen_ns, to_json(report).decode())
             for (site, robot), (version, seen_ns, report) in reports.items()
         ],
+    )
+
+
+def _bare_report(row: FailureRow, error: LinkError) -> FailureReport:
+    words = f"the stored report cannot be read; `mapserver fleet remove {row.number}` removes it ({error})"
+    known = {name: getattr(row, name) for name in _REPORT_COLUMNS}
+    return FailureReport(
+        id=row.failure_id, stamp_ns=row.happened_ns, wall_ns=row.happened_ns, calibration=words[:2000], **known
     )
 
 

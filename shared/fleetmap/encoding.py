@@ -1,9 +1,16 @@
-"""Encoding of all output: numpy values become Python's, which MessagePack, JSON and databases support."""
+"""Encoding of all output: numpy values become Python's, which MessagePack, JSON and databases support; limits of decoded numbers."""
 
-from typing import Any, Literal
+import math
+from collections.abc import Iterable
+from typing import Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
+
+T = TypeVar("T")
+MOST = 1e12
+"""Largest magnitude of a stranger's number with decimals: far above any metre or covariance, and its products stay finite."""
+_UNIT_WITHIN = 1e-3
 
 
 def python_value(value: Any) -> Any:
@@ -27,3 +34,30 @@ def to_json(value: object, *, indent: int = 0, order: Literal["deterministic", "
     """Encode as JSON, with null for NaN and infinity. indent: spaces; 0 writes one line. order: of keys, as in msgspec's encoder."""
     data = msgspec.json.encode(value, enc_hook=python_value, order=order)
     return msgspec.json.format(data, indent=indent) if indent else data
+
+
+def bounded(value: T) -> T:
+    """Return a stranger's decoded value. ValueError, naming the field, for a number in it that is not finite, beyond MOST, or an
+    integer beyond 64 bits, and for a quaternion (`quat_wxyz`) that is not of unit length.
+    """
+    if isinstance(value, float):
+        if not abs(value) <= MOST:
+            raise ValueError(f" is {value}, the limit is {MOST:g}")
+    elif isinstance(value, int):
+        if not -(1 << 63) <= value < 1 << 63:
+            raise ValueError(" is an integer of more than 64 bits")
+    elif isinstance(value, dict | list | tuple | msgspec.Struct):
+        for name, item in _items(value):
+            try:
+                bounded(item)
+            except ValueError as error:
+                raise ValueError(f".{name}{error}") from None
+            if name == "quat_wxyz" and not abs(math.hypot(*item) - 1) <= _UNIT_WITHIN:
+                raise ValueError(f".{name} is {item}, not a unit quaternion")
+    return value
+
+
+def _items(value: Any) -> Iterable[tuple[Any, Any]]:
+    if isinstance(value, msgspec.Struct):
+        return ((name, getattr(value, name)) for name in value.__struct_fields__)
+    return value.items() if isinstance(value, dict) else enumerate(value)

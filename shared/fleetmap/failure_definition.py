@@ -118,3 +118,9 @@ def radius_95_m(cov_rot_trans: Array | None) -> float:
     if cov_rot_trans is None or not np.isfinite(cov_rot_trans[3:, 3:]).all():
         return float("inf")
     return _RADIUS_95_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(cov_rot_trans[3:, 3:])[-1]))
+
+
+def radius_95_m_if_known(cov_rot_trans: Array | None) -> float | None:
+    """As `radius_95_m`, for messages: None where it is infinite."""
+    radius_m = radius_95_m(cov_rot_trans)
+    return radius_m if np.isfinite(radius_m) else None

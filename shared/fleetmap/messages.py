@@ -16,14 +16,13 @@ fleetmap/{site}/robots/{robot}/trust/{file} queried by the robot, ChunkRequest: 
 fleetmap/{site}/live/survey              published by a running survey: fleetmap.live_survey
 """
 
-import math
 from enum import StrEnum
 from typing import Annotated, Any, Self, TypeVar
 
 import msgspec
 import numpy as np
 
-from fleetmap.encoding import to_msgpack, to_plain
+from fleetmap.encoding import MOST, bounded, to_msgpack, to_plain
 from fleetmap.errors import LinkError
 from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
 
@@ -238,7 +237,7 @@ class PoseMessage(msgspec.Struct, frozen=True, kw_only=True):
             stamp_ns=int(stamp_ns),
             position_map_m=placed.position_m,
             quat_wxyz=placed.quat_wxyz,
-            cov_rot_trans=tuple(float(value) for value in cov_rot_trans.ravel()),
+            cov_rot_trans=covariance_entries(cov_rot_trans),
             status=status,
             map_version=map_version,
         )
@@ -356,18 +355,23 @@ class FailureAck(msgspec.Struct, frozen=True, kw_only=True):
 M = TypeVar("M", bound=msgspec.Struct)
 
 
+def covariance_entries(cov_rot_trans: Array) -> tuple[float, ...]:
+    """Entries (36,) of a covariance (6, 6), row by row; those that are not known, infinite or above MOST, as MOST."""
+    return tuple(np.nan_to_num(cov_rot_trans, nan=MOST).clip(-MOST, MOST).ravel().tolist())
+
+
 def encode_message(message: msgspec.Struct) -> bytes:
     """Encode a message as MessagePack."""
     return to_msgpack(message)
 
 
 def decode_message(data: bytes, message_type: type[M]) -> M:
-    """Decode the message in `data`; raises LinkError for bytes of another type."""
+    """Decode the message in `data`; raises LinkError for bytes of another type, and for numbers that `bounded` refuses."""
     if len(data) > MAX_MESSAGE_BYTES:
         raise LinkError(f"{message_type.__name__} of {len(data)} bytes, the limit is {MAX_MESSAGE_BYTES}")
     try:
-        return msgspec.msgpack.decode(data, type=message_type)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        return bounded(msgspec.msgpack.decode(data, type=message_type))
+    except (ValueError, RecursionError) as error:
         raise LinkError(
             f"{len(data)} bytes are no {message_type.__name__} ({error}); do both sides run the same fleetmap?"
         ) from error
@@ -384,15 +388,6 @@ def report_dict(message: msgspec.Struct) -> dict[str, Any]:
     """The message as plain values, for reports."""
     built: dict[str, Any] = to_plain(message)
     return built
-
-
-def finite(value: Any) -> Any:
-    """Plain values with null for numbers that JSON lacks."""
-    if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def robot_key(site: str, robot: str, what: str) -> str:

@@ -51,8 +51,8 @@ AREAS = (
 )
 POLYGON = [(1.0, 1.0), (3.0, 1.0), (3.0, 3.0)]
 FAILURE = blindness(
-    site="hall", tile=(0, 0), innovation=float("nan"), radius_95_m=float("inf"),
-    map_from_base=Placement(position_m=(float("nan"), 1.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0)),
+    site="hall", tile=(0, 0), innovation=4.0, radius_95_m=0.2,
+    map_from_base=Placement(position_m=(0.5, 1.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0)),
     thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=b"\xff\xd8\xff\xd9"),),
 )  # fmt: skip
 LOOKED = msgspec.structs.replace(
