@@ -19,6 +19,7 @@ from fleetmap.sensors.samples import ImuSamples, SensorSet, Stamps, WheelSample
 from mapserver.calibration.estimate import CalibrationEstimate, continued_from, estimate_from
 from mapserver.calibration.parameters import COLUMNS, INDEX, CalibrationParameter, RigAxes, corrected_rig
 from mapserver.calibration.problem import CalibrationData, MotionState
+from mapserver.survey.odometry_pass import parts_between_lifts
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import begin_survey
 from mapserver.survey.state import Keyframe, Landmarks, SurveyState
@@ -137,7 +138,10 @@ def busiest_stretch(
     begun: AdjustedChain, rig: tuple[RigCalibration, Rectifier], wheel: Sequence[WheelSample]
 ) -> CalibrationData:
     """Return the keyframes of a survey with the most rotation, and their observations. rig: the survey's calibration and rectifier."""
-    chosen, keyframes = _busiest(begun.state), begun.odometry.keyframes
+    keyframes, frames = begun.odometry.keyframes, np.arange(len(begun.odometry.estimates))
+    parts = [frames[part] for part in parts_between_lifts(begun.odometry.estimates)]
+    chosen = max((np.isin(begun.odometry.keyframe_frames, part) for part in parts), key=np.count_nonzero)
+    chosen[chosen] = _busiest(begun.state.of(chosen))
     part = begun.state.of(chosen)
     marks, motion = _thinned(part.landmarks, len(part.stamps_ns)), part.motion
     order = np.argsort(marks.obs_landmark, kind="stable")

@@ -55,6 +55,8 @@ _UNKNOWN = {
     "held_out_frames": "too few of them",
     "yesterdays_recordings": "too few frames of them were played against it",
     "last_versions_places": "too few of them could be tried",
+    "version_before": "there was none",
+    "ground_truth": "the recordings have none",
     "aliasing_probes": "too few frames could be tried",
     "calibration": "no recording was examined for it",
     "motion": "nothing to compare it with",

@@ -166,6 +166,13 @@ class Built:
         """The recordings that were joined to the map."""
         return [s for s, outcome in zip(self.surveyed, self.joined.outcomes, strict=True) if outcome.joined]
 
+    @property
+    def left_out(self) -> dict[str, str]:
+        """The reasons for the recordings of which no part was joined, by content hash."""
+        taken = {s.entry.sha256 for s in self.taken}
+        parts = zip(self.surveyed, self.joined.outcomes, strict=True)
+        return {s.entry.sha256: o.reason for s, o in parts if s.entry.sha256 not in taken}
+
 
 @dataclass(frozen=True, slots=True)
 class Draft:
@@ -263,7 +270,7 @@ def _survey(
         survey_options = SurveyConfig(settings, default_vocabulary(), run.zones)
         tools = run.tools(executor, view, told)
 
-        def survey_one(path: Path, pinhole: StereoCamera | None) -> Surveyed:
+        def survey_one(path: Path, pinhole: StereoCamera | None) -> list[Surveyed]:
             options.look_at([path])
             return survey_recording(path, admitted.pop(path), run.reading, pinhole, survey_options, tools)
 
@@ -293,7 +300,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     site, survey_map, camera = run.request.site, built.joined.map, built.joined.map.camera
     wanted = None if parent is None else parent.wanted_ids(survey_map)
     judged = [
-        JudgedSession(trajectory, s.probed, s.survey)
+        JudgedSession(trajectory, s.probed, s.survey, s.entry.name)
         for trajectory, s in zip(map_trajectories(built.joined), built.taken, strict=True)
     ]
     run.times.begin("choosing")
@@ -375,7 +382,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         version,
         maps.areas(site).name_tiles(words, TILE_SIZE_M),
         to_plain(report),
-        {s.entry.sha256: o.reason for s, o in zip(built.surveyed, built.joined.outcomes, strict=True) if not o.joined},
+        built.left_out,
     )
     _write_files(run, built, draft)
     return draft

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,7 +24,7 @@ from fleetmap.version_grid import Tiles as Grid
 from fleetmap.version_grid import known_grid
 from mapserver.drafting.sensor_subset import reduced
 from mapserver.quality.directions import tile_directions
-from mapserver.quality.evidence import Probes, examine, trajectory_breaks
+from mapserver.quality.evidence import Probes, displaced, examine, trajectory_breaks
 from mapserver.quality.figures import Evidence, RigEvidence, TrajectoryBreaks
 from mapserver.quality.probes import (
     Probe,
@@ -41,6 +42,7 @@ from mapserver.survey.stages import Survey
 from mapserver.survey.survey_map import SurveyMap, history_of
 
 PROBES = 40  # of each kind: one wrong or missing frame counts 2.5 %
+_LEAST_PROBES = 20  # of each recording in the version before
 _HELD_OUT = 2 * PROBES  # every second one has a say in the landmarks for robots, and only the others can judge these
 
 
@@ -64,11 +66,12 @@ class ProbedFrame:
 
 
 class JudgedSession(NamedTuple):
-    """A recording in the map: poses of its frames in `map`, its probed frames, and its survey."""
+    """A recording in the map: poses of its frames in `map`, its probed frames, its survey, and its name."""
 
     trajectory: Trajectory
     probed: Sequence[ProbedFrame]
     survey: Survey
+    name: str = ""
 
     def asked(self, recordings: int) -> list[ProbedFrame]:
         """Return the frames whose views get landmarks: every second held-out one of one of so many recordings, and both ends."""
@@ -79,6 +82,11 @@ class JudgedSession(NamedTuple):
         """Return the other held-out frames: the tiles do not depend on them."""
         asked = {frame.number for frame in self.asked(recordings)}
         return [frame for frame in self._held_out(recordings, 0) if frame.number not in asked]
+
+    def spread(self, recordings: int) -> list[Probe]:
+        """Return the probes of one of so many recordings for the version before, which none of them has influenced."""
+        chosen = spread(np.arange(len(self.probed)), max(PROBES // recordings, _LEAST_PROBES))
+        return [self.probed[n].probe(self.trajectory.frame_from_body) for n in chosen]
 
     def _held_out(self, recordings: int, first: int) -> list[ProbedFrame]:
         """Return all views of every second held-out frame of one of so many recordings."""
@@ -242,16 +250,21 @@ def examine_draft(
         lambda: repetition(draft, probes.frames),
         lambda: examine(draft, current, probes, _breaks(sessions), None if before is None else before.removed_ids),
     ]
-    starts, repeated, evidence = executor.map(lambda _, task: task(), None, tasks)
+    if before is not None and current is not None:
+        recall = before.manifest.report.get("lookalike_recall") or 0.0
+        tasks += [partial(displaced, s.name, current, s.spread(len(sessions)), recall) for s in sessions]
+    starts, repeated, evidence, *moved = executor.map(lambda _, task: task(), None, tasks)
     directions = tile_directions({(tile.tile_x, tile.tile_y): tile.map_from_cam for tile in stored})
-    found: Evidence = msgspec.structs.replace(evidence, directions=directions, starts=starts, repetition=repeated)
+    found: Evidence = msgspec.structs.replace(
+        evidence, directions=directions, starts=starts, repetition=repeated, displaced=moved or None
+    )
     return found
 
 
 def _breaks(sessions: Sequence[JudgedSession]) -> TrajectoryBreaks | None:
     """Return the breaks of all recordings together; a single camera's odometry has no scale to compare."""
     found = []
-    for trajectory, _, survey in sessions:
+    for trajectory, _, survey, _ in sessions:
         if survey.state.camera.baseline_m > 0:
             guess = survey.odometry
             odometry = (guess.odom_from_body, guess.covariances, guess.tracked.astype(bool))

@@ -20,7 +20,7 @@ from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
-from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps, Trajectory
+from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps, Trajectory, wheel_between
 from mapserver.calibration import CalibrationParameter
 from mapserver.calibration.problem import CalibrationData
 from mapserver.calibration.recordings import LONGEST_S, busiest_stretch
@@ -47,8 +47,9 @@ from mapserver.survey.finish.dock_alignment import aligned_by_priors
 from mapserver.survey.finish.map_transform import scaled, scaled_state
 from mapserver.survey.loops.zones import Zones, zones_of
 from mapserver.survey.merge.multi_session import MergedMap, chained
+from mapserver.survey.odometry_pass import LEAD_NS, parts_between_lifts
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.stages import Survey, begin_survey, finish_survey
+from mapserver.survey.stages import Survey, begin_survey, finish_survey, survey
 from mapserver.survey.state import SurveyState
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools
 
@@ -354,10 +355,12 @@ def survey_recording(
     pinhole: StereoCamera | None,
     options: SurveyConfig,
     tools: SurveyTools,
-) -> Surveyed:
-    """Survey one recording resampled to `pinhole` (or the camera that suits it). The caller drops its references to the first stages."""
+) -> list[Surveyed]:
+    """Survey one recording resampled to `pinhole` (or the camera that suits it). The caller drops its references to the first stages.
+
+    One from which the robot was lifted has several surveys: each part is a drive of its own, which finds its place in the map or does not.
+    """
     found, given, chain = admission.checked, admission.given, admission.begun
-    said = () if given is None else (given.words,)
     with reading.open(path) as (opened, indices):
         rig = with_other_views(found.rig, opened.calibration)
         recording = replace(opened, calibration=rig)
@@ -367,24 +370,74 @@ def survey_recording(
         inputs = survey_inputs_of(recording, indices, rectifier, None if given is None else given.trajectory)
         if chain is None or chain.state.camera != rectifier.camera:
             chain = begin_survey(inputs, options.settings, tools)
-        held = [chain]
+        parts, held = parts_between_lifts(chain.odometry.estimates), [chain]
         del admission, chain  # otherwise it would be in memory twice
-        done = finish_survey(held.pop(), inputs, options, tools)
-        done, map_from_survey = _aligned(done, recording)
-        return Surveyed(
-            entry=RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(indices)),
-            format=recording.format,
-            sensor_set=recording.sensor_set,
-            issues=recording.issues,
-            truth=recording.ground_truth,
-            survey=done,
-            map_from_survey=map_from_survey,
-            findings=(*found.statements(), *said),
-            checks=summary(found.findings, DECISIVE),
-            calibration=found.calibration,
-            corrections=found.corrections,
-            probed=probed_frames(recording, indices.tolist(), rectifier, done, options.settings.orb),
-        )
+        said = [] if given is None else [given.words]
+        if parts == [slice(None)]:
+            surveys = [(recording, indices, finish_survey(held.pop(), inputs, options, tools))]
+        else:
+            held.clear()
+            surveys = _by_parts(recording, [indices[p] for p in parts], rectifier, options, tools, said)
+        sha256 = recording.content_hash()
+        return [
+            Surveyed(
+                entry=RecordingEntry(name=part.name, sha256=sha256, frames=len(chosen)),
+                format=part.format,
+                sensor_set=part.sensor_set,
+                issues=part.issues,
+                truth=part.ground_truth,
+                survey=done,
+                map_from_survey=map_from_survey,
+                findings=(*found.statements(), *said),
+                checks=summary(found.findings, DECISIVE),
+                calibration=found.calibration,
+                corrections=found.corrections,
+                probed=probed_frames(part, chosen.tolist(), rectifier, done, options.settings.orb),
+            )
+            for part, chosen, own in surveys
+            for done, map_from_survey in [_aligned(own, part)]
+        ]
+
+
+def _by_parts(
+    recording: Recording,
+    parts: list[NDArray[np.int64]],
+    rectifier: Rectifier,
+    options: SurveyConfig,
+    tools: SurveyTools,
+    said: list[str],
+) -> list[tuple[Recording, NDArray[np.int64], Survey]]:
+    """Return each part with its frames and its survey, and add remarks to those said. SurveyError if none can be surveyed."""
+    done = []
+    for number, chosen in enumerate(parts, 1):
+        part = _between(recording, chosen, rectifier, f"{recording.name}, part {number}")
+        first_s, last_s = (part.frame_stamps_ns[chosen[[0, -1]]] - part.frame_stamps_ns[0]) * 1e-9
+        said.append(f"part {number} of {len(parts)}, {first_s:.1f} to {last_s:.1f} s, by itself: the robot was lifted")
+        try:
+            done.append((part, chosen, survey(survey_inputs_of(part, chosen, rectifier, None), options, tools)))
+        except SurveyError as error:
+            said[-1] += f"; left out: {error}"
+    if not done:
+        raise SurveyError(f"{recording.path}: nothing between two lifts can be surveyed: {'; '.join(said)}")
+    return done
+
+
+def _between(recording: Recording, chosen: NDArray[np.int64], rectifier: Rectifier, name: str) -> Recording:
+    """Return a recording with the samples and the truth of its chosen frames alone, under a name."""
+    first_ns, last_ns = recording.frame_stamps_ns[chosen[[0, -1]]].tolist()
+    offset_ns, truth = int(rectifier.imu_minus_cam_s * 1e9), recording.ground_truth
+    samples = first_ns + offset_ns, last_ns + offset_ns + LEAD_NS
+    if truth is not None:
+        rows = slice(*np.searchsorted(truth.stamps_ns, [first_ns, last_ns + 1]))
+        truth = Trajectory(truth.stamps_ns[rows], truth.frame_from_body[rows])
+    return replace(
+        recording,
+        name=name,
+        imu=recording.imu.between(*samples),
+        wheel=tuple(wheel_between(recording.wheel, *samples)),
+        priors=tuple(prior for prior in recording.priors if first_ns <= prior.stamp_ns <= last_ns),
+        ground_truth=truth,
+    )
 
 
 def _aligned(done: Survey, recording: Recording) -> tuple[Survey, Array | None]:
@@ -401,7 +454,7 @@ def _aligned(done: Survey, recording: Recording) -> tuple[Survey, Array | None]:
 
 def survey_all(
     paths: Sequence[Path],
-    survey_one: Callable[[Path, StereoCamera | None], Surveyed],
+    survey_one: Callable[[Path, StereoCamera | None], list[Surveyed]],
     pinhole: StereoCamera | None,
     unusable: dict[Path, str] | None = None,
 ) -> list[Surveyed]:
@@ -412,7 +465,7 @@ def survey_all(
     done: list[Surveyed] = []
     for path in paths:
         with _noting(path, unusable):
-            done.append(survey_one(path, pinhole))
+            done += survey_one(path, pinhole)
             pinhole = pinhole or done[0].survey.state.camera
     if not done:
         raise SurveyError(f"none of {len(paths)} recordings can be surveyed: {'; '.join((unusable or {}).values())}")

@@ -6,17 +6,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.failure_definition import is_wrong
+from fleetmap.failure_definition import ERROR_LIMIT_M, is_wrong
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.samples import Stamps
-from mapserver.quality.figures import Aliasing, Compared, Evidence, ProbeFigures, TrajectoryBreaks
-from mapserver.quality.probes import ELSEWHERE_M, Probe, most_similar_beyond, relocalized
+from mapserver.quality.figures import Aliasing, Compared, Displaced, Evidence, ProbeFigures, TrajectoryBreaks
+from mapserver.quality.probes import ELSEWHERE_M, Probe, anywhere, most_similar_beyond, relocalized
+from mapserver.survey.merge.session_alignment import count_places
+from mapserver.survey.settings import SessionSettings
 
 _STRETCH_M, _APART_M = 3.0, 1.0
 _BREAK_M, _BREAK_SHARE = 0.15, 0.05
 _CONTINUOUS_NS = 500_000_000
+_JOINED = SessionSettings()
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +57,32 @@ def examine(
         starts=None,
         motion=motion,
     )
+
+
+def displaced(recording: str, before: MapView, probes: Sequence[Probe], lookalike_recall: float) -> Displaced:
+    """Localize a recording's frames anywhere in the version before, and compare.
+
+    A frame at a place that looks like another one has a fix there, too. Those count that have none at their own place, find more of
+    the other than `lookalike_recall`, and agree on it by the motion between them, as many and as far apart as those of a joined survey.
+    """
+    here, placed, found = 0, list[Array](), list[Array]()
+    for probe in probes:
+        fixes = anywhere(before, probe)
+        if any(not is_wrong(float(np.linalg.norm((fix.map_from_cam - probe.map_from_cam)[:3, 3]))) for fix in fixes):
+            here += 1
+            continue
+        fixes = [fix for fix in fixes if fix.landmark_recall > lookalike_recall]
+        placed += [probe.map_from_cam for _ in fixes]
+        found += [fix.map_from_cam for fix in fixes]
+    drafted, seen = np.reshape(placed, (-1, 4, 4)), np.reshape(found, (-1, 4, 4))
+    moved = [seed @ se3_inverse(own) @ drafted for own, seed in zip(drafted, seen, strict=True)]
+    agreeing = [np.linalg.norm((places - seen)[:, :3, 3], axis=1) <= ERROR_LIMIT_M for places in moved]
+    best = max(agreeing, key=np.count_nonzero, default=np.zeros(0, bool))
+    number = int(best.sum())
+    if number < _JOINED.min_fixes or count_places(drafted[best, :3, 3]) < _JOINED.min_places:
+        return Displaced(recording, here + number, 0, 0.0)
+    off_m = float(np.median(np.linalg.norm((seen - drafted)[best, :3, 3], axis=1)))
+    return Displaced(recording, here + number, number, round(off_m, 3))
 
 
 def _placed_by_either(draft: MapView, before: MapView | None, probes: Sequence[Probe]) -> Sequence[Probe]:

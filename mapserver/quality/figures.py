@@ -45,6 +45,18 @@ class Aliasing(msgspec.Struct, frozen=True):
     accepted_share: float
 
 
+class Displaced(msgspec.Struct, frozen=True):
+    """Frames of one recording localized anywhere in the version before: their number, and how many of them agree on one other place.
+
+    off_m: median distance of these from where the draft has them.
+    """
+
+    recording: str
+    frames: int
+    elsewhere: int
+    off_m: float
+
+
 class LookAlike(msgspec.Struct, frozen=True):
     """A place, (x, y) in `map`, mistaken for another one if its surroundings are unmapped; recall: landmark recall there."""
 
@@ -184,6 +196,7 @@ class Evidence(msgspec.Struct, frozen=True):
     held_out: Compared | None = None
     replayed: Compared | None = None
     last_version: Compared | None = None
+    displaced: list[Displaced] | None = None
     aliasing: Aliasing | None = None
     aliasing_before: Aliasing | None = None
     starts: Starts | None = None

@@ -1,6 +1,6 @@
 """Gate before publishing: reasons against a draft, by itself and compared with the robots' present version. Pure."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -8,14 +8,17 @@ import msgspec
 
 from fleetmap.config import Section
 from fleetmap.encoding import to_plain
+from fleetmap.failure_definition import ERROR_LIMIT_M
 from fleetmap.mapformat import Manifest
-from mapserver.quality.figures import Aliasing, Compared, Evidence, TrajectoryBreaks, trusted_calibrations
+from mapserver.quality.figures import Aliasing, Compared, Displaced, Evidence, TrajectoryBreaks, trusted_calibrations
 
 CHECKS = {
     "joining": "recordings that belong to the site",
     "held_out_frames": "frames that the build left out",
     "yesterdays_recordings": "earlier recordings",
     "last_versions_places": "places of the version before",
+    "version_before": "recordings where the version before has them",
+    "ground_truth": "error against ground truth",
     "aliasing_probes": "places that look alike",
     "calibration": "calibration",
     "motion": "trajectory in one piece",
@@ -38,6 +41,7 @@ class GateSettings(Section, frozen=True):
     margin_localised_share: Share = 0.1
     max_wrong_share: Share = 0.05
     max_median_error_m: Share = 0.1
+    max_truth_error_m: Share = ERROR_LIMIT_M
     margin_error_m: Share = 0.03
     max_residual_px: Share = 3.0
     min_inliers_share: Share = 0.8
@@ -88,6 +92,15 @@ def judge(
         else:
             over = f"over {compared.draft.frames} frames"
             checked[name] = [f"{CHECKS[name]}: {words}, {over}" for words in _frame_reasons(compared, settings)]
+    if examined.displaced is None or current is None:
+        not_judged.append("version_before")
+    else:
+        checked["version_before"] = list(_displaced_reasons(draft, current, examined.displaced, settings))
+    if not isinstance(error_m := draft.report.get("ate_rmse_m"), int | float):
+        not_judged.append("ground_truth")
+    else:
+        over = f"{CHECKS['ground_truth']}: {error_m:.3f} m are above the limit ({settings.max_truth_error_m:g})"
+        checked["ground_truth"] = [over] if error_m > settings.max_truth_error_m else []
     if examined.aliasing is None or examined.aliasing.offered < settings.min_frames:
         not_judged.append("aliasing_probes")
     else:
@@ -112,6 +125,17 @@ def judge(
     report |= {"evidence": to_plain(examined), "passed": passed, "not_judged": not_judged, "unjudged": unjudged}
     reasons = tuple(words for found in checked.values() for words in found)
     return GateVerdict(reasons, _hard_reasons(draft, strangers), report, tuple(unjudged))
+
+
+def _displaced_reasons(
+    draft: Manifest, current: Manifest, recordings: Iterable[Displaced], settings: GateSettings
+) -> Iterator[str]:
+    if draft.parent != current.version:
+        yield f"{CHECKS['version_before']}: compared with version {draft.parent}, and {current.version} is current; build it again"
+    for one in recordings:
+        if one.elsewhere > settings.max_wrong_share * one.frames:
+            frames = f"{one.elsewhere} of {one.frames} frames of {one.recording} agree in that version"
+            yield f"{CHECKS['version_before']}: {frames} on a place {one.off_m:.2f} m from the draft's; build without it"
 
 
 def _motion_reasons(motion: TrajectoryBreaks, settings: GateSettings) -> list[str]:

@@ -153,13 +153,14 @@ def repetition(view: MapView, probes: Sequence[Probe]) -> Repetition | None:
 
 def aliases(view: MapView, probe: Probe) -> list[Fix]:
     """Return the fixes that robots without a prior accept for a probe at other places than its own."""
-    found = finished(Relocalizer(view, probe.camera, _ROBOTS).anywhere(probe.features))
     place_m = probe.map_from_cam[:3, 3]
-    return [
-        fix
-        for fix in found
-        if np.linalg.norm(fix.map_from_cam[:3, 3] - place_m) > SAME_PLACE_M and is_reliable(fix, _ROBOTS.fix)
-    ]
+    return [fix for fix in anywhere(view, probe) if np.linalg.norm(fix.map_from_cam[:3, 3] - place_m) > SAME_PLACE_M]
+
+
+def anywhere(view: MapView, probe: Probe) -> list[Fix]:
+    """Return the fixes that robots without a prior accept for a probe, also at places that look like its own."""
+    found = finished(Relocalizer(view, probe.camera, _ROBOTS).anywhere(probe.features))
+    return [fix for fix in found if is_reliable(fix, _ROBOTS.fix)]
 
 
 def alias_step_m(found: Repetition | None, known_m: float | None) -> float | None:

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse
 from fleetmap.odometry import ContinuousFrame, OdometryEstimate, OdometryStatus, is_away, make_odometry
+from fleetmap.odometry.lift_check import WINDOW_NS
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample, wheel_between
@@ -18,7 +19,7 @@ from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import FrameTracks, OdometryPass
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
-_LEAD_NS = 30_000_000  # lead of IMU and wheels over a frame, whose stamp may be too early
+LEAD_NS = 30_000_000  # lead of IMU and wheels over a frame, whose stamp may be too early
 _GIVEN_UP_RAD, _GIVEN_UP_M = 0.1, 1.0
 _AWAY_RAD, _AWAY_MPS = np.pi, 1.0  # during a pause: any rotation, and a person's walking speed
 _NO_IDS = np.zeros(0, np.int64)
@@ -72,7 +73,7 @@ class SampleFeed:
 
     def until(self, stamp_ns: int) -> tuple[ImuSamples, Sequence[WheelSample]]:
         """Return the samples since the last call, up to a frame."""
-        since_ns, self._fed_ns = self._fed_ns, stamp_ns + self._offset_ns + _LEAD_NS
+        since_ns, self._fed_ns = self._fed_ns, stamp_ns + self._offset_ns + LEAD_NS
         return self._imu.between(since_ns, self._fed_ns), wheel_between(self._wheel, since_ns, self._fed_ns)
 
 
@@ -210,6 +211,20 @@ def longest_run(odometry: OdometryPass, body_from_cam: Array) -> OdometryPass:
     return replace(
         odometry, odom_from_body=odom_from_body, covariances=covariances, tracked=tracked, keyframes=keyframes
     )
+
+
+def parts_between_lifts(estimates: Sequence[OdometryEstimate]) -> list[slice]:
+    """Return the runs of frames in which the robot was on its floor: nothing measures how hands or a fork carry it to the next.
+
+    A lift is noticed by the motion within `WINDOW_NS`, whose frames belong to no part; nor does a run that is not longer.
+    """
+    if not any(estimate.is_lifted for estimate in estimates):
+        return [slice(None)]
+    stamps_ns = np.array([estimate.stamp_ns for estimate in estimates])
+    ends = [n for n, estimate in enumerate(estimates) if estimate.is_lifted]
+    begins = np.searchsorted(stamps_ns, stamps_ns[ends] - WINDOW_NS).tolist()
+    runs = zip([0, *(end + 1 for end in ends)], [*begins, len(estimates)], strict=True)
+    return [slice(a, b) for a, b in runs if b > a and stamps_ns[b - 1] - stamps_ns[a] > WINDOW_NS]
 
 
 def _levelled(

@@ -3,6 +3,7 @@
 Only one component can be in a map: the pose of any other relative to it is unknown.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -88,7 +89,7 @@ def find_components(state: SurveyState, odometry_sigmas_m: "SigmaBetween", join_
     return Components(labels, components, [component(run, False, _BLIND) for run in runs if len(run)])
 
 
-def find_groups(state: SurveyState, sigmas_m: "SigmaBetween", join_sigma_m: float) -> KeyframeGroups:
+def find_groups(state: SurveyState, sigmas_m: Callable[[int, int], float], join_sigma_m: float) -> KeyframeGroups:
     """Return the same before loops are closed: there may be many groups, and none is chosen."""
     rows, columns = _shared_landmarks(state, MIN_SHARED)
     seeing = _seeing(state)
@@ -101,7 +102,7 @@ def _seeing(state: SurveyState) -> NDArray[np.bool_]:
 
 
 def bridges(
-    seeing: NDArray[np.bool_], sigmas_m: "SigmaBetween", join_sigma_m: float, first: int = 0
+    seeing: NDArray[np.bool_], sigmas_m: Callable[[int, int], float], join_sigma_m: float, first: int = 0
 ) -> list[tuple[int, int]]:
     """Yield keyframes connected by odometry, from `first` on; seeing (K,): False for blind ones. See find_components."""
     seen = first + np.flatnonzero(seeing[first:])

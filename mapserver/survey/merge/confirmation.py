@@ -76,7 +76,12 @@ def due(expected: VisibleLandmarks, pixels: Array) -> NDArray[np.bool_]:
 def look(
     view: MapView, camera: StereoCamera, query: FrameFeatures, map_from_cam: Array
 ) -> tuple[Rows, NDArray[np.bool_]]:
-    """Return rows (V,) of the landmarks expected in a picture at this pose, and which of them it shows: the pose is not refined."""
+    """Return rows (V,) of the landmarks expected in a picture at this pose, and which of them it shows: the pose is not refined.
+
+    A picture without features, in the dark, is no look.
+    """
+    if not len(query.pixels):
+        return np.zeros(0, np.int64), np.zeros(0, bool)
     expected = view.visible(map_from_cam, camera, -EDGE_PX, WIDER_VIEW_RAD)
     shown = due(expected, query.pixels)
     expected = VisibleLandmarks(expected.rows[shown], expected.pixels[shown], expected.octaves[shown])

@@ -21,7 +21,14 @@ from fleetmap.relocalization.landmark_visibility import places_around
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.merge.confirmation import Confirmation, confirmation, look
-from mapserver.survey.merge.session_alignment import Alignment, alignments, find_fixes, fixes_around, follow_fixes
+from mapserver.survey.merge.session_alignment import (
+    Alignment,
+    alignments,
+    count_places,
+    find_fixes,
+    fixes_around,
+    follow_fixes,
+)
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import SessionSettings
@@ -101,7 +108,7 @@ class SessionKeyframes:
 
     views (K * V) with their features and depths, those of the first keyframe, those of the second one, and so on; survey_from_body
     (K, 4, 4) and the edges of its motion; camera, body_from_cams (V, 4, 4): of each view. map_from_survey: pose by position priors,
-    None without any.
+    None without any. pieces (K,): equal for keyframes that pictures link, not odometry alone; None if they link all.
     """
 
     views: Sequence[FrameFeatures]
@@ -110,6 +117,7 @@ class SessionKeyframes:
     camera: StereoCamera
     body_from_cams: Array
     map_from_survey: Array | None = None
+    pieces: NDArray[np.int64] | None = None
 
     @property
     def by_priors(self) -> Array | None:
@@ -157,7 +165,41 @@ class MembershipTest:
             priors_off_m = None if apart_m is None else round(apart_m, 2)
             seen = self.confirmation(map_from_body)
             places.append(SessionPlace(map_from_body, placed, believed, seen, priors_off_m))
-        return self._chosen(places)
+        chosen = self._chosen(places)
+        best = max(places, key=lambda one: len(one.placed.fixes)) if isinstance(chosen, Membership) else chosen
+        return self._broken(best, found) or chosen
+
+    def _broken(self, chosen: SessionPlace, found: Sequence[Alignment]) -> Membership | None:
+        """Return why a session is held of which some keyframes agree on another place than its own motion gives them.
+
+        They may stand at a place that looks like that one. Not so if no picture links them to the others, or the map contradicts them
+        where they are: then the motion in between is wrong, by a slip, a lift or wrong stamps.
+        """
+        session, own = self._session, {fix.k for fix in chosen.placed.fixes}
+        pieces = np.zeros(len(session.survey_from_body)) if session.pieces is None else session.pieces
+        linked = np.isin(pieces, pieces[sorted(own)])
+        for other in found:
+            fixes = [fix for fix in other.fixes if fix.k not in own]
+            ks = [fix.k for fix in fixes]
+            if (
+                len(ks) < self._settings.min_fixes
+                or count_places(session.survey_from_body[ks, :3, 3]) < self._settings.min_places
+            ):
+                continue
+            if linked[ks].all() and not contradicts(self.confirmation(chosen.map_from_body, ks)):
+                continue
+            off_m = np.median(
+                [np.linalg.norm((fix.map_from_body - chosen.map_from_body[fix.k])[:3, 3]) for fix in fixes]
+            )
+            steps_m = np.linalg.norm(np.diff(session.survey_from_body[:, :3, 3], axis=0), axis=1)
+            first_m, last_m = (float(steps_m[:k].sum()) for k in (min(ks), max(ks)))
+            return Membership(
+                f"its motion is broken: {len(ks)} keyframes, {first_m:.1f} to {last_m:.1f} m along its way, agree on a place "
+                f"{off_m:.1f} m from where its motion puts them; it slipped, was lifted, or its stamps are wrong: drive again, or build "
+                "its parts alone, with --frames",
+                evidence=self.evidence(chosen, chosen.seen),
+            )
+        return None
 
     def _beside_the_map(self, map_from_body: Array) -> NDArray[np.bool_]:
         """Return which views (K, V) of keyframes at map_from_body (K, 4, 4) are near a place of the map, with a similar heading."""
@@ -176,15 +218,17 @@ class MembershipTest:
         off_m = self._priors_off_m(placed, placed.map_from_survey @ self._session.survey_from_body)
         return off_m is None or off_m >= _PRIOR_M
 
-    def confirmation(self, map_from_body: Array) -> Confirmation:
-        """Return the share of the map seen by the session with its keyframes at map_from_body (K, 4, 4).
+    def confirmation(self, map_from_body: Array, chosen: Sequence[int] | None = None) -> Confirmation:
+        """Return the share of the map seen by the session with its keyframes, or chosen ones, at map_from_body (K, 4, 4).
 
         Only views near places of the map are used: parts of the next aisle that a survey saw through gaps in the racks
         may be hidden by other goods from within that aisle. Without any near ones all are used, with few expected landmarks.
         """
         session, view = self._session, self._relocalizer.view
         beside = self._beside_the_map(map_from_body)
-        beside |= not beside.any()
+        asked = np.zeros_like(beside)
+        asked[slice(None) if chosen is None else list(chosen)] = True
+        beside = beside & asked if (beside & asked).any() else asked
         count = beside.shape[1]
         looks = [
             look(view, session.camera, session.views[k * count + v], map_from_body[k] @ session.body_from_cams[v])

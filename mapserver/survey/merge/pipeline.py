@@ -8,6 +8,7 @@ from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.bundle.odometry_factors import chain_edges
 from mapserver.survey.finish.frame_adjustment import frame_trajectory
+from mapserver.survey.keyframes.connected_components import find_groups
 from mapserver.survey.merge.area_corrections import SurveyLimits
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import what_changes
@@ -90,6 +91,7 @@ def extend(
         camera=state.camera,
         body_from_cams=state.body_from_view @ state.body_from_cam,
         map_from_survey=map_from_survey,
+        pieces=find_groups(state, lambda *_: np.inf, 0.0).labels(),
     )
     firm = firm_landmarks(len(base.points_map), base.map.obs_landmark)
     test = MembershipTest(relocalizer, firm, session, settings.sessions)

@@ -92,7 +92,7 @@ def alignments(fixes: Sequence[SessionFix], survey_from_body: Array, chain: Grap
         sets = {n: [m for m in agreeing[n] if m in free] for n in sorted(free)}
         best = max(sets, key=lambda n: (len(sets[n]), sum(fixes[m].inliers for m in sets[n]), -n))
         chosen = tuple(fixes[m] for m in sets[best])
-        places = _places(survey_from_body[[fix.k for fix in chosen], :3, 3])
+        places = count_places(survey_from_body[[fix.k for fix in chosen], :3, 3])
         seed = fixes[best]
         found.append(Alignment(chosen, seed.map_from_body @ se3_inverse(survey_from_body[seed.k]), places))
         free -= set(sets[best])
@@ -119,7 +119,7 @@ def _agreeing(seed: int, fixes: Sequence[SessionFix], survey_from_body: Array, c
     return [seed, *(row for _, row in best.values())]
 
 
-def _places(positions_m: Array) -> int:
+def count_places(positions_m: Array) -> int:
     """Return how many of positions (F, 3), chosen in order, are at least a metre from each other."""
     chosen: list[Array] = []
     for position in positions_m:

@@ -10,7 +10,7 @@ from fleetmap.geometry import Array, length, se3_inverse
 from fleetmap.odometry.floor_motion import FloorMotion
 from fleetmap.sensors.samples import WheelSample
 
-_WINDOW_NS = 400_000_000
+WINDOW_NS = 400_000_000
 # Climb that a floor allows: thresholds, and slopes of 17 degrees over the rolled distance.
 _CLIMB_M, _CLIMB_SHARE = 0.05, 0.3
 _SIGMAS = 4.0
@@ -52,7 +52,7 @@ class LiftCheck:
         self._wheel = wheel[-1] if wheel else self._wheel
         if self._wheel is None:
             return self._floor_motion.is_lifted(stamp_ns, odom_from_body[2, :3], earlier_from_body, climb_sigma_mps)
-        if stamp_ns - self._wheel.stamp_ns > _WINDOW_NS or earlier_from_body is None:
+        if stamp_ns - self._wheel.stamp_ns > WINDOW_NS or earlier_from_body is None:
             self._steps.clear()
             return False
         up_body = odom_from_body[2, :3]
@@ -63,13 +63,13 @@ class LiftCheck:
         rolled_m = speed_mps * (stamp_ns - self._steps[-1].stamp_ns) * 1e-9 if self._steps else 0.0
         is_rolling = speed_mps > 0.0 or any(sample.yaw_rate_radps for sample in rolling)
         self._steps.append(_Step(stamp_ns, climb_m, (step_m - climb_m * up)[:2], rolled_m, is_rolling))
-        while stamp_ns - self._steps[0].stamp_ns > _WINDOW_NS:
+        while stamp_ns - self._steps[0].stamp_ns > WINDOW_NS:
             self._steps.popleft()
         return self._climbs(climb_sigma_mps) or self._is_tilted(up, speed_mps) or self._is_moved(speed_mps)
 
     def _climbs(self, sigma_mps: float) -> bool:
         climb_m, rolled_m = sum(s.climb_m for s in self._steps), sum(s.rolled_m for s in self._steps)
-        return abs(climb_m) > _CLIMB_M + _CLIMB_SHARE * rolled_m + _SIGMAS * sigma_mps * _WINDOW_NS * 1e-9
+        return abs(climb_m) > _CLIMB_M + _CLIMB_SHARE * rolled_m + _SIGMAS * sigma_mps * WINDOW_NS * 1e-9
 
     def _is_tilted(self, up: Array, speed_mps: float) -> bool:
         is_tilted = self._floor_up is not None and bool(self._floor_up @ up < _TILT)

@@ -76,9 +76,8 @@ def surveyed(path: Path, frames: str, pinhole: StereoCamera | None) -> Surveyed:
     admitted = admit_recordings([path], reading, Console(quiet=True), needs_truth=True)
     with reading.open(path) as (recording, _):
         settings = survey_settings(None, recording.sensor_set)
-    return survey_recording(
-        path, admitted[path], reading, pinhole, SurveyConfig(settings, default_vocabulary()), SurveyTools()
-    )
+    config = SurveyConfig(settings, default_vocabulary())
+    return survey_recording(path, admitted[path], reading, pinhole, config, SurveyTools())[0]
 
 
 def ate_m(trajectories: Sequence[Trajectory], surveys: Sequence[Surveyed]) -> float:

@@ -160,7 +160,7 @@ def surveyed(path: Path, pinhole: StereoCamera | None) -> Surveyed:
     reading = RecordingOptions()
     admitted = admit_recordings([path], reading, Console(quiet=True), needs_truth=False)
     options = SurveyConfig(SETTINGS, default_vocabulary())
-    return survey_recording(path, admitted[path], reading, pinhole, options, SurveyTools())
+    return survey_recording(path, admitted[path], reading, pinhole, options, SurveyTools())[0]
 
 
 def off_in_map_m(here: Surveyed, placed: Trajectory, truth: Trajectory) -> Array:

@@ -1,6 +1,7 @@
 """Recordings of a build: opened once, and their frames decoded once."""
 
 import weakref
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -28,6 +29,7 @@ from mapserver.drafting.survey_recordings import (
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey import stages
 from mapserver.survey.bundle.stereo_yaw_check import StereoYaw
+from mapserver.survey.odometry_pass import parts_between_lifts
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyTools
 from support.recordings.recording_samples import make_sample, write_euroc
@@ -117,6 +119,22 @@ def test_a_survey_goes_on_from_what_was_followed_under_its_calibration(
         assert first == second == [images]
 
 
+@pytest.mark.parametrize(
+    ("lifted", "parts"),
+    [
+        ((), [(None, None)]),
+        ((40, 41, 50), [(0, 36), (51, 100)]),  # what it noticed within 0.4 s began before, and hands held it in between
+        ((2, 97), [(3, 93)]),
+        (range(100), []),
+    ],
+)
+def test_a_recording_ends_where_its_robot_is_lifted(
+    lifted: Sequence[int], parts: list[tuple[int | None, int | None]]
+) -> None:
+    estimates: Any = [SimpleNamespace(stamp_ns=100_000_000 * n, is_lifted=n in lifted) for n in range(100)]
+    assert [(part.start, part.stop) for part in parts_between_lifts(estimates)] == parts
+
+
 def test_nobody_holds_what_was_begun_once_its_loops_are_closed(euroc: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its landmarks are as large as those that are made anew then."""
 
@@ -133,7 +151,7 @@ def test_nobody_holds_what_was_begun_once_its_loops_are_closed(euroc: Path, monk
     with open_recording(euroc) as recording:
         rig, camera = recording.calibration, Rectifier(recording.calibration).camera
     state: Any = State(camera)
-    parts: Any = SimpleNamespace(keyframes=[]), state, set(), object()
+    parts: Any = SimpleNamespace(keyframes=[], estimates=[]), state, set(), object()
     chain = AdjustedChain(*parts)
     admitted = [Admission(CheckedRecording(rig, [], RigEvidence("", [], {}, {}), {}), begun=chain)]
     begun = weakref.ref(state)

@@ -79,7 +79,7 @@ def manifest(tiles: Sequence[Tile], version: int) -> Manifest:
         data = encode_tile(tile)
         entries.append(TileEntry(x=tile.tile_x, y=tile.tile_y, sha256="0" * 64, bytes=len(data), landmarks=len(tile)))
     return Manifest(
-        site="lab", version=version, parent=None, tiles=tuple(entries), vocabulary=BlobEntry(sha256="1" * 64, bytes=1),
+        site="lab", version=version, parent=version - 1 or None, tiles=tuple(entries), vocabulary=BlobEntry(sha256="1" * 64, bytes=1),
         created="2026-01-02T03:04:05Z", tile_size_m=16.0, recordings=(), configuration={}, libraries={}, report={},
         camera=CameraEntry(focal_px=200.0, width_px=320, height_px=240, baseline_m=0.2),
     )  # fmt: skip
@@ -160,9 +160,12 @@ def test_a_shift_that_the_surveys_own_trajectory_shares_is_seen_by_the_last_vers
     moved = shift_first_wall(0.5 * np.cross(facing(), [0, 0, 1.0]))
     frames = moved.trajectory.frame_from_body.copy()
     frames[looks_at_first_wall(frames), :3, 3] += 0.5 * np.cross(facing(), [0, 0, 1.0])
-    said, _ = verdict(moved, trajectory=Trajectory(moved.trajectory.stamps_ns, frames))
+    said, evidence = verdict(moved, trajectory=Trajectory(moved.trajectory.stamps_ns, frames))
     assert not any("left out: share of frames in a wrong place" in reason for reason in said.reasons)
     assert any("version before: share of frames in a wrong place" in reason for reason in said.reasons)
+    assert any("agree in that version on a place 0.50 m from the draft's" in each for each in said.reasons)
+    swapped = judge(manifest([], 2), manifest([], 3), GateSettings(), evidence)
+    assert any("compared with version 1, and 3 is current" in reason for reason in swapped.reasons)
 
 
 def nights_after(first: SurveyMap, nights: int) -> SurveyMap:
@@ -444,8 +447,11 @@ def test_without_evidence_only_hard_limits_refuse() -> None:
     assert said.accepted
     assert set(said.report["not_judged"]) == {
         "held_out_frames", "yesterdays_recordings", "last_versions_places", "aliasing_probes", "motion",
-        "size_against_last_version", "calibration", "joining",
+        "size_against_last_version", "calibration", "joining", "ground_truth", "version_before",
     }  # fmt: skip
+    for error_m, accepts in ((0.29, True), (1.98, False)):
+        draft = msgspec.structs.replace(manifest(tiles, 1), report={"ate_rmse_m": error_m})
+        assert judge(draft, None, GateSettings()).accepted is accepts
     assert not judge(manifest([], 1), None, GateSettings()).accepted
 
 

@@ -1,11 +1,14 @@
 """The test of joining: sessions of the site, of another building, past docks that are right, wrong or another building's."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3
+from fleetmap.geometry import Array, se3, se3_inverse
 from mapserver.survey.merge.membership import Membership, MembershipTest, MembershipVerdict, SessionPlace
-from support.worlds.aisle_world import Aisle, aisle, drive, membership, relocalizer, repainted
+from support.worlds.aisle_world import SETTINGS, Aisle, aisle, drive, membership, relocalizer, repainted
 
 HOME = aisle(1)
 KNOWN = relocalizer(HOME, drive(56))
@@ -104,6 +107,19 @@ def test_against_the_surveys_direction_a_rear_pair_tells_the_place(given: bool) 
     assert np.linalg.norm((located.map_from_body - places)[:, :3, 3], axis=1).max() < 0.03
     elsewhere = membership(KNOWN, shared_above(0.8), places[:12], None, body_from_views=pairs)
     assert verdict(elsewhere)[0] is not MembershipVerdict.JOINED
+
+
+@pytest.mark.parametrize(("pieces", "is_mapped"), [(None, True), (np.arange(30) // 15, False)])
+def test_a_session_whose_motion_is_broken_is_held(pieces: NDArray[np.int64] | None, is_mapped: bool) -> None:
+    """Lifted and set down: the map sees nothing of what it knows there, or knows nothing, and no picture links both halves."""
+    step = se3(np.eye(3), np.array([5.0 if is_mapped else 0.0, 0.0 if is_mapped else 12.0, 0.0]))
+    session = membership(KNOWN, HOME, drive(30, start_m=4.0), None)._session
+    places = np.concatenate([session.survey_from_body[:15], step @ session.survey_from_body[15:]])
+    chain = [replace(e, i_from_j=se3_inverse(places[e.i]) @ places[e.j]) for e in session.chain]
+    session = replace(session, survey_from_body=places, chain=chain, pieces=pieces)
+    held = refused(MembershipTest(*KNOWN, session, SETTINGS.sessions))
+    assert "its motion is broken" in held.reason
+    assert f"a place {5.0 if is_mapped else 12.0:.1f} m from" in held.reason
 
 
 def test_a_session_between_both_is_held_with_its_figures() -> None:
