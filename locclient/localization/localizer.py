@@ -112,6 +112,14 @@ class Localizer:
             self.forget_pose()
         self._tracker.handle_prior(prior)
 
+    def handle_contradiction(self, text: str) -> None:
+        """Use no images from now on for this reason, by all other sensors, and drop the pose by them; empty: use them again."""
+        if text and not self._calibration.contradiction:
+            was_tracking = self._tracker.was_tracking
+            self.forget_pose()
+            self._tracker.was_tracking = was_tracking
+        self._calibration.contradiction = text
+
     def forget_pose(self) -> None:
         """Search the whole map from the next frame on; cancel a running map query."""
         self._tracker.forget()
@@ -352,9 +360,10 @@ class Localizer:
             self._query.is_riding = self._follow_lift(odometry, percept.ride)
         if frame is not None:
             self._calibration.work()
-            percept.is_reversed = self._followed == 0 and self._calibration.is_reversed(
-                frame, is_localized=tracker.confirmed is not None
+            percept.is_reversed = bool(self._calibration.contradiction) or (
+                self._followed == 0 and self._calibration.is_reversed(frame, is_localized=tracker.confirmed is not None)
             )
+            percept.calibration = self._calibration.state
         result = self._query.step(percept, frame)
         if frame is not None:
             if self._query.finished is not None and self._query.view == 0:

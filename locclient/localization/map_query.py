@@ -15,7 +15,6 @@ from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, Relocalizer
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import ViewpointGate
-from locclient.localization.calibration.pair_order import REVERSED_TEXT
 from locclient.localization.estimate import QueryResult
 from locclient.localization.image_quality import UNUSABLE
 from locclient.localization.percept import Percept, QueryInput
@@ -130,7 +129,8 @@ class MapQuery:
             self.forget()
             result = QueryResult(refused="the robot rides in a lift")
         else:
-            result = QueryResult(refused=REVERSED_TEXT) if percept.is_reversed else self._step(percept, frame)
+            refused = QueryResult(refused=percept.calibration.text)
+            result = refused if percept.is_reversed else self._step(percept, frame)
         self._last_ns = percept.odometry.stamp_ns
         return result
 

@@ -1,13 +1,18 @@
 """Speed of a robot by wheels or odometry, and consistency checks: wheels and IMU with images, estimates with docks. Pure."""
 
+from cmath import phase, rect
 from collections.abc import Iterable, Sequence
 from math import dist, hypot
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, se3_inverse, so3_exp, so3_log
 from fleetmap.messages import Flag, Status
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.accelerometer_check import AccelerometerCheck
+from fleetmap.sensors.axes import speed_in_words
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import MountedCamera
 from fleetmap.sensors.samples import PositionPrior, WheelSample
 from locclient.localization.estimate import Estimate
 
@@ -101,10 +106,6 @@ class SpeedGauge:
 
 
 _ASK = "record a drive and ask `mapserver doctor`"
-WHEELS_REFUSED = {
-    Flag.WHEELS_REFUSED: f"the wheels are left out: their speed contradicts the images and the IMU; {_ASK} how",
-}
-"""Flag of RobotHealth with its text: the camera's motion contradicts the sensor, which is not used."""
 
 
 def imu_refused(late_s: float | None) -> dict[Flag, str]:
@@ -127,20 +128,41 @@ def accelerometer_refused(fault: str) -> dict[Flag, str]:
 _OFF_SHARE, _OFF_MPS = 0.5, 0.3  # relative, and absolute for low speeds: slip of a tyre is far less
 _LIMIT_M = 3.0  # of contradicting motion: a spinning wheel or a person in front of the camera takes less
 _FOLLOWED_SHARE = 0.5  # of the tracks
+_SAME_WAY_RAD = np.pi / 4  # between two directions that agree
 _REST_SHARE = 0.2  # weight of resting wheels, as the robot may be carried
+_DOUBT_M = 1.0  # of contradicting motion, for a sensor that another one supports
 
 
 class WheelAgreement:
     """Compares wheels and odometry frame by frame.
 
-    is_refused: they have contradicted each other for metres, and have not agreed for as long since.
+    is_doubted: rolling wheels contradict the last comparable frame. is_refused: wheels have done so for metres, and have not agreed for as
+    long since. ratio: meanwhile, of their speed to that of the images, complex, forward and left.
     """
 
     def __init__(self, base_from_body: Array) -> None:
         self._base_from_body = base_from_body
         self._last_ns: int | None = None
         self._against_m = 0.0
-        self.is_refused = False
+        self._seen_squares, self._products = 0.0, 0j
+        self._is_compared = False
+        self.is_doubted = self.is_refused = False
+
+    @property
+    def ratio(self) -> complex:
+        return self._products / self._seen_squares if self._seen_squares else 1.0
+
+    @property
+    def refused(self) -> dict[Flag, str]:
+        """Return the flag of RobotHealth with its text; empty unless the wheels are refused."""
+        fault = speed_in_words(self.ratio) or "their speed contradicts the images and the IMU"
+        return {Flag.WHEELS_REFUSED: f"the wheels are left out: {fault}"} if self.is_refused else {}
+
+    def favours(self, turn_rad: float) -> bool | None:
+        """Return whether the wheels say that the images' motion is turned by this angle; None if unknown."""
+        if self._against_m < _DOUBT_M:
+            return False if self._is_compared and not self._against_m else None
+        return abs(phase(self.ratio * rect(1.0, -turn_rad))) < _SAME_WAY_RAD
 
     def handle(self, wheel: Sequence[WheelSample], odometry: OdometryEstimate) -> None:
         """Add a frame; wheel: samples since the previous one."""
@@ -148,7 +170,7 @@ class WheelAgreement:
         moved = odometry.previous_from_body
         # Frames too far apart for tracking are no evidence: the odometry itself may be wrong.
         is_followed = odometry.inlier_share >= _FOLLOWED_SHARE and not odometry.after_gap
-        is_known = odometry.status is OdometryStatus.TRACKING and odometry.scale_known and is_followed
+        is_known = odometry.status is not OdometryStatus.DEGRADED and odometry.scale_known and is_followed
         if last_ns is None or not wheel or not is_known or moved is None:
             return
         duration_s = (odometry.stamp_ns - last_ns) * 1e-9
@@ -158,10 +180,46 @@ class WheelAgreement:
         step_m = min(max(seen, min(rolled, 1.0)), 10.0) * duration_s
         if np.linalg.norm(rolled_mps - seen_mps) > max(_OFF_MPS, _OFF_SHARE * min(seen, rolled)):
             self._against_m += step_m * (_REST_SHARE if rolled < 0.01 else 1.0)
+            self._products += complex(*rolled_mps) * complex(*seen_mps).conjugate()
+            self._seen_squares += seen**2
+            self.is_doubted = rolled >= 0.01
         else:
             self._against_m -= step_m
+            self.is_doubted = False
+            self._is_compared |= seen > _OFF_MPS
         self._against_m = min(max(self._against_m, 0.0), 2.0 * _LIMIT_M)
         if self._against_m >= _LIMIT_M:
             self.is_refused = True
         elif self._against_m == 0.0:
-            self.is_refused = False
+            self.is_refused, self._seen_squares, self._products = False, 0.0, 0j
+
+
+class ExchangedViews:
+    """Compares the images with all other sensors at once: what one rotation of the images explains for each is a fault of the images.
+
+    Rotations are those of other views against the first one, whose topics may be exchanged, and that of the wheels against the images.
+    """
+
+    def __init__(self, calibration: RigCalibration, mounted: Sequence[MountedCamera]) -> None:
+        """mounted: the cameras of the rig's views."""
+        self._base_from_body = calibration.base_from_body[:3, :3]
+        first, *names = (" and ".join(f"cam{number}" for number in numbers) for numbers in calibration.views)
+        axes = [self._base_from_body @ each.body_from_cam[:3, :3] for each in mounted]
+        self._turns_rad = {
+            f"the topics of {first} are exchanged with those of {name}, or ": float(so3_log(other @ axes[0].T)[2])
+            for name, other in zip(names, axes[1:], strict=True)
+        }
+
+    def refused(self, wheels: WheelAgreement, accelerometer: AccelerometerCheck) -> dict[Flag, str]:
+        """Return the flag of images that all other sensors contradict, with its text; empty without evidence."""
+        for exchange, turn_rad in {**self._turns_rad, "": phase(wheels.ratio)}.items():
+            seen_from_true = self._base_from_body.T @ so3_exp(np.array([0.0, 0.0, -turn_rad])) @ self._base_from_body
+            by = {"wheels": wheels.favours(turn_rad), "accelerometer": accelerometer.favours(seen_from_true)}
+            against = [sensor for sensor, favours in by.items() if favours]
+            is_clear = abs(turn_rad) > _SAME_WAY_RAD and False not in by.values()
+            if is_clear and len(against) > (0 if exchange else 1):
+                words = f"they move turned by {abs(np.degrees(turn_rad)):.0f} degrees against {' and '.join(against)}"
+                mounted = "the cameras" if len(against) > 1 else f"the cameras or the {against[0]}"
+                cause = f"{exchange}{mounted} are mounted otherwise than calibrated"
+                return {Flag.IMAGES_REFUSED: f"the images are left out: {words}: {cause}"}
+        return {}

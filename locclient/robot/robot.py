@@ -22,8 +22,8 @@ from locclient.robot.failure_monitor import Failure, FailureMonitor
 from locclient.robot.failure_onset import Evidence, Onset, OnsetRecorder, refined_cause
 from locclient.robot.failure_ring import FailureCut, FailureRing
 from locclient.robot.motion_checks import (
-    WHEELS_REFUSED,
     DockCheck,
+    ExchangedViews,
     SpeedGauge,
     WheelAgreement,
     accelerometer_refused,
@@ -104,6 +104,8 @@ class Robot:
         self._last: tuple[RectifiedFrame, Estimate] | None = None
         self._speed = SpeedGauge()
         self._wheels = WheelAgreement(calibration.base_from_body)
+        self._views = ExchangedViews(calibration, rectifier.mounted)
+        self._images_refused = dict[Flag, str]()
         self._wheels_fault, self._wheels_unused = calibration.wheels_fault, dict[Flag, str]()
         self._aligned: BuildingFrame | None = None
         self._of_version: BuildingFrame | None = None
@@ -157,7 +159,8 @@ class Robot:
         self.localizer.handle_imu(bundle.imu)
         if bundle.wheel and self._wheels_fault and not self._wheels_unused:
             self._wheels_unused = {Flag.WHEELS_UNMOUNTED: f"the wheels are left out: {self._wheels_fault}"}
-        wheel = [] if self._wheels.is_refused or self._wheels_fault else bundle.wheel
+        is_bad = self._wheels.is_doubted or self._wheels.is_refused or self._wheels_fault
+        wheel = [] if is_bad else bundle.wheel
         self.localizer.handle_wheel(wheel)
         if self.ring is not None:
             self.ring.handle_samples(replace(bundle, wheel=wheel))
@@ -187,6 +190,8 @@ class Robot:
         published = replace(self._odom.handle(estimate), building_from_map=self._building_from_map(), level=level)
         speed_mps = self._speed.handle(wheel, estimate.odometry, published.odom_from_base)
         self._wheels.handle(wheel if self._wheels_fault else bundle.wheel, estimate.odometry)
+        self._images_refused = self._views.refused(self._wheels, self.localizer.odometry.accelerometer)
+        self.localizer.handle_contradiction("".join(self._images_refused.values()))
         is_covered = self._may_be_mapped(estimate)
         failure = self.monitor.handle(estimate, speed_mps, may_be_mapped=is_covered)
         if self.ring is not None and self.localizer.percept is not None:
@@ -201,7 +206,9 @@ class Robot:
 
     def _left_out(self) -> dict[Flag, str]:
         odometry = self.localizer.odometry
-        wheels = WHEELS_REFUSED if self._wheels.is_refused else self._wheels_unused
+        if self._images_refused:
+            return {**self._images_refused, **self._wheels_unused}
+        wheels = self._wheels.refused or self._wheels_unused
         imu = imu_refused(odometry.imu_late_s) if odometry.refuses_imu else {}
         return {**imu, **accelerometer_refused(odometry.accelerometer_fault), **wheels}
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
+from fleetmap.sensors.axes import speed_in_words
 from fleetmap.sensors.samples import WheelSample
 from mapserver.doctor.accelerometer_images import AxesFit
 from mapserver.doctor.camera_motion import CameraTurns
@@ -19,7 +20,6 @@ _RESTS_MPS = 0.05  # the noise of images at rest is below
 _OFF = 1.3  # a ratio beyond contradicts; smaller errors are measured with the calibration
 _SURE_SIGMAS = 3.0
 _KNOWN_SHARE = 0.2  # a ratio with a larger sigma decides nothing
-_UNITS = {1000.0: "mm/s", 100.0: "cm/s", 3.6: "km/h", 2.237: "miles per hour"}
 # Implausible for any robot: distance of cameras (m), median depth (m), speed of cameras and of wheels (m/s)
 _BASELINES_M, _DEPTHS_M, _FASTEST_MPS, _FASTEST_WHEELS_MPS = (0.005, 3.0), (0.05, 500.0), 70.0, 25.0
 _LIMIT = f"fail if a ratio is certainly beyond {_OFF:g}, or its sign is wrong"
@@ -135,15 +135,7 @@ def _speed_fault(fit: WheelFit, blamed: str) -> str:
         return f"the wheels drive at {fit.wheel_mps:.2g} m/s while the images rest: check that the pictures change"
     if abs(speed) < 0.01 and fit.wheel_mps < 0.01 * fit.image_mps:
         return f"the wheels rest while the images move at {fit.image_mps:.2g} m/s: check that odometry is published"
-    angle_deg = float(np.degrees(np.angle(speed)))
-    if abs(angle_deg) > 135.0:
-        return "wheels drive backwards while the images move forwards: negate their speed, or correct base_from_body"
-    if abs(angle_deg) > 45.0:
-        return f"the wheels drive {angle_deg:+.0f} degrees away from the motion of the images: correct base_from_body"
-    if blamed != WHEELS:
-        return ""
-    units = (f": they are in {unit}" for factor, unit in _UNITS.items() if abs(abs(speed) / factor - 1.0) < 0.1)
-    return f"the wheels drive {abs(speed):.3g} times as fast as the images move{next(units, '')}; check their unit and radius"
+    return speed_in_words(speed, has_wrong_size=blamed == WHEELS)
 
 
 def _yaw_fault(fit: WheelFit) -> str:

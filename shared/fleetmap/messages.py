@@ -90,6 +90,7 @@ class Flag(StrEnum):
     ACCELEROMETER_REFUSED = "accelerometer_refused"
     WHEELS_REFUSED = "wheels_refused"
     WHEELS_UNMOUNTED = "wheels_unmounted"
+    IMAGES_REFUSED = "images_refused"
 
 
 class FailureKind(StrEnum):

@@ -34,9 +34,10 @@ class CalibrationMonitor:
         self._job: TimeSliced[None] | None = None
         self._searched_ns: int | None = None
         self._order, self._order_ns = PairOrder.UNKNOWN, -(2**62)
+        self.contradiction = ""  # reason why the images cannot be used, by all other sensors
 
     def is_reversed(self, frame: RectifiedFrame, *, is_localized: bool) -> bool:
-        """Return True if the images of the pair are known to be exchanged or mirrored; test this frame if due."""
+        """Return True if images are known to be exchanged or mirrored; test the order of this frame's pair if due."""
         age_s = (frame.stamp_ns - self._order_ns) * 1e-9
         undecided = {PairOrder.UNKNOWN: _UNDECIDED_S, PairOrder.REVERSED: _REVERSED_S}
         if age_s >= undecided.get(self._order, np.inf if is_localized else _NOT_LOCALIZED_S):
@@ -68,7 +69,8 @@ class CalibrationMonitor:
 
     @property
     def state(self) -> CalibrationState:
-        return CalibrationState(text=REVERSED_TEXT) if self._order is PairOrder.REVERSED else self.watch.state
+        text = self.contradiction or (REVERSED_TEXT if self._order is PairOrder.REVERSED else "")
+        return CalibrationState(text=text) if text else self.watch.state
 
     def _view(self, query: FinishedQuery) -> TimeSliced[None]:
         self.watch.handle(query)

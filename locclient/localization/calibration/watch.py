@@ -45,6 +45,7 @@ _STOOD_M, _STOOD_S = 0.03, 0.35
 _LOCAL_FLOORS = 2.0
 _MAP_TILT_SIGMA_RAD = 0.05  # of a map surveyed without IMU, which is levelled by its cameras
 _GRAVITY_MPS2, _UNHELD_S = 9.81, 0.9  # age of a fix beyond which no pose is TRACKING
+_KNOCKED_RAD = np.pi / 4  # no knock turns a camera further; which sensor is wrong then is decided by `WheelAgreement`
 _PRIOR_SIGMA = 10.0  # of a parameter: practically none; keeps the equations regular for unobserved parameters
 _JUDGED_SIGMA_SHARE = 0.5  # a parameter known no better than this share of the prior was not judged
 
@@ -165,6 +166,8 @@ class CalibrationWatch:
         covariance = transport_cov(fix.cov_rot_trans, map_from_base[:3, 3] - fix.map_from_cam[:3, 3])
         base = BasePose(map_from_base, covariance, self._wheels.at(odometry.stamp_ns))
         turned = None if self._last_base is None else mounting.heading(self._last_base, base)
+        if turned is not None and abs(turned[0]) > _KNOCKED_RAD:
+            turned = None
         for at_one, measurement in (
             (HEADING, turned),
             (HEIGHT, mounting.height(base, query.relocalizer.view.points_map)),

@@ -40,6 +40,18 @@ class AccelerometerCheck:
         # Normal equations of body_from_sensor (9), bias (3), up in the run's axes times gravity (3), and a change of velocity
         self._normal = np.zeros((16, 16))
         self._windows = 0.0
+        # The squares' matrix for axes (9) and -1, those of the given axes and of the best fit, and the variance
+        self._judged: tuple[Array, float, float, float] | None = None
+
+    def favours(self, seen_from_true: Array) -> bool | None:
+        """Return whether it says that the images' motion is rotated by (3, 3), in body axes; None without evidence."""
+        if self._judged is None:
+            return None
+        left, given, best, variance = self._judged
+        squares = float(np.append(seen_from_true, -1.0) @ left @ np.append(seen_from_true, -1.0))
+        if self.fault:
+            return squares < best + _NAMED_SQUARES * variance
+        return False if squares > max(given + _SURE_SQUARES * variance, _SURE_RATIO * given) else None
 
     def handle(self, stamp_ns: int, earlier_from_body: Array | None, imu: ImuSamples, *, on_wheels: bool) -> None:
         """Process a frame on the IMU's clock; earlier_from_body (4, 4): by images, since the frame before, None if unknown.
@@ -107,6 +119,7 @@ class AccelerometerCheck:
         size = float(np.linalg.norm(ups[given]))
         best = float(squares.min())
         variance = max(1.0, best / max(3.0 * self._windows - 6.0, 1.0))
+        self._judged = left, float(squares[given]), best, variance
         sigma_mps2 = float(np.sqrt(variance * np.trace(np.linalg.inv(normal[9:15, 9:15])[3:, 3:])))
         if abs(size - GRAVITY_MPS2) > _GRAVITY_OFF_MPS2 + _REACH_SIGMAS * sigma_mps2:
             self.fault = (

@@ -406,12 +406,12 @@ class StartingMode(GyroMode):
         return None if start is None else self._moving_evenly(start)
 
     def _moving_evenly(self, start: InitialState) -> InitialState | None:
-        """The start with the speed by wheels or images in its steady window; None if that speed changed.
+        """The start with the speed by images in its steady window; None if that speed changed, or wheels alone show one: they may be wrong.
 
         Constant acceleration is as steady as rest: an IMU alone sees it as a tilt, of 5 degrees for 0.8 m/s^2. At a speed far from zero
         the measurements of it would be rejected as outliers.
         """
-        settings, base_from_body = self._rig.settings.start, self._rig.base_from_body
+        settings = self._rig.settings.start
         begin_ns = start.stamp_ns - int(settings.steady_window_s * 1e9)
         seen = [(stamp, placed) for stamp, placed in self._trajectory if begin_ns <= stamp <= start.stamp_ns]
         places = [(stamp, placed[:3, 3]) for stamp, placed in seen]
@@ -422,8 +422,8 @@ class StartingMode(GyroMode):
         velocity_body, by_pictures = np.zeros(3), polynomial_rate(places, 1)
         if by_pictures is not None:
             velocity_body = seen[-1][1][:3, :3].T @ by_pictures
-        elif rates[1] is not None:
-            velocity_body = base_from_body[:3, :3].T @ np.mean([speed for _, speed in speeds], axis=0)
+        elif speeds and np.linalg.norm(np.mean([speed for _, speed in speeds], axis=0)) > _NEAR_REST_MPS:
+            return None
         if np.linalg.norm(velocity_body) > _NEAR_REST_MPS:
             start.state.velocity_mps = start.state.rotation @ velocity_body
         return start

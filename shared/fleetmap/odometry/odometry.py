@@ -48,7 +48,7 @@ class Odometry:
         )
         self._stereo_settings = stereo_settings
         self._samples = SensorBuffer()
-        self._accelerometer = AccelerometerCheck(base_from_body)
+        self.accelerometer = AccelerometerCheck(base_from_body)
         self._clock = GyroClock(MAX_OFFSET_SIGMAS * settings.filter.time_offset_sigma_s)
         self._tracker = self._new_tracker(0, 0)
         self._before: RectifiedFrame | None = None  # of a camera that is followed from the next frame on
@@ -108,7 +108,7 @@ class Odometry:
     @property
     def accelerometer_fault(self) -> str:
         """Reason why the accelerometer is not used, its axes or unit; empty if it is, or may be."""
-        return self._accelerometer.fault
+        return self.accelerometer.fault
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """earlier_from_now (4, 4) since a frame (counted from 0) as known now, and its covariance.
@@ -127,5 +127,5 @@ class Odometry:
         window = SlidingWindow(self._rig, NavState(), np.diag([1e-10] * 15), 0)
         if self._rig.imu is None:
             return VisualMode(window)
-        inputs = ImuInputs(self._rig, self._rig.imu, self._samples, self._clock, self._accelerometer)
+        inputs = ImuInputs(self._rig, self._rig.imu, self._samples, self._clock, self.accelerometer)
         return StartingMode(window, inputs)

@@ -1,4 +1,4 @@
-"""Wheels that the robot's other sensors contradict are left out until they agree again."""
+"""A sensor that all others contradict is left out until they agree again; without its camera, the robot does not know its place."""
 
 from dataclasses import replace
 from typing import Any
@@ -6,10 +6,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleetmap.geometry import se3
-from fleetmap.sensors.samples import WheelSample
+from fleetmap.geometry import se3, se3_inverse, so3_exp
+from fleetmap.messages import Cause, Flag, Status
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.samples import ImuSamples, WheelSample
 from locclient.robot.motion_checks import WheelAgreement, imu_refused
+from locclient.robot.robot import Outcome, Robot
+from mapserver.store import MapStore
 from support.fleet.estimates import estimate
+from support.recordings.recording_samples import calibration
+from support.worlds import robot_world
 
 
 def drive(
@@ -57,3 +63,74 @@ def test_an_imu_that_is_left_out_is_named_with_its_clock() -> None:
     assert "turns otherwise" in imu_refused(None)["imu_refused"]
     assert "about 0.10 s late" in imu_refused(0.101)["imu_refused"]
     assert "about 0.20 s early" in imu_refused(-0.198)["imu_refused"]
+
+
+TURNED = so3_exp(np.array([0.0, 0.0, np.pi]))
+FRAMES = 100
+
+
+def driven(store: MapStore, *, views: int = 1, imu: float | None = 1, wheels: float | None = 1) -> list[Outcome]:
+    """Two laps of a robot in its map. imu, wheels: -1 for samples as of a body that looks back, None without them. views: 2 for a rig whose
+    second pair looks back and shows nothing."""
+    rig = calibration()
+    rear = [replace(c, body_from_cam=se3(TURNED, np.zeros(3)) @ c.body_from_cam) for c in rig.cameras]
+    rig = replace(rig, cameras=(*rig.cameras, *rear[: 2 * views - 2]), imu=None if imu is None else rig.imu)
+    robot = Robot(rig, Rectifier(rig), robot_world.SETTINGS, robot_world.TRIAL)
+    robot.use(robot_world.loaded(store))
+    outcomes = []
+    for number, bundle in enumerate(robot_world.bundles(FRAMES)):
+        moved = se3_inverse(robot_world.truth(max(number - 1, 0))) @ robot_world.truth(number)
+        assert bundle.frame is not None
+        stamp_ns, velocity_mps = bundle.frame.stamp_ns, moved[:3, 3] / robot_world.FRAME_S * (wheels or 0)
+        turn = TURNED if imu == -1 else np.eye(3)
+        samples = ImuSamples(bundle.imu.stamps_ns, bundle.imu.gyro_radps @ turn, bundle.imu.accel_mps2 @ turn)
+        wheel = WheelSample(stamp_ns, velocity_mps, float(moved[1, 0]) / robot_world.FRAME_S, 0.05, 0.05)
+        frame = replace(bundle.frame, others=(None,) * (views - 1))
+        parts = {"imu": ImuSamples.empty() if imu is None else samples, "wheel": [] if wheels is None else [wheel]}
+        outcome = robot.handle(replace(bundle, frame=frame, **parts))
+        assert outcome is not None
+        outcomes.append(outcome)
+    return outcomes
+
+
+@pytest.mark.parametrize(
+    ("imu", "wheels", "against"),
+    [(-1, -1, "wheels and accelerometer"), (-1, None, "accelerometer"), (None, -1, "wheels")],
+)
+def test_a_robot_whose_front_and_rear_topics_are_exchanged_does_not_know_its_place(
+    store: MapStore, imu: int | None, wheels: int | None, against: str
+) -> None:
+    outcomes = driven(store, views=2, imu=imu, wheels=wheels)
+    told = next(n for n, outcome in enumerate(outcomes) if Flag.IMAGES_REFUSED in outcome.left_out)
+    assert told < FRAMES / 2
+    assert all(o.estimate.status is Status.LOST and o.estimate.map_from_body is None for o in outcomes[told + 1 :])
+    last = outcomes[-1]
+    assert list(last.left_out) == [Flag.IMAGES_REFUSED]
+    text = last.left_out[Flag.IMAGES_REFUSED]
+    assert f"by 180 degrees against {against}:" in text
+    assert "the topics of cam0 and cam1 are exchanged with those of cam2 and cam3" in text
+    assert last.estimate.calibration.text == text
+    assert [o.failure.failure.cause for o in outcomes if o.failure is not None] == [Cause.CALIBRATION]
+
+
+@pytest.mark.parametrize(
+    ("views", "imu", "wheels", "flag", "words"),
+    [
+        (1, 1, -1, Flag.WHEELS_REFUSED, "wheels drive backwards"),
+        (2, 1, -1, Flag.WHEELS_REFUSED, "wheels drive backwards"),
+        (1, 1, 1000, Flag.WHEELS_REFUSED, "they are in mm/s"),
+        (2, -1, 1, Flag.ACCELEROMETER_REFUSED, "the images contradict it"),
+    ],
+)
+def test_one_sensor_that_all_others_contradict_costs_itself(
+    store: MapStore, views: int, imu: int, wheels: float, flag: Flag, words: str
+) -> None:
+    outcomes = driven(store, views=views, imu=imu, wheels=wheels)
+    assert words in outcomes[-1].left_out[flag]
+    assert Flag.IMAGES_REFUSED not in {flag for o in outcomes for flag in o.left_out}
+    for number, outcome in enumerate(outcomes):
+        known = outcome.estimate.map_from_body
+        if outcome.estimate.status is Status.TRACKING:
+            assert known is not None
+            assert np.linalg.norm(known[:3, 3] - robot_world.truth(number)[:3, 3]) < 0.1
+    assert np.mean([o.estimate.status is Status.TRACKING for o in outcomes[20:]]) > 0.9
