@@ -159,12 +159,10 @@ class _StampRecorder(Intake):
         self.stamps_ns: list[int] = []
         self.last_frame: CameraFrame | StoredFrame | None = None
 
-    def put_frame(self, frame: CameraFrame | StoredFrame) -> None:
-        before = self.counts.frames
-        super().put_frame(frame)
-        if self.counts.frames > before:
-            self.stamps_ns.append(frame.stamp_ns)
-            self.last_frame = frame
+    def _queue(self, certain: list[CameraFrame | StoredFrame]) -> None:
+        super()._queue(certain)
+        for self.last_frame in certain:
+            self.stamps_ns.append(self.last_frame.stamp_ns)
 
     def wait_for_room(self, timeout_s: float) -> bool:
         """Return True: there is always room (see Intake)."""

@@ -6,6 +6,7 @@ Stereo frames may be dropped, the oldest first, and are counted; inertial sample
 import threading
 from collections import deque
 from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -19,6 +20,10 @@ _IMU_LEAD_NS = 10_000_000  # a frame is handled once IMU samples slightly past i
 _ABSURD = 1e5
 _SET_BACK_NS = 1_000_000_000  # a stamp older by more than this is not due to a late arrival
 _STAYS_NS = 500_000_000  # duration of older stamps after which the clock counts as set back
+_NEVER_NS, _LATEST_NS = -(2**62), 2**62  # in 2116; later stamps are no times
+_STEP_NS = 100_000_000  # between values, until their own steps are known
+_STEPS = 9  # whose median is the usual one
+V = TypeVar("V")
 
 
 @dataclass
@@ -32,13 +37,14 @@ class IntakeCounts:
     imu_refused: int = 0
     imu_stale: int = 0
     imu_late: int = 0
+    wheel_refused: int = 0
     unreadable: int = 0
 
 
 @dataclass
 class _ImuQueue:
     stamps_ns: list[int] = field(default_factory=list)
-    rows: list[tuple[float, ...]] = field(default_factory=list)
+    rows: list[list[float]] = field(default_factory=list)
 
     def take_until(self, until_ns: int) -> ImuSamples:
         count = int(np.searchsorted(np.array(self.stamps_ns, np.int64), until_ns)) if self.stamps_ns else 0
@@ -47,25 +53,68 @@ class _ImuQueue:
         return ImuSamples(stamps, np.ascontiguousarray(rows[:, :3]), np.ascontiguousarray(rows[:, 3:]))
 
 
-class _Forward:
-    """Accepts increasing stamps. After a pause the first one waits for confirmation by a second: a single wrong stamp is dropped alone."""
+class _Stream(Generic[V]):
+    """Values of one sensor in order of their stamps.
 
-    def __init__(self) -> None:
-        self._last_ns: int | None = None
-        self._ahead_ns: int | None = None
+    The first one, and one that comes later than after a single lost one, may have a wrong stamp: it is held until the next value. A newer
+    one confirms it, and an older one replaces it. Thus a wrong stamp ahead costs its own value, and one amid the lost at most two more.
+    """
 
-    def takes(self, stamp_ns: int) -> bool:
-        """True if the value with this stamp is accepted."""
-        last_ns, ahead_ns, self._ahead_ns = self._last_ns, self._ahead_ns, None
-        if last_ns is not None and stamp_ns <= last_ns:
-            return False
-        if last_ns is not None and stamp_ns - last_ns > PAUSE_NS:
-            is_confirmed = ahead_ns is not None and 0 < stamp_ns - ahead_ns <= PAUSE_NS
-            if not is_confirmed:
-                self._ahead_ns = stamp_ns
-                return False
-        self._last_ns = stamp_ns
-        return True
+    def __init__(self, what: str) -> None:
+        self.last_ns, self.refused, self.set_back = _NEVER_NS, 0, ""
+        self._what = what
+        self._held: tuple[int, V] | None = None
+        self._steps_ns = deque([_STEP_NS], _STEPS)
+        self._usual_ns = _STEP_NS
+        self._older_since_ns: int | None = None
+
+    @property
+    def newest_ns(self) -> int:
+        """Stamp of the last value, which may be held."""
+        return self.last_ns if self._held is None else self._held[0]
+
+    @property
+    def has_first(self) -> bool:
+        """True if the only value is held."""
+        return self._held is not None and self.last_ns == _NEVER_NS
+
+    def put(self, stamp_ns: int, value: V) -> list[V]:
+        """Return the values whose stamps are certain by this one, in order."""
+        if not self.last_ns < stamp_ns < _LATEST_NS:
+            self.refused += 1
+            self._note_older(stamp_ns)
+            return []
+        certain = list[V]()
+        if self._held is not None and 0 < stamp_ns - self._held[0] <= PAUSE_NS:
+            certain = self.release()
+        is_in_step = stamp_ns - self.last_ns <= 2.5 * self._usual_ns
+        self.refused += self._held is not None
+        self._held = stamp_ns, value
+        return [*certain, *self.release()] if is_in_step else certain
+
+    def release(self) -> list[V]:
+        """Return the held value as certain."""
+        if self._held is None:
+            return []
+        (stamp_ns, value), self._held = self._held, None
+        if self.last_ns != _NEVER_NS:
+            self._steps_ns.append(stamp_ns - self.last_ns)
+            self._usual_ns = sorted(self._steps_ns)[len(self._steps_ns) // 2]
+        self.last_ns, self._older_since_ns = stamp_ns, None
+        return [value]
+
+    def _note_older(self, stamp_ns: int) -> None:
+        """Detect stamps that continue from far before the last one."""
+        since_ns = self._older_since_ns
+        if self.last_ns - stamp_ns < _SET_BACK_NS:
+            self._older_since_ns = None
+        elif since_ns is None or stamp_ns < since_ns:
+            self._older_since_ns = stamp_ns
+        elif stamp_ns - since_ns >= _STAYS_NS:
+            self.set_back = (
+                f"{self._what}: the stamps went back by {(self.last_ns - since_ns) * 1e-9:.1f} s, from {self.last_ns} to {since_ns}, and "
+                "go on from there: the sensors' clock was set; start again, which begins a new run with the new clock"
+            )
 
 
 class Intake:
@@ -80,67 +129,55 @@ class Intake:
         self._offset_ns = int(imu_minus_cam_s * 1e9)
         self._has_imu, self._imu_wait_s = has_imu, imu_wait_s
         self._changed = threading.Condition()
-        self._imu, self._last_imu_ns, self._last_frame_ns = _ImuQueue(), -(2**62), -(2**62)
-        self._frame_stamps, self._imu_stamps = _Forward(), _Forward()
+        self._imu = _ImuQueue()
+        self._frame_stream = _Stream[CameraFrame | StoredFrame]("images")
+        self._imu_stream = _Stream[tuple[int, list[float]]]("imu")
+        self._wheel_stream = _Stream[WheelSample]("wheel odometry")
         self._wheel: list[WheelSample] = []
         self._priors: list[PositionPrior] = []
         self._finished = self._forget = False
-        self._older_since_ns: dict[str, int] = {}
-        self._set_back = ""
 
     def put_frame(self, frame: CameraFrame | StoredFrame) -> None:
-        """Put a frame, dropping the oldest if full. A frame not newer than all before, or alone far ahead, is refused and counted.
+        """Put a frame, dropping the oldest if full. A frame not newer than all before, or alone ahead, is refused and counted.
 
         RecordingError for a stamp in another unit than the IMU's.
         """
         with self._changed:
-            _check_unit("images'", frame.stamp_ns, self._last_imu_ns)
-            if _coarser_unit(self._last_imu_ns, frame.stamp_ns):
-                self._imu, self._last_imu_ns, self._imu_stamps = _ImuQueue(), -(2**62), _Forward()
-            if not self._frame_stamps.takes(frame.stamp_ns):
-                self.counts.frames_disordered += 1
-                if frame.stamp_ns <= self._last_frame_ns:
-                    self._note_older("images", frame.stamp_ns, self._last_frame_ns)
-                return
-            self._older_since_ns.pop("images", None)
-            self._last_frame_ns = frame.stamp_ns
-            self.counts.frames += 1
-            self._frames.append(frame)
-            while len(self._frames) > self._limit:
-                self._frames.popleft()
-                self.counts.frames_dropped += 1
-            self._changed.notify_all()
+            _check_unit("images'", frame.stamp_ns, self._imu_stream.newest_ns)
+            if _coarser_unit(self._imu_stream.newest_ns, frame.stamp_ns):
+                self._imu, self._imu_stream = _ImuQueue(), _Stream("imu")
+            self._queue(self._frame_stream.put(frame.stamp_ns, frame))
 
     def put_imu(self, samples: ImuSamples) -> None:
         """Put inertial samples; those that are not finite, implausible or not newer are refused and counted.
 
         RecordingError for stamps in another unit than the frames'.
         """
+        stream = self._imu_stream
         with self._changed:
             if len(samples):
-                _check_unit("imu", int(samples.stamps_ns[-1]), self._last_frame_ns)
+                _check_unit("imu", int(samples.stamps_ns[-1]), self._frame_stream.newest_ns)
             values = np.hstack([samples.gyro_radps, samples.accel_mps2])
             possible = np.asarray((np.abs(values) < _ABSURD).all(axis=1))
             for stamp_ns, row, good in zip(samples.stamps_ns.tolist(), values.tolist(), possible.tolist(), strict=True):
-                if not good or not self._imu_stamps.takes(stamp_ns):
-                    self.counts.imu_refused += 1
-                    if good and stamp_ns <= self._last_imu_ns:
-                        self._note_older("imu", stamp_ns, self._last_imu_ns)
+                if not good:
+                    stream.refused += 1
                     continue
-                self._older_since_ns.pop("imu", None)
-                self._last_imu_ns = stamp_ns
-                self.counts.imu_samples += 1
-                self._imu.stamps_ns.append(stamp_ns)
-                self._imu.rows.append(tuple(row))
+                for certain_ns, certain in stream.put(stamp_ns, (stamp_ns, row)):
+                    self.counts.imu_samples += 1
+                    self._imu.stamps_ns.append(certain_ns)
+                    self._imu.rows.append(certain)
+            self.counts.imu_refused = stream.refused
             if not self._frames:
-                self.counts.imu_stale += len(self._imu.take_until(self._last_imu_ns - INTEGRATED_NS))
+                self.counts.imu_stale += len(self._imu.take_until(stream.last_ns - INTEGRATED_NS))
             self._changed.notify_all()
 
     def put_wheel(self, sample: WheelSample) -> None:
-        """Put wheel odometry; RecordingError for a stamp in another unit than the frames'."""
+        """Put wheel odometry; as of images. RecordingError for a stamp in another unit than the frames'."""
         with self._changed:
-            _check_unit("wheel odometry", sample.stamp_ns, self._last_frame_ns)
-            self._wheel.append(sample)
+            _check_unit("wheel odometry", sample.stamp_ns, self._frame_stream.newest_ns)
+            self._wheel += self._wheel_stream.put(sample.stamp_ns, sample)
+            self.counts.wheel_refused = self._wheel_stream.refused
             del self._wheel[:-1000]
 
     def put_prior(self, prior: PositionPrior) -> None:
@@ -165,6 +202,7 @@ class Intake:
         """End the stream: no more samples will come."""
         with self._changed:
             self._finished = True
+            self._use_first()
             self._changed.notify_all()
 
     @property
@@ -184,10 +222,11 @@ class Intake:
         RecordingError once the stamps have permanently gone back: nothing would be accepted until they have caught up.
         """
         with self._changed:
-            has_come = self._changed.wait_for(lambda: self._frames or self._finished or self._set_back, timeout_s)
-            if self._set_back:
-                raise RecordingError(self._set_back)
-            if not has_come or not self._frames:
+            self._changed.wait_for(lambda: self._frames or self._finished or self._set_back(), timeout_s)
+            if reason := self._set_back():
+                raise RecordingError(reason)
+            self._use_first()
+            if not self._frames:
                 return SensorBundle()
             if self._has_imu and not self._changed.wait_for(self._imu_is_there, self._imu_wait_s):
                 self.counts.imu_late += 1
@@ -202,23 +241,28 @@ class Intake:
             self._changed.notify_all()
             return SensorBundle(frame, imu, wheel, priors, forget)
 
-    def _note_older(self, what: str, stamp_ns: int, last_ns: int) -> None:
-        """Detect stamps that continue from far before the last one. The caller holds the lock."""
-        since_ns = self._older_since_ns.get(what)
-        if last_ns - stamp_ns < _SET_BACK_NS:
-            self._older_since_ns.pop(what, None)
-        elif since_ns is None or stamp_ns < since_ns:
-            self._older_since_ns[what] = stamp_ns
-        elif stamp_ns - since_ns >= _STAYS_NS:
-            self._set_back = (
-                f"{what}: the stamps went back by {(last_ns - since_ns) * 1e-9:.1f} s, from {last_ns} to {since_ns}, and go on from "
-                "there: the sensors' clock was set; start again, which begins a new run with the new clock"
-            )
-            self._changed.notify_all()
+    def _queue(self, certain: list[CameraFrame | StoredFrame]) -> None:
+        """Queue frames. One that was held and the one that confirms it do not displace each other. The caller holds the lock."""
+        self.counts.frames += len(certain)
+        self.counts.frames_disordered = self._frame_stream.refused
+        self._frames += certain
+        while len(self._frames) > self._limit + (len(certain) > 1):
+            self._frames.popleft()
+            self.counts.frames_dropped += 1
+        self._changed.notify_all()
+
+    def _use_first(self) -> None:
+        """Queue a first frame that no second one has confirmed in time."""
+        if self._frame_stream.has_first:
+            self._queue(self._frame_stream.release())
+
+    def _set_back(self) -> str:
+        """Reason why no more samples of a sensor would be accepted, empty in general."""
+        return self._frame_stream.set_back or self._imu_stream.set_back or self._wheel_stream.set_back
 
     def _imu_is_there(self) -> bool:
         """True if the IMU samples reach the oldest frame, which may have changed since the wait began."""
-        return self._finished or self._last_imu_ns >= self._frames[0].stamp_ns + self._offset_ns
+        return self._finished or self._imu_stream.last_ns >= self._frames[0].stamp_ns + self._offset_ns
 
 
 def _coarser_unit(stamp_ns: int, other_ns: int) -> int | None:

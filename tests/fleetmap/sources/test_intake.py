@@ -103,12 +103,13 @@ def test_a_clock_that_was_set_back_is_an_error_and_not_waited_for() -> None:
     """Stamps that go on from an hour before would be refused for an hour."""
     hour_ms = 3_600_000
     queue = intake(frames=30)
+    queue.put_frame(frame(hour_ms - 50))
     queue.put_frame(frame(hour_ms))
     queue.put_frame(frame(0))  # one bad stamp is one frame
     queue.put_frame(frame(hour_ms + 50))
     for stamp_ms in range(0, 450, 50):
         queue.put_frame(frame(stamp_ms))
-    assert queue.take(0).frame.stamp_ns == hour_ms * MS
+    assert queue.take(0).frame.stamp_ns == (hour_ms - 50) * MS
     queue.put_frame(frame(550))
     with pytest.raises(RecordingError, match=r"images: the stamps went back by 3600\.1 s.*clock was set; start again"):
         queue.take(0)
@@ -119,11 +120,34 @@ def test_a_clock_that_was_set_back_is_an_error_and_not_waited_for() -> None:
         inertial.take(0)
 
 
-def test_one_stamp_far_ahead_costs_itself_and_a_pause_one_frame() -> None:
-    queue = intake(frames=9)
-    for stamp_ms in (0, 50, 18_000_000, 100, 150, 36_000_000, 36_000_050, 36_000_100):
+AHEAD_MS = [130, 300, 900, 1600, 9900, 10_100, 18_000_000, (2**63 - 1) / MS, -300, -1600, -18_000_000, -(2**63) / MS]
+
+
+@pytest.mark.parametrize("ahead_ms", AHEAD_MS)
+@pytest.mark.parametrize("at", [0, 1, 2, 7, 38])
+def test_one_wrong_stamp_costs_itself(ahead_ms: float, at: int) -> None:
+    """Of every sensor, and nothing later. As one of the first two, or no further ahead than after a lost value, it costs two more."""
+    queue, stamps = intake(frames=99), [10**9 + n * 50 * MS for n in range(40)]
+    wrong_ns = max(min(stamps[at] + int(ahead_ms * MS), 2**63 - 1), -(2**63))
+    for stamp_ns in [*stamps[:at], wrong_ns, *stamps[at + 1 :]]:
+        queue.put_imu(ImuSamples(np.array([stamp_ns]), np.zeros((1, 3)), np.ones((1, 3))))
+        queue.put_wheel(WheelSample(stamp_ns, np.zeros(3), 0.0, 0.1, 0.1))
+        queue.put_frame(CameraFrame(stamp_ns, np.zeros((2, 2), np.uint8)))
+    bundles = [bundle for _ in stamps if (bundle := queue.take(0)).frame is not None]
+    images = [bundle.frame.stamp_ns for bundle in bundles]
+    inertial = np.concatenate([bundle.imu.stamps_ns for bundle in bundles]).tolist()
+    wheels = [sample.stamp_ns for bundle in bundles for sample in bundle.wheel]
+    del stamps[at]
+    for taken in (images, inertial, wheels):
+        assert taken == sorted(taken)
+        assert len(set(stamps) - set(taken)) <= (2 if at < 2 or ahead_ms == 130 else 0)
+        assert set(taken) - set(stamps) <= ({wrong_ns} if at < 2 or ahead_ms == 130 else set())
+
+
+def test_a_pause_and_a_clock_set_forward_cost_nothing() -> None:
+    queue, stamps_ms = intake(frames=9), [0, 50, 100, 3000, 3050, 3100, 36_000_000, 36_000_050, 36_000_100]
+    for stamp_ms in stamps_ms:
         queue.put_imu(imu(stamp_ms))
         queue.put_frame(frame(stamp_ms))
-    stamps_ms = [bundle.frame.stamp_ns // MS for _ in range(6) if (bundle := queue.take(0)).frame is not None]
-    assert stamps_ms == [0, 50, 100, 150, 36_000_050, 36_000_100]
-    assert (queue.counts.frames_disordered, queue.counts.imu_refused) == (2, 2)
+    assert [queue.take(0).frame.stamp_ns // MS for _ in stamps_ms] == stamps_ms
+    assert (queue.counts.frames_disordered, queue.counts.imu_refused) == (0, 0)

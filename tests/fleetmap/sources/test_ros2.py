@@ -109,16 +109,17 @@ def test_running_ends_when_it_is_told_and_hears_nothing_more() -> None:
     hub = MemoryHub()
     with MemoryBus(hub) as bus, MemoryBus(hub) as driver:
         queue, source = intake(), Ros2Source(bus, RmwZenohKeys(0), TOPICS, calibration())
-        payload = encode_imu(5, "imu", np.ones(3), np.ones(3))
 
         def publish_and_stop(_: float) -> bool:
-            driver.publish(RmwZenohKeys(0).key(TOPICS.imu, "sensor_msgs/Imu"), payload)
+            for stamp_ns in (5, 6):
+                payload = encode_imu(stamp_ns, "imu", np.ones(3), np.ones(3))
+                driver.publish(RmwZenohKeys(0).key(TOPICS.imu, "sensor_msgs/Imu"), payload)
             return True
 
         source.run(queue, publish_and_stop)
-        assert queue.counts.imu_samples == 1
-        driver.publish(RmwZenohKeys(0).key(TOPICS.imu, "sensor_msgs/Imu"), encode_imu(6, "imu", np.ones(3), np.ones(3)))
-        assert queue.counts.imu_samples == 1
+        assert queue.counts.imu_samples == 2
+        publish_and_stop(0.0)
+        assert (queue.counts.imu_samples, queue.counts.imu_refused) == (2, 0)
         source.close()
 
 

@@ -3,7 +3,7 @@
 import threading
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -238,6 +238,23 @@ def test_a_robot_that_is_told_its_place_believes_it_until_fixes_outweigh_it(worl
     assert listener.estimates[-1].status is Status.TRACKING
     (event,) = [event for event in world.store.events("room") if event.kind == "robot placed"]
     assert (event.actor, event.reason) == ("ada", "it was pushed")
+
+
+@pytest.mark.parametrize(("at", "ahead_ns"), [(0, 5 * 10**9), (60, 4 * 10**8), (60, 5 * 10**9), (60, 2**62)])
+def test_one_wrong_stamp_of_a_camera_and_an_imu_costs_a_frame(world: World, at: int, ahead_ns: int) -> None:
+    robot, listener, bundles = robot_world.new_robot(), Listener(), list(robot_world.bundles(100))
+    wrong, stamps_ns = bundles[at], bundles[at].imu.stamps_ns.copy()
+    stamps_ns[-1] = wrong.frame.stamp_ns + ahead_ns
+    wrong_frame = replace(wrong.frame, stamp_ns=wrong.frame.stamp_ns + ahead_ns)
+    bundles[at] = replace(wrong, frame=wrong_frame, imu=replace(wrong.imu, stamps_ns=stamps_ns))
+    source = ScriptedSource(bundles, ready=lambda: robot.running is not None)
+    Runtime(world.parts(source, robot, listener), ServiceManager("")).run()
+    assert [one.stamp_ns for one in listener.estimates[-99:]] == [
+        b.frame.stamp_ns for b in bundles if b is not bundles[at]
+    ]
+    assert {one.status for one in listener.estimates[35:]} == {Status.TRACKING}
+    off_m = listener.estimates[-1].map_from_body[:3, 3] - robot_world.truth(99)[:3, 3]
+    assert np.linalg.norm(off_m) < 0.1
 
 
 def test_what_kills_a_thread_ends_the_daemon(world: World) -> None:
