@@ -1,4 +1,7 @@
-"""Threads of the daemon: sensors, disk, network, and the calling thread, which localizes. An error in any thread ends all."""
+"""Threads of the daemon: sensors, disk, network, and the calling thread, which localizes.
+
+An error of sensors or localization ends all. What comes from outside, of disk and network, does not: it is logged and tried again.
+"""
 
 import logging
 import threading
@@ -17,7 +20,7 @@ from fleetmap.log_lines import LogLimit
 from fleetmap.messages import RobotHealth, WantedVersion, encode_message
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import Source
-from fleetmap.threads import ended_by_threads
+from fleetmap.threads import Jobs, ended_by_threads
 from locclient.daemon.publishers import Publisher
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.service_manager import ServiceManager
@@ -245,13 +248,10 @@ class Runtime:
             self._parts.intake.finish()
 
     def _run_disk(self) -> None:
+        kept = [part.work for part in (self._parts.replays, self._parts.drives) if part is not None]
+        jobs = Jobs(self._load_maps, self._queue_failures, *kept)
         while not self._stop.wait(_IDLE_S):
-            self._load_maps()
-            self._queue_failures()
-            if self._parts.replays is not None:
-                self._parts.replays.work()
-            if self._parts.drives is not None:
-                self._parts.drives.work()
+            jobs.work()
 
     def _load_maps(self) -> None:
         loader, server, bound = self._parts.tile_loader, self._server, self._bound
@@ -345,11 +345,11 @@ class Runtime:
                 _log.error("failure %s is lost: %s", report.id, error)
 
     def _run_network(self, server: ServerSync) -> None:
+        fleet_manager = self._parts.fleet_manager
+        jobs = Jobs(server.step, *([] if fleet_manager is None else [fleet_manager.adapter.work]))
         while not self._stop.wait(_IDLE_S):
-            server.step()
-            if self._parts.fleet_manager is not None:
-                self._parts.fleet_manager.adapter.work()
-        server.step()  # a last time: delivers the last version changes and failures if the server is reachable
+            jobs.work()
+        jobs.work()  # a last time: delivers the last version changes and failures if the server is reachable
         server.close()
 
 

@@ -10,6 +10,7 @@ from fleetmap.log_lines import LogLimit
 from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.messages import RobotHealth, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
+from fleetmap.threads import Jobs
 from locclient.delivery.outbox import Outbox
 from locclient.delivery.report_delivery import deliver, deliver_replay_part
 from locclient.delivery.survey_drives import SurveyDrives
@@ -48,7 +49,10 @@ class ServerSync:
         self.drives: SurveyDrives | None = None  # through areas that operators want to be surveyed
         self.floors: FloorMaps | None = None  # of the robot's building
         self._replayed_bytes: dict[str, int] = {}
-        self._replay_at_s = self._deliver_at_s = 0.0
+        self._replay_at_s = 0.0
+        # The upkeep first: after a renewal whose response was lost, the server admits no other request.
+        jobs = (self._keep_up, self._publish_health, self._deliver, self._fetch_again, self._ask, self._send_recordings)
+        self._jobs = Jobs(*jobs, passed=UnreachableError, clock_s=clock_s)
         self.follows = True  # the server selects the version; False: the fleet manager does
         self.on_change: Callable[[VersionChange], None] = lambda _: None
         self._refusals = LogLimit(_log)  # repeated refusals would fill the log
@@ -79,31 +83,24 @@ class ServerSync:
         ]
 
     def step(self) -> None:
-        """Do all due work. Return early if the server does not answer, then wait with exponential backoff."""
+        """Do all due work, each part even if another fails. Stop if the server does not answer, then wait with exponential backoff."""
         self._handle_changes()
         now_s = self._clock_s()
         if not self._is_connected(now_s) or now_s < self._silent_until_s:
             return
         try:
-            # First: after a renewal whose response was lost, the server admits no other request.
-            if now_s >= self._upkeep_at_s:
-                self._upkeep_at_s = now_s + _UPKEEP_EVERY_S
-                self._upkeep()
-            self._publish_health()
-            self._deliver(now_s)
-            self._fetch_again()
-            if self._announced or now_s >= self._ask_at_s:
-                self._ask(now_s)
-            self._send_recordings(now_s)
+            self._jobs.work()
         except UnreachableError as error:
             _log.info("the map server is away: %s", error)
             self._silent_until_s = self._clock_s() + self._backoff_s
             self._backoff_s = min(2 * self._backoff_s, _MAX_BACKOFF_S)
-        except FleetmapError as error:
-            _log.warning("the map server refused: %s", error)
-            self._ask_at_s = max(self._ask_at_s, now_s + _MAX_BACKOFF_S)
         else:
             self._backoff_s = _BACKOFF_S
+
+    def _keep_up(self) -> None:
+        if self._clock_s() >= self._upkeep_at_s:
+            self._upkeep_at_s = self._clock_s() + _UPKEEP_EVERY_S
+            self._upkeep()
 
     def _is_connected(self, now_s: float) -> bool:
         """True if a peer is reachable. The log says once that none is, and when one is again."""
@@ -126,11 +123,18 @@ class ServerSync:
 
     # --- versions -----------------------------------------------------------------------------------------------------
 
-    def _ask(self, now_s: float) -> None:
+    def _ask(self) -> None:
+        now_s = self._clock_s()
+        if not self._announced and now_s < self._ask_at_s:
+            return
         self._announced.clear()
         wanted = self.client.wanted()
         self._ask_at_s = now_s + _ASK_EVERY_S
+        self._follow(wanted, now_s)
         self._send_again()
+
+    def _follow(self, wanted: WantedVersion, now_s: float) -> None:
+        """Fetch what the server wants, and all that belongs to it."""
         if self.drives is not None:
             self.drives.requests = self.client.surveys
         self._learn_frame()
@@ -233,16 +237,9 @@ class ServerSync:
 
     # --- reports ------------------------------------------------------------------------------------------------------
 
-    def _deliver(self, now_s: float) -> None:
-        """Deliver reports. An unusable spool delays neither maps nor health."""
-        if now_s < self._deliver_at_s:
-            return
-        try:
-            if not deliver(self.client, self._outbox):
-                self._silent_until_s = self._clock_s() + _MAX_BACKOFF_S
-        except StoreError as error:
-            self._deliver_at_s = now_s + _MAX_BACKOFF_S
-            _log.warning("reports of failures wait: %s", error)
+    def _deliver(self) -> None:
+        if not deliver(self.client, self._outbox):
+            self._silent_until_s = self._clock_s() + _MAX_BACKOFF_S
 
     def _send_again(self) -> None:
         """After the server's store was restored: what it had acknowledged before may be lost."""
@@ -257,20 +254,14 @@ class ServerSync:
                     "the map server was restored from a backup: %d reports or recordings are sent again", count
                 )
 
-    def _send_recordings(self, now_s: float) -> None:
+    def _send_recordings(self) -> None:
         """Send a part of a recording, at most one per second, while no report waits and no version is fetched; failures first."""
-        if now_s < self._replay_at_s:
+        now_s = self._clock_s()
+        if now_s < self._replay_at_s or self._outbox.waiting():
             return
-        goes_on = False
-        try:
-            if self._outbox.waiting():
-                return
-            if self.replays is not None:
-                goes_on = deliver_replay_part(self.client, self.replays, self._replayed_bytes)
-            if not goes_on and self.drives is not None:
-                goes_on = self.drives.deliver_part(self.client)
-        except StoreError as error:
-            _log.warning("recordings wait: %s", error)
+        goes_on = self.replays is not None and deliver_replay_part(self.client, self.replays, self._replayed_bytes)
+        if not goes_on and self.drives is not None:
+            goes_on = self.drives.deliver_part(self.client)
         self._replay_at_s = now_s + (_REPLAY_PART_EVERY_S if goes_on else _MAX_BACKOFF_S)
 
     def _publish_health(self) -> None:

@@ -133,7 +133,7 @@ class WantedVersion(msgspec.Struct, frozen=True, kw_only=True):
     site: Name
     version: Version | None
     manifest_sha256: str | None
-    restored_ns: int = 0
+    restored_ns: Annotated[int, msgspec.Meta(ge=0, le=1 << 62)] = 0
     surveys: Annotated[tuple[SurveyArea, ...], msgspec.Meta(max_length=20)] = ()
 
 
@@ -350,7 +350,7 @@ class FailureAck(msgspec.Struct, frozen=True, kw_only=True):
 
     id: Name
     refused: Text = ""
-    received_bytes: int = 0
+    received_bytes: Annotated[int, msgspec.Meta(ge=0, le=1 << 40)] = 0
 
 
 M = TypeVar("M", bound=msgspec.Struct)

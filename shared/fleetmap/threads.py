@@ -2,12 +2,43 @@
 
 import logging
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from fleetmap.errors import FleetmapError
 
+_WAIT_S, _LONGEST_WAIT_S = 1.0, 30.0
 _log = logging.getLogger(__name__)
+
+
+class Jobs:
+    """Jobs that a thread does in turn. One that fails is logged and waits, twice as long each time; the others go on."""
+
+    def __init__(
+        self,
+        *jobs: Callable[[], None],
+        passed: type[Exception] | tuple[()] = (),
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """passed: errors that `work` raises, without the jobs after that one."""
+        self._due_s = dict.fromkeys(jobs, (0.0, _WAIT_S))
+        self._passed, self._clock_s = passed, clock_s
+
+    def work(self) -> None:
+        """Do every job that does not wait."""
+        for job, (due_s, wait_s) in self._due_s.items():
+            if self._clock_s() < due_s:
+                continue
+            try:
+                job()
+                self._due_s[job] = 0.0, _WAIT_S
+            except self._passed:
+                raise
+            except Exception as error:
+                self._due_s[job] = self._clock_s() + wait_s, min(2 * wait_s, _LONGEST_WAIT_S)
+                known = isinstance(error, FleetmapError)
+                _log.warning("%s; next attempt in %.0f s", error, wait_s, exc_info=None if known else error)
 
 
 @contextmanager

@@ -257,6 +257,38 @@ def test_one_wrong_stamp_of_a_camera_and_an_imu_costs_a_frame(world: World, at: 
     assert np.linalg.norm(off_m) < 0.1
 
 
+def test_a_lying_account_on_the_bus_ends_nothing(world: World) -> None:
+    """From frame 30 on it answers and speaks in the server's place; at the next start the server hears the failure of then."""
+    robot, listener = robot_world.new_robot(), Listener()
+    source = ScriptedSource(list(robot_world.bundles(125, dark=range(55, 95))), ready=lambda: robot.running is not None)
+    honest, spoken = list(world.hub.queryables), list[str]()
+    wanted = {"site": "room", "version": 1, "manifest_sha256": "0" * 64, "restored_ns": 2**63 + 5}
+    placed = {"site": "room", "robot": "r1", "x_map_m": 0.0, "y_map_m": 0.0, "heading_rad": 0.0, "sigma_m": 0.5}
+
+    def lie(key: str, payload: bytes) -> bytes:
+        spoken.append(key.rpartition("/")[2])
+        told = wanted if key.endswith("wanted") else {"id": "", "received_bytes": 2**63 + 5}
+        return encode_message(told)  # type: ignore[arg-type]
+
+    def begin() -> None:
+        world.hub.queryables.insert(0, (robot_key("room", "r1", "*"), lie, None))
+        with MemoryBus(world.hub) as bus:
+            for changed in ({"sigma_m": 1e-300}, {"x_map_m": 1e300}, {"y_map_m": float("nan")}, {"heading_rad": 1e300}):
+                bus.publish(robot_key("room", "r1", "initial_pose"), encode_message(placed | changed))  # type: ignore[arg-type]
+            bus.publish(robot_key("room", "r1", "wanted"), encode_message(wanted | {"restored_ns": 0}))  # type: ignore[arg-type]
+
+    source.before[30] = begin
+    Runtime(world.parts(source, robot, listener), ServiceManager("")).run()
+    assert {one.status for one in listener.estimates[35:54]} == {listener.estimates[-1].status} == {Status.TRACKING}
+    assert {"wanted", "failures"} <= set(spoken)
+    assert world.table == []
+    world.hub.queryables = honest
+    robot, listener = robot_world.new_robot(), Listener()
+    source = ScriptedSource(list(robot_world.bundles(40)), ready=lambda: robot.running is not None)
+    Runtime(world.parts(source, robot, listener), ServiceManager("")).run()
+    assert (len(world.table), listener.estimates[-1].status) == (1, Status.TRACKING)
+
+
 def test_what_kills_a_thread_ends_the_daemon(world: World) -> None:
     robot = robot_world.new_robot()
 
@@ -301,16 +333,22 @@ def test_a_robot_that_ends_without_frames_says_so(world: World, monkeypatch: pyt
     assert Cause.NO_FRAMES.value in world.fleet.robots("room")[0].last_health["flags"]
 
 
-def test_a_spool_on_a_disk_that_refuses_costs_no_estimate(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [StoreError("attempt to write a readonly database"), OverflowError("too large")])
+def test_a_spool_that_refuses_costs_no_estimate(
+    world: World, monkeypatch: pytest.MonkeyPatch, error: Exception
+) -> None:
+    """And no report of health, whatever the error is."""
+
     def refuse(*_: object) -> object:
-        raise StoreError("attempt to write a readonly database")
+        raise error
 
     listener = Listener()
     parts = world.parts(ScriptedSource(list(robot_world.bundles(5))), robot_world.new_robot(), listener)
-    for name in ("counts", "waiting", "put"):
+    for name in ("waiting", "put", *["counts"] * isinstance(error, StoreError)):
         monkeypatch.setattr(parts.outbox, name, refuse)
     Runtime(parts, ServiceManager("")).run()
     assert len(listener.estimates) == 5
+    assert world.fleet.robots("room")[0].last_health is not None
 
 
 @pytest.mark.parametrize("has_grid", [True, False])
