@@ -5,10 +5,12 @@ or lost whenever a run is killed: an incomplete draft is not stored; a stored dr
 recordings already in a version are only moved.
 """
 
+import logging
 import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field, replace
+from math import ceil
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +29,12 @@ from mapserver.nightly.retention import apply_retention
 from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, FleetRetention, MapStore, VersionInfo
 
+_log = logging.getLogger(__name__)
 JOB = "nightly"
 _MOST_A_NIGHT = 1000  # recordings, and lines on entries left in place
 _MOST_ENDED = 2
+# Of a night that ended with several recordings in work, for each: after two such nights each is built alone, and judged by itself.
+_ENDED_TOGETHER, _ALONE_ABOVE = 0.75, 1.0
 _ENDED = (
     "{nights} nights ended while this was read or built: killed, out of memory or time, or by a bug; "
     "try `mapserver doctor` on it, and move it back, alone, to try again"
@@ -54,7 +59,7 @@ class NightReport:
     """The report of a night, with the keys of docs/reports.md. version: the current one at the end.
 
     expired: by kind, how much was removed after its period. looking_at: names of the recordings being read or built.
-    ended: by name, number of nights that ended during its processing.
+    ended: by name, number of nights that ended during its processing; one that ended with several in work counts less.
     """
 
     job: int
@@ -66,7 +71,7 @@ class NightReport:
     expired: dict[str, int] = field(default_factory=dict)
     builds: list[dict[str, Any]] = field(default_factory=list)
     looking_at: list[str] = field(default_factory=list)
-    ended: dict[str, int] = field(default_factory=dict)
+    ended: dict[str, float] = field(default_factory=dict)
 
 
 def run_night(request: NightRequest, gate: GateSettings, console: Console) -> str:
@@ -126,7 +131,8 @@ def _resume_killed(maps: MapStore, site: str, report: NightReport) -> None:
     report.ended = dict(nights[0].report.get("ended", {})) if nights else {}
     for job in killed:
         for name in job.report.get("looking_at", []):
-            report.ended[name] = report.ended.get(name, 0) + 1
+            share = 1.0 if len(job.report["looking_at"]) == 1 else _ENDED_TOGETHER
+            report.ended[name] = report.ended.get(name, 0) + share
         report.resumes += [job.id, *job.report.get("resumes", [])]
     maps.update_job(report.job, "running", "", asdict(report))
     for job in killed:
@@ -161,9 +167,7 @@ class _Night:
         draft = self._left_draft()
         if draft is not None:
             recordings = self._publish(draft, recordings)
-        fresh = self._unknown(recordings)
-        if fresh:
-            self._build(fresh)
+        self._build_all(self._unknown(recordings))
         if not self._report.published:
             return f"site {self._request.site}: nothing new"
         versions = ", ".join(str(version) for version in self._report.published)
@@ -179,7 +183,7 @@ class _Night:
                 self._put_away(path, boxes.BAD, None, f"its name {name} is invalid; rename it")
                 continue
             if self._report.ended.get(name, 0) >= _MOST_ENDED:
-                self._put_away(path, boxes.BAD, None, _ENDED.format(nights=self._report.ended[name]))
+                self._put_away(path, boxes.BAD, None, _ENDED.format(nights=ceil(self._report.ended[name])))
                 continue
             self._look_at([path])
             recorded = boxes.identify(path, self._request.options.reading.opening)
@@ -213,6 +217,31 @@ class _Night:
             if recorded.sha256 in known:
                 self._put_away(recorded.path, boxes.DONE, recorded.sha256, f"in version {known[recorded.sha256]}")
         return [recorded for recorded in recordings if recorded.sha256 not in known]
+
+    def _build_all(self, recordings: list[Recorded]) -> None:
+        """Build recordings together. Those in work when nights ended are built alone, and where a fault ends a build all are: only the
+        one at fault is blamed.
+        """
+        alone = [[r] for r in recordings if self._report.ended.get(r.path.name, 0) > _ALONE_ABOVE]
+        groups = [[r for r in recordings if [r] not in alone], *alone]
+        failed, published = None, len(self._report.published)
+        for group in filter(None, groups):
+            try:
+                self._build(group)
+            except (RecordingError, SurveyError, GateRefusedError) as error:
+                failed = error
+            except (FleetmapError, OSError, MemoryError):
+                raise
+            except Exception as error:
+                _log.exception("%s", ", ".join(r.path.name for r in group))
+                if len(group) > 1:
+                    groups += [[r] for r in group]
+                    continue
+                words = f"{type(error).__name__}: {str(error)[:200]}; a bug; report it with the log"
+                self._put_all_away(group, {group[0].path: words}, words)
+                failed = RecordingError(f"{group[0].path}: {words}")
+        if failed is not None and len(self._report.published) == published:
+            raise failed
 
     def _build(self, recordings: list[Recorded]) -> None:
         request = self._request

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fleetmap.encoding import MOST
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array
 from fleetmap.recordings.calibration_files import CalibrationFile, calibration_files, load_calibration
@@ -81,6 +82,9 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
         check_together(np.array([value.stamp_ns for value in values], np.int64), what, parts.frame_stamps_ns)
     if truth is not None:
         check_together(truth.stamps_ns, "ground truth", parts.frame_stamps_ns)
+        if not (np.abs(truth.frame_from_body) <= MOST).all():
+            log.note("ground truth not used", f"it has a position that is not finite, or farther than {MOST:g} m")
+            truth = None
     if len(imu) and parts.calibration.imu is None:
         how = "the mounting of the IMU is unknown; pass a calibration with --calibration FILE"
         log.note("imu not used", f"{len(imu)} samples, but {how}")

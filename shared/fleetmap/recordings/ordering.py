@@ -10,6 +10,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.encoding import MOST
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, rotation_from_quat_wxyz, se3
 from fleetmap.sensors.samples import PAUSE_NS, DataIssue, ImuSamples, Stamps, Trajectory
@@ -237,9 +238,9 @@ def clean_imu(stamps_ns: Stamps, gyro_radps: Array, accel_mps2: Array, log: Read
 def trajectory_of_rows(stamps_ns: Stamps, position_quat_wxyz: Array, log: ReadLog) -> Trajectory | None:
     """Ground truth from rows x y z qw qx qy qz (N, 7), None if no row is usable; rows without a unit quaternion are noted."""
     norms = np.linalg.norm(position_quat_wxyz[:, 3:7], axis=1)
-    good = np.isfinite(position_quat_wxyz).all(axis=1) & (np.abs(norms - 1) < 0.01)
+    good = (np.abs(position_quat_wxyz) <= MOST).all(axis=1) & (np.abs(norms - 1) < 0.01)
     if not good.all():
-        detail = f"{int((~good).sum())} of {len(good)} rows without a unit quaternion left out"
+        detail = f"{int((~good).sum())} of {len(good)} rows without a unit quaternion or a near position left out"
         log.note("ground truth: no rotation", detail)
     rows = np.flatnonzero(good)
     rows = rows[forward_only(stamps_ns[rows], "ground truth", log)]

@@ -70,6 +70,10 @@ def no_rotation(rows: list[str]) -> None:
     rows[2] = ",".join([rows[2].split(",")[0], *["0"] * 16])
 
 
+def far_away(rows: list[str]) -> None:
+    rows[2] = ",".join([rows[2].split(",")[0], "1e308", "-1e308", "0", "1", *["0"] * 12])
+
+
 def larger_lens(folder: Path) -> None:
     edit("mav0/cam0/sensor.yaml", lambda rows: [row.replace(f"[{WIDTH}, {HEIGHT}]", "[752, 480]") for row in rows])(
         folder
@@ -133,6 +137,7 @@ def test_what_cannot_be_read_is_named(euroc: Path, spoil: Spoil, says: str) -> N
         (edit(TABLE, lambda rows: [*rows[:-1], rows[-1][:-60]]), 4, "data.csv: unreadable lines: 1 of"),
         (imu(gyro=np.where(np.arange(len(GYRO))[:, None] == 7, np.nan, GYRO)), 4, "imu: impossible values: 1 of"),
         (edit(TRUTH, no_rotation), 4, "ground truth: no rotation: 1 of 4 rows without a unit quaternion"),
+        (edit(TRUTH, far_away), 4, "ground truth: no rotation: 1 of 4 rows without a unit quaternion or a near position"),
     ],
 )  # fmt: skip
 def test_what_is_lost_is_counted(euroc: Path, spoil: Spoil, frames: int, says: str) -> None:

@@ -372,17 +372,17 @@ def test_files_that_may_not_be_read_end_no_night() -> None:
         assert "Permission denied" in (folder / "inbox/bad/other.reason.txt").read_text()
 
 
-@pytest.mark.parametrize("where", ["read", "built", "broken"])
-def test_what_ended_two_nights_is_set_aside_by_the_third(
+@pytest.mark.parametrize("where", ["read", "built", "joined", "broken"])
+def test_what_ended_two_nights_is_set_aside_by_the_third_and_nothing_beside_it(
     hall: Path, where: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Killed while one recording is read or built, as by the kernel; a fault of the program counts as that."""
+    """Killed while one recording is read, surveyed or joined with the others, as by the kernel; a fault of the program ends no night."""
     fatal = record(hall / "inbox", "fatal", 5)
     read = open_recording
 
     def killed(path: Path) -> None:
         if path == fatal and where == "broken":
-            raise ZeroDivisionError
+            raise np.linalg.LinAlgError("SVD did not converge")
         if path == fatal:
             os.kill(os.getpid(), signal.SIGKILL)
 
@@ -392,22 +392,25 @@ def test_what_ended_two_nights_is_set_aside_by_the_third(
 
     def builds(request: BuildRequest, settings: SurveySettings, unusable: dict[Path, str]) -> tuple[Draft, None]:
         for path in request.recordings:
-            request.options.look_at([path])
+            request.options.look_at(request.recordings if where == "joined" else [path])
             killed(path)
         return built(request, settings, unusable)
 
     monkeypatch.setattr(*((boxes, "open_recording", reads) if where == "read" else (night, "build_draft", builds)))
-    for _ in range(2):
-        status, _ = in_child(hall, Disk("/nowhere"))
-        assert status == (4 if where == "broken" else -signal.SIGKILL)
-        assert names(hall / "inbox") == ["fatal", "monday", "tuesday"]
-    assert "2 done, 0 held, 1 bad" in spend(hall)
-    assert "2 nights ended while this was read or built" in (hall / "inbox/bad/fatal.reason.txt").read_text()
-    assert states(hall) == [("current", ["monday", "tuesday"])]
-    (hall / "inbox/bad/fatal").rename(fatal)
+    for _ in range({"broken": 0, "joined": 3}.get(where, 2)):
+        assert in_child(hall, Disk("/nowhere"))[0] == -signal.SIGKILL
+        assert (hall / "inbox/fatal").is_dir()
+    assert "1 bad" in spend(hall)
+    reason = {"broken": "LinAlgError: SVD did not converge; a bug"}.get(
+        where, " nights ended while this was read or built"
+    )
+    assert reason in next((hall / "inbox/bad").glob("*fatal.reason.txt")).read_text()
+    taken = [["monday"], ["tuesday"]] if where in {"joined", "broken"} else [["monday", "tuesday"]]
+    assert [recordings for _, recordings in states(hall)] == taken
+    next((hall / "inbox/bad").glob("*fatal")).rename(fatal)
     monkeypatch.undo()
     monkeypatch.setattr(night, "build_draft", built)
-    assert "version 2 published" in spend(hall), "it is tried again"
+    assert f"version {len(taken) + 1} published" in spend(hall), "it is tried again"
 
 
 def test_a_fault_of_the_program_leaves_one_recording_out_of_a_build() -> None:
