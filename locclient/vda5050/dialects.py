@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from fleetmap.encoding import to_json
-from locclient.vda5050.messages import MAX_PAYLOAD_BYTES
+from locclient.vda5050.messages import MAX_PAYLOAD_BYTES, without_nulls
 
 Message = dict[str, Any]
 _INITIALIZE = "initializePosition"
@@ -60,7 +60,7 @@ def _new_actions(payload: bytes) -> bytes:
     if len(payload) > MAX_PAYLOAD_BYTES:
         return payload
     try:
-        message = msgspec.json.decode(payload, type=dict[str, Any])
+        message = without_nulls(msgspec.json.decode(payload, type=dict[str, Any]))
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
         return payload
     actions = message.get("actions", message.get("instantActions"))

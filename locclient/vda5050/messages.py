@@ -32,7 +32,7 @@ class Strict(Struct, forbid_unknown_fields=True):
 
 class ActionParameter(Struct):
     key: Text
-    value: Any
+    value: Any = None
 
 
 class Action(Struct):
@@ -160,12 +160,19 @@ class RobotPart(Strict):
     information: Annotated[list[Information], msgspec.Meta(max_length=_MOST)] = []
 
 
+def without_nulls(value: Any) -> Any:
+    """Return decoded JSON without the members that are null: fleet managers write optional fields that they do not use so."""
+    if isinstance(value, dict):
+        return {key: without_nulls(member) for key, member in value.items() if member is not None}
+    return [without_nulls(each) for each in value] if isinstance(value, list) else value
+
+
 def decode(payload: bytes, kind: type[T]) -> T:
     """Decode the message of a payload; LinkError if invalid."""
     if len(payload) > MAX_PAYLOAD_BYTES:
         raise LinkError(f"{len(payload)} bytes, the limit is {MAX_PAYLOAD_BYTES}")
     try:
-        return bounded(msgspec.json.decode(payload, type=kind))
+        return bounded(msgspec.convert(without_nulls(msgspec.json.decode(payload)), kind))
     except (ValueError, RecursionError) as error:
         raise LinkError(str(error)[:300]) from error
 

@@ -28,10 +28,14 @@ def evaluate(
     from rich.table import Table
 
     from fleetmap.console import plain_console
-    from fleetmap.recordings.tum import read_covariances, read_tum
+    from fleetmap.recordings.ordering import ReadLog
+    from fleetmap.recordings.tum import read_covariances, read_truth, read_tum
     from mapserver.evaluation.trajectory_error import summary
 
-    trajectories = read_tum(estimate), read_tum(ground_truth)
+    log = ReadLog()
+    trajectories = read_tum(estimate), read_truth(ground_truth, log)
+    for issue in log.issues:
+        typer.echo(f"note: {issue.what}: {issue.detail}", err=True)
     spread = None if covariances is None else read_covariances(covariances)
     found = summary(*trajectories, frames=frames, from_first=from_first, covariances=spread)
     if json:

@@ -63,6 +63,12 @@ def decode_plan(name: str, data: bytes) -> PlanFile:
         raise UsageError(f"plan {name} has {size[0]}x{size[1]} pixels, the limit is {MAX_PLAN_PIXELS}; save it smaller")
     try:
         grey = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+        is_png = data.startswith(b"\x89PNG")
+        picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if is_png else None
+        if grey is not None and picture is not None and picture.ndim == 3 and picture.shape[2] == 4:
+            # Transparent pixels are paper, whatever colour is stored under them.
+            opaque = cv2.convertScaleAbs(picture[:, :, 3], alpha=1.0 if picture.dtype == np.uint8 else 1 / 257)
+            grey = 255 - cv2.multiply(255 - grey, opaque, scale=1 / 255)
     except cv2.error:
         grey = None
     if grey is None or grey.shape != (size[1], size[0]):

@@ -70,7 +70,7 @@ function begin() {
       plan?.remove();
       const sheet = Object.assign(document.createElement("div"), { className: "site-map", tabIndex: 0 });
       paper.replaceChildren(sheet);
-      const layers = [{ name: "Plan", items: [{ kind: "picture", url: image.src, box, tone: "" }], shown: true }, { name: "Points", items: [], shown: true }];
+      const layers = [{ name: "Plan", items: [{ kind: "picture", url: image.src, box, tone: "paper" }], shown: true }, { name: "Points", items: [], shown: true }];
       plan = new SiteMap(sheet, { label: "Floor plan", box, layers, follows: false, hasAxes: false }, { onPick: (x, y) => pick("plan", [x, -y].map(Math.round)) });
       show();
     };

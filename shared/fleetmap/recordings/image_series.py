@@ -59,7 +59,9 @@ def pair_images(
         detail = f"{alone} of {len(first)} and {len(second)}; {len(firsts)} pairs remain"
         if len(first) and len(second):
             apart_ns = second.stamps_ns[nearest(second.stamps_ns, first.stamps_ns)] - first.stamps_ns
-            apart_ms, most_ms = float(np.median(apart_ns)) * 1e-6, tolerance_ns * 1e-6
+            # Half a period apart the nearest is sometimes the one before, sometimes the one after.
+            way = np.where(np.mean(apart_ns > 0) < 0.5, -1.0, 1.0)
+            apart_ms, most_ms = way * float(np.median(np.abs(apart_ns))) * 1e-6, tolerance_ns * 1e-6
             if abs(apart_ms) > most_ms:
                 detail += (
                     f"; the second is {apart_ms:+.3f} ms from the first in the median, {most_ms:g} ms are allowed: trigger both "

@@ -38,6 +38,15 @@ class KeptBytes:
             )
 
 
+_PACKED = {b"\x28\xb5\x2f\xfd": "zstd", b"\x04\x22\x4d\x18": "lz4"}  # first bytes; a CDR message begins with 0
+
+
+def unpack_message(data: memoryview) -> memoryview:
+    """Return a message, unpacked if its recorder packed each one by itself, as rosbag2 does; ValueError as of `unpack`."""
+    kind = _PACKED.get(bytes(data[:4]))
+    return data if kind is None else memoryview(unpack(kind, data))
+
+
 def unpack(compression: str, packed: bytes | memoryview, most_bytes: int = MAX_MESSAGE_BYTES) -> bytes:
     """Unpack bytes; ValueError if they are damaged or unpack to more than `most_bytes`.
 

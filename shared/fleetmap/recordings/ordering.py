@@ -243,7 +243,11 @@ def trajectory_of_rows(stamps_ns: Stamps, position_quat_wxyz: Array, log: ReadLo
         detail = f"{int((~good).sum())} of {len(good)} rows without a unit quaternion or a near position left out"
         log.note("ground truth: no rotation", detail)
     rows = np.flatnonzero(good)
-    rows = rows[forward_only(stamps_ns[rows], "ground truth", log)]
+    try:
+        rows = rows[forward_only(stamps_ns[rows], "ground truth", log)]
+    except RecordingError as error:
+        log.note("ground truth not used", str(error))
+        return None
     if not len(rows):
         return None
     frame_from_body = [se3(rotation_from_quat_wxyz(row[3:7]), row[:3]) for row in position_quat_wxyz[rows]]

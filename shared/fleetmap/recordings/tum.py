@@ -14,6 +14,7 @@ import numpy as np
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
 from fleetmap.recordings.files import read_text
+from fleetmap.recordings.ordering import ReadLog, forward_only
 from fleetmap.sensors.samples import Stamps, Trajectory
 
 _NS = 1_000_000_000
@@ -31,14 +32,14 @@ def format_tum(trajectory: Trajectory) -> str:
     return "\n".join(lines) + "\n"
 
 
-def parse_tum(text: str, what: str = "trajectory") -> Trajectory:
+def parse_tum(text: str, what: str = "trajectory", first_line: int = 1) -> Trajectory:
     """Parse the trajectory in `text`; empty lines and those that begin with # are skipped.
 
     Raises RecordingError, naming `what` and the line, for anything but eight finite numbers, a quaternion that is not
     of unit length within 1 %, or stamps that do not rise.
     """
     stamps, frame_from_body = [], []
-    for line in stamped_lines(text, what):
+    for line in stamped_lines(text, what, first_line):
         values = line.values
         if len(values) != 7 or not np.isfinite(values).all() or abs(np.linalg.norm(values[3:]) - 1.0) > 0.01:
             fault = "is not 't x y z qx qy qz qw' with a unit quaternion"
@@ -65,6 +66,26 @@ def read_tum(path: Path) -> Trajectory:
     return parse_tum(read_text(path, "a TUM trajectory is expected"), str(path))
 
 
+def read_truth(path: Path, log: ReadLog) -> Trajectory:
+    """Read the ground truth in the file at `path`: each line without a pose, or with a stamp that does not rise, is left out and noted.
+
+    RecordingError if the file cannot be read, or most of it cannot be used.
+    """
+    poses, faults = list[Trajectory](), list[str]()
+    for number, line in enumerate(read_text(path, "a TUM trajectory is expected").splitlines(), start=1):
+        try:
+            poses.append(parse_tum(line, str(path), number))
+        except RecordingError as error:
+            faults.append(str(error))
+    if len(faults) >= sum(map(len, poses)):
+        raise RecordingError(faults[0] if faults else f"{path} holds no pose; leave the file out")
+    if faults:
+        log.note("ground truth: unreadable lines", f"{len(faults)} left out; {faults[0]}")
+    stamps_ns = np.concatenate([pose.stamps_ns for pose in poses])
+    kept = forward_only(stamps_ns, "ground truth", log)
+    return Trajectory(stamps_ns[kept], np.concatenate([pose.frame_from_body for pose in poses])[kept])
+
+
 class StampedLine(NamedTuple):
     """A line of numbers: its location, its first 80 characters, its stamp and the values after it."""
 
@@ -74,11 +95,11 @@ class StampedLine(NamedTuple):
     values: Array
 
 
-def stamped_lines(text: str, what: str) -> Iterator[StampedLine]:
+def stamped_lines(text: str, what: str, first_line: int = 1) -> Iterator[StampedLine]:
     """The lines of a table with rising stamps, comments and empty lines skipped; RecordingError for other lines."""
     last_ns: int | None = None
     is_first = True
-    for number, line in enumerate(text.splitlines(), start=1):
+    for number, line in enumerate(text.splitlines(), start=first_line):
         fields = line.replace(",", " ").split()
         if not fields or fields[0].startswith("#"):
             continue

@@ -1,14 +1,18 @@
 """TUM RGB-D folders, whose images OpenCV writes."""
 
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings import OpenOptions, open_recording
 from fleetmap.sensors.samples import SensorSet
+from mapserver.cli import app
 from support.recordings.recording_samples import HEIGHT, kalibr_text, make_sample, write_tum_rgbd
 
 SAMPLE = make_sample(4)
@@ -78,6 +82,33 @@ def test_hostile_lists(folder: Path, line: str, words: str) -> None:
     (folder / "rgb.txt").write_text(line + "\n")
     with pytest.raises(RecordingError, match=words):
         open_recording(folder, options(folder))
+
+
+@pytest.mark.parametrize(
+    ("spoil", "left", "says"),
+    [
+        (lambda rows: [rows[0], *rows], 4, "stamps repeated"),
+        (lambda rows: [rows[1], rows[0], *rows[2:]], 3, "stamps not increasing"),
+        (lambda rows: [rows[0].rpartition(" ")[0] + " nan", *rows[1:]], 3, "line 1: .*NaN"),
+        (lambda rows: [*rows[:-1], rows[-1][:30]], 3, "line 4: "),
+        (lambda rows: [], None, "holds no pose"),
+    ],
+    ids=["repeated", "unsorted", "nan", "cut", "empty"],
+)
+def test_a_bad_row_of_the_truth_costs_itself(
+    folder: Path, spoil: Callable[[list[str]], list[str]], left: int | None, says: str
+) -> None:
+    truth = folder / "groundtruth.txt"
+    rows = [line for line in truth.read_text().splitlines() if not line.startswith("#")]
+    truth.write_text("\n".join(spoil(rows)))
+    with open_recording(folder, options(folder)) as recording:
+        assert recording.ground_truth is None if left is None else len(recording.ground_truth or ()) == left
+        (issue,) = recording.issues
+        assert re.search(says, f"{issue.what} {issue.detail}")
+    if left is not None:
+        (folder / "estimate.tum").write_text("\n".join(rows))
+        done = CliRunner().invoke(app, ["evaluate", str(folder / "estimate.tum"), "--ground-truth", str(truth)])
+        assert (done.exit_code, bool(re.search(says, done.stderr))) == (0, True), done.stderr
 
 
 def test_what_is_missing(folder: Path) -> None:

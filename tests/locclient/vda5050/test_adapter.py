@@ -172,6 +172,8 @@ def test_each_floor_has_its_map_id() -> None:
     order = {**HEADER, "orderId": "o", "orderUpdateId": 0, "nodes": nodes, "edges": []}
     adapter.order(json.dumps(order).encode())
     assert "UNKNOWN_MAP_ID" not in adapter.error_types()
+    adapter.order(_order("yard").replace(b'"x": 0', b'"theta": null, "mapDescription": null, "x": 0'))
+    assert "UNKNOWN_MAP_ID" in adapter.error_types()
     estimate.status = Status.LOST
     adapter.after_frame(outcome, frozenset({1}), floors, {"hall-2": 5})  # type: ignore[arg-type]
     given = {"x": 12.0, "y": 1.0, "theta": 0.0, "lastNodeId": "n"}
@@ -252,7 +254,11 @@ def test_the_robots_own_part_is_missed_and_checked() -> None:
         adapter.robot_part(json.dumps({**PART, **wrong}).encode())
         assert adapter.error_types() == ["ROBOT_PART_INVALID"], wrong
         assert adapter.said()["operatingMode"] == "AUTOMATIC", "the last one stands"
-    adapter.robot_part(json.dumps({**PART, "errors": [{"errorType": "FORK_BENT", "errorLevel": "URGENT"}]}).encode())
+    bent = {"errorType": "FORK_BENT", "errorLevel": "URGENT", "errorHint": None}
+    optional = dict.fromkeys(
+        ("nodeStates", "actionStates", "orderId", "lastNodeId", "velocity", "loads", "information")
+    )
+    adapter.robot_part(json.dumps({**PART, **optional, "errors": [bent]}).encode())
     assert adapter.error_types() == ["FORK_BENT"]
     adapter.now_s += 11.0
     assert adapter.error_types() == ["ROBOT_PART_MISSING"]
@@ -392,6 +398,8 @@ def test_an_order_on_a_map_that_is_not_here() -> None:
     assert {"referenceKey": "orderId", "referenceValue": "o-7"} in error["errorReferences"]
     adapter.order(_order("hall"))
     assert "UNKNOWN_MAP_ID" not in adapter.error_types()
+    adapter.order(_order("yard").replace(b'"x": 0', b'"theta": null, "mapDescription": null, "x": 0'))
+    assert "UNKNOWN_MAP_ID" in adapter.error_types()
 
 
 def _order(*map_ids: str) -> bytes:

@@ -98,6 +98,12 @@ def test_instant_actions_of_all_versions_are_understood() -> None:
         (heard,) = decode(dialect(version).heard(json.dumps(message).encode()), InstantActions).actions
         assert (heard.action_type, heard.action_id, heard.action_descriptor) == ("initializePosition", "a", "words")
         assert heard.action_parameters[0].key == "x"
+        for optional in ("actionDescription", "actionParameters"):
+            (heard,) = decode(
+                dialect(version).heard(json.dumps({"headerId": 1, "actions": [asked | {optional: None}]}).encode()),
+                InstantActions,
+            ).actions
+            assert (heard.action_type, heard.action_id) == ("initializePosition", "a")
 
 
 @pytest.mark.parametrize(

@@ -4,12 +4,14 @@ import base64
 import math
 from dataclasses import replace
 from datetime import UTC
+from io import BytesIO
 from pathlib import Path
 
 import cv2
 import msgspec
 import numpy as np
 import pytest
+from PIL import Image
 
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3, se3_inverse
@@ -156,14 +158,22 @@ def shown(png: bytes) -> np.ndarray:
     return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
 
 
-def test_the_floor_plan_lies_under_the_map_as_it_was_aligned(store: MapStore) -> None:
+@pytest.mark.parametrize("mode", ["L", "RGBA", "LA", "P"])
+def test_the_floor_plan_lies_under_the_map_as_it_was_aligned(store: MapStore, mode: str) -> None:
+    """Also one whose paper is transparent, with black stored under it."""
     data = MapData(store, GateSettings(), 0.05)
     assert data.underlays(SITE, 2, "") == []
     drawing = np.full((200, 300), 255, np.uint8)
     drawing[40:50, 100:110] = 0  # 5 m from the left edge, 2.25 m below the upper one
+    picture, packed = Image.fromarray(drawing), BytesIO()
+    if mode != "L":
+        picture = Image.merge("LA", (Image.fromarray(np.zeros_like(drawing)), Image.fromarray(255 - drawing))).convert(
+            "RGBA" if mode == "P" else mode
+        )
+    (picture.quantize() if mode == "P" else picture).save(packed, "PNG")
     frame = BuildingFrame(x_m=9.0, y_m=-8.0, yaw_rad=np.pi / 2)
     alignment = Alignment(frame=frame, metres_per_unit=0.05, method="pins", plan="hall.png")
-    files = {PLAN: cv2.imencode(".png", drawing)[1].tobytes(), ALIGNMENT: encode_alignment(alignment)}
+    files = {PLAN: packed.getvalue(), ALIGNMENT: encode_alignment(alignment)}
     store.keep_site_files(SITE, files, "aligned")
     (layer,) = data.underlays(SITE, 2, "/dashboard")
     assert (layer.name, layer.items[0].url) == ("Floor plan", "/dashboard/underlays/hall/2/floor.png")

@@ -14,11 +14,11 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings.bags.container import Channel, Message, Place
 from fleetmap.recordings.bags.streams import open_messages
 from fleetmap.recordings.files import file_head, natural_key, what_file_instead
-from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, KeptBytes, unpack
+from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, KeptBytes, unpack_message
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.samples import DataIssue
 
-_MAGIC, _ZSTD = b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
+_MAGIC = b"SQLite format 3\0"
 _PACKED = ".db3.zstd"
 _TOPICS = "SELECT id, name, type, serialization_format FROM topics"
 _MESSAGES = "SELECT rowid, topic_id, timestamp, data FROM messages"
@@ -94,7 +94,7 @@ class SqliteFiles(KeptBytes):
                 odd += 1
                 continue
             try:
-                yield channel, stamp_ns, (number, row, 0), memoryview(_unpacked(data))
+                yield channel, stamp_ns, (number, row, 0), unpack_message(memoryview(data))
             except ValueError:
                 odd += 1
         if odd:
@@ -111,7 +111,7 @@ class SqliteFiles(KeptBytes):
             ) from error
         if found is None or not isinstance(found[0], bytes):
             raise RecordingError(f"{file}: row {row} is gone; is it still being written?")
-        return _unpacked(found[0])
+        return bytes(unpack_message(memoryview(found[0])))
 
     def close(self) -> None:
         for database in self._databases:
@@ -151,8 +151,3 @@ def _opened(file: Path) -> sqlite3.Connection:
 
 def _recovery(file: Path) -> str:
     return f"save what is whole with `sqlite3 {file} .recover | sqlite3 saved.db3`"
-
-
-def _unpacked(data: bytes) -> bytes:
-    """Unpack a message if the recording is compressed per message; ValueError if that fails."""
-    return unpack("zstd", data) if data.startswith(_ZSTD) else data  # CDR begins with 0

@@ -126,7 +126,7 @@ def open_kitti(path: Path, options: OpenOptions) -> Recording:
         calibration = _calibration(path / "calib.txt", left.sources[0], (left_row, right_row))
         log.files.append(path / "calib.txt")
     left, right = pair_images(left, right, log, tolerance_ns=0)
-    truth = optional_truth(path / "poses.txt", log, lambda file: _ground_truth(file, stamps_of_number))
+    truth = optional_truth(path / "poses.txt", log, lambda file: _ground_truth(file, stamps_of_number, log))
     parts = image_parts(path, "kitti", calibration, SeriesFrames(FileReader(path, log.files), left, right))
     return finalize(replace(parts, ground_truth=truth), log)
 
@@ -193,11 +193,12 @@ def _projections(file: Path) -> dict[int, Array]:
     return rows
 
 
-def _ground_truth(file: Path, stamps_of_number: Stamps | None) -> Trajectory:
-    rows = read_numbers(file, (12, 16))
+def _ground_truth(file: Path, stamps_of_number: Stamps | None, log: ReadLog) -> Trajectory:
+    rows = read_numbers(file, (12, 16), log)
     stamps_ns = np.arange(len(rows)) * _PERIOD_NS if stamps_of_number is None else stamps_of_number
     if len(stamps_ns) != len(rows):
         raise RecordingError(f"poses.txt has {len(rows)} rows, times.txt {len(stamps_ns)}")
     frame_from_body = np.tile(np.eye(4), (len(rows), 1, 1))
     frame_from_body[:, :3] = rows[:, :12].reshape(-1, 3, 4)
-    return Trajectory(stamps_ns.astype(np.int64), frame_from_body)
+    kept = np.isfinite(rows).all(axis=1)
+    return Trajectory(stamps_ns.astype(np.int64)[kept], frame_from_body[kept])

@@ -286,10 +286,12 @@ def optional_truth(file: Path, log: ReadLog, read: Callable[[Path], Trajectory])
         return None
 
 
-def read_numbers(path: Path, widths: Sequence[int]) -> Array:
-    """Read a text table of finite numbers (N, width), with one of the widths; RecordingError for anything else."""
+def read_numbers(path: Path, widths: Sequence[int], log: ReadLog | None = None) -> Array:
+    """Read a text table of finite numbers (N, width), with one of the widths; RecordingError for anything else, or where a log is given,
+    a note and a row of NaN."""
     rows: list[list[float]] = []
     expected = " or ".join(str(width) for width in widths)
+    bad = list[str]()
     for number, line in enumerate(read_table(path).splitlines(), start=1):
         words = line.partition("#")[0].replace(",", " ").split()
         if not words:
@@ -299,10 +301,15 @@ def read_numbers(path: Path, widths: Sequence[int]) -> Array:
         except ValueError:
             row = []
         if len(row) not in ((len(rows[0]),) if rows else widths) or not np.isfinite(row).all():
-            raise RecordingError(
+            bad.append(
                 f"{path}, line {number}: {line[:60]!r} are not {expected} finite numbers; copy the recording again"
             )
+            if log is None:
+                raise RecordingError(bad[0])
+            row = [np.nan] * (len(rows[0]) if rows else widths[0])
         rows.append(row)
+    if log is not None and bad:
+        log.note(f"{path.name}: unreadable lines", f"{len(bad)} left out; {bad[0]}")
     if not rows:
         raise RecordingError(
             f"{path} is empty; lines of {expected} finite numbers are expected, copy the recording again"

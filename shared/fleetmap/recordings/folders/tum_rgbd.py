@@ -23,7 +23,7 @@ from fleetmap.recordings.folders.layout import (
 from fleetmap.recordings.image_series import SeriesFrames, pair_images
 from fleetmap.recordings.ordering import DEPTH_TOLERANCE_NS, ReadLog, pair_stamps
 from fleetmap.recordings.recording import OpenOptions, Recording
-from fleetmap.recordings.tum import read_tum
+from fleetmap.recordings.tum import read_truth as read_tum_truth
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.samples import Trajectory
 
@@ -59,7 +59,7 @@ def open_tum_rgbd(path: Path, options: OpenOptions) -> Recording:
     cam_from_body = se3_inverse(calibration.cameras[0].body_from_cam)
 
     def read_truth(file: Path) -> Trajectory:
-        written = read_tum(file)
+        written = read_tum_truth(file, log)
         frame_from_body = [frame_from_cam @ cam_from_body for frame_from_cam in written.frame_from_body]
         return Trajectory(written.stamps_ns, np.array(frame_from_body).reshape(-1, 4, 4))
 

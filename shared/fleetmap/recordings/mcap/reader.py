@@ -25,7 +25,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings.bags.container import Channel, Message, Place
 from fleetmap.recordings.bags.streams import open_messages
 from fleetmap.recordings.files import file_head, natural_key, what_file_instead
-from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, KeptBytes, unpack
+from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, KeptBytes, unpack, unpack_message
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.samples import DataIssue
@@ -143,12 +143,13 @@ class McapFile(KeptBytes):
     def read(self, place: Place) -> bytes:
         at, length, chunk_at = place
         if chunk_at >= 0:
-            return self._unpacked_chunk(chunk_at)[at : at + length]
-        self._file.seek(at)
-        data = self._file.read(length)
+            data = self._unpacked_chunk(chunk_at)[at : at + length]
+        else:
+            self._file.seek(at)
+            data = self._file.read(length)
         if len(data) < length:
             raise RecordingError(f"{self.path} became shorter while it was read; is it still being written?")
-        return data
+        return bytes(unpack_message(memoryview(data)))
 
     def close(self) -> None:
         self._file.close()
@@ -229,11 +230,12 @@ class McapFile(KeptBytes):
             channel = self._channels.get(channel_id)
             if channel is None:
                 raise ValueError(f"message of an unknown channel {channel_id}")
+            data = unpack_message(content[_MESSAGE_HEAD.size :])
         except ValueError as error:
             self._note("a damaged record", f"kind {opcode} at byte {at}: {error}")
             return
         head = _MESSAGE_HEAD.size
-        yield channel, log_time, (at + head, len(content) - head, chunk_at), content[head:]
+        yield channel, log_time, (at + head, len(content) - head, chunk_at), data
 
     def _keep_record(self, record: Any, content: memoryview) -> None:
         self.keep(len(content))

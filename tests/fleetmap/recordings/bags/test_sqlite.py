@@ -30,11 +30,20 @@ def test_the_same_sensors_give_the_same_samples_through_mcap_and_sqlite(tmp_path
         assert recording.content_hash() == file.content_hash()
 
 
-def test_messages_that_are_compressed_one_by_one(tmp_path: Path) -> None:
-    plain = write_rosbag2(tmp_path / "plain", foreign_messages())
-    packed = write_rosbag2(tmp_path / "packed", foreign_messages(), CompressionMode.MESSAGE)
+@pytest.mark.parametrize("storage", StoragePlugin)
+def test_messages_that_are_compressed_one_by_one(tmp_path: Path, storage: StoragePlugin) -> None:
+    """Also one of them that is damaged: it alone is left out."""
+    messages = [*foreign_messages()]
+    plain = write_rosbag2(tmp_path / "plain", messages, storage=storage)
+    packed = write_rosbag2(tmp_path / "packed", messages, CompressionMode.MESSAGE, storage)
     with open_recording(plain) as first, open_recording(packed) as second:
         assert_same(first, second)
+        assert first.issues == second.issues == ()
+    (row,) = [n for n, m in enumerate(messages) if m[1] == "sensor_msgs/Imu"][7:8]
+    packed_imu = zstandard.compress(bytes(messages[row][3]))
+    messages[row] = (*messages[row][:3], packed_imu[:20] + bytes(8) + packed_imu[28:])
+    with open_recording(write_rosbag2(tmp_path / "torn", messages, storage=storage)) as torn:
+        assert (len(torn.imu), len(torn.issues)) == (len(first.imu) - 1, 1)
 
 
 def test_a_bag_of_several_files(tmp_path: Path) -> None:
