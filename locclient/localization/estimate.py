@@ -139,7 +139,7 @@ def _of_confirmed(
     age_s = (estimate.odometry.stamp_ns - confirmed.stamp_ns) * 1e-9
     cause = _cause(estimate, has_failed=has_failed)
     # Its tracks or its IMU were lost, and the map has not confirmed its place since.
-    is_doubted = (confirmed.has_broken and has_failed) or confirmed.lost_imu
+    is_doubted = confirmed.has_broken or confirmed.lost_imu
     if radius_m > settings.lost_radius_m:
         status = Status.LOST
     elif (

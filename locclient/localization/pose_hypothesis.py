@@ -79,8 +79,9 @@ class PoseHypothesis:
         """Propagate a pose at the frame of a map query to the present. query: the identity at that frame, propagated to the present."""
         then = compose_end_cov(map_from_body, cov_rot_trans, query.map_from_body, query.cov_rot_trans)
         now = compose_end_cov(map_from_body, cov_rot_trans, query.now_map_from_body, query.now_cov)
-        since = {"has_broken": query.has_broken, "lost_imu": query.lost_imu, "is_by_vision": query.is_by_vision}
-        return cls(query.frame_index, query.stamp_ns, *then, *now, **since, floor=floor)
+        fresh = cls(query.frame_index, query.stamp_ns, *then, *now, has_broken=query.has_broken, floor=floor)
+        fresh.lost_imu, fresh.is_by_vision = query.lost_imu, query.is_by_vision
+        return fresh
 
     @property
     def evidence(self) -> str:

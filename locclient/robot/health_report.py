@@ -30,6 +30,7 @@ _CAUSE_WORDS = {
     Cause.NO_MATCH: _MAP_WORDS,
     Cause.FIX_REFUSED: _MAP_WORDS,
     Cause.AMBIGUOUS: "several places of the map look alike: give it a prior",
+    Cause.OVERLOADED: "most frames are dropped: this computer is too slow for them",
     Cause.ODOMETRY: "the odometry is lost: are camera and IMU connected, and is the calibration theirs?",
 }
 
@@ -207,6 +208,7 @@ class HealthFigures:
             flags += [Flag.NOT_LOCALISED] if self.search.is_long and not self.search.is_off_map else []
             flags += [Cause.NO_MAP] if last.map_version is None else []
             figures["not_localised_m"] = self.search.metres
+            figures["frames_dropped_share"] = 0.0 if self.last is None else self.last.dropped_share
             flags += [] if self.last is None else self.last.left_out
             figures |= {"floor": last.floor} if last.floor else {}
         return RobotHealth(

@@ -1,6 +1,7 @@
-"""Speed of a robot by wheels or odometry, and consistency checks: wheels and IMU with images, estimates with docks. Pure."""
+"""Speed of a robot by wheels or odometry, its load, and consistency checks: wheels and IMU with images, estimates with docks. Pure."""
 
 from cmath import phase, rect
+from collections import deque
 from collections.abc import Iterable, Sequence
 from math import dist, hypot
 
@@ -123,6 +124,37 @@ def accelerometer_refused(fault: str) -> dict[Flag, str]:
     """Return the flag of an accelerometer with this fault, with its text; empty without a fault."""
     words = f"the accelerometer is left out, the images contradict it: {fault}; mend its driver, or how the calibration mounts it"
     return {Flag.ACCELEROMETER_REFUSED: words} if fault else {}
+
+
+_LOAD_NS = 5_000_000_000
+_OVERLOADED_SHARE = 0.1  # a robot that keeps up drops none; other work that takes half a second costs as much
+
+
+class Load:
+    """Follows how many frames are dropped before they are handled, over the last seconds."""
+
+    def __init__(self) -> None:
+        self._begun_ns: int | None = None
+        self._recent = deque[tuple[int, int]]()  # stamp of a handled frame, number of those dropped before it
+        self.dropped_share = 0.0
+
+    def handle(self, stamp_ns: int, dropped: int) -> None:
+        """Add a handled frame. The first seconds, in which a map is loaded, say nothing."""
+        self._begun_ns = stamp_ns if self._begun_ns is None else self._begun_ns
+        self._recent.append((stamp_ns, dropped))
+        while stamp_ns - self._recent[0][0] > _LOAD_NS:
+            self._recent.popleft()
+        lost = sum(count for _, count in self._recent)
+        is_known = stamp_ns - self._begun_ns >= _LOAD_NS
+        self.dropped_share = lost / (lost + len(self._recent)) if is_known else 0.0
+
+    @property
+    def overload(self) -> dict[Flag, str]:
+        """Return the flag of a robot that is too slow for its frames, with its text; empty if it keeps up."""
+        if self.dropped_share <= _OVERLOADED_SHARE:
+            return {}
+        words = f"{self.dropped_share:.0%} of the frames are dropped, this computer is too slow for them"
+        return {Flag.OVERLOADED: words}
 
 
 _OFF_SHARE, _OFF_MPS = 0.5, 0.3  # relative, and absolute for low speeds: slip of a tyre is far less

@@ -24,6 +24,7 @@ from locclient.robot.failure_ring import FailureCut, FailureRing
 from locclient.robot.motion_checks import (
     DockCheck,
     ExchangedViews,
+    Load,
     SpeedGauge,
     WheelAgreement,
     accelerometer_refused,
@@ -32,6 +33,7 @@ from locclient.robot.motion_checks import (
 from locclient.robot.version_trial import TrialSettings, VersionChange, VersionTrials
 
 Clock = Callable[[], float]  # seconds
+_MAY_BE_OVERLOAD = {Cause.NONE, Cause.ODOMETRY, Cause.UNMATCHED}  # what frames too far apart look like
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +58,8 @@ class Outcome:
 
     cpu_s: from received images to estimate; stage_s: the same by stage. dock_error_m: from `DockCheck`, None without
     an arrival. speed_mps: by the wheels, else by the odometry, None if unknown. may_be_mapped: False if the robot is not localized and
-    the map has no tile nearby. left_out: flags of disabled sensors, which contradict all others, with texts.
+    the map has no tile nearby. left_out: flags of disabled sensors, which contradict all others, and of an overload, with texts.
+    dropped_share: of the frames of the last seconds, dropped before they were handled.
     """
 
     estimate: Estimate
@@ -68,6 +71,7 @@ class Outcome:
     speed_mps: float | None = None
     may_be_mapped: bool = True
     left_out: Mapping[Flag, str] = field(default_factory=dict)
+    dropped_share: float = 0.0
 
     def pose_message(self) -> PoseMessage | None:
         """Return the pose for the server; None while there is no single one with a covariance, or it is on another site's floor."""
@@ -103,6 +107,7 @@ class Robot:
         self._onsets = OnsetRecorder()
         self._last: tuple[RectifiedFrame, Estimate] | None = None
         self._speed = SpeedGauge()
+        self._load = Load()
         self._wheels = WheelAgreement(calibration.base_from_body)
         self._views = ExchangedViews(calibration, rectifier.mounted)
         self._images_refused = dict[Flag, str]()
@@ -179,6 +184,10 @@ class Robot:
             return None
         estimate = self.localizer.handle_stereo(frame)
         cpu_s = self._clock_s() - begun_s
+        self._load.handle(estimate.stamp_ns, bundle.dropped)
+        is_open = estimate.status is not Status.TRACKING and estimate.map_version is not None
+        if is_open and self._load.overload and estimate.cause in _MAY_BE_OVERLOAD:
+            estimate = replace(estimate, cause=Cause.OVERLOADED)
         stage_s = {"decode": decoded_s - begun_s, "rectify": rectified_s - decoded_s, **estimate.stage_s}
         self._last = (frame, estimate)
         self._enter(estimate.floor)
@@ -201,16 +210,17 @@ class Robot:
         self._onsets.handle(estimate, frame, odom_from_body, self.monitor.begun_ns)
         dock_error_m = self._docks.handle(bundle.priors, estimate)
         return Outcome(
-            estimate, published, cpu_s, stage_s, context, dock_error_m, speed_mps, is_covered, self._left_out()
-        )
+            estimate, published, cpu_s, stage_s, context, dock_error_m, speed_mps, is_covered, self._left_out(),
+            self._load.dropped_share,
+        )  # fmt: skip
 
     def _left_out(self) -> dict[Flag, str]:
         odometry = self.localizer.odometry
         if self._images_refused:
-            return {**self._images_refused, **self._wheels_unused}
+            return {**self._images_refused, **self._wheels_unused, **self._load.overload}
         wheels = self._wheels.refused or self._wheels_unused
         imu = imu_refused(odometry.imu_late_s) if odometry.refuses_imu else {}
-        return {**imu, **accelerometer_refused(odometry.accelerometer_fault), **wheels}
+        return {**imu, **accelerometer_refused(odometry.accelerometer_fault), **wheels, **self._load.overload}
 
     def handle_silence(self, for_s: float) -> FailureContext | None:
         """Return the failure of a source without frames for so many seconds."""

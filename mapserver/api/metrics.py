@@ -14,7 +14,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from fleetmap.errors import FleetmapError, StateError, StoreError, UsageError
-from fleetmap.messages import Status
+from fleetmap.messages import Flag, Status
 from mapserver.fleet.alerts import AlertSettings, lost_since_ns
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet_statistics.kpis import Counters
@@ -43,8 +43,8 @@ _SITE_SUMS = (
     ("usable_seconds", "Driving time with a usable position.", "usable_ms"),
     ("after_first_fix_seconds", "Of it since the run's first fix.", "after_fix_ms"),
     ("localised_seconds", "Of that TRACKING.", "localised_ms"),
-    ("frames", "Processed frames.", "frames"),
-    ("frames_dropped", "Frames that were not.", "frames_dropped"),
+    ("frames", "Received frames.", "frames"),
+    ("frames_dropped", "Of them dropped, by robots that are too slow.", "frames_dropped"),
     ("docks", "Arrivals at docks.", "docks"),
     ("docks_wrong", "Of them with an estimate more than 0.30 m off.", "docks_wrong"),
 )
@@ -64,6 +64,7 @@ _ROBOTS = {
     "robots_current": "Robots on the wanted version.",
     "robots_present": "Robots on the bus now.",
     "robots_copied": "Robots of which two were there at once within the last hour.",
+    "robots_overloaded": "Robots seen in the last minute that drop a tenth of their frames or more.",
     "robots_lost": "Robots that have not known their position for longer than [alerts] lost_s.",
     "clock_skew_max_seconds": "Largest clock error of a robot.",
     "map_word_hours_max": "Age of the oldest map approval on a robot seen in the last minute.",
@@ -173,6 +174,7 @@ class _FleetCollector(Collector):
                 "robots_current": sum(robot.version == robot.wanted_version is not None for robot in own),
                 "robots_present": sum(robot.is_present is True for robot in own),
                 "robots_copied": sum(robot.is_copied for robot in own),
+                "robots_overloaded": sum(Flag.OVERLOADED in each.get("flags", ()) for each in health),
                 "clock_skew_max_seconds": max((abs(robot.clock_ahead_s or 0.0) for robot in own), default=0.0),
                 "map_word_hours_max": max((hours for hours in proofs if isinstance(hours, int | float)), default=0.0),
             }

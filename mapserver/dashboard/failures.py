@@ -56,6 +56,7 @@ ADVICE: dict[str, str] = {
     "them apart.",
     Cause.MAP_CHANGED: "Images and odometry are sound, but far fewer landmarks are there than the map holds: survey this place again.",
     Cause.CALIBRATION: "The cameras do not agree with the map any more: check their mounting, then calibrate the robot.",
+    Cause.OVERLOADED: "The robot's computer is too slow and drops its frames: end other programs on it, or lower the frame rate.",
     Cause.DARK: "The images are dark: check the light and the lenses.",
     Cause.NO_MATCH: "Nothing in the map agrees: not mapped, or mapped in the other direction only.",
 }

@@ -4,6 +4,7 @@ pages; the Overview is kept up to date by a stream of server-sent events.
 
 import time
 
+from fleetmap.messages import Flag
 from mapserver.dashboard import fleet_parts
 from mapserver.dashboard.console import PAGES, PageContext, Services, scene_of
 from mapserver.dashboard.data import EVER
@@ -13,6 +14,7 @@ from mapserver.dashboard.live import LiveRobot, LiveSite
 from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
 from mapserver.dashboard.map_page import verdict_words
 from mapserver.dashboard.rendering import age, begun, share
+from mapserver.fleet.alerts import dropped_words
 from mapserver.fleet_statistics.area_trend import trend_sentence
 from mapserver.fleet_statistics.kpis import Rate, figure, is_telling
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
@@ -87,6 +89,7 @@ def _troubles(robot: LiveRobot) -> list[str]:
     """What is wrong beside the state."""
     found = [f"refuses a version: {robot.refused}"] if robot.refused else []
     found += ["is there twice: has another robot its name, or was its certificate copied?"] if robot.is_copied else []
+    found += [dropped_words(robot.metrics)] if Flag.OVERLOADED in robot.flags else []
     if robot.is_behind and robot.wanted_version is not None:
         found.append(f"runs version {robot.version or 'none'}, should run {robot.wanted_version}")
     if robot.clock_ahead_s is not None and abs(robot.clock_ahead_s) >= 1:
@@ -97,7 +100,8 @@ def _troubles(robot: LiveRobot) -> list[str]:
 def remarks(robot: LiveRobot) -> list[str]:
     """What it reports, what is wrong, and whether it tries a version."""
     trial = ["tries a new version"] if robot.is_canary else []
-    return [flag.replace("_", " ") for flag in robot.flags] + _troubles(robot) + trial
+    flags = [flag.replace("_", " ") for flag in robot.flags if flag != Flag.OVERLOADED]
+    return flags + _troubles(robot) + trial
 
 
 def since_words(context: PageContext, robot: LiveRobot) -> tuple[str, str]:

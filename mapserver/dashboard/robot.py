@@ -18,13 +18,14 @@ _TICKS, _BAND_PARTS = 5, 400
 _FIGURES = (
     ("CPU of a frame, mean", "frame_ms_mean", "{:.1f} ms"),
     ("CPU of a frame, slowest of a hundred", "frame_ms_p99", "{:.1f} ms"),
+    ("Frames that it is too slow for", "frames_dropped_share", "{:.0%}"),
     ("Brightness of the image (0 to 1)", "exposure", "{:.2f}"),
     ("Sharpness (1 is usual)", "sharpness", "{:.2f}"),
     ("Believed uncertainty (95 % radius)", "radius_95_m", "{:.2f} m"),
     ("Speed", "speed_mps", "{:.2f} m/s"),
     ("Failure reports that wait", "spool_waiting", "{:.0f}"),
 )
-_CURVES = (("CPU of a frame", "frame_ms", "{:.1f} ms"), *_FIGURES[2:4])  # and brightness and sharpness
+_CURVES = (("CPU of a frame", "frame_ms", "{:.1f} ms"), *_FIGURES[3:5])  # and brightness and sharpness
 
 
 def page(services: Services, context: PageContext, robot: str) -> dict[str, object]:

@@ -1,7 +1,7 @@
 """Alerts for operators: robots fail too often, one stays lost, a nightly run failed, a version was rolled back."""
 
 import shlex
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated
@@ -10,7 +10,7 @@ import msgspec
 
 from fleetmap.config import Section
 from fleetmap.errors import StateError
-from fleetmap.messages import Status
+from fleetmap.messages import Flag, Status
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, figure, hour_of, kpis
 from mapserver.store import MapStore
@@ -41,8 +41,8 @@ class AlertSettings(Section, frozen=True):
 
 @dataclass(frozen=True, slots=True)
 class Alert:
-    """A present condition. name: FleetmapFailureRate, FleetmapRobotLost, FleetmapRobotCopied, FleetmapNightFailed,
-    FleetmapCanaryRolledBack, FleetmapDiskFills or FleetmapTrustFault.
+    """A present condition. name: FleetmapFailureRate, FleetmapRobotLost, FleetmapRobotCopied, FleetmapRobotOverloaded,
+    FleetmapNightFailed, FleetmapCanaryRolledBack, FleetmapDiskFills or FleetmapTrustFault.
 
     about: its robot, job or version, empty for a site as a whole; since_ns: start, nanoseconds since 1970, now if it is unknown.
     """
@@ -84,6 +84,10 @@ def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site: str, 
     yield from _failure_rate(store, settings, site, now_ns)
     for robot in fleet.robots(site):
         yield from _lost(robot, settings, now_ns)
+        health = robot.last_health or {}
+        if Flag.OVERLOADED in health.get("flags", ()) and robot.seconds_since <= _HEARD_WITHIN_S:
+            words = f"{robot.robot} of {site} is too slow: {dropped_words(health.get('metrics', {}))}"
+            yield Alert("FleetmapRobotOverloaded", site, robot.robot, now_ns, words)
         if robot.is_copied:
             ends = f"`mapserver robots revoke {robot.robot} --site {site}` stops the copy"
             words = f"{robot.robot} of {site} is there twice; has another robot its name, or was its certificate copied? {ends}"
@@ -109,6 +113,13 @@ def _failure_rate(store: MapStore, settings: AlertSettings, site: str, now_ns: i
             f"({figure(found.low)} to {figure(found.high)}), more than {settings.failures_per_robot_day:g}"
         )
         yield Alert("FleetmapFailureRate", site, "", now_ns, words)
+
+
+def dropped_words(metrics: Mapping[str, object]) -> str:
+    """Return how many frames an overloaded robot drops, by the figures of its health."""
+    share = metrics.get("frames_dropped_share")
+    told = f"{share:.0%}" if isinstance(share, float | int) else "many"
+    return f"{told} of its frames are dropped; end other programs on its computer, or lower the frame rate"
 
 
 def lost_since_ns(robot: RobotStatus, settings: AlertSettings, now_ns: int) -> int | None:

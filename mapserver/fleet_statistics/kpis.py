@@ -148,7 +148,6 @@ class Kpis:
 
 def kpis(counts: Counters) -> Kpis:
     """Return the indicators of some counters."""
-    arrived = counts.frames + counts.frames_dropped
     return Kpis(
         observed_h=counts.observed_ms / 3.6e6,
         driving_h=counts.driving_ms / 3.6e6,
@@ -166,7 +165,7 @@ def kpis(counts: Counters) -> Kpis:
         fix_innovation_mean_m=_over(counts.innovation_m_sum, counts.innovations),
         fix_innovation_exceeded=share(counts.exceeded, counts.innovations),
         frame_ms_mean=_over(counts.cpu_ms_sum, counts.cpu_reports),
-        frame_drop_share=_over(counts.frames_dropped, arrived),
+        frame_drop_share=_over(counts.frames_dropped, counts.frames),
         landmarks_seen_share=_over(counts.landmarks_seen, counts.landmarks_expected),
     )
 

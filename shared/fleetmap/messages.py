@@ -78,6 +78,7 @@ class Cause(StrEnum):
     ALIASED = "aliased"
     MAP_CHANGED = "map_changed"
     CALIBRATION = "calibration"
+    OVERLOADED = "overloaded"
 
 
 class Flag(StrEnum):
@@ -91,6 +92,7 @@ class Flag(StrEnum):
     WHEELS_REFUSED = "wheels_refused"
     WHEELS_UNMOUNTED = "wheels_unmounted"
     IMAGES_REFUSED = "images_refused"
+    OVERLOADED = "overloaded"
 
 
 class FailureKind(StrEnum):

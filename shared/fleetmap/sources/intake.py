@@ -136,6 +136,7 @@ class Intake:
         self._wheel: list[WheelSample] = []
         self._priors: list[PositionPrior] = []
         self._finished = self._forget = False
+        self._dropped = 0  # since the frame that was taken last
 
     def put_frame(self, frame: CameraFrame | StoredFrame) -> None:
         """Put a frame, dropping the oldest if full. A frame not newer than all before, or alone ahead, is refused and counted.
@@ -238,8 +239,9 @@ class Intake:
             self._wheel = [sample for sample in self._wheel if sample.stamp_ns > body_ns]
             self._priors = [prior for prior in self._priors if prior.stamp_ns > frame.stamp_ns]
             forget, self._forget = self._forget, False
+            dropped, self._dropped = self._dropped, 0
             self._changed.notify_all()
-            return SensorBundle(frame, imu, wheel, priors, forget)
+            return SensorBundle(frame, imu, wheel, priors, forget, dropped)
 
     def _queue(self, certain: list[CameraFrame | StoredFrame]) -> None:
         """Queue frames. One that was held and the one that confirms it do not displace each other. The caller holds the lock."""
@@ -249,6 +251,7 @@ class Intake:
         while len(self._frames) > self._limit + (len(certain) > 1):
             self._frames.popleft()
             self.counts.frames_dropped += 1
+            self._dropped += 1
         self._changed.notify_all()
 
     def _use_first(self) -> None:

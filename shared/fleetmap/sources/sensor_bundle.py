@@ -8,10 +8,12 @@ from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Whe
 
 @dataclass(frozen=True, slots=True)
 class SensorBundle:
-    """A frame, None if none came in time, and the samples to handle before it. forget: first reset the pose estimate."""
+    """A frame, None if none came in time, and the samples to handle before it. forget: first reset the pose estimate. dropped:
+    number of frames between the one before and this one that came faster than they were taken."""
 
     frame: CameraFrame | StoredFrame | None = None
     imu: ImuSamples = field(default_factory=ImuSamples.empty)
     wheel: list[WheelSample] = field(default_factory=list)
     priors: list[PositionPrior] = field(default_factory=list)
     forget: bool = False
+    dropped: int = 0

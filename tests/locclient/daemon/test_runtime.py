@@ -23,6 +23,7 @@ from fleetmap.messages import (
     robot_key,
 )
 from fleetmap.occupancy_grid import OccupancyGrid
+from fleetmap.sensors.samples import CameraFrame
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.daemon import runtime
@@ -40,6 +41,10 @@ from locclient.maps.tile_loader import TileLoader
 from locclient.robot.continuous_odom import PublishedPose
 from locclient.robot.failure_report import RobotProfile
 from locclient.robot.robot import Robot
+from mapserver.api.metrics import Metrics
+from mapserver.dashboard.live import live_robot
+from mapserver.dashboard.overview import remarks
+from mapserver.fleet.alerts import AlertSettings, active_alerts
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.serving.robot_placing import RobotPlacing
@@ -179,6 +184,48 @@ def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(world:
     assert len(world.table) == len(set(world.table)) == 1
     assert waiting in ([], world.table)
     assert world.fleet.robots("room")[0].last_ack["version"] == 1
+
+
+@dataclass
+class CrowdedSource(ScriptedSource):
+    """Puts four frames at once, of which the last is taken."""
+
+    def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
+        while not self.ready() and not wait(0.01):
+            pass
+        for first in range(0, len(self.bundles), 4):
+            while not intake.wait_for_room(0.1) and not wait(0.0):
+                pass
+            crowd = self.bundles[first : first + 4]
+            for bundle in crowd:
+                assert bundle.frame is not None
+                intake.put_frame(bundle.frame)
+            for bundle in crowd:  # without its samples no frame is taken
+                intake.put_imu(bundle.imu)
+
+
+def test_a_robot_that_is_too_slow_for_its_frames_stays_exact_and_people_see_it(world: World) -> None:
+    """On its page, in the metrics, as an alert, and as the cause once nothing in the pictures is known any more."""
+    robot, listener, rng = robot_world.new_robot(), Listener(), np.random.default_rng(3)
+    bundles = list(robot_world.bundles(240))
+    for number, bundle in enumerate(bundles[160:], 160):
+        noise = rng.integers(0, 255, bundle.frame.left.shape, np.uint8)
+        bundles[number] = replace(bundle, frame=CameraFrame(bundle.frame.stamp_ns, noise, noise))
+    source = CrowdedSource(bundles, ready=lambda: robot.running is not None)
+    Runtime(world.parts(source, robot, listener), ServiceManager("")).run()
+    for number, one in zip(range(3, 160, 4), listener.estimates, strict=False):
+        off_m = one.map_from_body[:3, 3] - robot_world.truth(number)[:3, 3]
+        assert one.status is Status.TRACKING
+        assert off_m @ np.linalg.solve(one.cov_rot_trans[3:, 3:], off_m) < 16.27, "0.999 of chi-square"
+    assert Cause.OVERLOADED in {one.cause for one in listener.estimates[40:]}
+    (status,) = world.fleet.robots("room")
+    told = "75% of its frames are dropped"
+    assert told in " ".join(remarks(live_robot(status)))
+    alerts = active_alerts(world.store, world.fleet, AlertSettings(), world.store.now_ns())
+    assert [alert.about for alert in alerts if alert.name == "FleetmapRobotOverloaded" and told in alert.words] == [
+        "r1"
+    ]
+    assert 'fleetmap_site_robots_overloaded{site="room"} 1.0' in Metrics(world.store, world.fleet).text().decode()
 
 
 def test_a_new_version_is_taken_while_driving(world: World) -> None:
