@@ -1,15 +1,20 @@
 """Intake of failures' recordings: parts from robots are joined, checked as untrusted files, and stored with their failure."""
 
 import logging
+import sys
 import threading
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+import msgspec
+
 from fleetmap.errors import FleetmapError, LinkError, RecordingError
-from fleetmap.failure_summary import MAX_FILE_BYTES, ReplayPart, decode_summary
+from fleetmap.failure_summary import MAX_FILE_BYTES, ReplayPart
 from fleetmap.messages import FailureAck, decode_message
+from mapserver.fleet.bounded_process import ProcessLimits, run_bounded
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.store import FailureReplay, MapStore
 
@@ -17,7 +22,8 @@ from mapserver.store import FailureReplay, MapStore
 REPLAY_BURST, REPLAYS_PER_S = 10, 1 / 600
 MAX_UPLOADS = 4  # simultaneous ones, all in memory
 _IDLE_NS = 60_000_000_000
-_MAX_PICTURES, _MAX_PICTURE_BYTES, _MAX_PIXELS = 64, 64 << 10, 1_000_000
+# A full recording takes a second and 200 MB. Two at a time, and their robots ask again meanwhile: others' parts do not wait.
+_LIMITS, _AT_ONCE, _ANSWER_WITHIN_S = ProcessLimits(memory_bytes=1 << 30, cpu_s=20), 2, 2.0
 _log = logging.getLogger(__name__)
 
 
@@ -27,6 +33,7 @@ class _Upload:
     total_bytes: int
     heard_ns: int
     data: bytearray = field(default_factory=bytearray)
+    judged: Future[FailureAck] | None = None
 
 
 class ReplayIntake:
@@ -35,7 +42,7 @@ class ReplayIntake:
     def __init__(self, store: MapStore, keep_bytes: int, clock_ns: Callable[[], int]) -> None:
         """keep_bytes: limit for all recordings; the oldest are deleted."""
         self._store, self._keep_bytes, self._clock_ns = store, keep_bytes, clock_ns
-        self._lock = threading.Lock()
+        self._lock, self._judges = threading.Lock(), ThreadPoolExecutor(_AT_ONCE, "judges of recordings")
         self._uploads: dict[tuple[str, str], _Upload] = {}
         self._rates = RateLimit(REPLAY_BURST, REPLAYS_PER_S, clock_ns)
 
@@ -57,8 +64,13 @@ class ReplayIntake:
             upload.heard_ns = self._clock_ns()
             if len(upload.data) < upload.total_bytes:
                 return FailureAck(id=part.id, received_bytes=len(upload.data))
-            del self._uploads[site, robot]
-        return self._kept(site, robot, upload)
+            if upload.judged is None:
+                upload.judged = self._judges.submit(self._kept, site, robot, upload)
+        if not wait([upload.judged], _ANSWER_WITHIN_S).done:
+            raise LinkError("later: the recording is being judged")
+        with self._lock:
+            self._uploads.pop((site, robot), None)
+        return upload.judged.result()
 
     def _upload(self, site: str, robot: str, part: ReplayPart) -> _Upload | FailureAck:
         """Return the upload of the part, or the answer to a part without one. The caller holds the lock."""
@@ -98,41 +110,16 @@ class ReplayIntake:
 
 
 def _judged(data: bytes, named: tuple[str, str, str]) -> FailureReplay:
-    """Return the recording with its summary and number of pictures; named: site, robot and report. FleetmapError for invalid data."""
+    """Return the recording with its summary and pictures, judged in a process with limits; named: site, robot and report.
+
+    FleetmapError for invalid data, and for what takes more than the limits.
+    """
     with TemporaryDirectory() as folder:
-        path = Path(folder) / "failure.mcap"
+        path, found = Path(folder) / "failure.mcap", Path(folder) / "found"
         path.write_bytes(data)
-        try:
-            return _read(path, data, named)
-        except FleetmapError as error:
-            raise RecordingError(str(error).replace(str(path), "the recording")) from error
-
-
-def _read(path: Path, data: bytes, named: tuple[str, str, str]) -> FailureReplay:
-    # Recordings' readers import OpenCV: otherwise every command that reads a configuration would load it.
-    from fleetmap.recordings import open_recording
-    from fleetmap.recordings.failure_recording import SUMMARY, attachments_of
-    from fleetmap.recordings.images import image_size
-
-    summary_bytes = attachments_of(path)[SUMMARY]
-    summary = decode_summary(summary_bytes)
-    if (summary.site, summary.robot, summary.id) != named:
-        raise RecordingError(
-            f"the recording is of failure {summary.id!r} of {summary.robot!r}, not of {named[2]!r} of {named[1]!r}"
-        )
-    with open_recording(path) as recording:
-        if len(recording) > _MAX_PICTURES:
-            raise RecordingError(
-                f"the recording has {len(recording)} pictures; a failure's has at most {_MAX_PICTURES}"
-            )
-        stored = [recording.stored_frame(number) for number in range(len(recording))]
-    if any(frame.depth is not None for frame in stored):
-        raise RecordingError("the recording has depth images; a failure's has none")
-    pictures = [(frame.stamp_ns, frame.left.data) for frame in stored]
-    for stamp_ns, jpeg in [*pictures, *((frame.stamp_ns, frame.right.data) for frame in stored if frame.right)]:
-        size = image_size(jpeg)
-        if not (jpeg.startswith(b"\xff\xd8") and jpeg.endswith(b"\xff\xd9")) or len(jpeg) > _MAX_PICTURE_BYTES:
-            raise RecordingError(f"the picture at {stamp_ns} is not a JPEG of at most {_MAX_PICTURE_BYTES} bytes")
-        if size is None or size[0] * size[1] > _MAX_PIXELS:
-            raise RecordingError(f"the picture at {stamp_ns} is of size {size}; the limit is {_MAX_PIXELS} pixels")
-    return FailureReplay(summary_bytes, data, pictures)
+        command = [sys.executable, "-m", "mapserver.fleet.replay_judge", str(path), str(found), *named]
+        ended = run_bounded(command, _LIMITS, "the judgement of the recording")
+        if ended.status:
+            raise RecordingError(ended.errors.strip().rpartition("\n")[2].replace(str(path), "the recording"))
+        summary, pictures = msgspec.msgpack.decode(found.read_bytes(), type=tuple[bytes, list[tuple[int, bytes]]])
+    return FailureReplay(summary, data, pictures)

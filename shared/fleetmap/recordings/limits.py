@@ -19,13 +19,23 @@ MAX_VIDEO_TABLE_BYTES = 256 << 20
 # the extreme: zstd compresses recorded odometry, mostly empty covariances, 8 to 1, and zeros 30,000 to 1.
 _KEPT_BYTES, _KEPT_PER_FILE_BYTE = 64 << 20, 32
 _KEPT_RECORD_BYTES = 256  # memory of a record's place, stamp and object
+# Records that a file of any size may have, and bytes of it for each further one: no recorder packs one into less than ten.
+_PASSED_RECORDS, _LEAST_RECORD_BYTES = 250_000, 4
 
 
 class KeptBytes:
     """Counts the memory kept for files of `size` bytes."""
 
     def __init__(self, path: Path, size: int) -> None:
-        self.path, self.size, self._kept = path, size, 0
+        self.path, self.size, self._kept, self._passed = path, size, 0, 0
+
+    def pass_record(self) -> None:
+        """Count a record that is read, kept or not; RecordingError if the file unpacks to more than a real recording can."""
+        self._passed += 1
+        if self._passed > (most := _PASSED_RECORDS + self.size // _LEAST_RECORD_BYTES):
+            raise RecordingError(
+                f"{self.path}: {self.size} bytes unpack to more than {most} records; leave the file out"
+            )
 
     def keep(self, size: int) -> None:
         """Count a record of `size` bytes kept in memory; RecordingError if the file unpacks to more than a real recording can."""

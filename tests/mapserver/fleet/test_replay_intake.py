@@ -1,22 +1,29 @@
 """Recordings of failures come in parts, are judged as files of strangers, and cost the reports nothing. Rows 8, 23, 25."""
 
+import struct
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+import zstandard
+from mcap.opcode import Opcode
 
 from fleetmap.errors import LinkError, UsageError
 from fleetmap.failure_summary import ReplayPart
 from fleetmap.messages import FailureAck, encode_message
 from mapserver.fleet import replay_intake
+from mapserver.fleet.bounded_process import Ended, ProcessLimits
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.ingest import IngestSettings
 from mapserver.store import MapStore
-from support.fleet.failed_robot import small_file
+from support.fleet.failed_robot import asked, small_file
 from support.fleet.reports import blindness
 from support.storage.clock import Clock
 from support.storage.map_samples import publish_samples
+
+MAGIC = b"\x89MCAP0\r\n"
 
 
 @dataclass
@@ -34,7 +41,7 @@ class Server:
         offset = 0
         while True:
             part = ReplayPart(id=name, total_bytes=len(data), offset=offset, data=data[offset : offset + part_bytes])
-            ack = self.fleet.replays.take("lab", robot, encode_message(part))
+            ack = asked(self.fleet, "lab", robot, part)
             if ack.refused or ack.received_bytes in (offset, len(data)):
                 return ack
             offset = ack.received_bytes
@@ -106,6 +113,33 @@ def test_bytes_that_are_no_recording_are_refused(server: Server, data: bytes) ->
     assert server.send(data).refused
 
 
+@pytest.mark.parametrize("opcode", [0, Opcode.MESSAGE])
+def test_a_small_file_of_many_records_costs_little_and_nobody_waits_for_it(
+    server: Server, tmp_path: Path, opcode: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """507 bytes of 7 million empty records took 6 s, on the thread that hears all robots."""
+    records = (bytes([opcode]) + bytes(8)) * (60_000_000 // 9)
+    packed = zstandard.ZstdCompressor().compress(records)
+    chunk = struct.pack("<QQQII4sQ", 0, 0, len(records), 0, 4, b"zstd", len(packed)) + packed
+    server.report()
+    assert "records; leave" in server.send(MAGIC + struct.pack("<BQ", Opcode.CHUNK, len(chunk)) + chunk + MAGIC).refused
+    monkeypatch.setattr(replay_intake, "_LIMITS", ProcessLimits(wall_s=0.0))
+    server.report("f2")
+    assert "was ended after" in server.send(small_file(tmp_path / "f.mcap", id="f2"), "f2").refused
+    held = threading.Event()
+    monkeypatch.setattr(replay_intake, "run_bounded", lambda *_: held.wait(20.0))
+    monkeypatch.setattr(replay_intake, "_ANSWER_WITHIN_S", 0.0)
+    server.report("f3")
+    part = encode_message(ReplayPart(id="f3", total_bytes=1, offset=0, data=b"x"))
+    for _ in range(2):
+        with pytest.raises(LinkError, match="later: the recording is being judged"):
+            server.fleet.replays.take("lab", "r1", part)
+    server.report("f3", robot="r2")
+    more = ReplayPart(id="f3", total_bytes=2, offset=0, data=b"x")
+    assert server.fleet.replays.take("lab", "r2", encode_message(more)).received_bytes == 1
+    held.set()
+
+
 def test_a_recording_without_a_report_and_one_too_large_are_refused(server: Server, tmp_path: Path) -> None:
     assert "send its report first" in server.send(small_file(tmp_path / "f.mcap")).refused
     server.report()
@@ -115,7 +149,8 @@ def test_a_recording_without_a_report_and_one_too_large_are_refused(server: Serv
         server.fleet.replays.take("lab", "r1", b"no message")
 
 
-def test_uploads_and_rates_are_bounded(server: Server) -> None:
+def test_uploads_and_rates_are_bounded(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replay_intake, "run_bounded", lambda *_: Ended(1, "", "no recording", has_network=False))
     for number in range(replay_intake.MAX_UPLOADS + 1):
         server.report("f1", robot=f"r{number}")
         part = encode_message(ReplayPart(id="f1", total_bytes=1000, offset=0, data=b"x"))

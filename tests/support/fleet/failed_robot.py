@@ -6,8 +6,9 @@ from pathlib import Path
 
 import msgspec
 
+from fleetmap.errors import LinkError
 from fleetmap.failure_summary import FailureSummary, Moment, ReplayPart
-from fleetmap.messages import PART_BYTES, FailureReport, encode_message
+from fleetmap.messages import PART_BYTES, FailureAck, FailureReport, encode_message
 from fleetmap.recordings.failure_recording import LOCALIZER, SUMMARY
 from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
@@ -93,4 +94,14 @@ def send_replay(fleet: Fleet, site: str, robot: str, report_id: str, data: bytes
     """Gives a server a failure's recording, as a robot sends it."""
     for offset in range(0, len(data), PART_BYTES):
         part = ReplayPart(id=report_id, total_bytes=len(data), offset=offset, data=data[offset : offset + PART_BYTES])
-        assert not fleet.replays.take(site, robot, encode_message(part)).refused
+        assert not asked(fleet, site, robot, part).refused
+
+
+def asked(fleet: Fleet, site: str, robot: str, part: ReplayPart) -> FailureAck:
+    """The answer to a part, once the recording is judged."""
+    while True:
+        try:
+            return fleet.replays.take(site, robot, encode_message(part))
+        except LinkError as error:
+            if "being judged" not in str(error):
+                raise

@@ -210,6 +210,7 @@ class McapFile(KeptBytes):
         while position + _RECORD_HEAD.size <= len(unpacked):
             opcode, length = _RECORD_HEAD.unpack_from(unpacked, position)
             position += _RECORD_HEAD.size
+            self.pass_record()
             if position + length > len(unpacked):
                 return
             if opcode in (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL):
