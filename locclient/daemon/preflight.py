@@ -12,7 +12,7 @@ from fleetmap.errors import FleetmapError, LinkError, UnreachableError
 from fleetmap.features.settings import OrbSettings
 from fleetmap.recordings import StoredFrame
 from fleetmap.recordings.images import decode_frame
-from fleetmap.sensors.calibration import RigCalibration, stereo_baseline_m
+from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
 from fleetmap.sources.intake import Intake
@@ -87,7 +87,7 @@ def _sensors(config: LocclientConfig, listen_s: float) -> Iterator[Finding]:
 def _calibration(calibration: RigCalibration, rectifier: Rectifier) -> Finding:
     camera = rectifier.camera
     text = f"{camera.width_px}x{camera.height_px} px, focal {camera.focal_px:.0f} px, baseline {1000 * camera.baseline_m:.0f} mm"
-    if len(calibration.cameras) > 1 and not _BASELINE_M[0] < stereo_baseline_m(calibration) < _BASELINE_M[1]:
+    if len(calibration.views[0]) > 1 and not _BASELINE_M[0] < camera.baseline_m < _BASELINE_M[1]:
         return Finding(WARN, "calibration", f"{text}: is the baseline in metres? Calibrate again")
     if calibration.imu is None:
         hint = "no IMU: darkness and fast turns will lose the robot; calibrate with its IMU"

@@ -28,6 +28,8 @@ _NOT_LOST = (
     "stamps far apart",
     "bits in 16",
     "not optical",
+    "said twice",
+    "order of their views",
 )
 
 

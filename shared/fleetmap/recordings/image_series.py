@@ -1,8 +1,9 @@
 """Images of each camera by stamp, paired to frames and read one frame at a time."""
 
 import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Generic, Protocol, TypeVar
 
 import cv2
@@ -18,9 +19,11 @@ from fleetmap.recordings.ordering import (
     nearest,
     pair_stamps,
 )
+from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, Stamps
 
 T = TypeVar("T")
+SILENT_NS = 500_000_000  # a camera without images for longer is silent
 _DAY_NS = 86_400_000_000_000
 
 
@@ -81,25 +84,76 @@ class ViewSeries(Generic[T]):
     depth: ImageSeries[T] | None = None
 
     @classmethod
-    def beside(
-        cls,
-        frame_stamps_ns: Stamps,
-        cameras: "Sequence[ImageSeries[T]]",
-        log: ReadLog,
-        depth: ImageSeries[T] | None = None,
-    ) -> "ViewSeries[T]":
-        """The images of one or two cameras, or of one with its depth, that are nearest to each frame (F,), at most half a usual period
-        away."""
-        left, right = (cameras[0], None) if len(cameras) == 1 else pair_images(cameras[0], cameras[1], log)
-        if depth is not None:
-            left, depth = pair_images(left, depth, log, DEPTH_TOLERANCE_NS)
-        if not len(left):
-            return cls(left, right, np.full(len(frame_stamps_ns), -1), depth)
-        period_ns = int(np.median(np.diff(frame_stamps_ns))) if len(frame_stamps_ns) > 1 else _DAY_NS
-        frames, images = pair_stamps(frame_stamps_ns, left.stamps_ns, period_ns // 2)
+    def beside(cls, frame_stamps_ns: Stamps, images: "ViewImages[T]") -> "ViewSeries[T]":
+        """The images of a view that are nearest to each frame (F,), at most half a usual period away."""
+        left, right, depth = images
         rows = np.full(len(frame_stamps_ns), -1)
-        rows[frames] = images
+        if len(left):
+            period_ns = int(np.median(np.diff(frame_stamps_ns))) if len(frame_stamps_ns) > 1 else _DAY_NS
+            frames, chosen = pair_stamps(frame_stamps_ns, left.stamps_ns, period_ns // 2)
+            rows[frames] = chosen
         return cls(left, right, rows, depth)
+
+
+ViewImages = tuple[ImageSeries[T], ImageSeries[T] | None, ImageSeries[T] | None]
+"""Left images, right ones and depth of a view at the same moments."""
+
+
+def rig_images(
+    calibration: RigCalibration,
+    cameras: Mapping[int, tuple[str, ImageSeries[T]]],
+    log: ReadLog,
+    depths: Mapping[int, ImageSeries[T]] = MappingProxyType({}),
+) -> tuple[RigCalibration, ViewImages[T], tuple[ViewSeries[T], ...]]:
+    """Pair a rig's images, by the camera's number and with its name for messages; return the cameras in the order of views, and the views.
+
+    The first view has the frames: that of the first camera, unless it is silent more often than another of its kind. Cameras that are
+    silent while others send are noted with the moments.
+    """
+    numbers = list(cameras)
+    recorded = replace(calibration, cameras=tuple(calibration.cameras[number] for number in numbers))
+    views = [tuple(numbers[k] for k in view) for view in recorded.views]
+    every_ns = np.unique(np.concatenate([series.stamps_ns for _, series in cameras.values()]))
+    for name, series in cameras.values():
+        _note_silence(name, series.stamps_ns, every_ns, log)
+    images = []
+    for view in views:
+        left, right, depth = cameras[view[0]][1], None, depths.get(view[0])
+        if len(view) == 2:
+            left, right = pair_images(left, cameras[view[1]][1], log)
+        elif depth is not None:
+            left, depth = pair_images(left, depth, log, DEPTH_TOLERANCE_NS)
+        images.append((left, right, depth))
+    alike = [
+        k for k, (_, *rest) in enumerate(images) if [s is None for s in rest] == [s is None for s in images[0][1:]]
+    ]
+    first = min(alike, key=lambda k: int(_silent(images[k][0].stamps_ns, every_ns).sum()))
+    turn = sorted(range(len(views)), key=lambda k: k != first)
+    order = [number for k in turn for number in views[k]]
+    if order != sorted(order):
+        names = ", ".join(f"cam{n} is {cameras[number][0]}" for n, number in enumerate(order))
+        log.note("cameras in the order of their views", names)
+    order += [number for number in range(len(calibration.cameras)) if number not in order]
+    ordered = replace(calibration, cameras=tuple(calibration.cameras[number] for number in order))
+    stamps_ns = images[first][0].stamps_ns
+    return ordered, images[first], tuple(ViewSeries.beside(stamps_ns, images[k]) for k in turn[1:])
+
+
+def _note_silence(name: str, stamps_ns: Stamps, every_ns: Stamps, log: ReadLog) -> None:
+    silent_ns = every_ns[_silent(stamps_ns, every_ns)]
+    if len(silent_ns):
+        parts = np.split(silent_ns, np.flatnonzero(np.diff(silent_ns) > SILENT_NS) + 1)
+        spans_s = [f"{(part[0] - every_ns[0]) * 1e-9:.1f} to {(part[-1] - every_ns[0]) * 1e-9:.1f} s" for part in parts]
+        when = f"{', '.join(spans_s[:3])}{', ...' if len(parts) > 3 else ''} after the start"
+        log.note("camera silent", f"{name} has no images from {when}, while others have; its view is missing there")
+
+
+def _silent(stamps_ns: Stamps, every_ns: Stamps) -> NDArray[np.bool_]:
+    """(N,) mask of the moments (N,) that have no stamp within half a second, or within the usual period if that is longer."""
+    if not len(stamps_ns):
+        return np.ones(len(every_ns), np.bool_)
+    usual_ns = int(np.median(np.diff(stamps_ns))) if len(stamps_ns) > 1 else 0
+    return np.asarray(np.abs(stamps_ns[nearest(stamps_ns, every_ns)] - every_ns) > max(SILENT_NS, usual_ns))
 
 
 class ImageReader(Protocol[T]):

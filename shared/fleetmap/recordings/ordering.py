@@ -48,23 +48,20 @@ class ReadLog:
         self.issues.append(DataIssue(what, detail))
 
 
-def with_log_times(stamps_ns: Stamps, log_times_ns: Stamps, what: str, log: ReadLog) -> Stamps:
-    """Replace unset stamps (0) among (N,) by log times (N,) minus the logging delay of the others; noted in `log`."""
-    unset = (stamps_ns == 0) & (log_times_ns != 0)
-    if not unset.any():
-        return stamps_ns
-    delay_ns = 0 if unset.all() else int(np.median((log_times_ns - stamps_ns)[~unset]))
-    log.note(f"{what}: stamps of zero", f"{int(unset.sum())} of {len(unset)}; the times of logging stand in for them")
-    return np.where(unset, log_times_ns - delay_ns, stamps_ns)
+def as_logged(stamps_ns: Stamps, log_times_ns: Stamps, what: str, log: ReadLog) -> tuple[Stamps, NDArray[np.int64]]:
+    """Stamps (N,), and indices (N,) of the order in which they were logged: files hold chunks, parts and channels one after the other.
 
-
-def arrival_order(stamps_ns: Stamps, log_times_ns: Stamps) -> NDArray[np.int64]:
-    """(N,) indices of values as they were logged: a file holds chunks, parts and channels one after the other.
-
-    The order of the file is kept where more stamps (N,) increase in it: the recorder's clock may have been set.
+    The order of the file is kept where more stamps increase in it: the recorder's clock may have been set. Unset stamps (0) are replaced by
+    log times (N,) minus the logging delay of the others; noted in `log`.
     """
+    unset = (stamps_ns == 0) & (log_times_ns != 0)
+    if unset.any():
+        delay_ns = 0 if unset.all() else int(np.median((log_times_ns - stamps_ns)[~unset]))
+        stamps_ns = np.where(unset, log_times_ns - delay_ns, stamps_ns)
+        share = f"{int(unset.sum())} of {len(unset)}"
+        log.note(f"{what}: stamps of zero", f"{share}; the times of logging stand in for them")
     orders = np.argsort(log_times_ns, kind="stable"), np.arange(len(stamps_ns))
-    return max(orders, key=lambda order: int(_longest_increasing(stamps_ns[order]).sum()))
+    return stamps_ns, max(orders, key=lambda order: int(_longest_increasing(stamps_ns[order]).sum()))
 
 
 def usual_size(sizes_px: Sequence[tuple[int, int] | None], what: str, log: ReadLog) -> NDArray[np.bool_]:

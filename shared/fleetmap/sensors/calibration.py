@@ -11,7 +11,9 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.cameras import CAMERA_MODELS
 
 _SUB_PX = 4  # bits of a pixel's fraction
-_SAME_WAY_COSINE = 0.7  # of 45 degrees: half of a usual lens's image is common to both cameras
+SAME_WAY_COSINE = 0.7  # of 45 degrees: half of a usual lens's image is common to both cameras
+LEAST_BASELINE_M = 1e-3  # less is none
+SIDEWAYS = 0.7  # least share of a baseline along the images' rows
 Polygon = tuple[tuple[float, float], ...]  # corners (u, v) in pixels as recorded
 
 
@@ -76,7 +78,7 @@ NO_BASE = (
 
 @dataclass(frozen=True, slots=True)
 class RigCalibration:
-    """All sensors of one robot. Cameras view by view (see `views`), of a pair the left one first; `imu` is None for a rig without one.
+    """All sensors of one robot. Of a pair the left camera first (see `views`); `imu` is None for a rig without one.
 
     assumed: names of values without a source, of `imu` and `base_from_body`.
     """
@@ -88,17 +90,38 @@ class RigCalibration:
 
     @property
     def views(self) -> tuple[tuple[int, ...], ...]:
-        """Numbers of the cameras of each view: a depth camera, a stereo pair, which is two other successive cameras that look the same
-        way, or a single camera."""
+        """Numbers of the cameras of each view: a depth camera, a stereo pair, or a single camera.
+
+        A pair is two cameras that look the same way from places side by side, whatever their numbers: of several the two with the most
+        in common, then those with the lowest numbers.
+        """
         views, numbers = list[tuple[int, ...]](), list(range(len(self.cameras)))
         while numbers:
-            ahead = [self.cameras[number] for number in numbers[:2]]
-            is_pair = len(ahead) == 2 and not any(camera.has_depth for camera in ahead)
-            axes = [camera.body_from_cam[:3, 2] for camera in ahead]
-            size = 2 if is_pair and axes[0] @ axes[1] > _SAME_WAY_COSINE else 1
-            views.append(tuple(numbers[:size]))
-            del numbers[:size]
+            first, *numbers = numbers
+            shares = {number: self._common_share(first, number) for number in numbers}
+            alike = [number for number in numbers if shares[number] > 0]
+            # The next number belongs to it wherever it lies: rectification says what is wrong with its place
+            beside = [n for n in alike if self._is_beside(first, n)] or [n for n in alike if n == numbers[0]]
+            other = max(beside, key=lambda number: shares[number], default=None)
+            views.append((first,) if other is None else (first, other))
+            numbers = [number for number in numbers if number != other]
         return tuple(views)
+
+    def _common_share(self, first: int, other: int) -> float:
+        """Share of their images, to a tenth, that two cameras have in common; 0 unless they look the same way, without depth."""
+        cameras = self.cameras[first], self.cameras[other]
+        axes = [camera.body_from_cam[:3, 2] for camera in cameras]
+        cosine = float(axes[0] @ axes[1])
+        if cosine <= SAME_WAY_COSINE or any(camera.has_depth for camera in cameras):
+            return 0.0
+        narrow, wide = sorted(float(camera.focal_px.mean()) / camera.width_px for camera in cameras)
+        return round(cosine * narrow / wide, 1)
+
+    def _is_beside(self, first: int, other: int) -> bool:
+        """True if one camera lies to the left or right of the other, not above it, before it or in its place."""
+        left_from_other = se3_inverse(self.cameras[first].body_from_cam) @ self.cameras[other].body_from_cam
+        distance_m = float(np.linalg.norm(left_from_other[:3, 3]))
+        return distance_m > LEAST_BASELINE_M and abs(left_from_other[0, 3]) > SIDEWAYS * distance_m
 
     @property
     def wheels_fault(self) -> str:
@@ -141,9 +164,3 @@ def check_camera(camera: CameraCalibration, name: str) -> CameraCalibration:
     if not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) or np.linalg.det(rotation) < 0:
         raise CalibrationError(f"{name}: the rotation of body_from_cam is not orthonormal: {rotation.tolist()}")
     return camera
-
-
-def stereo_baseline_m(calibration: RigCalibration) -> float:
-    """Distance between the first two cameras' centres."""
-    left, right = calibration.cameras[:2]
-    return float(np.linalg.norm((se3_inverse(left.body_from_cam) @ right.body_from_cam)[:3, 3]))

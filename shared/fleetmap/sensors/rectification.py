@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
-from fleetmap.sensors.calibration import CameraCalibration, Polygon, RigCalibration, hidden_pixels
+from fleetmap.sensors.calibration import (
+    LEAST_BASELINE_M,
+    SIDEWAYS,
+    CameraCalibration,
+    Polygon,
+    RigCalibration,
+    hidden_pixels,
+)
 from fleetmap.sensors.cameras import CAMERA_MODELS
 from fleetmap.sensors.samples import CameraFrame, Image
 
@@ -135,14 +142,14 @@ class Rectifier:
         *,
         has_depth: bool = False,
         pinhole: StereoCamera | None = None,
-        first_camera: int = 0,
+        numbers: tuple[int, ...] = (),
     ) -> None:
-        """first_camera: its number in messages."""
+        """numbers: of the cameras in messages, by default as in the calibration."""
         if not calibration.cameras:
             raise CalibrationError("the calibration holds no camera; pass one with --calibration FILE")
         view, *others = calibration.views
         cameras = tuple(calibration.cameras[number] for number in view)
-        self._numbers = tuple(first_camera + number for number in view)
+        self._numbers = numbers or view
         self._sizes = [(c.height_px, c.width_px) for c in cameras]
         self.has_depth = has_depth or cameras[0].has_depth
         if self.has_depth or len(cameras) == 1:
@@ -162,10 +169,10 @@ class Rectifier:
         for camera in used:
             body_from_rect = self.body_from_cam[:3, :3]
             cam_from_rect = camera.body_from_cam[:3, :3].T @ body_from_rect
-            numbers = camera.intrinsics_px, camera.distortion, cam_from_rect.ravel()
+            values = camera.intrinsics_px, camera.distortion, cam_from_rect.ravel()
             size = camera.width_px, camera.height_px
             tables, shows_robot = _remap_tables(
-                self.camera, camera.model, size, *(tuple(each.tolist()) for each in numbers), camera.mask
+                self.camera, camera.model, size, *(tuple(each.tolist()) for each in values), camera.mask
             )
             self._maps.append(tables)
             hidden.append(shows_robot)
@@ -176,7 +183,7 @@ class Rectifier:
         view = replace(calibration, cameras=tuple(calibration.cameras[number] for number in numbers))
         focal_px = float(np.mean([camera.focal_px.mean() for camera in view.cameras]))
         is_alike = 1 / _MAX_ZOOM < focal_px / self.camera.focal_px < _MAX_ZOOM
-        return Rectifier(view, pinhole=self.camera if is_alike else None, first_camera=numbers[0])
+        return Rectifier(view, pinhole=self.camera if is_alike else None, numbers=numbers)
 
     @property
     def mounted(self) -> tuple[MountedCamera, ...]:
@@ -228,11 +235,11 @@ def _rectifying_rotation(
     cam0_from_cam1 = se3_inverse(left.body_from_cam) @ right.body_from_cam
     baseline_cam0 = cam0_from_cam1[:3, 3]
     baseline_m = float(np.linalg.norm(baseline_cam0))
-    if baseline_m < 1e-3:
+    if baseline_m < LEAST_BASELINE_M:
         raise CalibrationError(
             f"cam{numbers[0]} and cam{numbers[1]} are {baseline_m * 1000:.3f} mm apart; stereo needs a baseline, check body_from_cam"
         )
-    if baseline_cam0[0] < 0.7 * baseline_m:
+    if baseline_cam0[0] < SIDEWAYS * baseline_m:
         raise CalibrationError(
             f"cam{numbers[1]} lies at {np.round(baseline_cam0, 4).tolist()} m in cam{numbers[0]}'s axes, not to its right; "
             "are left and right swapped?"

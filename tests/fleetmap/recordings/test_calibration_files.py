@@ -12,7 +12,8 @@ from fleetmap.errors import CalibrationError
 from fleetmap.geometry import se3, se3_exp
 from fleetmap.recordings import format_calibration, read_calibration
 from fleetmap.recordings.calibration_files import load_calibration, parse_calibration, read_euroc_camera
-from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, stereo_baseline_m
+from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration
+from fleetmap.sensors.rectification import Rectifier
 from support.recordings.realdata import real_data
 from support.recordings.recording_samples import calibration, kalibr_text
 
@@ -251,7 +252,7 @@ def test_the_chains_of_open_vins(tmp_path: Path) -> None:
     """T_imu_cam is the other direction than Kalibr's T_cam_imu; the IMU's noise is in a second file."""
     found = read_calibration(open_vins(tmp_path))
     np.testing.assert_allclose(found.cameras[0].body_from_cam, MOUNTED, atol=1e-12)
-    assert stereo_baseline_m(found) == pytest.approx(0.11)
+    assert Rectifier(found).camera.baseline_m == pytest.approx(0.11)
     assert found.imu is not None
     assert found.imu.gyro_noise_radps_rthz == pytest.approx(1.7e-4)
 
@@ -330,4 +331,4 @@ def test_a_file_that_opencv_writes(tmp_path: Path) -> None:
     found = read_calibration(file)
     assert [len(camera.distortion) for camera in found.cameras] == [5, 5]
     np.testing.assert_allclose(found.cameras[0].body_from_cam, MOUNTED, atol=1e-9)
-    assert stereo_baseline_m(found) == pytest.approx(0.1)
+    assert Rectifier(found).camera.baseline_m == pytest.approx(0.1)

@@ -1,9 +1,11 @@
 """Recordings of rigs with several views: every format that has them gives the images of all cameras."""
 
 import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -14,9 +16,12 @@ from fleetmap.recordings.images import StoredImage, decode_frame, store_frame
 from fleetmap.recordings.mcap import writer
 from fleetmap.recordings.mcap.writer import McapRecordingWriter, copy_to_mcap
 from fleetmap.recordings.ros2 import messages
+from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
-from support.recordings.recording_samples import make_sample, write_euroc
+from fleetmap.sources.ros2 import RigFrames
+from support.recordings.mcap_samples import Message, write_foreign
+from support.recordings.recording_samples import START_NS, make_sample, write_euroc
 from support.recordings.rig_samples import images_of, simulated, write_kitti_raw, write_rig
 
 
@@ -26,8 +31,11 @@ def written(file: Path, rig: str, frames: tuple[CameraFrame, ...] | None = None)
 
 
 def shows_the_same(one: CameraFrame, other: CameraFrame) -> bool:
-    pairs = zip(images_of(one), images_of(other), strict=True)
-    return one.stamp_ns == other.stamp_ns and all(np.array_equal(a, b) for a, b in pairs)
+    return one.stamp_ns == other.stamp_ns and has_the_images(one, other)
+
+
+def has_the_images(one: CameraFrame, other: CameraFrame) -> bool:
+    return all(np.array_equal(a, b) for a, b in zip(images_of(one), images_of(other), strict=True))
 
 
 @pytest.mark.parametrize(("rig", "views"), [("front-rear", ((0, 1), (2, 3))), ("front-sides", ((0, 1), (2,), (3,)))])
@@ -191,3 +199,125 @@ def test_a_rig_is_described_by_camera_info_and_transforms(
         assert other is not None and recorded is not None and recorded.right is not None
         assert np.array_equal(other.left, recorded.right if lacks[:1] == ("cam2",) else recorded.left)
         assert any(issue in each.detail for each in recording.issues) if issue else not recording.issues
+
+
+INTERLEAVED = [0, 2, 1, 3]  # front left, rear left, front right, rear right
+
+
+def numbered_otherwise(rig: str, numbers: Sequence[int]) -> tuple[RigCalibration, tuple[CameraFrame, ...]]:
+    calibration, frames = simulated(rig)
+    return replace(calibration, cameras=tuple(calibration.cameras[number] for number in numbers)), frames
+
+
+def write_topics(
+    file: Path, topics: Sequence[str], frames: Sequence[CameraFrame], silent: Mapping[int, tuple[float, float]]
+) -> Path:
+    """The images of each camera on its topic at 10 Hz for 3 s as PNG files, without those of `silent` (seconds) by camera."""
+    recorded: list[Message] = []
+    for moment in range(30):
+        stamp_ns = START_NS + moment * 100_000_000
+        for number, (topic, image) in enumerate(zip(topics, images_of(frames[moment % 4]), strict=True)):
+            first_s, last_s = silent.get(number, (9.0, 9.0))
+            if not first_s <= 0.1 * moment < last_s:
+                png = StoredImage("file", cv2.imencode(".png", image)[1].tobytes(), form="png")
+                data = messages.encode_compressed_image(stamp_ns, "camera", png, "png")
+                recorded.append((topic, "sensor_msgs/CompressedImage", stamp_ns, data))
+    return write_foreign(file, recorded)
+
+
+@pytest.mark.parametrize(
+    ("rostopic", "recorded"),
+    [
+        ("/rig/cam_{}", "/rig/cam_{}/compressed"),
+        ("/rig/cam_{}", "/rig/cam_{}/image_raw/compressed"),
+        ("/rig/cam_{}/image_raw", "/rig/cam_{}/image_raw/compressed"),
+        ("/rig/cam_{}/compressed", "/rig/cam_{}/compressed"),
+    ],
+)
+def test_pairs_are_found_by_their_mounting_and_topics_by_their_transport(
+    tmp_path: Path, rostopic: str, recorded: str
+) -> None:
+    """A calibration that numbers front left, rear left, front right, rear right is a front and a rear pair."""
+    calibration, frames = numbered_otherwise("front-rear", INTERLEAVED)
+    text = format_calibration(calibration)
+    for number in range(4):
+        text = text.replace(f"cam{number}:\n", f"cam{number}:\n  rostopic: {rostopic.format(number)}\n")
+    (tmp_path / "camchain.yaml").write_text(text)
+    topics = [recorded.format(INTERLEAVED.index(number)) for number in range(4)]
+    file = write_topics(tmp_path / "a.mcap", topics, frames, {})
+    with open_recording(file, OpenOptions(calibration_file=tmp_path / "camchain.yaml")) as recording:
+        assert recording.calibration.views == ((0, 1), (2, 3)) and recording.sensor_set is SensorSet.STEREO
+        mounted = Rectifier(recording.calibration).mounted
+        assert [camera.baseline_m for camera, _ in mounted] == pytest.approx([0.12, 0.12])
+        assert has_the_images(recording.read_frame(2), frames[2])
+        (issue,) = recording.issues
+        assert f"cam1 is cam2 ({topics[1]})" in issue.detail
+        copy_to_mcap(recording, tmp_path / "b.mcap")
+    with open_recording(tmp_path / "b.mcap") as copy:
+        assert not copy.issues and has_the_images(copy.read_frame(2), frames[2])
+
+
+def test_a_robot_and_its_recordings_pair_by_mounting(tmp_path: Path) -> None:
+    calibration, frames = numbered_otherwise("front-rear", INTERLEAVED)
+    assert calibration.views == ((0, 2), (1, 3))
+    live, complete = RigFrames(calibration), []
+    for frame in frames:
+        stored = store_frame(frame)
+        (rear,) = stored.others
+        assert rear is not None
+        for number, image in ((1, rear.left), (3, rear.right), (0, stored.left), (2, stored.right)):
+            assert image is not None
+            complete += live.add(number, frame.stamp_ns, image)
+    with open_recording(write_rig(tmp_path / "a.mcap", calibration, map(decode_frame, complete))) as recording:
+        assert recording.calibration.views == ((0, 1), (2, 3)) and len(recording) == 4
+        assert all(shows_the_same(recording.read_frame(k), frame) for k, frame in enumerate(frames))
+
+
+@pytest.mark.parametrize(
+    ("places_m", "views"),
+    [
+        ([(0, 0), (0, 0.1), (0.1, 0)], ((0, 2), (1,))),  # one above the pair
+        ([(0, 0), (0.1, 0), (0.2, 0), (0.3, 0)], ((0, 1), (2, 3))),
+        ([(0, 0), (0, 0)], ((0, 1),)),  # refused by rectification
+    ],
+)
+def test_cameras_that_look_the_same_way(
+    places_m: list[tuple[float, float]], views: tuple[tuple[int, ...], ...]
+) -> None:
+    camera = simulated("front-rear")[0].cameras[0]
+    cameras = [
+        replace(camera, body_from_cam=camera.body_from_cam @ se3(np.eye(3), np.array([*place, 0.0])))
+        for place in places_m
+    ]
+    rig = RigCalibration(tuple(cameras))
+    assert rig.views == views
+    if len(set(places_m)) == 1:
+        with pytest.raises(CalibrationError, match=r"cam0 and cam1 are 0\.000 mm apart"):
+            Rectifier(rig)
+
+
+@pytest.mark.parametrize("rig", ["front-rear", "interleaved"])
+@pytest.mark.parametrize(
+    ("camera", "silent_s"),
+    [(1, (1.0, 9.0)), (0, (1.0, 9.0)), (0, (0.0, 2.0)), (1, (1.0, 2.2)), (3, (1.0, 9.0))],
+    ids=["right dies", "left dies", "left starts late", "right pauses", "rear dies"],
+)
+def test_a_camera_that_is_silent_costs_its_view(
+    tmp_path: Path, rig: str, camera: int, silent_s: tuple[float, float]
+) -> None:
+    """Frames are those of a pair that sees all the time; the other one is missing while one of its cameras is silent."""
+    numbers = INTERLEAVED if rig == "interleaved" else range(4)
+    calibration, frames = numbered_otherwise("front-rear", numbers)
+    (tmp_path / "camchain.yaml").write_text(format_calibration(calibration))
+    topics = [f"/cam{list(numbers).index(number)}/image_raw/compressed" for number in range(4)]
+    file = write_topics(tmp_path / "a.mcap", topics, frames, {camera: silent_s})
+    with open_recording(file, OpenOptions(calibration_file=tmp_path / "camchain.yaml")) as recording:
+        assert len(recording) == 30
+        seen = [
+            [image is not None for image in (f.left, f.right, *f.others)] for f in map(recording.read_frame, range(30))
+        ]
+        assert seen == [[True, True, not silent_s[0] <= 0.1 * k < silent_s[1]] for k in range(30)]
+        leads = images_of(frames[0])[0 if camera == 3 else 2]
+        assert np.array_equal(recording.read_frame(0).left, leads)
+        (said,) = [issue.detail for issue in recording.issues if issue.what == "camera silent"]
+        assert topics[camera] in said

@@ -7,9 +7,16 @@ from typing import NamedTuple
 import numpy as np
 
 from fleetmap.errors import CalibrationError
-from fleetmap.geometry import Array, se3, se3_inverse
+from fleetmap.geometry import Array, se3, se3_inverse, so3_log
 from fleetmap.recordings.ros2.messages import CameraInfo, FrameLink
-from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
+from fleetmap.sensors.calibration import (
+    LEAST_BASELINE_M,
+    SAME_WAY_COSINE,
+    CameraCalibration,
+    ImuNoise,
+    RigCalibration,
+    check_camera,
+)
 from fleetmap.sensors.cameras import lens_of
 
 _UPRIGHT = 0.9  # the cosine of 26 degrees
@@ -75,31 +82,26 @@ def info_of_images(info: CameraInfo, size_px: tuple[int, int], where: str) -> Ca
 
 
 def calibration_of_messages(
-    cameras: Sequence[InfoCamera], links: Sequence[FrameLink], imu_frame: str | None, where: str
+    cameras: Sequence[InfoCamera],
+    cam0_from_cams: Sequence[Array | None],
+    links: Sequence[FrameLink],
+    imu_frame: str | None,
+    where: str,
 ) -> RigCalibration:
-    """Build the calibration from CameraInfo (left first, further ones as `mounted` gives them) and transforms between frames.
+    """Build the calibration from CameraInfo, the poses of `camera_poses`, and transforms; cameras without a pose are left out.
 
-    The body is `imu_frame` if transforms connect it to every camera (the IMU's noise is then the default),
-    else the left camera; the right camera's pose then comes from the transforms or from the baseline in its
-    projection matrix.
+    The body is `imu_frame` if transforms connect it to the first camera (the IMU's noise is then the default), else that camera.
     """
-    lenses = [_lens(camera, where) for camera in cameras]
-    found = [_target_from_source(links, imu_frame, camera.frame) if imu_frame else None for camera in cameras[:2]]
-    body_from_cams = [body_from_cam for body_from_cam in found if body_from_cam is not None]
-    has_imu = len(body_from_cams) == len(cameras[:2])
-    if not has_imu:
-        body_from_cams = [np.eye(4)] + [_left_from_right(cameras, links, where) for _ in cameras[1:2]]
-    for number in range(2, len(cameras)):
-        before, camera = cameras[number - 1 : number + 1]
-        if camera.frame == before.frame:
-            body_from_cams.append(body_from_cams[-1] @ _left_from_right((before, camera), links, where))
-        else:
-            cam0_from_cam = _target_from_source(links, cameras[0].frame, camera.frame)
-            assert cam0_from_cam is not None, "as `mounted` says"
-            body_from_cams.append(body_from_cams[0] @ cam0_from_cam)
+    body_from_cam0 = _target_from_source(links, imu_frame, cameras[0].frame) if imu_frame else None
+    has_imu = body_from_cam0 is not None
+    body_from_first = np.eye(4) if body_from_cam0 is None else body_from_cam0
     placed = [
-        check_camera(replace(lens, body_from_cam=body_from_cam), f"{where}: {camera.info.frame_id}")
-        for lens, body_from_cam, camera in zip(lenses, body_from_cams, cameras, strict=True)
+        check_camera(
+            replace(_lens(camera, where), body_from_cam=body_from_first @ cam0_from_cam),
+            f"{where}: {camera.info.frame_id}",
+        )
+        for camera, cam0_from_cam in zip(cameras, cam0_from_cams, strict=True)
+        if cam0_from_cam is not None
     ]
     body_frame = imu_frame if has_imu and imu_frame else cameras[0].frame
     bases = (_target_from_source(links, name, body_frame) for name in _BASE_FRAMES)
@@ -109,17 +111,43 @@ def calibration_of_messages(
     return RigCalibration(tuple(placed), ImuNoise() if has_imu else None, base, assumed)
 
 
-def mounted(cameras: Sequence[InfoCamera], links: Sequence[FrameLink]) -> list[int]:
-    """Numbers of the cameras whose pose is known: the first two, whatever they lack; further ones that transforms connect to the first, and
-    those behind such a one in its frame, with a baseline in the projection."""
-    numbers = list(range(len(cameras[:2])))
-    for number in range(2, len(cameras)):
-        before, camera = cameras[number - 1 : number + 1]
-        is_beside = camera.frame == before.frame and number - 1 in numbers[2:] and camera.info.projection[0, 3] < 0
-        is_linked = camera.frame not in (cameras[0].frame, before.frame)
-        if is_beside or (is_linked and _target_from_source(links, cameras[0].frame, camera.frame) is not None):
-            numbers.append(number)
-    return numbers
+def camera_poses(cameras: Sequence[InfoCamera], links: Sequence[FrameLink], where: str) -> list[Array | None]:
+    """cam0_from_cam (4, 4) of every camera: by transforms, or in the frame of an earlier camera by the baseline in the projection.
+
+    None for an unknown one, CalibrationError for that of the second camera.
+    """
+    frames, cam0_from_cams = [camera.frame for camera in cameras], list[Array | None]([np.eye(4)])
+    for number, camera in list(enumerate(cameras))[1:]:
+        first = frames.index(camera.frame)
+        cam0_from_left = cam0_from_cams[first % number]  # of camera 0 for the second camera, whatever its frame
+        if cam0_from_left is not None and (number == 1 or (first < number and camera.info.projection[0, 3] < 0)):
+            cam0_from_cams.append(cam0_from_left @ _left_from_right((cameras[first % number], camera), links, where))
+        else:
+            cam0_from_cams.append(_target_from_source(links, frames[0], frames[number]) if first == number else None)
+    return cam0_from_cams
+
+
+def last_links(links: Sequence[FrameLink]) -> tuple[list[FrameLink], list[str]]:
+    """The last usable transform of each child frame, as tf2 keeps it, and those that cannot be used; also words on children with several
+    values."""
+    sound = [link for link in links if link.is_usable and link.parent != link.child]
+    last = {link.child: link for link in sound}
+    others = {link.child: link for link in sound if not _is_same(link, last[link.child])}
+    words = [
+        f"{_in_words(link)}, and later {_in_words(last[link.child])}; the last one is used, as tf2 does"
+        for link in others.values()
+    ]
+    return [*(link for link in links if not link.is_usable), *last.values()], words
+
+
+def _is_same(link: FrameLink, other: FrameLink) -> bool:
+    """True if both say the same, to the rounding of drivers."""
+    return link.parent == other.parent and np.allclose(link.parent_from_child, other.parent_from_child, atol=1e-6)
+
+
+def _in_words(link: FrameLink) -> str:
+    place_m, turn_deg = link.parent_from_child[:3, 3], np.degrees(so3_log(link.parent_from_child[:3, :3]))
+    return f"{link.parent} -> {link.child} at {place_m.round(4).tolist()} m, turned by {turn_deg.round(2).tolist()} degrees"
 
 
 def frames_not_optical(cameras: Sequence[InfoCamera], links: Sequence[FrameLink]) -> list[str]:
@@ -148,20 +176,22 @@ def _lens(camera: InfoCamera, where: str) -> CameraCalibration:
 def _left_from_right(cameras: Sequence[InfoCamera], links: Sequence[FrameLink], where: str) -> Array:
     """(4, 4) cam0_from_cam1 by the transforms, else by the right camera's projection.
 
-    There, K, R and P are those of ROS's stereo calibration: P[0, 3] = -fx * baseline.
+    There, K, R and P are those of ROS's stereo calibration: P[0, 3] = -fx * baseline. Drivers without a calibration send transforms of
+    length 0, which are right only for cameras that look different ways.
     """
     left, right = cameras[0].info, cameras[1].info
-    if left.frame_id != right.frame_id:
-        cam0_from_cam1 = _target_from_source(links, cameras[0].frame, cameras[1].frame)
-        if cam0_from_cam1 is not None:
-            return cam0_from_cam1
+    cam0_from_cam1 = _target_from_source(links, cameras[0].frame, cameras[1].frame)
+    if cam0_from_cam1 is not None and np.linalg.norm(cam0_from_cam1[:3, 3]) > LEAST_BASELINE_M:
+        return cam0_from_cam1
     fx = right.projection[0, 0]
     baseline_m = -right.projection[0, 3] / fx if fx else 0.0
-    if baseline_m <= 0:
+    if baseline_m <= LEAST_BASELINE_M:
+        if cam0_from_cam1 is not None and cam0_from_cam1[2, 2] < SAME_WAY_COSINE:
+            return cam0_from_cam1
         issues = "".join(f", {link.issue}" for link in links if link.issue)
         raise CalibrationError(
             f"{where}: the pose of the right camera is unknown (no transform from {left.frame_id} to "
-            f"{right.frame_id}, no baseline in its projection {right.projection[0].tolist()}{issues}); pass a calibration "
+            f"{right.frame_id} with a length, no baseline in its projection {right.projection[0].tolist()}{issues}); pass a calibration "
             "with --calibration FILE"
         )
     rect_from_rect = se3(np.eye(3), np.array([baseline_m, 0.0, 0.0]))

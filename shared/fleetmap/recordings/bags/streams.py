@@ -17,9 +17,10 @@ from fleetmap.geometry import Array
 from fleetmap.recordings.bags.calibration import (
     InfoCamera,
     calibration_of_messages,
+    camera_poses,
     frames_not_optical,
     info_of_images,
-    mounted,
+    last_links,
     same_lens,
     setting_of,
 )
@@ -31,22 +32,22 @@ from fleetmap.recordings.bags.topics import (
     KNOWN_TYPES,
     choose_topics,
     info_topics,
+    transports,
     video_issues,
 )
 from fleetmap.recordings.calibration_files import CalibrationFile, parse_calibration
 from fleetmap.recordings.files import hash_file
-from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
-from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, ViewSeries, pair_images
+from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize, image_parts
+from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, ViewSeries, pair_images, rig_images
 from fleetmap.recordings.images import StoredImage, check_image
 from fleetmap.recordings.ordering import (
     DEPTH_TOLERANCE_NS,
     ReadLog,
-    arrival_order,
+    as_logged,
     clean_imu,
     trajectory_of_rows,
     usual_size,
     values_forward,
-    with_log_times,
 )
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.recordings.ros2.messages import CameraInfo
@@ -218,9 +219,8 @@ def _parts(
     left = _images(roles["left"], "left images", log, lenses.get("left"))
     right = _images(roles["right"], "right images", log, lenses.get("right")) if "right" in roles else None
     depth = _images(roles["depth"], "depth images", log) if "depth" in roles else None
-    alone = {0: left} if right is None else {0: left, 1: right}
     if right is not None:
-        (left, right), depth = pair_images(left, right, log), None
+        depth = None
     elif depth is not None:
         left, depth = pair_images(left, depth, log, DEPTH_TOLERANCE_NS)
     described: tuple[str, ...] = CAMERA_ROLES
@@ -228,25 +228,27 @@ def _parts(
         calibration = given.calibration
     else:
         calibration, described = _calibration(container, roles, lenses, imu_frame, log)
-    numbers, views = list[int](), tuple[ViewSeries[_Source], ...]()
+    views = tuple[ViewSeries[_Source], ...]()
     if depth is None and len(calibration.cameras) > 1:
-        for number, role in list(enumerate(described))[len(alone) : len(calibration.cameras)]:
-            if role in roles:
-                alone[number] = _images(roles[role], f"{role} images", log, lenses.get(role))
+        read = {"left": left, "right": right}
+        cameras = {
+            n: (
+                f"{role} ({roles[role][0].channel.topic})",
+                read.get(role) or _images(roles[role], f"{role} images", log, lenses.get(role)),
+            )
+            for n, role in enumerate(described[: len(calibration.cameras)])
+            if role in roles
+        }
         if not given and CALIBRATION_ATTACHMENT not in container.attachments:
             calibration = _marked(calibration, [f"{role}_depth" in roles for role in described])
-        first, *further = _views_of(calibration, list(alone))
-        if len(first) == 1:
-            left, right = alone[0], None
         depths = {
             n: _images(roles[f"{described[n]}_depth"], f"depth images of cam{n}", log)
-            for (n, *_) in further
+            for n in cameras
             if calibration.cameras[n].has_depth and f"{described[n]}_depth" in roles
         }
-        views = tuple(
-            ViewSeries.beside(left.stamps_ns, [alone[n] for n in view], log, depths.get(view[0])) for view in further
-        )
-        numbers = [number for view in further for number in view]
+        calibration, (left, right, _), views = rig_images(calibration, cameras, log, depths)
+    elif right is not None:
+        left, right = pair_images(left, right, log)
     if depth is not None:
         beside = [role for role in CAMERA_ROLES[2:] if role in roles]
         if beside:
@@ -262,16 +264,10 @@ def _parts(
         if stream.damaged and not stream.is_of_images:
             what = f"{stream.channel.topic}: damaged messages"
             log.note(what, f"{stream.damaged} left out, {len(stream.messages)} were found")
-    return RecordingParts(
-        path=container.path,
+    frames = SeriesFrames(MessageReader(opener, container, log.files), left, right, depth, others=views)
+    return replace(
+        image_parts(container.path, "", calibration, frames),
         name=container.name,
-        format="",
-        calibration=calibration,
-        frame_stamps_ns=left.stamps_ns,
-        frames=SeriesFrames(MessageReader(opener, container, log.files), left, right, depth, others=views),
-        others=tuple(numbers),
-        has_right=right is not None,
-        has_depth=depth is not None,
         imu=imu,
         wheel=wheel,
         priors=priors,
@@ -282,13 +278,6 @@ def _parts(
 def _marked(calibration: RigCalibration, has_depth: Sequence[bool]) -> RigCalibration:
     cameras = zip(calibration.cameras, has_depth, strict=False)
     return replace(calibration, cameras=tuple(replace(camera, has_depth=mark) for camera, mark in cameras))
-
-
-def _views_of(calibration: RigCalibration, present: list[int]) -> list[tuple[int, ...]]:
-    """Numbers of the cameras of each view, of those with images."""
-    described = [number for number in present if number < len(calibration.cameras)]
-    recorded = replace(calibration, cameras=tuple(calibration.cameras[number] for number in described))
-    return [tuple(described[k] for k in view) for view in recorded.views]
 
 
 def _collect(container: Container, topics: Topics, log: ReadLog) -> tuple[list[_Stream], list[Channel]]:
@@ -365,8 +354,10 @@ def _with_hints(topics: Topics, given: CalibrationFile | None, present: set[str]
     changes = {}
     for role, key in (*((role, f"cam{number}") for number, role in enumerate(CAMERA_ROLES)), ("imu", "imu0")):
         hint = given.topics.get(key, "") if given else ""
-        if hint in present and getattr(topics, role) == getattr(Topics(), role):
-            changes[role] = hint
+        bases = [hint, hint.removesuffix("/compressed"), f"{hint}/image_raw"] if hint else []
+        named = next((base for base in bases if present.intersection(transports(base, role))), None)
+        if named and getattr(topics, role) == getattr(Topics(), role):
+            changes[role] = named
     return msgspec.structs.replace(topics, **changes)
 
 
@@ -412,12 +403,11 @@ def _images(streams: Sequence[_Stream], what: str, log: ReadLog, lenses: _Lenses
             raise RecordingError(f"{why} (none of {damaged} {what} can be read)")
         log.note(f"{what} left out", f"{damaged} of {damaged + len(stamps_ns)}; the first: {why}")
     sources = tuple((stream.decoder, place) for stream in streams for place in stream.places)
-    images = ImageSeries(with_log_times(stamps_ns, log_times_ns, what, log), sources)
-    order = arrival_order(images.stamps_ns, log_times_ns)
+    stamps_ns, order = as_logged(stamps_ns, log_times_ns, what, log)
     kept = usual_size([size for stream in streams for size in stream.sizes_px], what, log)
     if lenses is not None:
         kept &= _of_usual_lens(lenses, what, log)
-    return images.take(order[kept[order]]).forward(what, log)
+    return ImageSeries(stamps_ns, sources).take(order[kept[order]]).forward(what, log)
 
 
 def _of_usual_lens(lenses: _Lenses, what: str, log: ReadLog) -> NDArray[np.bool_]:
@@ -436,10 +426,8 @@ def _of_usual_lens(lenses: _Lenses, what: str, log: ReadLog) -> NDArray[np.bool_
 def _samples(samples: Sequence[tuple[int, Sample]], what: str, log: ReadLog) -> tuple[Sample, ...]:
     """The samples, with their log times, whose stamps increase as they arrived."""
     stamps_ns = np.array([sample.stamp_ns for _, sample in samples], np.int64)
-    log_times_ns = np.array([at for at, _ in samples], np.int64)
-    stamps_ns = with_log_times(stamps_ns, log_times_ns, what, log)
-    order = arrival_order(stamps_ns, log_times_ns).tolist()
-    stamped = [replace(samples[k][1], stamp_ns=int(stamps_ns[k])) for k in order]
+    stamps_ns, order = as_logged(stamps_ns, np.array([at for at, _ in samples], np.int64), what, log)
+    stamped = [replace(samples[k][1], stamp_ns=int(stamps_ns[k])) for k in order.tolist()]
     return values_forward(stamped, [sample.stamp_ns for sample in stamped], what, log)
 
 
@@ -458,9 +446,7 @@ def _imu(streams: Sequence[_Stream], log: ReadLog) -> tuple[ImuSamples, str | No
     if not parts:
         return ImuSamples.empty(), None
     stamps_ns, gyro, accel = (np.concatenate([part[i] for part in parts]) for i in range(3))
-    logged_ns = np.array(log_times_ns, np.int64)
-    stamps_ns = with_log_times(stamps_ns.astype(np.int64), logged_ns, "imu", log)
-    order = arrival_order(stamps_ns, logged_ns)
+    stamps_ns, order = as_logged(stamps_ns.astype(np.int64), np.array(log_times_ns, np.int64), "imu", log)
     return clean_imu(stamps_ns[order], gyro[order], accel[order], log), parts[0][3]
 
 
@@ -471,8 +457,7 @@ def _ground_truth(streams: Sequence[_Stream], log: ReadLog) -> Trajectory | None
     stamps_ns = np.array([stamp_ns for _, (stamp_ns, _) in values], np.int64)
     log_times_ns = np.array([at for at, _ in values], np.int64)
     rows = np.stack([row for _, (_, row) in values])
-    stamps_ns = with_log_times(stamps_ns, log_times_ns, "ground truth", log)
-    order = arrival_order(stamps_ns, log_times_ns)
+    stamps_ns, order = as_logged(stamps_ns, log_times_ns, "ground truth", log)
     return trajectory_of_rows(stamps_ns[order], rows[order], log)
 
 
@@ -520,15 +505,21 @@ def _calibration(
             setting = f"{setting_of(info)}, of images of just that size; the calibration is used as it is"
             log.note("binning or roi not used", f"the CameraInfo beside {image_topic} says {setting}")
         cameras.append(InfoCamera(info, bool(_RECTIFIED.search(image_topic.lower()))))
-    streams = roles.get("tf_static", ())
-    links = [link for stream in streams for _, found in stream.values(stream.decoder.links) for link in found]
+    said = [value for stream in roles.get("tf_static", ()) for value in stream.values(stream.decoder.links)]
+    said.sort(key=lambda value: value[0])
+    links, changes = last_links([link for _, found in said for link in found])
+    for words in changes:
+        log.note("transform said twice", words)
     for issue in dict.fromkeys(link.issue for link in links if link.issue):
         log.note("transform not sound", issue)
-    numbers = mounted(cameras, links)
-    for number in sorted({*range(len(cameras))} - {*numbers}):
-        what = f"no transform connects {cameras[number].frame} to {cameras[0].frame}"
-        log.note("camera not mounted", f"{sides[number]}: {what}; its images are not used")
-    cameras, sides = [cameras[number] for number in numbers], tuple(sides[number] for number in numbers)
+    cam0_from_cams = camera_poses(cameras, links, str(container.path))
+    for camera, side, cam0_from_cam in zip(cameras, sides, cam0_from_cams, strict=True):
+        if cam0_from_cam is None:
+            what = f"no transform connects {camera.frame} to {cameras[0].frame}"
+            log.note("camera not mounted", f"{side}: {what}; its images are not used")
     for words in frames_not_optical(cameras, links):
         log.note("camera frame not optical", words)
-    return calibration_of_messages(cameras, links, imu_frame, str(container.path)), sides
+    mounted = tuple(
+        side for side, cam0_from_cam in zip(sides, cam0_from_cams, strict=True) if cam0_from_cam is not None
+    )
+    return calibration_of_messages(cameras, cam0_from_cams, links, imu_frame, str(container.path)), mounted

@@ -56,7 +56,7 @@ def open_euroc(path: Path, options: OpenOptions) -> Recording:
             cameras.append(existing_images(stamps_ns, images, folder.name, log))
     calibration, euroc_from_imu = _calibration(root, len(cameras), options, log)
     parts = replace(
-        image_parts(path, "euroc", calibration, rig_frames(root, log, cameras, calibration)),
+        image_parts(path, "euroc", *rig_frames(root, log, cameras, calibration)),
         name=root.resolve().name,
         imu=read_imu(root / "mav0/imu0/data.csv", log),
         ground_truth=_ground_truth(root, euroc_from_imu, log),

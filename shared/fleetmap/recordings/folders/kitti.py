@@ -63,7 +63,7 @@ def open_kitti_raw(path: Path, options: OpenOptions) -> Recording:
             )
         )
         log.files.append(file)
-    return finalize(image_parts(path, "kitti-raw", calibration, rig_frames(path, log, cameras, calibration)), log)
+    return finalize(image_parts(path, "kitti-raw", *rig_frames(path, log, cameras, calibration)), log)
 
 
 def _raw_stamps(file: Path, log: ReadLog) -> Stamps:

@@ -7,7 +7,7 @@ import os
 import re
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.recordings.files import hash_file, read_text, what_instead
-from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, ViewSeries, pair_images
+from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, rig_images
 from fleetmap.recordings.images import StoredImage, file_kind, image_size, is_cut, is_damaged_png
 from fleetmap.recordings.limits import MAX_IMAGE_BYTES
 from fleetmap.recordings.ordering import ReadLog, clean_imu, trajectory_of_rows, usual_size, wrong_unit
@@ -61,19 +61,18 @@ class FileReader:
 
 def rig_frames(
     root: Path, log: ReadLog, cameras: Sequence[ImageFiles], calibration: RigCalibration
-) -> SeriesFrames[Path]:
-    """Frames of all cameras, paired by time (see `pair_images`) and view by view; CalibrationError for more cameras than described."""
+) -> tuple[RigCalibration, SeriesFrames[Path]]:
+    """The calibration in the order of the views, and the frames of all cameras (see `rig_images`); CalibrationError for more cameras than
+    described."""
     described = len(calibration.cameras)
     if described < len(cameras):
         raise CalibrationError(
             f"{root}: {len(cameras)} cameras are recorded, the calibration describes {described}; "
             "pass one that has all with --calibration FILE"
         )
-    recorded = replace(calibration, cameras=calibration.cameras[: len(cameras)])
-    first, *others = ([cameras[number] for number in numbers] for numbers in recorded.views)
-    left, right = (first[0], None) if len(first) == 1 else pair_images(first[0], first[1], log)
-    views = tuple(ViewSeries.beside(left.stamps_ns, each, log) for each in others)
-    return SeriesFrames(FileReader(root, log.files), left, right, others=views)
+    named = {number: (f"camera {number}", series) for number, series in enumerate(cameras)}
+    ordered, (left, right, _), others = rig_images(calibration, named, log)
+    return ordered, SeriesFrames(FileReader(root, log.files), left, right, others=others)
 
 
 def read_image(path: Path) -> StoredImage:

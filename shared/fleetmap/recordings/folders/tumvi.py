@@ -42,7 +42,7 @@ def open_tumvi(path: Path, options: OpenOptions) -> Recording:
         log.files += calibration_files(camchain)
         given = load_calibration(camchain)
     parts = replace(
-        image_parts(path, "tumvi", given.calibration, rig_frames(path, log, cameras, given.calibration)),
+        image_parts(path, "tumvi", *rig_frames(path, log, cameras, given.calibration)),
         imu=read_imu(path / "imu.txt", log),
         ground_truth=read_ground_truth(path / "gt_imu.csv", log),
     )

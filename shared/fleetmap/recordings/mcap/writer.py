@@ -87,24 +87,19 @@ class McapRecordingWriter:
         Images that are JPEG or PNG already as CompressedImage, all others as Image.
         """
         stored = frame if isinstance(frame, StoredFrame) else store_frame(frame)
-        topics, stamp_ns = self._topics, stored.stamp_ns
-        self._write_image(topics.left, stamp_ns, "cam0", stored.left)
-        self._write_camera_info(topics.left_info, stamp_ns, 0)
-        if stored.right is not None:
-            self._write_image(topics.right, stamp_ns, "cam1", stored.right)
-            self._write_camera_info(topics.right_info, stamp_ns, 1)
-        if stored.depth is not None:
-            self._write_image(topics.depth, stamp_ns, "cam0", stored.depth, is_depth=True)
-        for numbers, view in zip(self._calibration.views[1:], stored.others, strict=False):
+        topics = self._topics
+        infos = {0: topics.left_info, 1: topics.right_info}
+        for numbers, view in zip(self._calibration.views, (stored, *stored.others), strict=False):
             if view is None:
                 continue
             for number, image in zip(numbers, (view.left, view.right), strict=False):
                 if image is not None:
                     topic = topics.camera(number)
                     self._write_image(topic, view.stamp_ns, f"cam{number}", image)
-                    self._write_camera_info(f"{topic.rpartition('/')[0]}/camera_info", view.stamp_ns, number)
+                    info = infos.get(number, f"{topic.rpartition('/')[0]}/camera_info")
+                    self._write_camera_info(info, view.stamp_ns, number)
             if view.depth is not None:
-                topic = topics.depth_of(numbers[0])
+                topic = topics.depth_of(numbers[0]) if numbers[0] else topics.depth
                 self._write_image(topic, view.stamp_ns, f"cam{numbers[0]}", view.depth, is_depth=True)
 
     def write_imu(self, samples: ImuSamples) -> None:
