@@ -5,7 +5,7 @@ baselines (depths), a robot at 2 m/s (clocks). Beyond the second limit the file 
 errors outside the adjustment: remaining lens distortion, bias of sub-pixel matching, a gyro's scale.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -122,9 +122,11 @@ def findings_of(estimate: CalibrationEstimate, focal_px: float) -> list[Finding]
     return [_finding(p, estimate, focal_px) for p in estimate.parameters]
 
 
-def corrected(rig: RigCalibration, measured: MeasuredCalibration) -> tuple[RigCalibration, dict[str, float]]:
-    """Return `rig` with its wrong parameters corrected, given the others; the corrections by parameter, in its unit."""
-    wrong = measured.wrong()
+def corrected(
+    rig: RigCalibration, measured: MeasuredCalibration, held: Container[str] = ()
+) -> tuple[RigCalibration, dict[str, float]]:
+    """Return `rig` with its wrong parameters but those `held` corrected, given the others; the corrections by parameter, in its unit."""
+    wrong = [p for p in measured.wrong() if p.value not in held]
     if measured.estimate is None or not wrong:
         return rig, {}
     chosen = tuple(replace(p, is_judged=p.name in wrong) for p in measured.estimate.parameters)

@@ -14,6 +14,7 @@ from mapserver.doctor.sensors import NO_IMU
 OFFSET, SCALE, AXES = "camera-imu time offset", "gyro scale", "gyro axes"
 _MIN_PAIRS = 20
 _SEARCH_S, _STEP_S = 0.2, 0.002
+SAME_OFFSET_S = 0.006  # beyond, two offsets differ: a warning
 _LEAST_RATE_RADPS = 0.05
 _SURE_CORRELATION = 0.9
 _AS_WELL = 0.01  # of the turning: a tenth of it, as an angle
@@ -42,15 +43,22 @@ class GyroFit:
         """True if the two clocks drift against each other within the run."""
         return len(self.offsets_s) > 1 and float(np.ptp(self.offsets_s)) > _UNSTEADY_S
 
+    @property
+    def is_sure(self) -> bool:
+        """True if images and gyro agree well enough to correct the calibration by the offset."""
+        return self.correlation > _SURE_CORRELATION and not self.is_unsteady
 
-def gyro_check(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> tuple[list[Finding], float | None, bool]:
-    """Return time offset (beyond the calibrated one), scale and axes of the gyro; not judged with too little rotation.
+    @property
+    def is_repeated(self) -> bool:
+        """True if two stretches of the run say the same offset."""
+        return self.is_sure and int((np.abs(self.offsets_s - self.offset_s) <= SAME_OFFSET_S).sum()) > 1
 
-    Also return the offset in seconds if images and gyro agree well enough to correct the calibration by it, and whether it changes.
-    """
+
+def gyro_check(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> tuple[list[Finding], GyroFit | None]:
+    """Return time offset (beyond the calibrated one), scale and axes of the gyro, and the fit; not judged with too little rotation."""
     unknown = _why_not(turns, imu, imu_minus_cam_s)
     if unknown:
-        return [not_judged(name, *unknown) for name in (OFFSET, SCALE, AXES)], None, False
+        return [not_judged(name, *unknown) for name in (OFFSET, SCALE, AXES)], None
     fit = fit_gyro(turns, imu, imu_minus_cam_s)
     if fit.correlation < 0.6:
         words = f"the images' and the gyro's rates hardly agree (correlation {fit.correlation:.2f} at best)"
@@ -61,11 +69,8 @@ def gyro_check(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> t
                 *(not_judged(name, words, "check the gyro's axes first") for name in (OFFSET, SCALE)),
             ],
             None,
-            False,
         )
-    findings = [_offset_finding(fit, imu_minus_cam_s), _scale_finding(fit), _axes_finding(fit)]
-    is_sure = fit.correlation > _SURE_CORRELATION and not fit.is_unsteady
-    return findings, fit.offset_s if is_sure else None, fit.is_unsteady
+    return [_offset_finding(fit, imu_minus_cam_s), _scale_finding(fit), _axes_finding(fit)], fit
 
 
 def turn_upside_down(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float, body_from_cam: Array) -> bool | None:
@@ -197,7 +202,7 @@ def _offset_finding(fit: GyroFit, imu_minus_cam_s: float) -> Finding:
         return Finding(OFFSET, Verdict.FAIL, float(high_ms - low_ms), limit, words)
     words = f"the IMU's stamps are {fit.offset_s * 1e3:+.1f} ms from the calibration"
     advice = f"set timeshift_cam_imu to {imu_minus_cam_s + fit.offset_s:+.4f} s, or stamp both by one clock"
-    return judge(OFFSET, abs(fit.offset_s) * 1e3, Limits(6.0, 25.0, "ms"), words, f"{words}; {advice}")
+    return judge(OFFSET, abs(fit.offset_s) * 1e3, Limits(1e3 * SAME_OFFSET_S, 25.0, "ms"), words, f"{words}; {advice}")
 
 
 def _scale_finding(fit: GyroFit) -> Finding:

@@ -1,7 +1,7 @@
 """Reads the frames for the checks and runs all checks."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from mapserver.doctor.accelerometer_images import accelerometer_axes, fit_accele
 from mapserver.doctor.calibration import MeasuredCalibration, followed_frames, measure_calibration, unknown_calibration
 from mapserver.doctor.camera_motion import CameraTurns, body_motion
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
-from mapserver.doctor.gyro_images import AXES, gyro_check, turn_upside_down
+from mapserver.doctor.gyro_images import AXES, GyroFit, gyro_check, turn_upside_down
 from mapserver.doctor.metres import ImageMetres, WheelFit, fit_wheels, judge_metres
 from mapserver.doctor.stereo import (
     ROTATE_BACK,
@@ -36,14 +36,16 @@ TURN_FRAMES = 200
 
 @dataclass(frozen=True, slots=True)
 class CheckResults:
-    """All findings, in a fixed order, and the time offset of gyro and images beyond the calibration's.
+    """All findings, in a fixed order.
 
-    measured_offset_s is None if unknown or uncertain. calibration: its measurement, empty without a pair.
+    gyro: its fit to the images, None if unknown. calibration: its measurement, empty without a pair. metres: of a metre of the images, with
+    the sigma, by wheels and accelerometer as far as these know it.
     """
 
     findings: list[Finding]
-    measured_offset_s: float | None
+    gyro: GyroFit | None
     calibration: MeasuredCalibration
+    metres: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 class _Frames:
@@ -95,7 +97,7 @@ def run_checks(
 
     rig = rectifier.camera, rectifier.body_from_cam
     turns = CameraTurns.of(executor.map(body_motion, rig, _consecutive(recording, frames, rectifier, turn_frames)))
-    gyro, measured_offset_s, is_unsteady = gyro_check(turns, imu, shift_s)
+    gyro, gyro_fit = gyro_check(turns, imu, shift_s)
     upside_down = turn_upside_down(turns, imu, shift_s, rectifier.body_from_cam)
     if has_pair:
         soon = [swapped_cameras(seen.pairs, upside_down=upside_down) if f.name == SWAPPED else f for f in soon]
@@ -115,7 +117,7 @@ def run_checks(
     findings = [*sensors.stream_checks(recording), *soon, *gyro, axes, wheels, metres]
     before_calibration(findings)
     calibration = MeasuredCalibration([], None)
-    if has_pair and is_unsteady:
+    if has_pair and gyro_fit is not None and gyro_fit.is_unsteady:
         reason = "the stamps of images and IMU drift against each other"
         calibration = unknown_calibration(reason, "stamp both by one clock, each image at its exposure")
     elif has_pair:
@@ -126,7 +128,13 @@ def run_checks(
     findings += [images.flicker_check(recording, frames.read), _readable(frames)]
     if len(imu):
         findings.append(_repeated_images(frames.repeats, min(turn_frames, len(recording))))
-    return CheckResults(findings + sensors.other_issues(recording.issues), measured_offset_s, calibration)
+    known = (
+        {}
+        if seen.wheels is None or not seen.wheels.size
+        else {"the wheels": (seen.wheels.size, seen.wheels.speed_sigma)}
+    )
+    known |= {} if given is None or given.metres <= 0 else {"the accelerometer": (given.metres, given.sigma)}
+    return CheckResults(findings + sensors.other_issues(recording.issues), gyro_fit, calibration, known)
 
 
 def run_cheap_checks(recording: Recording, sampled: int) -> list[Finding]:

@@ -1,24 +1,29 @@
 """Checks before a survey: a recording that could only make a wrong map is refused, a clock offset is corrected."""
 
 import hashlib
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
+
+import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, format_calibration
 from fleetmap.sensors.calibration import RigCalibration
 from mapserver.calibration import CalibrationParameter
+from mapserver.calibration.parameters import RANGES
 from mapserver.calibration.recordings import Follow
 from mapserver.doctor import Finding, Verdict, accelerometer_images, images, run_checks
-from mapserver.doctor.calibration import TOLERANCES, corrected, in_words, measure_calibration
+from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES, corrected, in_words, measure_calibration
 from mapserver.doctor.findings import grouped
+from mapserver.doctor.gyro_images import SAME_OFFSET_S
 from mapserver.doctor.metres import METRES, WHEELS
 from mapserver.doctor.rig import further_findings
-from mapserver.doctor.run_checks import run_cheap_checks
+from mapserver.doctor.run_checks import CheckResults, run_cheap_checks
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.executor import SERIAL, Executor
 
+P = CalibrationParameter
 # Wrong units, axes or cameras: a survey would not fail but give a wrong map. Gaps, blur and damage are tolerated.
 DECISIVE = {"camera-imu overlap", "gravity magnitude", "left and right", "epipolar error", "depth"}
 DECISIVE |= {
@@ -46,13 +51,14 @@ class CheckedRecording:
     """A recording fit to be surveyed.
 
     rig: its calibration, corrected if needed. findings: all findings of the doctor. calibration: those on the calibration that
-    came with the recording. corrections: by parameter, in its unit.
+    came with the recording. corrections: by parameter, in its unit. held: reasons for corrections that were not made.
     """
 
     rig: RigCalibration
     findings: list[Finding]
     calibration: RigEvidence
     corrections: dict[str, float]
+    held: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def leaves_wheels_out(self) -> bool:
@@ -76,7 +82,8 @@ class CheckedRecording:
     def _with_corrections(self, words: Iterable[str]) -> list[str]:
         done = ", ".join(f"{name} by {in_words(name, value)}" for name, value in self.corrections.items())
         said = f"corrected: {done}, as measured; robots that use this calibration file keep its error"
-        return [*words, said] if done else list(words)
+        held = (f"not corrected: {name}: {reason}" for name, reason in self.held.items())
+        return [*words, *held, *([said] if done else [])]
 
 
 def leaves_wheels_out(findings: Sequence[Finding]) -> bool:
@@ -122,17 +129,43 @@ def checked(
     refuse(checks.findings)
     used = replace(recording, wheel=()) if leaves_wheels_out(checks.findings) else recording
     given = fingerprint(recording.calibration)
-    rig, corrections = corrected(recording.calibration, checks.calibration)
+    gyro_s = checks.gyro.offset_s if checks.gyro is not None and checks.gyro.is_sure else None
+    held = _unconfirmed(checks, gyro_s)
+    rig, corrections = corrected(recording.calibration, checks.calibration, held)
     again: list[Finding] = []
     if corrections:
         measured = measure_calibration(replace(used, calibration=rig), on_frame, executor, follow)
         again = [f for f in measured.findings if f.verdict in (Verdict.WARN, Verdict.FAIL)]
-    elif checks.measured_offset_s is not None and abs(checks.measured_offset_s) >= _CORRECTED_FROM_S:
-        corrections = {CalibrationParameter.TIME_OFFSET.value: round(checks.measured_offset_s, 7)}
-        rig = _with_clock(rig, checks.measured_offset_s)
+    elif P.TIME_OFFSET.value not in held and gyro_s is not None and abs(gyro_s) >= _CORRECTED_FROM_S:
+        corrections = {P.TIME_OFFSET.value: round(gyro_s, 7)}
+        rig = _with_clock(rig, gyro_s)
     settled = [f for f in checks.findings if f.name not in corrections or f.verdict is not Verdict.WARN]
     found = rig_evidence(given, [*settled, *(replace(f, sentence=f"after its correction {f.sentence}") for f in again)])
-    return CheckedRecording(rig, checks.findings, found, corrections)
+    return CheckedRecording(rig, checks.findings, found, corrections, held)
+
+
+def _unconfirmed(checks: CheckResults, gyro_s: float | None) -> dict[str, str]:
+    """Return the reasons not to correct parameters that move the metres: something else must say the same. gyro_s: offset by the gyro.
+
+    An offset is measured by the adjustment and by the gyro; where only the gyro knows it, in two stretches. Baseline and focal length
+    must not leave the metres of wheels or accelerometer.
+    """
+    estimate, wrong, held = checks.calibration.estimate, checks.calibration.wrong(), dict[str, str]()
+    clock = None if estimate is None else estimate.get(P.TIME_OFFSET)
+    is_repeated = checks.gyro is not None and checks.gyro.is_repeated
+    is_known = clock is not None and SURE_SIGMAS * clock.sigma < SAME_OFFSET_S
+    if clock is not None and is_known and abs(clock.estimate - (gyro_s or 0.0)) > SAME_OFFSET_S:
+        turns = "nothing sure" if gyro_s is None else f"{1e3 * gyro_s:+.1f} ms"
+        held[P.TIME_OFFSET] = f"{1e3 * clock.estimate:+.1f} ms by the adjustment, {turns} by the gyro's turns"
+    elif not is_known and gyro_s is not None and not (abs(gyro_s) < _CORRECTED_FROM_S or is_repeated):
+        held[P.TIME_OFFSET] = f"{1e3 * gyro_s:+.1f} ms in one stretch of the drive only; drive more turns"
+    moved = [p for p in (P.BASELINE, P.FOCAL) if p in wrong]
+    scale = float(np.prod([1 + estimate.get(p).estimate for p in moved])) if estimate is not None else 1.0
+    for name, (metres, sigma) in checks.metres.items():
+        sigma_all = float(np.hypot(sigma / metres, RANGES[P.WHEEL_SCALE].prior_sigma))
+        if abs(np.log(metres / scale)) > max(SURE_SIGMAS * sigma_all, abs(np.log(metres))):
+            held |= dict.fromkeys(moved, f"a metre of the images is {metres:.3f} m by {name}, not {scale:.3f} m")
+    return {str(parameter): reason for parameter, reason in held.items()}
 
 
 def with_further_views(result: CheckedRecording, recording: Recording) -> CheckedRecording:

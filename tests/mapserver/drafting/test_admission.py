@@ -1,7 +1,9 @@
 """What a build makes of a recording's calibration before it surveys."""
 
 import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from mapserver.calibration.parameters import COLUMNS, RANGES
 from mapserver.doctor import Finding, Verdict, sensors
 from mapserver.doctor.calibration import MeasuredCalibration, findings_of
 from mapserver.doctor.findings import not_judged
+from mapserver.doctor.gyro_images import GyroFit
 from mapserver.doctor.run_checks import CheckResults
 from mapserver.drafting import admission
 from support.recordings.recording_samples import make_sample, write_euroc
@@ -37,10 +40,16 @@ def measured(parameter: P, value: float) -> MeasuredCalibration:
 
 
 def checked(
-    recording: Recording, monkeypatch: pytest.MonkeyPatch, first: MeasuredCalibration, again: MeasuredCalibration
+    recording: Recording,
+    monkeypatch: pytest.MonkeyPatch,
+    first: MeasuredCalibration,
+    again: MeasuredCalibration,
+    gyro: GyroFit | None = None,
+    metres: Mapping[str, tuple[float, float]] = MappingProxyType({}),
 ) -> admission.CheckedRecording:
     """With a doctor who measures `first`, and `again` after a correction."""
-    monkeypatch.setattr(admission, "run_checks", lambda *_, **__: CheckResults(list(first.findings), None, first))
+    checks = CheckResults(list(first.findings), gyro, first, metres)
+    monkeypatch.setattr(admission, "run_checks", lambda *_, **__: checks)
     monkeypatch.setattr(admission, "measure_calibration", lambda *_: again)
     return admission.checked(recording)
 
@@ -59,6 +68,69 @@ def test_a_small_error_is_corrected_and_said(recording: Recording, monkeypatch: 
     assert "corrected: focal length by -1.96 %, as measured" in found.remarks()[-1]
     assert found.calibration.doubted == {}
     assert "metric scale" in found.calibration.judged
+
+
+def gyro_fit(offset_s: float, stretches_s: Sequence[float] = (), correlation: float = 0.97) -> GyroFit:
+    return GyroFit(offset_s, np.eye(3), 1.0, correlation, 3, np.eye(3), np.array(stretches_s))
+
+
+NOTHING, SAME, OTHER = MeasuredCalibration([], None), measured(P.TIME_OFFSET, -0.1038), measured(P.TIME_OFFSET, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("calibration", "gyro", "corrected_s", "says"),
+    [
+        (NOTHING, gyro_fit(-0.1038), None, "-103.8 ms in one stretch of the drive only"),
+        (NOTHING, gyro_fit(-0.1038, [-0.1038]), None, "-103.8 ms in one stretch of the drive only"),
+        (NOTHING, gyro_fit(-0.1038, [-0.105, -0.101]), -0.1038, "corrected: time offset by -103.8 ms"),
+        (NOTHING, gyro_fit(-0.1038, [-0.105, -0.101, -0.04]), None, ""),  # it drifts
+        (OTHER, gyro_fit(-0.1038, [-0.105, -0.101]), None, "+0.0 ms by the adjustment, -103.8 ms by the gyro's turns"),
+        (SAME, gyro_fit(-0.1038), -0.1038, "corrected: time offset by -103.8 ms"),
+        (SAME, gyro_fit(0.0), None, "-103.8 ms by the adjustment, +0.0 ms by the gyro's turns"),
+        (SAME, None, None, "-103.8 ms by the adjustment, nothing sure by the gyro's turns"),
+        (OTHER, gyro_fit(-0.1038, correlation=0.7), None, ""),
+        (OTHER, gyro_fit(0.0), None, ""),
+    ],
+)
+def test_a_time_offset_is_corrected_if_two_say_the_same(
+    recording: Recording,
+    monkeypatch: pytest.MonkeyPatch,
+    calibration: MeasuredCalibration,
+    gyro: GyroFit | None,
+    corrected_s: float | None,
+    says: str,
+) -> None:
+    found = checked(recording, monkeypatch, calibration, OTHER, gyro)
+    assert found.corrections.get("time offset") == corrected_s
+    assert found.rig.cameras[0].imu_minus_cam_s == pytest.approx(corrected_s or 0.0)
+    assert says in " ".join(found.remarks()) and ("not corrected" in " ".join(found.remarks())) == bool(found.held)
+
+
+@pytest.mark.parametrize("parameter", [P.BASELINE, P.FOCAL])
+@pytest.mark.parametrize(
+    ("metres", "is_corrected"),
+    [
+        ({}, True),
+        ({"the wheels": (0.98, 0.001)}, True),
+        ({"the wheels": (1.0, 0.001)}, False),
+        ({"the wheels": (0.98, 0.001), "the accelerometer": (1.0, 0.08)}, True),  # which cannot tell
+        ({"the accelerometer": (1.0, 0.002)}, False),
+    ],
+)
+def test_a_correction_that_leaves_the_metres_of_another_sensor_is_not_made(
+    recording: Recording,
+    monkeypatch: pytest.MonkeyPatch,
+    parameter: P,
+    metres: dict[str, tuple[float, float]],
+    is_corrected: bool,
+) -> None:
+    found = checked(recording, monkeypatch, measured(parameter, -0.02), measured(parameter, 0.0), metres=metres)
+    assert (parameter.value in found.corrections, found.rig is recording.calibration) == (
+        is_corrected,
+        not is_corrected,
+    )
+    assert ("metric scale" in found.calibration.doubted) == (not is_corrected)
+    assert is_corrected or "a metre of the images is 1.000 m by the" in found.remarks()[-1]
 
 
 def test_a_correction_that_the_second_look_denies_is_for_a_person(
