@@ -17,7 +17,7 @@ from fleetmap.recordings import Recording
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from mapserver.calibration import CalibrationParameter as P
 from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES
-from mapserver.doctor.camera_motion import body_motion
+from mapserver.doctor.camera_motion import SceneError, body_motion, scene_error
 from mapserver.doctor.findings import Finding, Verdict, not_judged
 from mapserver.doctor.gyro_images import AXES, OFFSET
 from mapserver.doctor.run_checks import frames_to_check, run_checks
@@ -25,25 +25,13 @@ from mapserver.doctor.stereo import SWAPPED
 
 _INTERVALS, _APART_NS = 400, 200_000_000
 _LEAST = 20
-_PLACE_SIGMA_M, _SCALE_SIGMA = (
-    0.1,
-    0.03,
-)  # of a mounting by hand, and of a baseline: what a drive without turns leaves unknown
+_PLACE_SIGMA_M, _SCALE_SIGMA = 0.1, 0.03  # of a mounting by hand, and of a baseline: unknown without turns
+_EVERY, _HALF_VIEW_RAD = 10, 0.7  # intervals at which the scene is measured
 _ROUNDS, _FAR_SIGMAS = 8, 3.5
 _MAD_SIGMA = 1.4826  # standard deviation of a normal distribution by its median absolute deviation
 _OF_CAMERAS = {p.value for p in P} - {P.WHEEL_SCALE.value, P.GYRO_NOISE.value, P.ACCEL_NOISE.value}
-_OF_CAMERAS |= {
-    SWAPPED,
-    AXES,
-    OFFSET,
-    "epipolar error",
-    "lens",
-    "sharpness",
-    "images",
-    "camera rate",
-    "camera gaps",
-    "depth",
-}
+_OF_CAMERAS |= {SWAPPED, AXES, OFFSET, "epipolar error", "lens", "sharpness", "images", "camera rate", "camera gaps"}
+_OF_CAMERAS.add("depth")
 _DRIVE = "record a drive of a minute with turns, where every camera sees something near"
 
 
@@ -98,10 +86,12 @@ def _names(recording: Recording) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class Mounting:
-    """Error of a view's mounting against the first one, in body axes: rotation vector (3,) and its covariance (3, 3)."""
+    """Error of a view's mounting against the first one, in body axes: rotation vector (3,), and its covariances (3, 3) by noise, and by
+    errors that motions have in common."""
 
     turn_rad: Array
     cov: Array
+    cov_repeated: Array
 
 
 def check_mountings(recording: Recording, on_frame: Callable[[], None] = lambda: None) -> list[Finding]:
@@ -109,17 +99,39 @@ def check_mountings(recording: Recording, on_frame: Callable[[], None] = lambda:
     names, rectifier = _names(recording), Rectifier(recording.calibration)
     motions: list[list[tuple[Array, Array]]] = [[] for _ in names]
     rigs = [(mounted.camera, mounted.body_from_cam) for mounted in rectifier.mounted]
-    for before, after in _intervals(recording, rectifier, on_frame):
-        first = body_motion(rigs[0], (before, after))[2]
-        for number, rig in enumerate(rigs[1:], start=1):
-            pair = before.view(number), after.view(number)
-            if first is not None and pair[0] is not None and pair[1] is not None:
-                motion = body_motion(rig, (pair[0], pair[1]))[2]
-                motions[number] += [] if motion is None else [(first, motion)]
+    scenes: list[list[SceneError]] = [[] for _ in names]
+    for count, (before, after) in enumerate(_intervals(recording, rectifier, on_frame)):
+        first: Array | None = None
+        for number, rig in enumerate(rigs):
+            pair = (before.view(number), after.view(number)) if number else (before, after)
+            if pair[0] is None or pair[1] is None:
+                continue
+            motion = body_motion(rig, (pair[0], pair[1]))[2]
+            first = first if number else motion
+            motions[number] += [] if motion is None or first is None else [(first, motion)]
+            error = scene_error(pair[0], pair[1], rig[0]) if count % _EVERY == 0 else None
+            axes = np.kron(np.eye(2), rig[1][:3, :3])
+            scenes[number] += [] if error is None else [(axes @ error[0] @ axes.T, error[1])]
     return [
-        judge_mounting(f"{name} against {names[0]}", mounting_error(seen))
-        for name, seen in zip(names[1:], motions[1:], strict=True)
+        judge_mounting(
+            f"{name} against {names[0]}", mounting_error(seen, _repeated(seen, [*scenes[0], *own], recording))
+        )
+        for name, seen, own in zip(names[1:], motions[1:], scenes[1:], strict=True)
     ]
+
+
+def _repeated(motions: Sequence[tuple[Array, Array]], scenes: Sequence[SceneError], recording: Recording) -> Array:
+    """Return the covariance (6, 6) of what scenes leave in the mean difference of two views' motions.
+
+    A scene is new after a way as long as things are away, or a turn by half the view.
+    """
+    if not scenes or not motions:
+        return np.zeros((6, 6))
+    depth_m = float(np.median([depth_m for _, depth_m in scenes]))
+    way = np.nanmean([0.0, *(np.linalg.norm(first[:3, 3]) for first, _ in motions)]) / depth_m
+    turn = np.mean([np.linalg.norm(so3_log(first[:3, :3])) for first, _ in motions]) / _HALF_VIEW_RAD
+    intervals = float(recording.frame_stamps_ns[-1] - recording.frame_stamps_ns[0]) / _APART_NS
+    return np.asarray(2.0 * np.mean([cov for cov, _ in scenes], axis=0) / (1.0 + (way + turn) * intervals))
 
 
 def judge_mounting(name: str, found: Mounting | None) -> Finding:
@@ -128,8 +140,9 @@ def judge_mounting(name: str, found: Mounting | None) -> Finding:
     if found is None:
         return not_judged(name, "too few frames of both could be followed", _DRIVE)
     variances, axes = np.linalg.eigh(found.cov)
-    sigmas, along = np.sqrt(variances + 2 * tolerance.floor**2), axes.T @ found.turn_rad
-    is_known = sigmas <= tolerance.warn_above
+    variances += np.diag(axes.T @ found.cov_repeated @ axes) + 2 * tolerance.floor**2
+    sigmas, along = np.sqrt(variances), axes.T @ found.turn_rad
+    is_known = (sigmas <= tolerance.warn_above) | (np.abs(along) > SURE_SIGMAS * sigmas)
     turn_rad = axes @ np.where(is_known, along, 0.0)
     worst = int(np.argmax(np.where(is_known, np.abs(along) / sigmas, -1.0)))
     excess_rad, size_deg = abs(along[worst]) - SURE_SIGMAS * sigmas[worst], float(np.degrees(np.linalg.norm(turn_rad)))
@@ -145,11 +158,11 @@ def judge_mounting(name: str, found: Mounting | None) -> Finding:
     return Finding(name, Verdict.OK, size_deg, limit, words)
 
 
-def mounting_error(motions: Sequence[tuple[Array, Array]]) -> Mounting | None:
+def mounting_error(motions: Sequence[tuple[Array, Array]], repeated: Array | None = None) -> Mounting | None:
     """Return the error of a view's mounting by motions (4, 4) of the body, earlier_from_later, by the first view and by that one.
 
     Gauss-Newton for rotation, position and scale of the other view, by residuals weighted by their own spread; a translation of NaN does
-    not count. None with too few motions.
+    not count. None with too few motions. repeated: covariance (6, 6) of an error that all differences of the two motions have in common.
     """
     if len(motions) < _LEAST:
         return None
@@ -172,12 +185,11 @@ def mounting_error(motions: Sequence[tuple[Array, Array]]) -> Mounting | None:
         step = cov @ (np.einsum("kri,kr,kr->i", rows, weights, residuals) - prior @ at)
         error = se3(so3_exp(step[:3]) @ error[:3, :3], error[:3, 3] + step[3:6])
         scale += float(step[6])
-    by_noise = 2.0 * float(
-        (weights > 0).any(axis=1).sum()
-    )  # information that turns and ways of noise alone would seem to give
+    lever = (cov @ np.einsum("kri,kr->ir", rows, weights))[:3]
+    by_noise = 2.0 * float((weights > 0).any(axis=1).sum())  # which turns and ways of noise alone would seem to give
     known, axes = np.linalg.eigh(np.linalg.inv(cov[:3, :3]))
     cov = axes @ np.diag(1.0 / np.maximum(known - by_noise, 1.0)) @ axes.T
-    return Mounting(so3_log(error[:3, :3]), cov)
+    return Mounting(so3_log(error[:3, :3]), cov, lever @ (np.zeros((6, 6)) if repeated is None else repeated) @ lever.T)
 
 
 def _conjugated(motion: Array, error: Array, scale: float) -> Array:

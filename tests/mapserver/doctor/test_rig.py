@@ -15,6 +15,7 @@ from fleetmap.recordings import OpenOptions, format_calibration, open_recording
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, SensorSet
+from fleetsim.recorder import Order, prepare
 from mapserver.cli import app
 from mapserver.doctor.findings import Finding, Verdict
 from mapserver.doctor.rig import check_mountings, check_rig, further_findings, judge_mounting, mounting_error
@@ -23,6 +24,7 @@ from support.recordings.rig_samples import write_rig
 
 REAR = se3(so3_exp(np.array([0.0, 0.0, np.pi])), np.array([-0.1, 0.0, 0.0]))  # body_from_turned
 HALF_DEGREE = np.radians(0.5)
+DEGREE_Z = np.array([0.0, 0.0, 2.0 * HALF_DEGREE])
 
 
 def motions(
@@ -101,9 +103,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_rig(tmp_path_factory.mktemp("rig") / "ride.mcap", *ride())
 
 
-def with_turned(calibration: RigCalibration, numbers: tuple[int, ...]) -> RigCalibration:
-    """Cameras turned by half a degree about the vertical axis, in their place."""
-    off = se3(so3_exp(np.array([0.0, 0.0, HALF_DEGREE])), np.zeros(3))
+def with_turned(calibration: RigCalibration, numbers: tuple[int, ...], turn: Array = DEGREE_Z) -> RigCalibration:
+    """Cameras turned in their place."""
+    off = se3(so3_exp(turn), np.zeros(3))
     middle = se3(np.eye(3), np.mean([calibration.cameras[n].body_from_cam[:3, 3] for n in numbers], axis=0))
     turned = middle @ off @ se3_inverse(middle)
     cameras = [
@@ -114,7 +116,7 @@ def with_turned(calibration: RigCalibration, numbers: tuple[int, ...]) -> RigCal
 
 
 @pytest.mark.parametrize("turned", [(), (2, 3)])
-def test_a_rear_pair_turned_by_half_a_degree_is_named(recorded: Path, tmp_path: Path, turned: tuple[int, ...]) -> None:
+def test_a_rear_pair_turned_by_a_degree_is_named(recorded: Path, tmp_path: Path, turned: tuple[int, ...]) -> None:
     (tmp_path / "cams.yaml").write_text(format_calibration(with_turned(ride()[0], turned) if turned else ride()[0]))
     with open_recording(recorded, OpenOptions(tmp_path / "cams.yaml")) as recording:
         (found,) = check_mountings(recording)
@@ -137,6 +139,22 @@ def test_a_depth_camera_behind_is_checked_and_its_mounting_named(tmp_path: Path,
     assert found["depth of cam2"].verdict is Verdict.OK, found["depth of cam2"].sentence
     mounting = found["cam2 against cam0 and cam1"]
     assert mounting.verdict is (Verdict.WARN if turned else Verdict.OK), mounting.sentence
+
+
+@pytest.mark.parametrize("seed", [0, 1, 4])
+def test_a_straight_drive_does_not_turn_a_right_mounting(tmp_path: Path, seed: int) -> None:
+    """What a camera sees there is the same for seconds, and so is the error of its motion; a mounting that is quite wrong is found."""
+    session = prepare(Order("small-loop", seed=seed, frames=80, size_px=(320, 240), rig="front-rear"))
+    try:
+        file = write_rig(tmp_path / "drive.mcap", replace(session.nominal, imu=None), session.frames())
+    finally:
+        session.renderer.close()
+    for turn in (np.zeros(3), np.radians([0.0, 6.0, 0.0])):
+        wrong = with_turned(replace(session.nominal, imu=None), (2, 3), turn)
+        (tmp_path / "cams.yaml").write_text(format_calibration(wrong))
+        with open_recording(file, OpenOptions(tmp_path / "cams.yaml")) as recording:
+            (found,) = check_mountings(recording)
+        assert found.verdict is (Verdict.WARN if turn.any() else Verdict.NOT_JUDGED), found.sentence
 
 
 def test_a_view_with_another_lens_is_named(recorded: Path, tmp_path: Path) -> None:
