@@ -160,7 +160,8 @@ class RobotIdentity:
 
 @dataclass(frozen=True, kw_only=True)
 class MapAddress:
-    """Source of a robot's map: `server`, an endpoint, or `store`, a folder. identity: for servers that authenticate robots.
+    """Source of a robot's map: `server`, an endpoint, or `store`, a folder; neither if a fleet manager brings it. identity: for servers
+    that authenticate robots.
 
     version: number in the store, drafts included; None for the current one.
     """
@@ -191,8 +192,8 @@ class GivenAddress:
     insecure: bool
     sign: str = ""  # before the names in messages
 
-    def resolve(self, usual_robot: str | None = None) -> MapAddress:
-        """Return the address. usual_robot: the name of a robot that has none.
+    def resolve(self, usual_robot: str | None = None, *, may_be_alone: bool = False) -> MapAddress:
+        """Return the address. usual_robot: the name of a robot that has none. may_be_alone: with neither, under a fleet manager.
 
         UsageError for contradictions, and for a server on another machine that cannot authenticate the robot."""
         if self.server is not None and self.store is not None:
@@ -202,7 +203,7 @@ class GivenAddress:
         if identity is None:
             self._named("site", None, None)  # first error of an empty configuration
         server = self.server or (None if identity is None else identity.who.endpoint)
-        if server is None and self.store is None:
+        if server is None and self.store is None and not may_be_alone:
             raise UsageError(
                 f"give either {self.sign}server, such as tcp/127.0.0.1:7447, or {self.sign}store, a folder; or {_ENROL}"
             )

@@ -61,7 +61,7 @@ def check_run(config: LocclientConfig) -> MapAddress:
             root=run.root,
             identity=run.identity,
             insecure=run.insecure,
-        ).resolve()
+        ).resolve(may_be_alone=config.vda5050.broker is not None)
     except UsageError as error:
         raise UsageError(f"[run] {error}") from error
     topics = None if config.source.kind == "recording" else config.source.endpoint
@@ -91,8 +91,10 @@ def check_run(config: LocclientConfig) -> MapAddress:
         check_section(config.vda5050, insecure=run.insecure)
         if address.store is not None:
             raise UsageError(
-                "[vda5050] needs a map server: its signed lists define the admitted maps; set server, not store"
+                "[vda5050] and store exclude each other: set server, whose signed lists define the admitted maps, or neither"
             )
+        if address.server is None and config.vda5050.versions == "map server":
+            raise UsageError('[vda5050] versions = "map server" needs [run] server')
     return address
 
 
@@ -106,6 +108,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
     run = config.run
     address = check_run(config)
     site, name = address.site, address.robot
+    is_alone = address.server is None and address.store is None
     with ExitStack() as stack:
         prior = parse_prior(run.prior)
         source = open_source(config.source, config.topics, config.output.map_frame)
@@ -139,14 +142,15 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             # Two caches of the same folder, because one is not thread-safe; the second only reads.
             caches = tuple(TileCache(cache_folder(run.cache), max_bytes=run.cache_bytes) for _ in range(2))
             client = MapClient(bus, caches[0], site, name, patience_s=_PATIENCE_S)
-            client.require(trusted_map(bus, address, cache_folder(run.cache)))
+            client.require(None if is_alone else trusted_map(bus, address, cache_folder(run.cache)))
             maps, first = CachedMap(caches[1], site), client.active()
             server = ServerSync(client, outbox, retry_s=run.trial.retry_s, upkeep=_upkeep(address, bus))
-        keeps_replay = server is not None and run.replays != "off"
+            server.is_alone = is_alone
+        keeps_replay = server is not None and not is_alone and run.replays != "off"
         robot = Robot(calibration, rectifier, config.localizer, run.trial, time.thread_time, keeps_replay=keeps_replay)
         if prior is not None:
             robot.localizer.handle_prior(prior)
-        told_bus = _output_bus(config, bus, stack)
+        told_bus = _output_bus(config, None if is_alone else bus, stack)
         publisher = None
         if told_bus is not None:
             publisher = open_publisher(config.output, told_bus, site, name, calibration, intake)
@@ -232,8 +236,8 @@ def _fleet_manager(
     section, insecure, client, maps = config.vda5050, config.run.insecure, server.client, None
     if section.versions == "fleet manager":
         server.follows = False
-        folder = cache_folder(config.run.cache) / "incoming"
-        maps = FleetMaps(cache, site, folder, origins_of(section, insecure=insecure), client.check_admitted)
+        folder, admits = cache_folder(config.run.cache) / "incoming", None if server.is_alone else client.check_admitted
+        maps = FleetMaps(cache, site, folder, origins_of(section, insecure=insecure), admits)
     adapter = FleetAdapter(
         section,
         site,

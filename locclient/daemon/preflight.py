@@ -222,12 +222,14 @@ def _cache_and_server(config: LocclientConfig, address: MapAddress) -> Iterator[
         yield Finding(WARN, "disk", f"{free_bytes / 1e6:.0f} MB free beside {folder}; make room for new versions")
     active = cache.active(site)
     if active is None:
-        hint = "the robot needs its server for the first one"
+        hint = "the robot needs its server, or a fleet manager, for the first one"
         yield Finding(WARN, "cache", f"{folder} holds no whole version yet; {hint}")
     else:
         damaged = sum(cache.get(sha256) is None for sha256 in active.blobs)
         reasons = ["missing or damaged, fetched again at the next start"] * damaged
         yield _pieces("cache", active.version, len(active.blobs) - damaged, reasons)
+    if address.server is None:
+        return
     bus = open_bus(address)
     try:
         client = MapClient(bus, cache, site, address.robot, timeout_s=_ANSWER_S)

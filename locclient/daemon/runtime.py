@@ -190,9 +190,10 @@ class Runtime:
         self._bound = self._bound_tracker.handle(estimate)
         self._note_failure(outcome.failure, 0.0)
         message = outcome.pose_message()
-        if self._server is not None and message is not None and estimate.stamp_ns - self._pose_ns >= _POSE_EVERY_NS:
+        server = None if self._server is None or self._server.is_alone else self._server
+        if server is not None and message is not None and estimate.stamp_ns - self._pose_ns >= _POSE_EVERY_NS:
             self._pose_ns = estimate.stamp_ns
-            _send(partial(self._server.client.publish_pose, message))
+            _send(partial(server.client.publish_pose, message))
 
     def _note_failure(self, context: FailureContext | None, silent_s: float) -> None:
         if context is not None:

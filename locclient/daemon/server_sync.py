@@ -53,6 +53,7 @@ class ServerSync:
         # The upkeep first: after a renewal whose response was lost, the server admits no other request.
         jobs = (self._keep_up, self._publish_health, self._deliver, self._fetch_again, self._ask, self._send_recordings)
         self._jobs = Jobs(*jobs, passed=UnreachableError, clock_s=clock_s)
+        self.is_alone = False  # there is no server: the fleet manager brings versions
         self.follows = True  # the server selects the version; False: the fleet manager does
         self.on_change: Callable[[VersionChange], None] = lambda _: None
         self._refusals = LogLimit(_log)  # repeated refusals would fill the log
@@ -86,7 +87,7 @@ class ServerSync:
         """Do all due work, each part even if another fails. Stop if the server does not answer, then wait with exponential backoff."""
         self._handle_changes()
         now_s = self._clock_s()
-        if not self._is_connected(now_s) or now_s < self._silent_until_s:
+        if self.is_alone or not self._is_connected(now_s) or now_s < self._silent_until_s:
             return
         try:
             self._jobs.work()

@@ -16,6 +16,7 @@ from locclient.maps.map_source import LocalMapSource, MapSource
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES, TileCache
 
 _log = logging.getLogger(__name__)
+_NOWHERE = "tcp/127.0.0.1:7447"
 _PATIENCE_S = 120.0  # without an answer during a fetch; long enough for a server's restart
 
 
@@ -29,7 +30,9 @@ class MapConnection:
 
 
 def open_bus(address: MapAddress) -> Bus:
-    """Open a connection to the server, with the robot's identity if it has one."""
+    """Open a connection to the server, with the robot's identity if it has one. Without a server the bus stays closed."""
+    if address.server is None:
+        return Bus(_NOWHERE)
     return Bus.connect(str(address.server), tls=address.tls)
 
 

@@ -42,7 +42,7 @@ def parameters(action: Action) -> dict[str, Any]:
 
 def _fits(value: object, kind: str) -> bool:
     if kind == "STRING":
-        return isinstance(value, str) and 0 < len(value) <= _MOST_SIGNS
+        return isinstance(value, str) and len(value) <= _MOST_SIGNS
     return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 

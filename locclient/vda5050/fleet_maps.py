@@ -25,7 +25,9 @@ class DuplicateMapError(StateError):
 
 
 class FleetMaps:
-    """For the thread that owns the cache. check_admitted: raises UntrustedError for versions outside the site's signed list."""
+    """For the thread that owns the cache. check_admitted: raises UntrustedError for versions outside the site's signed list; None for
+    a robot without a map server, which takes what the fleet manager names with its hash.
+    """
 
     def __init__(
         self,
@@ -33,12 +35,12 @@ class FleetMaps:
         site: str,
         folder: Path,
         origins: Origins,
-        check_admitted: Callable[[WantedVersion], None],
+        check_admitted: Callable[[WantedVersion], None] | None,
     ) -> None:
         """folder: for files during download. Raises UsageError for invalid origins. A disk error now makes later downloads fail."""
         origins.check()
         self._cache, self._site, self._folder, self._origins = cache, site, folder, origins
-        self._check_admitted = check_admitted
+        self._needs_hash, self._check_admitted = check_admitted is None, check_admitted or (lambda _: None)
         active = cache.active(site)
         try:
             with disk_errors(f"{folder} cannot be used", "choose another cache"):
@@ -58,12 +60,14 @@ class FleetMaps:
     def download(self, version: int, link: str, sha256: str | None) -> None:
         """Fetch a version's file, check it by the signed list, and keep the version. Other versions are not affected.
 
-        sha256: of the file, None if unknown.
+        sha256: of the file, None or empty if unknown.
 
         Raises DuplicateMapError, NoRoomError, LinkError, UntrustedError, MapFormatError, StoreError.
         """
         if self._find(version) is not None:
             raise DuplicateMapError(f"version {version} is on the robot already; delete it before another download")
+        if self._needs_hash and not sha256:
+            raise LinkError("without a map server no signed list admits a file; send its SHA-256 as mapHash")
         room_bytes = self._cache.room_bytes() // _TOGETHER
         with disk_errors(f"{self._folder} cannot be written", "make space for the cache"), self._file() as file:
             try:
@@ -73,7 +77,7 @@ class FleetMaps:
                     f"{error}: half of the room in the cache; delete a map, or raise [run] cache_bytes"
                 ) from error
             file.flush()
-            if sha256 is not None and got != sha256.lower():
+            if sha256 and got != sha256.lower():
                 raise LinkError(
                     f"the file behind {link[:200]} has SHA-256 {got}, the fleet manager named {sha256[:64]}"
                 )

@@ -10,7 +10,7 @@ from locclient.robot.robot import Outcome
 from locclient.vda5050.messages import Error
 
 _NO_FRAMES = "no images come from the cameras; check them and their cables"
-_NO_MAP = "the robot has no map; download and enable one"
+_NO_MAP = "no map is enabled: the fleet manager must send enableMap, or the map server publish a version"
 _NO_BUILDING = "the map does not define its pose in the building; align the site and build a version, or set [vda5050] frame to map"
 _WORDS = {
     Cause.DARK: "the images are dark: lights out, or a covered lens",

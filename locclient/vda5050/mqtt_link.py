@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import UsageError, disk_errors
+from fleetmap.threads import Jobs
 from locclient.vda5050.adapter import FleetAdapter
 from locclient.vda5050.dialects import dialect
 from locclient.vda5050.messages import MAX_PAYLOAD_BYTES, timestamp
@@ -23,6 +24,7 @@ _LEAST_S = 0.1  # between two states
 _VISUALIZATION_S = 0.2
 _GOODBYE_S = 2.0
 _KEEPALIVE_S = 15
+_MAX_PACKET_BYTES = MAX_PAYLOAD_BYTES + 4096
 _log = logging.getLogger(__name__)
 
 
@@ -37,6 +39,8 @@ class MqttLink:
         self._dialect = dialect(section.version)
         self._prefix = f"{section.interface}/{self._dialect.major}/{section.manufacturer}/{section.serial_number}"
         self._sent: Counter[str] = Counter()
+        self._state_at_s, self._shown_at_s = 0.0, 0.0
+        self._shown: dict[str, Any] | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="vda5050", daemon=True)
         self._heard: dict[str, Callable[[bytes], None]] = {
@@ -65,7 +69,8 @@ class MqttLink:
     def _new_client(self) -> "Client":
         try:
             from paho.mqtt import client as mqtt
-            from paho.mqtt.enums import CallbackAPIVersion
+            from paho.mqtt.enums import CallbackAPIVersion, MQTTErrorCode
+            from paho.mqtt.exception import MalformedPacket
         except ImportError as error:
             raise UsageError(
                 "[vda5050] needs paho-mqtt, which is not installed: pip install '.[client,vda5050]'"
@@ -74,7 +79,22 @@ class MqttLink:
         kind: dict[str, Any] = {"protocol": mqtt.MQTTv5}
         if self._dialect.major == "v2":  # whose brokers need not know MQTT 5
             kind = {"protocol": mqtt.MQTTv311, "clean_session": True}
-        client = mqtt.Client(CallbackAPIVersion.VERSION2, client_id=name, **kind)
+
+        class BoundedClient(mqtt.Client):
+            """Leaves a broker that sends a packet without bounds, or one that cannot be read, and connects again."""
+
+            def _sock_recv(self, bufsize: int) -> bytes:
+                if bufsize > _MAX_PACKET_BYTES:  # the rest of a packet: brokers of MQTT 3.1.1 know no limit
+                    raise ConnectionAbortedError(f"a packet of {bufsize} bytes, the limit is {_MAX_PACKET_BYTES}")
+                return super()._sock_recv(bufsize)
+
+            def _packet_handle(self) -> MQTTErrorCode:
+                try:
+                    return super()._packet_handle()
+                except Exception as error:  # would end paho's thread
+                    raise MalformedPacket(str(error)) from error
+
+        client = BoundedClient(CallbackAPIVersion.VERSION2, client_id=name, **kind)
         client.suppress_exceptions = True  # exceptions would end paho's thread; its logger has them
         client.enable_logger(_log)
         client.reconnect_delay_set(1, 30)
@@ -96,13 +116,14 @@ class MqttLink:
         more: dict[str, Any] = {}
         if self._dialect.major != "v2":
             limits = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
-            limits.MaximumPacketSize = MAX_PAYLOAD_BYTES + 4096  # the broker keeps larger ones back
+            limits.MaximumPacketSize = _MAX_PACKET_BYTES  # the broker keeps larger ones back
             more = {"clean_start": True, "properties": limits}
         self._set_will()
         self._client.connect_async(self._broker.host, self._broker.port, _KEEPALIVE_S, **more)
 
     def _set_will(self) -> None:
-        will = self._encoded("connection", {"connectionState": "CONNECTION_BROKEN"})
+        after_online = self._sent["connection"] + 1
+        will = self._encoded("connection", {"connectionState": "CONNECTION_BROKEN"}, after_online)
         self._client.will_set(f"{self._prefix}/connection", will, qos=1, retain=True)
 
     def _on_connect(self, client: "Client", _: object, __: object, reason: Any, ___: object) -> None:
@@ -112,6 +133,7 @@ class MqttLink:
         for topic in self._heard:
             client.subscribe(f"{self._prefix}/{topic}", qos=0)
         self._publish("connection", {"connectionState": "ONLINE"}, qos=1, retain=True)
+        self._sent["connection"] += 1  # the will's
         if self._factsheet is not None:
             self.adapter.factsheet_wanted.set()
         self.adapter.changed.set()
@@ -122,37 +144,38 @@ class MqttLink:
             handle(message.payload)
 
     def _run(self) -> None:
-        state_at_s, shown_at_s, seen = 0.0, 0.0, None
-        while not self._stop.is_set():
-            is_changed = self.adapter.changed.wait(_VISUALIZATION_S)
-            if not self._client.is_connected() or self._stop.is_set():
-                self._stop.wait(_LEAST_S)
-                continue
-            if self._factsheet is not None and self.adapter.factsheet_wanted.is_set():
-                self.adapter.factsheet_wanted.clear()
-                self._publish("factsheet", self._factsheet, qos=0, retain=True)
-            if is_changed or time.monotonic() >= state_at_s:
-                self.adapter.changed.clear()
-                state_at_s = time.monotonic() + self._section.state_interval_s
-                self._publish("state", self.adapter.state(), qos=0, retain=False)
-            position = self.adapter.position()
-            if position is not None and position != seen and time.monotonic() >= shown_at_s:
-                shown_at_s = time.monotonic() + _VISUALIZATION_S
-                last = {"referenceStateHeaderId": (self._sent["state"] - 1) & 0xFFFFFFFF}
-                self._publish("visualization", {**last, **position}, qos=0, retain=False)
-                seen = position
-            self._stop.wait(_LEAST_S)
+        jobs = Jobs(self._send_due)
+        while not self._stop.wait(_LEAST_S):
+            self.adapter.changed.wait(_VISUALIZATION_S)
+            if self._client.is_connected() and not self._stop.is_set():
+                jobs.work()
+
+    def _send_due(self) -> None:
+        if self._factsheet is not None and self.adapter.factsheet_wanted.is_set():
+            self.adapter.factsheet_wanted.clear()
+            self._publish("factsheet", self._factsheet, qos=0, retain=True)
+        if self.adapter.changed.is_set() or time.monotonic() >= self._state_at_s:
+            self.adapter.changed.clear()
+            self._state_at_s = time.monotonic() + self._section.state_interval_s
+            self._publish("state", self.adapter.state(), qos=0, retain=False)
+        position = self.adapter.position()
+        if position is not None and position != self._shown and time.monotonic() >= self._shown_at_s:
+            self._shown_at_s = time.monotonic() + _VISUALIZATION_S
+            last = {"referenceStateHeaderId": (self._sent["state"] - 1) & 0xFFFFFFFF}
+            self._publish("visualization", {**last, **position}, qos=0, retain=False)
+            self._shown = position
 
     def _publish(self, topic: str, content: dict[str, Any], *, qos: int, retain: bool) -> Any:
-        return self._client.publish(f"{self._prefix}/{topic}", self._encoded(topic, content), qos=qos, retain=retain)
+        data = self._encoded(topic, content, self._sent[topic])
+        self._sent[topic] += 1
+        return self._client.publish(f"{self._prefix}/{topic}", data, qos=qos, retain=retain)
 
-    def _encoded(self, topic: str, content: dict[str, Any]) -> bytes:
+    def _encoded(self, topic: str, content: dict[str, Any], header_id: int) -> bytes:
         header = {
-            "headerId": self._sent[topic] & 0xFFFFFFFF,
+            "headerId": header_id & 0xFFFFFFFF,
             "timestamp": timestamp(time.time_ns()),
             "version": self._dialect.version,
             "manufacturer": self._section.manufacturer,
             "serialNumber": self._section.serial_number,
         }
-        self._sent[topic] += 1
         return to_json({**header, **self._dialect.said(topic, content)})

@@ -6,6 +6,8 @@ import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ import pytest
 import uvicorn
 
 from fleetmap.bus import Bus
+from fleetmap.mapformat import sha256_hex
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
 from mapserver.fleet.fleet import Fleet
@@ -46,10 +49,14 @@ def http_server(store: MapStore, fleet: Fleet) -> Iterator[str]:
 def robot(
     folder: Path, endpoint: str, broker: int, http: str, version: str = "3.0.0"
 ) -> Iterator[subprocess.Popen[bytes]]:
-    recording = robot_world.write(folder / "ride", robot_world.carried(FRAMES, CARRIED_AT))
+    recording = folder / "ride"
+    if not recording.exists():
+        robot_world.write(recording, robot_world.carried(FRAMES, CARRIED_AT))
     config = folder / "robot.toml"
     config.write_text(
-        f'[run]\nserver = "{endpoint}"\nsite = "room"\nrobot = "r1"\ncache = "{folder}/cache"\noutbox = "{folder}/outbox"\n'
+        "[run]\n"
+        + f'server = "{endpoint}"\n' * bool(endpoint)
+        + f'site = "room"\nrobot = "r1"\ncache = "{folder}/cache"\noutbox = "{folder}/outbox"\n'
         f'[source]\nkind = "recording"\nrecording = "{recording}"\n'
         f'[vda5050]\nbroker = "mqtt://127.0.0.1:{broker}"\nmanufacturer = "acme"\nserial_number = "0001"\n'
         f'download_from = ["{http}"]\nstate_interval_s = 0.5\ninitialize_s = 10.0\nversion = "{version}"\n'
@@ -88,37 +95,65 @@ def test_a_fleet_manager_gives_a_robot_its_maps_and_hears_that_it_was_carried_aw
         assert len(master.visualizations) > 10
 
 
+@contextmanager
+def files(folder: Path) -> Iterator[str]:
+    """A web server that knows nothing of maps."""
+    with ThreadingHTTPServer(("127.0.0.1", 0), partial(SimpleHTTPRequestHandler, directory=folder)) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
 @pytest.mark.timeout(600)
-def test_a_fleet_manager_of_an_older_version_is_understood(tmp_path: Path) -> None:
+def test_an_older_fleet_manager_and_a_broker_are_enough(tmp_path: Path) -> None:
+    """Without a map server; also for a robot that was killed, and after messages that nobody can read."""
     with (
         mosquitto(tmp_path) as broker,
         MapStore.open(tmp_path / "store", create=True) as store,
-        Bus.listen("tcp/127.0.0.1:0") as bus,
+        files(tmp_path) as http,
     ):
         robot_world.save(store)
-        init_here(store)
-        fleet = Fleet(store)
-        service = BusService(store, fleet, bus, lambda *_: None)
+        store.export_version("room", 1, tmp_path / "room-1", archive=False)
+        link = {"mapId": "room", "mapVersion": "1", "mapDownloadLink": f"{http}/room-1"}
+        named = link | {"mapHash": sha256_hex((tmp_path / "room-1").read_bytes())}
         master = Master(broker, "2.1.0")
         try:
-            with http_server(store, fleet) as http, robot(tmp_path, bus.endpoint, broker, http, "2.1.0") as process:
+            with robot(tmp_path, "", broker, http, "2.1.0") as process:
                 until(lambda: bool(master.states), "no state", START_S)
                 assert (master.connections[-1], master.state["operatingMode"]) == ("ONLINE", "MANUAL")
                 master.begin_robot_part()
-                master.done(master.act("downloadMap", **httpx.get(f"{http}/v1/sites/room/versions/1/vda5050").json()))
+                until(lambda: "the fleet manager must send enableMap" in str(master.errors("LOCALIZATION_ERROR")))
+                assert "mapHash" in str(master.done(master.act("downloadMap", **link), "FAILED")["errors"])
+                master.done(master.act("downloadMap", **named))
                 master.done(master.act("enableMap", mapId="room", mapVersion="1"))
                 assert master.maps() == {"1": "ENABLED"}
                 until(lambda: master.state.get("agvPosition", {}).get("positionInitialized", False))
+                master.send("instantActions", b" " * 3_000_000)
+                until(lambda: master.connections[-2:] == ["CONNECTIONBROKEN", "ONLINE"], lambda: master.connections)
                 there = {key: master.state["agvPosition"][key] for key in ("x", "y", "theta")}
-                master.done(master.act("initPosition", **there, mapId="room", lastNodeId="n-9"))
-                assert master.state["lastNodeId"] == "n-9"
+                master.done(master.act("initPosition", **there, mapId="room", lastNodeId=""))
+                assert master.state["lastNodeId"] == ""
                 assert master.state["batteryState"]["batteryCharge"] == 71.5
                 until(lambda: bool(master.visualizations))
                 process.kill()
                 until(lambda: master.connections[-1] == "CONNECTIONBROKEN")
+            assert master.connections == ["ONLINE", "CONNECTIONBROKEN"] * 2
+            assert master.header_ids["connection"] == [0, 1, 2, 3]
+            before = len(master.states)
+            with robot(tmp_path, "", broker, http, "2.1.0"):
+                until(
+                    lambda: (
+                        len(master.states) > before
+                        and master.state.get("agvPosition", {}).get("positionInitialized", False)
+                    ),
+                    "",
+                    START_S,
+                )
+                assert (master.connections[-1], master.maps()) == ("ONLINE", {"1": "ENABLED"})
+            ids = master.header_ids["state"]
+            assert ids == [*range(before), *range(len(ids) - before)]
         finally:
             master.close()
-            service.close()
         assert master.faults == []
 
 

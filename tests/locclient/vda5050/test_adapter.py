@@ -35,6 +35,8 @@ PART = {
     "powerSupply": {"stateOfCharge": 50, "charging": True, "range": 12.5},
     "safetyState": {"activeEmergencyStop": "NONE", "fieldViolation": False},
 }
+PLACED = b"""{"headerId": 1, "actions": [{"actionId": "p", "actionType": "initializePosition", "blockingType": "NONE",
+    "actionParameters": [{"key": "x", "value": %s}]}]}"""
 TRACKING = Localization(
     Status.TRACKING,
     "",
@@ -274,14 +276,29 @@ def test_the_robots_own_part_is_missed_and_checked() -> None:
         b'{"headerId": 1}',
         b"[" * 200_000,
         b'{"headerId":1,"actions":' + b" " * MAX_PAYLOAD_BYTES + b"[]}",
+        *(PLACED % number for number in (b"1" * 400, b"1" * 5000, b"1e400", b"NaN", b"[" * 2000 + b"]" * 2000)),
     ],
-    ids=["empty", "cut", "no text", "list", "half", "deep", "huge"],
+    ids=[
+        "empty",
+        "cut",
+        "no text",
+        "list",
+        "half",
+        "deep",
+        "huge",
+        "400 digits",
+        "5000 digits",
+        "1e400",
+        "NaN",
+        "nested",
+    ],
 )
 def test_malformed_messages_are_said_and_change_nothing(payload: bytes) -> None:
     adapter = Adapter()
     for take in (adapter.instant_actions, adapter.order):
         take(payload)
-    assert adapter.error_types() == ["VALIDATION_FAILURE", "ROBOT_PART_MISSING"]
+        adapter.instant_actions(dialect("2.1.0").heard(payload))
+    assert adapter.error_types() == [*["VALIDATION_FAILURE"] * 3, "ROBOT_PART_MISSING"]
     assert adapter.said()["instantActionStates"] == []
     assert adapter.ask("stateRequest")["actionStatus"] == "FINISHED"
     assert adapter.error_types() == ["ROBOT_PART_MISSING"], "it ends when another action is accepted"
@@ -460,6 +477,24 @@ def test_a_factsheet_is_completed(tmp_path: Path) -> None:
 def test_settings_that_cannot_be_right(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
         check_section(Vda5050Section(**{"manufacturer": "acme", "serial_number": "1", **settings}), insecure=False)
+
+
+def test_the_session_in_the_manual_is_one() -> None:
+    text = (
+        (Path(__file__).parents[3] / "docs/service.md")
+        .read_text("utf-8")
+        .split("## The robot under a fleet manager")[1]
+    )
+    part, *asked, state = (json.loads(block.split("```")[0]) for block in text.split("```json\n")[1:])
+    adapter = Adapter()
+    adapter.robot_part(json.dumps(part).encode())
+    for message in asked:
+        assert list(validator("instantActions").iter_errors({**HEADER, **message})) == []
+        adapter.instant_actions(json.dumps({**HEADER, **message}).encode())
+    said = adapter.said()
+    assert [one["actionType"] for one in said["instantActionStates"]] == ["downloadMap", "enableMap"]
+    assert list(adapter.schema.iter_errors({**HEADER, **state})) == []
+    assert state.keys() == said.keys() - HEADER.keys()
 
 
 def test_moments_are_written_as_the_standard_does() -> None:

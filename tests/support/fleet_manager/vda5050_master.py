@@ -74,6 +74,7 @@ class Master:
         self.visualizations: list[dict[str, Any]] = []
         self.faults: list[str] = []
         self.retained: list[str] = []
+        self.header_ids: dict[str, list[int]] = {}
         topics = ("state", "connection", "factsheet", "visualization", "instantActions")
         self._schemas = {topic: validator(topic, version) for topic in topics}
         self._count = 0
@@ -97,6 +98,7 @@ class Master:
         if topic not in {"state", "connection", "factsheet", "visualization"}:
             return
         content = json.loads(message.payload)
+        self.header_ids.setdefault(topic, []).append(content["headerId"])
         self.faults += [
             f"{topic}: {error.message} at {list(error.instance_path)}"
             for error in self._schemas[topic].iter_errors(content)
