@@ -17,7 +17,7 @@ def in_words(figures: Kpis) -> str:
     """Return a line of a table."""
     failures = figures.failures
     if failures.per_robot_day is None:
-        return f"{figures.observed_h:7.1f} h, not driven"
+        return f"{figures.driving_h:7.1f} h, {failures.events} failures, too little driving for a rate"
     interval = f"{failures.low:.2f} to {failures.high:.2f}"
     share = figures.localised_share_of_all
     localised = "-" if share is None else f"{share:.1%} of the driving"

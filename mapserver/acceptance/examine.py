@@ -17,7 +17,7 @@ from mapserver.acceptance.ladders import darkest_grey
 from mapserver.drafting.draft_evidence import PROBES
 from mapserver.drafting.worker import single_threaded_libraries
 from mapserver.fleet_statistics.day_rate import Stratum, day_rate
-from mapserver.fleet_statistics.kpis import ROBOT_DAY_S, Counters, format_rate, is_telling, rate
+from mapserver.fleet_statistics.kpis import ROBOT_DAY_S, Counters, format_rate, rate
 from mapserver.floor_plan.areas import Areas
 from mapserver.quality.directions import tile_directions
 from mapserver.quality.figures import merged
@@ -158,5 +158,5 @@ def incidents(maps: MapStore, site: str, version: int, drives: Sequence[Drive]) 
     counts = maps.fleet.counters(site, "version", key=str(version)).get((site, str(version)), Counters())
     reported = rate(counts.position_failures, counts.robot_days)
     per_day, low, high, silent_high = (round(value, 5) for value in (every.rate, every.low, every.high, silent.high))
-    fleet = format_rate(reported) if is_telling(reported) else None
+    fleet = None if reported.low is None else format_rate(reported)
     return Incidents(per_day, low, high, silent_high, fleet, _ASSUMPTIONS)

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 from mapserver.dashboard.rendering import begun, share
 from mapserver.fleet_statistics.canary_decision import CanaryFinding
-from mapserver.fleet_statistics.kpis import Kpis, Rate, driven_words, figure, format_rate, is_telling
+from mapserver.fleet_statistics.kpis import Kpis, Rate, driven_words, figure, format_rate
 from mapserver.fleet_statistics.robot_calibration import CalibrationFigure
 from mapserver.store import CanaryRow
 
@@ -67,10 +67,10 @@ def trial_of(canary: CanaryRow, found: CanaryFinding) -> Trial:
 
 def rate_figure(name: str, found: Rate, more: str) -> Figure:
     """A rate with its interval; a dash where too little was driven."""
-    if found.low is None:
+    if found.robot_days <= 0:
         return Figure(name, "–", f"nothing was driven{more}")
     counted = f"{found.events} in {driven_words(found.robot_days)}"
-    if not is_telling(found):
+    if found.low is None:
         return Figure(name, "–", f"{counted}: too little for a rate{more}")
     interval = f"{figure(found.low)} to {figure(found.high)} with 95 %"
     return Figure(name, figure(found.per_robot_day), f"{counted}: {interval}{more}")
@@ -103,7 +103,7 @@ def trials_shown(
         labels = f"version {version}", f"others, version {trial.canary.base_version}"
         name = f"Failures per robot-day with version {version} and with the others"
         drawn = Bars(name, [rate_bar(*side) for side in zip(labels, sides, strict=True)])
-        shown.append((*trial_words(trial, moment), drawn if any(map(is_telling, sides)) else None))
+        shown.append((*trial_words(trial, moment), drawn if any(side.low is not None for side in sides) else None))
     return shown
 
 
@@ -118,6 +118,4 @@ def cameras(
 def rate_bar(label: str, found: Rate) -> Bar:
     """A bar of failures per robot-day; none where too little was driven."""
     words = f"{found.events} in {driven_words(found.robot_days)}: {format_rate(found)} per robot-day"
-    if not is_telling(found):
-        return Bar(label, None, None, None, words)
     return Bar(label, found.per_robot_day, found.low, found.high, words)

@@ -16,7 +16,7 @@ from mapserver.dashboard.map_page import verdict_words
 from mapserver.dashboard.rendering import age, begun, share
 from mapserver.fleet.alerts import dropped_words
 from mapserver.fleet_statistics.area_trend import trend_sentence
-from mapserver.fleet_statistics.kpis import Rate, figure, is_telling
+from mapserver.fleet_statistics.kpis import Rate, figure
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.floor_plan.areas import OUTSIDE, Areas
 
@@ -145,9 +145,9 @@ def _figures(live: LiveSite, health: SiteHealth) -> list[dict[str, object]]:
     found: list[dict[str, object]] = [{"name": "Online", "value": f"{online} of {len(live.robots)}"}]
     if shown := share(health.day.localised_share_of_all):
         found.append({"name": "Localised while driving, 24 h", "value": shown})
-    if is_telling(failures):
+    if failures.low is not None:
         low, high = (figure(value or 0.0) for value in (failures.low, failures.high))
-        days = [day.per_robot_day if is_telling(day) else None for day in health.days]
+        days = [day.per_robot_day for day in health.days]
         value, more = figure(failures.per_robot_day or 0.0), f"in truth {low} to {high}, with 95 % certainty"
         found.append({"name": "Failures per robot-day, 24 h", "value": value, "more": more, "days": days})
     return found

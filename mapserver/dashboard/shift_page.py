@@ -10,7 +10,7 @@ from mapserver.dashboard import fleet_parts
 from mapserver.dashboard.fleet_parts import Bar, Bars, Figure
 from mapserver.dashboard.rendering import TEMPLATES, share
 from mapserver.fleet.shift_summary import FleetSummary
-from mapserver.fleet_statistics.kpis import HOUR_NS, Rate, format_rate, is_telling
+from mapserver.fleet_statistics.kpis import HOUR_NS, Rate, format_rate
 
 _STYLE = Path(__file__).parent / "static" / "style.css"
 _ROWS = 15
@@ -73,7 +73,7 @@ def _by_hour(summary: FleetSummary, step: int) -> Bars:
 def _rate(found: Rate) -> str:
     if found.robot_days <= 0:
         return _UNKNOWN
-    return format_rate(found) if is_telling(found) else "too little driven"
+    return "too little driven" if found.low is None else format_rate(found)
 
 
 def _share(value: float | None) -> str:

@@ -12,7 +12,7 @@ from fleetmap.config import Section
 from fleetmap.errors import StateError
 from fleetmap.messages import Flag, Status
 from mapserver.fleet.fleet import Fleet, RobotStatus
-from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, figure, hour_of, kpis
+from mapserver.fleet_statistics.kpis import HOUR_NS, TOO_MANY_PER_ROBOT_DAY, Counters, format_rate, hour_of, kpis
 from mapserver.store import MapStore
 
 _HEARD_WITHIN_S = 60.0
@@ -29,13 +29,13 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 class AlertSettings(Section, frozen=True):
     """webhook: notified address, None for none; token_file: its content is sent as bearer token.
 
-    failures_per_robot_day: limit for the rate of the last 24 h, exceeded with 97.5 % confidence; lost_s: limit for the time that a robot
+    failures_per_robot_day: limit for the rate of the last 24 h, exceeded with 97.5 % confidence after enough driving for a rate; lost_s: limit for the time that a robot
     does not know its position.
     """
 
     webhook: str | None = None
     token_file: str | None = None
-    failures_per_robot_day: Positive = 5.0
+    failures_per_robot_day: Positive = TOO_MANY_PER_ROBOT_DAY
     lost_s: Positive = 300.0
 
 
@@ -106,11 +106,9 @@ def _failure_rate(store: MapStore, settings: AlertSettings, site: str, now_ns: i
     counters = store.fleet.counters(site, "site", since_hour=hour_of(now_ns) + 1 - _RATE_HOURS)
     found = kpis(counters.get((site, ""), Counters())).failures
     if found.low is not None and found.low > settings.failures_per_robot_day:
-        assert found.per_robot_day is not None
-        assert found.high is not None
         words = (
-            f"robots of {site} failed {found.events} times in {_RATE_HOURS} h: {figure(found.per_robot_day)} per robot-day "
-            f"({figure(found.low)} to {figure(found.high)}), more than {settings.failures_per_robot_day:g}"
+            f"robots of {site} failed {found.events} times in {_RATE_HOURS} h: {format_rate(found)} per robot-day, "
+            f"more than {settings.failures_per_robot_day:g}"
         )
         yield Alert("FleetmapFailureRate", site, "", now_ns, words)
 

@@ -6,7 +6,7 @@ from typing import Literal
 
 import scipy
 
-from mapserver.fleet_statistics.kpis import Counters, Rate, figure, is_telling, kpis, rate
+from mapserver.fleet_statistics.kpis import Counters, Rate, figure, is_enough, kpis, rate
 
 Verdict = Literal["worse", "better", "no clear change", "too little driving to say"]
 _CONFIDENCE_TAIL = 0.05
@@ -47,7 +47,7 @@ def area_trends(now: Mapping[str, Counters], before: Mapping[str, Counters]) -> 
     """
     nothing = Counters()
     pairs = {name: (now.get(name, nothing), before.get(name, nothing)) for name in {*now, *before}}
-    told = [name for name, both in pairs.items() if all(is_telling(rate(0, counts.robot_days)) for counts in both)]
+    told = [name for name, both in pairs.items() if all(is_enough(counts.robot_days) for counts in both)]
     tail = _CONFIDENCE_TAIL / max(1, len(told)) / 2
     found = [_trend(name, *both, tail if name in told else None) for name, both in pairs.items()]
     return sorted(found, key=lambda trend: (_ORDER[trend.verdict], -(trend.low or 0.0), -trend.now.events, trend.name))

@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 
 from fleetmap.config import Section
-from mapserver.fleet_statistics.kpis import Counters, Rate, driven_words, format_rate, is_telling, rate
+from mapserver.fleet_statistics.kpis import Counters, Rate, driven_words, format_rate, rate
 
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Probability = Annotated[float, msgspec.Meta(gt=0, lt=1)]
@@ -125,5 +125,5 @@ def _rate_text(found: Rate) -> str:
     count = f"{found.events or 'no'} failure{'' if found.events == 1 else 's'}"
     if found.robot_days <= 0:
         return f"{count} and nothing driven"
-    per_day = f", {format_rate(found)} per robot-day" if is_telling(found) else ", too little for a rate"
+    per_day = f", {format_rate(found)} per robot-day" if found.low is not None else ", too little for a rate"
     return f"{count} in {driven_words(found.robot_days)}{per_day}"

@@ -11,8 +11,8 @@ import scipy
 ROBOT_DAY_S = 16 * 3600.0
 HOUR_NS = 3_600_000_000_000
 _TAIL = 0.05
-LEAST_ROBOT_DAYS = 0.1
-"""Below it (96 minutes of driving) one failure would mean ten or more per robot-day: counts are shown, but no rate."""
+TOO_MANY_PER_ROBOT_DAY = 5.0
+"""Rate of failures that operators are told of by default. Driving is enough for a rate once none in it would show less than this."""
 
 
 @dataclass(slots=True)
@@ -97,7 +97,7 @@ COUNTER_COLUMNS = tuple(field.name for field in fields(Counters))
 
 @dataclass(frozen=True, slots=True)
 class Rate:
-    """Events per robot-day with the 95 % interval of the true rate; None without driving."""
+    """Events per robot-day with the 95 % interval of the true rate; None with too little driving to say, as of `is_enough`."""
 
     events: int
     robot_days: float
@@ -172,8 +172,8 @@ def kpis(counts: Counters) -> Kpis:
 
 def rate(events: int, robot_days: float) -> Rate:
     """Return events per robot-day with their interval."""
-    if robot_days <= 0:
-        return Rate(events, 0.0, None, None, None)
+    if not is_enough(robot_days):
+        return Rate(events, max(0.0, robot_days), None, None, None)
     low, high = poisson_interval(events)
     return Rate(events, robot_days, events / robot_days, low / robot_days, high / robot_days)
 
@@ -204,9 +204,13 @@ def share(hits: int, tries: int) -> Share:
     return Share(hits, tries, hits / tries, low, high)
 
 
-def is_telling(found: Rate) -> bool:
-    """True if there was enough driving to give a rate."""
-    return found.robot_days >= LEAST_ROBOT_DAYS
+def is_enough(robot_days: float) -> bool:
+    """True if there was enough driving to say a rate: 9.6 h.
+
+    After that no failure at all would show, by the interval's upper end, a rate below TOO_MANY_PER_ROBOT_DAY. After less no count could
+    show it, and a few failures of one cause would seem to be hundreds per robot-day.
+    """
+    return robot_days * TOO_MANY_PER_ROBOT_DAY >= poisson_interval(0)[1]
 
 
 def figure(value: float | None) -> str:
@@ -218,7 +222,7 @@ def figure(value: float | None) -> str:
 
 def format_rate(found: Rate) -> str:
     """Return a rate with its 95 % interval as text; a dash with too little driving."""
-    if not is_telling(found):
+    if found.per_robot_day is None:
         return "–"
     return f"{figure(found.per_robot_day)} ({figure(found.low)} to {figure(found.high)})"
 

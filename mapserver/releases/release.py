@@ -110,8 +110,9 @@ def roll_back(
         raise StateError(f"trial {canary} of site {site} has ended already; check `versions`")
     if rows.canary is not None and to is None:
         outcome = f"taken back by hand: {actor.reason or 'no reason given'}"
-        end_canary(store, rows.canary, promote=False, outcome=outcome, actor=actor)
-        return rows.canary.base_version
+        tried = rows.canary
+        _change(store, site, lambda rows: rules.canary_withdrawal(rows, tried, outcome, actor, by_hand=True))
+        return tried.base_version
     if rows.rollback_target is not None:
         store.check_bytes(rows.versions[rows.rollback_target])
     changes = _change(store, site, lambda rows: rules.rollback(rows, actor, to))

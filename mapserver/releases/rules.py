@@ -138,15 +138,17 @@ def canary_promotion(rows: SiteReleases, canary: CanaryRow, actor: Actor) -> Rel
     return promotion(rows, canary.version, actor)
 
 
-def canary_withdrawal(rows: SiteReleases, canary: CanaryRow, outcome: str, actor: Actor) -> ReleaseChanges:
-    """End a canary and retire its version; raises StateError if it is no longer running."""
+def canary_withdrawal(
+    rows: SiteReleases, canary: CanaryRow, outcome: str, actor: Actor, *, by_hand: bool = False
+) -> ReleaseChanges:
+    """End a canary, stopped by hand or rolled back, and retire its version; raises StateError if it is no longer running."""
     _check_running(rows, canary)
     detail = f"version {canary.version}; version {canary.base_version} stays current"
     entry = LogEntry("canary_rolled_back", detail, canary.version, replace(actor, reason=outcome))
     is_published = canary.version in rows.versions and rows.versions[canary.version].state == "published"
     return ReleaseChanges(
         states=((canary.version, "retired"),) if is_published else (),
-        ended_canary=CanaryEnd(canary.id, "rolled_back", outcome),
+        ended_canary=CanaryEnd(canary.id, "stopped" if by_hand else "rolled_back", outcome),
         log=(entry,),
     )
 

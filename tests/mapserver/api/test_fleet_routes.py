@@ -94,7 +94,7 @@ def test_a_canary_begins_and_ends_over_http(server: Server) -> None:
         server.client.post("/v1/sites/lab/versions/2/canary", json={"actor": "ada", "share": 7}), 422, "share"
     )
     assert server.client.post("/v1/sites/lab/rollback", json={"actor": "ada", "reason": "no"}).json()["version"] == 1
-    assert server.client.get("/v1/sites/lab/canary").json()["canary"]["state"] == "rolled_back"
+    assert server.client.get("/v1/sites/lab/canary").json()["canary"]["state"] == "stopped"
 
 
 def test_a_resurvey_list_and_its_route(server: Server) -> None:

@@ -1,17 +1,29 @@
 """Rates are told where enough was driven, counts everywhere."""
 
-from mapserver.fleet_statistics.kpis import driven_words, format_rate, is_telling, rate
+import runpy
+
+import pytest
+
+from mapserver.fleet_statistics.kpis import Counters, driven_words, format_rate, is_enough, kpis, rate
+from support.fleet.contracts_documents import REPOSITORY
 
 
-def test_one_failure_in_two_minutes_is_no_rate() -> None:
-    little, enough = rate(1, 2 / 960), rate(1, 50.0)
-    assert (is_telling(little), format_rate(little), driven_words(little.robot_days)) == (
-        False,
-        "–",
-        "2 min of driving",
-    )
-    assert (is_telling(enough), format_rate(enough)) == (True, "0.02 (0.00051 to 0.11)")
-    assert not is_telling(rate(0, 0.0))
+@pytest.mark.parametrize("failures", [0, 2, 1000])
+def test_no_rate_is_said_before_none_would_show_a_good_one(failures: int) -> None:
+    in_words = runpy.run_path(str(REPOSITORY / "examples" / "fleet_figures.py"))["in_words"]
+    for minutes, is_said in ((0, False), (5, False), (570, False), (580, True)):
+        found = rate(failures, minutes / 960)
+        assert [value is not None for value in (found.per_robot_day, found.low, found.high)] == [is_said] * 3
+        assert is_enough(minutes / 960) == is_said
+        assert (rate(0, minutes / 960).high or 5.0) <= 5.0
+        assert (format_rate(found) != "–") == is_said
+        words = in_words(kpis(Counters(failures=failures, driving_ms=60_000 * minutes)))
+        assert ("too little driving" in words) != is_said
+        assert f" {failures} failures" in words or is_said
+
+
+def test_rates_and_driving_as_text() -> None:
+    assert format_rate(rate(1, 50.0)) == "0.02 (0.00051 to 0.11)"
     assert [driven_words(days) for days in (0.0, 0.5, 1.0, 37.4)] == [
         "0 min of driving", "8.0 h of driving", "1 robot-days", "37 robot-days",
     ]  # fmt: skip

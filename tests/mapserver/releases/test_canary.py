@@ -146,7 +146,7 @@ def test_people_may_end_it_in_both_ways(world: World) -> None:
     assert "complaints" in world.store.canaries("lab")[0].outcome
     releases.start_canary(world.store, "lab", 2, 0.1)  # a second try
     releases.promote(world.store, "lab", 2, actor=Actor("ada", "the others agree"))
-    assert [row.state for row in world.store.canaries("lab")] == ["promoted", "rolled_back"]
+    assert [row.state for row in world.store.canaries("lab")] == ["promoted", "stopped"]
     assert world.store.canaries("lab", running=True) == []
     releases.start_canary(world.store, "lab", 1, 0.1)
     publish_samples(world.store, 1, first=8)

@@ -87,6 +87,9 @@ def test_what_holds_is_named_and_nothing_else(store: MapStore, clock: Clock) -> 
     assert names() == [("FleetmapNightFailed", "job 1")], "until another has ended"
     store.update_job(2, "done", "nothing to do", {})
     assert names() == []
+    releases.start_canary(store, "lab", 1, 0.5)
+    releases.roll_back(store, "lab")
+    assert names() == [], "who did it by hand knows it"
     canary = releases.start_canary(store, "lab", 1, 0.5)
     releases.end_canary(store, canary, promote=False, outcome="it fails more often")
     assert names() == [("FleetmapCanaryRolledBack", "version 1")]
@@ -95,17 +98,18 @@ def test_what_holds_is_named_and_nothing_else(store: MapStore, clock: Clock) -> 
 
 
 def test_a_rate_is_too_high_only_when_chance_does_not_explain_it(store: MapStore, clock: Clock) -> None:
-    fleet = Fleet(store, clock_ns=clock)
-    for number in range(7200):
-        clock.now_ns += 10**9
-        fleet.take_health("lab", "r1", health("TRACKING", number))
-    for number, wanted in enumerate([0, 0, 0, 1]):
-        assert not fleet.take_failure("lab", "r1", blindness(f"f{number}", wall_ns=clock())).refused
+    fleet, number = Fleet(store, clock_ns=clock), 0
+    for minutes, failures, wanted in ((5, 2, 0), (120, 7, 0), (600, 7, 0), (600, 8, 1)):
+        while number < 15 * minutes:
+            number, clock.now_ns = number + 1, clock.now_ns + 4 * 10**9
+            fleet.take_health("lab", "r1", health("TRACKING", 4 * number))
+        for failure in range(failures):
+            assert not fleet.take_failure("lab", "r1", blindness(f"f{failure}", wall_ns=clock())).refused
         fleet.flush()
         found = active_alerts(store, fleet, AlertSettings(), clock())
-        assert len(found) == wanted, f"after {number + 1} failures in two hours"
+        assert len(found) == wanted, f"after {failures} failures in {minutes} minutes"
     assert found[0].name == "FleetmapFailureRate"
-    assert "failed 4 times in 24 h" in found[0].words
+    assert "failed 8 times in 24 h: 13 (5.5 to 25) per robot-day" in found[0].words
 
 
 def test_it_is_told_once_and_once_more_when_it_is_over(clock: Clock, tmp_path: Path) -> None:
