@@ -3,7 +3,7 @@
 #
 #   deploy/dashboard_pictures.sh HTTP OUT SITE PAGE...
 #
-# HTTP: address of the server. PAGE: overview, map, failures, ... Without Chromium or Chrome it prints a note and exits with status 0.
+# HTTP: address of the server. PAGE: overview, map, failures, failures/1, ... Without Chromium or Chrome it prints a note and exits with status 0.
 set -euo pipefail
 http=$1 out=$2 site=$3
 shift 3
@@ -26,7 +26,7 @@ options=(--headless=new --hide-scrollbars --window-size=1440,900 --user-data-dir
 for page in "$@"; do
   path=$page
   [[ $page != overview ]] || path=
-  picture=$out/dashboard-$page.png
+  picture=$out/dashboard-${page//\//-}.png
   if timeout "$WITHIN_S" "$browser" "${options[@]}" --screenshot="$picture" "$http/dashboard/$path?site=$site" >"$profile/log" 2>&1 \
     && [[ -s $picture ]]; then
     printf 'picture of the dashboard: %s\n' "$picture"

@@ -162,7 +162,7 @@ warehouse() {
     pictures overview map
   fi
   drives_ended
-  is_watched || pictures failures
+  is_watched || pictures failures failures/1  # the daemons ended after its recording had arrived
   for number in "${!ROBOTS[@]}"; do
     robot=${ROBOTS[$number]}
     wait "${replay_pids[$number]}" || { cat "$OUT/$robot.log" >&2; fail "$robot could not be localized"; }

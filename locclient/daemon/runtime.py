@@ -40,6 +40,7 @@ _TAKE_S, _IDLE_S = 0.2, 0.1
 _HEALTH_EVERY_S, _POSE_EVERY_NS = 1.0, 500_000_000
 _SILENT_S = 1.0
 _DRAIN_S = 5.0
+_DELIVERED_WITHIN_S = 30.0  # after the end of a recording
 _MAX_PENDING = 100
 _log = logging.getLogger(__name__)
 
@@ -69,14 +70,17 @@ class RuntimeParts:
 
 
 class Runtime:
-    """Runs until `stop` is called, the source ends, or a thread fails; `run` raises its error."""
+    """Runs until `stop` is called, the source ends, or a thread fails; `run` raises its error.
+
+    After the source's end it waits until a connected server has the failures with their recordings, at most 30 s.
+    """
 
     def __init__(
         self, parts: RuntimeParts, manager: ServiceManager, *, wall_ns: Callable[[], int] = time.time_ns
     ) -> None:
         self._parts, self._manager, self._wall_ns = parts, manager, wall_ns
         self._robot, self._server, self._publisher = parts.robot, parts.server, parts.publisher
-        self._stop, self._sensors_stop = threading.Event(), threading.Event()
+        self._stop, self._sensors_stop, self._disk_stop = (threading.Event() for _ in range(3))
         # Exchanged between threads: deques and plain values, which need no lock.
         self._bound = PositionBound()
         self._held: list[WantedVersion] = []
@@ -99,6 +103,7 @@ class Runtime:
     def stop(self) -> None:
         self._stop.set()
         self._sensors_stop.set()
+        self._disk_stop.set()
 
     def run(self) -> None:
         """Localize on the calling thread until the end; then join all threads and write their data to the disk."""
@@ -106,8 +111,8 @@ class Runtime:
             works: dict[str, Callable[[], None]] = {"sensors": self._run_sensors, "disk": self._run_disk}
             if self._server is not None:
                 works["network"] = partial(self._run_network, self._server)
-            threads = [threading.Thread(target=work, name=name, daemon=True) for name, work in works.items()]
-            for thread in threads:
+            threads = {name: threading.Thread(target=work, name=name, daemon=True) for name, work in works.items()}
+            for thread in threads.values():
                 thread.start()
             if self._parts.fleet_manager is not None:
                 self._parts.fleet_manager.start()
@@ -119,24 +124,40 @@ class Runtime:
             finally:
                 self._finish(threads)
 
-    def _finish(self, threads: list[threading.Thread]) -> None:
+    def _finish(self, threads: dict[str, threading.Thread]) -> None:
         self._manager.stopping()
         if self._server is not None:
             self._server.health.append(self._health())  # including the last frames
-        self.stop()
-        for thread in threads:
-            thread.join(_DRAIN_S)
-        if self._parts.fleet_manager is not None:
-            self._parts.fleet_manager.stop()
+        self._sensors_stop.set()
+        self._disk_stop.set()
+        for name in ("sensors", "disk"):
+            threads[name].join(_DRAIN_S)
         self._queue_failures()
         if self._parts.replays is not None and self._robot.ring is not None:
             self._robot.ring.finish()
             self._parts.replays.work()
         if self._parts.drives is not None:
             self._parts.drives.finish()
+        if self._server is not None and self._parts.intake.exhausted:
+            self._await_delivery(self._server)
+        self.stop()
+        for thread in threads.values():
+            thread.join(_DRAIN_S)
+        if self._parts.fleet_manager is not None:
+            self._parts.fleet_manager.stop()
         _log.info("stopped: %s", self._health())
         if words := self._figures.search.words:
             _log.warning("stopped: %s", words)
+
+    def _await_delivery(self, server: ServerSync) -> None:
+        """Wait while a connected server takes failures and their recordings. What is left stays in the spool."""
+        server.hurry()
+        spools = [spool for spool in (self._parts.outbox, server.replays) if spool is not None]
+        until_s = time.monotonic() + _DELIVERED_WITHIN_S
+        with suppress(StoreError):  # logged by the network thread
+            while time.monotonic() < until_s and server.client.connected() and any(s.waiting() for s in spools):
+                if self._stop.wait(_IDLE_S):
+                    return
 
     # --- the thread that localizes ------------------------------------------------------------------------------------
 
@@ -251,7 +272,7 @@ class Runtime:
     def _run_disk(self) -> None:
         kept = [part.work for part in (self._parts.replays, self._parts.drives) if part is not None]
         jobs = Jobs(self._load_maps, self._queue_failures, *kept)
-        while not self._stop.wait(_IDLE_S):
+        while not self._disk_stop.wait(_IDLE_S):
             jobs.work()
 
     def _load_maps(self) -> None:

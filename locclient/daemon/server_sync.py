@@ -118,6 +118,10 @@ class ServerSync:
             self._refusals.warning("no connection", words, now_s - self._connected_s, self.client.endpoint, running)
         return False
 
+    def hurry(self) -> None:
+        """Look for recordings in the next step; thread-safe."""
+        self._replay_at_s = 0.0
+
     def close(self) -> None:
         for handle in self._handles:
             handle.close()

@@ -29,8 +29,8 @@ Positive = Annotated[float, msgspec.Meta(gt=0)]
 class AlertSettings(Section, frozen=True):
     """webhook: notified address, None for none; token_file: its content is sent as bearer token.
 
-    failures_per_robot_day: limit for the rate of the last 24 h, exceeded with 97.5 % confidence after enough driving for a rate; lost_s: limit for the time that a robot
-    does not know its position.
+    failures_per_robot_day: limit for the rate of the last 24 h, exceeded with 97.5 % confidence after enough driving for a rate; lost_s:
+    limit for the time that a robot does not know its position.
     """
 
     webhook: str | None = None

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fleetmap.errors import FleetmapError, RecordingError, StoreError
+from fleetmap.errors import FleetmapError, LinkError, RecordingError, StoreError
 from fleetmap.geometry import se3_inverse
 from fleetmap.messages import (
     Cause,
@@ -31,6 +31,7 @@ from locclient.daemon.runtime import Runtime, RuntimeParts
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.service_manager import ServiceManager
 from locclient.delivery.outbox import Outbox
+from locclient.delivery.report_delivery import ReplayQueue
 from locclient.localization.estimate import Estimate
 from locclient.maps.floor_maps import FloorMaps
 from locclient.maps.loaded_map import PositionBound, TileSelectionSettings
@@ -48,7 +49,7 @@ from mapserver.fleet.alerts import AlertSettings, active_alerts
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
 from mapserver.serving.robot_placing import RobotPlacing
-from mapserver.store import Actor, MapStore
+from mapserver.store import Actor, FailureFilter, MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
@@ -141,7 +142,7 @@ def world(tmp_path: Path) -> Iterator[World]:
 
         def take(_: str, payload: bytes) -> bytes:
             made.table.append(decode_message(payload, FailureReport).id)
-            return encode_message(FailureAck(id=made.table[-1]))
+            return encode_message(fleet.take_failure_bytes("room", "r1", payload))
 
         bus.queryable(
             robot_key("*", "*", "failures"), take
@@ -226,6 +227,30 @@ def test_a_robot_that_is_too_slow_for_its_frames_stays_exact_and_people_see_it(w
         "r1"
     ]
     assert 'fleetmap_site_robots_overloaded{site="room"} 1.0' in Metrics(world.store, world.fleet).text().decode()
+
+
+@pytest.mark.parametrize("is_stopped", [False, True])
+def test_the_recording_of_a_failure_at_the_end_has_arrived(
+    world: World, monkeypatch: pytest.MonkeyPatch, is_stopped: bool
+) -> None:
+    robot = Robot(calibration(), robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
+    bundles = list(robot_world.bundles(110, dark=range(60, 110)))
+    plain = world.parts(ScriptedSource(bundles, ready=lambda: robot.running is not None), robot, Listener())
+    assert plain.server is not None
+    spool = plain.server.replays = Outbox(world.folder / "replays", max_bytes=10**8)
+    made = Runtime(replace(plain, replays=ReplayQueue(spool, plain.profile, "blurred")), ServiceManager(""))
+
+    def ctrl_c(_: object) -> FailureAck:
+        made.stop()
+        raise LinkError("later")
+
+    if is_stopped:
+        monkeypatch.setattr(runtime, "_DELIVERED_WITHIN_S", 10**6)
+        monkeypatch.setattr(plain.server.client, "send_replay_part", ctrl_c)
+    made.run()
+    (failure,) = world.store.fleet.failures(FailureFilter(site="room"))
+    assert (world.store.fleet.replay_summary(failure.number) is None) == is_stopped
+    assert len(spool.waiting()) == is_stopped
 
 
 def test_a_new_version_is_taken_while_driving(world: World) -> None:
