@@ -59,7 +59,7 @@ def _page(services: Services, context: PageContext, robot: LiveRobot) -> dict[st
     version = robot.version or services.maps.current_version(context.site)
     drawn = None
     if version is not None and services.maps.has_version(context.site, version):
-        trail = way(rows, shown)
+        trail = way(rows, shown, services.settings.ingest.trace_every_s)
         layers = [
             Layer("Way", trail),
             Layer("Failures", failure_marks(context, within)),

@@ -69,26 +69,38 @@ def band(parts: Sequence[Stretch], least_ns: int) -> list[Stretch]:
     return found
 
 
-def way(rows: Sequence[TraceRow], parts: Sequence[Stretch]) -> list[Line]:
-    """Where it drove, in the tones of the stretches, the worst on top. Nothing joins what lies apart in time; who stands adds nothing."""
+def way(rows: Sequence[TraceRow], parts: Sequence[Stretch], every_s: float = 10.0) -> list[Line]:
+    """Where it drove, in the tones of the stretches, the worst on top; who stands adds nothing.
+
+    every_s: longest time between two rows of a robot that is heard. Nothing joins rows farther apart than that and some lost reports, nor
+    where it thought to be while it was lost and where it found itself.
+    """
     found: list[Line] = []
-    remaining, before_ns = iter(parts), None
+    remaining, before = iter(parts), None
     part = next(remaining, None)
     for row in rows:
         if row.x_map_m is None or row.y_map_m is None:
-            before_ns = None
+            before = None
             continue
         while part is not None and part.until_ns <= row.heard_ns:
             part = next(remaining, None)
         here, tone = (round(row.x_map_m, 2), round(row.y_map_m, 2)), "quiet" if part is None else part.state[1]
-        if before_ns is None or row.heard_ns - before_ns > GAP_NS:
+        if (
+            before is None
+            or row.heard_ns - before.heard_ns > 1.5e9 * every_s
+            or (_is_lost(before) and not _is_lost(row))
+        ):
             found.append(Line([here], tone))
         elif tone != found[-1].tone:
             found.append(Line([found[-1].points[-1], here], tone))
         elif dist(found[-1].points[-1], here) >= _STEP_M:
             found[-1].points.append(here)
-        before_ns = row.heard_ns
+        before = row
     return sorted((line for line in found if len(line.points) > 1), key=lambda line: -ORDER[line.tone])
+
+
+def _is_lost(row: TraceRow) -> bool:
+    return words_of(row.status)[1] == "bad"
 
 
 def curve(rows: Sequence[TraceRow], name: str, shown: Range) -> tuple[float, float, str] | None:

@@ -333,7 +333,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         if parent is not None and PICTURES_KEY in parent.manifest.report:
             with suppress(StateError):  # all of them were removed after their period
                 before = maps.survey_pictures(site, parent.manifest.version)
-        pictures, pictures_said = kept_pictures(sessions, corrections.pictures_before(before), maps.blob)
+        pictures, pictures_said = kept_pictures(sessions, corrections.pictures_before(before), maps.blob, maps.now_ns())
     run.times.begin("examining")
     evidence = msgspec.structs.replace(_evidence(run, built, judged, tiles, parent), views=views)
     run.times.begin("storing")

@@ -16,6 +16,7 @@ from rich.console import Console
 from fleetmap.config import Section, load_toml
 from fleetmap.errors import FleetmapError, RecordingError, SurveyError
 from fleetmap.geometry import Array
+from fleetmap.log_lines import printable
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
 from fleetmap.sensors.calibration import RigCalibration
@@ -144,8 +145,13 @@ class RecordingOptions:
     trajectory: OtherTrajectory | None = None
 
     def opened(self, path: Path, keep_in: Path | None = None) -> tuple[Recording, NDArray[np.int64]]:
-        """Return the recording at `path`, to be closed, and the indices of its selected frames. keep_in: a folder for KeptFrames."""
+        """Return the recording at `path`, to be closed, and the indices of its selected frames. keep_in: a folder for KeptFrames.
+
+        Its name is that of its file, by which people look for it, where another one was written into it.
+        """
         recording = open_recording(path, self.opening)
+        if recording.name not in {path.name, path.stem}:
+            recording = replace(recording, name=printable(path.name))
         try:
             recording = reduced(recording, self.use)
             selected = FrameSelection.parse(self.frames).apply(recording)
@@ -325,7 +331,7 @@ def _admission(
 ) -> Admission:
     with options.open(path) as (recording, indices):
         for issue in recording.issues:
-            console.print(f"issue: {issue.what}: {issue.detail}", markup=False)
+            console.print(f"{recording.name}: issue: {issue.what}: {issue.detail}", markup=False)
         if needs_truth:
             check_truth(str(recording.path), recording.frame_stamps_ns[indices], recording.ground_truth)
         first = recording.view(0)

@@ -80,7 +80,6 @@ from mapserver.store.version_rows import (
     mentioned,
     site_releases,
 )
-from mapserver.survey.merge.area_corrections import CLOCKS_BEGIN_NS
 
 if TYPE_CHECKING:
     from mapserver.surfels.survey_pictures import SurveyPicture
@@ -367,19 +366,19 @@ class MapStore(StoreQueries):
             return garbage
 
     def remove_survey_pictures(self, days: float, *, dry_run: bool = False) -> int:
-        """Remove the surveys' pictures taken longer ago from all versions, and return their number; StoreError on a disk error.
+        """Remove the surveys' pictures kept for longer from all versions, and return their number; StoreError on a disk error.
 
-        One of a recording whose clock does not count from 1970 is as old as the oldest version that has it. Indexes of versions, which
-        are signed, still name them.
+        Their age counts from their first build, whatever their recording's clock says: one of an earlier fleetmap is as old as the oldest
+        version that has it. Indexes of versions, which are signed, still name them.
         """
-        before_ns, taken_ns = self.now_ns() - int(days * 86_400e9), dict[str, int]()
+        before_ns, kept_ns = self.now_ns() - int(days * 86_400e9), dict[str, int]()
         with self._locked(shared=dry_run):
             for site in self.sites():
                 for info in self.versions(site.site):
                     for one in _pictures_of(self, info):
-                        since_ns = one.stamp_ns if one.stamp_ns > CLOCKS_BEGIN_NS else info.saved_ns
-                        taken_ns[one.sha256] = min(since_ns, taken_ns.get(one.sha256, since_ns))
-            old = [sha256 for sha256, since_ns in taken_ns.items() if since_ns < before_ns]
+                        since_ns = one.kept_ns or info.saved_ns
+                        kept_ns[one.sha256] = min(since_ns, kept_ns.get(one.sha256, since_ns))
+            old = [sha256 for sha256, since_ns in kept_ns.items() if since_ns < before_ns]
             if not dry_run and old:
                 with self._transactions.write() as connection:
                     connection.executemany("DELETE FROM surfel_blobs WHERE sha256 = ?", [(sha256,) for sha256 in old])

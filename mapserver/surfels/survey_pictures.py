@@ -6,6 +6,7 @@ from typing import Annotated
 import cv2
 import msgspec
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from fleetmap.encoding import to_json
@@ -28,7 +29,8 @@ _Triple = Annotated[tuple[float, ...], msgspec.Meta(min_length=3, max_length=3)]
 class SurveyPicture(msgspec.Struct, frozen=True, kw_only=True):
     """A picture of a survey: position of its camera and unit vector along its axis in `map`, its stamp, the recording, the JPEG's address.
 
-    stamp_ns: of the recording's clock, which may count from another moment than 1970.
+    stamp_ns: of the recording's clock, which may count from another moment than 1970. kept_ns: of the build that kept it first; 0 if an
+    earlier fleetmap did.
     """
 
     place_map_m: _Triple
@@ -37,6 +39,7 @@ class SurveyPicture(msgspec.Struct, frozen=True, kw_only=True):
     recording: Annotated[str, msgspec.Meta(max_length=400)]
     sha256: Sha256
     bytes: Positive
+    kept_ns: int = 0
 
 
 class PictureIndex(msgspec.Struct, frozen=True, kw_only=True):
@@ -83,11 +86,11 @@ def nearest_pictures(
 
 
 def kept_pictures(
-    sessions: Iterable[GridSession], before: Sequence[SurveyPicture], blob: Callable[[str], bytes]
+    sessions: Iterable[GridSession], before: Sequence[SurveyPicture], blob: Callable[[str], bytes], now_ns: int
 ) -> tuple[list[bytes], PicturesReport | None]:
     """Return the index and each JPEG, and their report; no bytes and None without pictures.
 
-    before: pictures of the version before, which stay where no later survey looked the same way; blob: their bytes.
+    before: pictures of the version before, which stay where no later survey looked the same way; blob: their bytes. now_ns: of the build.
     """
     data, found = dict[str, bytes](), list[SurveyPicture]()
     for session in sessions:
@@ -106,10 +109,12 @@ def kept_pictures(
                 SurveyPicture(
                     place_map_m=tuple(place.round(3).tolist()), looks_map=tuple(looks.round(4).tolist()),
                     stamp_ns=int(keyframe.frame.stamp_ns), recording=session.name, sha256=sha256, bytes=len(jpeg),
+                    kept_ns=now_ns,
                 )
             )  # fmt: skip
         found = taken + [one for one in found if not _is_among(one.place_map_m, one.looks_map, taken)]
-    found = (found + [one for one in before if not _is_among(one.place_map_m, one.looks_map, found)])[:_MOST]
+    others = [one for one in before if not _is_among(one.place_map_m, one.looks_map, found)]
+    found = (found + [replace(one, kept_ns=one.kept_ns or now_ns) for one in others])[:_MOST]
     if not found:
         return [], None
     addresses = sorted({one.sha256 for one in found})

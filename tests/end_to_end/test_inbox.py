@@ -51,7 +51,12 @@ def built(served: Served, recording: str) -> int:
 def test_an_upload_becomes_a_version(tmp_path: Path) -> None:
     inbox, ride, other = tmp_path / "inbox", tmp_path / "ride.mcap", tmp_path / "other.mcap"
     for path, seconds in ((ride, 4.0), (other, 3.6)):
-        run(app, "convert", write_euroc(path.with_suffix(""), ride_sample(out_and_back(seconds), 38, 0.1)), path)
+        run(
+            app,
+            "convert",
+            write_euroc(tmp_path / f"recorder {seconds}", ride_sample(out_and_back(seconds), 38, 0.1)),
+            path,
+        )
     inbox.mkdir()
     with MapStore.open(tmp_path / "store", create=True):
         pass
@@ -78,6 +83,8 @@ def test_an_upload_becomes_a_version(tmp_path: Path) -> None:
         log = httpx.get(f"{served.http}/v1/jobs/{first}/log").text
         assert log.startswith("reading ride.mcap\n")
         assert "draft 1 " in log and "--trust-calibration" in log
+        assert "\nride.mcap: " in log and "recorder" not in log, "it names the file, not what the recorder called it"
+        assert list(job(first)["report"]["builds"][0]["findings"]) == ["ride.mcap"]
         trusted = httpx.post(f"{served.http}{LAB}/versions/1/publish", json=ADA | {"trust_calibration": True})
         assert trusted.status_code == 200
         again = httpx.post(f"{served.http}{LAB}/inbox/held/{held['name']}/retry", json=ADA)

@@ -16,8 +16,7 @@ from mapserver import releases
 from mapserver.cli import app
 from mapserver.drafting.job_lock import only_one
 from mapserver.nightly.inbox import BAD, DONE, HELD, put_away, remove_old
-from mapserver.store import FleetRetention, MapStore
-from mapserver.survey.merge.area_corrections import CLOCKS_BEGIN_NS
+from mapserver.store import FleetRetention, MapStore, Retention
 from support.storage.clock import Clock
 from support.storage.map_samples import save_picture_draft
 from support.storage.room_sessions import Seen, session_at
@@ -33,28 +32,33 @@ def pictured(*x_m: float, since_ns: int = 0):
     return session
 
 
-def test_pictures_of_surveys_go_from_every_version_that_has_them(tmp_path: Path) -> None:
+@pytest.mark.parametrize("since_ns", [0, 1_400_000_000 * 10**9, 4_000_000_000 * 10**9])
+def test_pictures_of_surveys_go_from_every_version_that_has_them(tmp_path: Path, since_ns: int) -> None:
+    """After their period since they came: their clock counts from a start, from 1970 and is of 2014, or is ahead."""
     clock = Clock()
     with MapStore.open(tmp_path, create=True, clock_ns=clock) as store:
-        young_ns = store.now_ns() - 2 * DAY_S * 10**9
-        assert young_ns > CLOCKS_BEGIN_NS
-        first = save_picture_draft(store, [pictured(0.0, 3.0, since_ns=young_ns - 9 * DAY_S * 10**9)])
+        first = save_picture_draft(store, [pictured(0.0, 3.0, since_ns=since_ns)])
         releases.publish(store, "lab", first)
-        sessions = [pictured(0.0, 3.0, since_ns=young_ns - 9 * DAY_S * 10**9), pictured(-3.0, since_ns=young_ns)]
-        both, counting = save_picture_draft(store, sessions), save_picture_draft(store, [pictured(6.0)])
-        assert [len(store.survey_pictures("lab", version)) for version in (first, both, counting)] == [2, 3, 1]
+        clock.now_ns += 3 * DAY_S * 10**9
+        both = save_picture_draft(store, [pictured(-3.0, since_ns=since_ns)], store.survey_pictures("lab", first))
+        last = save_picture_draft(store, [], store.survey_pictures("lab", both))
+        for version in (both, last):
+            releases.publish(store, "lab", version)
+        assert [len(store.survey_pictures("lab", version)) for version in (first, both, last)] == [2, 3, 3]
         blobs = len(list(tmp_path.glob("blobs/*/*")))
+        assert store.remove_survey_pictures(5.0) == 0
+        clock.now_ns += 3 * DAY_S * 10**9
         assert store.remove_survey_pictures(5.0, dry_run=True) == 2
         assert len(list(tmp_path.glob("blobs/*/*"))) == blobs
-        assert store.remove_survey_pictures(5.0) == 2
-        assert len(list(tmp_path.glob("blobs/*/*"))) == blobs - 2
-        assert [one.stamp_ns for one in store.survey_pictures("lab", both)] == [young_ns]
-        with pytest.raises(StateError, match="removed after their period"):
-            store.survey_pictures("lab", first)
+        store.collect_garbage(Retention(keep_versions=0, keep_drafts=0, keep_days=0.0))
+        assert [info.version for info in store.versions("lab")] == [both, last]
+        assert store.remove_survey_pictures(5.0) == 2, "though the version that came with them is gone"
+        assert [len(store.survey_pictures("lab", version)) for version in (both, last)] == [1, 1]
         assert store.verify().faults == []
-        assert store.remove_survey_pictures(5.0) == 0
-        clock.now_ns += 6 * DAY_S * 10**9  # a picture whose clock counts from a start is as old as its oldest version
-        assert store.remove_survey_pictures(5.0) == 2
+        clock.now_ns += 3 * DAY_S * 10**9
+        assert store.remove_survey_pictures(5.0) == 1
+        with pytest.raises(StateError, match="removed after their period"):
+            store.survey_pictures("lab", both)
         store.export_version("lab", both, tmp_path / "lab.fmex")
     with MapStore.open(tmp_path / "other", create=True) as other:
         other.import_version(tmp_path / "lab.fmex")

@@ -36,27 +36,27 @@ def test_a_picture_each_two_metres_is_kept_within_ten_kilobytes_a_metre() -> Non
     for number in (0, 8):  # noise fills any JPEG
         noise = rng.integers(0, 256, (480, 640), np.uint8)
         session.survey.odometry.keyframes[number] = Seen(RectifiedFrame(number, noise, None, None), number)
-    blobs, report = kept_pictures([session], (), {}.__getitem__)
+    blobs, report = kept_pictures([session], (), {}.__getitem__, 7)
     found = index_of(blobs)
     np.testing.assert_allclose(np.diff([one.place_map_m[0] for one in found]), 2.4, atol=1e-3)
     assert (report.pictures, report.sha256, report.bytes) == (4, sha256_hex(blobs[0]), sum(map(len, blobs)))
     assert max(map(len, blobs[1:])) <= 20_000
     assert {sha256_hex(data) for data in blobs[1:]} == {one.sha256 for one in found}
-    assert kept_pictures([session], (), {}.__getitem__) == (blobs, report)
-    assert kept_pictures([], (), {}.__getitem__) == ([], None)
+    assert kept_pictures([session], (), {}.__getitem__, 7) == (blobs, report)
+    assert kept_pictures([], (), {}.__getitem__, 7) == ([], None)
 
 
 def test_a_later_drive_replaces_what_it_saw_the_same_way() -> None:
-    first, _ = kept_pictures([along(9.0)], (), {}.__getitem__)
+    first, _ = kept_pictures([along(9.0)], (), {}.__getitem__, 7)
     kept = {sha256_hex(data): data for data in first}
     for session, left in ((along(3.0), 2), (along(9.0, yaw=np.pi), 4), (along(9.0, y=3.0), 4), (along(9.0, y=1.0), 0)):
-        later, _ = kept_pictures([session._replace(name="later")], index_of(first), kept.__getitem__)
+        later, _ = kept_pictures([session._replace(name="later")], index_of(first), kept.__getitem__, 8)
         assert len(set(index_of(later)) & set(index_of(first))) == left
         assert {sha256_hex(data) for data in later[1:]} >= {one.sha256 for one in index_of(later)}
 
 
 def test_those_that_look_elsewhere_come_last() -> None:
-    ahead, back = (index_of(kept_pictures([along(9.0, yaw=yaw)], (), {}.__getitem__)[0]) for yaw in (0.0, np.pi))
+    ahead, back = (index_of(kept_pictures([along(9.0, yaw=yaw)], (), {}.__getitem__, 7)[0]) for yaw in (0.0, np.pi))
     place, looks = np.array([4.0, 0.0, 0.5]), np.array(back[0].looks_map)
     found = nearest_pictures((*ahead, *back), place, looks)
     assert [one for one, _ in found[:4]] == sorted(

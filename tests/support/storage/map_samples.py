@@ -17,7 +17,7 @@ from mapserver import releases
 from mapserver.grid.survey_grid import GridSession
 from mapserver.store import DraftContent, DraftDetails, MapStore
 from mapserver.surfels.surfel_map import EDGE_M, TILE_SIZE_M, Surfels, SurfelTiles, encode_tile, surfel_report
-from mapserver.surfels.survey_pictures import kept_pictures
+from mapserver.surfels.survey_pictures import SurveyPicture, kept_pictures
 from mapserver.survey.survey_map import SurveyMap
 
 
@@ -159,9 +159,11 @@ def save_surfel_draft(store: MapStore, surfels: Surfels, *, site: str = "lab") -
     return _save_tile(store, site, said, surfels=blobs)
 
 
-def save_picture_draft(store: MapStore, sessions: Sequence[GridSession], *, site: str = "lab") -> int:
-    """A draft with the pictures of these sessions."""
-    blobs, said = kept_pictures(sessions, (), {}.__getitem__)
+def save_picture_draft(
+    store: MapStore, sessions: Sequence[GridSession], before: Sequence[SurveyPicture] = (), *, site: str = "lab"
+) -> int:
+    """A draft with the pictures of these sessions, and those of a version before."""
+    blobs, said = kept_pictures(sessions, before, store.blob, store.now_ns())
     return _save_tile(store, site, {"pictures": msgspec.to_builtins(said)}, pictures=blobs)
 
 
