@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from fleetmap.errors import StoreError
+from fleetmap.files import OWN_FILE
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS report (
@@ -62,6 +63,8 @@ class Outbox:
         path = self._path
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
+            path.touch(OWN_FILE)
+            path.chmod(OWN_FILE)  # of an earlier version; SQLite gives its other files the same
             try:
                 self._check()
             except sqlite3.DatabaseError as error:

@@ -2,7 +2,9 @@
 
 import hashlib
 import http.client
+import socket
 import ssl
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -70,8 +72,15 @@ def download(link: str, origins: Origins, target: IO[bytes], *, max_bytes: int) 
         headers["Authorization"] = f"Bearer {origins.token}"
     path = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
     try:
-        connection.request("GET", path, headers=headers)
-        answer = connection.getresponse()
+        connection.connect()
+        # Each byte of a head, and each `100 Continue`, begins the socket's own time anew.
+        late = threading.Timer(_STALL_S, connection.sock.shutdown, (socket.SHUT_RDWR,))
+        late.start()
+        try:
+            connection.request("GET", path, headers=headers)
+            answer = connection.getresponse()
+        finally:
+            late.cancel()
         if answer.status != http.client.OK:
             raise LinkError(f"{link[:200]} answers {answer.status} {answer.reason[:80]}")
         return _receive(answer, link, target, max_bytes)

@@ -25,6 +25,7 @@ from mapserver.trust.signing import sign_ahead
 _NO_STORE = {"lock", "lost+found", _PART := ".restore"}
 _VERSIONS_AHEAD = 1000  # more than a site gets between a backup and the next restoration
 _ROOTS = 2  # beyond all that robots may know: one that the lost store made after its backup, and one more
+_MOST_ROOTS = 100  # more than a store makes between a backup and its restoration; a robot follows 1024 in all
 _LISTS_AHEAD = 100_000  # the same, of a timestamp each six hours and with each release
 _log = logging.getLogger(__name__)
 Progress = Callable[[int, int], None]
@@ -96,7 +97,7 @@ def restore(
                     f"{folder} holds {others[0]!r} already; name a new folder, so that nothing is overwritten"
                 )
             name, snapshot = target.read(name)
-            _check_room(folder, sum(snapshot.objects().values()))
+            _check_room(folder, snapshot.written_bytes())
             keys, number, part = _keys(target, snapshot, list(identities)), target.count_restore(), folder / _PART
             shutil.rmtree(part, ignore_errors=True)  # of a killed restoration
             try:
@@ -135,7 +136,8 @@ def _sign(store: MapStore, number: int, target: BackupTarget) -> Literal["none",
     lists = SignedLists(store.folder)
     if not lists.are_there:
         return "none"
-    roots = max(target.known_root() - lists.newest("root"), 0) + _ROOTS
+    newest = lists.newest("root")
+    roots = max(target.known_root(newest + _MOST_ROOTS) - newest, 0) + _ROOTS
     try:
         found = sign_ahead(store, number * _LISTS_AHEAD, roots)
     except FleetmapError as error:  # such as a key whose passphrase only the server's unit has

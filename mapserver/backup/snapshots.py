@@ -63,6 +63,10 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
         pieces = dict.fromkeys([*keys, *(piece for pieces in self.files.values() for piece in pieces)], PIECE_BYTES)
         return {**pieces, **self.blobs}
 
+    def written_bytes(self) -> int:
+        """Return what a restoration writes at most: a piece counts as often as it is named."""
+        return sum(self.blobs.values()) + PIECE_BYTES * sum(len(pieces) for pieces in self.files.values())
+
 
 class BackupTarget:
     """Objects and snapshots under one URL or in one folder, created if needed. Raises StoreError if it cannot be reached."""
@@ -172,11 +176,14 @@ class BackupTarget:
         """Keep the number of the newest root that a restoration signed."""
         self._put(f"{_RESTORES}/{number:06}-root-{root}", b"")
 
-    def known_root(self) -> int:
-        """Return the newest root of all restorations, 0 without any."""
+    def known_root(self, most: int) -> int:
+        """Return the newest root of all restorations, 0 without any; StoreError for one above `most`."""
         with self._errors():
             found = [re.fullmatch(r"[0-9]{6}-root-([0-9]{1,4})", name) for name, _, _ in self._listed(_RESTORES)]
-        return max((int(name[1]) for name in found if name is not None), default=0)
+        newest = max((int(name[1]) for name in found if name is not None), default=0)
+        if newest > most:
+            raise StoreError(f"{self.where} counts {newest} roots, which cannot be; look at {_RESTORES} there")
+        return newest
 
     def _listed(self, prefix: str) -> Iterator[tuple[str, int, datetime]]:
         for batch in obstore.list(self._store, prefix):

@@ -24,12 +24,12 @@ from itertools import chain, count
 from pathlib import Path
 from types import FrameType
 
-from fleetmap.errors import FleetmapError, RecordingError, StateError, UsageError, disk_errors
+from fleetmap.errors import FleetmapError, RecordingError, StateError, StoreError, UsageError, disk_errors
 from fleetmap.files import sync_path, write_atomically
 from fleetmap.log_lines import printable
 from fleetmap.mapformat.names import is_name
 from fleetmap.recordings import FILE_SUFFIXES, OpenOptions, open_recording
-from mapserver.store.files import make_folder
+from mapserver.store.files import check_no_link, make_folder
 
 DONE, HELD, BAD = "done", "held", "bad"
 _HASH_SIGNS = 12
@@ -235,6 +235,7 @@ def _is_being_written(path: Path) -> bool:
     except PermissionError:
         return False
     try:
+        fcntl.fcntl(descriptor, fcntl.F_SETSIG, signal.SIGURG)  # not SIGIO, which ends a process, if it is opened now
         fcntl.fcntl(descriptor, fcntl.F_SETLEASE, fcntl.F_RDLCK)
         fcntl.fcntl(descriptor, fcntl.F_SETLEASE, fcntl.F_UNLCK)
     except BlockingIOError:
@@ -255,6 +256,7 @@ def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> 
     """
     folder = path.parent / where
     prefix = "" if sha256 is None or path.name.startswith(sha256[:_HASH_SIGNS]) else f"{sha256[:_HASH_SIGNS]}-"
+    check_no_link(path.parent, folder)
     with disk_errors(f"{path} cannot be moved to {folder}", "check the rights and space of the inbox"):
         make_folder(folder)
         named = f"{prefix}{path.name}"
@@ -321,8 +323,9 @@ def contents(inbox: Path, settle_s: float, now_ns: int) -> InboxContents:
 
 
 def _names(folder: Path) -> list[str]:
-    """Return the names of recordings that were put away."""
-    with suppress(FileNotFoundError):
+    """Return the names of recordings that were put away; none of a folder that is a link."""
+    with suppress(FileNotFoundError, StoreError):
+        check_no_link(folder.parent, folder)
         return sorted(name for name in os.listdir(folder) if not name.endswith(_REASON) and is_safe_name(name))  # noqa: PTH208
     return []
 
@@ -353,6 +356,7 @@ def put_back(inbox: Path, where: str, name: str) -> None:
     Raises UsageError for an unknown one, StateError if the inbox has one of this name, StoreError if the disk refuses.
     """
     path, target = inbox / where / name, inbox / name
+    check_no_link(inbox, path.parent)
     if not is_safe_name(name) or not os.path.lexists(path) or name.endswith(_REASON):
         raise UsageError(f"{where} has no recording {printable(name)[:80]!r}; it may be back in the inbox already")
     if os.path.lexists(target):
@@ -418,8 +422,7 @@ def kept(inbox: Path, sha256s: list[str]) -> list[Path]:
     """Return the recordings of these hashes still in the inbox, in the same order: done, or held and later published by an operator."""
     found: dict[str, Path] = {}
     for where in (DONE, HELD):
-        with suppress(FileNotFoundError):
-            for path in sorted((inbox / where).iterdir()):
-                if not path.name.endswith(_REASON) and is_openable(path):
-                    found.setdefault(path.name[:_HASH_SIGNS], path)
+        for name in _names(inbox / where):
+            if is_openable(inbox / where / name):
+                found.setdefault(name[:_HASH_SIGNS], inbox / where / name)
     return [found[sha256[:_HASH_SIGNS]] for sha256 in sha256s if sha256[:_HASH_SIGNS] in found]

@@ -70,8 +70,8 @@ class PostgresTransactions(Transactions):
         super().__init__(clock_ns)
         try:
             named = make_url(url)
-        except SQLAlchemyError as error:
-            raise UsageError("the database's URL is invalid; write it like postgresql://user@host/name") from error
+        except (SQLAlchemyError, ValueError):  # the error holds what may be a password
+            raise UsageError("the database's URL is invalid; write it like postgresql://user@host/name") from None
         self._name = named.set(query={}).render_as_string(hide_password=True)  # it may hold a password, too
         if named.drivername != "postgresql":
             raise UsageError(
@@ -257,7 +257,9 @@ class PostgresTransactions(Transactions):
                 f"{self._name} has store format {number}, this fleetmap reads up to {FORMAT}; update fleetmap to open it"
             )
 
-    def _tls(self, sslmode: Any = "prefer", sslrootcert: Any = None, **others: object) -> ssl.SSLContext | bool | None:
+    def _tls(
+        self, /, sslmode: Any = "prefer", sslrootcert: Any = None, **others: object
+    ) -> ssl.SSLContext | bool | None:
         """Return the driver's setting for a URL's query: None for TLS, unchecked, if the server has it; False for none."""
         if sslmode not in ("disable", "prefer", "verify-full") or others or (sslrootcert and sslmode != "verify-full"):
             words = "sslmode=disable, sslmode=prefer or sslmode=verify-full, the last with &sslrootcert=FILE for an authority of your own"

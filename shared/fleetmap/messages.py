@@ -35,6 +35,7 @@ _MAX_KEY = 256  # two names and two addresses of bytes
 
 _STORED = r"\A[^\x00]*\Z"  # not every database takes NUL in text
 Name = Annotated[str, msgspec.Meta(max_length=64, pattern=_STORED)]
+FileName = Annotated[str, msgspec.Meta(max_length=64, pattern=r"\A[A-Za-z0-9_-]+\Z")]
 Text = Annotated[str, msgspec.Meta(max_length=2000, pattern=_STORED)]
 Version = Annotated[int, msgspec.Meta(ge=1, le=(1 << 31))]
 _Key = Annotated[str, msgspec.Meta(max_length=64)]  # in JSON, where NUL is escaped
@@ -121,7 +122,7 @@ class Part(msgspec.Struct, frozen=True, kw_only=True):
 class SurveyArea(msgspec.Struct, frozen=True, kw_only=True):
     """An area of which operators want a new survey: a polygon in `map`, metres, its first corner not repeated at the end."""
 
-    id: Name
+    id: FileName
     corners_map_m: Annotated[list[tuple[float, float]], msgspec.Meta(min_length=3, max_length=200)]
 
 

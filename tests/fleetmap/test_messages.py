@@ -21,6 +21,7 @@ from fleetmap.messages import (
     RobotAck,
     RobotHealth,
     Status,
+    SurveyArea,
     Thumbnail,
     WantedVersion,
     decode_message,
@@ -110,6 +111,9 @@ def test_oversized_and_foreign_messages_are_refused() -> None:
         decode_message(bytes(2 << 20), RobotAck)
     with pytest.raises(LinkError, match="same fleetmap"):
         decode_message(encode_message(SAMPLES[0]), RobotAck)
+    area = SurveyArea(id="../../../outside/evil", corners_map_m=[(0.0, 0.0), (1.0, 0.0), (1.0, 1.0)])
+    with pytest.raises(LinkError, match="surveys"):
+        decode_message(encode_message(msgspec.structs.replace(SAMPLES[0], surveys=(area,))), WantedVersion)
 
 
 def test_keys_can_be_taken_apart() -> None:

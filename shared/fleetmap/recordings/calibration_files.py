@@ -415,6 +415,9 @@ def _outlines(name: str, size_px: tuple[int, int], where: str, folder: Path | No
         )
     image = cv2.imdecode(np.frombuffer(stored.data, np.uint8), cv2.IMREAD_UNCHANGED)
     shown = np.atleast_3d(np.asarray(image))[:, :, :3].any(axis=2)
+    areas = sum(cv2.connectedComponents(np.asarray(side, np.uint8))[0] for side in (shown, ~shown))
+    if 3 * areas > _MOST_CORNERS:  # before their outlines are made: noise has millions
+        raise CalibrationError(f"{where}: {name} has {areas} areas; the limit is {_MOST_CORNERS // 3}, simplify it")
     contours, _ = cv2.findContours(np.asarray(shown, np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     outlines = [_simplified(np.asarray(contour, np.int32).reshape(-1, 2)) for contour in contours]
     return tuple(tuple((float(u), float(v)) for u, v in outline) for outline in outlines)

@@ -1,6 +1,7 @@
 """Reading of files that may be missing, too large or of another kind: Git LFS pointers, HTML pages, zip files."""
 
 import hashlib
+import os
 import re
 import stat
 from pathlib import Path
@@ -69,7 +70,9 @@ def read_text(
 def hash_file(path: Path, digest: "hashlib._Hash") -> None:
     """Feed the bytes of a file to `digest`, a block at a time."""
     try:
-        with path.open("rb") as file:
+        with os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb") as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                raise RecordingError(f"{path} is no file but a folder, a pipe or a device; copy the recording again")
             while block := file.read(_BLOCK_BYTES):
                 digest.update(block)
     except OSError as error:

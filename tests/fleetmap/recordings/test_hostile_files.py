@@ -4,6 +4,7 @@ Rows 25, 26 and 27 of docs/security.md.
 """
 
 import contextlib
+import hashlib
 import struct
 import time
 import zlib
@@ -20,7 +21,8 @@ import zstandard
 from fleetmap.config import load_toml
 from fleetmap.errors import CalibrationError, RecordingError, UsageError
 from fleetmap.recordings import OpenOptions, open_recording
-from fleetmap.recordings.calibration_files import parse_calibration, read_yaml
+from fleetmap.recordings.calibration_files import calibration_files, parse_calibration, read_yaml
+from fleetmap.recordings.files import hash_file
 from fleetmap.recordings.images import StoredImage, decode_grey, image_size
 from fleetmap.recordings.limits import MAX_CALIBRATION_BYTES, MAX_MESSAGE_BYTES, MAX_PIXELS, unpack
 from fleetmap.recordings.mcap.reader import MAGIC
@@ -158,6 +160,13 @@ def test_an_index_that_points_at_the_whole_file_is_not_read_at_once(tmp_path: Pa
 
 def aliases(levels: int) -> str:
     return "a0: &a0 [x]\n" + "".join(f"a{n}: &a{n} [{','.join([f'*a{n - 1}'] * 10)}]\n" for n in range(1, levels + 1))
+
+
+def test_a_calibration_that_names_a_device_does_not_read_it_for_ever(tmp_path: Path) -> None:
+    (tmp_path / "cams.yaml").write_text("notes: {mask: /dev/zero}\n")
+    with pytest.raises(RecordingError, match="/dev/zero is no file"):
+        for file in calibration_files(tmp_path / "cams.yaml"):
+            hash_file(file, hashlib.sha256())
 
 
 def test_nine_levels_of_aliases_are_refused_at_once() -> None:

@@ -224,6 +224,7 @@ def camchain(mask: object, cameras: int = 1) -> str:
         ([[[u, u % 2] for u in range(1200)]], "1200 corners"),
         ("white.png", "hides the whole image"),
         ("missing.png", "missing.png is not there"),
+        ("noise.png", "noise.png has .* areas; the limit is 333"),
         ("pipe", "pipe is not there, no file"),
         (".", "is not there, no file"),
         ("small.png", "small.png is 32x20"),
@@ -237,6 +238,8 @@ def test_a_mask_that_cannot_be_meant_is_refused(tmp_path: Path, mask: object, wo
     head = bytearray((tmp_path / "small.png").read_bytes())
     head[16:24] = (30_000).to_bytes(4, "big") * 2
     (tmp_path / "bomb.png").write_bytes(head)
+    noise = np.random.default_rng(0).integers(0, 2, SIZE_PX[::-1], np.uint8)
+    cv2.imwrite(str(tmp_path / "noise.png"), noise)
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "cams.yaml").write_text(camchain(mask))
     with pytest.raises(CalibrationError, match=words):

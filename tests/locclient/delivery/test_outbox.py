@@ -1,5 +1,6 @@
 """Reports outlive the process, the order is kept, room is bounded and what is lost is counted."""
 
+import stat
 import subprocess
 import sys
 from pathlib import Path
@@ -7,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from fleetmap.errors import StoreError
+from fleetmap.files import OWN_FILE
 from locclient.delivery.outbox import Outbox, QueuedReport
 
 
@@ -16,6 +18,7 @@ def report(name: str, size: int = 10) -> QueuedReport:
 
 def test_what_waits_survives_a_restart_in_order(tmp_path: Path) -> None:
     spool = Outbox(tmp_path / "new" / "spool.sqlite3", max_bytes=10_000)
+    assert stat.S_IMODE((tmp_path / "new" / "spool.sqlite3").stat().st_mode) == OWN_FILE
     for name in ("a", "b", "c"):
         spool.put(report(name))
     spool.put(report("a", size=20))

@@ -1,5 +1,6 @@
 """Downloads that must not become maps of a robot, and the one that may."""
 
+import contextlib
 import hashlib
 import threading
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ import pytest
 
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StateError, UntrustedError, UsageError
 from fleetmap.messages import WantedVersion
+from locclient.maps import version_download
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.version_download import Origins
 from locclient.vda5050.fleet_maps import DuplicateMapError, FleetMaps, NoRoomError
@@ -163,7 +165,7 @@ def test_links_lead_to_named_servers_alone(tmp_path: Path, file: bytes) -> None:
             Origins((origin,)).check()
 
 
-def test_bodies_without_end_and_servers_that_hang_up(tmp_path: Path) -> None:
+def test_bodies_and_heads_without_end_and_servers_that_hang_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def endless(request: BaseHTTPRequestHandler) -> None:
         request.send_response(200)
         request.end_headers()
@@ -173,6 +175,14 @@ def test_bodies_without_end_and_servers_that_hang_up(tmp_path: Path) -> None:
         except OSError:
             return
 
+    def endless_head(request: BaseHTTPRequestHandler) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                request.wfile.write(b"HTTP/1.1 100 Continue\r\n\r\n")
+
+    with monkeypatch.context() as patch, web_server(endless_head) as http:
+        patch.setattr(version_download, "_STALL_S", 0.3)
+        Robot(tmp_path, http).refuses(LinkError, "cannot be fetched", f"{http}/file")
     with web_server(endless) as http:
         Robot(tmp_path, http, max_bytes=1_000_000).refuses(NoRoomError, "more than 500000", f"{http}/file")
     with web_server(serve(b"short", **{"Content-Length": "5000"})) as http:

@@ -178,6 +178,7 @@ def test_a_hostile_target_writes_nowhere_else(store: MapStore, tmp_path: Path) -
         msgspec.structs.replace(found, keys=sha256_hex(stolen)),
         msgspec.structs.replace(found, files={**found.files, "keys/online.pem": found.files["store.sqlite3"]}),
         msgspec.structs.replace(found, format=3),
+        msgspec.structs.replace(found, files={"store.sqlite3": found.files["store.sqlite3"][:1] * 300_000}),  # 1.2 TB
     ]
     for bad in [to_json(snapshot) for snapshot in hostile] + [b"{", b"[]", b"\xff"]:
         (tmp_path / "backups" / "snapshots" / f"{name}.json").write_bytes(bad)
@@ -250,6 +251,9 @@ def test_what_counts_restorations_is_bounded(store: MapStore, tmp_path: Path) ->
     restores.mkdir()
     (restores / str(10**18)).touch()
     restore(target, tmp_path / "new", ADA)
+    (restores / "000001-root-1300").touch()
+    with pytest.raises(StoreError, match="1300 roots"):
+        target.known_root(100)
     (restores / "60000").touch()
     with pytest.raises(StoreError, match="60000 restorations"):
         restore(target, tmp_path / "newer", ADA)

@@ -315,6 +315,43 @@ def test_bad_entries_go_to_bad_with_their_reasons_and_the_night_goes_on(hall: Pa
     assert states(hall) == [("current", ["monday", "tuesday"])]
 
 
+@pytest.mark.parametrize("where", [boxes.DONE, boxes.HELD, boxes.BAD])
+def test_a_folder_of_the_inbox_that_is_a_link_moves_nothing(hall: Path, where: str) -> None:
+    outside = hall / "outside"
+    outside.mkdir()
+    (outside / "store.mcap").write_bytes(b"x")
+    (hall / "inbox" / where).symlink_to(outside)
+    (hall / "inbox/broken.mcap").write_bytes(b"x")
+    record(hall / "inbox", "lost one", 7)
+    spend(hall)
+    with pytest.raises(StoreError, match="symbolic link"):
+        boxes.put_back(hall / "inbox", where, "store.mcap")
+    shown = boxes.contents(hall / "inbox", 0.0, 0)
+    assert "store.mcap" not in {entry.name for entry in (*shown.held, *shown.bad)}
+    assert names(outside) == ["store.mcap"]
+
+
+def test_who_writes_a_recording_while_it_is_looked_at_ends_no_night(
+    hall: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file lease that is broken sends SIGIO, which ends a process."""
+    control = fcntl.fcntl
+
+    def written_meanwhile(descriptor: int, command: int, value: int) -> int:
+        found = control(descriptor, command, value)
+        if value == fcntl.F_RDLCK:
+            with contextlib.suppress(BlockingIOError):
+                os.open(f"/proc/self/fd/{descriptor}", os.O_WRONLY | os.O_NONBLOCK)
+        return found
+
+    heard: list[int] = []
+    before = signal.signal(signal.SIGIO, lambda number, _: heard.append(number))
+    monkeypatch.setattr(fcntl, "fcntl", written_meanwhile)
+    spend(hall)
+    signal.signal(signal.SIGIO, before)
+    assert heard == []
+
+
 def test_nothing_waits_without_a_word(hall: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is left where it is, is named: no recordings, what cannot be moved, what changes while it is read, and what is too much."""
     for name in ("notes.txt", "photo.png", "x.mcap", "y.mcap", "z.mcap"):

@@ -285,6 +285,8 @@ def test_wrong_words_get_a_next_step(tmp_path: Path, postgres: PostgresServer) -
     url = postgres.database()
     for wrong, words in (
         ("nonsense", "invalid"),
+        ("postgresql://fleet:secret@host:port/x", "invalid"),
+        (f"{url}?self=secret", "verify-full"),
         ("mysql://a/b", "PostgreSQL alone"),
         (f"{url}?sslmode=maybe", "verify-full"),
         (f"{url}?password=secret", "PGPASSWORD"),
