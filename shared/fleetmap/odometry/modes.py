@@ -230,6 +230,11 @@ def _with_matches(tracked: Tracked, kept: Iterable[Earlier]) -> Tracked:
     return replace(tracked, earlier=earlier, cam_from_previous=tracked.cam_from_previous if is_kept else None)
 
 
+def _verified(tracked: Tracked) -> Tracked:
+    """The tracks, none that no motion verifies: without an IMU nothing else reveals wrong observations."""
+    return replace(tracked, ids=tracked.ids[:0], pixels=tracked.pixels[:0]) if tracked.lost else tracked
+
+
 class VisualMode(WindowMode):
     """Vision alone: the state moves by the motion measured between frames, gravity is unknown."""
 
@@ -269,8 +274,7 @@ class VisualMode(WindowMode):
             if tracked.lost:
                 change = self.window.filter.begin_frame_anew()
             self._predict_random_walk(tracked)
-            if tracked.lost:  # not verified by a motion, and without an IMU nothing else reveals wrong observations
-                tracked = replace(tracked, ids=tracked.ids[:0], pixels=tracked.pixels[:0])
+            tracked = _verified(tracked)
         used = self.window.update(frame_index, tracked, self._rig.settings.filter.chunk_frames_without_imu, 4)
         return Step(self, used, change, is_lost=tracked.lost)
 
@@ -507,6 +511,7 @@ class InertialMode(WindowMode):
         self._seen = seen = tracked.cam_from_previous
         if self._guess is not None:
             self._bridge_gap(tracked, self._guess)
+            tracked = _verified(tracked)
         elif seen is not None and monitor.is_wrong_imu(self.cam_from_earlier(frame_index - 1), seen):
             window.filter.return_to_clone(frame_index - 1)  # vision moves the state from there, not once more
             return VisualMode(window, seen).process(frame_index, tracked)
