@@ -20,7 +20,7 @@ _STEREO = StereoSettings()
 # points' depths have errors too, and half of it stays while a camera sees the same points.
 _REPEATED = 1.4
 SceneError = tuple[Array, float]
-"""Covariance (6, 6) of the error that stays, of a rotation vector and a translation in camera axes, and the points' median depth in m."""
+"""Covariance (6, 6), rotation vector and translation in camera axes, of what stays while the same points are seen; their median depth."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ def body_motion(
 ) -> tuple[int, int, Array | None]:
     """Return stamps of two frames and the body's motion (4, 4) between them, earlier_from_later. rig: the camera, and body_from_cam."""
     (camera, body_from_cam), (before, after) = rig, pair
-    motion = motion_between(before, after, camera)
+    motion, _ = motion_between(before, after, camera)
     if motion is None:
         return before.stamp_ns, after.stamp_ns, None
     axes, place = body_from_cam[:3, :3], body_from_cam[:3, 3]
@@ -62,23 +62,14 @@ def body_motion(
     return before.stamp_ns, after.stamp_ns, se3(turn, axes @ motion[:3, 3] + place - turn @ place)
 
 
-def scene_error(before: RectifiedFrame, after: RectifiedFrame, camera: StereoCamera) -> SceneError | None:
-    """Return the error of `motion_between` that stays while a camera sees the same points, however many frames; None without depth."""
-    return _followed(before, after, camera)[1]
-
-
-def motion_between(before: RectifiedFrame, after: RectifiedFrame, camera: StereoCamera) -> Array | None:
-    """Return (4, 4) before_from_after in camera axes, None with too few tracked points.
+def motion_between(
+    before: RectifiedFrame, after: RectifiedFrame, camera: StereoCamera
+) -> tuple[Array | None, SceneError | None]:
+    """Return (4, 4) before_from_after in camera axes, None with too few tracked points, and its error, None without depth.
 
     With a second camera or depth by perspective-n-point from the first frame's points, which is exact in pure rotation
     too, else the rotation of the essential matrix, and a translation of NaN.
     """
-    return _followed(before, after, camera)[0]
-
-
-def _followed(
-    before: RectifiedFrame, after: RectifiedFrame, camera: StereoCamera
-) -> tuple[Array | None, SceneError | None]:
     is_clear = None if camera.clearance_px is None else (camera.clearance_px > _WINDOW_PX // 2).astype(np.uint8)
     corners = cv2.goodFeaturesToTrack(before.left, _CORNERS, 0.01, 12, mask=is_clear)
     if corners is None or len(corners) < _MIN_POINTS:

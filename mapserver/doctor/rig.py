@@ -17,7 +17,7 @@ from fleetmap.recordings import Recording
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from mapserver.calibration import CalibrationParameter as P
 from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES
-from mapserver.doctor.camera_motion import SceneError, body_motion, scene_error
+from mapserver.doctor.camera_motion import SceneError, body_motion, motion_between
 from mapserver.doctor.findings import Finding, Verdict, not_judged
 from mapserver.doctor.gyro_images import AXES, OFFSET
 from mapserver.doctor.run_checks import frames_to_check, run_checks
@@ -109,7 +109,7 @@ def check_mountings(recording: Recording, on_frame: Callable[[], None] = lambda:
             motion = body_motion(rig, (pair[0], pair[1]))[2]
             first = first if number else motion
             motions[number] += [] if motion is None or first is None else [(first, motion)]
-            error = scene_error(pair[0], pair[1], rig[0]) if count % _EVERY == 0 else None
+            error = motion_between(pair[0], pair[1], rig[0])[1] if count % _EVERY == 0 else None
             axes = np.kron(np.eye(2), rig[1][:3, :3])
             scenes[number] += [] if error is None else [(axes @ error[0] @ axes.T, error[1])]
     return [

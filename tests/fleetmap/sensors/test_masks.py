@@ -98,7 +98,7 @@ def test_checks_of_a_recording_look_beside_the_body() -> None:
     assert points is not None
     assert not hidden_pixels((BODY,), SIZE_PX)[tuple(np.rint(points.left).astype(int).T[::-1])].any()
     rectifier = Rectifier(masked())
-    found = motion_between(*(rectifier.rectify(frame) for frame in frames), rectifier.camera)  # type: ignore[misc]
+    found, _ = motion_between(*(rectifier.rectify(frame) for frame in frames), rectifier.camera)  # type: ignore[misc]
     before, after = (analytic_motion(k * FRAME_NS * 1e-9).map_from_body @ BODY_FROM_CAM for k in (1, 4))
     assert found is not None
     assert np.linalg.norm((found - np.linalg.inv(before) @ after)[:3, 3]) < 0.02
