@@ -25,7 +25,7 @@ def parse_prior(text: str | None, name: str = "prior") -> PositionPrior | None:
 def told_prior(told: InitialPoseMessage) -> PositionPrior:
     """Return an operator's pose as a prior that overrides the tracked pose until fixes outweigh it. LinkError for an invalid pose."""
     values = [told.x_map_m, told.y_map_m, told.heading_rad or 0.0, told.sigma_m]
-    if not np.isfinite(values).all() or not told.sigma_m > 0:
+    if not np.isfinite(values).all() or not told.sigma_m >= 1e-3:  # nobody knows a place better than to a millimetre
         raise LinkError(f"invalid initial pose: {values[:2]} m, heading {told.heading_rad} rad, sigma {told.sigma_m} m")
     sigmas = UNSAID_SIGMAS.copy()
     sigmas[3:5] = told.sigma_m

@@ -122,8 +122,7 @@ class MqttLink:
         self._client.connect_async(self._broker.host, self._broker.port, _KEEPALIVE_S, **more)
 
     def _set_will(self) -> None:
-        after_online = self._sent["connection"] + 1
-        will = self._encoded("connection", {"connectionState": "CONNECTION_BROKEN"}, after_online)
+        will = self._encoded("connection", {"connectionState": "CONNECTION_BROKEN"}, self._sent["connection"] + 1)
         self._client.will_set(f"{self._prefix}/connection", will, qos=1, retain=True)
 
     def _on_connect(self, client: "Client", _: object, __: object, reason: Any, ___: object) -> None:

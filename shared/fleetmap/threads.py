@@ -9,18 +9,15 @@ from contextlib import contextmanager
 from fleetmap.errors import FleetmapError
 
 _WAIT_S, _LONGEST_WAIT_S = 1.0, 30.0
+Job = Callable[[], None]
+Clock = Callable[[], float]
 _log = logging.getLogger(__name__)
 
 
 class Jobs:
     """Jobs that a thread does in turn. One that fails is logged and waits, twice as long each time; the others go on."""
 
-    def __init__(
-        self,
-        *jobs: Callable[[], None],
-        passed: type[Exception] | tuple[()] = (),
-        clock_s: Callable[[], float] = time.monotonic,
-    ) -> None:
+    def __init__(self, *jobs: Job, passed: type[Exception] | tuple[()] = (), clock_s: Clock = time.monotonic) -> None:
         """passed: errors that `work` raises, without the jobs after that one."""
         self._due_s = dict.fromkeys(jobs, (0.0, _WAIT_S))
         self._passed, self._clock_s = passed, clock_s
@@ -37,8 +34,8 @@ class Jobs:
                 raise
             except Exception as error:
                 self._due_s[job] = self._clock_s() + wait_s, min(2 * wait_s, _LONGEST_WAIT_S)
-                known = isinstance(error, FleetmapError)
-                _log.warning("%s; next attempt in %.0f s", error, wait_s, exc_info=None if known else error)
+                is_known = isinstance(error, FleetmapError)
+                _log.warning("%s; next attempt in %.0f s", error, wait_s, exc_info=not is_known)
 
 
 @contextmanager

@@ -4,8 +4,9 @@ Stereo frames may be dropped, the oldest first, and are counted; inertial sample
 """
 
 import threading
+from bisect import bisect_left
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -41,18 +42,6 @@ class IntakeCounts:
     unreadable: int = 0
 
 
-@dataclass
-class _ImuQueue:
-    stamps_ns: list[int] = field(default_factory=list)
-    rows: list[list[float]] = field(default_factory=list)
-
-    def take_until(self, until_ns: int) -> ImuSamples:
-        count = int(np.searchsorted(np.array(self.stamps_ns, np.int64), until_ns)) if self.stamps_ns else 0
-        stamps, rows = np.array(self.stamps_ns[:count], np.int64), np.array(self.rows[:count], float).reshape(-1, 6)
-        del self.stamps_ns[:count], self.rows[:count]
-        return ImuSamples(stamps, np.ascontiguousarray(rows[:, :3]), np.ascontiguousarray(rows[:, 3:]))
-
-
 class _Stream(Generic[V]):
     """Values of one sensor in order of their stamps.
 
@@ -65,18 +54,12 @@ class _Stream(Generic[V]):
         self._what = what
         self._held: tuple[int, V] | None = None
         self._steps_ns = deque([_STEP_NS], _STEPS)
-        self._usual_ns = _STEP_NS
         self._older_since_ns: int | None = None
 
     @property
     def newest_ns(self) -> int:
         """Stamp of the last value, which may be held."""
         return self.last_ns if self._held is None else self._held[0]
-
-    @property
-    def has_first(self) -> bool:
-        """True if the only value is held."""
-        return self._held is not None and self.last_ns == _NEVER_NS
 
     def put(self, stamp_ns: int, value: V) -> list[V]:
         """Return the values whose stamps are certain by this one, in order."""
@@ -87,7 +70,7 @@ class _Stream(Generic[V]):
         certain = list[V]()
         if self._held is not None and 0 < stamp_ns - self._held[0] <= PAUSE_NS:
             certain = self.release()
-        is_in_step = stamp_ns - self.last_ns <= 2.5 * self._usual_ns
+        is_in_step = stamp_ns - self.last_ns <= 2.5 * sorted(self._steps_ns)[len(self._steps_ns) // 2]
         self.refused += self._held is not None
         self._held = stamp_ns, value
         return [*certain, *self.release()] if is_in_step else certain
@@ -99,7 +82,6 @@ class _Stream(Generic[V]):
         (stamp_ns, value), self._held = self._held, None
         if self.last_ns != _NEVER_NS:
             self._steps_ns.append(stamp_ns - self.last_ns)
-            self._usual_ns = sorted(self._steps_ns)[len(self._steps_ns) // 2]
         self.last_ns, self._older_since_ns = stamp_ns, None
         return [value]
 
@@ -129,7 +111,7 @@ class Intake:
         self._offset_ns = int(imu_minus_cam_s * 1e9)
         self._has_imu, self._imu_wait_s = has_imu, imu_wait_s
         self._changed = threading.Condition()
-        self._imu = _ImuQueue()
+        self._imu: list[tuple[int, list[float]]] = []
         self._frame_stream = _Stream[CameraFrame | StoredFrame]("images")
         self._imu_stream = _Stream[tuple[int, list[float]]]("imu")
         self._wheel_stream = _Stream[WheelSample]("wheel odometry")
@@ -146,7 +128,7 @@ class Intake:
         with self._changed:
             _check_unit("images'", frame.stamp_ns, self._imu_stream.newest_ns)
             if _coarser_unit(self._imu_stream.newest_ns, frame.stamp_ns):
-                self._imu, self._imu_stream = _ImuQueue(), _Stream("imu")
+                self._imu, self._imu_stream = [], _Stream("imu")
             self._queue(self._frame_stream.put(frame.stamp_ns, frame))
 
     def put_imu(self, samples: ImuSamples) -> None:
@@ -154,8 +136,8 @@ class Intake:
 
         RecordingError for stamps in another unit than the frames'.
         """
-        stream = self._imu_stream
         with self._changed:
+            stream = self._imu_stream
             if len(samples):
                 _check_unit("imu", int(samples.stamps_ns[-1]), self._frame_stream.newest_ns)
             values = np.hstack([samples.gyro_radps, samples.accel_mps2])
@@ -164,13 +146,12 @@ class Intake:
                 if not good:
                     stream.refused += 1
                     continue
-                for certain_ns, certain in stream.put(stamp_ns, (stamp_ns, row)):
-                    self.counts.imu_samples += 1
-                    self._imu.stamps_ns.append(certain_ns)
-                    self._imu.rows.append(certain)
+                certain = stream.put(stamp_ns, (stamp_ns, row))
+                self.counts.imu_samples += len(certain)
+                self._imu += certain
             self.counts.imu_refused = stream.refused
             if not self._frames:
-                self.counts.imu_stale += len(self._imu.take_until(stream.last_ns - INTEGRATED_NS))
+                self.counts.imu_stale += len(_take_until(self._imu, stream.last_ns - INTEGRATED_NS))
             self._changed.notify_all()
 
     def put_wheel(self, sample: WheelSample) -> None:
@@ -233,7 +214,7 @@ class Intake:
                 self.counts.imu_late += 1
             frame = self._frames.popleft()
             body_ns = frame.stamp_ns + self._offset_ns
-            imu = self._imu.take_until(body_ns + _IMU_LEAD_NS)
+            imu = _take_until(self._imu, body_ns + _IMU_LEAD_NS)
             wheel = [sample for sample in self._wheel if sample.stamp_ns <= body_ns]
             priors = [prior for prior in self._priors if prior.stamp_ns <= frame.stamp_ns]
             self._wheel = [sample for sample in self._wheel if sample.stamp_ns > body_ns]
@@ -256,7 +237,7 @@ class Intake:
 
     def _use_first(self) -> None:
         """Queue a first frame that no second one has confirmed in time."""
-        if self._frame_stream.has_first:
+        if self._frame_stream.last_ns == _NEVER_NS:
             self._queue(self._frame_stream.release())
 
     def _set_back(self) -> str:
@@ -266,6 +247,14 @@ class Intake:
     def _imu_is_there(self) -> bool:
         """True if the IMU samples reach the oldest frame, which may have changed since the wait began."""
         return self._finished or self._imu_stream.last_ns >= self._frames[0].stamp_ns + self._offset_ns
+
+
+def _take_until(imu: list[tuple[int, list[float]]], until_ns: int) -> ImuSamples:
+    count = bisect_left(imu, until_ns, key=lambda sample: sample[0])
+    stamps_ns = np.array([stamp_ns for stamp_ns, _ in imu[:count]], np.int64)
+    rows = np.array([row for _, row in imu[:count]], float).reshape(-1, 6)
+    del imu[:count]
+    return ImuSamples(stamps_ns, np.ascontiguousarray(rows[:, :3]), np.ascontiguousarray(rows[:, 3:]))
 
 
 def _coarser_unit(stamp_ns: int, other_ns: int) -> int | None:
