@@ -166,13 +166,6 @@ class Built:
         """The recordings that were joined to the map."""
         return [s for s, outcome in zip(self.surveyed, self.joined.outcomes, strict=True) if outcome.joined]
 
-    @property
-    def left_out(self) -> dict[str, str]:
-        """The reasons for the recordings of which no part was joined, by content hash."""
-        taken = {s.entry.sha256 for s in self.taken}
-        parts = zip(self.surveyed, self.joined.outcomes, strict=True)
-        return {s.entry.sha256: o.reason for s, o in parts if s.entry.sha256 not in taken}
-
 
 @dataclass(frozen=True, slots=True)
 class Draft:
@@ -378,11 +371,12 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     report = msgspec.structs.replace(report, map_bytes=maps.version(site, version).map_bytes)
     run.times.begin("writing")
     words = sentence(site, version, None if parent is None else parent.manifest.version, report, maps.folder)
+    taken, outcomes = {s.entry.sha256 for s in built.taken}, zip(built.surveyed, built.joined.outcomes, strict=True)
     draft = Draft(
         version,
         maps.areas(site).name_tiles(words, TILE_SIZE_M),
         to_plain(report),
-        built.left_out,
+        {s.entry.sha256: o.reason for s, o in outcomes if s.entry.sha256 not in taken},
     )
     _write_files(run, built, draft)
     return draft

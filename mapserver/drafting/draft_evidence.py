@@ -83,11 +83,6 @@ class JudgedSession(NamedTuple):
         asked = {frame.number for frame in self.asked(recordings)}
         return [frame for frame in self._held_out(recordings, 0) if frame.number not in asked]
 
-    def spread(self, recordings: int) -> list[Probe]:
-        """Return the probes of one of so many recordings for the version before, which none of them has influenced."""
-        chosen = spread(np.arange(len(self.probed)), max(PROBES // recordings, _LEAST_PROBES))
-        return [self.probed[n].probe(self.trajectory.frame_from_body) for n in chosen]
-
     def _held_out(self, recordings: int, first: int) -> list[ProbedFrame]:
         """Return all views of every second held-out frame of one of so many recordings."""
         numbers = list(dict.fromkeys(frame.number for frame in self.probed if frame.is_held_out))
@@ -252,7 +247,10 @@ def examine_draft(
     ]
     if before is not None and current is not None:
         recall = before.manifest.report.get("lookalike_recall") or 0.0
-        tasks += [partial(displaced, s.name, current, s.spread(len(sessions)), recall) for s in sessions]
+        for session in sessions:
+            chosen = spread(np.arange(len(session.probed)), max(PROBES // len(sessions), _LEAST_PROBES))
+            frames = [session.probed[n].probe(session.trajectory.frame_from_body) for n in chosen]
+            tasks.append(partial(displaced, session.name, current, frames, recall))
     starts, repeated, evidence, *moved = executor.map(lambda _, task: task(), None, tasks)
     directions = tile_directions({(tile.tile_x, tile.tile_y): tile.map_from_cam for tile in stored})
     found: Evidence = msgspec.structs.replace(

@@ -15,6 +15,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.failure_definition import is_wrong
 from fleetmap.geometry import Array
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.landmark_visibility import places_around
@@ -179,24 +180,19 @@ class MembershipTest:
         pieces = np.zeros(len(session.survey_from_body)) if session.pieces is None else session.pieces
         linked = np.isin(pieces, pieces[sorted(own)])
         for other in found:
-            fixes = [fix for fix in other.fixes if fix.k not in own]
-            ks = [fix.k for fix in fixes]
-            if (
-                len(ks) < self._settings.min_fixes
-                or count_places(session.survey_from_body[ks, :3, 3]) < self._settings.min_places
-            ):
+            ks = sorted({fix.k for fix in other.fixes} - own)
+            places = count_places(session.survey_from_body[ks, :3, 3])
+            if len(ks) < self._settings.min_fixes or places < self._settings.min_places:
                 continue
-            if linked[ks].all() and not contradicts(self.confirmation(chosen.map_from_body, ks)):
+            there = other.map_from_survey @ session.survey_from_body[ks]
+            off_m = float(np.median(np.linalg.norm((there - chosen.map_from_body[ks])[:, :3, 3], axis=1)))
+            is_alias = linked[ks].all() and not contradicts(self.confirmation(chosen.map_from_body, ks))
+            if is_alias or not is_wrong(off_m):  # the joint adjustment takes up less
                 continue
-            off_m = np.median(
-                [np.linalg.norm((fix.map_from_body - chosen.map_from_body[fix.k])[:3, 3]) for fix in fixes]
-            )
-            steps_m = np.linalg.norm(np.diff(session.survey_from_body[:, :3, 3], axis=0), axis=1)
-            first_m, last_m = (float(steps_m[:k].sum()) for k in (min(ks), max(ks)))
             return Membership(
-                f"its motion is broken: {len(ks)} keyframes, {first_m:.1f} to {last_m:.1f} m along its way, agree on a place "
-                f"{off_m:.1f} m from where its motion puts them; it slipped, was lifted, or its stamps are wrong: drive again, or build "
-                "its parts alone, with --frames",
+                f"its motion is broken: {len(ks)} of its keyframes, the first after {ks[0] / len(linked):.0%} of them, agree on a place "
+                f"{off_m:.1f} m from where it puts them; it slipped, was lifted, or its stamps are wrong: drive again, or build its parts "
+                "alone, with --frames",
                 evidence=self.evidence(chosen, chosen.seen),
             )
         return None
@@ -226,9 +222,8 @@ class MembershipTest:
         """
         session, view = self._session, self._relocalizer.view
         beside = self._beside_the_map(map_from_body)
-        asked = np.zeros_like(beside)
-        asked[slice(None) if chosen is None else list(chosen)] = True
-        beside = beside & asked if (beside & asked).any() else asked
+        asked = np.isin(np.arange(len(beside)), range(len(beside)) if chosen is None else chosen)[:, None]
+        beside = beside & asked if (beside & asked).any() else np.broadcast_to(asked, beside.shape)
         count = beside.shape[1]
         looks = [
             look(view, session.camera, session.views[k * count + v], map_from_body[k] @ session.body_from_cams[v])
