@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.failure_definition import radius_95_m_if_known
+from fleetmap.failure_definition import known_radius_m
 from fleetmap.features.extraction import extract
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
@@ -153,7 +153,7 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
         version=failure.estimate.map_version if is_own else None,
         tile=_tile(context, map_from_base),
         map_from_base=None if map_from_base is None else Placement.of(map_from_base),
-        radius_95_m=None if belief is None else radius_95_m_if_known(belief.cov_rot_trans),
+        radius_95_m=None if belief is None else known_radius_m(belief.cov_rot_trans),
         wrong_by_m=context.evidence.wrong_by_m,
         landmarks_expected=None if matches is None else len(matches[2]),
         landmarks_seen=seen,

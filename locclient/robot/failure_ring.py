@@ -12,7 +12,7 @@ from math import atan2
 import msgspec
 import numpy as np
 
-from fleetmap.failure_definition import radius_95_m_if_known
+from fleetmap.failure_definition import known_radius_m
 from fleetmap.failure_summary import Moment
 from fleetmap.messages import FailureKind
 from fleetmap.relocalization.frame_features import FrameFeatures
@@ -94,7 +94,7 @@ def moment_of(estimate: Estimate) -> Moment:
         return said
     x_m, y_m, z_m = map_from_body[:3, 3].tolist()
     heading_rad = atan2(map_from_body[1, 0], map_from_body[0, 0])
-    radius_m = radius_95_m_if_known(covariance)
+    radius_m = known_radius_m(covariance)
     return msgspec.structs.replace(said, position_map_m=(x_m, y_m, z_m), heading_rad=heading_rad, radius_95_m=radius_m)
 
 

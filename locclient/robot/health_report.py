@@ -6,14 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fleetmap.failure_definition import (
-    FIND_DRIVING_S,
-    is_blind,
-    is_driving,
-    is_usable,
-    radius_95_m,
-    radius_95_m_if_known,
-)
+from fleetmap.failure_definition import FIND_DRIVING_S, is_blind, is_driving, is_usable, known_radius_m, radius_95_m
 from fleetmap.messages import Cause, Flag, RobotHealth, Status
 from fleetmap.sensors.samples import PAUSE_NS
 from locclient.localization.estimate import Estimate
@@ -145,7 +138,7 @@ class FixFigures:
         figures |= {"landmarks_expected": self._expected, "landmarks_seen": self._seen}
         if self._last is not None:
             figures["speed_mps"] = self._speed_mps
-            figures["radius_95_m"] = radius_95_m_if_known(self._last.cov_rot_trans)
+            figures["radius_95_m"] = known_radius_m(self._last.cov_rot_trans)
         return figures
 
     def _note(self, name: str, value: float | None) -> None:

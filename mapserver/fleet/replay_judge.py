@@ -1,9 +1,4 @@
-"""Judges a failure's recording, an untrusted file: a program of its own, so that its time and memory can be limited.
-
-    python -m mapserver.fleet.replay_judge FAILURE.mcap FOUND SITE ROBOT REPORT
-
-writes summary and pictures as MessagePack to FOUND; status 1 and the reason for an invalid file.
-"""
+"""Judges a failure's recording in a process of its own, with limits: arguments FAILURE.mcap FOUND SITE ROBOT REPORT."""
 
 import sys
 from pathlib import Path
@@ -23,14 +18,11 @@ def judged(path: Path, named: tuple[str, str, str]) -> tuple[bytes, list[tuple[i
     summary_bytes = attachments_of(path)[SUMMARY]
     summary = decode_summary(summary_bytes)
     if (summary.site, summary.robot, summary.id) != named:
-        raise RecordingError(
-            f"the recording is of failure {summary.id!r} of {summary.robot!r}, not of {named[2]!r} of {named[1]!r}"
-        )
+        words = f"the recording is of failure {summary.id!r} of {summary.robot!r}"
+        raise RecordingError(f"{words}, not of {named[2]!r} of {named[1]!r}")
     with open_recording(path) as recording:
         if len(recording) > _MAX_PICTURES:
-            raise RecordingError(
-                f"the recording has {len(recording)} pictures; a failure's has at most {_MAX_PICTURES}"
-            )
+            raise RecordingError(f"{len(recording)} pictures; a failure's recording has at most {_MAX_PICTURES}")
         stored = [recording.stored_frame(number) for number in range(len(recording))]
     if any(frame.depth is not None for frame in stored):
         raise RecordingError("the recording has depth images; a failure's has none")

@@ -1,7 +1,6 @@
 """Encoding of all output: numpy values become Python's, which MessagePack, JSON and databases support; limits of decoded numbers."""
 
 import math
-from collections.abc import Iterable
 from typing import Any, Literal, TypeVar
 
 import msgspec
@@ -47,7 +46,8 @@ def bounded(value: T) -> T:
         if not -(1 << 63) <= value < 1 << 63:
             raise ValueError(" is an integer of more than 64 bits")
     elif isinstance(value, dict | list | tuple | msgspec.Struct):
-        for name, item in _items(value):
+        parts: Any = msgspec.structs.asdict(value) if isinstance(value, msgspec.Struct) else value
+        for name, item in parts.items() if isinstance(parts, dict) else enumerate(parts):
             try:
                 bounded(item)
             except ValueError as error:
@@ -55,9 +55,3 @@ def bounded(value: T) -> T:
             if name == "quat_wxyz" and not abs(math.hypot(*item) - 1) <= _UNIT_WITHIN:
                 raise ValueError(f".{name} is {item}, not a unit quaternion")
     return value
-
-
-def _items(value: Any) -> Iterable[tuple[Any, Any]]:
-    if isinstance(value, msgspec.Struct):
-        return ((name, getattr(value, name)) for name in value.__struct_fields__)
-    return value.items() if isinstance(value, dict) else enumerate(value)

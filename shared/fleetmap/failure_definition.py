@@ -120,7 +120,7 @@ def radius_95_m(cov_rot_trans: Array | None) -> float:
     return _RADIUS_95_SIGMAS * float(np.sqrt(np.linalg.eigvalsh(cov_rot_trans[3:, 3:])[-1]))
 
 
-def radius_95_m_if_known(cov_rot_trans: Array | None) -> float | None:
+def known_radius_m(cov_rot_trans: Array | None) -> float | None:
     """As `radius_95_m`, for messages: None where it is infinite."""
     radius_m = radius_95_m(cov_rot_trans)
     return radius_m if np.isfinite(radius_m) else None

@@ -1,5 +1,6 @@
 """A robot that fails in the painted room, and the recording of its failure. Made once."""
 
+import time
 from collections.abc import Iterable
 from functools import lru_cache
 from pathlib import Path
@@ -105,3 +106,4 @@ def asked(fleet: Fleet, site: str, robot: str, part: ReplayPart) -> FailureAck:
         except LinkError as error:
             if "being judged" not in str(error):
                 raise
+            time.sleep(0.05)
