@@ -70,10 +70,7 @@ class RuntimeParts:
 
 
 class Runtime:
-    """Runs until `stop` is called, the source ends, or a thread fails; `run` raises its error.
-
-    After the source's end it waits until a connected server has the failures with their recordings, at most 30 s.
-    """
+    """Runs until `stop` is called, the source ends and a connected server has its failures, or a thread fails; `run` raises its error."""
 
     def __init__(
         self, parts: RuntimeParts, manager: ServiceManager, *, wall_ns: Callable[[], int] = time.time_ns
@@ -151,7 +148,7 @@ class Runtime:
 
     def _await_delivery(self, server: ServerSync) -> None:
         """Wait while a connected server takes failures and their recordings. What is left stays in the spool."""
-        server.hurry()
+        server.recordings_at_s = 0.0
         spools = [spool for spool in (self._parts.outbox, server.replays) if spool is not None]
         until_s = time.monotonic() + _DELIVERED_WITHIN_S
         with suppress(StoreError):  # logged by the network thread

@@ -49,7 +49,7 @@ class ServerSync:
         self.drives: SurveyDrives | None = None  # through areas that operators want to be surveyed
         self.floors: FloorMaps | None = None  # of the robot's building
         self._replayed_bytes: dict[str, int] = {}
-        self._replay_at_s = 0.0
+        self.recordings_at_s = 0.0
         # The upkeep first: after a renewal whose response was lost, the server admits no other request.
         jobs = (self._keep_up, self._publish_health, self._deliver, self._fetch_again, self._ask, self._send_recordings)
         self._jobs = Jobs(*jobs, passed=UnreachableError, clock_s=clock_s)
@@ -117,10 +117,6 @@ class ServerSync:
             words = "no connection to the map server for %.0f s: is it running, and is %s its zenoh endpoint? %s"
             self._refusals.warning("no connection", words, now_s - self._connected_s, self.client.endpoint, running)
         return False
-
-    def hurry(self) -> None:
-        """Look for recordings in the next step; thread-safe."""
-        self._replay_at_s = 0.0
 
     def close(self) -> None:
         for handle in self._handles:
@@ -262,12 +258,12 @@ class ServerSync:
     def _send_recordings(self) -> None:
         """Send a part of a recording, at most one per second, while no report waits and no version is fetched; failures first."""
         now_s = self._clock_s()
-        if now_s < self._replay_at_s or self._outbox.waiting():
+        if now_s < self.recordings_at_s or self._outbox.waiting():
             return
         goes_on = self.replays is not None and deliver_replay_part(self.client, self.replays, self._replayed_bytes)
         if not goes_on and self.drives is not None:
             goes_on = self.drives.deliver_part(self.client)
-        self._replay_at_s = now_s + (_REPLAY_PART_EVERY_S if goes_on else _MAX_BACKOFF_S)
+        self.recordings_at_s = now_s + (_REPLAY_PART_EVERY_S if goes_on else _MAX_BACKOFF_S)
 
     def _publish_health(self) -> None:
         while self.health:

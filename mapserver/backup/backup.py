@@ -131,10 +131,7 @@ class _Upload:
 def _trusted(
     store: MapStore, upload: _Upload, recipient: "pyrage.x25519.Recipient | None"
 ) -> tuple[dict[str, list[str]], str]:
-    """Upload signed lists, enrolled robots and, for a recipient, keys.
-
-    They are older than the database then: the restored store signs what is missing.
-    """
+    """Upload signed lists, robots and, for a recipient, keys: older than the database, so that a restored store signs what is missing."""
     folder, files, secrets = store.folder, dict[str, list[str]](), list[Path]()
     with store.locked("trust/lock") if (folder / "trust").is_dir() else nullcontext():  # keys and lists change under it
         for path in sorted([*folder.glob("trust/*"), *folder.glob("keys/*")]):
@@ -162,6 +159,5 @@ def _packed(paths: list[Path], recipient: "pyrage.x25519.Recipient") -> bytes:
             archive.add(path, path.name)
     encrypted: bytes = pyrage.encrypt(packed.getvalue(), [recipient])
     if len(encrypted) > PIECE_BYTES:
-        largest = max(paths, key=lambda path: path.stat().st_size)
-        raise StateError(f"the keys have more than {PIECE_BYTES} bytes; move {largest} elsewhere, if it is no key")
+        raise StateError(f"the keys have more than {PIECE_BYTES} bytes; move what is no key out of {paths[0].parent}")
     return encrypted

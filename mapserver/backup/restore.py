@@ -5,6 +5,7 @@ import logging
 import shutil
 import tarfile
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -99,6 +100,7 @@ def restore(
             name, snapshot = target.read(name)
             _check_room(folder, snapshot.written_bytes())
             keys, number, part = _keys(target, snapshot, list(identities)), target.count_restore(), folder / _PART
+            robots = 0
             shutil.rmtree(part, ignore_errors=True)  # of a killed restoration
             try:
                 _write(target, snapshot, part, keys, progress)
@@ -106,7 +108,9 @@ def restore(
                     words = f"snapshot {name}, of {snapshot.versions} versions"
                     store.note_restored(words, number * _VERSIONS_AHEAD, actor)
                     lists = _sign(store, number, target)
-                    counts = len(store.sites()), _robots(store), len(Operators(store).all())
+                    with suppress(StoreError):  # damaged before the backup; everything else is worth having
+                        robots = len(RobotRegister(store).robots())
+                    counts = len(store.sites()), robots, len(Operators(store).all())
                 # The database last: until it is there, the folder is no store.
                 for path in sorted(part.iterdir(), key=lambda path: path.name.startswith("store.sqlite3")):
                     path.replace(folder / path.name)
@@ -122,14 +126,6 @@ def _check_room(folder: Path, needed: int) -> None:
         raise StoreError(
             f"the snapshot has up to {needed} bytes, the disk of {folder} {free}; name a folder with more room"
         )
-
-
-def _robots(store: MapStore) -> int:
-    try:
-        return len(RobotRegister(store).robots())
-    except StoreError as error:  # damaged before the backup; everything else is worth having
-        _log.warning("no robot is enrolled: %s", error)
-        return 0
 
 
 def _sign(store: MapStore, number: int, target: BackupTarget) -> Literal["none", "new", "ahead", "old"]:

@@ -34,10 +34,9 @@ _NAME, _NAME_FORMAT = re.compile(r"[0-9]{8}T[0-9]{6}Z"), "%Y%m%dT%H%M%SZ"
 NAMED = re.compile(r"store\.sqlite3|keys/robots\.json|trust/[a-z0-9][a-z0-9._-]{0,120}\.json")
 """Files of a store that a snapshot names by their paths; all others in `keys` are encrypted."""
 LEFT_OUT = re.compile(
-    r"(.*/)?(lock|\..*)|[^/]*\.lock|store\.sqlite3-(wal|shm)|store-format-[0-9]+\.sqlite3|reserve|places\.json|job-[0-9]+\.log|"
-    r"(blobs|sites|refused)/.*"
+    r"(.*/)?(lock|\..*)|[^/]+\.lock|store[.-].+|reserve|places\.json|job-[0-9]+\.log|(blobs|sites|refused)/.*"
 )
-"""Files that no snapshot names: the database names the blobs, `sites` is made of it, the others are locks, logs, refused messages."""
+"""Files that no snapshot names: the database names the blobs, `sites` is made of it, the others are locks, logs, journals."""
 _LONGEST_BACKUP = timedelta(days=1)
 _MOST_BYTES = 1 << 30  # of a snapshot
 _MOST_RESTORES = 50_000  # signed lists count in ten digits

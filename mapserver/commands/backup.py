@@ -77,13 +77,10 @@ def restore(
     if json:
         print_json(done)
         return
-    typer.echo(
-        f"{store} holds snapshot {done.snapshot}: {done.versions} versions of {done.sites} sites, {done.robots} enrolled robots, "
-        f"{done.people} people and programs, {len(done.keys)} key files"
-    )
+    counts = f"{done.versions} versions of {done.sites} sites, {done.robots} enrolled robots, {done.people} people and programs"
+    typer.echo(f"{store} holds snapshot {done.snapshot}: {counts}, {len(done.keys)} key files")
     if "server.pem" in done.keys and not done.robots:
-        again = f"`mapserver robots enrol ROBOT --site SITE --store {store}`"
-        typer.echo(f"no robots are in it, as in no backup of an earlier fleetmap; {again} makes their bundles")
+        typer.echo(f"robots are enrolled again by `mapserver robots enrol ROBOT --site SITE --store {store}`")
     if done.lists == "ahead":
         typer.echo(
             "the root key is elsewhere: if sites or keys were added after the backup, robots refuse the lists until "

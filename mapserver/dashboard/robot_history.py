@@ -76,31 +76,24 @@ def way(rows: Sequence[TraceRow], parts: Sequence[Stretch], every_s: float = 10.
     where it thought to be while it was lost and where it found itself.
     """
     found: list[Line] = []
-    remaining, before = iter(parts), None
+    remaining, before_ns, was_lost = iter(parts), None, False
     part = next(remaining, None)
     for row in rows:
         if row.x_map_m is None or row.y_map_m is None:
-            before = None
+            before_ns = None
             continue
         while part is not None and part.until_ns <= row.heard_ns:
             part = next(remaining, None)
         here, tone = (round(row.x_map_m, 2), round(row.y_map_m, 2)), "quiet" if part is None else part.state[1]
-        if (
-            before is None
-            or row.heard_ns - before.heard_ns > 1.5e9 * every_s
-            or (_is_lost(before) and not _is_lost(row))
-        ):
+        is_lost = words_of(row.status)[1] == "bad"
+        if before_ns is None or row.heard_ns - before_ns > 1.5e9 * every_s or (was_lost and not is_lost):
             found.append(Line([here], tone))
         elif tone != found[-1].tone:
             found.append(Line([found[-1].points[-1], here], tone))
         elif dist(found[-1].points[-1], here) >= _STEP_M:
             found[-1].points.append(here)
-        before = row
+        before_ns, was_lost = row.heard_ns, is_lost
     return sorted((line for line in found if len(line.points) > 1), key=lambda line: -ORDER[line.tone])
-
-
-def _is_lost(row: TraceRow) -> bool:
-    return words_of(row.status)[1] == "bad"
 
 
 def curve(rows: Sequence[TraceRow], name: str, shown: Range) -> tuple[float, float, str] | None:

@@ -145,12 +145,9 @@ class RecordingOptions:
     trajectory: OtherTrajectory | None = None
 
     def opened(self, path: Path, keep_in: Path | None = None) -> tuple[Recording, NDArray[np.int64]]:
-        """Return the recording at `path`, to be closed, and the indices of its selected frames. keep_in: a folder for KeptFrames.
-
-        Its name is that of its file, by which people look for it, where another one was written into it.
-        """
+        """Return the recording at `path`, to be closed, and the indices of its selected frames. keep_in: a folder for KeptFrames."""
         recording = open_recording(path, self.opening)
-        if recording.name not in {path.name, path.stem}:
+        if recording.name not in {path.name, path.stem}:  # people look for the file, whatever its recorder called it
             recording = replace(recording, name=printable(path.name))
         try:
             recording = reduced(recording, self.use)

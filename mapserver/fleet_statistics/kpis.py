@@ -205,10 +205,9 @@ def share(hits: int, tries: int) -> Share:
 
 
 def is_enough(robot_days: float) -> bool:
-    """True if there was enough driving to say a rate: 9.6 h.
+    """True after enough driving to say a rate, 9.6 h: no failure in it would show, by the interval's end, less than TOO_MANY_PER_ROBOT_DAY.
 
-    After that no failure at all would show, by the interval's upper end, a rate below TOO_MANY_PER_ROBOT_DAY. After less no count could
-    show it, and a few failures of one cause would seem to be hundreds per robot-day.
+    After less no count could, and a few failures of one cause would seem to be hundreds per robot-day.
     """
     return robot_days * TOO_MANY_PER_ROBOT_DAY >= poisson_interval(0)[1]
 

@@ -51,12 +51,8 @@ def built(served: Served, recording: str) -> int:
 def test_an_upload_becomes_a_version(tmp_path: Path) -> None:
     inbox, ride, other = tmp_path / "inbox", tmp_path / "ride.mcap", tmp_path / "other.mcap"
     for path, seconds in ((ride, 4.0), (other, 3.6)):
-        run(
-            app,
-            "convert",
-            write_euroc(tmp_path / f"recorder {seconds}", ride_sample(out_and_back(seconds), 38, 0.1)),
-            path,
-        )
+        ride_folder = write_euroc(tmp_path / f"recorder {seconds}", ride_sample(out_and_back(seconds), 38, 0.1))
+        run(app, "convert", ride_folder, path)
     inbox.mkdir()
     with MapStore.open(tmp_path / "store", create=True):
         pass

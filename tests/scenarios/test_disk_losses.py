@@ -7,6 +7,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pyrage
+import pytest
 
 from fleetmap.messages import FailureReport, encode_message
 from fleetmap.trust import TrustedMap
@@ -85,15 +86,8 @@ class Robot:
         return self.failed - {report.id for report in self.outbox.waiting(1000)}
 
 
-def test_nothing_acknowledged_is_lost(tmp_path: Path) -> None:
-    drill(tmp_path, robots=4, losses=5)
-
-
-def test_nothing_acknowledged_is_lost_in_fifty_losses(tmp_path: Path) -> None:
-    drill(tmp_path, robots=30, losses=50)
-
-
-def drill(tmp_path: Path, *, robots: int, losses: int) -> None:
+@pytest.mark.parametrize(("robots", "losses"), [(4, 5), (30, 50)])
+def test_nothing_acknowledged_is_lost(tmp_path: Path, robots: int, losses: int) -> None:
     clock, rng = Clock(time.time_ns()), random.Random(7)
     server = Server(tmp_path, MemoryHub(), clock)
     server.start()

@@ -12,10 +12,9 @@ import pytest
 from fleetmap.recordings.calibration_files import format_calibration
 from mapserver.store import FailureFilter, MapStore
 from support.fleet.contracts_documents import REPOSITORY
-from support.fleet.tls_site import START_S, TlsSite
+from support.fleet.tls_site import START_S, TlsSite, forgotten_files
 from support.fleet.unit_filter import filtered
 from support.recordings.recording_samples import calibration, write_euroc
-from support.storage.store_files import forgotten_files
 from support.worlds import robot_world
 from support.worlds.box_room import out_and_back, ride_sample
 

@@ -254,17 +254,8 @@ def test_traces_become_stretches_of_one_state_and_curves_that_break() -> None:
 
 
 def test_the_way_of_a_robot_has_gaps_where_it_was_silent() -> None:
-    told = [
-        (0, "TRACKING"),
-        (10, "TRACKING"),
-        (20, "LOST"),
-        (300, "LOST"),
-        (310, "LOST"),
-        (311, "TRACKING"),
-        (312, "TRACKING"),
-    ]
-    told += [(330, "TRACKING"), (340, "TRACKING")]
-    rows = [traced(*each) for each in told]
+    seconds = (0, 10, 20, 300, 310, 311, 312, 330, 340)
+    rows = [traced(at_s, "LOST" if 20 <= at_s <= 310 else "TRACKING") for at_s in seconds]
     parts = stretches(rows, 350_000_000_000)
     drawn = [(line.tone, line.points[0][0] - 1.0, line.points[-1][0] - 1.0) for line in way(rows, parts)]
     assert drawn == [("good", 0, 10), ("good", 311, 312), ("good", 330, 340), ("bad", 10, 20), ("bad", 300, 310)]

@@ -13,9 +13,15 @@ import httpx
 
 from locclient.identity import RobotIdentity
 from locclient.maps.connection import outbox_path
-from support.storage.store_files import forgotten_files
+from mapserver.backup.snapshots import LEFT_OUT, NAMED
 
 START_S = 120.0  # on a machine that may be busy
+
+
+def forgotten_files(store: Path) -> list[str]:
+    """Files of a store that are in no backup, and of which nothing says that they need not be."""
+    names = [path.relative_to(store).as_posix() for path in store.rglob("*") if path.is_file()]
+    return [n for n in names if not (n.startswith("keys/") or NAMED.fullmatch(n) or LEFT_OUT.fullmatch(n))]
 
 
 class TlsSite:
