@@ -151,7 +151,7 @@ class Runtime:
         server.recordings_at_s = 0.0
         spools = [spool for spool in (self._parts.outbox, server.replays) if spool is not None]
         until_s = time.monotonic() + _DELIVERED_WITHIN_S
-        with suppress(StoreError):  # logged by the network thread
+        with suppress(Exception):  # a faulty spool; logged by the network thread
             while time.monotonic() < until_s and server.client.connected() and any(s.waiting() for s in spools):
                 if self._stop.wait(_IDLE_S):
                     return
