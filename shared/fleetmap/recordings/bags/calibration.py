@@ -132,17 +132,14 @@ def last_links(links: Sequence[FrameLink]) -> tuple[list[FrameLink], list[str]]:
     values."""
     sound = [link for link in links if link.is_usable and link.parent != link.child]
     last = {link.child: link for link in sound}
-    others = {link.child: link for link in sound if not _is_same(link, last[link.child])}
-    words = [
-        f"{_in_words(link)}, and later {_in_words(last[link.child])}; the last one is used, as tf2 does"
-        for link in others.values()
-    ]
+    others = {
+        link.child: link
+        for link in sound
+        if (now := last[link.child]).parent != link.parent
+        or not np.allclose(now.parent_from_child, link.parent_from_child, atol=1e-6)  # drivers round
+    }
+    words = [f"{_in_words(link)}, and later {_in_words(last[child])}" for child, link in others.items()]
     return [*(link for link in links if not link.is_usable), *last.values()], words
-
-
-def _is_same(link: FrameLink, other: FrameLink) -> bool:
-    """True if both say the same, to the rounding of drivers."""
-    return link.parent == other.parent and np.allclose(link.parent_from_child, other.parent_from_child, atol=1e-6)
 
 
 def _in_words(link: FrameLink) -> str:

@@ -509,7 +509,7 @@ def _calibration(
     said.sort(key=lambda value: value[0])
     links, changes = last_links([link for _, found in said for link in found])
     for words in changes:
-        log.note("transform said twice", words)
+        log.note("transform said twice", f"{words}; the last one is used, as tf2 does")
     for issue in dict.fromkeys(link.issue for link in links if link.issue):
         log.note("transform not sound", issue)
     cam0_from_cams = camera_poses(cameras, links, str(container.path))
