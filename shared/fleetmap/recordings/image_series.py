@@ -61,7 +61,11 @@ def pair_images(
     if alone:
         detail = f"{alone} of {len(first)} and {len(second)}; {len(firsts)} pairs remain"
         if len(first) and len(second):
-            apart_ns = second.stamps_ns[nearest(second.stamps_ns, first.stamps_ns)] - first.stamps_ns
+            both_ns = first.stamps_ns[
+                slice(*first.stamps_ns.searchsorted([second.stamps_ns[0], second.stamps_ns[-1] + 1]))
+            ]
+            shared_ns = both_ns if len(both_ns) else first.stamps_ns
+            apart_ns = second.stamps_ns[nearest(second.stamps_ns, shared_ns)] - shared_ns
             # Half a period apart the nearest is sometimes the one before, sometimes the one after.
             way = np.where(np.mean(apart_ns > 0) < 0.5, -1.0, 1.0)
             apart_ms, most_ms = way * float(np.median(np.abs(apart_ns))) * 1e-6, tolerance_ns * 1e-6
@@ -143,8 +147,10 @@ def _note_silence(name: str, stamps_ns: Stamps, every_ns: Stamps, log: ReadLog) 
     silent_ns = every_ns[_silent(stamps_ns, every_ns)]
     if len(silent_ns):
         parts = np.split(silent_ns, np.flatnonzero(np.diff(silent_ns) > SILENT_NS) + 1)
-        spans_s = [f"{(part[0] - every_ns[0]) * 1e-9:.1f} to {(part[-1] - every_ns[0]) * 1e-9:.1f} s" for part in parts]
-        when = f"{', '.join(spans_s[:3])}{', ...' if len(parts) > 3 else ''} after the start"
+        around_ns = np.concatenate([every_ns[:1], stamps_ns, every_ns[-1:]])
+        gone = [np.searchsorted(stamps_ns, part[0]) for part in parts]  # from the image before to the one after
+        spans_s = [(around_ns[row : row + 2] - every_ns[0]) * 1e-9 for row in gone]
+        when = f"{', '.join(f'{a:.1f} to {b:.1f} s' for a, b in spans_s[:3])}{', ...' if len(parts) > 3 else ''} after the start"
         log.note("camera silent", f"{name} has no images from {when}, while others have; its view is missing there")
 
 
