@@ -134,19 +134,18 @@ class Load:
     """Follows how many frames are dropped before they are handled, over the last seconds."""
 
     def __init__(self) -> None:
-        self._begun_ns: int | None = None
         self._recent = deque[tuple[int, int]]()  # stamp of a handled frame, number of those dropped before it
         self.dropped_share = 0.0
 
     def handle(self, stamp_ns: int, dropped: int) -> None:
         """Add a handled frame. The first seconds, in which a map is loaded, say nothing."""
-        self._begun_ns = stamp_ns if self._begun_ns is None else self._begun_ns
         self._recent.append((stamp_ns, dropped))
+        if stamp_ns - self._recent[0][0] < _LOAD_NS:
+            return
         while stamp_ns - self._recent[0][0] > _LOAD_NS:
             self._recent.popleft()
         lost = sum(count for _, count in self._recent)
-        is_known = stamp_ns - self._begun_ns >= _LOAD_NS
-        self.dropped_share = lost / (lost + len(self._recent)) if is_known else 0.0
+        self.dropped_share = lost / (lost + len(self._recent))
 
     @property
     def overload(self) -> dict[Flag, str]:

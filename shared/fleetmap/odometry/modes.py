@@ -153,7 +153,7 @@ class WindowMode(Mode):
         seen, samples = tracked.cam_from_previous, imu.samples
         if tracked.by_descriptors or tracked.inlier_share < _FOLLOWED_SHARE:
             seen = None  # poorly tracked images are no evidence against a sensor
-        moved = None if seen is None else self._rig.body_from_cam @ se3_inverse(seen) @ self._rig.cam_from_body
+        moved = None if seen is None else self._body_from_next(seen)
         imu.clock.handle(stamp_ns, moved, samples.imu)
         if imu.accelerometer is not None:
             imu.accelerometer.handle(stamp_ns, moved, samples.imu, on_wheels=samples.on_wheels)
@@ -216,8 +216,7 @@ class WindowMode(Mode):
         rotation = self._rig.body_from_cam[:3, :3]
         body_from_cam[:3, :3] = body_from_cam[3:, 3:] = rotation
         body_from_cam[3:, :3] = skew(self._rig.body_from_cam[:3, 3]) @ rotation
-        cov_rot_trans = np.linalg.inv(tracked.information + 1e-9 * np.eye(6))
-        wide = sigmas**2 * cov_rot_trans
+        wide = sigmas**2 * np.linalg.inv(tracked.information + 1e-9 * np.eye(6))
         return np.asarray(body_from_cam @ wide @ body_from_cam.T)
 
 
@@ -248,7 +247,7 @@ class VisualMode(WindowMode):
 
     def follow(self, rig: OdometryRig) -> None:
         """See Mode; the last motion becomes that of the other camera."""
-        body_from_next = self._rig.body_from_cam @ se3_inverse(self._cam_from_previous) @ self._rig.cam_from_body
+        body_from_next = self._body_from_next(self._cam_from_previous)
         self._cam_from_previous = rig.cam_from_body @ se3_inverse(body_from_next) @ rig.body_from_cam
         super().follow(rig)
 
@@ -335,7 +334,7 @@ class GyroMode(VisualMode):
         )
         super().predict(stamp_ns)
         if self._turned is not None:
-            body_from_next = self._rig.body_from_cam @ se3_inverse(self._cam_from_previous) @ self._rig.cam_from_body
+            body_from_next = self._body_from_next(self._cam_from_previous)
             body_from_next[:3, :3] = self._turned
             self._cam_from_previous = self._rig.cam_from_body @ se3_inverse(body_from_next) @ self._rig.body_from_cam
 
