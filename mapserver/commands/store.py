@@ -71,7 +71,7 @@ def gc(
     from mapserver.store import Retention
     from mapserver.store.database import format_of
     from mapserver.store.files import keep_reserve, release_reserve
-    from mapserver.store.schema import FORMAT, LAST_UNNAMED
+    from mapserver.store.schema import FORMAT
 
     retention = Retention(keep_versions, keep_drafts, keep_days, robot_days)
 
@@ -83,7 +83,7 @@ def gc(
         garbage = collect()
     except StoreError:
         # A store of another format raises its own error, and its disk reserve is kept.
-        is_ours = LAST_UNNAMED <= format_of(store / "store.sqlite3") <= FORMAT
+        is_ours = 0 < format_of(store / "store.sqlite3") <= FORMAT
         if dry_run or not is_ours or not release_reserve(store):
             raise
         try:

@@ -2,7 +2,7 @@
 
 Format 2, magic FMAR, in the envelope of `fleetmap.mapformat.container`. The payload: u32 length of a JSON head (the
 camera, the next free ids, then name, dtype and shape of every array), the head, and the arrays' bytes in that
-order, little-endian. Format 1 had no history and one sigma for each observation.
+order, little-endian.
 """
 
 import struct
@@ -52,7 +52,7 @@ _ARRAYS: dict[str, tuple[str, tuple[int | str, ...]]] = {
     "landmark_seen": ("<u4", ("N",)),
     "landmark_missed": ("<u4", ("N",)),
 }
-_HISTORY = frozenset(_ARRAYS.keys() & History.__dataclass_fields__.keys())  # absent in format 1
+_HISTORY = frozenset(_ARRAYS.keys() & History.__dataclass_fields__.keys())
 
 
 class _ArrayHead(msgspec.Struct, frozen=True):
@@ -64,8 +64,8 @@ class _ArrayHead(msgspec.Struct, frozen=True):
 class _Head(msgspec.Struct, frozen=True):
     camera: StereoCamera
     arrays: tuple[_ArrayHead, ...]
-    next_keyframe_id: int = 0
-    next_landmark_id: int = 0
+    next_keyframe_id: int
+    next_landmark_id: int
     scale_known: bool = True
 
 
@@ -97,12 +97,11 @@ def decode_archive(data: bytes) -> SurveyMap:
     the bytes, whatever sizes they state.
     """
     limit = min(MAX_ARCHIVE_PAYLOAD_BYTES, _FREE_BYTES + _MOST_TIMES_SMALLER * len(data))
-    number, payload = unpack(ARCHIVE_MAGIC, ARCHIVE_FORMAT, data, "archive", limit)
+    payload = unpack(ARCHIVE_MAGIC, ARCHIVE_FORMAT, data, "archive", limit)
     head, offset = _read_head(payload)
-    expected = _ARRAYS.keys() - (_HISTORY if number == 1 else set())
     arrays: dict[str, AnyArray] = {}
     for entry in head.arrays:
-        if entry.name not in expected or _ARRAYS[entry.name][0] != entry.dtype or entry.name in arrays:
+        if entry.name not in _ARRAYS or _ARRAYS[entry.name][0] != entry.dtype or entry.name in arrays:
             reason = f"archive: array {entry.name!r} of {entry.dtype!r} is unknown; the bytes are damaged"
             raise MapFormatError(reason)
         count = prod(entry.shape)
@@ -111,23 +110,16 @@ def decode_archive(data: bytes) -> SurveyMap:
             raise MapFormatError(f"archive: array {entry.name} of {entry.shape} does not fit in {len(payload)} bytes")
         arrays[entry.name] = np.frombuffer(payload, entry.dtype, count, offset).reshape(entry.shape).copy()
         offset = end
-    if offset != len(payload) or len(arrays) != len(expected):
-        missing = sorted(expected - arrays.keys())
+    if offset != len(payload) or len(arrays) != len(_ARRAYS):
+        missing = sorted(_ARRAYS.keys() - arrays.keys())
         reason = f"archive: {len(payload) - offset} bytes too many, arrays missing: {missing}; it is damaged"
         raise MapFormatError(reason)
-    if number == 1:
-        arrays["obs_sigma_px"] = np.repeat(arrays["obs_sigma_px"].reshape(-1, 1), 2, axis=1)
     _check(arrays)
     trajectory = Trajectory(arrays.pop("trajectory_stamps_ns"), arrays.pop("trajectory_frame_from_body"))
+    remembered: dict[str, Any] = {name: arrays.pop(name) for name in _HISTORY}
+    remembered |= {"next_keyframe_id": head.next_keyframe_id, "next_landmark_id": head.next_landmark_id}
     fields: dict[str, Any] = {"camera": head.camera, "scale_known": head.scale_known, "trajectory": trajectory}
-    remembered: dict[str, Any] = {name: arrays.pop(name) for name in _HISTORY & arrays.keys()}
-    if remembered:
-        next_ids: dict[str, Any] = {
-            "next_keyframe_id": head.next_keyframe_id,
-            "next_landmark_id": head.next_landmark_id,
-        }
-        fields["history"] = History(**remembered, **next_ids)
-    return SurveyMap(**fields | arrays)
+    return SurveyMap(**fields | arrays, history=History(**remembered))
 
 
 def _check(arrays: dict[str, AnyArray]) -> None:

@@ -14,7 +14,7 @@ from sqlite_utils import Database
 from fleetmap.errors import NewerFormatError, StoreError, UsageError
 from fleetmap.files import sync_path
 from mapserver.store.files import locked
-from mapserver.store.schema import FORMAT, LAST_UNNAMED, MIGRATIONS, TABLES
+from mapserver.store.schema import FORMAT, MIGRATIONS, TABLES
 from mapserver.store.transactions import Transactions
 
 APPLICATION_ID = 0x464D4150  # "FMAP": identifies the file as a map store
@@ -216,11 +216,6 @@ def _check_ours(database: Database, path: Path) -> None:
     if application != APPLICATION_ID and (application != 0 or number != 0 or tables != 0):
         reason = f"{path} is not the database of a map store (application id {application}); choose another --store"
         raise StoreError(reason)
-    if application == APPLICATION_ID and number < LAST_UNNAMED:
-        raise StoreError(
-            f"{path} was made by an earlier fleetmap (store format {number}; this one migrates {LAST_UNNAMED}), and is left unchanged; "
-            "export its versions with that one (`mapserver export FILE`), and import them into another --store, or build them again there"
-        )
     if number > FORMAT:
         raise NewerFormatError(
             f"{path} has store format {number}, this fleetmap reads up to {FORMAT}; update fleetmap to open it"

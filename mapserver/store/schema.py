@@ -273,15 +273,10 @@ TABLES = re.findall(r"CREATE TABLE (\w+)", _TABLES)
 
 @MIGRATIONS()
 def tables(database: Database) -> None:
-    """Create the first schema; a store of the last numbered format has it except for one column."""
-    if database["versions"].exists():
-        database.execute("ALTER TABLE sites DROP COLUMN vocabulary_sha256")
-        database.execute("DELETE FROM traces WHERE heard_ns IS NULL")  # without a time; pages do not show them
-        return
+    """Create the first schema."""
     for statement in STATEMENTS:
         database.execute(statement)
 
 
-LAST_UNNAMED = 12  # the last numbered format, before named migrations
-FORMAT = LAST_UNNAMED + len(MIGRATIONS.pending(Database(memory=True)))
+FORMAT = len(MIGRATIONS.pending(Database(memory=True)))
 """SQLite's user_version of a database with all migrations: reveals an older database by its header, and is newer for older programs."""

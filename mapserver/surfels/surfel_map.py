@@ -245,7 +245,7 @@ def encode_tile(place: tuple[int, int], surfels: Surfels) -> SurfelTile:
 
 
 def _decode_tile(data: bytes) -> tuple[tuple[int, int], Surfels]:
-    _, payload = unpack(SURFEL_MAGIC, SURFEL_FORMAT, data, "surfel tile", _MOST_BYTES)
+    payload = unpack(SURFEL_MAGIC, SURFEL_FORMAT, data, "surfel tile", _MOST_BYTES)
     count = _HEAD.unpack_from(payload)[3] if len(payload) >= _HEAD.size else -1
     if len(payload) != _HEAD.size + _BYTES_EACH * count:
         raise MapFormatError(f"surfel tile: {len(payload)} bytes for {count} surfels; the bytes are damaged")

@@ -93,32 +93,6 @@ class SignedLists:
             return False
         return any(keyid in role.keyids for keyid in signatures)
 
-    def retired(self) -> dict[str, str]:
-        """Return by role setups of an earlier fleetmap that are no longer supported: several keys, a token's, no predecessors."""
-        root, found = self.read("root"), {}
-        for name in ("root", "targets"):
-            role = root.roles[name]
-            kinds = {root.keys[keyid].keytype for keyid in role.keyids if keyid in root.keys} - {"ed25519"}
-            if role.threshold > 1 or kinds:
-                fault = f"{role.threshold} keys must sign {name}"
-                if role.threshold == 1:
-                    fault = f"a key of {name} is of the kind {min(kinds)}, as PKCS#11 tokens have"
-                found[name] = (
-                    f"{self.folder}: {fault}; fleetmap now signs with one root key in a file. Continue with the fleetmap that made it, "
-                    "or start again: move the store's folders trust and keys away, `mapserver trust init`, and enrol the robots again"
-                )
-        for name, signed_by in self.site_roles().items():
-            # Lists of earlier versions may omit the previous version.
-            if signed_by.threshold > 1 or not signed_by.unrecognized_fields.get("previous", 1):
-                site, fault = name.removeprefix("site-"), f"{signed_by.threshold} keys must sign its lists"
-                if signed_by.threshold == 1:
-                    fault = "its lists admit only the current version"
-                found[name] = (
-                    f"site {site}: {fault}, which is no longer supported; `mapserver trust admit {site} --key ROOT` lets one key of "
-                    "this server sign lists that admit the version before, too"
-                )
-        return found
-
     def path(self, role: str, number: int) -> Path:
         return self.folder / (f"{TIMESTAMP}.json" if role == TIMESTAMP else f"{number}.{role}.json")
 

@@ -102,8 +102,7 @@ def try_update_lists(store: MapStore) -> None:
 def prepare_lists(store: MapStore, endpoint: str) -> None:
     """Prepare the lists before a server listens at `endpoint`: create them for loopback only, and sign those due.
 
-    Raises UsageError if a store without lists would be served to other machines, and for unsupported lists:
-    signed by several keys, a token, or another account.
+    Raises UsageError if a store without lists would be served to other machines, and if another account signs a site's.
     """
     from fleetmap.bus import is_loopback  # imported late: it needs zenoh, builds do not
 
@@ -115,8 +114,6 @@ def prepare_lists(store: MapStore, endpoint: str) -> None:
                 f"first: `mapserver trust init --here --store {store.folder}`"
             )
         init_here(store)
-    if retired := lists.retired():
-        raise UsageError("; ".join(retired.values()))
     for name, role in lists.site_roles().items():
         signer = keys.signer(name)
         if signer is None or signer.public_key.keyid not in role.keyids:
@@ -196,8 +193,6 @@ def _changing(store: MapStore, root_key: "Signer", words: str) -> Iterator["List
     lists = SignedLists(store.folder)
     if not lists.are_there:
         raise StateError(f"{store.folder} has no signed lists; `mapserver trust init` makes them")
-    if retired := [words for role, words in lists.retired().items() if role in ("root", "targets")]:
-        raise UsageError(retired[0])
     with _held(store) as repository:
         repository.check_root_key(root_key)
         yield repository
@@ -322,8 +317,6 @@ def _update_site(repository: "ListRepository", rows: SiteReleases) -> int | None
             return None
         signer = keys.signer(role) or keys.make(role)
         repository.delegate(rows.site, signer.public_key, root_key)
-    if words := lists.retired().get(role):
-        raise UsageError(words)
     site_key = keys.signer(role)
     if site_key is None:
         return None

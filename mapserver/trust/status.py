@@ -61,7 +61,6 @@ def trust_status(store: MapStore) -> TrustStatus:
     for name in ("root", "targets", "snapshot", TIMESTAMP, *known):
         found.roles.append(_role(lists, name, now))
     found.faults = [f"{status.role}: {status.fault}" for status in found.roles if status.fault]
-    found.faults += lists.retired().values()
     own = KeyFolder(store.folder / "keys")
     for info in store.sites():
         role = site_role(info.site)

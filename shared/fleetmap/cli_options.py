@@ -14,8 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args, get_orig
 
 import typer
 
-from fleetmap.errors import UsageError
-
 if TYPE_CHECKING:
     from fleetmap.config import Section
 
@@ -94,25 +92,11 @@ def make_app(commands: Commands, callback: Command, read_config: ReadConfig) -> 
         if isinstance(command, Group):
             group = typer.Typer(no_args_is_help=True, add_completion=False, rich_markup_mode=None, help=command.help)
             for inner_name, inner in command.commands.items():
-                group.command(inner_name, cls=RetiringCommand)(inner)
+                group.command(inner_name)(inner)
             app.add_typer(group, name=name)
         else:
-            app.command(name, cls=RetiringCommand)(command)
+            app.command(name)(command)
     return app
-
-
-class RetiringCommand(typer.core.TyperCommand):
-    """A command that refuses removed options and names their replacement."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """As typer's; UsageError for a removed option."""
-        known = {option for parameter in self.params for option in parameter.opts}
-        for option in {word.partition("=")[0] for word in args if word.startswith("--")} - known:
-            from fleetmap.config import RETIRED
-
-            if instead := RETIRED.get(option) or RETIRED.get(option.lstrip("-").replace("-", "_")):
-                raise UsageError(f"{option} is gone: {instead.removesuffix('; delete the key')}")
-        return super().parse_args(ctx, args)
 
 
 def options_of(command: Command) -> dict[str, inspect.Parameter]:

@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from fleetmap.cli_exit import run_cli
-from fleetmap.cli_options import RetiringCommand, Version
+from fleetmap.cli_options import Version
 from fleetmap.errors import UsageError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False)
@@ -29,7 +29,7 @@ def scenarios() -> None:
         typer.echo(f"{name}  [{' '.join(scenario.runs)}]  {scenario.description}")
 
 
-@app.command(cls=RetiringCommand)
+@app.command()
 def record(
     scenario: Annotated[str, typer.Argument(metavar="SCENARIO", help="A name that `fleetsim scenarios` lists.")],
     out: Annotated[Path, Option(help="File to write (.mcap).")],

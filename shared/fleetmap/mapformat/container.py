@@ -41,10 +41,10 @@ def pack(magic: bytes, format_number: int, payload: bytes | Sequence[bytes], *, 
     return _HEADER.pack(magic, format_number, 0, size) + b"".join(frame)
 
 
-def unpack(magic: bytes, newest: int, data: bytes, what: str, max_bytes: int) -> tuple[int, bytes]:
-    """Return format number and payload of `data`.
+def unpack(magic: bytes, format_number: int, data: bytes, what: str, max_bytes: int) -> bytes:
+    """Return the payload of `data`.
 
-    Raises NewerFormatError for a format number above `newest`, MapFormatError for anything else but a complete
+    Raises NewerFormatError for a format above `format_number`, MapFormatError for anything else but a complete
     envelope of kind `magic` with at most `max_bytes` inside. `what` names the thing in messages.
     """
     if len(data) < _HEADER.size or data[:4] != magic:
@@ -52,17 +52,17 @@ def unpack(magic: bytes, newest: int, data: bytes, what: str, max_bytes: int) ->
             f"{what}: {len(data)} bytes beginning {data[:4]!r}, not {magic!r}; this is another kind of file"
         )
     _, number, reserved, size = _HEADER.unpack_from(data)
-    if number > newest:
+    if number > format_number:
         raise NewerFormatError(
-            f"{what} has format {number}, this fleetmap reads up to {newest}; update fleetmap to read it"
+            f"{what} has format {number}, this fleetmap reads up to {format_number}; update fleetmap to read it"
         )
-    if number < 1 or reserved != 0:
+    if number != format_number or reserved != 0:
         raise MapFormatError(
             f"{what}: format {number} with reserved bytes {reserved} is invalid; the bytes are damaged"
         )
     if size > max_bytes:
         raise MapFormatError(f"{what} declares {size} bytes, the limit is {max_bytes}; it is damaged or not ours")
-    return number, _decompress(data[_HEADER.size :], size, what)
+    return _decompress(data[_HEADER.size :], size, what)
 
 
 def _decompress(frame: bytes, size: int, what: str) -> bytes:

@@ -28,7 +28,7 @@ def decode_grid_tile(data: bytes) -> tuple[tuple[int, int], NDArray[np.uint8]]:
 
     MapFormatError or NewerFormatError for anything else; memory is bounded for any input.
     """
-    _, payload = unpack(_MAGIC, GRID_FORMAT, data, "grid tile", _TILE_BYTES)
+    payload = unpack(_MAGIC, GRID_FORMAT, data, "grid tile", _TILE_BYTES)
     if len(payload) != _TILE_BYTES:
         raise MapFormatError(f"grid tile: {len(payload)} bytes, not {_TILE_BYTES}; the bytes are damaged")
     layers = np.frombuffer(payload, np.uint8, offset=_HEAD.size).reshape(_LAYERS, TILE_CELLS, TILE_CELLS)

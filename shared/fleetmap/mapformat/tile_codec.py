@@ -1,12 +1,10 @@
 """Encoding of tiles, magic FMTL, in the envelope of `container`. docs/map_format.md describes every byte.
 
-Writes format 2, reads 1 and 2, which differ only in their quantisation steps (`_STEPS`). Stored by column, with
-integers wider than a byte as byte planes (all low bytes, then all next ones), because similar high bytes compress well.
-Quantisation is idempotent: a decoded tile encodes to the same bytes.
+Stored by column, with integers wider than a byte as byte planes (all low bytes, then all next ones), because similar high
+bytes compress well. Quantisation is idempotent: a decoded tile encodes to the same bytes.
 """
 
 import struct
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,33 +150,19 @@ _HEAD = struct.Struct("<iidiIII")
 _PLACE_STEPS_PER_M = 65536.0
 
 
-@dataclass(frozen=True, slots=True)
-class _Steps:
-    """Quantisation of a format. A tile's side has `side` quanta; distance_m and sigma_m: smallest value, codes per octave."""
-
-    side: int
-    direction: int
-    half_angle: int
-    distance_m: tuple[float, int]
-    sigma_m: tuple[float, int]
-
-    def quantum_m(self, size_m: float) -> float:
-        return size_m / self.side
-
-
-# Coarser steps save bytes at no cost: a quantum of 2 mm adds 0.6 mm to the standard deviation of
+# Coarse steps save bytes at no cost: a quantum of 2 mm adds 0.6 mm to the standard deviation of
 # landmarks that are known to a few millimetres at best, and robots tolerate 75 degrees beyond the directions.
-_STEPS = {
-    1: _Steps(65536, 127, 255, (0.1, 20), (1e-4, 16)),
-    2: _Steps(8192, 42, 60, (0.1, 8), (1e-4, 4)),
-}
-_NOW = _STEPS[TILE_FORMAT]
+_SIDE_STEPS = 8192  # quanta of a tile's side
+_DIRECTION_STEPS = 42
+_HALF_ANGLE_STEPS = 60
+_DISTANCE_M = (0.1, 8)  # smallest value, codes per octave
+_SIGMA_M = (1e-4, 4)
 
 
 def encode_tile(tile: Tile) -> bytes:
     """Encode a tile; raises MapFormatError for a tile that is invalid or does not fit."""
     check_tile(tile)
-    z_codes = np.round(tile.points_map[:, 2] / _NOW.quantum_m(tile.size_m))
+    z_codes = np.round(tile.points_map[:, 2] / (tile.size_m / _SIDE_STEPS))
     z_base = int(z_codes.min()) if len(tile) else 0
     if len(tile) and (z_codes.max() - z_base >= 1 << 24 or abs(z_base) >= 1 << 31):
         low, high = tile.points_map[:, 2].min(), tile.points_map[:, 2].max()
@@ -197,12 +181,12 @@ def encode_tile(tile: Tile) -> bytes:
 
 
 def decode_tile(data: bytes) -> Tile:
-    """Decode the bytes of `encode_tile`, or of an older format.
+    """Decode the bytes of `encode_tile`.
 
     Raises NewerFormatError for a newer format, MapFormatError for bytes that are not a complete tile. Time and memory are
     bounded by MAX_TILE_PAYLOAD_BYTES and MAX_TILE_PLACES for any input.
     """
-    number, payload = unpack(_MAGIC, TILE_FORMAT, data, "tile", MAX_TILE_PAYLOAD_BYTES)
+    payload = unpack(_MAGIC, TILE_FORMAT, data, "tile", MAX_TILE_PAYLOAD_BYTES)
     if len(payload) < _HEAD.size:
         raise MapFormatError(f"tile: {len(payload)} bytes are too few for its header; the bytes are damaged")
     tile_x, tile_y, size_m, z_base, count, places, references = _HEAD.unpack_from(payload)
@@ -216,8 +200,8 @@ def decode_tile(data: bytes) -> Tile:
         raise MapFormatError(f"tile ({tile_x}, {tile_y}): {places} places, the limit is {MAX_TILE_PLACES}")
     if not (np.isfinite(size_m) and 0 < size_m < 1e6):
         raise MapFormatError(f"tile ({tile_x}, {tile_y}): size_m is {size_m}; the bytes are damaged")
-    columns, steps = Columns(payload, _HEAD.size), _STEPS[number]
-    quantum_m = steps.quantum_m(size_m)
+    columns = Columns(payload, _HEAD.size)
+    quantum_m = size_m / _SIDE_STEPS
     tile = Tile(
         tile_x=tile_x,
         tile_y=tile_y,
@@ -233,11 +217,11 @@ def decode_tile(data: bytes) -> Tile:
         ),
         descriptors=columns.bytes(count * 32).reshape(count, 32).copy(),
         view_directions_map=direction_value(
-            columns.bytes(count * 2).view(np.int8).reshape(2, count).T, steps.direction
+            columns.bytes(count * 2).view(np.int8).reshape(2, count).T, _DIRECTION_STEPS
         ),
-        view_half_angle_rad=half_angle_value(columns.bytes(count), steps.half_angle),
-        max_distance_m=log_value(columns.bytes(count), *steps.distance_m),
-        sigma_m=log_value(columns.bytes(count), *steps.sigma_m),
+        view_half_angle_rad=half_angle_value(columns.bytes(count), _HALF_ANGLE_STEPS),
+        max_distance_m=log_value(columns.bytes(count), *_DISTANCE_M),
+        sigma_m=log_value(columns.bytes(count), *_SIGMA_M),
         place_ids=columns.increasing(places),
         map_from_cam=_map_from_cam(columns, places),
         place_landmark_ids=_references(columns, places, references),
@@ -246,18 +230,18 @@ def decode_tile(data: bytes) -> Tile:
 
 
 def _landmark_columns(tile: Tile, z_codes: Array) -> list[bytes]:
-    steps = (tile.points_map[:, :2] - tile.origin_m) / _NOW.quantum_m(tile.size_m)
-    plane_codes = np.clip(np.round(steps), 0, _NOW.side - 1).astype(np.uint32)
+    steps = (tile.points_map[:, :2] - tile.origin_m) / (tile.size_m / _SIDE_STEPS)
+    plane_codes = np.clip(np.round(steps), 0, _SIDE_STEPS - 1).astype(np.uint32)
     return [
         planes(differences(tile.landmark_ids), 4),
         planes(plane_codes[:, 0], 2),
         planes(plane_codes[:, 1], 2),
         planes(z_codes.astype(np.uint32), 3),
         np.ascontiguousarray(tile.descriptors, np.uint8).tobytes(),
-        direction_code(tile.view_directions_map, _NOW.direction).T.tobytes(),
-        half_angle_code(tile.view_half_angle_rad, _NOW.half_angle).tobytes(),
-        log_code(tile.max_distance_m, *_NOW.distance_m).tobytes(),
-        log_code(tile.sigma_m, *_NOW.sigma_m).tobytes(),
+        direction_code(tile.view_directions_map, _DIRECTION_STEPS).T.tobytes(),
+        half_angle_code(tile.view_half_angle_rad, _HALF_ANGLE_STEPS).tobytes(),
+        log_code(tile.max_distance_m, *_DISTANCE_M).tobytes(),
+        log_code(tile.sigma_m, *_SIGMA_M).tobytes(),
     ]
 
 

@@ -76,17 +76,13 @@ def golden_payload() -> bytes:
 
 
 def test_layout_is_the_documented_one() -> None:
-    number, payload = unpack(b"FMTL", 2, encode_tile(golden_tile()), "tile", LIMIT)
-    assert number == 2
-    assert payload == golden_payload()
+    assert unpack(b"FMTL", 2, encode_tile(golden_tile()), "tile", LIMIT) == golden_payload()
 
 
-@pytest.mark.parametrize("number", [1, 2])
-def test_files_of_every_format_stay_readable(number: int) -> None:
+def test_the_released_file_stays_readable() -> None:
     # Written by the release that brought the format; never to be changed.
-    data = bytes.fromhex(GOLDEN_HEX[number])
-    assert sha256_hex(data) == GOLDEN_SHA256[number]
-    assert data[4] == number
+    data = bytes.fromhex(GOLDEN_HEX)
+    assert sha256_hex(data) == GOLDEN_SHA256
     tile, expected = decode_tile(data), golden_tile()
     for field in expected.__dataclass_fields__:
         found, wanted = getattr(tile, field), getattr(expected, field)
@@ -119,7 +115,7 @@ def test_round_trip_loses_only_what_is_documented(seed: int, landmarks: int, pla
 
 def test_landmarks_take_48_bytes_before_compression() -> None:
     sizes = [
-        len(unpack(b"FMTL", 2, encode_tile(random_tile(np.random.default_rng(0), landmarks=n, places=0)), "", LIMIT)[1])
+        len(unpack(b"FMTL", 2, encode_tile(random_tile(np.random.default_rng(0), landmarks=n, places=0)), "", LIMIT))
         for n in (0, 1000)
     ]
     assert sizes[1] - sizes[0] == 1000 * LANDMARK_BYTES == 48_000
@@ -203,22 +199,11 @@ def test_many_places_cannot_take_long() -> None:
         decode_tile(pack(b"FMTL", 2, head + bytes(27 * places), level=1))
 
 
-GOLDEN_HEX = {
-    1: (
-        "464d544c01000000a700000028b52ffd24a75d04004407ff0200304000f001000000030000000725000100f8000008f0"
-        "000000300000000102030405060708090a0b0c0d0e0f101112131415161718191a1b1c1d1e1f20212223242526272829"
-        "2a2b2c2d2e2f303132333435363738393a3b3c3d3e3f7f00000000ff148c004005ff004028000001000000080034037c"
-        "24c04552968787e98e3f7310402000d85a30caa5"
-    ),
-    2: (
-        "464d544c02000000a700000028b52ffd24a7000100ffffffff02000000000000000000304000feffff02000000010000"
-        "000300000040000007250001000000002000000000001f2000000000011e300000000000060000000200000102030405"
-        "060708090a0b0c0d0e0f101112131415161718191a1b1c1d1e1f202122232425262728292a2b2c2d2e2f303132333435"
-        "363738393a3b3c3d3e3f2000002a000000100000003c10000008381000000010d80000050000000000f8ff0040280000"
-        "0001000000000000000003000000600000072500000100000001000000010000725fc30a"
-    ),
-}
-GOLDEN_SHA256 = {
-    1: "d0346ce18229f33cf3bde5e090af33d269b7573348ea42106ca1357a5366b92e",
-    2: "05ff2dcc7afce05f4111cf83bb2446d5e7977aa3ddd9fbfebe2898af40f97fd3",
-}
+GOLDEN_HEX = (
+    "464d544c02000000a700000028b52ffd24a7000100ffffffff02000000000000000000304000feffff02000000010000"
+    "000300000040000007250001000000002000000000001f2000000000011e300000000000060000000200000102030405"
+    "060708090a0b0c0d0e0f101112131415161718191a1b1c1d1e1f202122232425262728292a2b2c2d2e2f303132333435"
+    "363738393a3b3c3d3e3f2000002a000000100000003c10000008381000000010d80000050000000000f8ff0040280000"
+    "0001000000000000000003000000600000072500000100000001000000010000725fc30a"
+)
+GOLDEN_SHA256 = "05ff2dcc7afce05f4111cf83bb2446d5e7977aa3ddd9fbfebe2898af40f97fd3"

@@ -1,6 +1,5 @@
 """A survey under way from end to end, on a small recording."""
 
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -124,13 +123,6 @@ def test_what_cannot_be_mapped_live_is_refused_before_it_begins(recording: Path,
         with pytest.raises(UsageError, match="--speed"), played(recording, speed=speed):
             pass
     assert not (tmp_path / "maps").exists()
-
-
-@pytest.mark.parametrize("option", ["--frozen", "--map=7", "--ros2=tcp/127.0.0.1:1"])
-def test_an_option_that_is_gone_names_what_replaces_it(recording: Path, tmp_path: Path, option: str) -> None:
-    said = CliRunner().invoke(app, ["live", str(recording), "--site", "lab", "--store", str(tmp_path), option])
-    assert isinstance(said.exception, UsageError)
-    assert re.match("--(frozen|map|ros2) is gone: .*(locclient replay|--foxglove)", str(said.exception))
 
 
 @pytest.mark.usefixtures("ordered")

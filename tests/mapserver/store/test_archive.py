@@ -1,6 +1,5 @@
 """Archives keep a survey to the bit."""
 
-import json
 from collections.abc import Callable
 from dataclasses import fields, replace
 from typing import Any
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import MapFormatError, NewerFormatError
-from fleetmap.mapformat import pack, unpack
+from fleetmap.mapformat import pack
 from mapserver.store.archive import decode_archive, encode_archive
 from support.storage.map_samples import random_survey
 
@@ -51,27 +50,6 @@ def test_arrays_that_do_not_fit_each_other_are_refused(name: str, change: Callab
     survey = random_survey(np.random.default_rng(0))
     with pytest.raises(MapFormatError, match=r"archive: .*; it is damaged"):
         decode_archive(encode_archive(replace(survey, **{name: change(getattr(survey, name))})))
-
-
-def test_archives_of_format_1_are_read() -> None:
-    """They held one sigma for each observation, and no history."""
-    survey = random_survey(np.random.default_rng(0))
-    _, payload = unpack(b"FMAR", 2, encode_archive(survey), "archive", 1 << 30)
-    size = int.from_bytes(payload[:4], "little")
-    head, offset, arrays, body = json.loads(payload[4 : 4 + size]), 4 + size, [], []
-    for entry in head["arrays"]:
-        length = int(np.prod(entry["shape"])) * np.dtype(entry["dtype"]).itemsize
-        part, offset = payload[offset : offset + length], offset + length
-        if entry["name"] == "obs_sigma_px":
-            part, entry["shape"] = np.frombuffer(part).reshape(-1, 2)[:, 0].tobytes(), entry["shape"][:1]
-        if entry["name"] not in HISTORY:
-            arrays.append(entry)
-            body.append(part)
-    old = json.dumps({"camera": head["camera"], "arrays": arrays}).encode()
-    back = decode_archive(pack(b"FMAR", 1, b"".join([len(old).to_bytes(4, "little"), old, *body])))
-    assert back.history is None
-    np.testing.assert_array_equal(back.obs_sigma_px, np.repeat(survey.obs_sigma_px[:, :1], 2, axis=1))
-    np.testing.assert_array_equal(back.points_map, survey.points_map)
 
 
 def test_damaged_archives_are_refused() -> None:

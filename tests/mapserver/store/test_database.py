@@ -2,7 +2,6 @@
 
 import errno
 import os
-import shutil
 import sqlite3
 import threading
 from collections.abc import Iterator
@@ -13,12 +12,10 @@ import pytest
 from sqlite_utils import Database, Migrations
 
 from fleetmap.errors import StoreError
-from mapserver import releases
-from mapserver.store import FailureFilter, MapStore, schema
+from mapserver.store import MapStore, schema
 from mapserver.store import database as database_module
-from mapserver.store.access.chain import chain_faults
-from mapserver.store.database import APPLICATION_ID, SqliteTransactions
-from mapserver.store.schema import FORMAT, LAST_UNNAMED
+from mapserver.store.database import SqliteTransactions
+from mapserver.store.schema import FORMAT
 from support.storage.map_samples import save_sample_draft
 
 COUNT = "SELECT count(*) AS n FROM events"
@@ -69,51 +66,6 @@ def test_closing_leaves_one_file(tmp_path: Path) -> None:
     opened.query(COUNT)
     opened.close()
     assert [path.name for path in tmp_path.iterdir()] == ["store.sqlite3"]
-
-
-@pytest.mark.parametrize("read_only", [False, True])
-@pytest.mark.parametrize("number", [1, LAST_UNNAMED - 1])
-def test_a_store_of_before_is_refused_and_stays_as_it_is(tmp_path: Path, number: int, read_only: bool) -> None:
-    path = tmp_path / "store.sqlite3"
-    with closing(sqlite3.connect(path)) as connection:
-        connection.execute("CREATE TABLE sites (site TEXT PRIMARY KEY, vocabulary_sha256 TEXT)")
-        connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-        connection.execute(f"PRAGMA user_version = {number}")
-    before = path.read_bytes()
-    with pytest.raises(StoreError, match=rf"store format {number};.*`mapserver export FILE`.*another --store"):
-        MapStore.open(tmp_path, read_only=read_only)
-    assert path.read_bytes() == before
-    assert [found.name for found in tmp_path.iterdir() if found.is_file()] == [path.name]
-
-
-@pytest.mark.parametrize("unchained", [2, 1 << 30])
-def test_a_store_of_the_last_numbered_format_is_copied_and_migrated(tmp_path: Path, unchained: int) -> None:
-    golden = Path(__file__).parents[2] / "golden"
-    path, copy = tmp_path / "store.sqlite3", tmp_path / f"store-format-{LAST_UNNAMED}.sqlite3"
-    shutil.copy(golden / f"store-{LAST_UNNAMED}.sqlite3", path)
-    shutil.copytree(golden / "store-blobs", tmp_path / "blobs")
-    with (
-        closing(sqlite3.connect(path)) as connection,
-        connection,
-    ):  # as one that began before the chain and the moments of traces
-        connection.execute("DROP TRIGGER events_stay_as_they_are")
-        connection.execute("UPDATE events SET sha256 = '' WHERE id <= ?", (unchained,))
-        connection.execute("INSERT INTO traces (hour, key_id, stamp_ns, status) VALUES (0, 1, 1, 'LOST')")
-    before = path.read_bytes()
-    with MapStore.open(tmp_path, read_only=True) as store:
-        assert [info.state for info in store.versions("lab")] == ["current", "retired", "draft"]
-    assert (path.read_bytes(), copy.exists()) == (before, False)
-    with MapStore.open(tmp_path) as store:
-        assert store.verify().faults == []
-        assert [robot.robot for robot in store.robots("lab")] == ["r1"]
-        (failure,) = store.fleet.failures(FailureFilter())
-        assert store.fleet.counters("lab", "cause", key="dark")["lab", "dark"].failures == 1
-        assert releases.publish(store, "lab") == 3
-        assert releases.roll_back(store, "lab") == 1
-        assert store.verify().faults == []
-        assert chain_faults(store.audit_lines()) == []
-        assert store._transactions.query("SELECT * FROM traces WHERE heard_ns IS NULL") == []
-    assert (failure.failure_id, format_of(path), format_of(copy)) == ("f1", FORMAT, LAST_UNNAMED)
 
 
 def test_a_store_is_copied_before_it_is_migrated_and_never_by_who_only_looks(

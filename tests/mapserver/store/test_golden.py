@@ -23,18 +23,16 @@ GOLDEN = Path(__file__).parents[2] / "golden"
 
 
 @pytest.mark.parametrize(
-    ("name", "newest"),
+    "name",
     [
-        ("tile-{}.fmtl", TILE_FORMAT),
-        ("tile-{}.json", TILE_FORMAT),
-        ("manifest-{}.json", MANIFEST_FORMAT),
-        ("archive-{}.fmar", ARCHIVE_FORMAT),
-        ("version-{}.fmex", EXPORT_FORMAT),
+        f"tile-{TILE_FORMAT}.fmtl",
+        f"manifest-{MANIFEST_FORMAT}.json",
+        f"archive-{ARCHIVE_FORMAT}.fmar",
+        f"version-{EXPORT_FORMAT}.fmex",
     ],
 )
-def test_every_format_has_its_file(name: str, newest: int) -> None:
-    missing = [name.format(number) for number in range(1, newest + 1) if not (GOLDEN / name.format(number)).is_file()]
-    assert missing == [], "python tests/golden/add.py adds the newest"
+def test_every_format_has_its_file(name: str) -> None:
+    assert (GOLDEN / name).is_file(), "python tests/golden/add.py adds the newest"
 
 
 @pytest.mark.parametrize("file", sorted(GOLDEN.glob("tile-*.fmtl")), ids=lambda file: file.stem)
@@ -87,12 +85,11 @@ def test_archives(file: Path) -> None:
     assert survey.map_from_body.shape == (3, 4, 4)
 
 
-@pytest.mark.parametrize("number", range(1, EXPORT_FORMAT + 1))
-def test_exports(number: int, tmp_path: Path) -> None:
+def test_exports(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
-        info = store.import_version(GOLDEN / f"version-{number}.fmex", actor=Actor("ada"))
-        assert list(known_grid(store.manifest("lab", 1), store.blob)) == ([(0, 0)] if number >= 2 else [])
-        assert len(known_surfels(store.manifest("lab", 1), store.blob)) == (20 if number >= 3 else 0)
+        info = store.import_version(GOLDEN / f"version-{EXPORT_FORMAT}.fmex", actor=Actor("ada"))
+        assert list(known_grid(store.manifest("lab", 1), store.blob)) == [(0, 0)]
+        assert len(known_surfels(store.manifest("lab", 1), store.blob)) == 20
         assert (info.site, info.version, info.state, info.tiles) == ("lab", 1, "draft", 2)
         assert store.archive("lab", 1) == b"archive 1"
         assert releases.publish(store, "lab") == 1
@@ -106,7 +103,7 @@ def test_newer_formats_are_refused_by_number(tmp_path: Path) -> None:
         decode_archive(pack(b"FMAR", ARCHIVE_FORMAT + 1, b""))
     with pytest.raises(NewerFormatError, match=f"format {MANIFEST_FORMAT + 1}.*up to {MANIFEST_FORMAT}"):
         decode_manifest(b'{"format_version": %d}' % (MANIFEST_FORMAT + 1))
-    export = bytearray((GOLDEN / "version-1.fmex").read_bytes())
+    export = bytearray((GOLDEN / f"version-{EXPORT_FORMAT}.fmex").read_bytes())
     struct.pack_into("<H", export, 4, EXPORT_FORMAT + 1)
     (tmp_path / "newer.fmex").write_bytes(export)
     with MapStore.open(tmp_path / "store", create=True) as store:

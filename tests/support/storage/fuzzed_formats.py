@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from fleetmap.errors import FleetmapError
-from fleetmap.mapformat import decode_manifest, decode_tile, pack, unpack
+from fleetmap.mapformat import TILE_FORMAT, decode_manifest, decode_tile, pack, unpack
 from fleetmap.mapformat.grid_tile import TILE_CELLS, decode_grid_tile
 from fleetmap.mapformat.version_file import open_export
 from fleetmap.version_grid import encode_grid
@@ -112,10 +112,10 @@ def manifests() -> st.SearchStrategy[bytes]:
     )
 
 
-def _enveloped(file: str, magic: bytes, newest: int) -> st.SearchStrategy[bytes]:
+def _enveloped(file: str, magic: bytes, number: int) -> st.SearchStrategy[bytes]:
     """Binary files, damaged outside, and damaged inside of a sound envelope."""
     whole = (GOLDEN / file).read_bytes()
-    number, payload = unpack(magic, newest, whole, file, 1 << 30)
+    payload = unpack(magic, number, whole, file, 1 << 30)
     # Small outside, large inside.
     swollen = [pack(magic, number, bytes(1 << bits), level=1) for bits in (20, 24, 26)]
     return st.one_of(
@@ -131,17 +131,17 @@ def _enveloped(file: str, magic: bytes, newest: int) -> st.SearchStrategy[bytes]
 
 def tiles() -> st.SearchStrategy[bytes]:
     """Tiles."""
-    return _enveloped("tile-1.fmtl", b"FMTL", 1)
+    return _enveloped("tile-2.fmtl", b"FMTL", TILE_FORMAT)
 
 
 def archives() -> st.SearchStrategy[bytes]:
     """Surveys' archives."""
-    return _enveloped("archive-1.fmar", b"FMAR", ARCHIVE_FORMAT)
+    return _enveloped("archive-2.fmar", b"FMAR", ARCHIVE_FORMAT)
 
 
 def exports() -> st.SearchStrategy[bytes]:
     """Export files, damaged, and damaged with a right sum at their end."""
-    body = (GOLDEN / "version-1.fmex").read_bytes()[:-32]
+    body = (GOLDEN / "version-3.fmex").read_bytes()[:-32]
     head_bytes = int.from_bytes(body[8:12], "little")
 
     def summed(data: bytes) -> bytes:
