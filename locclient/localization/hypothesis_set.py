@@ -69,9 +69,9 @@ class HypothesisSet:
     def _vote(self, fix: Fix, fresh: PoseHypothesis, odom_from_body: Array | None) -> None:
         """Let a fix vote for the hypothesis at its pose and update it, or create one. fresh: the fix's pose at present."""
         for hypothesis in self.hypotheses:
-            if self._is_same_pose(fresh, hypothesis):
+            if hypothesis.is_same_pose(fresh, self._settings):
                 if hypothesis.misses:  # at most one vote per query
-                    hypothesis.support, hypothesis.misses = hypothesis.support + 1, 0
+                    hypothesis.support, hypothesis.misses = hypothesis.support + fresh.support, 0
                     self._count(hypothesis, fix, fresh, odom_from_body)
                 hypothesis.take_pose(fresh)
                 return
@@ -83,13 +83,6 @@ class HypothesisSet:
         hypothesis.add_fix(fix.inliers, fix.landmark_recall)
         if self._settings.is_whole_site_mapped and fix.covisible is not None and odom_from_body is not None:
             hypothesis.history.add(odom_from_body @ se3_inverse(fresh.now_map_from_body), fix.covisible)
-
-    def _is_same_pose(self, fresh: PoseHypothesis, hypothesis: PoseHypothesis) -> bool:
-        error, covariance = boxminus(fresh.now_map_from_body, hypothesis.now_map_from_body), hypothesis.now_cov
-        far_m = self._settings.hypothesis_distance_m + 3 * np.sqrt(np.trace(covariance[3:, 3:]))
-        far_rad = np.radians(self._settings.hypothesis_angle_deg) + 3 * np.sqrt(np.trace(covariance[:3, :3]))
-        is_near = bool(np.linalg.norm(error[3:]) < far_m and np.linalg.norm(error[:3]) < far_rad)
-        return is_near and fresh.floor == hypothesis.floor
 
     def update(self, observations: Observations, odom_from_body: Array) -> TimeSliced[None]:
         """Run `observe` and the disambiguation, in time slices."""
@@ -166,7 +159,12 @@ class HypothesisSet:
     # --- confirmation -------------------------------------------------------------------------------------------------
 
     def may_be_lookalike(self, hypothesis: PoseHypothesis) -> bool:
-        """Return True if an unmapped place could look as similar, by the hypothesis's recall in all queries so far."""
+        """Return True if an unmapped place could look as similar, by its recall and by its inliers."""
+        known = self.lookalikes
+        return known is not None and self.has_low_recall(hypothesis) and hypothesis.mean_inliers <= known.inliers
+
+    def has_low_recall(self, hypothesis: PoseHypothesis) -> bool:
+        """Return True if its recall in all queries so far, which a confirmed pose needs, excludes no unmapped place."""
         return self.lookalikes is not None and 0.0 < self.lookalikes.recall >= hypothesis.recall
 
     def is_supported(self, hypothesis: PoseHypothesis) -> bool:

@@ -171,7 +171,8 @@ class Localizer:
         self._tracker.lookalikes = None
         if known:
             shares = [each.max_wrong_share for each in known] + [1.0] * (len(self._maps) - len(known))
-            self._tracker.lookalikes = LookAlikes(max(each.recall for each in known), max(shares))
+            most = max(each.recall for each in known), max(shares), max(each.inliers for each in known)
+            self._tracker.lookalikes = LookAlikes(*most)
         self._tracker.alias_step_m = min((held.alias_step_m for held in self._maps.values()), default=ALIAS_STEP_M)
 
     @property

@@ -9,7 +9,7 @@ import numpy as np
 from fleetmap.geometry import Array, length
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from locclient.localization.alias_disambiguation import ObservationHistory
-from locclient.localization.pose_covariance import bounded_turn, compose_cov, compose_end_cov
+from locclient.localization.pose_covariance import bounded_turn, boxminus, compose_cov, compose_end_cov
 from locclient.localization.settings import TrackSettings
 
 # Sigmas of one step: radians, metres, share of the distance.
@@ -99,6 +99,13 @@ class PoseHypothesis:
     @property
     def recall(self) -> float:
         return self.recall_total / max(self.looks, 1)
+
+    def is_same_pose(self, fresh: "PoseHypothesis", settings: TrackSettings) -> bool:
+        error, covariance = boxminus(fresh.now_map_from_body, self.now_map_from_body), self.now_cov
+        far_m = settings.hypothesis_distance_m + 3 * np.sqrt(np.trace(covariance[3:, 3:]))
+        far_rad = np.radians(settings.hypothesis_angle_deg) + 3 * np.sqrt(np.trace(covariance[:3, :3]))
+        is_near = bool(np.linalg.norm(error[3:]) < far_m and np.linalg.norm(error[:3]) < far_rad)
+        return is_near and fresh.floor == self.floor
 
     def speaks_against_others(self, settings: TrackSettings) -> bool:
         """Return True if its fixes may contradict a confirmed pose: strong ones, or ones that moved with the robot, farther than the

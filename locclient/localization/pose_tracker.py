@@ -89,6 +89,7 @@ class PoseTracker:
         self._view, self.body_from_cam = 0, mounted[0].body_from_cam  # of the last query
         self.prior: InitialPosePrior | None = None
         self.candidates = HypothesisSet(settings.track)
+        self._repeated = HypothesisSet(settings.track)  # by all fixes of searches, also those of few matches
         self.confirmed: PoseHypothesis | None = None
         self.was_tracking = False
         self.is_carried = False  # it was lifted since it knew its pose
@@ -131,6 +132,7 @@ class PoseTracker:
         self.confirmed = self._query_frame = None
         self.forget_frames()
         self.candidates.reset()
+        self._repeated.reset()
         self.was_tracking &= is_carried
         self.is_carried = self.was_tracking
 
@@ -206,7 +208,11 @@ class PoseTracker:
             self.prior.propagate(odometry, step)
 
     def _tracked(self) -> list[PoseHypothesis]:
-        found = [*self.candidates.tracked(), *([] if self.prior is None else self.prior.tracked())]
+        found = [
+            *self.candidates.tracked(),
+            *self._repeated.tracked(),
+            *([] if self.prior is None else self.prior.tracked()),
+        ]
         if self.confirmed is not None:
             found.append(self.confirmed)
         found.extend(each.frame for each in self._unmatched)
@@ -300,14 +306,23 @@ class PoseTracker:
         return is_reliable(fix, self._settings.fix, self._track.strong_inliers)
 
     def believed(self, fixes: Sequence[Fix]) -> list[Fix]:
-        """Return the fixes that are reliable, or within the gate of a prior that names one place, such as a dock's.
+        """Return the fixes that speak for a place, and those of few matches at the only place that searches agree on: chance matches do not
+        repeat there while the noise of the images changes. An unmapped place that looks the same does, so they confirm no pose."""
+        self._repeated.observe(self.observations(fixes), None)
+        order, competitors = self._repeated.ranking()
+        is_agreed = bool(order) and not competitors and order[0].support >= self._track.confirming_fixes
+        return [
+            fix
+            for fix, at in self.observations(fixes)
+            if self._speaks(fix, at) or (is_agreed and order[0].is_same_pose(at, self._track))
+        ]
 
-        As near a confirmed pose, other places are excluded there, and few matches decide only about the last decimetres.
-        """
+    def _speaks(self, fix: Fix, at: PoseHypothesis) -> bool:
+        """Return True for a reliable fix, or one within the gate of a prior that names one place, such as a dock's: as near a confirmed
+        pose, other places are excluded there, and few matches decide only about the last decimetres."""
         known = None if self.prior is None else self.prior.known_pose(0.5 * self.alias_step_m)
-        return [fix for fix, at in self.observations(fixes) if self.is_reliable(fix) or self._is_at(known, fix, at)]
-
-    def _is_at(self, known: PoseHypothesis | None, fix: Fix, at: PoseHypothesis) -> bool:
+        if self.is_reliable(fix):
+            return True
         if known is None or fix.inliers < self._settings.fix.min_inliers or fix.floor != known.floor:
             return False
         _, innovation = innovation_of(at.now_map_from_body, at.now_cov, known.now_map_from_body, known.now_cov)
@@ -382,7 +397,10 @@ class PoseTracker:
         # True if the robot cannot be at an unmapped place that looks like a mapped one.
         is_excluded = self.lookalikes is not None and (is_near or self._track.is_whole_site_mapped)
         candidates.lookalikes = LookAlikes(0.0, 0.0) if is_excluded else self.lookalikes
-        yield from candidates.update(self.observations(fixes), self.odom_from_body)
+        observations = self.observations(fixes)
+        for fix, at in observations:
+            at.support = int(self._speaks(fix, at))
+        yield from candidates.update(observations, self.odom_from_body)
         if not fixes:
             return OUTSIDE_PRIOR if outside else NO_AGREEMENT
         (best, *_), competitors = candidates.ranking()
@@ -390,16 +408,17 @@ class PoseTracker:
             told = "; ".join(hypothesis.evidence for hypothesis in (best, *competitors[:2]))
             return QueryResult(None, f"{len(competitors) + 1} places match the image: {told}")
         moved_m = None
-        has_prior = self.prior is not None and self.prior.confirms(best)
+        has_prior = self.prior is not None and best.support > 0 and self.prior.confirms(best)
         if not has_prior and self.missing_floors:
             return QueryResult(None, f"floor {min(self.missing_floors)}, whose map is not here yet, may look the same")
         if not has_prior and candidates.may_be_lookalike(best):
             assert self.lookalikes is not None
             told = f"{best.evidence} here, {self.lookalikes.recall:.0%} there"
             return QueryResult(None, f"a place that is not in the map may look the same: {told}")
-        if has_prior or candidates.is_confirmed(best, fixes, floors=floors):
+        if has_prior or (not candidates.has_low_recall(best) and candidates.is_confirmed(best, fixes, floors=floors)):
             moved_m = candidates.moved_m(best)
             candidates.reset()
+            self._repeated.reset()
             self.confirmed, self.prior, self.floor = best, None, best.floor
             self.was_tracking, self.is_carried = True, False
         best_m = best.now_map_from_body[:3, 3]

@@ -120,8 +120,11 @@ class LoadedMap:
     @property
     def lookalikes(self) -> LookAlikes | None:
         """Similarity of unmapped places to the map; None if its build did not measure it."""
-        recall, starts = self.manifest.report.get("lookalike_recall"), self.manifest.report.get("starts")
-        share = starts.get("max_wrong_share") if isinstance(starts, dict) else None
+        recall, evidence = self.manifest.report.get("lookalike_recall"), self.manifest.report.get("evidence")
+        starts = evidence.get("starts") if isinstance(evidence, dict) else None
+        measured = starts if isinstance(starts, dict) else {}
+        share, inliers = measured.get("max_wrong_share"), measured.get("lookalike_inliers")
         if not isinstance(recall, int | float):
             return None
-        return LookAlikes(float(recall), float(share)) if isinstance(share, int | float) else LookAlikes(float(recall))
+        share = float(share) if isinstance(share, int | float) else 1.0
+        return LookAlikes(float(recall), share, float(inliers) if isinstance(inliers, int | float) else float("inf"))

@@ -351,6 +351,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         removed_landmarks={} if parent is None else parent.removed(),
         alias_step_m=step_m,
     )
+    starts = None if evidence.starts is None else msgspec.structs.replace(evidence.starts, lookalikes=[])
     details = DraftDetails(
         created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
         tile_size_m=TILE_SIZE_M,
@@ -360,7 +361,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         libraries=library_versions(),
         # A robot downloads the manifest: its part about the build is short.
         report={key: value for key, value in to_plain(report).items() if key not in _NOT_FOR_ROBOTS}
-        | {EVIDENCE_KEY: to_plain(msgspec.structs.replace(evidence, directions=None, starts=None, views=None))},
+        | {EVIDENCE_KEY: to_plain(msgspec.structs.replace(evidence, directions=None, starts=starts, views=None))},
     )
     job = run.request.options.job
     content = DraftContent(

@@ -69,7 +69,8 @@ class Starts(msgspec.Struct, frozen=True):
     """Frames without a prior in the tiles without those around their own place: robots that start at an unmapped place.
 
     taken_share: share localised at another place. lookalike_recall: landmark recall that a start without a prior must
-    exceed: an unmapped place like these exceeds it with a probability of at most max_wrong_share. lookalikes: the wrongly localised frames.
+    exceed: an unmapped place like these exceeds it with a probability of at most max_wrong_share; or lookalike_inliers, with the same
+    probability. lookalikes: the wrongly localised frames.
     """
 
     frames: int
@@ -77,6 +78,7 @@ class Starts(msgspec.Struct, frozen=True):
     lookalike_recall: float
     max_wrong_share: float
     lookalikes: list[LookAlike]
+    lookalike_inliers: int | None = None
 
 
 class Repetition(msgspec.Struct, frozen=True):

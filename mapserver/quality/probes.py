@@ -55,15 +55,12 @@ def relocalized(view: MapView, probe: Probe, prior_map_from_cam: Array) -> Fix |
     return next((fix for fix in near if is_reliable(fix, _ROBOTS.fix)), None)
 
 
-def taken_elsewhere(view: MapView, probe: Probe, radius_m: float) -> Fix | None:
-    """Return the fix with the largest landmark recall among those accepted by robots without a prior, if nothing within a
-    radius of a probe were mapped; None without any."""
+def fixes_elsewhere(view: MapView, probe: Probe, radius_m: float) -> list[Fix]:
+    """Return the fixes of a robot without a prior if nothing within a radius of a probe were mapped."""
     place_m = probe.map_from_cam[:3, 3]
     is_far = np.linalg.norm(view.map_from_cam[:, :3, 3] - place_m, axis=1) > radius_m
     fixes = finished(Relocalizer(view, probe.camera, _ROBOTS).anywhere(probe.features, is_far))
-    far = (fix for fix in fixes if np.linalg.norm(fix.map_from_cam[:3, 3] - place_m) > radius_m)
-    believed = (fix for fix in far if is_reliable(fix, _ROBOTS.fix))
-    return max(believed, key=lambda fix: fix.landmark_recall, default=None)
+    return [fix for fix in fixes if np.linalg.norm(fix.map_from_cam[:3, 3] - place_m) > radius_m]
 
 
 def most_similar_beyond(view: MapView, probe: Probe, radius_m: float) -> Array | None:
@@ -122,8 +119,9 @@ def starts_without_prior(view: MapView, probes: Sequence[Probe]) -> Starts | Non
     offered = [probe for probe in probes if most_similar_beyond(view, probe, ELSEWHERE_M) is not None]
     if not offered:
         return None
-    found = [(probe, taken_elsewhere(view, probe, ELSEWHERE_M)) for probe in offered]
-    taken = [(probe, fix) for probe, fix in found if fix is not None]
+    found = [(probe, fixes_elsewhere(view, probe, ELSEWHERE_M)) for probe in offered]
+    believed = [(probe, [fix for fix in fixes if is_reliable(fix, _ROBOTS.fix)]) for probe, fixes in found]
+    taken = [(probe, max(fixes, key=lambda fix: fix.landmark_recall)) for probe, fixes in believed if fixes]
     return Starts(
         frames=len(found),
         taken_share=round(len(taken) / len(found), 4),
@@ -133,6 +131,7 @@ def starts_without_prior(view: MapView, probes: Sequence[Probe]) -> Starts | Non
             LookAlike(_xy(probe.map_from_cam), _xy(fix.map_from_cam), round(fix.landmark_recall, 4))
             for probe, fix in taken
         ],
+        lookalike_inliers=max((fix.inliers for _, fixes in found for fix in fixes), default=0),
     )
 
 

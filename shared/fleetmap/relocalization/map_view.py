@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from math import inf
 from typing import NamedTuple
 
 import numpy as np
@@ -54,11 +55,13 @@ class CovisibleLandmarks:
 class LookAlikes(NamedTuple):
     """Similarity of places outside a map to it, measured by its build.
 
-    recall: the landmark recall that one of them exceeds with a probability of at most max_wrong_share, 0 if none resembled the map.
+    recall: the landmark recall that one of them exceeds with a probability of at most max_wrong_share, 0 if none resembled the map;
+    inliers: the same of a fix's inliers, infinite if not measured.
     """
 
     recall: float
     max_wrong_share: float = 1.0
+    inliers: float = inf
 
 
 class MapView:

@@ -103,7 +103,9 @@ def measured_lookalikes(view: MapView, survey: EstimatorSession) -> LookAlikes |
     places = [survey.map_from_body[number] @ survey.body_from_cam for number in numbers]
     probes = [Probe(survey.camera, estimator_loop.seen(survey, n), at) for n, at in zip(numbers, places, strict=True)]
     starts = starts_without_prior(view, probes)
-    return None if starts is None else LookAlikes(starts.lookalike_recall, starts.max_wrong_share)
+    if starts is None:
+        return None
+    return LookAlikes(starts.lookalike_recall, starts.max_wrong_share, float(starts.lookalike_inliers or 0))
 
 
 @dataclass(frozen=True, slots=True)

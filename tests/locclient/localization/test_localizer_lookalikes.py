@@ -88,6 +88,33 @@ def test_fixes_that_agree_confirm_a_standing_robot_where_look_alikes_were_measur
         assert said == [Status.INITIALISING, Status.INITIALISING, last]
 
 
+@pytest.mark.parametrize(
+    ("lookalikes", "step_m", "has_fix"),
+    [
+        (None, 0.0, True),
+        (None, 0.4, True),
+        (LookAlikes(0.14, 1 / 41, 30), 0.0, True),
+        (LookAlikes(0.14, 1 / 41, 45), 0.0, False),
+    ],
+)
+def test_few_matches_that_repeat_at_one_place_are_a_fix_and_confirm_none(
+    monkeypatch: pytest.MonkeyPatch, lookalikes: LookAlikes | None, step_m: float, *, has_fix: bool
+) -> None:
+    """As by night, with a tenth of the landmarks in every look: an unmapped look-alike repeats as well, so the robot is not TRACKING."""
+    robot = Robot(monkeypatch).load(lookalikes=lookalikes)
+    robot.inliers, robot.landmark_recall = 40, 0.1
+    said = [robot.go(step_m, turn_rad=0.0) for _ in range(12)]
+    assert [e.fix is not None for e in said] == [has_fix and number >= 2 for number in range(12)]
+    assert {e.status for e in said} <= {Status.INITIALISING, Status.AMBIGUOUS}
+    assert (said[-1].map_from_body is not None) is has_fix
+
+
+def test_few_matches_at_changing_places_are_chance(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot = Robot(monkeypatch).load()
+    robot.inliers, robot.landmark_recall = 20, 0.1
+    assert all(robot.go(0.0, [off(2.0 * (number % 5))], turn_rad=0.0).fix is None for number in range(12))
+
+
 def test_a_search_takes_more_of_a_frame_where_the_robot_stands_or_knows_nothing(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
