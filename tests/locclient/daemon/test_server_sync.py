@@ -383,13 +383,6 @@ def test_a_spool_that_refuses_holds_up_neither_maps_nor_health(world: World, mon
     assert len(asked) == 4
 
 
-def test_an_unusable_spool_delays_no_map(world: World, tmp_path: Path) -> None:
-    (tmp_path / "outbox").unlink()
-    (tmp_path / "outbox").mkdir()
-    world.step(61.0)
-    assert [wanted.version for wanted in world.sync.fetched] == [1]
-
-
 def test_after_a_restoration_delivered_reports_are_sent_again_once(world: World) -> None:
     world.outbox.put(report("f1"))
     world.step(61.0)

@@ -110,23 +110,6 @@ def test_a_store_folder_gives_the_same(world: World) -> None:
         other.manifest(other.wanted())
 
 
-@pytest.mark.parametrize("damage", ["flip", "cut", "missing"])
-def test_a_corrupt_tile_is_refused_and_the_rest_stays(world: World, damage: str) -> None:
-    manifest = world.link.manifest(world.link.wanted())
-    bad = manifest.tiles[0]
-    path = world.folder / blob_path(bad.sha256)
-    data = path.read_bytes()
-    if damage == "missing":
-        path.unlink()
-    else:
-        path.write_bytes(data[:-1] if damage == "cut" else data[:100] + bytes([data[100] ^ 1]) + data[101:])
-    for link in (world.link, LocalMapSource(world.folder, "lab")):
-        fetched = link.tiles(manifest)
-        assert sorted(fetched.tiles) == [(1, 0)]
-        assert list(fetched.refused) == [(0, 0)]
-        assert bad.sha256 in fetched.refused[0, 0]
-
-
 def test_a_lying_server_is_refused_by_hash(world: World) -> None:
     manifest = world.link.manifest(world.link.wanted())
     world.service.close()

@@ -15,7 +15,7 @@ import pytest
 from fleetmap.errors import GateRefusedError, MapFormatError, NewerFormatError, StoreError, UsageError
 from fleetmap.mapformat import current_path, decode_tile, sha256_hex
 from mapserver import releases
-from mapserver.store import Actor, DraftContent, MapStore, chain_faults, map_store, queries, schema
+from mapserver.store import Actor, DraftContent, MapStore, chain_faults, queries, schema
 from mapserver.store.places import read_places
 from mapserver.store.schema import FORMAT
 from support.storage.map_samples import draft_details, publish_samples, random_tile, save_sample_draft
@@ -192,22 +192,6 @@ def test_other_files_are_refused(tmp_path: Path) -> None:
         MapStore.open(tmp_path)
 
 
-def test_a_crash_before_the_transaction_leaves_no_version(store: MapStore, tmp_path: Path, monkeypatch) -> None:
-    publish_samples(store, 1, first=1)
-
-    def crash(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(map_store, "insert_draft", crash)
-    with pytest.raises(KeyboardInterrupt):
-        save_sample_draft(store, seed=2)
-    monkeypatch.undo()
-    with MapStore.open(tmp_path / "store") as again:
-        assert [info.version for info in again.versions("lab")] == [1]
-        assert save_sample_draft(again, seed=2) == 2
-        assert releases.publish(again, "lab") == 2
-
-
 def test_a_kill_between_the_transaction_and_the_derived_file_is_repaired(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         publish_samples(store, 1, first=1)
@@ -226,21 +210,6 @@ def test_a_kill_between_the_transaction_and_the_derived_file_is_repaired(tmp_pat
     with MapStore.open(tmp_path) as store:
         assert store.current("lab").version == 2
         assert current.read_text().strip() == wanted
-
-
-def test_a_full_disk_is_told_and_leaves_nothing_half_written(tmp_path: Path, monkeypatch) -> None:
-    store = MapStore.open(tmp_path / "store", create=True)
-
-    def full(_: int) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("mapserver.store.blobs.os.fsync", full)
-    with pytest.raises(StoreError, match="No space left"):
-        save_sample_draft(store)
-    monkeypatch.undo()
-    assert not list((tmp_path / "store").rglob("*.tmp"))
-    assert store.sites() == []
-    store.close()
 
 
 def test_what_a_killed_writer_left_goes_after_a_day(tmp_path: Path) -> None:
