@@ -278,5 +278,5 @@ def tables(database: Database) -> None:
         database.execute(statement)
 
 
-FORMAT = len(MIGRATIONS.pending(Database(memory=True)))
+FORMAT = 12 + len(MIGRATIONS.pending(Database(memory=True)))  # there were 12 before migrations had names
 """SQLite's user_version of a database with all migrations: reveals an older database by its header, and is newer for older programs."""

@@ -68,6 +68,14 @@ def test_closing_leaves_one_file(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["store.sqlite3"]
 
 
+def test_a_store_of_the_first_day_with_named_migrations_opens(tmp_path: Path) -> None:
+    MapStore.open(tmp_path, create=True).close()
+    with closing(sqlite3.connect(tmp_path / "store.sqlite3")) as connection:
+        connection.execute("PRAGMA user_version = 13")
+    with MapStore.open(tmp_path) as store:
+        assert store.sites() == []
+
+
 def test_a_store_is_copied_before_it_is_migrated_and_never_by_who_only_looks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
