@@ -63,6 +63,29 @@ class Disk:
         self.journal.append(call)
 
 
+class FullDisk(Disk):
+    """A disk without space: writing fails until something is removed, which gives as many writes as it had kilobytes."""
+
+    free = 0
+
+    def begin(self, kind: str) -> int:
+        """ENOSPC for what needs space and finds none."""
+        if kind not in ("create", "write", "map"):
+            return 0
+        self.free -= 1
+        return errno.ENOSPC if self.free < 0 else 0
+
+    def note(self, *call: Any) -> None:
+        """A file that goes gives its space back."""
+        if call[0] == "unlink":
+            self.free = max(0, self.free) + self.sizes.pop(call[1], 0) // 1024
+
+    def measure(self) -> None:
+        """Looks at the files that are there."""
+        names = [os.path.join(folder, name) for folder, _, files in os.walk(self.root) for name in files]  # noqa: PTH118
+        self.sizes = {name: _real["stat"](name).st_size for name in names}
+
+
 def folder_of(path: str) -> str:
     """The folder that a path's name is in."""
     return path.rpartition("/")[0]
