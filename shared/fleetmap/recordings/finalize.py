@@ -21,6 +21,7 @@ _TRIED_FRAMES = 5
 _ACCEL_IN_G = (0.8, 1.25)
 _FASTEST_GYRO_RADPS = 35.0  # 2000 deg/s, the full scale of the usual sensors
 _WINDOW_S, _SMOOTH_S = 0.5, 0.1
+_ROTATION_OFF = 0.02  # as of a quaternion whose length is 1 % off
 
 
 @dataclass(frozen=True)
@@ -57,6 +58,19 @@ def calibration_of_options(options: OpenOptions, log: ReadLog) -> CalibrationFil
     return load_calibration(options.calibration_file)
 
 
+def _sound_truth(truth: Trajectory, log: ReadLog) -> Trajectory | None:
+    """The ground truth without rows that are no pose or too far away, which are noted; None if no row is left."""
+    poses = truth.frame_from_body
+    near = (np.abs(poses) <= MOST).all(axis=(1, 2))
+    rotations = np.where(near[:, None, None], poses[:, :3, :3], 0.0)
+    off = rotations @ rotations.transpose(0, 2, 1) - np.eye(3)
+    kept = near & (np.abs(off) < _ROTATION_OFF).all(axis=(1, 2))
+    if not kept.all():
+        words = f"{int((~kept).sum())} of {len(kept)} left out: not finite, farther than {MOST:g} m, or no rotation"
+        log.note("ground truth: rows that are no pose", words)
+    return Trajectory(truth.stamps_ns[kept], poses[kept]) if kept.any() else None
+
+
 def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
     """Build the Recording of `parts`, with the issues of `log`.
 
@@ -82,9 +96,7 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
         check_together(np.array([value.stamp_ns for value in values], np.int64), what, parts.frame_stamps_ns)
     if truth is not None:
         check_together(truth.stamps_ns, "ground truth", parts.frame_stamps_ns)
-        if not (np.abs(truth.frame_from_body) <= MOST).all():
-            log.note("ground truth not used", f"it has a position that is not finite, or farther than {MOST:g} m")
-            truth = None
+        truth = _sound_truth(truth, log)
     if len(imu) and parts.calibration.imu is None:
         how = "the mounting of the IMU is unknown; pass a calibration with --calibration FILE"
         log.note("imu not used", f"{len(imu)} samples, but {how}")

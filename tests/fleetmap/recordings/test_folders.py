@@ -147,6 +147,20 @@ def test_kitti_calibration_and_stamps(tmp_path: Path) -> None:
     assert (left.width_px, left.height_px) == (WIDTH, HEIGHT)
 
 
+@pytest.mark.parametrize(
+    ("rows", "left"),
+    [({0: "x"}, 3), ({2: "1e300 " * 16}, 3), ({1: "0 " * 16}, 3), (dict.fromkeys(range(4), "x"), None)],
+    ids=["unreadable", "far away", "no rotation", "none"],
+)
+def test_a_bad_row_of_kittis_poses_costs_itself(tmp_path: Path, rows: dict[int, str], left: int | None) -> None:
+    folder = write_kitti(tmp_path / "r", SAMPLE)
+    good = " ".join(map(str, np.eye(4).ravel()))
+    (folder / "poses.txt").write_text("\n".join(rows.get(number, good) for number in range(4)))
+    recording = open_recording(folder)
+    assert (None if recording.ground_truth is None else len(recording.ground_truth)) == left
+    assert any("ground truth" in issue.what for issue in recording.issues)
+
+
 def test_kitti_times_and_unlabelled_rows(tmp_path: Path) -> None:
     folder = write_kitti(tmp_path / "r", SAMPLE)
     (folder / "times.txt").write_text("0.0\n1.037e-01\n0.2074\n0.311\n")

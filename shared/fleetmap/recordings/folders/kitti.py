@@ -200,5 +200,4 @@ def _ground_truth(file: Path, stamps_of_number: Stamps | None, log: ReadLog) -> 
         raise RecordingError(f"poses.txt has {len(rows)} rows, times.txt {len(stamps_ns)}")
     frame_from_body = np.tile(np.eye(4), (len(rows), 1, 1))
     frame_from_body[:, :3] = rows[:, :12].reshape(-1, 3, 4)
-    kept = np.isfinite(rows).all(axis=1)
-    return Trajectory(stamps_ns.astype(np.int64)[kept], frame_from_body[kept])
+    return Trajectory(stamps_ns.astype(np.int64), frame_from_body)

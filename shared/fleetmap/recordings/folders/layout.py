@@ -299,18 +299,19 @@ def read_numbers(path: Path, widths: Sequence[int], log: ReadLog | None = None) 
             row = [float(word) for word in words]
         except ValueError:
             row = []
-        if len(row) not in ((len(rows[0]),) if rows else widths) or not np.isfinite(row).all():
-            bad.append(
-                f"{path}, line {number}: {line[:60]!r} are not {expected} finite numbers; copy the recording again"
-            )
-            if log is None:
-                raise RecordingError(bad[0])
-            row = [np.nan] * (len(rows[0]) if rows else widths[0])
+        if len(row) not in widths or not np.isfinite(row).all():
+            what = f"{line[:60]!r} are not {expected} finite numbers"
+            bad.append(f"{path}, line {number}: {what}; copy the recording again")
+            row = []
+        else:
+            widths = (len(row),)
         rows.append(row)
+    if bad and (log is None or not any(rows)):
+        raise RecordingError(bad[0])
     if log is not None and bad:
         log.note(f"{path.name}: unreadable lines", f"{len(bad)} left out; {bad[0]}")
     if not rows:
         raise RecordingError(
             f"{path} is empty; lines of {expected} finite numbers are expected, copy the recording again"
         )
-    return np.array(rows)
+    return np.array([row or [np.nan] * widths[0] for row in rows])
