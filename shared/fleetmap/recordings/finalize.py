@@ -61,10 +61,10 @@ def calibration_of_options(options: OpenOptions, log: ReadLog) -> CalibrationFil
 def _sound_truth(truth: Trajectory, log: ReadLog) -> Trajectory | None:
     """The ground truth without rows that are no pose or too far away, which are noted; None if no row is left."""
     poses = truth.frame_from_body
-    near = (np.abs(poses) <= MOST).all(axis=(1, 2))
+    near = np.asarray((np.abs(poses) <= MOST).all(axis=(1, 2)))
     rotations = np.where(near[:, None, None], poses[:, :3, :3], 0.0)
     off = rotations @ rotations.transpose(0, 2, 1) - np.eye(3)
-    kept = near & (np.abs(off) < _ROTATION_OFF).all(axis=(1, 2))
+    kept = near & np.asarray((np.abs(off) < _ROTATION_OFF).all(axis=(1, 2)))
     if not kept.all():
         words = f"{int((~kept).sum())} of {len(kept)} left out: not finite, farther than {MOST:g} m, or no rotation"
         log.note("ground truth: rows that are no pose", words)

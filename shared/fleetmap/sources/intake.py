@@ -184,8 +184,7 @@ class Intake:
         """End the stream: no more samples will come."""
         with self._changed:
             self._finished = True
-            self._use_first()
-            self._changed.notify_all()
+            self._queue(self._frame_stream.release())
 
     @property
     def exhausted(self) -> bool:

@@ -89,12 +89,15 @@ def test_without_frames_memory_stays_bounded() -> None:
     assert len(queue.take(0).imu) <= 6001
 
 
-def test_the_end_is_told_once_all_is_taken() -> None:
-    queue = intake()
-    queue.put_frame(frame(1))
+@pytest.mark.parametrize("stamps_ms", [[1], [1, 51, 101, 601]], ids=["alone", "after lost ones"])
+def test_the_end_is_told_once_all_is_taken(stamps_ms: list[int]) -> None:
+    queue = intake(frames=9)
+    for stamp_ms in stamps_ms:
+        queue.put_frame(frame(stamp_ms))
     queue.finish()
-    assert not queue.exhausted
-    assert queue.take(10.0).frame is not None
+    for _ in stamps_ms:
+        assert not queue.exhausted
+        assert queue.take(10.0).frame is not None
     assert queue.exhausted
     assert queue.take(10.0).frame is None
 
