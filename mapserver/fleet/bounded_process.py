@@ -24,7 +24,7 @@ class ProcessLimits:
     file_bytes: int = 64 << 20
     open_files: int = 256
 
-    def apply(self) -> None:
+    def apply(self, process_id: int) -> None:
         for kind, wanted in (
             (resource.RLIMIT_AS, self.memory_bytes),
             (resource.RLIMIT_CPU, self.cpu_s),
@@ -34,7 +34,7 @@ class ProcessLimits:
         ):
             hard = resource.getrlimit(kind)[1]
             limit = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
-            resource.setrlimit(kind, (limit, limit))
+            resource.prlimit(process_id, kind, (limit, limit))
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +67,9 @@ def run_bounded(command: list[str], limits: ProcessLimits, what: str) -> Ended:
             stdout=output,
             stderr=errors,
             start_new_session=True,
-            preexec_fn=limits.apply,  # noqa: PLW1509  commands have one thread
         )
         try:
+            limits.apply(process.pid)  # not between fork and exec, where another thread's lock is never released
             status = process.wait(limits.wall_s)
         except subprocess.TimeoutExpired as error:
             raise FleetmapError(f"{what} was ended after {limits.wall_s:.0f} s; report it with its file") from error
