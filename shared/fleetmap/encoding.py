@@ -37,7 +37,7 @@ def to_json(value: object, *, indent: int = 0, order: Literal["deterministic", "
 
 def bounded(value: T) -> T:
     """Return a stranger's decoded value. ValueError, naming the field, for a number in it that is not finite, beyond MOST, or an
-    integer beyond 64 bits, and for a quaternion (`quat_wxyz`) that is not of unit length.
+    integer beyond 64 bits, and for a quaternion (a struct's `quat_wxyz`) that is not of unit length.
     """
     if isinstance(value, float):
         if not abs(value) <= MOST:
@@ -52,6 +52,6 @@ def bounded(value: T) -> T:
                 bounded(item)
             except ValueError as error:
                 raise ValueError(f".{name}{error}") from None
-            if name == "quat_wxyz" and not abs(math.hypot(*item) - 1) <= _UNIT_WITHIN:
+            if name == "quat_wxyz" and parts is not value and not abs(math.hypot(*item) - 1) <= _UNIT_WITHIN:
                 raise ValueError(f".{name} is {item}, not a unit quaternion")
     return value

@@ -36,7 +36,7 @@ SAMPLES = [
     WantedVersion(site="lab", version=None, manifest_sha256=None),
     RobotAck(site="lab", robot="r1", stamp_ns=5, version=3, refused="tile (0, 1): damaged"),
     RobotHealth(
-        site="lab", robot="r1", stamp_ns=5, version=3, status="TRACKING", flags=("dark",), metrics={"a": 1.5, "b": "x"}
+        site="lab", robot="r1", stamp_ns=5, version=3, status="TRACKING", flags=("dark",), metrics={"quat_wxyz": 1.5}
     ),
     PoseMessage.of(7, np.eye(4), np.eye(6), "TRACKING", 3),
     EstimateMessage(
