@@ -35,9 +35,8 @@ class PoseHypothesis:
     agreeing fixes. inlier_sum, recall_sum, queries: sums of inliers, of landmark recall, and of map queries, older ones
     decayed. query_inliers, query_recall: of this query's fix, 0 without. recall_total, looks: landmark recall of all queries, 0
     for those without a fix, and their number. misses: queries since the last fix. told_log_odds: log odds that an operator who chose
-    this place is right, 0 without one. has_broken: tracks were lost since the last fix, lost_imu: so was
-    the IMU. is_by_vision: it moved without an IMU since its frame. floor: whose `map` it is, empty for the
-    robot's own.
+    this place is right, 0 without one. has_broken: tracks were lost since the last fix, lost_imu: so was the IMU, for longer than
+    images alone are believed. is_by_vision: it moved without an IMU since its frame. floor: whose `map` it is, empty for the robot's own.
     """
 
     frame_index: int

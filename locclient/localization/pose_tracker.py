@@ -8,6 +8,7 @@ import numpy as np
 
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse
+from fleetmap.inertial import GRAVITY_MPS2
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes
@@ -96,7 +97,7 @@ class PoseTracker:
         self.lookalikes: LookAlikes | None = None
         self.alias_step_m = ALIAS_STEP_M
         self.odom_from_body: Array | None = None  # of the last frame
-        self._had_imu = False  # in the last frame
+        self._imu_ns: int | None = None  # stamp of the last frame with an IMU, None once its loss is a doubt
         self._query_frame: PoseHypothesis | None = None  # of the running map query, as the identity
         self._query_index: int | None = None  # of the last map query's frame
         self.floor = ""  # of the last confirmed pose
@@ -188,8 +189,12 @@ class PoseTracker:
     def propagate(self, odometry: OdometryEstimate, motions: Mapping[int, Motion], *, has_broken: bool) -> None:
         """Propagate every hypothesis to the present frame. has_broken: tracks are lost in a good image."""
         change, last = odometry.new_odom_from_old_odom, self.odom_from_body
-        had_imu, self._had_imu = self._had_imu, odometry.inertial and not odometry.is_bridged
-        lost_imu = had_imu and not self._had_imu
+        if odometry.inertial and not odometry.is_bridged:
+            self._imu_ns = odometry.stamp_ns
+        unheld_s = 0.0 if self._imu_ns is None else (odometry.stamp_ns - self._imu_ns) * 1e-9
+        # What friction allows a robot to do that images misread: about its weight accelerates it at most.
+        lost_imu = 0.5 * GRAVITY_MPS2 * unheld_s**2 > self._track.degraded_radius_m
+        self._imu_ns = None if lost_imu else self._imu_ns
         if last is not None and change is not None:
             last = change @ last
         step = np.eye(4) if last is None else se3_inverse(last) @ odometry.odom_from_body
