@@ -28,7 +28,10 @@ _MOST_JOBS = 16
 _ENABLE_S = 120.0  # for the trial of a version, and that of the previous one after a failure
 _TILT_SIGMA_RAD, _HEIGHT_SIGMA_M = 0.05, 0.2  # of a flat floor, as x, y and theta define neither
 _SIGMAS = 3.7  # maximum distance from the fleet manager's pose for agreement
-_ERRORS = {DuplicateMapError: ("DUPLICATE_MAP", "WARNING"), NoRoomError: ("INSUFFICIENT_MEMORY", "URGENT")}
+_ERRORS: dict[type[Exception], tuple[str, str]] = {
+    DuplicateMapError: ("DUPLICATE_MAP", "WARNING"),
+    NoRoomError: ("INSUFFICIENT_MEMORY", "URGENT"),
+}
 _UNKNOWN: dict[str, Any] = {
     "operatingMode": "STARTUP",
     "powerSupply": {"stateOfCharge": 0.0, "charging": False},
@@ -195,10 +198,12 @@ class FleetAdapter:
             self.changed.set()
         try:
             self._act(maps, action, given)
-        except FleetmapError as error:
+        except Exception as error:
             kind, level = _ERRORS.get(type(error), ("MAP_ACTION_FAILED", "WARNING"))
             with self._lock:
                 self._book.fail(action, kind, str(error), level)
+            if not isinstance(error, FleetmapError):
+                raise  # to the log of the thread
         with self._lock:
             self._versions = maps.versions()
             self.changed.set()

@@ -328,6 +328,13 @@ def test_actions_that_cannot_be_done_fail(kind: str, parameters: dict[str, Any],
     (error,) = (error for error in adapter.said()["errors"] if error["errorType"] == error_type)
     assert error["errorLevel"] == "WARNING"
     assert {"referenceKey": "actionId", "referenceValue": "a"} in error["errorReferences"]
+
+
+def test_an_action_that_ends_by_a_fault_of_ours_does_not_run_for_ever() -> None:
+    adapter = Adapter()
+    with pytest.raises(AttributeError):  # FakeMaps has no download
+        adapter.ask("downloadMap", mapId="hall", mapVersion="3", mapDownloadLink="https://maps.example/3")
+    assert [state["actionStatus"] for state in adapter.said()["instantActionStates"]] == ["FAILED"]
     assert adapter.offers == adapter.priors == []
 
 
