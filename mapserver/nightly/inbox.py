@@ -11,24 +11,27 @@ sockets and devices are bad, as is any entry with a read error. One entry never 
 
 import fcntl
 import hashlib
+import json
 import os
-import resource
 import shutil
 import signal
 import stat
-import threading
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, count
+from math import ceil
 from pathlib import Path
-from types import FrameType
 
+from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, RecordingError, StateError, StoreError, UsageError, disk_errors
 from fleetmap.files import sync_path, write_atomically
 from fleetmap.log_lines import printable
 from fleetmap.mapformat.names import is_name
-from fleetmap.recordings import FILE_SUFFIXES, OpenOptions, open_recording
+from fleetmap.recordings import FILE_SUFFIXES, OpenOptions
+from mapserver.fleet.bounded_process import ProcessLimits, run_bounded
+from mapserver.nightly import reading
 from mapserver.store.files import check_no_link, make_folder
 
 DONE, HELD, BAD = "done", "held", "bad"
@@ -39,13 +42,12 @@ _UNFINISHED = (".part", ".partial", ".filepart", ".crdownload", ".tmp")
 _REASON = ".reason.txt"
 _REASON_BYTES = 2000
 _MOST_LISTED = 1000
-_MOST_ISSUES = 5
 _KINDS = {stat.S_IFLNK: "a symbolic link", stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket"}
 # Limit of one recording: an hour of two cameras at 30 Hz has 216,000 files
 _MOST_FILES, _DEEPEST = 2_000_000, 32
 # Time limit to read one: this, and 1 s for each 4 MiB on the disk; sparse files do not raise it
 _READ_S, _SLOWEST_BYTES_PER_S = 600, 4 << 20
-_LEAST_MEMORY_BYTES = 4 << 30
+_LEAST_MEMORY_BYTES, _OPEN_FILES = 4 << 30, 1024
 _DAY_S = 86_400
 
 
@@ -103,31 +105,41 @@ def arrivals(inbox: Path, settle_s: float, now_ns: int, *, is_brief: bool = Fals
         except FileNotFoundError:
             waiting.append((path, "it changes right now"))
         except (OSError, RecordingError) as error:
-            bad.append((path, _reason(path, error)))
+            bad.append((path, reading.why_unreadable(path, error)))
     return Arrivals(tuple(complete), tuple(waiting), tuple(bad), tuple(others))
 
 
 def identify(path: Path, options: OpenOptions) -> Recorded | str | None:
-    """Return a recording with its hash, or the reason why it is unreadable; None if it changed meanwhile. Limits memory and time."""
-    found: Recorded | str
-    before: object = None
+    """Return a recording with its hash, or the reason why it is unreadable; None if it changed meanwhile.
+
+    Its memory and time are limited. StoreError if this machine cannot start a process.
+    """
     try:
         before, seconds = _state(path)
-        with _limited(seconds), open_recording(path, options) as recording:
-            issues = "; ".join(
-                f"{issue.what}: {issue.detail}".rstrip(": ") for issue in recording.issues[:_MOST_ISSUES]
-            )
-            found = Recorded(path, recording.content_hash(), issues)
-    except _TooSlowError:
-        found = f"{path} was not read within {seconds:.0f} s; is it whole? Copy it again"
-    except Exception as error:  # a library's error on an untrusted file must not end the nightly run
-        found = _reason(path, error)
-    try:
-        return found if before is None or _state(path)[0] == before else None
+        sha256, words = _read(path, options, seconds)
+        found = Recorded(path, sha256, words) if sha256 else words
+        return found if _state(path)[0] == before else None
     except FileNotFoundError:
         return None
     except (OSError, RecordingError) as error:
-        return _reason(path, error)
+        return reading.why_unreadable(path, error)
+
+
+def _read(path: Path, options: OpenOptions, seconds: float) -> tuple[str, str]:
+    """Return the result of `reading.read`, in a process of its own. StoreError if this machine cannot start one."""
+    limits = ProcessLimits(_most_memory_bytes(), ceil(seconds), seconds, open_files=_OPEN_FILES)
+    given = [str(path), str(options.calibration_file or ""), to_json(options.topics).decode()]
+    try:
+        with disk_errors("no process can be started", "see memory and disk of this machine"):
+            ended = run_bounded([sys.executable, "-m", reading.__name__, *given], limits, f"the reading of {path}")
+    except StoreError:
+        raise
+    except FleetmapError as error:
+        return "", str(error)
+    if ended.status:
+        return "", f"{path} cannot be read: {ended.errors.strip().rpartition(chr(10))[2][:500]}"
+    sha256, words = json.loads(ended.output)
+    return sha256, words
 
 
 def is_openable(path: Path) -> bool:
@@ -164,47 +176,6 @@ def _state(path: Path) -> tuple[object, float]:
     stored_bytes = sum(512 * status.st_blocks for _, status in parts)
     state = {(part, status.st_ino, status.st_size, status.st_ctime_ns) for part, status in parts}
     return state, _READ_S + stored_bytes / _SLOWEST_BYTES_PER_S
-
-
-def _reason(path: Path, error: Exception) -> str:
-    if isinstance(error, FleetmapError):
-        return str(error)
-    if isinstance(error, MemoryError):
-        return (
-            f"{path} takes more than {_most_memory_bytes() >> 20} MiB of memory to read; is it damaged? Copy it again"
-        )
-    if isinstance(error, OSError):
-        named = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else path
-        return f"{named} cannot be read ({error.strerror or error}); give this account read access, or copy it again"
-    return f"{path} cannot be read ({type(error).__name__}: {str(error)[:200]}); try `mapserver doctor {path}`"
-
-
-class _TooSlowError(BaseException):
-    """Raised at the time limit. A BaseException, so that code that catches every Exception does not catch it."""
-
-
-@contextmanager
-def _limited(seconds: float) -> Iterator[None]:
-    """Limit the block's memory (MemoryError), and in the main thread its time (_TooSlowError)."""
-
-    def interrupt(_: int, __: FrameType | None) -> None:
-        raise _TooSlowError
-
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    held_bytes = int(Path("/proc/self/statm").read_bytes().split()[0]) * resource.getpagesize()
-    limits = [limit for limit in (held_bytes + _most_memory_bytes(), soft) if limit != resource.RLIM_INFINITY]
-    is_main = threading.current_thread() is threading.main_thread()
-    before = signal.signal(signal.SIGALRM, interrupt) if is_main else None
-    resource.setrlimit(resource.RLIMIT_AS, (min(limits), hard))
-    try:
-        if is_main:
-            signal.setitimer(signal.ITIMER_REAL, seconds)
-        yield
-    finally:
-        if is_main:
-            signal.setitimer(signal.ITIMER_REAL, 0)
-            signal.signal(signal.SIGALRM, before)
-        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
 def _most_memory_bytes() -> int:

@@ -1,6 +1,7 @@
 """Memory limits for untrusted files: all limits on sizes, and the functions that unpack within them."""
 
 import bz2
+from collections.abc import Callable
 from pathlib import Path
 
 import zstandard
@@ -21,13 +22,25 @@ _KEPT_BYTES, _KEPT_PER_FILE_BYTE = 64 << 20, 32
 _KEPT_RECORD_BYTES = 256  # memory of a record's place, stamp and object
 # Records that a file of any size may have, and bytes of it for each further one: no recorder packs one into less than ten.
 _PASSED_RECORDS, _LEAST_RECORD_BYTES = 250_000, 4
+# Bytes to which a file of any size may unpack, and for each byte of it: pictures of a simulator, a wall without noise, pack 100
+# to 1. The limit takes a second of the processor for 4 MiB of the file.
+_UNPACKED_BYTES, _UNPACKED_PER_FILE_BYTE = 1 << 30, 256
 
 
 class KeptBytes:
-    """Counts the memory kept for files of `size` bytes."""
+    """Counts what is unpacked and read of files of `size` bytes, and the memory kept for them."""
 
     def __init__(self, path: Path, size: int) -> None:
-        self.path, self.size, self._kept, self._passed = path, size, 0, 0
+        self.path, self.size, self._kept, self._passed, self._unpacked = path, size, 0, 0, 0
+
+    def unpack(self, compression: str, packed: bytes | memoryview, most_bytes: int = MAX_MESSAGE_BYTES) -> bytes:
+        """See `unpack`; RecordingError if the file unpacks to more than a real recording can. Damaged bytes count as `most_bytes`."""
+        if self._unpacked > (most := _UNPACKED_BYTES + _UNPACKED_PER_FILE_BYTE * self.size):
+            raise RecordingError(f"{self.path}: {self.size} bytes unpack to more than {most} bytes; leave the file out")
+        self._unpacked += most_bytes
+        unpacked = unpack(compression, packed, most_bytes)
+        self._unpacked -= most_bytes - len(unpacked)
+        return unpacked
 
     def pass_record(self) -> None:
         """Count a record that is read, kept or not; RecordingError if the file unpacks to more than a real recording can."""
@@ -46,15 +59,6 @@ class KeptBytes:
                 f"{self.path}: {self.size} bytes unpack to more than {limit} bytes beside the images; no recorder writes "
                 "that, leave the file out"
             )
-
-
-_PACKED = {b"\x28\xb5\x2f\xfd": "zstd", b"\x04\x22\x4d\x18": "lz4"}  # first bytes; a CDR message begins with 0
-
-
-def unpack_message(data: memoryview) -> memoryview:
-    """Return a message, unpacked if its recorder packed each one by itself, as rosbag2 does; ValueError as of `unpack`."""
-    kind = _PACKED.get(bytes(data[:4]))
-    return data if kind is None else memoryview(unpack(kind, data))
 
 
 def unpack(compression: str, packed: bytes | memoryview, most_bytes: int = MAX_MESSAGE_BYTES) -> bytes:
@@ -81,3 +85,12 @@ def unpack(compression: str, packed: bytes | memoryview, most_bytes: int = MAX_M
     if len(unpacked) > most_bytes:
         raise ValueError(f"{len(packed)} bytes unpack to more than {most_bytes}, which is the limit")
     return unpacked
+
+
+_PACKED = {b"\x28\xb5\x2f\xfd": "zstd", b"\x04\x22\x4d\x18": "lz4"}  # first bytes; a CDR message begins with 0
+
+
+def unpack_message(data: memoryview, unpack: Callable[[str, memoryview], bytes] = unpack) -> memoryview:
+    """Return a message, unpacked if its recorder packed each one by itself, as rosbag2 does; ValueError as of `unpack`."""
+    kind = _PACKED.get(bytes(data[:4]))
+    return data if kind is None else memoryview(unpack(kind, data))

@@ -17,16 +17,21 @@ import lz4.frame
 import numpy as np
 import pytest
 import zstandard
+from mcap.writer import CompressionType
+from rosbags.rosbag1 import Writer
+from rosbags.rosbag2 import CompressionMode, StoragePlugin
 
 from fleetmap.config import load_toml
 from fleetmap.errors import CalibrationError, RecordingError, UsageError
-from fleetmap.recordings import OpenOptions, open_recording
+from fleetmap.recordings import OpenOptions, limits, open_recording
 from fleetmap.recordings.calibration_files import calibration_files, parse_calibration, read_yaml
 from fleetmap.recordings.files import hash_file
 from fleetmap.recordings.images import StoredImage, decode_grey, image_size
 from fleetmap.recordings.limits import MAX_CALIBRATION_BYTES, MAX_MESSAGE_BYTES, MAX_PIXELS, unpack
 from fleetmap.recordings.mcap.reader import MAGIC
+from fleetmap.recordings.ros2.messages import encode_image
 from mapserver.config import MapserverConfig
+from support.recordings.bag_samples import write_rosbag1, write_rosbag2
 from support.recordings.mcap_samples import foreign_messages, write_foreign
 from support.storage.memory_limit import memory_at_most
 
@@ -114,6 +119,27 @@ def test_many_chunks_that_each_obey_do_not_add_up(tmp_path: Path) -> None:
         memory_at_most(MEMORY + (128 << 20)),
         pytest.raises(RecordingError, match=r"many\.mcap: \d+ bytes unpack to more than"),
     ):
+        open_recording(path)
+
+
+@pytest.mark.parametrize("kind", ["chunks", "chunks without messages", "messages", "sqlite", "ros1"])
+def test_what_is_unpacked_adds_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
+    """Black pictures of a megabyte, each within its limit: 8 MiB of them took minutes."""
+    monkeypatch.setattr(limits, "_UNPACKED_BYTES", 1 << 20)
+    black = StoredImage("mono8", bytes(1 << 20), "", 1024, 1024, 1024)
+    images = [("/cam0/image_raw", "sensor_msgs/Image", t, encode_image(t, "c", black)) for t in range(1, 200)]
+    path = tmp_path / "black"
+    if kind == "chunks":
+        write_foreign(path, images, compression=CompressionType.ZSTD)
+    elif kind == "chunks without messages":
+        content = record(0x7F, bytes(1 << 20))
+        path.write_bytes(MAGIC + 200 * chunk("zstd", zstandard.compress(content), len(content)) + footer())
+    elif kind == "ros1":
+        write_rosbag1(path, images, Writer.CompressionFormat.BZ2)
+    else:
+        storage = StoragePlugin.SQLITE3 if kind == "sqlite" else StoragePlugin.MCAP
+        write_rosbag2(path, images, CompressionMode.MESSAGE, storage)
+    with pytest.raises(RecordingError, match=r"black.*: \d+ bytes unpack to more than \d+ bytes; leave the file out"):
         open_recording(path)
 
 

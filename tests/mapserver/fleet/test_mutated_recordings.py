@@ -13,14 +13,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rosbags.rosbag1 import Writer
+from rosbags.rosbag2 import CompressionMode
 
 from fleetmap.errors import FleetmapError
 from fleetmap.recordings import OpenOptions
 from mapserver.fleet.replay_judge import judged
-from mapserver.nightly.inbox import identify
+from mapserver.nightly.reading import read
 from support.fleet.failed_robot import small_file
+from support.recordings.bag_samples import write_rosbag1, write_rosbag2
+from support.recordings.mcap_samples import foreign_messages
+from support.recordings.recording_samples import make_sample, write_euroc
 
-COUNT = int(os.environ.get("MUTATED", "60"))
+COUNT = int(os.environ.get("MUTATED", "15"))
 MOST_S, MOST_BYTES = 20.0, 512 << 20
 SIZES = (0, 1, 255, 1 << 20, (1 << 26) - 1, 1 << 31, (1 << 63) - 1, (1 << 64) - 1)
 
@@ -35,19 +40,38 @@ def mutated(data: bytes, rng: np.random.Generator) -> bytes:
     return data
 
 
-def judge_all(folder: Path) -> None:
-    whole, path = small_file(folder / "whole.mcap"), folder / "failure.mcap"
+def whole(kind: str, folder: Path) -> Path:
+    """A recording of this kind that can be read."""
+    if kind == "euroc":
+        return write_euroc(folder / "whole", make_sample(4))
+    if kind == "mcap":
+        small_file(folder / "whole.mcap")
+    elif kind == "bag":
+        write_rosbag1(folder / "whole.bag", foreign_messages(), Writer.CompressionFormat.LZ4)
+    else:
+        write_rosbag2(folder / "whole", foreign_messages(), CompressionMode.MESSAGE)
+    return next(folder.rglob(f"*.{kind}"))
+
+
+def judge_all(kind: str, folder: Path) -> None:
+    path = whole(kind, folder)
+    files = {file: file.read_bytes() for file in sorted([path, *path.rglob("*")]) if file.is_file()}
+    assert read(path, OpenOptions())[0]
     for seed in range(COUNT):
-        path.write_bytes(mutated(whole, np.random.default_rng(seed)))
+        rng = np.random.default_rng(seed)
+        file = list(files)[rng.integers(len(files))]
+        file.write_bytes(mutated(files[file], rng))
         begun_s = time.process_time()
-        with suppress(FleetmapError):
+        with suppress(FleetmapError, IsADirectoryError):
             judged(path, ("lab", "r1", "f1"))
-        identify(path, OpenOptions())
+        read(path, OpenOptions())
         assert time.process_time() - begun_s < MOST_S, seed
         assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 < MOST_BYTES, seed
+        file.write_bytes(files[file])
 
 
 @pytest.mark.timeout(36_000)
-def test_mutated_recordings_cost_little(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", ["mcap", "db3", "bag", "euroc"])
+def test_mutated_recordings_cost_little(tmp_path: Path, kind: str) -> None:
     with get_context("spawn").Pool(1) as pool:
-        pool.apply(judge_all, (tmp_path,))
+        pool.apply(judge_all, (kind, tmp_path))

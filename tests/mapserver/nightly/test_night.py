@@ -7,7 +7,6 @@ import io
 import json
 import os
 import re
-import resource
 import signal
 import socket
 import tempfile
@@ -39,9 +38,10 @@ from mapserver.config import survey_settings
 from mapserver.drafting.draft import BuildOptions, BuildRequest, Draft
 from mapserver.drafting.survey_recordings import RecordingOptions, admit_recordings, survey_all
 from mapserver.nightly import inbox as boxes
-from mapserver.nightly import night
+from mapserver.nightly import night, reading
 from mapserver.nightly.inbox import arrivals
 from mapserver.nightly.night import NightRequest, last_report, run_night
+from mapserver.nightly.reading import read
 from mapserver.quality.gate import GateSettings
 from mapserver.store import DraftContent, FleetRetention, MapStore
 from mapserver.survey.settings import SurveySettings
@@ -51,6 +51,7 @@ from support.storage.faulty_disk import Disk, install
 from support.storage.map_samples import draft_details, random_tile
 
 LATER_NS = 3_600 * 10**9
+READ = boxes._read
 Build = Callable[..., tuple[Draft, None]]
 
 
@@ -92,6 +93,7 @@ def built(
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(night, "build_draft", built)
+    monkeypatch.setattr(boxes, "_read", lambda path, options, _: read(path, options))
 
 
 @pytest.fixture
@@ -364,7 +366,7 @@ def test_nothing_waits_without_a_word(hall: Path, monkeypatch: pytest.MonkeyPatc
             (path / "mav0/late").write_bytes(b"late")
         return read(path, *more)
 
-    monkeypatch.setattr(boxes, "open_recording", while_it_is_copied)
+    monkeypatch.setattr(reading, "open_recording", while_it_is_copied)
     monkeypatch.setattr(night, "_MOST_A_NIGHT", 4)
     replace = os.replace
 
@@ -433,7 +435,7 @@ def test_what_ended_two_nights_is_set_aside_by_the_third_and_nothing_beside_it(
             killed(path)
         return built(request, settings, unusable)
 
-    monkeypatch.setattr(*((boxes, "open_recording", reads) if where == "read" else (night, "build_draft", builds)))
+    monkeypatch.setattr(*((reading, "open_recording", reads) if where == "read" else (night, "build_draft", builds)))
     for _ in range({"broken": 0, "joined": 3}.get(where, 2)):
         assert in_child(hall, Disk("/nowhere"))[0] == -signal.SIGKILL
         assert (hall / "inbox/fatal").is_dir()
@@ -464,19 +466,17 @@ def test_a_fault_of_the_program_leaves_one_recording_out_of_a_build() -> None:
         survey_all([Path("fatal")], survey_one, None)
 
 
-def test_reading_has_limits(hall: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monday = hall / "inbox/monday"
-
-    def takes(what: Callable[[], object]) -> str:
-        monkeypatch.setattr(boxes, "open_recording", lambda *_: what())
-        found = boxes.identify(monday, OpenOptions())
-        assert isinstance(found, str)
-        return found
-
-    assert "MiB of memory" in takes(lambda: bytearray(1 << 46))
-    assert resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY
-    monkeypatch.setattr(boxes, "_READ_S", 0.05)
-    assert "was not read within 0 s" in takes(signal.pause)
+@pytest.mark.parametrize(
+    ("limit", "value", "said"),
+    [("_READ_S", 0.05, "was ended after 0 s"), ("_most_memory_bytes", lambda: 1 << 20, "monday")],
+)
+def test_reading_has_limits(hall: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: object, said: str) -> None:
+    monkeypatch.setattr(boxes, "_read", READ)
+    assert isinstance(boxes.identify(hall / "inbox/monday", OpenOptions()), boxes.Recorded)
+    monkeypatch.setattr(boxes, limit, value)
+    found = boxes.identify(hall / "inbox/monday", OpenOptions())
+    assert isinstance(found, str)
+    assert said in found
 
 
 def test_nothing_joined_is_a_failed_night(hall: Path) -> None:

@@ -17,7 +17,7 @@ from fleetmap.recordings.bags.decoders import ros1_digest
 from fleetmap.recordings.bags.streams import open_messages
 from fleetmap.recordings.bags.topics import KNOWN_TYPES, video_issues
 from fleetmap.recordings.files import file_head
-from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, KeptBytes, unpack
+from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, KeptBytes
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.samples import DataIssue
 
@@ -47,7 +47,7 @@ class BagFile(KeptBytes):
         self.attachments: dict[str, bytes] = {}
         self.issues: list[DataIssue] = []
         self._reader = _bounded_reader()(_BagPath(path))
-        self._reader.file_bytes = self.size
+        self._reader.file_bytes, self._reader.unpack = self.size, self.unpack
         try:
             self._reader.open()
         except (self._reader.error, *_DAMAGED) as error:
@@ -76,13 +76,15 @@ class BagFile(KeptBytes):
                 before_ns, count = last.get(connection.id, (-1, 0))
                 count = count + 1 if stamp_ns == before_ns else 0
                 last[connection.id] = stamp_ns, count
-                yield channels[connection.id], stamp_ns, (connection.id, stamp_ns, count), memoryview(data)
+                found = memoryview(self.unpack("", data))  # an index may count a message again and again
+                yield channels[connection.id], stamp_ns, (connection.id, stamp_ns, count), found
         except (self._reader.error, *_DAMAGED) as error:
             reason = _reason(error, self.path)
             self.issues.append(DataIssue("the bag is damaged", f"what follows is not read: {reason}"))
 
     def read(self, place: Place) -> bytes:
         number, stamp_ns, count = place
+        self._unpacked = 0  # frames are read as often as the caller wants
         try:
             found = self._reader.messages([self._connections[number]], stamp_ns, stamp_ns + 1)
             return bytes(next(islice(found, count, None))[2])
@@ -132,17 +134,16 @@ def _bounded_reader() -> Any:
         raise RecordingError(
             "ROS 1 bags need another library: pip install '.[bags]' in fleetmap's source folder"
         ) from error
-    unpackers: dict[Any, Callable[[bytes], bytes]] = {
-        decompressors[kind]: partial(unpack, kind) for kind in ("bz2", "lz4")
-    }
+    kinds: dict[Any, str] = {each: kind.replace("none", "") for kind, each in decompressors.items()}
 
     class BoundedReader(Reader):
         error = ReaderError
         file_bytes, index_bytes = 0, 0
+        unpack: Callable[[str, bytes], bytes]
 
         def read_chunk(self) -> Any:
             chunk = super().read_chunk()
-            return chunk._replace(decompressor=unpackers.get(chunk.decompressor, chunk.decompressor))
+            return chunk._replace(decompressor=partial(self.unpack, kinds[chunk.decompressor]))
 
         def read_index_data(self, pos: int, indexes: Any) -> None:
             assert self.bio is not None

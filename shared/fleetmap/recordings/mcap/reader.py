@@ -193,7 +193,7 @@ class McapFile(KeptBytes):
                 return
             if is_cut and chunk.compression:
                 raise ValueError("the rest of a compressed chunk says nothing")
-            unpacked = memoryview(unpack(chunk.compression, chunk.data, chunk.uncompressed_size))
+            unpacked = memoryview(self.unpack(chunk.compression, chunk.data, chunk.uncompressed_size))
             is_sound = len(unpacked) == chunk.uncompressed_size
             if chunk.uncompressed_crc and is_sound:
                 is_sound = zlib.crc32(unpacked) == chunk.uncompressed_crc
@@ -231,7 +231,7 @@ class McapFile(KeptBytes):
             channel = self._channels.get(channel_id)
             if channel is None:
                 raise ValueError(f"message of an unknown channel {channel_id}")
-            data = unpack_message(content[_MESSAGE_HEAD.size :])
+            data = unpack_message(content[_MESSAGE_HEAD.size :], self.unpack)
         except ValueError as error:
             self._note("a damaged record", f"kind {opcode} at byte {at}: {error}")
             return
