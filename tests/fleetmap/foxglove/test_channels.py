@@ -1,7 +1,5 @@
 """Channels, read back by Foxglove's published schemas as another library has them."""
 
-import io
-
 import cv2
 import numpy as np
 import pytest
@@ -14,8 +12,6 @@ from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-from mcap.reader import make_reader
-from mcap_protobuf.decoder import DecoderFactory
 
 from fleetmap.errors import UsageError
 from fleetmap.foxglove import ViewerAddress, channels, require_foxglove, viewer_address
@@ -162,31 +158,6 @@ def test_surveys_are_shown_in_their_own_frame_or_in_the_map() -> None:
     assert "/log" not in again, "its status is the same"
     lost = told.shown(LiveSurveyState(**plain))
     assert {shown.topic for shown in lost} == {"/survey/landmarks", "/survey/path", "/survey/revisits", "/log"}
-
-
-def test_an_mcap_file_holds_the_same_channels() -> None:
-    messages = [
-        channels.points(STAMP_NS, np.ones((2, 3))),
-        channels.place("/fixes", STAMP_NS + 1, TURNED),
-        *channels.failure(STAMP_NS + 2, failure(), [("frame", b"one")]),
-    ]
-    files = [io.BytesIO(), io.BytesIO()]
-    for file in files:
-        with channels.ChannelWriter(file) as writer:
-            for message in messages:
-                writer.write(message)
-        file.seek(0)
-    assert files[0].getvalue() == files[1].getvalue()
-    reader = make_reader(files[0], decoder_factories=[DecoderFactory()])
-    found = list(reader.iter_messages())
-    assert [(channel.topic, message.log_time) for _, channel, message in found] == [
-        (m.topic, m.stamp_ns) for m in messages
-    ]
-    for schema, channel, message in found:
-        assert (schema.name, schema.data) == (CHANNELS[channel.topic].name, CHANNELS[channel.topic].data)
-        assert message.data == next(m.data for m in messages if m.topic == channel.topic)
-    protobuf = list(reader.iter_decoded_messages(topics=["/fixes"]))
-    np.testing.assert_allclose(matrix(protobuf[0].decoded_message.pose), TURNED, atol=1e-12)
 
 
 def test_addresses() -> None:

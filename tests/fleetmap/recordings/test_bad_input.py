@@ -11,7 +11,6 @@ import pytest
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings import RECORDING_FORMATS, OpenOptions, open_recording
-from fleetmap.recordings.images import StoredImage, decode_grey
 from support.recordings.recording_samples import (
     HEIGHT,
     WIDTH,
@@ -147,23 +146,6 @@ def test_what_is_lost_is_counted(euroc: Path, spoil: Spoil, frames: int, says: s
     assert (np.diff(recording.frame_stamps_ns) > 0).all()
     assert np.isfinite(recording.imu.gyro_radps).all()
     assert any(f"{issue.what}: {issue.detail}".startswith(says) for issue in recording.issues), recording.issues
-
-
-def test_a_picture_that_is_damaged_inside_is_told_in_our_words(euroc: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    flipped(euroc)
-    assert open_recording(euroc).damaged_ns.tolist() == [SAMPLE.stamps_ns[2]], (
-        "rows of a trajectory are counted with it"
-    )
-    with pytest.raises(RecordingError, match="the png image is damaged"):
-        decode_grey(StoredImage("file", image(euroc).read_bytes(), "a robot's own"))
-    assert capfd.readouterr().err == "", "libpng has nothing to say"
-
-
-def test_a_cut_jpeg_is_left_out_instead_of_filled_with_grey(tmp_path: Path) -> None:
-    folder = write_euroc(tmp_path / "r", SAMPLE, image_type="jpg")
-    file = folder / "mav0/cam0/data/image2.jpg"
-    file.write_bytes(file.read_bytes()[:-900])
-    assert SAMPLE.stamps_ns[2] not in open_recording(folder).frame_stamps_ns
 
 
 @pytest.mark.parametrize(("write", "gone"), [(write_kitti, "image_0"), (write_kitti, "image_1"), (write_tumvi, "cam0")])

@@ -3,6 +3,7 @@
 import re
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +22,10 @@ from support.recordings.recording_samples import HEIGHT, WIDTH, kalibr_text, mak
 RNG = np.random.default_rng(0)
 
 
-def flipped(data: bytes) -> bytes:
-    spoiled = bytearray(data)
-    for at in RNG.integers(0, len(data), max(3, len(data) // 500)):
+def flipped(data: bytes, first: int = 0) -> bytes:
+    """Some of the bytes from the first one on are others."""
+    spoiled, first = bytearray(data), max(first, 0)
+    for at in RNG.integers(first, len(data), max(3, (len(data) - first) // 500)):
         spoiled[at] = RNG.integers(256)
     return bytes(spoiled)
 
@@ -39,6 +41,9 @@ DAMAGES: dict[str, Callable[[bytes], bytes]] = {
     "flipped": flipped,
     "flipped again": flipped,
 }
+OF_CONTAINERS = {f"flipped in its head {n}": lambda data: flipped(data[:4096], 13) + data[4096:] for n in range(10)}
+OF_CONTAINERS |= {f"flipped in its end {n}": lambda data: flipped(data, len(data) - 4096) for n in range(10)}
+CONTAINERS = (".bag", ".db3", ".mcap", ".mp4")
 OF_A_LIBRARY = re.compile(
     r"Traceback|could not convert|requires a buffer|NoneType|codec can't|not enough values|invalid literal|out of bounds|while parsing|"
     r"while scanning|unicode string|malformed|reshape|list index|Errno|invalid start byte|Error parsing|Invalid data found|usecols",
@@ -61,11 +66,15 @@ def test_damaged_files_of_every_format(name: str, tmp_path: Path, capsys: pytest
     }
     for file in kinds.values():
         sound = file.read_bytes()
-        for damage, spoil in DAMAGES.items():
+        for damage, spoil in (DAMAGES | (OF_CONTAINERS if file.suffix in CONTAINERS else {})).items():
             file.write_bytes(spoil(sound))
             try:
                 with open_recording(path, options) as recording:
                     told = " ".join(f"{issue.what} {issue.detail}" for issue in recording.issues)
+                    if file.suffix in CONTAINERS:
+                        with suppress(RecordingError):
+                            for index in range(len(recording)):
+                                recording.read_frame(index)
             except FleetmapError as error:
                 told = str(error)
                 assert path.name in told, (file.name, damage, told)
