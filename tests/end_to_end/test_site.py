@@ -3,6 +3,7 @@
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -179,8 +180,9 @@ def test_over_the_network_the_same_comes_out_and_the_server_sees_the_robot(
                 told = metrics.get("frames") == FRAMES
                 time.sleep(0.02)
         finally:
-            server.terminate()
-            server.wait(timeout=30)
+            server.send_signal(signal.SIGINT)
+            status = server.wait(timeout=30)
+    assert status == 0
     assert (tmp_path / "r.tum").read_bytes() == (replayed[1] / "r.tum").read_bytes(), "in one process and in two"
     assert robot["version"] == 1
     assert robot["last_health"]["status"] == "TRACKING"

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import pytest
 
-from fleetmap.errors import StoreError
 from fleetmap.files import OWN_FILE
 from locclient.delivery.outbox import Outbox, QueuedReport
 
@@ -47,14 +46,3 @@ def test_a_damaged_file_is_set_aside(tmp_path: Path, content: bytes) -> None:
     assert spool.set_aside.read_bytes() == content
     spool.put(report("a"))
     assert spool.waiting() == [report("a")]
-
-
-def test_a_place_that_cannot_be_written_is_told(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(StoreError, match="spool"):
-        Outbox(tmp_path / "file" / "spool", max_bytes=1000)
-    spool = Outbox(tmp_path / "spool", max_bytes=1000)
-    (tmp_path / "spool").unlink()
-    (tmp_path / "spool").mkdir()
-    with pytest.raises(StoreError, match="refused"):
-        spool.put(report("a"))

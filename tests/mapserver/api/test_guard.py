@@ -229,17 +229,6 @@ def test_an_open_page_keeps_no_session_from_ending(server: Server, monkeypatch: 
         assert client.get("/v1/sites", headers=headers).status_code == 401
 
 
-def test_a_token_does_what_it_was_made_for(server: Server) -> None:
-    operators = Operators(server.store)
-    token = operators.make_token("prometheus", ["metrics"], 1, Actor("root"))
-    with client_of(server) as client:
-        headers = {"Authorization": f"Bearer {token}"}
-        assert client.get("/metrics", headers=headers).status_code == 200
-        check_problem(client.get("/v1/sites", headers=headers), 403, "'read', which prometheus (program)")
-        server.store.operators.disable("prometheus", Actor("root"))
-        assert client.get("/metrics", headers=headers).status_code == 401
-
-
 def test_a_server_that_must_ask_does_without_anybody_named(server: Server) -> None:
     with client_of(server, must_sign_in=True) as client:
         assert client.get("/v1/sites").status_code == 401

@@ -290,23 +290,6 @@ def test_robots_accept_lists_older_than_a_site_or_a_key_that_they_know(
         follow(tmp_path / "robot", root, restored)
 
 
-def test_robots_follow_a_store_that_is_restored_again_and_again(store: MapStore, tmp_path: Path, clock: Clock) -> None:
-    """Each time from a backup of the last one, and twice from the same one."""
-    clock.now_ns = time.time_ns()
-    init_here(store)
-    root = (store.folder / "trust" / "1.root.json").read_bytes()
-    target, identity = BackupTarget(str(tmp_path / "backups"), create=True), pyrage.x25519.Identity.generate()
-    back_up(store, target, recipient=identity.to_public())
-    for number in range(10):
-        assert restore(target, tmp_path / f"{number}", ADA, identities=[identity]).lists == "new"
-        with MapStore.open(tmp_path / f"{number}", clock_ns=clock) as restored:
-            lists = follow(tmp_path / "robot", root, restored)
-            if number != 5:
-                clock.now_ns += 60 * 10**9
-                back_up(restored, target, recipient=identity.to_public())
-    assert lists.newest("root") == 21
-
-
 def follow(robot: Path, root: bytes, store: MapStore) -> SignedLists:
     """A robot that trusts this root takes the store's current version; the store's lists."""
     lists, current = SignedLists(store.folder), store.current("lab")

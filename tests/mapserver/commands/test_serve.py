@@ -1,10 +1,8 @@
 """The commands, and `serve` as a process with real HTTP and real zenoh on loopback."""
 
 import os
-import signal
 import subprocess
 import sys
-import time
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -19,7 +17,6 @@ from benchmarks.fleet.server_process import serving
 from fleetmap.bus import Bus
 from fleetmap.cli_options import Program
 from fleetmap.errors import StoreError, UnreachableError, UsageError
-from fleetmap.messages import RobotHealth, WantedVersion
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from mapserver import cli, releases
@@ -27,38 +24,7 @@ from mapserver.commands.serve import HttpOptions, serve
 from mapserver.config import MapserverConfig
 from mapserver.store import DraftContent, MapStore
 from support.fleet.dashboard_scene import serving as scene_serving
-from support.storage.map_samples import draft_details, publish_samples, random_tile
-
-
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_robot_gets_its_map_and_is_seen(tmp_path: Path, number: signal.Signals) -> None:
-    with MapStore.open(tmp_path / "store", create=True) as store:
-        publish_samples(store, 1)
-    with serving(tmp_path / "store") as (process, http, zenoh), Bus.connect(zenoh) as bus:
-        link = MapClient(bus, TileCache(tmp_path / "cache"), "lab", "r1")
-        heard: list[WantedVersion] = []
-        link.on_wanted(heard.append)
-        manifest = link.manifest(link.wanted())
-        fetched = link.tiles(manifest)
-        assert (len(fetched.tiles), fetched.refused) == (2, {})
-        link.ack(manifest.version, stamp_ns=1)
-        link.publish_health(RobotHealth(site="lab", robot="r1", stamp_ns=2, version=1, status="TRACKING"))
-        deadline = time.monotonic() + 10
-        robots: list[dict[str, object]] = []
-        while time.monotonic() < deadline and not (robots and robots[0]["last_health"]):
-            robots = httpx.get(f"{http}/v1/robots").json()["robots"]
-            time.sleep(0.02)
-        assert [(robot["robot"], robot["version"]) for robot in robots] == [("r1", 1)]
-        # Another process publishes while the server runs.
-        with MapStore.open(tmp_path / "store") as store:
-            publish_samples(store, 1, first=5)
-        while time.monotonic() < deadline and not any(wanted.version == 2 for wanted in heard):
-            time.sleep(0.02)
-        assert any(wanted.version == 2 for wanted in heard)
-        assert link.manifest(heard[-1]).version == 2
-        process.send_signal(number)
-        assert process.wait(timeout=20) == 0
-
+from support.storage.map_samples import draft_details, random_tile
 
 _ENDS = """
 import atexit, sys, threading

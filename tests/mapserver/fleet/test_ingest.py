@@ -13,7 +13,7 @@ import pytest
 from msgspec.structs import replace as replace_struct
 
 from fleetmap.errors import LinkError, StoreError, UnknownOutcomeError
-from fleetmap.messages import FailureReport, Placement, PoseMessage, RobotHealth
+from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.ingest import IngestSettings
@@ -22,7 +22,6 @@ from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, kpis
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.store import FailureFilter, FleetRetention, MapStore
 from support.fleet.made_fleet import NS, SPEED_MPS, Known, MadeRobot, drive
-from support.fleet.reports import blindness
 from support.storage.map_samples import publish_samples
 
 START_NS = 490_000 * HOUR_NS + 1700 * NS  # an hour ends in the middle
@@ -128,7 +127,8 @@ def test_the_store_counts_what_the_robots_know(site: Site) -> None:
     assert total.reports == known.health
     assert total.blind_seen == total.blind_failures == total.failures
     found = kpis(total)
-    assert found.failures.per_robot_day == known.failures["site", ""] / (known.driving_s["site", ""] / 57600)
+    assert found.failures.events == known.failures["site", ""]
+    assert found.failures.robot_days == known.driving_s["site", ""] / 57600
     assert found.landmarks_seen_share == pytest.approx(0.7)
     assert found.first_fix_mean_s == 1.5
     hours = site.store.fleet.hours("lab", "site")
@@ -366,11 +366,3 @@ def _size(folder: Path) -> int:
 def test_settings_reach_the_retention() -> None:
     settings = IngestSettings(tally_days=3.0, failure_days=4.0, picture_bytes=5, trace_days=6.0)
     assert settings.retention() == FleetRetention(3.0, 4.0, 5, 6.0)
-
-
-def test_a_place_that_is_no_number_is_none(site: Site) -> None:
-    nowhere = Placement(position_m=(float("nan"), 1.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0))
-    report = blindness(wall_ns=START_NS, tile=None, map_from_base=nowhere)
-    assert site.fleet.take_failure("lab", "r1", report).refused == ""
-    (row,) = site.store.fleet.failures(FailureFilter())
-    assert row.x_map_m is None

@@ -122,22 +122,6 @@ def test_a_fetch_goes_on_where_it_was(world: World, died_after: int) -> None:
     assert world.hall.received_bytes == sum(len(world.cache.get(sha256)) for sha256 in world.cache.active("hall").blobs)
 
 
-def test_a_fetch_waits_for_a_server_that_comes_back(world: World) -> None:
-    wanted = world.publish(large_site(world))
-    link = MapClient(world.robot_bus, world.cache, "hall", "r1", timeout_s=0.05, patience_s=20)
-    through, asked = world.robot_bus.get, []
-
-    def get(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
-        asked.append(key)
-        world.hub.reachable = len(asked) not in range(4, 7)  # away for three questions in the middle
-        return through(key, payload, timeout_s=timeout_s)
-
-    world.robot_bus.get = get
-    link.bring(wanted)
-    assert world.cache.active("hall").version == 1
-    assert link.received_bytes == sum(len(world.cache.get(sha256)) for sha256 in world.cache.active("hall").blobs)
-
-
 def test_no_message_of_a_large_site_exceeds_a_part(world: World) -> None:
     wanted = world.publish(large_site(world, 1, landmarks=30_000))
     sizes: list[int] = []

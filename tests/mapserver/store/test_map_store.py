@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleetmap.errors import GateRefusedError, MapFormatError, NewerFormatError, StoreError, UsageError
+from fleetmap.errors import GateRefusedError, MapFormatError, NewerFormatError, StoreError
 from fleetmap.mapformat import current_path, decode_tile, sha256_hex
 from mapserver import releases
 from mapserver.store import Actor, DraftContent, MapStore, chain_faults, queries, schema
@@ -94,23 +94,6 @@ def test_a_site_with_a_vocabulary_of_its_own_takes_another(store: MapStore) -> N
         save_sample_draft(store, vocabulary=words)
         releases.publish(store, "lab")
     assert store.verify().faults == []
-
-
-def test_wrong_use_is_told(store: MapStore, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="it has: none"):
-        store.versions("lab")
-    save_sample_draft(store)
-    with pytest.raises(UsageError, match="no version 9"):
-        releases.publish(store, "lab", 9)
-    releases.publish(store, "lab")
-    with pytest.raises(UsageError, match="no draft"):
-        releases.publish(store, "lab")
-    with pytest.raises(UsageError, match="is current"):
-        releases.publish(store, "lab", 1)
-    with pytest.raises(UsageError, match="site name"):
-        save_sample_draft(store, site="../up")
-    with pytest.raises(StoreError, match="no map store"):
-        MapStore.open(tmp_path / "nothing")
 
 
 def test_a_damaged_tile_is_not_published(store: MapStore) -> None:
