@@ -9,7 +9,6 @@ import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
 from collections.abc import Iterator
-from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ import numpy as np
 
 from benchmarks.common.recorded_runs import SITE, parsed, surveyed, write_results
 from benchmarks.robot.bench_real_robots import mapped
+from benchmarks.robot.standing_robot import Standing
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.errors import UsageError
 from fleetmap.failure_definition import is_wrong
@@ -43,30 +43,6 @@ _CLEARANCE_M = 0.25
 _DWELL_S = 10.0  # at each place, more than the automatic exposure remembers
 SIMULATED = {"small-loop": ("small-loop", None), "small-loop, seed 303": ("small-loop", 303)}
 RECORDED = ("euroc_mh01_start", "euroc_v101_keyframes", "7scenes_redkitchen_200")
-
-
-@dataclass(frozen=True, slots=True)
-class Looks:
-    """A motion that stands at one place after another, each for _DWELL_S; see `fleetsim.motion.body_motion.Motion`."""
-
-    places: Array
-
-    @property
-    def duration_s(self) -> float:
-        """At all places together."""
-        return _DWELL_S * len(self.places)
-
-    def map_from_body(self, times_s: Array) -> Array:
-        """(N, 4, 4)."""
-        return self.places[np.clip((times_s / _DWELL_S).astype(int), 0, len(self.places) - 1)]
-
-    def rates(self, times_s: Array) -> tuple[Array, Array]:
-        """Nothing moves."""
-        return np.zeros((len(times_s), 3)), np.zeros((len(times_s), 3))
-
-    def velocity_body(self, times_s: Array) -> Array:
-        """Nothing moves."""
-        return np.zeros((len(times_s), 3))
 
 
 def published(store: Path) -> tuple[MapView, SurveyMap]:
@@ -103,7 +79,7 @@ def rendered(scenario: str, seed: int | None, survey: SurveyMap) -> Iterator[tup
                 continue
             numbers.append(k)
             places.append(place)
-    motion, rectifier = Looks(np.stack(places)), Rectifier(session.nominal)
+    motion, rectifier = Standing(np.stack(places), _DWELL_S), Rectifier(session.nominal)
     renderer = StereoRenderer(session.world, session.true, motion, RenderOptions(look=Look(has_blur=False), key=1))
     try:
         for number, (k, place) in enumerate(zip(numbers, places, strict=True)):

@@ -14,19 +14,24 @@ from fleetsim.sensors.measurements import measure_imu, measure_wheels, sample_ti
 
 @dataclass(frozen=True, slots=True)
 class Standing:
-    """A motion that is none; see `fleetsim.motion.body_motion.Motion`."""
+    """A motion that stands at one place after another, dwell_s at each; see `fleetsim.motion.body_motion.Motion`."""
 
-    map_from_standing: Array
-    duration_s: float
+    places: Array
+    dwell_s: float
+
+    @property
+    def duration_s(self) -> float:
+        """At all places together."""
+        return self.dwell_s * len(self.places)
 
     def map_from_body(self, times_s: Array) -> Array:
-        """(N, 4, 4), the same at all times."""
-        return np.tile(self.map_from_standing, (len(times_s), 1, 1))
+        """(N, 4, 4)."""
+        return self.places[np.clip((times_s / self.dwell_s).astype(int), 0, len(self.places) - 1)]
 
     def rates(self, times_s: Array) -> tuple[Array, Array]:
         """No angular rate, and the specific force that holds the body, (N, 3) each."""
-        force = self.map_from_standing[:3, :3].T @ np.array([0.0, 0.0, GRAVITY_MPS2])
-        return np.zeros((len(times_s), 3)), np.tile(force, (len(times_s), 1))
+        force = self.map_from_body(times_s)[:, 2, :3] * GRAVITY_MPS2
+        return np.zeros((len(times_s), 3)), force
 
     def velocity_body(self, times_s: Array) -> Array:
         """(N, 3) of nothing."""
@@ -40,7 +45,7 @@ def standing(drive: Session, time_s: float, number: int, duration_s: float, rate
     """
     order = drive.order
     kind, rng = find_scenario(order.scenario).run(order.robot)[1].kind, np.random.default_rng([order.seed, number])
-    motion = Standing(drive.motion.map_from_body(np.array([time_s]))[0], duration_s)
+    motion = Standing(drive.motion.map_from_body(np.array([time_s])), duration_s)
     return replace(
         drive,
         motion=motion,

@@ -341,21 +341,6 @@ def test_root_rotation(
     assert robot.number("root") == (3 if is_good else 2)
 
 
-def test_another_key_lets_robots_forget_what_a_thief_signed(publisher: ListPublisher, robot: ListReader) -> None:
-    """A thief's list with the highest number; another snapshot key lets robots begin again."""
-    honest = publisher.site.version
-    publisher.site.version = 2**31 - 2
-    publisher.renew(ROLE)
-    assert robot.refused() == ""
-    publisher.site.version = honest
-    publisher.renew(ROLE)
-    assert robot.refused().startswith(ROLLBACK)  # the control: the site's own key cannot undo it
-    publisher.rotate("snapshot", "timestamp")
-    publisher.publish("root", "snapshot", "timestamp")
-    assert robot.refused() == ""
-    assert robot.number(ROLE) == honest + 1
-
-
 def test_first_use_pins_the_root(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     first, other = ListPublisher(), ListPublisher()
     assert ListReader(tmp_path, first.ask, None).refused() == ""
@@ -413,16 +398,6 @@ def test_a_site_speaks_for_itself_alone(publisher: ListPublisher, robot: ListRea
 
 
 # ------------------------------------------------------------------------------------------------------------------ clocks
-
-
-def test_an_expired_root_is_renewed(publisher: ListPublisher, robot: ListReader) -> None:
-    publisher.root.expires = days(-1)
-    publisher.publish("root", "targets", "snapshot", "timestamp")
-    assert robot.refused().startswith(FREEZE)
-    assert [robot.number(role) for role in ("root", "timestamp", "snapshot")] == [2, None, None]
-    publisher.root.expires = days(700)
-    publisher.publish("root")
-    assert robot.refused() == ""
 
 
 @pytest.mark.parametrize("role", ["root", "timestamp"])

@@ -5,7 +5,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleetmap.errors import UsageError
 from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.messages import Cause, EstimateMessage, Status, decode_message
 from fleetmap.recordings.ros2.cdr import CdrReader
@@ -96,14 +95,6 @@ def test_the_building_is_told_once_the_map_says_it() -> None:
     np.testing.assert_allclose(heard[1][3].parent_from_child, building_from_map, atol=1e-12)
     told = published(OutputSection(format="ros2"), estimate(5.0))
     assert [len(decode_frame_links(payload)) for payload in told[key]] == [3]
-
-
-@pytest.mark.parametrize(
-    ("section", "said"), [({"format": "xml"}, "xml"), ({"format": "ros2", "tf_topic": "a b"}, "a b")]
-)
-def test_what_cannot_be_told_is_refused_at_once(section: dict[str, str], said: str) -> None:
-    with MemoryBus(MemoryHub()) as bus, pytest.raises(UsageError, match=said):
-        open_publisher(OutputSection(**section), *inputs(bus))
 
 
 def test_odom_is_continuous_once_a_place_was_named() -> None:

@@ -6,7 +6,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_exp
 from fleetmap.messages import Status
 from locclient.maps.map_source import FetchedTiles
@@ -200,14 +199,6 @@ def test_between_sparse_frames_nothing_better_is_known() -> None:
     assert counts(frame(2.5 * k, **kind) for k, kind in enumerate(kinds)) == (0, 1), "whoever is lost claims nothing"  # type: ignore[arg-type]
     kinds[2] = {"status": L, "error_m": 0.4, "sigma_m": 0.1}
     assert counts(frame(2.5 * k, **kind) for k, kind in enumerate(kinds)) == (1, 1)  # type: ignore[arg-type]
-
-
-def test_the_radius_holds_95_percent() -> None:
-    """Against samples of the distribution, and infinite where nothing is known."""
-    samples: Array = np.random.default_rng(3).normal(0, 0.05, (20_000, 3))
-    inside = np.linalg.norm(samples, axis=1) < radius_95_m(frame(0, sigma_m=0.05).cov_rot_trans)
-    assert inside.mean() == pytest.approx(0.95, abs=0.005)
-    assert radius_95_m(None) == np.inf
 
 
 def result(truths: list[Array | None], frames: list[FrameRecord], *, scale: float = 1.0) -> ReplayResult:

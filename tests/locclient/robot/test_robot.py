@@ -64,21 +64,6 @@ def test_a_robot_knows_where_its_map_lies_in_the_building(store: MapStore) -> No
     np.testing.assert_allclose(found[1], se3(so3_exp(np.array([0.0, 0.0, 0.5])), np.array([3.0, -4.0, 0.0])))
 
 
-def test_a_good_version_is_adopted_after_its_fixes(store: MapStore) -> None:
-    robot, bundles = robot_world.new_robot(), list(robot_world.bundles(100))
-    robot.use(robot_world.loaded(store))
-    drive(robot, range(70), bundles)
-    robot.take_changes()
-    robot_world.save(store)
-    second = robot_world.loaded(store)
-    robot.use(second)
-    assert [held.version for held in robot.held] == [1, 2]
-    assert max(drive(robot, range(70, 100), bundles)) < 0.05
-    changes = robot.take_changes()
-    assert [(change.change, change.wanted.version) for change in changes] == [(Change.ADOPTED, 2)]
-    assert [held.version for held in robot.held] == [2]
-
-
 def test_a_version_that_slipped_is_refused_and_the_place_kept(store: MapStore) -> None:
     """Status: never wrong; after the trial TRACKING in the old version. Flag: refused, with both versions named."""
     robot, bundles = robot_world.new_robot(), list(robot_world.bundles(130))

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fleetmap.errors import UsageError
 from fleetmap.geometry import se3, se3_inverse
 from fleetmap.mapformat import Manifest
 from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame
@@ -30,7 +29,6 @@ from mapserver.dashboard.plan import make_plan
 from mapserver.dashboard.rendering import TEMPLATES, age, size
 from mapserver.dashboard.robot_history import band, curve, stretches, way
 from mapserver.dashboard.underlays import grid_picture
-from mapserver.drafting.job_lock import recorded_job
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, rate
@@ -40,7 +38,7 @@ from mapserver.floor_plan.areas import Areas
 from mapserver.quality.gate import GateSettings
 from mapserver.serving.server_health import Ending
 from mapserver.store import MapStore, TraceRow
-from support.fleet.dashboard_scene import LENGTH_M, SITE, build_report, fill_store, hall_tiles
+from support.fleet.dashboard_scene import LENGTH_M, SITE, fill_store, hall_tiles
 
 EVIL = "<script>alert(1)</script>\"'&"
 
@@ -197,15 +195,6 @@ def test_the_occupancy_grid_is_a_picture() -> None:
     assert (opaque[3, 0], opaque[0, 5], opaque[1, 1]) == (255, 60, 0)
 
 
-def test_changes_of_tiles_and_sites(store: MapStore) -> None:
-    data = MapData(store, GateSettings(), 0.05)
-    kinds = data.changed_tiles(SITE, 1, 3)
-    assert sorted(kinds.values()) == ["added"] * 2 + ["changed"] * 6
-    assert set(data.changed_tiles(SITE, 3, 1).values()) == {"removed", "changed"}
-    with pytest.raises(UsageError, match="no site nowhere"):
-        data.chosen_site("nowhere")
-
-
 def status(**changed: object) -> RobotStatus:
     sent = {"position_map_m": [1.0, 2.0, 0.0], "status": "TRACKING"}
     usual = {"site": SITE, "robot": "r", "version": 2, "wanted_version": 2, "is_canary": False, "is_present": None}
@@ -275,10 +264,6 @@ def test_a_robot_that_wavers_is_drawn_in_few_parts() -> None:
     assert sum(part.length_ns for part in drawn) == 11_000_000_000_000
 
 
-def test_a_place_that_is_no_number_is_no_place() -> None:
-    assert live_robot(status(last_pose={"position_map_m": [None, 2.0, 0.0]})).place_m is None
-
-
 def test_many_pages_look_once(store: MapStore) -> None:
     class Counting(Fleet):
         looked = 0
@@ -341,18 +326,6 @@ def test_health_of_a_site(store: MapStore) -> None:
     assert health.span(SITE, None, now_ns - 2 * HOUR_NS).failures.events == 0
     assert len(health.places(SITE)) == 2
     assert health.places(SITE, None, now_ns - HOUR_NS) == []
-
-
-def test_a_job_is_noted_from_begin_to_end(store: MapStore) -> None:
-    with recorded_job(store, SITE, "build") as job:
-        assert store.jobs(SITE)[0].state == "running"
-        job.message, job.report = "draft 4", build_report()
-    done = store.jobs(SITE)[0]
-    assert (done.state, done.message, done.report["version"]) == ("done", "draft 4", 3)
-    with pytest.raises(UsageError), recorded_job(store, SITE, "build"):
-        raise UsageError("cameras are swapped")
-    failed = store.jobs(SITE)[0]
-    assert (failed.state, failed.message) == ("failed", "cameras are swapped")
 
 
 def test_both_rates_of_a_trial_are_drawn_once_they_tell_something(store: MapStore) -> None:

@@ -196,14 +196,6 @@ def test_a_gyro_that_turns_otherwise(
     assert any(part in finding.sentence for part in says.split("|"))
 
 
-def test_an_imu_of_another_ride(good: Recording) -> None:
-    rng = np.random.default_rng(5)
-    noise = rng.standard_normal((len(good.imu) // 20 + 2, 3))
-    other = np.repeat(noise, 20, axis=0)[: len(good.imu)]
-    finding = found(with_imu(good, lambda imu: replace(imu, gyro_radps=other)))["gyro axes"]
-    assert finding.verdict is Verdict.FAIL
-
-
 def test_sparse_frames_are_not_judged(good: Recording) -> None:
     sparse = replace(good, frame_stamps_ns=good.frame_stamps_ns[0] + 2_000_000_000 * np.arange(len(good)))
     findings = found(sparse)

@@ -101,6 +101,7 @@ def test_a_job_keeps_its_log(tmp_path: Path, capfd: pytest.CaptureFixture[str]) 
             plain_console(stderr=True).print("reading [red]monday")
         with pytest.raises(SurveyError), recorded_job(maps, "new", "build"):
             raise SurveyError("too dark")
+        assert (maps.job(2).state, maps.job(2).message) == ("failed", "too dark")
         assert log_path(tmp_path, job.number or 0).read_text() == "reading [red]monday\n"
         assert log_path(tmp_path, 2).read_text() == "too dark\n"
         with logged(tmp_path, 202), pytest.raises(ZeroDivisionError), logged(tmp_path, 201):

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import lru_cache
-from pathlib import Path
 
 import dask
 import pytest
@@ -19,7 +18,6 @@ from fleetmap.errors import LinkError, UsageError
 from fleetmap.mapformat import encode_tile
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples
-from mapserver import BuildOptions, build_map, open_map
 from mapserver.drafting import worker as workers
 from mapserver.drafting.worker import Cluster, Threads, open_executor, read_ahead
 from mapserver.store.archive import encode_archive
@@ -28,8 +26,7 @@ from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import survey
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyTools
 from mapserver.tiles.tiling import tiles_from_survey
-from support.recordings.recording_samples import calibration, make_sample, write_euroc
-from support.worlds.box_room import out_and_back, ride_sample
+from support.recordings.recording_samples import calibration, make_sample
 
 
 def surveyed_by(worker: Executor) -> tuple[bytes, ...]:
@@ -60,17 +57,6 @@ def test_linear_algebra_has_no_threads_beside_those_of_a_survey() -> None:
         assert there
         assert set(there) == {1}
         assert set(_blas_threads()) == {3}
-
-
-def test_threads_make_the_same_map(tmp_path: Path) -> None:
-    recording = write_euroc(tmp_path / "ride", ride_sample(out_and_back(3.0), 31, 0.1))
-    made = []
-    for threads in (1, 2, 4):
-        build = build_map(recording, tmp_path / str(threads), "hall", BuildOptions(threads=threads))
-        tiles = [tile.sha256 for tile in open_map(build.store, "hall", build.version).manifest.tiles]
-        made.append((encode_archive(build.map), tiles))
-    assert made[1] == made[0]
-    assert made[2] == made[0]
 
 
 @pytest.fixture(scope="module")

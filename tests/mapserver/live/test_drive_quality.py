@@ -29,14 +29,6 @@ def test_an_aisle_driven_one_way_misses_the_other() -> None:
     assert missing_directions(np.concatenate([east, west])) == []
 
 
-def test_only_what_was_driven_one_way_is_named() -> None:
-    both = AISLE[:19]
-    missing = missing_directions(np.concatenate([looking(AISLE, 0.0), looking(both, np.pi)]))
-    assert {each.heading for each in missing} == {"W"}
-    assert min(each.x_m for each in missing) > both[-1, 0]
-    assert missing_directions(np.zeros((0, 4, 4))) == []
-
-
 def test_a_square_is_covered_by_ten_landmarks() -> None:
     points = np.concatenate([np.full((10, 3), 1.0), np.full((9, 3), -1.0), np.full((30, 3), 6.0)])
     assert covered_cells(points, 10).tolist() == [[0, 0, 10], [1, 1, 30]]

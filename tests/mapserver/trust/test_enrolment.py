@@ -93,18 +93,6 @@ def test_row_35_a_copied_bundle(world: World) -> None:
     assert world.ask(bundle, thiefs), "the control: a server that does not remember the use"
 
 
-def test_lost_answers_do_no_harm(world: World) -> None:
-    bundle, first, second = world.bundle().own.encode(), enrolment.new_key(), enrolment.new_key()
-    for _ in range(3):
-        assert world.ask(bundle, first).fingerprint == enrolment.key_fingerprint(first)
-    for _ in range(3):
-        assert world.ask(first, second).fingerprint == enrolment.key_fingerprint(second)
-    with pytest.raises(LinkError, match="may not renew"):
-        world.ask(first, enrolment.new_key())
-    with pytest.raises(LinkError, match="may not renew"):
-        world.ask(bundle, first)
-
-
 @pytest.mark.parametrize("spoiled", ["nothing", "no message", "another proof", "another key", "bytes"])
 def test_what_proves_nothing_is_refused(world: World, spoiled: str) -> None:
     bundle, key = world.bundle().own.encode(), enrolment.new_key()
