@@ -60,7 +60,7 @@ def init(
         )
     if stick and len(stick) > 1:
         raise UsageError(f"--stick names {len(stick)} folders for one root key; name one, and copy the key yourself")
-    folder, hosts, made = _not_a_token(stick[0]) if stick else None, host or [socket.gethostname()], []
+    folder, hosts, made = stick[0] if stick else None, host or [socket.gethostname()], []
     with open_store(store) as maps:
         authorities = RobotRegister(maps).authorities
         # A store that was served on loopback already has lists but no certificates.
@@ -119,7 +119,7 @@ def rotate(
         root_key = _root_key(maps, key)
         if what is Rotated.ONLINE:
             signing.rotate_online(maps, root_key)
-        elif made := signing.rotate_root(maps, root_key, None if stick is None else _not_a_token(stick)):
+        elif made := signing.rotate_root(maps, root_key, stick):
             _show(*made)
     typer.echo("done; robots follow with their next query")
 
@@ -196,18 +196,12 @@ def _root_key(maps: "MapStore", path: Path | None) -> "Signer":
     from mapserver.trust.keys import KeyFolder, load_key
 
     if path is not None:
-        return load_key(_not_a_token(path), _passphrase(path))
+        return load_key(path, _passphrase(path))
     keys = KeyFolder(maps.folder / "keys")
     root = keys.signer("root")
     if root is None:
         raise UsageError(f"{keys.path('root')} is missing; name the file of the root key by --key")
     return root
-
-
-def _not_a_token(path: Path) -> Path:
-    if str(path).startswith("pkcs11:"):
-        raise UsageError(f"{path}: keys on PKCS#11 tokens are no longer supported; use a root key file")
-    return path
 
 
 def _passphrase(path: Path) -> str:

@@ -27,11 +27,6 @@ def read_chunks(path: Path) -> Iterator[bytes]:
         os.close(descriptor)
 
 
-def read_file(path: Path) -> bytes:
-    """Return all bytes of a file. Raises OSError as `os.read`."""
-    return b"".join(read_chunks(path))
-
-
 def make_folder(folder: Path) -> None:
     """Create `folder` and its parents durably, so that they exist after a power cut.
 

@@ -13,7 +13,7 @@ import hashlib
 import sqlite3
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, closing, contextmanager
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, cast
@@ -53,7 +53,7 @@ from mapserver.store.files import (
     locked,
     make_folder,
     make_own_file,
-    read_file,
+    read_chunks,
 )
 from mapserver.store.fleet_queries import name_failures
 from mapserver.store.garbage_collection import Garbage, Retention, collect
@@ -82,7 +82,7 @@ from mapserver.store.version_rows import (
 )
 
 if TYPE_CHECKING:
-    from mapserver.surfels.survey_pictures import SurveyPicture
+    pass
 
 _USUAL_RETENTION = Retention()
 AREAS_BEFORE = "areas before"
@@ -368,21 +368,20 @@ class MapStore(StoreQueries):
     def remove_survey_pictures(self, days: float, *, dry_run: bool = False) -> int:
         """Remove the surveys' pictures kept for longer from all versions, and return their number; StoreError on a disk error.
 
-        Their age counts from their first build, whatever their recording's clock says: one of an earlier fleetmap is as old as the oldest
-        version that has it. Indexes of versions, which are signed, still name them.
+        Their age counts from their first build, whatever their recording's clock says. Indexes of versions, which are signed, still
+        name them.
         """
-        before_ns, kept_ns = self.now_ns() - int(days * 86_400e9), dict[str, int]()
+        before_ns, old = self.now_ns() - int(days * 86_400e9), set[str]()
         with self._locked(shared=dry_run):
             for site in self.sites():
                 for info in self.versions(site.site):
-                    for one in _pictures_of(self, info):
-                        since_ns = one.kept_ns or info.saved_ns
-                        kept_ns[one.sha256] = min(since_ns, kept_ns.get(one.sha256, since_ns))
-            old = [sha256 for sha256, since_ns in kept_ns.items() if since_ns < before_ns]
+                    with suppress(StateError, MapFormatError):  # a version without pictures
+                        pictures = self.survey_pictures(info.site, info.version)
+                        old |= {one.sha256 for one in pictures if one.kept_ns < before_ns}
             if not dry_run and old:
                 with self._transactions.write() as connection:
                     connection.executemany("DELETE FROM surfel_blobs WHERE sha256 = ?", [(sha256,) for sha256 in old])
-                for sha256 in set(old) - self.named_blobs():
+                for sha256 in old - self.named_blobs():
                     self._blobs.remove(sha256)
         return len(old)
 
@@ -490,7 +489,7 @@ class MapStore(StoreQueries):
             return
         for row in self._transactions.query("SELECT site, manifest_sha256 FROM versions WHERE state = 'current'"):
             path = self._root / current_path(row["site"])
-            if not is_plain_file(path) or read_file(path) != f"{row['manifest_sha256']}\n".encode():
+            if not is_plain_file(path) or b"".join(read_chunks(path)) != f"{row['manifest_sha256']}\n".encode():
                 self._write_current_file(row["site"])
 
     def _write_current_file(self, site: str) -> None:
@@ -520,14 +519,6 @@ class MapStore(StoreQueries):
             yield
         except OSError as error:
             raise StoreError(f"{error.filename or self._root}: {error.strerror}; check the store's disk") from error
-
-
-def _pictures_of(store: MapStore, info: VersionInfo) -> "tuple[SurveyPicture, ...]":
-    """Return the surveys' pictures that a version still has; none for one without."""
-    try:
-        return store.survey_pictures(info.site, info.version)
-    except (StateError, MapFormatError):
-        return ()
 
 
 def _export_chunks(head: ExportHead, blobs: Blobs) -> Iterator[bytes]:

@@ -6,7 +6,6 @@ from typing import Annotated
 import cv2
 import msgspec
 import numpy as np
-from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from fleetmap.encoding import to_json
@@ -29,8 +28,7 @@ _Triple = Annotated[tuple[float, ...], msgspec.Meta(min_length=3, max_length=3)]
 class SurveyPicture(msgspec.Struct, frozen=True, kw_only=True):
     """A picture of a survey: position of its camera and unit vector along its axis in `map`, its stamp, the recording, the JPEG's address.
 
-    stamp_ns: of the recording's clock, which may count from another moment than 1970. kept_ns: of the build that kept it first; 0 if an
-    earlier fleetmap did.
+    stamp_ns: of the recording's clock, which may count from another moment than 1970. kept_ns: of the build that kept it first.
     """
 
     place_map_m: _Triple
@@ -39,7 +37,7 @@ class SurveyPicture(msgspec.Struct, frozen=True, kw_only=True):
     recording: Annotated[str, msgspec.Meta(max_length=400)]
     sha256: Sha256
     bytes: Positive
-    kept_ns: int = 0
+    kept_ns: int
 
 
 class PictureIndex(msgspec.Struct, frozen=True, kw_only=True):
@@ -62,7 +60,7 @@ def pictures_of(manifest: Manifest, blob: Callable[[str], bytes]) -> tuple[Surve
     where, found = f"version {manifest.version} of site {manifest.site}", manifest.report.get(PICTURES_KEY)
     if found is None:
         raise StateError(
-            f"{where} keeps no pictures of its surveys: it was built without `survey_pictures` in [survey], or by an earlier fleetmap"
+            f"{where} keeps no pictures of its surveys: it was built without `survey_pictures` in [survey]"
         )
     try:
         index = msgspec.json.decode(blob(msgspec.convert(found, PicturesReport).sha256), type=PictureIndex)
@@ -114,7 +112,7 @@ def kept_pictures(
             )  # fmt: skip
         found = taken + [one for one in found if not _is_among(one.place_map_m, one.looks_map, taken)]
     others = [one for one in before if not _is_among(one.place_map_m, one.looks_map, found)]
-    found = (found + [replace(one, kept_ns=one.kept_ns or now_ns) for one in others])[:_MOST]
+    found = (found + others)[:_MOST]
     if not found:
         return [], None
     addresses = sorted({one.sha256 for one in found})

@@ -210,8 +210,7 @@ class TrustedMap:
 
     def _read_clock(self) -> _Clock:
         try:
-            # Older versions stored only the first value, and robots whose clock had been ahead waited until that time.
-            heard, signed, number = [*(self._folder / "clock").read_text("ascii").split(), "0", "0"][:3]
+            heard, signed, number = (self._folder / "clock").read_text("ascii").split()
             return _Clock(max(0.0, float(heard)), max(0.0, float(signed)), int(number))
         except (FileNotFoundError, ValueError):
             return _Clock(0.0, 0.0, 0)

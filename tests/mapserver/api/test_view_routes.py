@@ -71,7 +71,7 @@ def test_the_nearest_picture_of_a_survey_is_given(server: Server) -> None:
     secret = server.store.version("lab", version).archive_sha256
     check_problem(server.client.get(f"{address}/{secret}"), 404, "has no picture")
     old = server.client.get("/v1/sites/lab/versions/1/pictures", params={"x_m": 0, "y_m": 0})
-    check_problem(old, 409, "by an earlier fleetmap")
+    check_problem(old, 409, "built without `survey_pictures`")
     check_problem(server.client.get(address), 422, "x_m")
 
 
