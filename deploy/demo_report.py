@@ -72,14 +72,6 @@ def table_of(titles: Sequence[str], reports: Sequence[Report], rows: Sequence[tu
     return table
 
 
-def has_truth(recording: Path) -> bool:
-    """Return True if the recording carries ground truth."""
-    from fleetmap.recordings import open_recording
-
-    with open_recording(recording) as source:
-        return source.ground_truth is not None
-
-
 def robots_at(url: str) -> list[Report]:
     """Return what the server tells of its robots."""
     with urlopen(url, timeout=10) as answer:  # an address that the server itself has printed
@@ -117,9 +109,11 @@ def main(arguments: list[str]) -> None:
     match arguments:
         case ["has-truth", recording]:
             from fleetmap.errors import FleetmapError
+            from fleetmap.recordings import open_recording
 
             try:
-                print("yes" if has_truth(Path(recording)) else "no")
+                with open_recording(Path(recording)) as source:
+                    print("no" if source.ground_truth is None else "yes")
             except FleetmapError as error:
                 print(f"demo: {error}", file=sys.stderr)
                 sys.exit(error.exit_status)

@@ -80,18 +80,13 @@ def round_path(way_points_map: Array, radius_m: float) -> Array:
     return np.stack([np.interp(even, along, points[:, axis]) for axis in range(2)], axis=1)
 
 
-def _smoothed(values: Array, half_width: int) -> Array:
-    window = np.ones(2 * half_width + 1) / (2 * half_width + 1)
-    return np.convolve(np.pad(values, half_width, "edge"), window, "valid")
-
-
 def time_path(route: Route, limits: Limits) -> TimedPath:
     """The route within the limits: rest, drive, stops, rest. Speeds by a forward and a backward sweep over the path."""
     way_points = np.array(route.way_points_map, np.float64)
     points = round_path(way_points, limits.corner_radius_m)
     tangents = np.gradient(points, STEP_M, axis=0)
     yaw = np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))
-    curvature = _smoothed(np.abs(np.gradient(yaw, STEP_M)), 15)
+    curvature = np.convolve(np.pad(np.abs(np.gradient(yaw, STEP_M)), 15, "edge"), np.ones(31) / 31, "valid")
     speed = np.minimum(limits.speed_mps, limits.yaw_rate_radps / np.maximum(curvature, 1e-6))
     speed[[0, -1]] = _CREEP_MPS
     stops = {

@@ -69,14 +69,11 @@ class HallMaker:
     def _scramble(self, column: int, row: int, number: int) -> int:
         return mix(self._seed, _TAG_HALL, column, 0 if self._layout.are_aisles_identical else row, number) >> 40
 
-    def _offset_texels(self, x_m: float, y_m: float, row: int) -> tuple[float, float]:
-        """Concrete's texels at a floor quad's corner, so that tiles join seamlessly; per aisle if aisles are identical."""
-        base = self._layout.margin_m + row * self._layout.pitch_m if self._layout.are_aisles_identical else 0.0
-        return x_m / TEXEL_M, (self._layout.width_m + 10.0 - (y_m - base)) / TEXEL_M
-
     def _add_floor_quad(self, builder: FaceBuilder, rectangle: Rectangle, z_m: float, texture: int, row: int) -> None:
         x_min, y_min, x_max, y_max = rectangle
-        offset_texels = self._offset_texels(x_min, y_max, row)
+        # Concrete's texels at the corner, so that tiles join seamlessly; per aisle if aisles are identical
+        base = self._layout.margin_m + row * self._layout.pitch_m if self._layout.are_aisles_identical else 0.0
+        offset_texels = x_min / TEXEL_M, (self._layout.width_m + 10.0 - (y_max - base)) / TEXEL_M
         surface = Surface(texture, material=MATERIAL_FLOOR, offset_texels=offset_texels)
         builder.add_quad((x_min, y_max, z_m), (x_max - x_min, 0, 0), (0, y_min - y_max, 0), surface)
 

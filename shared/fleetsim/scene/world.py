@@ -146,10 +146,6 @@ class World:
     def _neighbours(self, key: tuple[int, int], columns: int, rows: int) -> list[tuple[int, int]]:
         return [other for other in self._keys if abs(other[0] - key[0]) <= columns and abs(other[1] - key[1]) <= rows]
 
-    def _lamps_near(self, key: tuple[int, int]) -> Array:
-        lamps: list[Lamp] = [lamp for other in self._neighbours(key, 1, 1) for lamp in self._lamps[other]]
-        return np.array([(lamp.x_m, lamp.y_m, lamp.z_m, lamp.power, lamp.group) for lamp in lamps]).reshape(-1, 5)
-
     def _light_detailed(self, key: tuple[int, int]) -> LitFaces:
         """Light with shadows from the boxes of the chunk and the eight around it; further lamps are not counted."""
         parts = {other: self.detailed_faces(*other) for other in sorted(self._neighbours(key, 1, 1))}
@@ -163,7 +159,8 @@ class World:
         high = np.array([rectangles[:, 2].max(), rectangles[:, 3].max(), self.layout.ceiling_m]) + 0.5
         grid = core.BoxGrid(boxes, low, high, _CELL_M)
         light = np.zeros((LAMP_GROUPS, faces.light_samples), np.float32)
-        lamps = self._lamps_near(key)
+        near: list[Lamp] = [lamp for other in self._neighbours(key, 1, 1) for lamp in self._lamps[other]]
+        lamps = np.array([(lamp.x_m, lamp.y_m, lamp.z_m, lamp.power, lamp.group) for lamp in near]).reshape(-1, 5)
 
         def bake(first: int, last: int) -> None:
             columns = (faces.quads[first:last], faces.numbers[first:last], faces.owners[first:last])
