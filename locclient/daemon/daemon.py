@@ -150,7 +150,10 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         robot = Robot(calibration, rectifier, config.localizer, run.trial, time.thread_time, keeps_replay=keeps_replay)
         if prior is not None:
             robot.localizer.handle_prior(prior)
-        told_bus = _output_bus(config, None if is_alone else bus, stack)
+        told_bus = None if is_alone else bus
+        if config.output.endpoint is not None:
+            told_bus = Bus.connect(config.output.endpoint, is_ros=config.output.format == "ros2")
+            stack.callback(told_bus.close)
         publisher = None
         if told_bus is not None:
             publisher = open_publisher(config.output, told_bus, site, name, calibration, intake)
@@ -255,13 +258,6 @@ def _fleet_manager(
 def configured_outbox(run: RunSection, site: str, robot: str) -> Path:
     """Return the file of the spool: as set, else beside the default cache."""
     return outbox_path(site, robot) if run.outbox is None else Path(run.outbox)
-
-
-def _output_bus(config: LocclientConfig, bus: Bus | None, stack: ExitStack) -> Bus | None:
-    if config.output.endpoint is not None:
-        bus = Bus.connect(config.output.endpoint, is_ros=config.output.format == "ros2")
-        stack.callback(bus.close)
-    return bus
 
 
 def _local_map(run: RunSection, site: str) -> tuple[LocalMapSource, WantedVersion]:

@@ -218,10 +218,10 @@ class Ros2Localizer(Publisher):
         node.serve("~/change_state", "lifecycle_msgs/srv/ChangeState", self._change_state)
         node.serve("~/get_available_states", "lifecycle_msgs/srv/GetAvailableStates", lambda _: encode_states())
         transitions = "lifecycle_msgs/srv/GetAvailableTransitions"
-        node.serve("~/get_available_transitions", transitions, lambda _: encode_transitions(self._next_transitions()))
+        node.serve("~/get_available_transitions", transitions, self._next_transitions)
         graph = encode_transitions(TRANSITIONS, with_success=True)
         node.serve("~/get_transition_graph", transitions, lambda _: graph)
-        node.serve("set_initial_pose", "nav2_msgs/srv/SetInitialPose", self._set_initial_pose)
+        node.serve("set_initial_pose", "nav2_msgs/srv/SetInitialPose", self._take_initial_pose)
         node.serve("reinitialize_global_localization", "std_srvs/srv/Empty", self._search_anew)
         node.serve("request_nomotion_update", "std_srvs/srv/Empty", lambda _: EMPTY)
 
@@ -352,8 +352,8 @@ class Ros2Localizer(Publisher):
         if not section.publish_odom:
             self._driver.handle_tf(links)
 
-    def _next_transitions(self) -> list[Transition]:
-        return [transition for transition in TRANSITIONS if transition.start is self._state]
+    def _next_transitions(self, _: bytes) -> bytes:
+        return encode_transitions([transition for transition in TRANSITIONS if transition.start is self._state])
 
     def _change_state(self, request: bytes) -> bytes:
         with self._lock:
@@ -372,11 +372,7 @@ class Ros2Localizer(Publisher):
         _log.info("the node is %s", transition.goal.name.lower())
         return CdrWriter().byte(1).message()
 
-    def _set_initial_pose(self, request: bytes) -> bytes:
-        self._take_initial_pose(request)
-        return EMPTY
-
-    def _take_initial_pose(self, message: bytes) -> None:
+    def _take_initial_pose(self, message: bytes) -> bytes:
         try:
             prior = decode_initial_pose(message, self._section.map_frame)
         except (FleetmapError, ValueError) as error:
@@ -384,6 +380,7 @@ class Ros2Localizer(Publisher):
             raise
         self._refused.clear()
         self._intake.put_prior(prior)
+        return EMPTY
 
     def _search_anew(self, _: bytes) -> bytes:
         self._intake.put_forget()

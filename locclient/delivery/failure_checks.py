@@ -158,7 +158,10 @@ class _Walk:
         elif hasattr(value, "_fields"):
             self._members(value, value._fields, where)
         elif isinstance(value, Mapping | list | tuple):
-            self._many(list(value.items()) if isinstance(value, Mapping) else value, where)
+            if len(value) > MAX_ROWS:
+                raise _refused(where, f"{len(value)} of them, at most {MAX_ROWS} are read")
+            for place, each in enumerate(value.items() if isinstance(value, Mapping) else value):
+                self.check(each, f"{where}[{place}]")
         else:
             self._number(value, where)
 
@@ -177,12 +180,6 @@ class _Walk:
                 self._array(member, kind, at, lengths)
             else:
                 self.check(member, at)
-
-    def _many(self, values: Sequence[Any], where: str) -> None:
-        if len(values) > MAX_ROWS:
-            raise _refused(where, f"{len(values)} of them, at most {MAX_ROWS} are read")
-        for place, value in enumerate(values):
-            self.check(value, f"{where}[{place}]")
 
     def _array(self, array: AnyArray, kind: Kind | None, where: str, lengths: dict[str, int]) -> None:
         if kind is None:

@@ -47,8 +47,10 @@ class TileCache:
         with disk_errors(f"the cache {folder} cannot be used", "choose another folder"):
             folder.mkdir(parents=True, exist_ok=True)
             self._sizes = self._scan()
-            self._active = self._read_active()
-            self._kept = self._read_kept()
+            found = ((path.parent.name, self._read_record(path)) for path in folder.glob("sites/*/active"))
+            self._active = {site: record for site, record in found if record is not None}
+            kept = ((path.parent.parent.name, self._read_record(path)) for path in folder.glob("sites/*/kept/[0-9]*"))
+            self._kept = {(site, record.version): record for site, record in kept if record is not None}
 
     def __contains__(self, sha256: str) -> bool:
         return sha256 in self._sizes
@@ -107,7 +109,8 @@ class TileCache:
                 f"{missing[0]} first; {self._last_fault or 'fetch them again'}"
             )
         record = ActiveVersion(version, tuple(blobs))
-        if record != self._active.get(site) and not self._write(self._active_path(site), to_json(record)):
+        path = self._folder / "sites" / check_name(site, "site") / "active"
+        if record != self._active.get(site) and not self._write(path, to_json(record)):
             raise StoreError(f"version {version} of {site} cannot be made active: {self._last_fault}")
         self._active[site] = record
         self._reserved.pop(site, None)
@@ -182,18 +185,6 @@ class TileCache:
                     found.append((status.st_mtime_ns, path.name, status.st_size))
         return {name: size for _, name, size in sorted(found)}
 
-    def _read_active(self) -> dict[str, ActiveVersion]:
-        found = ((path.parent.name, self._read_record(path)) for path in self._folder.glob("sites/*/active"))
-        return {site: record for site, record in found if record is not None}
-
-    def _read_kept(self) -> dict[tuple[str, int], ActiveVersion]:
-        found = {}
-        for path in self._folder.glob("sites/*/kept/[0-9]*"):
-            record = self._read_record(path)
-            if record is not None:
-                found[path.parent.parent.name, record.version] = record
-        return found
-
     def _read_record(self, path: Path) -> ActiveVersion | None:
         try:
             record = msgspec.json.decode(path.read_bytes(), type=ActiveVersion)
@@ -231,9 +222,6 @@ class TileCache:
             self._note(f"{path} cannot be written ({error.strerror}); make space for the cache")
             return False
         return True
-
-    def _active_path(self, site: str) -> Path:
-        return self._folder / "sites" / check_name(site, "site") / "active"
 
     def _kept_path(self, site: str, version: int) -> Path:
         return self._folder / "sites" / check_name(site, "site") / "kept" / str(version)

@@ -128,16 +128,14 @@ def replay(
     if unread:
         result.notes.append(f"{len(unread)} of {number + 1} frames are left out; the first: {unread[0]}")
     if words := result.search.words:
-        result.notes += [words, *_lens_note(source.recording)]
+        result.notes.append(words)
+        recording = source.recording
+        fit = lens_of_frames(recording.calibration, recording.frame_stamps_ns, recording.read_frame)
+        if fit is not None and fit.is_doubtful:  # with a wrong lens model nothing in the map matches
+            result.notes.append(fit.words(recording.calibration.cameras[0]))
     if not truth_in_map and any(truth is not None for truth in result.truths):
         result.notes.append(result.alignment_note())
     return result
-
-
-def _lens_note(recording: Recording) -> list[str]:
-    """Return a note if another lens model fits the images better: with a wrong one nothing in the map matches."""
-    fit = lens_of_frames(recording.calibration, recording.frame_stamps_ns, recording.read_frame)
-    return [fit.words(recording.calibration.cameras[0])] if fit is not None and fit.is_doubtful else []
 
 
 def frame_record(outcome: Outcome, truth_map_from_body: Array | None, wall_s: float, decode_s: float) -> FrameRecord:

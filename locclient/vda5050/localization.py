@@ -76,8 +76,10 @@ class Localization:
         if fleet_from_map is None:
             position = None
         elif published.map_from_odom is not None and estimate.cov_rot_trans is not None:
-            map_from_base = published.map_from_odom @ published.odom_from_base
-            position = _position(fleet_from_map @ map_from_base, radius_95_m(estimate.cov_rot_trans), estimate.floor)
+            fleet_from_base = fleet_from_map @ published.map_from_odom @ published.odom_from_base
+            x_m, y_m = (float(value) for value in fleet_from_base[:2, 3])
+            heading_rad = float(atan2(fleet_from_base[1, 0], fleet_from_base[0, 0]))
+            position = Position(x_m, y_m, heading_rad, radius_95_m(estimate.cov_rot_trans), estimate.floor)
             is_localized = estimate.status in {Status.TRACKING, Status.DEGRADED} and position.radius_m <= lost_radius_m
         return Localization(
             estimate.status,
@@ -133,8 +135,3 @@ class Localization:
             error_description=f"the robot is not localized ({said})",
             error_hint=hint,
         )
-
-
-def _position(fleet_from_base: Array, radius_m: float, floor: str) -> Position:
-    x_m, y_m = (float(value) for value in fleet_from_base[:2, 3])
-    return Position(x_m, y_m, float(atan2(fleet_from_base[1, 0], fleet_from_base[0, 0])), radius_m, floor)

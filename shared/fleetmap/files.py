@@ -30,7 +30,9 @@ def write_atomically(path: Path, chunks: Iterable[bytes], mode: int = OWN_FILE) 
     try:
         try:
             for chunk in chunks:
-                _write_all(descriptor, chunk)
+                view = memoryview(chunk)
+                while view:
+                    view = view[os.write(descriptor, view) :]
             os.fsync(descriptor)
         finally:
             os.close(descriptor)
@@ -72,9 +74,3 @@ def _remove_leftovers(folder: Path, prefix: str) -> None:
             is_temporary = entry.name.startswith(prefix) and entry.name.endswith(TEMPORARY_SUFFIX)
             if is_temporary and time.time() - entry.stat(follow_symlinks=False).st_mtime > _LEFT_AFTER_S:
                 os.unlink(entry.path)  # noqa: PTH108
-
-
-def _write_all(descriptor: int, chunk: bytes) -> None:
-    view = memoryview(chunk)
-    while view:
-        view = view[os.write(descriptor, view) :]

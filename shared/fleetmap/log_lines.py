@@ -53,7 +53,9 @@ class LogLimit:
         with self._lock:
             now_s, told = self._clock_s(), ""
             if now_s - self._begun_s >= _MINUTE_S:
-                told = self._summary()
+                most = sorted(((count, key) for key, count in self._counts.items() if count > 1), reverse=True)[:5]
+                parts = [f"{count - 1} more of {key!r}" for count, key in most]
+                told = ", ".join([*parts, *([f"{self._others} of further keys"] if self._others else [])])
                 self._begun_s, self._counts, self._others = now_s, {}, 0
             if key not in self._counts and len(self._counts) >= _MAX_KEYS:
                 self._others += 1
@@ -64,9 +66,3 @@ class LogLimit:
             self._log.warning("in the minute before: %s", told)
         if is_first:
             self._log.warning(words, *values)
-
-    def _summary(self) -> str:
-        """Text about suppressed lines."""
-        most = sorted(((count, key) for key, count in self._counts.items() if count > 1), reverse=True)[:5]
-        parts = [f"{count - 1} more of {key!r}" for count, key in most]
-        return ", ".join([*parts, *([f"{self._others} of further keys"] if self._others else [])])

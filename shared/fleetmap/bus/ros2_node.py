@@ -55,7 +55,7 @@ class Ros2Node:
         self._show(endpoint)
         return send
 
-    def subscribe(self, topic: str, type_name: str, listen: Callable[[bytes], None], qos: Qos = Qos()) -> None:  # noqa: B008 - a value
+    def subscribe(self, topic: str, type_name: str, listen: Callable[[bytes], object], qos: Qos = Qos()) -> None:  # noqa: B008 - a value
         """Call `listen` with every message, on a thread of the bus; refused (FleetmapError) and invalid messages are logged."""
         endpoint = self._endpoint(SUBSCRIPTION, topic, type_name, qos)
 

@@ -63,9 +63,9 @@ def detect_in_slices(image: Image, settings: OrbSettings, clearance_px: Image | 
     image = np.ascontiguousarray(image)
     if noise_grey(image) > _NOISE_SHARE * settings.fast_threshold:
         image = np.asarray(cv2.GaussianBlur(image, (3, 3), 0), np.uint8)
-    levels = [
-        _detect_level(image, level, quota, settings, clearance_px) for level, quota in enumerate(_quotas(settings))
-    ]
+    shares = SCALE_FACTOR ** -np.arange(settings.levels)
+    quotas = [int(np.ceil(settings.count * share / shares.sum())) for share in shares]
+    levels = [_detect_level(image, level, quota, settings, clearance_px) for level, quota in enumerate(quotas)]
     yield
     octaves = np.repeat(np.arange(len(levels), dtype=np.int8), [len(pixels) for pixels, _ in levels])
     pixels, angles = (np.concatenate(parts) for parts in zip(*levels, strict=True))
@@ -102,11 +102,6 @@ def _described(
     # OpenCV scales level pixels up from their corners; positions in the image count from their centres.
     middle = 0.5 * (SCALE_FACTOR ** octaves.astype(np.float64) - 1.0)
     return Features(pixels.astype(np.float64) + middle[:, None], octaves, angles_deg, np.asarray(descriptors, np.uint8))
-
-
-def _quotas(settings: OrbSettings) -> list[int]:
-    shares = SCALE_FACTOR ** -np.arange(settings.levels)
-    return [int(np.ceil(settings.count * s / shares.sum())) for s in shares]
 
 
 def _detect_level(

@@ -145,10 +145,6 @@ class ExportReader:
             head = msgspec.json.decode(b"".join(self._span(_START.size, body)), type=ExportHead)
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
             raise self._damaged(str(error)) from error
-        self._check_head(head, body)
-        return head, body
-
-    def _check_head(self, head: ExportHead, body: int) -> None:
         kinds = [blob.kind for blob in head.blobs]
         if kinds[:1] != ["manifest"] or kinds.count("manifest") != 1 or kinds.count("archive") > 1:
             raise self._damaged("it does not begin with one manifest, or has several archives")
@@ -156,6 +152,7 @@ class ExportReader:
             raise self._damaged("a blob is larger than its kind may be")
         if body + sum(blob.bytes for blob in head.blobs) + DIGEST_BYTES != self._size:
             raise self._damaged(f"its head does not fit its {self._size} bytes")
+        return head, body
 
     def _span(self, start: int, end: int) -> Iterator[bytes]:
         while start < end:

@@ -159,7 +159,9 @@ class Rectifier:
         else:
             cam0_from_rect, baseline = _rectifying_rotation(cameras[0], cameras[1], self._numbers)
             used = cameras
-        self.camera = _common_pinhole(used, baseline)
+        cx, cy = np.mean([c.intrinsics_px[2:] for c in used], axis=0)
+        focal_px = float(np.mean([c.focal_px.mean() for c in used]))
+        self.camera = StereoCamera(focal_px, float(cx), float(cy), baseline, used[0].width_px, used[0].height_px)
         if pinhole is not None:
             self.camera = _as_pinhole(pinhole, self.camera)
         self.body_from_cam = cameras[0].body_from_cam @ se3(cam0_from_rect, np.zeros(3))
@@ -249,12 +251,6 @@ def _rectifying_rotation(
     y_axis = np.cross(half[:, 2], x_axis)
     y_axis /= np.linalg.norm(y_axis)
     return np.stack([x_axis, y_axis, np.cross(x_axis, y_axis)], axis=1), baseline_m
-
-
-def _common_pinhole(cameras: tuple[CameraCalibration, ...], baseline_m: float) -> StereoCamera:
-    focal = float(np.mean([c.focal_px.mean() for c in cameras]))
-    cx, cy = np.mean([c.intrinsics_px[2:] for c in cameras], axis=0)
-    return StereoCamera(focal, float(cx), float(cy), baseline_m, cameras[0].width_px, cameras[0].height_px)
 
 
 def _as_pinhole(pinhole: StereoCamera, own: StereoCamera) -> StereoCamera:

@@ -52,7 +52,8 @@ class RecordingSource:
             if number:
                 gap_ns = self._source.recorded_stamp_ns(number) - self._source.recorded_stamp_ns(number - 1)
                 recorded_s += min(gap_ns * 1e-9, _LONGEST_GAP_S)
-            if wait(self._ahead_s(recorded_s, begun_s)):
+            ahead_s = recorded_s / self._speed - (self._clock_s() - begun_s) if self._speed else 0.0
+            if wait(max(0.0, ahead_s)):
                 return
             while not self._speed and not intake.wait_for_room(_ROOM_WAIT_S):
                 if wait(0.0):
@@ -69,9 +70,6 @@ class RecordingSource:
 
     def close(self) -> None:
         self._recording.close()
-
-    def _ahead_s(self, recorded_s: float, begun_s: float) -> float:
-        return max(0.0, recorded_s / self._speed - (self._clock_s() - begun_s)) if self._speed else 0.0
 
 
 def _recording(section: SourceSection, topics: Topics, _map_frame: str) -> Source:

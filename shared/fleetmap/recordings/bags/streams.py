@@ -240,7 +240,9 @@ def _parts(
             if role in roles
         }
         if not given and CALIBRATION_ATTACHMENT not in container.attachments:
-            calibration = _marked(calibration, [f"{role}_depth" in roles for role in described])
+            marked = zip(calibration.cameras, described, strict=False)
+            marked_cameras = tuple(replace(camera, has_depth=f"{role}_depth" in roles) for camera, role in marked)
+            calibration = replace(calibration, cameras=marked_cameras)
         depths = {
             n: _images(roles[f"{described[n]}_depth"], f"depth images of cam{n}", log)
             for n in cameras
@@ -273,11 +275,6 @@ def _parts(
         priors=priors,
         ground_truth=ground_truth,
     )
-
-
-def _marked(calibration: RigCalibration, has_depth: Sequence[bool]) -> RigCalibration:
-    cameras = zip(calibration.cameras, has_depth, strict=False)
-    return replace(calibration, cameras=tuple(replace(camera, has_depth=mark) for camera, mark in cameras))
 
 
 def _collect(container: Container, topics: Topics, log: ReadLog) -> tuple[list[_Stream], list[Channel]]:

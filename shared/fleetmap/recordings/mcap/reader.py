@@ -131,7 +131,11 @@ class McapFile(KeptBytes):
                 if self._file.read() != MAGIC:
                     self._note("the file ends inside its index", "no message is missing")
                 break
-            at = self._next_indexed_chunk(at) if next_at is None else next_at
+            if next_at is None:
+                starts = self._read_index()
+                behind = bisect_right(starts, at)
+                next_at = starts[behind] if behind < len(starts) else None
+            at = next_at
         if self._too_large:
             limit = f"the limit of a record is {MAX_MESSAGE_BYTES >> 20} MiB"
             self.issues.append(DataIssue("records that are too large", f"{self._too_large} left out; {limit}"))
@@ -266,12 +270,6 @@ class McapFile(KeptBytes):
                 del self._chunks[next(iter(self._chunks))]
             self._chunks[at] = unpack(chunk.compression, chunk.data)
         return self._chunks[at]
-
-    def _next_indexed_chunk(self, after: int) -> int | None:
-        """Start of the first chunk after `after`, by the index at the file's end; None without one."""
-        chunk_starts = self._read_index()
-        behind = bisect_right(chunk_starts, after)
-        return chunk_starts[behind] if behind < len(chunk_starts) else None
 
     def _read_index(self) -> list[int]:
         """Starts of the chunks by the index at the file's end, empty without one; schemas and channels there are kept."""

@@ -97,7 +97,9 @@ class McapRecordingWriter:
                     topic = topics.camera(number)
                     self._write_image(topic, view.stamp_ns, f"cam{number}", image)
                     info = infos.get(number, f"{topic.rpartition('/')[0]}/camera_info")
-                    self._write_camera_info(info, view.stamp_ns, number)
+                    camera = self._calibration.cameras[number]
+                    data = messages.encode_camera_info(view.stamp_ns, f"cam{number}", camera)
+                    self._write(info, "sensor_msgs/CameraInfo", view.stamp_ns, data)
             if view.depth is not None:
                 topic = topics.depth_of(numbers[0]) if numbers[0] else topics.depth
                 self._write_image(topic, view.stamp_ns, f"cam{numbers[0]}", view.depth, is_depth=True)
@@ -176,10 +178,6 @@ class McapRecordingWriter:
         if rows.step_bytes == 0:
             raise RecordingError(f"{image.where or topic} at {stamp_ns}: an image in rows needs its step_bytes")
         self._write(topic, "sensor_msgs/Image", stamp_ns, messages.encode_image(stamp_ns, frame_id, rows))
-
-    def _write_camera_info(self, topic: str, stamp_ns: int, number: int) -> None:
-        data = messages.encode_camera_info(stamp_ns, f"cam{number}", self._calibration.cameras[number])
-        self._write(topic, "sensor_msgs/CameraInfo", stamp_ns, data)
 
     def _write(self, topic: str, type_name: str, stamp_ns: int, data: bytes) -> None:
         if not self._links_are_written:
