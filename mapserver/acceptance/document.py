@@ -75,17 +75,13 @@ def drawn(places_m: Array, starts: Sequence[tuple[Array, str]]) -> bytes:
 
 
 def _coverage(areas: Sequence[AreaFigures]) -> Section:
-    rows = [
-        (a.name, str(a.places), _directions(a.seen), ", ".join(a.missing) or ("none" if a.places else "–"))
-        for a in areas
-        if a.name not in (UNKNOWN_PLACE, ALL)
-    ]
+    rows = []
+    for a in areas:
+        if a.name not in (UNKNOWN_PLACE, ALL):
+            seen = ", ".join(f"{heading} {count}" for heading, count in a.seen.items()) or "–"
+            rows.append((a.name, str(a.places), seen, ", ".join(a.missing) or ("none" if a.places else "–")))
     words = ["Places of the map by the direction in which the camera looked (E along x of the map, N along y)."]
     return Section("Coverage", words, header=("area", "places", "seen facing", "not driven facing"), rows=rows)
-
-
-def _directions(seen: Mapping[str, int]) -> str:
-    return ", ".join(f"{heading} {count}" for heading, count in seen.items()) or "–"
 
 
 def _errors(report: Report, areas: Sequence[AreaFigures]) -> Section:

@@ -172,7 +172,11 @@ def examined(
         numbers = spread(np.flatnonzero(known & reference.free), request.pictures)
         pictures = list(_pictures(recording, [(int(selected[n]), truths[n]) for n in numbers], version.view))
         starts = [_start(frames, reference.trajectory) for frames in report.starts]
-        errors_m = [] if reference.trajectory is localised else _errors_m(localised, reference.trajectory)
+        poses = zip(localised.stamps_ns.tolist(), localised.frame_from_body, strict=True)
+        compared = [
+            (pose, reference.trajectory.at(stamp)) for stamp, pose in poses if reference.trajectory is not localised
+        ]
+        errors_m = [_off(map_from_body, truth)[0] for map_from_body, truth in compared if truth is not None]
         docks_mm = [
             1e3 * float(np.linalg.norm((there @ se3_inverse(recording.calibration.base_from_body) - prior.map_from_base)[:2, 3]))
             for prior in recording.priors
@@ -225,13 +229,6 @@ def _reference(
 def _off(map_from_body: Array, truth: Array) -> tuple[float, float]:
     off = se3_inverse(truth) @ map_from_body
     return float(np.linalg.norm(off[:3, 3])), rotation_angle_rad(off[:3, :3])
-
-
-def _errors_m(localised: Trajectory, reference: Trajectory) -> list[float]:
-    pairs = zip(localised.stamps_ns.tolist(), localised.frame_from_body, strict=True)
-    return [
-        _off(map_from_body, truth)[0] for stamp, map_from_body in pairs if (truth := reference.at(stamp)) is not None
-    ]
 
 
 def _silent(localised: Trajectory, reference: Trajectory) -> int:

@@ -56,8 +56,11 @@ def pdf(report: Report, shown: Sequence[Section], picture: bytes) -> bytes:
                 ListFlowable([_text(words) for words in section.items], bulletType="bullet", start="–", leftIndent=10)
             )
         if section.rows:
-            cells = [[_text(cell, bold=not n) for cell in row] for n, row in enumerate([section.header, *section.rows])]
-            story.append(Table(cells, repeatRows=1, style=_LOOK, colWidths=_widths([section.header, *section.rows])))
+            rows = [section.header, *section.rows]
+            cells = [[_text(cell, bold=not n) for cell in row] for n, row in enumerate(rows)]
+            longest = [min(40, max(6, *map(len, column))) for column in zip(*rows, strict=True)]
+            widths = [_WIDTH * length / sum(longest) for length in longest]
+            story.append(Table(cells, repeatRows=1, style=_LOOK, colWidths=widths))
         story.append(Spacer(0, 2 * mm))
     data = io.BytesIO()
     title = f"Acceptance report of {report.site}, version {report.version}"
@@ -69,9 +72,3 @@ def pdf(report: Report, shown: Sequence[Section], picture: bytes) -> bytes:
 def _text(words: str, style: str = "BodyText", color: colors.Color | None = None, *, bold: bool = False) -> Paragraph:
     inner = f'<font name="DejaVu-Bold">{escape(words)}</font>' if bold else escape(words)
     return Paragraph(inner if color is None else f'<font color="{color.hexval()}">{inner}</font>', _STYLES[style])
-
-
-def _widths(rows: Sequence[Sequence[str]]) -> list[float]:
-    """Return widths of the columns by their longest words, the page together."""
-    longest = [min(40, max(6, *(len(row[n]) for row in rows))) for n in range(len(rows[0]))]
-    return [_WIDTH * length / sum(longest) for length in longest]

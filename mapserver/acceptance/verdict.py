@@ -78,7 +78,7 @@ def _of_areas(report: Report, settings: GateSettings) -> Iterator[tuple[str, str
             )
         starts = area.starts.found_of_all
         if KNOWN_STARTS not in report.promises and _is_below(starts, settings):
-            alike = _lookalikes(area, report)
+            alike = ", ".join([alike.other for alike in report.similar if alike.area == area.name][:_NAMED])
             if area.starts.ambiguous > area.starts.lost:
                 yield (
                     f"{area.name} looks like {alike or 'another place'}: {area.starts.ambiguous} of {starts.tries} starts stay AMBIGUOUS",
@@ -89,11 +89,6 @@ def _of_areas(report: Report, settings: GateSettings) -> Iterator[tuple[str, str
                     f"{area.name}: {area.starts.lost} of {starts.tries} starts without a guess stay lost",
                     f"{area.name}: survey it",
                 )
-
-
-def _lookalikes(area: AreaFigures, report: Report) -> str:
-    """Return the places that look like those of an area, as text."""
-    return ", ".join([alike.other for alike in report.similar if alike.area == area.name][:_NAMED])
 
 
 def _of_site(report: Report, settings: GateSettings) -> Iterator[tuple[str, str]]:

@@ -85,7 +85,9 @@ def actor_of(request: Request, typed: str | None, reason: str) -> Actor:
     """Return the actor of an API request: the authenticated operator, or `typed` if sign-in is off."""
     who: Identity | None = getattr(request.state, "operator", None)
     if who is None:
-        return _typed(request, typed or "", reason)
+        if not typed:
+            raise HTTPException(422, "`actor` is missing: name the person who acts")
+        return Actor(typed, reason, "", address_of(request.scope))
     if typed and typed != who.name:
         raise HTTPException(403, f"the request comes from {who.name} and names {typed[:80]!r}; leave `actor` out")
     return who.actor(reason)
@@ -101,12 +103,6 @@ def _acting(
 
 By = Annotated[Actor, Depends(_acting)]
 """The actor of a request whose body is a file, with author and reason in the query."""
-
-
-def _typed(request: Request, name: str, reason: str) -> Actor:
-    if not name:
-        raise HTTPException(422, "`actor` is missing: name the person who acts")
-    return Actor(name, reason, "", address_of(request.scope))
 
 
 def cookie_name(scope: Scope) -> str:
@@ -183,10 +179,14 @@ class Guard:
         if right is None:
             return None
         if not self._settings.is_sign_in_on:
-            is_open = right not in {Right.OPERATORS, Right.ROBOTS} or _is_from_here(scope)
+            # The server's own machine, and not for somebody else, as a proxy on it does
+            is_from_here = is_loopback_name(address_of(scope)) and _FORWARDED.isdisjoint(_headers(scope))
+            is_open = right not in {Right.OPERATORS, Right.ROBOTS} or is_from_here
             words = "without operators only the server's own machine may do this; `mapserver operators add NAME --role admin` there"
             return None if is_open else _refuse(scope, 403, words)
-        who = self._settings.identify(scope, uses=_is_somebodys(scope))
+        headers = _headers(scope)
+        is_by_itself = "fleetmap-renewal" in headers or headers.get("accept") == "text/event-stream"  # an open page
+        who = self._settings.identify(scope, uses=not is_by_itself)
         if who is None and (name := proxied_name(scope)):
             return _refuse(
                 scope, 403, f"none of the groups of {name} has a role here; --sign-in-group gives one a role"
@@ -228,17 +228,6 @@ def _needed(scope: Scope) -> Right | None:
         if pattern.match(path):
             return right
     return Right.READ if scope["method"] in {"GET", "HEAD", "OPTIONS"} else Right.CHANGE
-
-
-def _is_from_here(scope: Scope) -> bool:
-    """True if the server's own machine sends the request, and not for somebody else, as a proxy on it does."""
-    return is_loopback_name(address_of(scope)) and _FORWARDED.isdisjoint(_headers(scope))
-
-
-def _is_somebodys(scope: Scope) -> bool:
-    """True if a user sends the request, not an open page by itself."""
-    headers = _headers(scope)
-    return "fleetmap-renewal" not in headers and headers.get("accept") != "text/event-stream"
 
 
 def _is_for_a_page(scope: Scope) -> bool:

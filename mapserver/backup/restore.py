@@ -98,7 +98,10 @@ def restore(
                     f"{folder} holds {others[0]!r} already; name a new folder, so that nothing is overwritten"
                 )
             name, snapshot = target.read(name)
-            _check_room(folder, snapshot.written_bytes())
+            needed, free = snapshot.written_bytes(), shutil.disk_usage(folder).free
+            if needed > free:
+                words = f"the snapshot has up to {needed} bytes, the disk of {folder} {free}"
+                raise StoreError(f"{words}; name a folder with more room")
             keys, number, part = _keys(target, snapshot, list(identities)), target.count_restore(), folder / _PART
             robots = 0
             shutil.rmtree(part, ignore_errors=True)  # of a killed restoration
@@ -118,14 +121,6 @@ def restore(
                 shutil.rmtree(part, ignore_errors=True)
             sync_path(folder)
     return RestoreReport(name, snapshot.versions, *counts, tuple(sorted(keys)), lists, tuple(snapshot.missing))
-
-
-def _check_room(folder: Path, needed: int) -> None:
-    free = shutil.disk_usage(folder).free
-    if needed > free:
-        raise StoreError(
-            f"the snapshot has up to {needed} bytes, the disk of {folder} {free}; name a folder with more room"
-        )
 
 
 def _sign(store: MapStore, number: int, target: BackupTarget) -> Literal["none", "new", "ahead", "old"]:

@@ -180,7 +180,8 @@ def guessed_rig(given: RigCalibration, matches: RawMatches) -> RigCalibration:
 
     RecordingError if the focal length is unobservable.
     """
-    width, baseline_m = given.cameras[0].width_px, _baseline_m(given)
+    width = given.cameras[0].width_px
+    left_m, right_m = (camera.body_from_cam[:3, 3] for camera in given.cameras)
     if len(matches.pair) < 100 or not matches.motions:
         raise RecordingError(
             f"{len(matches.pair)} matches between the cameras and {len(matches.motions)} motions of the left one: too few to "
@@ -199,13 +200,10 @@ def guessed_rig(given: RigCalibration, matches: RawMatches) -> RigCalibration:
     left = _distorted(given.cameras[0], focal_px, found.distortion)
     right = replace(left, intrinsics_px=left.intrinsics_px + np.concatenate([np.zeros(2), found.centre * width]))
     apart = np.array([1.0, *found.direction])
-    body_from_right = left.body_from_cam @ se3(so3_exp(found.turn), apart * (baseline_m / np.linalg.norm(apart)))
+    body_from_right = left.body_from_cam @ se3(
+        so3_exp(found.turn), apart * (np.linalg.norm(right_m - left_m) / np.linalg.norm(apart))
+    )
     return replace(given, cameras=(left, replace(right, body_from_cam=body_from_right)))
-
-
-def _baseline_m(rig: RigCalibration) -> float:
-    left, right = (camera.body_from_cam[:3, 3] for camera in rig.cameras)
-    return float(np.linalg.norm(right - left))
 
 
 class _EpipolarProblem:

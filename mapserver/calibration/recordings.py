@@ -22,7 +22,7 @@ from mapserver.calibration.problem import CalibrationData, MotionState
 from mapserver.survey.odometry_pass import parts_between_lifts
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import begin_survey
-from mapserver.survey.state import Keyframe, Landmarks, SurveyState
+from mapserver.survey.state import Keyframe, SurveyState
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyInputs, SurveyTools
 
 P = CalibrationParameter
@@ -143,7 +143,10 @@ def busiest_stretch(
     chosen = max((np.isin(begun.odometry.keyframe_frames, part) for part in parts), key=np.count_nonzero)
     chosen[chosen] = _busiest(begun.state.of(chosen))
     part = begun.state.of(chosen)
-    marks, motion = _thinned(part.landmarks, len(part.stamps_ns)), part.motion
+    motion, marks = part.motion, part.landmarks
+    share = min(1.0, _SEEN * len(part.stamps_ns) / max(len(marks.obs_landmark), 1))
+    kept = np.diff(np.floor(share * np.arange(len(marks.points_map) + 1))) > 0  # an even choice
+    marks = marks.keep_observations(kept[marks.obs_landmark], 1)
     order = np.argsort(marks.obs_landmark, kind="stable")
     number = np.flatnonzero(chosen).tolist()
     pixels = _with_rows(marks.obs_pixels, marks.obs_keyframe, [keyframes[k] for k in number])
@@ -165,13 +168,6 @@ def busiest_stretch(
         wheel=wheel,
         bias_px=_BIAS_PX,
     )
-
-
-def _thinned(marks: Landmarks, keyframes: int) -> Landmarks:
-    """Return an even choice of the landmarks, with about _SEEN of them in each keyframe."""
-    share = min(1.0, _SEEN * keyframes / max(len(marks.obs_landmark), 1))
-    kept = np.diff(np.floor(share * np.arange(len(marks.points_map) + 1))) > 0
-    return marks.keep_observations(kept[marks.obs_landmark], 1)
 
 
 def _busiest(state: SurveyState) -> NDArray[np.bool_]:

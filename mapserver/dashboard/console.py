@@ -214,7 +214,9 @@ class Console:
                 site = site if site in sites else next(iter(sites), "")
             elif site not in growing:
                 site = await load(self.services.maps.chosen_site, site)
-            check_query(request, knows)
+            if unknown := [name for name in request.query_params if name not in {"site", *knows}]:
+                names = ", ".join(("site", *knows))
+                raise UsageError(f"unknown parameter {unknown[0][:40]!r}; this page knows {names}")
             zone = zone_of(request.cookies.get(_ZONE_COOKIE))
             context = PageContext(root, site, zone, request.query_params)
             found = {"context": context} | await load(lambda: fill(self.services, context, **request.path_params))
@@ -250,13 +252,6 @@ class Console:
 async def load(function: Callable[..., T], *arguments: object) -> T:
     """Result of a blocking function, computed on another thread."""
     return await asyncio.to_thread(function, *arguments)
-
-
-def check_query(request: Request, knows: Sequence[str]) -> None:
-    """Raises UsageError for a query parameter beside `site` and those that a page knows."""
-    unknown = [name for name in request.query_params if name not in {"site", *knows}]
-    if unknown:
-        raise UsageError(f"unknown parameter {unknown[0][:40]!r}; this page knows {', '.join(('site', *knows))}")
 
 
 def number(text: str | None, name: str) -> int | None:

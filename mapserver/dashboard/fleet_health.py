@@ -119,6 +119,8 @@ class HealthData:
         days = [_sum(hours, next_hour - DAY_H * (n + 1), next_hour - DAY_H * n) for n in reversed(range(DAYS_SHOWN))]
         week = _sum(hours, next_hour - DAY_H * 8, next_hour - DAY_H)
         robots = self._store.fleet.counters(site, "robot", since_hour=next_hour - DAY_H)
+        ended_ns = now_ns - _ENDED_SHOWN_NS
+        trials = [row for row in self._store.canaries(site) if row.ended_ns is None or row.ended_ns > ended_ns][:3]
         has_areas = bool(self._store.areas(site))
         is_mapped = any(info.site == site for info in self._store.sites())
         return SiteHealth(
@@ -127,7 +129,7 @@ class HealthData:
             trend_words(days[-1], week),
             tuple(rate(counts.position_failures, counts.robot_days) for counts in days),
             {robot: kpis(counts) for (_, robot), counts in robots.items()},
-            self._trials(site, now_ns),
+            tuple(trial_of(row, find(self._store, row, self._canary, now_ns)) for row in trials),
             tuple(resurvey_list(self._store, site, self._resurvey, now_ns).tiles) if is_mapped else (),
             tuple(self._area_trends(site, next_hour - WEEK_H, next_hour)),
             has_areas,
@@ -150,11 +152,6 @@ class HealthData:
             for a, b in ((first, end), (first - WEEK_H, first))
         )
         return area_trends(now, before)
-
-    def _trials(self, site: str, now_ns: int) -> tuple[Trial, ...]:
-        rows = self._store.canaries(site)
-        recent = [row for row in rows if row.ended_ns is None or now_ns - row.ended_ns < _ENDED_SHOWN_NS][:3]
-        return tuple(trial_of(row, find(self._store, row, self._canary, now_ns)) for row in recent)
 
 
 def _sum(hours: Mapping[int, Counters], since: int, until: int) -> Counters:

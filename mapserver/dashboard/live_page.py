@@ -42,6 +42,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         tone = "bad"
         words = f"Nothing was heard of it for {survey.seconds_since:.0f} s; look at the survey robot."
     drafted = state.version if state.phase == "stored" else None
+    way = state.path()[:, :2] if len(state.path()) else np.zeros((1, 2))
     return {
         "state": state,
         "tone": tone,
@@ -52,7 +53,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         "picture": b64encode(state.picture).decode(),
         "scene": {
             "label": f"Survey of {state.site} so far",
-            "box": _box(state.path()),
+            "box": [*(way.min(axis=0) - _MARGIN_M).tolist(), *(way.max(axis=0) + _MARGIN_M).tolist()],  # in sight first
             "layers": _layers(state),
             "follows": True,
         },
@@ -101,12 +102,6 @@ def _units(state: LiveSurveyState) -> str:
 def _hue(number: int) -> int:
     """Degrees, as different as can be from those of the parts before."""
     return round(250 + number * 137.5) % 360
-
-
-def _box(way: Array) -> list[float]:
-    """What is in sight first."""
-    low, high = (way[:, :2].min(axis=0), way[:, :2].max(axis=0)) if len(way) else (np.zeros(2), np.zeros(2))
-    return [*(low - _MARGIN_M).tolist(), *(high + _MARGIN_M).tolist()]
 
 
 def _layers(state: LiveSurveyState) -> list[Layer]:

@@ -109,7 +109,9 @@ def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> Gyr
     centred = gyro[offset] - gyro[offset].mean(axis=0)
     turned = centred @ body_from_gyro.T
     scale = float((turned * turned).sum() / max((turned * seen).sum(), 1e-12))
-    signed = _signed_axes(seen, centred / scale, turned / scale)
+    most = 2.0 * (float(((turned / scale - seen) ** 2).sum()) + _AS_WELL * float((seen**2).sum()))
+    good = [axes for axes in SIGNED_AXES if float(((centred / scale @ axes.T - seen) ** 2).sum()) <= most]
+    signed = max(good, key=lambda axes: float(np.trace(axes)), default=None)
     parts = []
     for part in np.array_split(np.arange(len(all_seen)), _PARTS):
         shown = _scores(all_gyro[:, part], all_seen[part], body_from_gyro)
@@ -133,12 +135,6 @@ def _inliers(seen: Array, turned: Array) -> Array:
     apart = seen - share * turned
     off = np.linalg.norm(apart - np.median(apart, axis=0), axis=1)
     return np.asarray(off <= _REACH * max(float(np.median(off)), _NOISE_RADPS))
-
-
-def _signed_axes(seen: Array, gyro: Array, best: Array) -> Array | None:
-    least = float(((best - seen) ** 2).sum()) + _AS_WELL * float((seen**2).sum())
-    good = [axes for axes in SIGNED_AXES if float(((gyro @ axes.T - seen) ** 2).sum()) <= 2.0 * least]
-    return max(good, key=lambda axes: float(np.trace(axes)), default=None)
 
 
 def _why_not(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> tuple[str, str] | None:

@@ -127,7 +127,11 @@ def run_checks(
     findings += [*calibration.findings, images.sharpness(seen.variances)]
     findings += [images.flicker_check(recording, frames.read), _readable(frames)]
     if len(imu):
-        findings.append(_repeated_images(frames.repeats, min(turn_frames, len(recording))))
+        count = min(turn_frames, len(recording))
+        bad = f"an image repeats the previous one {frames.repeats} times in {count} frames; record each image once, with its own stamp"
+        limits = Limits(0.02, 0.1, "of the frames")
+        good = "every frame has an image of its own"
+        findings.append(judge("repeated images", frames.repeats / count, limits, good, bad))
     known = (
         {}
         if seen.wheels is None or not seen.wheels.size
@@ -280,13 +284,6 @@ def _busiest_start(recording: Recording, count: int) -> int:
     a = np.searchsorted(imu.stamps_ns, stamps_ns[starts])
     b = np.searchsorted(imu.stamps_ns, stamps_ns[starts + count])
     return int(starts[np.argmax(total[b] - total[a])])
-
-
-def _repeated_images(repeats: int, count: int) -> Finding:
-    """Count the images among `count` frames that equal the previous one and differ from the next."""
-    bad = f"an image repeats the previous one {repeats} times in {count} frames; record each image once, with its own stamp"
-    limits, good = Limits(0.02, 0.1, "of the frames"), "every frame has an image of its own"
-    return judge("repeated images", repeats / count, limits, good, bad)
 
 
 def _readable(frames: _Frames) -> Finding:

@@ -138,7 +138,8 @@ def checked(
         again = [f for f in measured.findings if f.verdict in (Verdict.WARN, Verdict.FAIL)]
     elif P.TIME_OFFSET.value not in held and gyro_s is not None and abs(gyro_s) >= _CORRECTED_FROM_S:
         corrections = {P.TIME_OFFSET.value: round(gyro_s, 7)}
-        rig = _with_clock(rig, gyro_s)
+        moved = tuple(replace(camera, imu_minus_cam_s=camera.imu_minus_cam_s + gyro_s) for camera in rig.cameras)
+        rig = replace(rig, cameras=moved)
     settled = [f for f in checks.findings if f.name not in corrections or f.verdict is not Verdict.WARN]
     found = rig_evidence(given, [*settled, *(replace(f, sentence=f"after its correction {f.sentence}") for f in again)])
     return CheckedRecording(rig, checks.findings, found, corrections, held)
@@ -189,9 +190,3 @@ def _refuse(recording: Recording, findings: Sequence[Finding]) -> None:
                 f"{recording.path}: {finding.name}: {finding.sentence}; a map of it would be wrong. "
                 "`mapserver doctor` shows every check"
             )
-
-
-def _with_clock(rig: RigCalibration, correction_s: float) -> RigCalibration:
-    """Return the calibration with this added to the time between IMU and cameras."""
-    moved = tuple(replace(camera, imu_minus_cam_s=camera.imu_minus_cam_s + correction_s) for camera in rig.cameras)
-    return replace(rig, cameras=moved)

@@ -13,7 +13,7 @@ from typing import Any, TextIO
 
 from fleetmap.errors import BusyError, FleetmapError, disk_errors
 from fleetmap.files import OWN_FILE
-from mapserver.store import JobInfo, MapStore
+from mapserver.store import MapStore
 
 INTERRUPTED = "interrupted"
 """Key in the report of a job that was ended as interrupted."""
@@ -50,7 +50,8 @@ def end_interrupted(maps: MapStore, now_ns: int) -> list[int]:
     """Mark jobs as failed that are recorded as running without a process; return their numbers."""
     ended, store = [], maps.folder
     for job in maps.running_jobs():
-        if _is_young(job, now_ns) or _is_held(maps, job.id):
+        begun_s = datetime.fromisoformat(job.started).astimezone(UTC).timestamp()
+        if 0 <= now_ns / 1e9 - begun_s < _YOUNG_S or _is_held(maps, job.id):
             continue
         message = "was interrupted: its process has ended; run it again, a nightly run resumes at the next start"
         maps.update_job(job.id, "failed", message, job.report | {INTERRUPTED: True})
@@ -58,10 +59,6 @@ def end_interrupted(maps: MapStore, now_ns: int) -> list[int]:
             _path(store, job.id).unlink()
         ended.append(job.id)
     return ended
-
-
-def _is_young(job: JobInfo, now_ns: int) -> bool:
-    return 0 <= now_ns / 1e9 - datetime.fromisoformat(job.started).astimezone(UTC).timestamp() < _YOUNG_S
 
 
 def _is_held(maps: MapStore, job: int) -> bool:

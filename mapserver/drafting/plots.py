@@ -31,7 +31,10 @@ _FLAT_AXES = {(2, 1): (0, 1), (2, -1): (1, 0), (1, 1): (2, 0), (1, -1): (0, 2), 
 def draw_survey(title: str, survey_map: SurveyMap, loops: Loops, found: Accuracy, report: BuildReport) -> bytes:
     """Return a PNG: the map from above and, with ground truth, position errors over time beside it."""
     with mpl.rc_context({"font.size": 9, "axes.edgecolor": _GRID, "axes.labelcolor": _INK, "text.color": _INK}):
-        flat = _flat_axes(survey_map)
+        # By the axis of the map that points up in most images, also without an IMU
+        up_map = -(survey_map.map_from_body @ survey_map.body_from_cam)[:, :3, 1].mean(axis=0)
+        axis = int(np.argmax(np.abs(up_map)))
+        flat = list(_FLAT_AXES[axis, 1 if up_map[axis] > 0 else -1])
         landmarks = survey_map.points_map[:: len(survey_map.points_map) // _MAX_LANDMARKS + 1, flat]
         low, high = _view(survey_map.trajectory.positions_m[:, flat], landmarks)
         width, height = high - low
@@ -50,14 +53,6 @@ def draw_survey(title: str, survey_map: SurveyMap, loops: Loops, found: Accuracy
         buffer = io.BytesIO()
         figure.savefig(buffer, format="png", dpi=_DPI, facecolor="white", metadata={"Software": None})
     return buffer.getvalue()
-
-
-def _flat_axes(survey_map: SurveyMap) -> list[int]:
-    """Return them from the map axis that points up in most images, also without an IMU."""
-    map_from_cam = survey_map.map_from_body @ survey_map.body_from_cam
-    up_map = -map_from_cam[:, :3, 1].mean(axis=0)
-    axis = int(np.argmax(np.abs(up_map)))
-    return list(_FLAT_AXES[axis, 1 if up_map[axis] > 0 else -1])
 
 
 def _view(path: Array, landmarks: Array) -> tuple[Array, Array]:

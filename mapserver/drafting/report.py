@@ -109,11 +109,6 @@ def check_truth(what: str, stamps_ns: Any, truth: Trajectory | None) -> None:
         )
 
 
-def path_length_m(trajectory: Trajectory) -> float:
-    """Return the length along the positions, in metres."""
-    return float(np.linalg.norm(np.diff(trajectory.positions_m, axis=0), axis=1).sum())
-
-
 def make_report(
     recordings: "Sequence[Surveyed]",
     joined: MergedMap,
@@ -127,6 +122,8 @@ def make_report(
     survey_map = joined.map
     taken = [s for s, outcome in zip(recordings, joined.outcomes, strict=True) if outcome.joined]
     duration_s = sum(float(t.stamps_ns[-1] - t.stamps_ns[0]) * 1e-9 for t in joined.trajectories)
+    steps_m = [np.linalg.norm(np.diff(t.positions_m, axis=0), axis=1) for t in joined.trajectories]
+    path_m = sum(float(lengths_m.sum()) for lengths_m in steps_m)
     loops = [s.survey.loops.counts() for s in taken]
     culled = [asdict(s.survey.culled) for s in taken]
     return BuildReport(
@@ -134,7 +131,7 @@ def make_report(
         duration_s=round(duration_s, 6),
         seconds=round(seconds, 3),
         realtime_factor=round(duration_s / max(seconds, 1e-9), 4),
-        path_m=round(sum(path_length_m(t) for t in joined.trajectories), 4),
+        path_m=round(path_m, 4),
         keyframes=len(survey_map.keyframe_stamps_ns),
         landmarks=len(survey_map.landmark_ids),
         map_bytes=None,
@@ -149,23 +146,23 @@ def make_report(
         findings={s.entry.name: s.remarks() for s in recordings},
         checks={s.entry.name: s.checks for s in recordings},
         corrections={s.entry.name: s.corrections for s in taken if s.corrections},
-        sessions=sessions_report([s.entry.name for s in recordings], joined),
+        sessions=[
+            {
+                "recording": recordings[o.number].entry.name,
+                "joined": o.joined,
+                "verdict": o.verdict.value,
+                "reason": o.reason,
+            }
+            | ({} if o.evidence is None else {"evidence": asdict(o.evidence)})
+            | ({} if o.counts is None else asdict(o.counts))
+            for o in joined.outcomes
+        ],
         joins={s.entry.name: o.verdict.value for s, o in zip(recordings, joined.outcomes, strict=True) if o.joined},
         directions=evidence.directions or [],
         starts=evidence.starts,
         views=evidence.views,
         lookalike_recall=None if evidence.starts is None else evidence.starts.lookalike_recall,
     )
-
-
-def sessions_report(names: list[str], joined: MergedMap) -> list[dict[str, Any]]:
-    """Return the result of every recording, in their order."""
-    return [
-        {"recording": names[o.number], "joined": o.joined, "verdict": o.verdict.value, "reason": o.reason}
-        | ({} if o.evidence is None else {"evidence": asdict(o.evidence)})
-        | ({} if o.counts is None else asdict(o.counts))
-        for o in joined.outcomes
-    ]
 
 
 def report_details(

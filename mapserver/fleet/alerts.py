@@ -83,8 +83,11 @@ def active_alerts(store: MapStore, fleet: Fleet, settings: AlertSettings, now_ns
 def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site: str, now_ns: int) -> Iterator[Alert]:
     yield from _failure_rate(store, settings, site, now_ns)
     for robot in fleet.robots(site):
-        yield from _lost(robot, settings, now_ns)
         health = robot.last_health or {}
+        since_ns = lost_since_ns(robot, settings, now_ns)
+        if since_ns is not None:
+            words = f"has had no known position for {(now_ns - since_ns) / 60e9:.0f} min ({health.get('status')})"
+            yield Alert("FleetmapRobotLost", site, robot.robot, since_ns, f"{robot.robot} of {site} {words}")
         if Flag.OVERLOADED in health.get("flags", ()) and robot.seconds_since <= _HEARD_WITHIN_S:
             words = f"{robot.robot} of {site} is too slow: {dropped_words(health.get('metrics', {}))}"
             yield Alert("FleetmapRobotOverloaded", site, robot.robot, now_ns, words)
@@ -126,11 +129,3 @@ def lost_since_ns(robot: RobotStatus, settings: AlertSettings, now_ns: int) -> i
     if status not in _LOST or since_ns is None or robot.seconds_since > _HEARD_WITHIN_S:
         return None
     return since_ns if now_ns - since_ns >= settings.lost_s * 1e9 else None
-
-
-def _lost(robot: RobotStatus, settings: AlertSettings, now_ns: int) -> Iterator[Alert]:
-    since_ns = lost_since_ns(robot, settings, now_ns)
-    if since_ns is not None:
-        told = f"{(now_ns - since_ns) / 60e9:.0f} min ({(robot.last_health or {}).get('status')})"
-        words = f"{robot.robot} of {robot.site} has had no known position for {told}"
-        yield Alert("FleetmapRobotLost", robot.site, robot.robot, since_ns, words)

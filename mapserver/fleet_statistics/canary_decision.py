@@ -78,8 +78,12 @@ def judge_canary(canary: Counters, others: Counters, age_days: float, settings: 
     elif age_days >= settings.max_days:
         why = f"after {age_days:.1f} days it is still not shown to be within the margin ({within:.1%})"
         action = "roll_back"
+    elif ours.robot_days <= 0 or theirs.robot_days <= 0:
+        missing = "it" if ours.robot_days <= 0 else "the version before"
+        action, why = "wait", f"no decision before robots drive with {missing}"
     else:
-        action, why = "wait", _why_wait(ours, theirs, within, evidence)
+        why = f"too early to decide: within the margin with {within:.1%}, evidence of harm {evidence:.2g} to 1"
+        action = "wait"
     allowed = f"{settings.margin_ratio:g} times the rate without it, plus {settings.margin_per_robot_day:g} failures per robot-day"
     reason = f"{why}. With it: {_rate_text(ours)}; without: {_rate_text(theirs)}. The limit is {allowed}"
     return CanaryFinding(action, reason, ours, theirs, evidence, within)
@@ -112,13 +116,6 @@ def within_margin(canary: Rate, others: Rate, margin_ratio: float, margin_per_ro
     other_rates = scipy.special.gammaincinv(others.events + 0.5, _QUANTILES) / others.robot_days
     limits = margin_ratio * other_rates + margin_per_robot_day
     return float(np.mean(scipy.special.gammainc(canary.events + 0.5, canary.robot_days * limits)))
-
-
-def _why_wait(canary: Rate, others: Rate, within: float, evidence: float) -> str:
-    if canary.robot_days <= 0 or others.robot_days <= 0:
-        missing = "it" if canary.robot_days <= 0 else "the version before"
-        return f"no decision before robots drive with {missing}"
-    return f"too early to decide: within the margin with {within:.1%}, evidence of harm {evidence:.2g} to 1"
 
 
 def _rate_text(found: Rate) -> str:

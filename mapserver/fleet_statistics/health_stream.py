@@ -55,7 +55,8 @@ class HealthStream:
         if self._is_known(health):
             return None
         figures = _figures(health)
-        if self._is_new_run(health, figures):
+        went_back = figures.get("frames", math.inf) < self._figures.get("frames", -math.inf)
+        if self._stamp_ns is None or went_back or health.stamp_ns < self._stamp_ns:
             self._begin_run()
         dt_ms = self._elapsed_ms(health)
         counts = Counters(reports=1, observed_ms=dt_ms)
@@ -80,12 +81,6 @@ class HealthStream:
         is_set_back = before_ns is not None and 0 < health.wall_ns - before_ns <= MAX_GAP_S * 1e9
         return not (is_set_back and self._wall_ns - health.wall_ns > MAX_GAP_S * 1e9)
 
-    def _is_new_run(self, health: RobotHealth, figures: dict[str, float]) -> bool:
-        if self._stamp_ns is None:
-            return True
-        went_back = figures.get("frames", math.inf) < self._figures.get("frames", -math.inf)
-        return went_back or health.stamp_ns < self._stamp_ns
-
     def _begin_run(self) -> None:
         self._stamp_ns, self._figures = None, {}
         self._has_fix = self._fix_counted = self.in_failure = False
@@ -101,22 +96,24 @@ class HealthStream:
             dt_ms = (health.wall_ns - self._wall_ns) // 1_000_000
         return dt_ms if 0 < dt_ms <= MAX_GAP_S * 1e3 else 0
 
-    def _is_stale(self, health: RobotHealth, dt_ms: int) -> bool:
-        """True if the last frame is so old that the status is outdated. Ends with the next frame."""
-        self._silent_ms = self._silent_ms + dt_ms if health.stamp_ns == self._stamp_ns else 0
-        return self._silent_ms > BLIND_S * 1e3
-
     def _count_status(
         self, counts: Counters, health: RobotHealth, figures: dict[str, float], dt_ms: int, speed_mps: float | None
     ) -> None:
-        is_stale = self._is_stale(health, dt_ms)
+        self._silent_ms = self._silent_ms + dt_ms if health.stamp_ns == self._stamp_ns else 0
+        is_stale = self._silent_ms > BLIND_S * 1e3  # the last frame is so old that the status is outdated
         is_tracking = health.status == Status.TRACKING and not is_stale
         radius_m = figures.get("radius_95_m", math.inf)
         self._has_fix = self._has_fix or is_tracking or "first_fix_s" in figures
         counts.usable_ms = dt_ms if not is_stale and is_usable(health.status, radius_m) else 0
         counts.judged_ms = dt_ms if is_driving(speed_mps) else 0
         counts.found_ms = counts.judged_ms if is_tracking else 0
-        is_new = self._is_search_failure(dt_ms, is_tracking, is_driving(speed_mps), Flag.OFF_MAP not in health.flags)
+        self._search_ns += dt_ms * 1_000_000
+        is_new = self._search.handle(
+            self._search_ns,
+            is_found=is_tracking,
+            is_driving=is_driving(speed_mps),
+            may_be_mapped=Flag.OFF_MAP not in health.flags,
+        )
         if self._has_fix:
             counts.after_fix_ms = dt_ms
             counts.localised_ms = dt_ms if is_tracking else 0
@@ -126,13 +123,6 @@ class HealthStream:
         counts.blind_seen = int(is_new and not self.in_failure)
         self.in_failure |= is_new
         self._end_failure(dt_ms, is_tracking)
-
-    def _is_search_failure(self, dt_ms: int, is_found: bool, is_driving: bool, may_be_mapped: bool) -> bool:
-        """True if the search of the robot for its position exceeds its limit with this report."""
-        self._search_ns += dt_ms * 1_000_000
-        return self._search.handle(
-            self._search_ns, is_found=is_found, is_driving=is_driving, may_be_mapped=may_be_mapped
-        )
 
     def _is_blindness(self, watched_ns: int, dt_ms: int, is_blind_now: bool) -> bool:
         """True if blindness just exceeded the limit. It lasts until the next better report."""

@@ -164,7 +164,10 @@ class _Night:
             known = ", ".join(FILE_SUFFIXES)
             words = f"no recording{_like(here.others)}; a recording is a folder, or a file that ends in {known}"
             self._wait(here.others[0], words)
-        draft = self._left_draft()
+        # The draft that a killed night saved, if still based on the current version
+        parent, resumed = _current(self._maps, self._request.site), set(self._report.resumes)
+        saved = [v for v in _versions(self._maps, self._request.site) if v.state == "draft" and v.job in resumed]
+        draft = next((info for info in reversed(saved) if info.parent == parent), None)
         if draft is not None:
             recordings = self._publish(draft, recordings)
         self._build_all(self._unknown(recordings))
@@ -198,13 +201,6 @@ class _Night:
                 found[recorded.sha256] = recorded
         self._look_at([])
         return list(found.values())
-
-    def _left_draft(self) -> VersionInfo | None:
-        """Return the draft that a killed night saved, if still based on the current version."""
-        site = self._request.site
-        parent, resumed = _current(self._maps, site), set(self._report.resumes)
-        drafts = [info for info in _versions(self._maps, site) if info.state == "draft" and info.job in resumed]
-        return next((info for info in reversed(drafts) if info.parent == parent), None)
 
     def _unknown(self, recordings: list[Recorded]) -> list[Recorded]:
         site = self._request.site

@@ -10,7 +10,7 @@ from fleetmap.errors import FleetmapError, LinkError, StateError
 from fleetmap.failure_summary import MAX_DRIVE_BYTES, ReplayPart
 from fleetmap.messages import FailureAck
 from mapserver.fleet.rate_limit import RateLimit
-from mapserver.floor_plan.survey_requests import DRIVEN, KIND, SurveyRequest
+from mapserver.floor_plan.survey_requests import DRIVEN, KIND
 from mapserver.nightly.inbox import arrivals
 from mapserver.nightly.upload import Upload
 from mapserver.serving.night_runs import SETTLE_S, NightRuns
@@ -55,7 +55,10 @@ class RobotDrives:
         with self._lock:
             drive = self._drives.get(key)
             if drive is None or (drive.id, drive.total_bytes) != (part.id, part.total_bytes):
-                known = self._handed_in(site, request)
+                # Robot and id of the drives for the request, by the log: those that other servers took, too
+                events = self._store.events(site, (request.asked_ns, None))
+                driven = [e for e in events if e.kind == KIND + request.id and e.detail.startswith(DRIVEN)]
+                known = {(event.actor, event.reason.partition(",")[0]) for event in driven}
                 if (robot, part.id) in known:  # the answer to its last part was lost
                     return FailureAck(id=part.id, received_bytes=part.total_bytes)
                 if self._path(site, robot, part).exists():
@@ -89,12 +92,6 @@ class RobotDrives:
                     self._nights.start(inbox.name)
                 except StateError as error:
                     _log.info("robots' drives at %s wait: %s", inbox.name, error)
-
-    def _handed_in(self, site: str, request: SurveyRequest) -> set[tuple[str, str]]:
-        """Return robot and id of the drives for a request, by the log: those that other servers took, too."""
-        events = self._store.events(site, (request.asked_ns, None))
-        driven = (e for e in events if e.kind == KIND + request.id and e.detail.startswith(DRIVEN))
-        return {(event.actor, event.reason.partition(",")[0]) for event in driven}
 
     def _ended(self, site: str, robot: str, part: ReplayPart) -> FailureAck:
         who = Actor(robot, f"{part.id}, {part.total_bytes / 1e6:.1f} MB")

@@ -141,7 +141,11 @@ class Operators:
         """Return the owner of this cookie or this `Authorization`; None if invalid. uses: True if this extends the session."""
         scheme, _, token = authorization.partition(" ")
         if scheme.lower() == "bearer":
-            return self._by_token(token.strip(), address)
+            held = self._store.operators.token(_digest(token.strip()))
+            if held is None or held.ends_ns <= self._now_ns():
+                return None
+            scopes = SCOPES[held.role] & set(held.scopes.split())
+            return Identity(held.name, held.role, scopes, address, is_token=True)
         if not session:
             return None
         sha256, now_ns = _digest(session), self._now_ns()
@@ -175,12 +179,6 @@ class Operators:
         row = self._store.operators.find(name)
         if row is not None and row.role == "program":
             raise StateError(f"{name} is a program, which has tokens alone; choose another name for a person")
-
-    def _by_token(self, token: str, address: str) -> Identity | None:
-        row = self._store.operators.token(_digest(token))
-        if row is None or row.ends_ns <= self._now_ns():
-            return None
-        return Identity(row.name, row.role, SCOPES[row.role] & set(row.scopes.split()), address, is_token=True)
 
 
 def _is_within(age_ns: int, most_s: float) -> bool:

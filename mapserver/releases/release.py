@@ -193,7 +193,7 @@ def _pass_gate(store: MapStore, draft: VersionInfo, actor: Actor, gate: GateSett
     store.check_bytes(draft)
     current = store.current(site)
     verdict = judge_draft(store, draft, gate)
-    forced = rules.is_forced(verdict, force=force)
+    forced = force and bool(verdict.reasons) and not verdict.hard_reasons
     reasons = (*verdict.hard_reasons, *verdict.reasons)
     row = VerdictRow(store.now_ns(), verdict.accepted, forced, reasons, verdict.report)
     store.record_verdict(draft, row, actor)

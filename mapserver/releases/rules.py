@@ -35,11 +35,6 @@ def chosen_draft(rows: SiteReleases, number: int | None) -> VersionInfo:
     return drafts[-1]
 
 
-def is_forced(verdict: GateVerdict, *, force: bool) -> bool:
-    """True if a refused draft is published by force: only without hard reasons against it."""
-    return force and bool(verdict.reasons) and not verdict.hard_reasons
-
-
 def refusal(draft: VersionInfo, verdict: GateVerdict, store: Path) -> GateRefusedError:
     """Return the error for a refused draft; its last line is the command that publishes it nevertheless, if possible."""
     words = f"draft {draft.version} of {draft.site} is refused: {'; '.join((*verdict.hard_reasons, *verdict.reasons))}"

@@ -166,7 +166,12 @@ class FleetQueries:
         try:
             report = decode_message(data, FailureReport)
         except LinkError as error:
-            report = _bare_report(FailureRow(**rows[0]), error)
+            words = f"the stored report cannot be read; `mapserver fleet remove {number}` removes it ({error})"
+            known = {name: rows[0][name] for name in _REPORT_COLUMNS}
+            at_ns = rows[0]["happened_ns"]
+            report = FailureReport(
+                id=rows[0]["failure_id"], stamp_ns=at_ns, wall_ns=at_ns, calibration=words[:2000], **known
+            )
         query = "SELECT place, kind, stamp_ns, length(jpeg) bytes FROM failure_pictures WHERE number = ? ORDER BY place"
         pictures = self._transactions.rows(PictureRow, query, (number,))
         return FailureDetail(FailureRow(**rows[0]), report, pictures)
@@ -212,7 +217,11 @@ class FleetQueries:
                 [(number, place + n, "replay", stamp_ns, jpeg) for n, (stamp_ns, jpeg) in enumerate(replay.pictures)],
             )
             self._picture_bytes += sum(len(jpeg) for _, jpeg in replay.pictures)
-            _prune_replays(connection, keep_bytes, number)
+            sizes = connection.execute(
+                "SELECT number, length(mcap) FROM failure_replays ORDER BY number DESC"
+            ).fetchall()
+            gone = "DELETE FROM failure_replays WHERE number <= ? AND number <> ?"
+            connection.execute(gone, (_newest_beyond(sizes, keep_bytes), number))
 
     def replay_summary(self, number: int) -> bytes | None:
         """Return the summary of a failure's recording, None if absent or deleted."""
@@ -249,7 +258,10 @@ class FleetQueries:
             gone = 0
             for rows, before in self._expired(retention).values():
                 gone += connection.execute(f"DELETE FROM {rows}", (before,)).rowcount
-            gone += _prune_traces(connection, retention.trace_rows)
+            # Whole hours of traces, the oldest first; the running hour stays
+            hours = connection.execute("SELECT hour, count(*) FROM traces GROUP BY hour ORDER BY hour DESC").fetchall()
+            last = _newest_beyond(hours[1:], retention.trace_rows - hours[0][1]) if hours else None
+            gone += connection.execute("DELETE FROM traces WHERE hour <= ?", (last,)).rowcount
             gone += _prune_pictures(connection, retention.picture_bytes)
             self._picture_bytes = _sum_of_pictures(connection)
         self._transactions.shrink(_SHRINK_PAGES)
@@ -320,14 +332,6 @@ def keep_last_reports(connection: Connection, reports: LastReports) -> None:
     )
 
 
-def _bare_report(row: FailureRow, error: LinkError) -> FailureReport:
-    words = f"the stored report cannot be read; `mapserver fleet remove {row.number}` removes it ({error})"
-    known = {name: getattr(row, name) for name in _REPORT_COLUMNS}
-    return FailureReport(
-        id=row.failure_id, stamp_ns=row.happened_ns, wall_ns=row.happened_ns, calibration=words[:2000], **known
-    )
-
-
 def tile_key(tile: tuple[int, int] | None) -> str | None:
     """Return a tile as text for keys and rows: "x,y"."""
     return None if tile is None else f"{tile[0]},{tile[1]}"
@@ -352,13 +356,6 @@ def _newest_beyond(rows: Sequence[tuple[int, int]], keep: float) -> int | None:
     return next((number for (number, _), kept in zip(rows, sums, strict=True) if kept > keep), None)
 
 
-def _prune_traces(connection: Connection, keep: int) -> int:
-    """Delete whole hours, the oldest first, until at most `keep` rows remain (the running hour always stays)."""
-    hours = connection.execute("SELECT hour, count(*) FROM traces GROUP BY hour ORDER BY hour DESC").fetchall()
-    last = _newest_beyond(hours[1:], keep - hours[0][1]) if hours else None
-    return connection.execute("DELETE FROM traces WHERE hour <= ?", (last,)).rowcount
-
-
 def _prune_failures(connection: Connection, robot: tuple[str, str], keep: int) -> None:
     """Delete the oldest failures of a robot until `keep` remain; their pictures are deleted with them."""
     (count,) = connection.execute("SELECT count(*) FROM failures WHERE site = ? AND robot = ?", robot).fetchone()
@@ -370,13 +367,6 @@ def _prune_failures(connection: Connection, robot: tuple[str, str], keep: int) -
 
 def _sum_of_pictures(connection: Connection) -> int:
     return int(connection.execute("SELECT coalesce(sum(length(jpeg)), 0) FROM failure_pictures").fetchone()[0])
-
-
-def _prune_replays(connection: Connection, keep_bytes: int, newest: int) -> None:
-    """Delete the oldest recordings until at most keep_bytes remain."""
-    sizes = connection.execute("SELECT number, length(mcap) FROM failure_replays ORDER BY number DESC").fetchall()
-    last = _newest_beyond(sizes, keep_bytes)
-    connection.execute("DELETE FROM failure_replays WHERE number <= ? AND number <> ?", (last, newest))
 
 
 def _prune_pictures(connection: Connection, keep_bytes: float) -> int:

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 from mapserver.store.blobs import Blobs
 from mapserver.store.rows import Actor, LogEntry, SiteReleases
-from mapserver.store.transactions import Connection, Transactions
+from mapserver.store.transactions import Transactions
 from mapserver.store.version_rows import EXTRA_TABLES, mentioned, set_state, site_releases
 
 _DAY_NS = 86_400_000_000_000
@@ -45,7 +45,13 @@ def collect(transactions: Transactions, blobs: Blobs, retention: Retention, *, d
     else:
         with transactions.write() as connection:
             _plan(transactions, retention, garbage)
-            _write_down(transactions, connection, garbage, actor)
+            for site, version in garbage.retired:
+                set_state(connection, (site, version), "retired", transactions.now_ns())
+                transactions.log(connection, site, LogEntry("retired", f"version {version}", version, actor))
+            for site, version in garbage.removed:
+                for table in ("currents", "verdicts", "evidence", *EXTRA_TABLES.values(), "version_blobs", "versions"):
+                    connection.execute(f"DELETE FROM {table} WHERE site = ? AND version = ?", (site, version))
+                transactions.log(connection, site, LogEntry("removed", f"version {version}", version, actor))
     kept = mentioned(transactions, set(garbage.removed) if dry_run else set())
     unmentioned = {sha256: size for sha256, size in sorted(blobs.sizes().items()) if sha256 not in kept}
     for found, remove in ((unmentioned, blobs.remove), (blobs.leftovers(), blobs.remove_leftover)):
@@ -87,13 +93,3 @@ def _protected(transactions: Transactions, releases: SiteReleases, seen_since_ns
     current = None if releases.current is None else releases.current.version
     tried = None if releases.canary is None else releases.canary.version
     return {current, tried, releases.rollback_target, *(row["version"] for row in robots)}
-
-
-def _write_down(transactions: Transactions, connection: Connection, garbage: Garbage, actor: Actor) -> None:
-    for site, version in garbage.retired:
-        set_state(connection, (site, version), "retired", transactions.now_ns())
-        transactions.log(connection, site, LogEntry("retired", f"version {version}", version, actor))
-    for site, version in garbage.removed:
-        for table in ("currents", "verdicts", "evidence", *EXTRA_TABLES.values(), "version_blobs", "versions"):
-            connection.execute(f"DELETE FROM {table} WHERE site = ? AND version = ?", (site, version))
-        transactions.log(connection, site, LogEntry("removed", f"version {version}", version, actor))

@@ -33,11 +33,11 @@ class StoreFindings:
 
 def verify(root: Path, transactions: Transactions, blobs: Blobs) -> StoreFindings:
     """Read everything in the store. Raises StoreError only if the database cannot be read at all."""
-    found = StoreFindings()
+    found, trust = StoreFindings(), root / "trust"
     found.faults += [f"database: {text}" for text in transactions.faults()]
     found.faults += [
         f"{path} is a symbolic link, which a store does not follow"
-        for path in (*blobs.links(), *_links(root / "trust"))
+        for path in (*blobs.links(), *sorted(path for path in (trust, *trust.rglob("*")) if path.is_symlink()))
     ]
     found.open_to_others = sum(bool(path.stat().st_mode & 0o077) for path in (root, *root.glob("store.sqlite3*")))
     sizes = blobs.sizes()
@@ -54,10 +54,6 @@ def verify(root: Path, transactions: Transactions, blobs: Blobs) -> StoreFinding
         if any(info.state != "draft" and info.manifest_sha256 not in sound for info in rows.versions.values()):
             found.faults.append(f"site {rows.site}: a published version has no whole manifest")
     return found
-
-
-def _links(folder: Path) -> list[Path]:
-    return sorted(path for path in (folder, *folder.rglob("*")) if path.is_symlink())
 
 
 def _check_blobs(transactions: Transactions, blobs: Blobs, sizes: dict[str, int], found: StoreFindings) -> set[str]:

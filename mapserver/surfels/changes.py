@@ -80,8 +80,10 @@ def changes_between(before: SeenSite, after: SeenSite) -> Changes:
         changed = _Voxels(*(column[verdicts == _CHANGED] for column in voxels))
         for rows in _joined(changed.points_map):
             if changed.areas_m2[rows].sum() >= _LEAST_AREA_M2:
-                patches.append(_patch(kind, changed, rows))
-                _fill(layers[kind], changed.points_map[rows], corner_m)
+                points = changed.points_map[rows]
+                box = np.stack([points.min(axis=0) - _VOXEL_M / 2, points.max(axis=0) + _VOXEL_M / 2])
+                patches.append(Patch(kind, box, float(changed.areas_m2[rows].sum())))
+                _fill(layers[kind], points, corner_m)
     both = np.zeros((2, *shape), bool)
     for layer, one in zip(both, (before, after), strict=True):
         _fill(layer, one.surfels.points_map, corner_m)
@@ -204,9 +206,3 @@ def _joined(points_map: Array) -> list[NDArray[np.int64]]:
     count, labels = scipy.sparse.csgraph.connected_components(links, directed=False)
     order = np.argsort(labels, kind="stable")
     return np.split(order, np.cumsum(np.bincount(labels, minlength=count))[:-1])
-
-
-def _patch(kind: str, voxels: _Voxels, rows: NDArray[np.int64]) -> Patch:
-    points, half_m = voxels.points_map[rows], _VOXEL_M / 2
-    box = np.stack([points.min(axis=0) - half_m, points.max(axis=0) + half_m])
-    return Patch(kind, box, float(voxels.areas_m2[rows].sum()))

@@ -170,14 +170,9 @@ def _likeness(
             continue
         shown = look.gain * renderer(splats, parameters, look.camera, look.map_from_cam).picture
         grey = np.clip(np.round(255 * shown), 0, 255).astype(np.uint8)
-        rows.append((_psnr_db(grey, look.picture, where), _ssim(grey, look.picture, where), where.mean()))
+        psnr_db = 10 * np.log10(255.0**2 / ((grey.astype(np.float64) - look.picture) ** 2)[where].mean())
+        rows.append((psnr_db, _ssim(grey, look.picture, where), where.mean()))
     return Likeness(*np.mean(rows, axis=0).tolist())
-
-
-def _psnr_db(first: NDArray[np.uint8], second: NDArray[np.uint8], where: NDArray[np.bool_]) -> float:
-    """Return the peak signal-to-noise ratio of these pixels (H, W)."""
-    squared = (first.astype(np.float64) - second) ** 2
-    return float(10 * np.log10(255.0**2 / squared[where].mean()))
 
 
 _C1, _C2 = (0.01 * 255) ** 2, (0.03 * 255) ** 2

@@ -46,15 +46,12 @@ def splat_ply(splats: Splats) -> bytes:
         table[f"f_dc_{i}"], table[f"scale_{i}"] = colours, scales[:, i]
     opacities = np.clip(splats.opacities, _TINY, 1 - _TINY)
     table["opacity"] = np.log(opacities / (1 - opacities))
-    for i, part in enumerate(_quaternions(splats.normals.astype(np.float64)).T):
+    normals = splats.normals.astype(np.float64)
+    # Quaternions (N, 4) w, x, y, z of the shortest rotations from z to the normals
+    turns = np.column_stack([1.0 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(len(normals))])
+    turns[normals[:, 2] < -0.99999] = (0.0, 1.0, 0.0, 0.0)
+    for i, part in enumerate((turns / np.linalg.norm(turns, axis=1, keepdims=True)).T):
         table[f"rot_{i}"] = part
     head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(splats)}"]
     head += [*(f"property float {name}" for name in _ALL), "end_header", ""]
     return "\n".join(head).encode() + table.tobytes()
-
-
-def _quaternions(normals: Array) -> Array:
-    """Return (N, 4) w, x, y, z of the shortest rotations from z to unit normals (N, 3)."""
-    turns = np.column_stack([1.0 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(len(normals))])
-    turns[normals[:, 2] < -0.99999] = (0.0, 1.0, 0.0, 0.0)
-    return np.asarray(turns / np.linalg.norm(turns, axis=1, keepdims=True))

@@ -181,7 +181,8 @@ class SurfelGrower:
         """
         shifts = [np.zeros(0)]
         for old, new in tiles:
-            (keys, first), (others, second) = (_of_voxels(surfels) for surfels in (old, new))
+            voxels = (core.voxel_keys(surfels.points_map, surfels.levels) for surfels in (old, new))
+            (keys, first), (others, second) = (np.unique(keys, return_index=True) for keys in voxels)
             _, mine, theirs = np.intersect1d(keys, others, assume_unique=True, return_indices=True)
             before, after = old.greys[first[mine]].astype(np.float64), new.greys[second[theirs]].astype(np.float64)
             sure = (before > _DARK) & (after > _DARK) & (before < _SATURATED) & (after < _SATURATED)
@@ -248,12 +249,6 @@ def _blocks(points_map: NDArray[np.float32]) -> tuple[NDArray[np.int64], list[sl
     order = np.argsort(keys, kind="stable")
     ends = [*(np.flatnonzero(np.diff(keys[order])) + 1).tolist(), len(order)]
     return order, [slice(first, last) for first, last in zip([0, *ends], ends, strict=False) if last > first]
-
-
-def _of_voxels(surfels: Surfels) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return the distinct voxels of surfels, and the first surfel of each."""
-    found, first = np.unique(core.voxel_keys(surfels.points_map, surfels.levels), return_index=True)
-    return found, first
 
 
 def _known_finer(surfels: Surfels, other: Surfels, *, finer_by: int) -> NDArray[np.bool_]:

@@ -201,11 +201,8 @@ class ListRepository:
             make_folder(path.parent)
             write_atomically(path, [metadata.to_bytes(_COMPACT)])
             if role not in ("root", TIMESTAMP):
-                self._remove_old(role)
-
-    def _remove_old(self, role: str) -> None:
-        for number in self.lists.numbers(role)[:-_MOST_FILES]:
-            self.lists.path(role, number).unlink(missing_ok=True)
+                for old in self.lists.numbers(role)[:-_MOST_FILES]:
+                    self.lists.path(role, old).unlink(missing_ok=True)
 
 
 def site_targets(site: str, admitted: Sequence[AdmittedVersion], number: int) -> Targets:
