@@ -203,6 +203,7 @@ class WheelAgreement:
         is_followed = odometry.inlier_share >= _FOLLOWED_SHARE and not odometry.after_gap
         is_known = odometry.status is not OdometryStatus.DEGRADED and odometry.scale_known and is_followed
         if last_ns is None or not wheel or not is_known or moved is None:
+            self.is_doubted &= not self._is_compared  # in the dark, wheels that agreed before are all that is left
             return
         duration_s = (odometry.stamp_ns - last_ns) * 1e-9
         seen_mps = (self._base_from_body @ moved @ se3_inverse(self._base_from_body))[:2, 3] / duration_s

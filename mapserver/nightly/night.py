@@ -168,10 +168,17 @@ class _Night:
         parent, resumed = _current(self._maps, self._request.site), set(self._report.resumes)
         saved = [v for v in _versions(self._maps, self._request.site) if v.state == "draft" and v.job in resumed]
         draft = next((info for info in reversed(saved) if info.parent == parent), None)
+        refused = None
         if draft is not None:
-            recordings = self._publish(draft, recordings)
+            try:
+                self._publish(draft, recordings)
+            except GateRefusedError as error:
+                refused = error
+            recordings = [recorded for recorded in recordings if recorded.path.exists()]
         self._build_all(self._unknown(recordings))
         if not self._report.published:
+            if refused is not None:
+                raise refused
             return f"site {self._request.site}: nothing new"
         versions = ", ".join(str(version) for version in self._report.published)
         return f"site {self._request.site}: version {versions} published, {self._counts()}"
@@ -215,8 +222,8 @@ class _Night:
         return [recorded for recorded in recordings if recorded.sha256 not in known]
 
     def _build_all(self, recordings: list[Recorded]) -> None:
-        """Build recordings together. Those in work when nights ended are built alone, and where a fault ends a build all are: only the
-        one at fault is blamed.
+        """Build recordings together. Those in work when nights ended are built alone, and where a fault ends a build or the gate refuses
+        it all are: only the one at fault is blamed.
         """
         alone = [[r] for r in recordings if self._report.ended.get(r.path.name, 0) > _ALONE_ABOVE]
         groups = [[r for r in recordings if [r] not in alone], *alone]
@@ -226,6 +233,8 @@ class _Night:
                 self._build(group)
             except (RecordingError, SurveyError, GateRefusedError) as error:
                 failed = error
+                if len(group) > 1:
+                    groups += [[r] for r in group if r.path.exists()]  # in the inbox still
             except (FleetmapError, OSError, MemoryError):
                 raise
             except Exception as error:
@@ -281,22 +290,21 @@ class _Night:
         entries = self._maps.manifest(self._request.site, current).recordings
         return boxes.kept(self._request.inbox, [entry.sha256 for entry in entries])
 
-    def _publish(self, draft: VersionInfo, recordings: list[Recorded]) -> list[Recorded]:
-        """Take a draft through the gate and move its recordings; return the others."""
+    def _publish(self, draft: VersionInfo, recordings: list[Recorded]) -> None:
+        """Take a draft through the gate and move its recordings; of several in a refused one each must be tried alone."""
         site, version = self._request.site, draft.version
         taken = {entry.sha256 for entry in self._maps.manifest(site, version).recordings}
         own = [recorded for recorded in recordings if recorded.sha256 in taken]
         try:
             releases.publish(self._maps, site, version, actor=self._actor(), gate=self._gate)
         except GateRefusedError as error:
-            for recorded in own:
-                self._put_away(recorded.path, boxes.HELD, recorded.sha256, str(error))
+            if len(own) == 1:
+                self._put_away(own[0].path, boxes.HELD, own[0].sha256, str(error))
             raise
         self._report.published.append(version)
         self._say(f"site {site}: version {version} is current")
         for recorded in own:
             self._put_away(recorded.path, boxes.DONE, recorded.sha256, f"in version {version}")
-        return [recorded for recorded in recordings if recorded.sha256 not in taken]
 
     def _put_away(self, path: Path, where: str, sha256: str | None, reason: str) -> None:
         reason = " ".join(reason.split())  # a refusal has several lines

@@ -8,11 +8,20 @@ from numpy.typing import NDArray
 
 from fleetmap.failure_definition import ERROR_LIMIT_M, is_wrong
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
+from fleetmap.relocalization.landmark_visibility import places_around
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.samples import Stamps
 from mapserver.quality.figures import Aliasing, Compared, Displaced, Evidence, ProbeFigures, TrajectoryBreaks
-from mapserver.quality.probes import ELSEWHERE_M, Probe, anywhere, most_similar_beyond, relocalized
+from mapserver.quality.probes import (
+    ELSEWHERE_M,
+    PRIOR_RADIUS_M,
+    SAME_WAY_COSINE,
+    Probe,
+    anywhere,
+    most_similar_beyond,
+    relocalized,
+)
 from mapserver.survey.merge.session_alignment import count_places
 from mapserver.survey.settings import SessionSettings
 
@@ -62,8 +71,9 @@ def examine(
 def displaced(recording: str, before: MapView, probes: Sequence[Probe], lookalike_recall: float) -> Displaced:
     """Localize a recording's frames anywhere in the version before, and compare.
 
-    A frame at a place that looks like another one has a fix there, too. Those count that have none at their own place, find more of
-    the other than `lookalike_recall`, and agree on it by the motion between them, as many and as far apart as those of a joined survey.
+    A frame at a place that looks like another one has a fix there, too. Those count that have none at their own place though that
+    version has it, find more of the other than `lookalike_recall`, and agree on it by the motion between them, as many and as far apart as
+    those of a joined survey.
     """
     here, placed, found = 0, list[Array](), list[Array]()
     for probe in probes:
@@ -71,6 +81,8 @@ def displaced(recording: str, before: MapView, probes: Sequence[Probe], lookalik
         if any(not is_wrong(float(np.linalg.norm((fix.map_from_cam - probe.map_from_cam)[:3, 3]))) for fix in fixes):
             here += 1
             continue
+        if not places_around(before.map_from_cam, probe.map_from_cam, PRIOR_RADIUS_M, SAME_WAY_COSINE).any():
+            continue  # it may lie in an aisle that looks the same, and is new
         fixes = [fix for fix in fixes if fix.landmark_recall > lookalike_recall]
         placed += [probe.map_from_cam for _ in fixes]
         found += [fix.map_from_cam for fix in fixes]

@@ -226,6 +226,17 @@ def test_a_refused_night_keeps_the_last_version_and_holds_its_recordings(
     assert "version 3 published" in spend(hall)
 
 
+def test_what_the_gate_refuses_takes_no_other_recording_with_it(hall: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spend(hall)
+    for seed, name in enumerate(("wednesday", "thursday"), 3):
+        record(hall / "inbox", name, seed)
+    is_poor = lambda request: any("wednesday" in path.name for path in request.recordings)  # noqa: E731
+    monkeypatch.setattr(night, "build_draft", lambda *a: built(*a, landmarks=10) if is_poor(a[0]) else built(*a))
+    assert "published, 1 done, 1 held" in spend(hall)
+    assert ("current", ["thursday"]) in states(hall)
+    assert names(hall / "inbox/held") == ["wednesday", "wednesday.reason.txt"]
+
+
 HOSTILE_NAMES = {
     "long": b"x" * 240 + b".mcap",
     "no UTF-8": b"caf\xe9.mcap",
