@@ -236,7 +236,10 @@ class Ros2Localizer(Publisher):
             return
         section, stamp_ns = self._section, estimate.stamp_ns
         if section.building_frame:
-            self._tell_building(published.building_from_map)
+            known, new = self._building_from_map, published.building_from_map
+            if new is not None and (known is None or not np.array_equal(known, new)):
+                self._building_from_map = new  # stays in tf: static transforms are never withdrawn
+                self._send_static_frames()
         map_from_odom, map_from_base = published.map_from_odom, published.map_from_base
         if map_from_odom is not None and map_from_base is not None:
             if section.publish_odom:
@@ -266,13 +269,6 @@ class Ros2Localizer(Publisher):
         message = encode_frame_links(stamp_ns, [link])
         self._sent_tf.append(message)
         self._put_tf(message)
-
-    def _tell_building(self, building_from_map: Array | None) -> None:
-        """Publish the building's frame. The last known one stays in tf: static transforms are never withdrawn."""
-        known = self._building_from_map
-        if building_from_map is not None and (known is None or not np.array_equal(known, building_from_map)):
-            self._building_from_map = building_from_map
-            self._send_static_frames()
 
     def alive(self, is_silent: bool) -> None:
         self._alive_s = time.monotonic()

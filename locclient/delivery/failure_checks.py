@@ -150,7 +150,14 @@ class _Walk:
 
     def check(self, value: Any, where: str) -> None:
         if isinstance(value, Section):
-            self._settings(value, where)
+            for name in value.__struct_fields__:
+                member, at = getattr(value, name), f"{where}.{name}"
+                is_number = isinstance(member, int | float) and name != "seed"
+                if is_number and not (isfinite(member) and abs(member) <= _MAX_SETTING):
+                    raise _refused(at, f"{member}")
+                if name.endswith("_share") and not 0 < member < 1:  # all of them are by default
+                    raise _refused(at, f"{member}")
+                self.check(member, at)
         elif isinstance(value, msgspec.Struct):
             self._members(value, value.__struct_fields__, where)
         elif is_dataclass(value):
@@ -194,16 +201,6 @@ class _Walk:
             )
         if max(array.shape) > MAX_ROWS or not kind.is_good(array, self._camera):
             raise _refused(where, f"values that cannot be, of shape {array.shape}")
-
-    def _settings(self, value: Section, where: str) -> None:
-        for name in value.__struct_fields__:
-            member, at = getattr(value, name), f"{where}.{name}"
-            is_number = isinstance(member, int | float) and name != "seed"
-            if is_number and not (isfinite(member) and abs(member) <= _MAX_SETTING):
-                raise _refused(at, f"{member}")
-            if name.endswith("_share") and not 0 < member < 1:  # all of them are by default
-                raise _refused(at, f"{member}")
-            self.check(member, at)
 
     def _number(self, value: Any, where: str) -> None:
         name = where.rpartition(".")[2]

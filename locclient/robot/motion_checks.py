@@ -36,7 +36,12 @@ class DockCheck:
 
         None without a dock, if the robot was not TRACKING, and for repeated reports while it stands.
         """
-        self._follow(estimate)
+        # The distance travelled, also when the odometry redefines its frame
+        now_m, change = estimate.odometry.odom_from_body[:3, 3], estimate.odometry.new_odom_from_old_odom
+        if self._last_m is not None:
+            last_m = self._last_m if change is None else change[:3, :3] @ self._last_m + change[:3, 3]
+            self._path_m += float(np.linalg.norm(now_m - last_m))
+        self._last_m = now_m
         was_tracking, self._was_tracking = self._was_tracking, estimate.status is Status.TRACKING
         exact = [prior for prior in priors if _is_exact(prior) and prior.floor in (None, estimate.floor)]
         if not exact:
@@ -49,14 +54,6 @@ class DockCheck:
             return None
         map_from_base = estimate.map_from_body @ self._body_from_base
         return float(np.linalg.norm(map_from_base[:2, 3] - dock.map_from_base[:2, 3]))
-
-    def _follow(self, estimate: Estimate) -> None:
-        """Count the distance travelled, also when the odometry redefines its frame."""
-        now_m, change = estimate.odometry.odom_from_body[:3, 3], estimate.odometry.new_odom_from_old_odom
-        if self._last_m is not None:
-            last_m = self._last_m if change is None else change[:3, :3] @ self._last_m + change[:3, 3]
-            self._path_m += float(np.linalg.norm(now_m - last_m))
-        self._last_m = now_m
 
 
 def _is_exact(prior: PositionPrior) -> bool:

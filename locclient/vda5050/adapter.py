@@ -190,7 +190,12 @@ class FleetAdapter:
         versions = [] if active is None or active.version is None else [(active.version, True)]
         with self._lock:
             self._versions = versions if maps is None else maps.versions()
-            self._end_enabling()
+            enabling = self._enabling
+            if enabling is not None and self._clock_s() > enabling[2]:
+                self._enabling = None
+                words = f"after {_ENABLE_S:.0f} s the robot has not confirmed it; check its cameras"
+                self._book.fail(enabling[0], "MAP_ACTION_FAILED", words)
+                self.changed.set()
             if maps is None or not self._jobs or (self._enabling and self._jobs[0][0].action_type == "enableMap"):
                 return
             action, given = self._jobs.popleft()
@@ -240,14 +245,6 @@ class FleetAdapter:
                 self._book.set(enabling[0], "FINISHED")
             else:
                 self._book.fail(enabling[0], "MAP_ACTION_FAILED", f"the robot did not adopt it: {change.reason}")
-            self.changed.set()
-
-    def _end_enabling(self) -> None:
-        enabling = self._enabling
-        if enabling is not None and self._clock_s() > enabling[2]:
-            self._enabling = None
-            words = f"after {_ENABLE_S:.0f} s the robot has not confirmed it; check its cameras"
-            self._book.fail(enabling[0], "MAP_ACTION_FAILED", words)
             self.changed.set()
 
     # --- position -----------------------------------------------------------------------------------------------------

@@ -57,15 +57,12 @@ class ProgressView:
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Show that `done` of `total` parts of a stage are done."""
         if self._bars is not None:
-            self._show_bar(self._bars, stage, done, total)
+            if stage not in self._tasks:
+                self._tasks[stage] = self._bars.add_task(stage, total=total)
+            if self._shown and stage != self._shown:  # "matching again" occurs twice: close the previous bar
+                last = self._bars.tasks[self._tasks[self._shown]]
+                self._bars.update(last.id, completed=last.total)
+            self._bars.update(self._tasks[stage], completed=done, total=total)
         elif stage != self._shown:
             self._console.print(f"{stage}: {total}" if total > 1 else stage, markup=False, highlight=False)
         self._shown = stage
-
-    def _show_bar(self, bars: Progress, stage: str, done: int, total: int) -> None:
-        if stage not in self._tasks:
-            self._tasks[stage] = bars.add_task(stage, total=total)
-        if self._shown and stage != self._shown:  # "matching again" occurs twice: close the previous bar
-            last = bars.tasks[self._tasks[self._shown]]
-            bars.update(last.id, completed=last.total)
-        bars.update(self._tasks[stage], completed=done, total=total)

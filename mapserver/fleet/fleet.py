@@ -213,7 +213,16 @@ class Fleet:
         try:
             _check_sender(site, robot, report)
             check_name(robot, "robot")
-            _check_failure(report)
+            if abs(report.wall_ns) > MAX_STAMP_NS or not 0 <= report.duration_s < math.inf:
+                raise LinkError(
+                    f"failure {report.id!r} began at {report.wall_ns} ns for {report.duration_s} s: invalid time"
+                )
+            if any(abs(thumbnail.stamp_ns) > MAX_STAMP_NS for thumbnail in report.thumbnails):
+                raise LinkError(f"failure {report.id!r} has a picture of an impossible time")
+            if not all(
+                thumb.jpeg.startswith(b"\xff\xd8") and thumb.jpeg.endswith(b"\xff\xd9") for thumb in report.thumbnails
+            ):
+                raise LinkError(f"failure {report.id!r} has a picture that is not a JPEG")
             with self._lock:
                 ahead_s = self._entry(site, robot, now_ns, None).skew.ahead_s
         except (LinkError, UsageError) as error:
@@ -353,12 +362,3 @@ def _check_sender(site: str, robot: str, message: RobotAck | RobotHealth | Failu
         raise LinkError(f"robot {robot!r} of {site!r} reports in the name of {message.robot!r} of {message.site!r}")
     if abs(message.stamp_ns) > MAX_STAMP_NS:
         raise LinkError(f"robot {robot!r} of {site!r} sent the stamp {message.stamp_ns} ns; check its clock")
-
-
-def _check_failure(report: FailureReport) -> None:
-    if abs(report.wall_ns) > MAX_STAMP_NS or not 0 <= report.duration_s < math.inf:
-        raise LinkError(f"failure {report.id!r} began at {report.wall_ns} ns for {report.duration_s} s: invalid time")
-    if any(abs(thumbnail.stamp_ns) > MAX_STAMP_NS for thumbnail in report.thumbnails):
-        raise LinkError(f"failure {report.id!r} has a picture of an impossible time")
-    if not all(thumb.jpeg.startswith(b"\xff\xd8") and thumb.jpeg.endswith(b"\xff\xd9") for thumb in report.thumbnails):
-        raise LinkError(f"failure {report.id!r} has a picture that is not a JPEG")

@@ -57,14 +57,22 @@ class HealthStream:
         figures = _figures(health)
         went_back = figures.get("frames", math.inf) < self._figures.get("frames", -math.inf)
         if self._stamp_ns is None or went_back or health.stamp_ns < self._stamp_ns:
-            self._begin_run()
+            self._stamp_ns, self._figures = None, {}
+            self._has_fix = self._fix_counted = self.in_failure = False
+            self._search, self._search_ns = SearchClock(), 0
+            self._blind_since_ns = self._good_since_ns = self._jump_ns = None
         dt_ms = self._elapsed_ms(health)
         counts = Counters(reports=1, observed_ms=dt_ms)
         speed_mps = figures.get("speed_mps", self._pose_mps)
         counts.driving_ms = dt_ms if speed_mps is not None and is_driving(speed_mps) else 0
         self._count_status(counts, health, figures, dt_ms, speed_mps)
         self._count_fixes(counts, health.stamp_ns, figures)
-        self._count_work(counts, figures)
+        if "frame_ms_mean" in figures:
+            counts.cpu_reports, counts.cpu_ms_sum = 1, figures["frame_ms_mean"]
+        for name in ("frames", "frames_dropped", "landmarks_expected", "landmarks_seen"):
+            if name in figures:
+                grown = figures[name] - self._figures.get(name, 0.0 if self._figures else figures[name])
+                setattr(counts, name, int(min(max(0.0, grown), _MAX_COUNT)))
         self._stamp_ns, self._wall_ns, self._figures = health.stamp_ns, health.wall_ns, figures
         return counts
 
@@ -80,12 +88,6 @@ class HealthStream:
         before_ns, self._older_wall_ns = self._older_wall_ns, health.wall_ns
         is_set_back = before_ns is not None and 0 < health.wall_ns - before_ns <= MAX_GAP_S * 1e9
         return not (is_set_back and self._wall_ns - health.wall_ns > MAX_GAP_S * 1e9)
-
-    def _begin_run(self) -> None:
-        self._stamp_ns, self._figures = None, {}
-        self._has_fix = self._fix_counted = self.in_failure = False
-        self._search, self._search_ns = SearchClock(), 0
-        self._blind_since_ns = self._good_since_ns = self._jump_ns = None
 
     def _elapsed_ms(self, health: RobotHealth) -> int:
         """Return the time since the last report by the robot's wall clock, which runs while its cameras are silent; else by stamps."""
@@ -122,7 +124,12 @@ class HealthStream:
             is_new |= self._is_blindness(self._watched_ns, dt_ms, is_blind_now)
         counts.blind_seen = int(is_new and not self.in_failure)
         self.in_failure |= is_new
-        self._end_failure(dt_ms, is_tracking)
+        if not is_tracking:  # a failure ends after 5 s of good tracking
+            self._good_since_ns = None
+        elif self._good_since_ns is None or dt_ms == 0:
+            self._good_since_ns = self._search_ns
+        if self._good_since_ns is not None and self._search_ns - self._good_since_ns >= GOOD_S * 1e9:
+            self.in_failure = False
 
     def _is_blindness(self, watched_ns: int, dt_ms: int, is_blind_now: bool) -> bool:
         """True if blindness just exceeded the limit. It lasts until the next better report."""
@@ -134,15 +141,6 @@ class HealthStream:
         elif self._blind_since_ns is None:
             self._blind_since_ns = watched_ns
         return began
-
-    def _end_failure(self, dt_ms: int, is_tracking: bool) -> None:
-        """End a failure after 5 s of good tracking."""
-        if not is_tracking:
-            self._good_since_ns = None
-        elif self._good_since_ns is None or dt_ms == 0:
-            self._good_since_ns = self._search_ns
-        if self._good_since_ns is not None and self._search_ns - self._good_since_ns >= GOOD_S * 1e9:
-            self.in_failure = False
 
     def _count_fixes(self, counts: Counters, stamp_ns: int, figures: dict[str, float]) -> None:
         if "first_fix_s" in figures and not self._fix_counted:
@@ -161,14 +159,6 @@ class HealthStream:
         dock_m = figures.get("dock_error_m")
         if dock_m is not None:
             counts.docks, counts.docks_wrong = 1, int(is_wrong(dock_m))
-
-    def _count_work(self, counts: Counters, figures: dict[str, float]) -> None:
-        if "frame_ms_mean" in figures:
-            counts.cpu_reports, counts.cpu_ms_sum = 1, figures["frame_ms_mean"]
-        for name in ("frames", "frames_dropped", "landmarks_expected", "landmarks_seen"):
-            if name in figures:
-                grown = figures[name] - self._figures.get(name, 0.0 if self._figures else figures[name])
-                setattr(counts, name, int(min(max(0.0, grown), _MAX_COUNT)))
 
 
 def _figures(health: RobotHealth) -> dict[str, float]:

@@ -67,7 +67,12 @@ def fit_pins(pins: Sequence[Pin], metres_per_unit: float | None, map_corners_m: 
     map_corners_m: (N, 2) extent of the map. UsageError for too few, too close or contradictory pins, naming
     the wrong one if possible, and for a mirrored drawing.
     """
-    _check_names(pins)
+    if not 2 <= len(pins) <= MAX_PINS:
+        raise UsageError(f"{len(pins)} pins: give 2 to {MAX_PINS}, three or four in the corners of the hall")
+    names = [pin.name for pin in pins]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise UsageError(f"two pins have the name {twice[0]!r}; give each its own")
     points = np.array([complex(*pin.map_m) for pin in pins])
     drawn = np.array([complex(*pin.drawing) for pin in pins])
     apart_m = max(abs(a - b) for a, b in combinations(points, 2))
@@ -98,15 +103,6 @@ def fit_pins(pins: Sequence[Pin], metres_per_unit: float | None, map_corners_m: 
     )
     left = {pin.name: float(off) for pin, off in zip(pins, off_m, strict=True)}
     return Fit(frame, scale, left, far_sigma_m, _spread_m(points) >= _LEAST_APART_M)
-
-
-def _check_names(pins: Sequence[Pin]) -> None:
-    if not 2 <= len(pins) <= MAX_PINS:
-        raise UsageError(f"{len(pins)} pins: give 2 to {MAX_PINS}, three or four in the corners of the hall")
-    names = [pin.name for pin in pins]
-    twice = sorted({name for name in names if names.count(name) > 1})
-    if twice:
-        raise UsageError(f"two pins have the name {twice[0]!r}; give each its own")
 
 
 def _fitted(drawn: _Complex, points: _Complex, metres_per_unit: float | None) -> tuple[complex, complex]:

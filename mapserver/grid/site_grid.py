@@ -52,7 +52,10 @@ class SessionViews:
         for tile, in_tile, in_window in parts:
             if tile in self.before:
                 was_free[in_window] = self.before[tile][in_tile][..., 1]
-        was_free = _all_around(was_free)
+        # The bits common to a cell and its eight neighbours; none at the border
+        for axis in (0, 1):
+            was_free = was_free & np.roll(was_free, 1, axis) & np.roll(was_free, -1, axis)
+        was_free[[0, -1]], was_free[:, [0, -1]] = 0, 0
         window = core.cast_view(px, nearest_px, sigma_px, camera.lens, turn, place, was_free)
         for (x, y), _, in_window in parts:
             if any(column[in_window].any() for column in window[:2]):
@@ -97,14 +100,6 @@ def _parts(corner: NDArray[np.int64], size: int) -> Iterator[_Part]:
                 tuple(slice(*ends) for ends in zip(low - off, high - off, strict=True)) for off in (start, 0)
             )
             yield (x, y), tile, window  # type: ignore[misc]
-
-
-def _all_around(bits: Counts) -> Counts:
-    """Return (R, C) the bits common to a cell and its eight neighbours; none at the border."""
-    for axis in (0, 1):
-        bits = bits & np.roll(bits, 1, axis) & np.roll(bits, -1, axis)
-    bits[[0, -1]], bits[:, [0, -1]] = 0, 0
-    return bits
 
 
 def updated(views: SessionViews) -> Tiles:

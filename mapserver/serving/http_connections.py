@@ -92,7 +92,8 @@ class BoundedListener(socket.socket):
         protocols = {protocol for protocol in protocols if _socket_of(protocol) is not None}
         marks = {protocol: _Mark.after(marks.get(protocol), protocol, now_s) for protocol in protocols}
         for protocol, mark in marks.items():
-            if mark.is_late(now_s):
+            most_s = _TAKEN_S if mark.state == "writes" else HEAD_S
+            if mark.state != "answers" and now_s - mark.since_s > most_s:
                 protocol.transport.abort()
         known = {held.fileno() for protocol in protocols if (held := _socket_of(protocol)) is not None}
         for connection, _, since_s in self._open:  # the others have not finished their handshake
@@ -119,9 +120,6 @@ class _Mark:
         elif hasattr(protocol, "cycle") and (cycle is None or cycle.response_complete):  # sockets of pages have none
             state = ("waits", cycle)
         return before if before is not None and before.state == state else cls(state, now_s, acked)
-
-    def is_late(self, now_s: float) -> bool:
-        return self.state != "answers" and now_s - self.since_s > (_TAKEN_S if self.state == "writes" else HEAD_S)
 
 
 def _socket_of(protocol: Any) -> Any:

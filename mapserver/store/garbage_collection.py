@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 
 from mapserver.store.blobs import Blobs
-from mapserver.store.rows import Actor, LogEntry, SiteReleases
+from mapserver.store.rows import Actor, LogEntry
 from mapserver.store.transactions import Transactions
 from mapserver.store.version_rows import EXTRA_TABLES, mentioned, set_state, site_releases
 
@@ -70,7 +70,13 @@ def _plan(transactions: Transactions, retention: Retention, garbage: Garbage) ->
         site = row["site"]
         releases = site_releases(transactions, site)
         versions = releases.versions.values()
-        needed = _protected(transactions, releases, now_ns - int(retention.robot_days * _DAY_NS))
+        robots = transactions.query(
+            "SELECT DISTINCT version FROM robots WHERE site = ? AND version IS NOT NULL AND last_seen_ns >= ?",
+            (site, now_ns - int(retention.robot_days * _DAY_NS)),
+        )
+        current = None if releases.current is None else releases.current.version
+        tried = None if releases.canary is None else releases.canary.version
+        needed = {current, tried, releases.rollback_target, *(row["version"] for row in robots)}
         published = sorted(
             (v for v in versions if v.state == "published"),
             key=lambda v: (v.published_ns or 0, v.version),
@@ -83,13 +89,3 @@ def _plan(transactions: Transactions, retention: Retention, garbage: Garbage) ->
         gone += surplus if retention.keep_days <= 0 else []
         gone += [v for v in versions if v.version in drafts and v.saved_ns <= old_ns]
         garbage.removed += sorted((site, v.version) for v in gone if v.version not in needed)
-
-
-def _protected(transactions: Transactions, releases: SiteReleases, seen_since_ns: int) -> set[int | None]:
-    robots = transactions.query(
-        "SELECT DISTINCT version FROM robots WHERE site = ? AND version IS NOT NULL AND last_seen_ns >= ?",
-        (releases.site, seen_since_ns),
-    )
-    current = None if releases.current is None else releases.current.version
-    tried = None if releases.canary is None else releases.canary.version
-    return {current, tried, releases.rollback_target, *(row["version"] for row in robots)}

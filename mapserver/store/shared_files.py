@@ -54,7 +54,12 @@ class SharedFiles:
                 for name in self._hashes(self._root, folder):
                     shutil.copy(self._root / folder / name, Path(draft) / folder)
                 yield Path(draft)
-                self._give(Path(draft), folder)
+                here, there = self._hashes(Path(draft), folder), self._there(folder)
+                with self._transactions.write() as connection:
+                    for name in there.keys() - here.keys():
+                        connection.execute("DELETE FROM shared_files WHERE name = ?", (f"{folder}/{name}",))
+                    for name in (name for name in here if here[name] != there.get(name)):
+                        _keep(connection, f"{folder}/{name}", (Path(draft) / folder / name).read_bytes())
             self._take(folder)
 
     def follow(self) -> None:
@@ -95,14 +100,6 @@ class SharedFiles:
                     write_atomically(path, [bytes(self._transactions.query(query, (f"{folder}/{name}",))[0]["data"])])
                 else:
                     path.unlink(missing_ok=True)
-
-    def _give(self, draft: Path, folder: str) -> None:
-        here, there = self._hashes(draft, folder), self._there(folder)
-        with self._transactions.write() as connection:
-            for name in there.keys() - here.keys():
-                connection.execute("DELETE FROM shared_files WHERE name = ?", (f"{folder}/{name}",))
-            for name in (name for name in here if here[name] != there.get(name)):
-                _keep(connection, f"{folder}/{name}", (draft / folder / name).read_bytes())
 
     def _differing(self, folder: str) -> dict[str, bool]:
         """Return names of files that are not as in the database, and whether they are there; none before the first change."""

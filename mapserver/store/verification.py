@@ -50,7 +50,12 @@ def verify(root: Path, transactions: Transactions, blobs: Blobs) -> StoreFinding
     for row, rows in zip(sites, releases, strict=True):
         found.sites += 1
         found.faults += _site_faults(transactions, row, rows)
-        found.faults += _file_faults(root, rows) if blobs.is_folder else []
+        if blobs.is_folder:
+            path = root / current_path(rows.site)
+            wanted = None if rows.current is None else f"{rows.current.manifest_sha256}\n"
+            text = path.read_bytes()[:100].decode("ascii", "replace") if is_plain_file(path) else None
+            if text != wanted:
+                found.faults.append(f"{path} does not name the current version; open the store again to repair it")
         if any(info.state != "draft" and info.manifest_sha256 not in sound for info in rows.versions.values()):
             found.faults.append(f"site {rows.site}: a published version has no whole manifest")
     return found
@@ -102,10 +107,3 @@ def _site_faults(transactions: Transactions, site: dict[str, Any], rows: SiteRel
     if not current and any(info.state in {"published", "retired"} for info in rows.versions.values()):
         faults.append(f"{name}: it has published versions, none of them current")
     return faults
-
-
-def _file_faults(root: Path, rows: SiteReleases) -> list[str]:
-    path = root / current_path(rows.site)
-    wanted = None if rows.current is None else f"{rows.current.manifest_sha256}\n"
-    text = path.read_bytes()[:100].decode("ascii", "replace") if is_plain_file(path) else None
-    return [] if text == wanted else [f"{path} does not name the current version; open the store again to repair it"]

@@ -163,7 +163,11 @@ def _verdicts(voxels: _Voxels, other: SeenSite) -> NDArray[np.uint8]:
         rows = _shown(voxels.points_map, view, other.tangent)
         if not len(rows):
             continue
-        map_from_cam = _facing(view)
+        # A camera with the view's position and direction, as level as possible
+        forward = view[3:6] / np.linalg.norm(view[3:6])
+        right = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.99 else [0.0, 1.0, 0.0])
+        right /= np.linalg.norm(right)
+        map_from_cam = se3(np.stack([right, np.cross(forward, right), forward], axis=1), view[:3])
         depth_m = expected_depth(other.surfels, camera, map_from_cam, MAX_RANGE_M + 1.0)
         is_known, around = np.isfinite(depth_m), np.ones((3, 3), np.uint8)
         nearest_m = np.asarray(cv2.erode(np.where(is_known, depth_m, np.float32(np.inf)), around))
@@ -185,14 +189,6 @@ def _shown(points_map: Array, view: Array, tangent: float) -> NDArray[np.int64]:
     depth_m = off @ view[3:6]
     aside_m = np.sqrt(np.maximum((off**2).sum(axis=1) - depth_m**2, 0.0))
     return np.flatnonzero((depth_m > MIN_RANGE_M) & (depth_m < MAX_RANGE_M) & (aside_m < tangent * depth_m))
-
-
-def _facing(view: Array) -> Array:
-    """Return map_from_cam (4, 4) of a camera with a view's position and direction, as level as possible."""
-    forward = view[3:6] / np.linalg.norm(view[3:6])
-    right = np.cross(forward, [0.0, 0.0, 1.0] if abs(forward[2]) < 0.99 else [0.0, 1.0, 0.0])
-    right /= np.linalg.norm(right)
-    return se3(np.stack([right, np.cross(forward, right), forward], axis=1), view[:3])
 
 
 def _joined(points_map: Array) -> list[NDArray[np.int64]]:

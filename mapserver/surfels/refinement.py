@@ -104,7 +104,11 @@ def looks_of(recording: Recording, survey: SurveyMap, surfels: Surfels, *, own_r
     )
     body_from_cam = survey.body_from_cam if own_rig else rectifier.body_from_cam
     camera = resized(pinhole(survey.camera), min(WIDTH_PX, survey.camera.width_px))
-    lens = _lens(camera, surfels)
+    # The share of light transmitted by the survey's lens
+    fx, fy, cx, cy = camera.intrinsics_px
+    v, u = np.mgrid[0 : camera.height_px, 0 : camera.width_px].astype(np.float64)
+    squared = ((u - cx) / fx) ** 2 + ((v - cy) / fy) ** 2
+    lens = lens_factor(np.minimum(squared, 1.0), np.array(surfels.falloff))
 
     def look(number: int, row: int) -> Look:
         left = rectifier.rectify(recording.read_frame(number)).left
@@ -190,11 +194,3 @@ def _ssim(first: NDArray[np.uint8], second: NDArray[np.uint8], where: NDArray[np
     likeness = (2 * mean_a * mean_b + _C1) * (2 * both + _C2)
     likeness /= (mean_a**2 + mean_b**2 + _C1) * (var_a + var_b + _C2)
     return float(likeness[where].mean())
-
-
-def _lens(camera: CameraCalibration, surfels: Surfels) -> Array:
-    """Return (H, W) the share of light transmitted by the survey's lens."""
-    fx, fy, cx, cy = camera.intrinsics_px
-    v, u = np.mgrid[0 : camera.height_px, 0 : camera.width_px].astype(np.float64)
-    squared = ((u - cx) / fx) ** 2 + ((v - cy) / fy) ** 2
-    return lens_factor(np.minimum(squared, 1.0), np.array(surfels.falloff))

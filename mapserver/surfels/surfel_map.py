@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.encoding import to_json
-from fleetmap.errors import MapFormatError, NewerFormatError, StateError
+from fleetmap.errors import MapFormatError, StateError
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.mapformat import Manifest, sha256_hex
 from fleetmap.mapformat.container import pack, unpack
 from fleetmap.mapformat.manifest import Positive, Sha256, TileEntry
+from fleetmap.version_grid import decode_index, report_entry
 from mapserver.surfels.exposure import FALLOFF
 
 _log = logging.getLogger(__name__)
@@ -185,7 +186,8 @@ def known_surfels(
     report = report_of(manifest)
     if report is None or report.sha256 is None:
         return SurfelTiles()
-    index = _read_index(blob(report.sha256))
+    own = {"tiles": (), "falloff": NO_FALLOFF, "exposures": ()}
+    index = decode_index(blob(report.sha256), SurfelIndex, "surfels", **own)
     tiles = {
         (entry.x, entry.y): SurfelTile(blob(entry.sha256), entry.landmarks)
         for entry in index.tiles
@@ -196,23 +198,7 @@ def known_surfels(
 
 def report_of(manifest: Manifest) -> SurfelReport | None:
     """Return the build's report on its surfels, None if they were not enabled. MapFormatError for an invalid entry."""
-    found = manifest.report.get(SURFELS_KEY)
-    try:
-        return None if found is None else msgspec.convert(found, SurfelReport)
-    except msgspec.ValidationError as error:
-        raise MapFormatError(f"manifest of {manifest.site} version {manifest.version}: surfels: {error}") from error
-
-
-def _read_index(data: bytes) -> SurfelIndex:
-    try:
-        index = msgspec.json.decode(data, type=SurfelIndex)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise MapFormatError(f"index of surfels: {error}; it is damaged or of another program") from error
-    if msgspec.structs.replace(index, tiles=(), falloff=NO_FALLOFF, exposures=()) != SurfelIndex():
-        raise NewerFormatError(
-            f"index of surfels of format {index.format_version}: made by another fleetmap; update this one"
-        )
-    return index
+    return report_entry(manifest, SURFELS_KEY, SurfelReport)
 
 
 def encode_tile(place: tuple[int, int], surfels: Surfels) -> SurfelTile:

@@ -31,7 +31,12 @@ def tiles_from_survey(
     Raises SurveyError for a survey with values that are not finite.
     """
     map_from_cam = survey.map_from_body @ survey.body_from_cam
-    _check_finite(survey, map_from_cam)
+    bad_points = int((~np.isfinite(survey.points_map).all(axis=1)).sum())
+    bad_places = int((~np.isfinite(map_from_cam).all(axis=(1, 2))).sum())
+    if bad_points or bad_places:
+        raise SurveyError(
+            f"{bad_points} landmarks and {bad_places} keyframes of the survey are not finite; its adjustment failed"
+        )
     cones = viewing_cones(survey, map_from_cam)
     counts = np.bincount(survey.obs_landmark, minlength=len(survey.landmark_ids))
     chosen = np.ones(len(survey.landmark_ids), bool) if chosen is None else chosen
@@ -64,15 +69,6 @@ def tiles_from_survey(
             )
         )
     return tiles
-
-
-def _check_finite(survey: SurveyMap, map_from_cam: Array) -> None:
-    points = int((~np.isfinite(survey.points_map).all(axis=1)).sum())
-    places = int((~np.isfinite(map_from_cam).all(axis=(1, 2))).sum())
-    if points or places:
-        raise SurveyError(
-            f"{points} landmarks and {places} keyframes of the survey are not finite; its adjustment failed"
-        )
 
 
 def _cells(points_map: Array, size_m: float) -> NDArray[np.int64]:

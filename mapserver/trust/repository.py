@@ -192,9 +192,6 @@ class ListRepository:
             metadata.sign(signer, append=True)
         for judge in judges:
             _check(judge, role, metadata)
-        self._write(role, metadata)
-
-    def _write(self, role: str, metadata: Metadata[Any]) -> None:
         number = metadata.signed.version
         path = self.lists.path(role, number)
         with disk_errors(f"{path} cannot be written", "free some space, and run the command again"):

@@ -24,7 +24,11 @@ def write_atomically(path: Path, chunks: Iterable[bytes], mode: int = OWN_FILE) 
     Raises OSError if the disk refuses.
     """
     prefix = f".{path.name[:16]}."
-    _remove_leftovers(path.parent, prefix)
+    with suppress(OSError):
+        for entry in os.scandir(path.parent):
+            is_temporary = entry.name.startswith(prefix) and entry.name.endswith(TEMPORARY_SUFFIX)
+            if is_temporary and time.time() - entry.stat(follow_symlinks=False).st_mtime > _LEFT_AFTER_S:
+                os.unlink(entry.path)  # noqa: PTH108
     temporary = path.with_name(f"{prefix}{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
     descriptor = os.open(temporary, os.O_WRONLY | os.O_EXCL | os.O_CREAT | os.O_CLOEXEC, mode)
     try:
@@ -66,11 +70,3 @@ def appearing_file(path: Path) -> Iterator[BinaryIO]:
     except BaseException:
         part.unlink(missing_ok=True)
         raise
-
-
-def _remove_leftovers(folder: Path, prefix: str) -> None:
-    with suppress(OSError):
-        for entry in os.scandir(folder):
-            is_temporary = entry.name.startswith(prefix) and entry.name.endswith(TEMPORARY_SUFFIX)
-            if is_temporary and time.time() - entry.stat(follow_symlinks=False).st_mtime > _LEFT_AFTER_S:
-                os.unlink(entry.path)  # noqa: PTH108

@@ -4,7 +4,7 @@ A cell is a square column of the map: floor below FLOOR_M, then SLICES voxels of
 """
 
 from collections.abc import Callable, Mapping
-from typing import Annotated
+from typing import Annotated, TypeVar
 
 import msgspec
 import numpy as np
@@ -29,6 +29,7 @@ FLOOR_M, SLICE_M, SLICES = 0.10, 0.25, 8  # the floor's unevenness, and the nois
 TOP_M = FLOOR_M + SLICES * SLICE_M
 HEIGHT_STEP_M, LOWEST_M = 0.01, -0.16  # codes of heights: 0 unknown, then steps from LOWEST_M
 Counts = NDArray[np.uint8]
+T = TypeVar("T", bound=msgspec.Struct)
 Tiles = dict[tuple[int, int], Counts]
 """By (x, y) of the tile: (N, N, 4) bits of occupied voxels, bits of free ones, codes of the lowest and the highest surface."""
 
@@ -131,23 +132,32 @@ def known_grid(manifest: Manifest, blob: Callable[[str], bytes]) -> Tiles:
 
 def report_of(manifest: Manifest) -> GridReport | None:
     """The build's report of its grid, None if the build had to make none. MapFormatError for invalid content."""
-    found = manifest.report.get(GRID_KEY)
+    return report_entry(manifest, GRID_KEY, GridReport)
+
+
+def report_entry(manifest: Manifest, key: str, kind: type[T]) -> T | None:
+    """An entry of the build's report, None if absent. MapFormatError for invalid content."""
+    found = manifest.report.get(key)
     try:
-        return None if found is None else msgspec.convert(found, GridReport)
+        return None if found is None else msgspec.convert(found, kind)
     except msgspec.ValidationError as error:
-        raise MapFormatError(f"manifest of {manifest.site} version {manifest.version}: grid: {error}") from error
+        raise MapFormatError(f"manifest of {manifest.site} version {manifest.version}: {key}: {error}") from error
 
 
 def read_index(data: bytes) -> GridIndex:
-    """Decode the index in `data`; MapFormatError for anything else, NewerFormatError for other parameters."""
+    """Decode the index in `data`; errors as of `decode_index`."""
+    return decode_index(data, GridIndex, "a grid", tiles=())
+
+
+def decode_index(data: bytes, kind: type[T], what: str, **own: object) -> T:
+    """Decode an index of tiles; MapFormatError for anything else, NewerFormatError unless all but its `own` values are the defaults."""
     try:
-        index = msgspec.json.decode(data, type=GridIndex)
+        index = msgspec.json.decode(data, type=kind)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise MapFormatError(f"index of a grid: {error}; it is damaged or not ours") from error
-    if msgspec.structs.replace(index, tiles=()) != GridIndex():
-        raise NewerFormatError(
-            f"index of a grid of format {index.format_version}: made by another fleetmap; update this one"
-        )
+        raise MapFormatError(f"index of {what}: {error}; it is damaged or of another program") from error
+    if msgspec.structs.replace(index, **own) != kind():
+        number = getattr(index, "format_version", None)
+        raise NewerFormatError(f"index of {what} of format {number}: made by another fleetmap; update this one")
     return index
 
 

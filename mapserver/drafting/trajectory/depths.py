@@ -13,7 +13,7 @@ from fleetmap.geometry import AnyArray, Array
 from fleetmap.recordings import Recording
 from fleetmap.recordings.recording import WrappedFrames
 from fleetmap.sensors.calibration import CameraCalibration
-from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps
+from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet
 from mapserver.drafting.trajectory.formats import array_in, read_poses
 from mapserver.drafting.trajectory.given import NEAR_NS, OtherTrajectory, check_span, stamps_on_clock
 
@@ -42,7 +42,12 @@ def with_depths(
         )
     written, camera = read_poses(other.file), recording.calibration.cameras[0]
     _check(file, len(written.map_from_it), camera)
-    frame_of_row = _frames_at(stamps_on_clock(written, recording, indices, other), recording.frame_stamps_ns)
+    # The frame at each stamp, -1 if absent
+    stamps, frame_stamps_ns = stamps_on_clock(written, recording, indices, other), recording.frame_stamps_ns
+    after = np.minimum(np.searchsorted(frame_stamps_ns, stamps), len(frame_stamps_ns) - 1)
+    before = np.maximum(after - 1, 0)
+    off_ns = np.abs(frame_stamps_ns[[before, after]] - stamps)
+    frame_of_row = np.where(off_ns.min(axis=0) > NEAR_NS, -1, np.where(off_ns[0] < off_ns[1], before, after))
     if (frame_of_row >= 0).mean() <= 0.5:
         raise RecordingError(
             f"{other.file} belongs to another recording: most of its stamps match no frame; pass the recording's own"
@@ -84,14 +89,6 @@ def _check(file: Path, count: int, camera: CameraCalibration) -> None:
             raise RecordingError(
                 f"{file}: image {number + 1} has invalid inverse depths: they must be finite and not negative"
             )
-
-
-def _frames_at(stamps: Stamps, frame_stamps_ns: Stamps) -> NDArray[np.int64]:
-    """Return (N,) the frame at each stamp, -1 if absent."""
-    after = np.minimum(np.searchsorted(frame_stamps_ns, stamps), len(frame_stamps_ns) - 1)
-    before = np.maximum(after - 1, 0)
-    off_ns = np.abs(frame_stamps_ns[[before, after]] - stamps)
-    return np.where(off_ns.min(axis=0) > NEAR_NS, -1, np.where(off_ns[0] < off_ns[1], before, after))
 
 
 def _pinhole(file: Path, camera: CameraCalibration, shape: tuple[int, ...]) -> Array:

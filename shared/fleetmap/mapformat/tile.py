@@ -80,19 +80,6 @@ def check_tile(tile: Tile) -> Tile:
         check_increasing(ids, f"{tile.name}: {field}")
     for place_id, ids in zip(tile.place_ids, tile.place_landmark_ids, strict=True):
         check_increasing(ids, f"{tile.name}: landmarks of place {place_id}")
-    _check_values(tile)
-    return tile
-
-
-def check_increasing(ids: Ids, what: str) -> None:
-    """Raise MapFormatError unless the ids are uint32 and strictly increasing."""
-    if ids.dtype != np.uint32 or ids.ndim != 1:
-        raise MapFormatError(f"{what} are {ids.dtype} of shape {ids.shape} instead of a row of uint32")
-    if (ids[1:] <= ids[:-1]).any():
-        raise MapFormatError(f"{what} are not strictly increasing; sort them and remove duplicates")
-
-
-def _check_values(tile: Tile) -> None:
     inside = tile.points_map[:, :2] - tile.origin_m
     if ((inside < -1e-3) | (inside > tile.size_m + 1e-3)).any():
         worst = tile.points_map[int(np.abs(inside - tile.size_m / 2).max(axis=1).argmax())]
@@ -102,3 +89,12 @@ def _check_values(tile: Tile) -> None:
         raise MapFormatError(
             f"{tile.name}: view_directions_map has lengths from {lengths.min()} to {lengths.max()}, not 1"
         )
+    return tile
+
+
+def check_increasing(ids: Ids, what: str) -> None:
+    """Raise MapFormatError unless the ids are uint32 and strictly increasing."""
+    if ids.dtype != np.uint32 or ids.ndim != 1:
+        raise MapFormatError(f"{what} are {ids.dtype} of shape {ids.shape} instead of a row of uint32")
+    if (ids[1:] <= ids[:-1]).any():
+        raise MapFormatError(f"{what} are not strictly increasing; sort them and remove duplicates")

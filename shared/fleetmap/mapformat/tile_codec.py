@@ -123,14 +123,10 @@ class Columns:
 
     def increasing(self, count: int) -> Ids:
         """The next `count` ids; raises MapFormatError unless they are strictly increasing."""
-        return self._sums(self.planes(count, 4))
+        return self.sums(self.planes(count, 4))
 
-    def increasing_lists(self, counts: NDArray[np.int64]) -> tuple[Ids, ...]:
-        """The next lists of ids, with the given lengths; errors as of `increasing`."""
-        values = self.planes(int(counts.sum()), 4)
-        return tuple(self._sums(part) for part in np.split(values, np.cumsum(counts)[:-1])) if len(counts) else ()
-
-    def _sums(self, steps: Ids) -> Ids:
+    def sums(self, steps: Ids) -> Ids:
+        """The ids that these steps give; errors as of `increasing`."""
         sums = np.cumsum(steps.astype(np.uint64))
         if len(sums) and sums[-1] >= 1 << 32:
             raise MapFormatError(f"tile: an id adds up to {sums[-1]}, more than 32 bits hold; the bytes are damaged")
@@ -284,4 +280,5 @@ def _references(columns: Columns, places: int, references: int) -> tuple[Ids, ..
         raise MapFormatError(
             f"tile: places list {counts.sum()} landmarks, the header says {references}; the bytes are damaged"
         )
-    return columns.increasing_lists(counts)
+    values = columns.planes(references, 4)
+    return tuple(columns.sums(part) for part in np.split(values, np.cumsum(counts)[:-1])) if places else ()

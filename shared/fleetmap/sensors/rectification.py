@@ -163,7 +163,12 @@ class Rectifier:
         focal_px = float(np.mean([c.focal_px.mean() for c in used]))
         self.camera = StereoCamera(focal_px, float(cx), float(cy), baseline, used[0].width_px, used[0].height_px)
         if pinhole is not None:
-            self.camera = _as_pinhole(pinhole, self.camera)
+            if not 1 / _MAX_ZOOM < self.camera.focal_px / pinhole.focal_px < _MAX_ZOOM:
+                raise CalibrationError(
+                    f"a camera of focal length {self.camera.focal_px:.1f} px cannot be joined to a map made at {pinhole.focal_px:.1f} px; "
+                    "survey the site with cameras that are alike, or as a site of its own"
+                )
+            self.camera = replace(pinhole, baseline_m=baseline)
         self.body_from_cam = cameras[0].body_from_cam @ se3(cam0_from_rect, np.zeros(3))
         self.imu_minus_cam_s = cameras[0].imu_minus_cam_s
         self.others = tuple(self._of_view(calibration, numbers) for numbers in others)
@@ -251,16 +256,6 @@ def _rectifying_rotation(
     y_axis = np.cross(half[:, 2], x_axis)
     y_axis /= np.linalg.norm(y_axis)
     return np.stack([x_axis, y_axis, np.cross(x_axis, y_axis)], axis=1), baseline_m
-
-
-def _as_pinhole(pinhole: StereoCamera, own: StereoCamera) -> StereoCamera:
-    ratio = own.focal_px / pinhole.focal_px
-    if not 1 / _MAX_ZOOM < ratio < _MAX_ZOOM:
-        raise CalibrationError(
-            f"a camera of focal length {own.focal_px:.1f} px cannot be joined to a map made at {pinhole.focal_px:.1f} px; "
-            "survey the site with cameras that are alike, or as a site of its own"
-        )
-    return replace(pinhole, baseline_m=own.baseline_m)
 
 
 @lru_cache(

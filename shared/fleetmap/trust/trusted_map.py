@@ -93,7 +93,12 @@ class TrustedMap:
                 self._refresh()
             self._fault = None
         except (LinkError, StoreError) as error:
-            fault = self._with_next_step(error) if isinstance(error, UntrustedError) else error
+            fault = error
+            if isinstance(error, UntrustedError):
+                step = "look at `mapserver trust status` on the server, and at both clocks"
+                if error.kind == "signature" and self._is_first_use:
+                    step = f"if the server's store was recreated, remove {self._folder}; else another server replies instead"
+                fault = UntrustedError(error.kind, f"{error.words}; {step}")
             if str(fault) != str(self._fault):
                 hours = self.word_hours
                 age = "" if hours is None else f", last word {hours:.1f} h ago"
@@ -145,12 +150,6 @@ class TrustedMap:
         """Hours since the last verified lists; None if there were none."""
         return None if self._clock.heard_s == 0 else max(0.0, self._wall_s() - self._clock.heard_s) / 3600
 
-    def _with_next_step(self, error: UntrustedError) -> UntrustedError:
-        step = "look at `mapserver trust status` on the server, and at both clocks"
-        if error.kind == "signature" and self._is_first_use:
-            step = f"if the server's store was recreated, remove {self._folder}; else another server replies instead"
-        return UntrustedError(error.kind, f"{error.words}; {step}")
-
     def _refresh(self) -> None:
         from fleetmap.trust.tuf_client import update_lists
 
@@ -158,7 +157,11 @@ class TrustedMap:
         update_lists(self._folder, self._site, self._root(), self._ask)
         wall_s, clock = self._wall_s(), self._clock
         files = ("root", "timestamp", "snapshot", "targets", site_role(self._site))
-        self._check_delegated()
+        # A site without a signing key: its last list stays in the folder, and python-tuf does not check it.
+        data = msgspec.json.decode((self._folder / "targets.json").read_bytes())
+        roles = (data["signed"].get("delegations") or {}).get("roles", [])
+        if site_role(self._site) not in {role["name"] for role in roles}:
+            raise UntrustedError("signature", f"no key may sign maps of site {self._site}")
         signed = {
             name: msgspec.json.decode((self._folder / f"{name}.json").read_bytes(), type=_File).signed for name in files
         }
@@ -183,13 +186,6 @@ class TrustedMap:
             write_atomically(self._folder / "clock", [" ".join(map(str, self._clock)).encode()], mode=0o666)
             self._kept_clock_s = wall_s
             self._sync(before)
-
-    def _check_delegated(self) -> None:
-        """Refuse a site without a signing key: its last list stays in the folder, and python-tuf does not check it."""
-        data = msgspec.json.decode((self._folder / "targets.json").read_bytes())
-        roles = (data["signed"].get("delegations") or {}).get("roles", [])
-        if site_role(self._site) not in {role["name"] for role in roles}:
-            raise UntrustedError("signature", f"no key may sign maps of site {self._site}")
 
     def _root(self) -> bytes:
         if self._pinned_root is None:

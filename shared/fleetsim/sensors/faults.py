@@ -1,7 +1,7 @@
 """Faults, by name and time. To add one: a line in FAULTS and its effect below."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -76,10 +76,9 @@ class FaultPlan:
 
     def spoil_wheels(self, samples: tuple[WheelSample, ...]) -> tuple[WheelSample, ...]:
         """The samples with slip."""
-        return tuple(self._slipped(sample) for sample in samples)
-
-    def _slipped(self, sample: WheelSample) -> WheelSample:
-        if not self.has("wheel-slip", (sample.stamp_ns - START_NS) * 1e-9):
-            return sample
-        velocity = sample.velocity_base_mps * SLIP
-        return WheelSample(sample.stamp_ns, velocity, sample.yaw_rate_radps, sample.sigma_mps, sample.sigma_radps)
+        return tuple(
+            replace(sample, velocity_base_mps=sample.velocity_base_mps * SLIP)
+            if self.has("wheel-slip", (sample.stamp_ns - START_NS) * 1e-9)
+            else sample
+            for sample in samples
+        )

@@ -202,7 +202,11 @@ def decode_prior(data: bytes) -> PositionPrior:
     """geometry_msgs/PoseWithCovarianceStamped as map_from_base."""
     reader = CdrReader(data)
     stamp_ns, _ = reader.stamp_ns(), reader.text()
-    map_from_base = _target_from_source(reader.doubles(7))
+    position_quat_xyzw = reader.doubles(7)
+    norm = float(np.linalg.norm(position_quat_xyzw[3:]))
+    if not np.isfinite(position_quat_xyzw).all() or abs(norm - 1) > 0.01:
+        raise ValueError(f"the quaternion {position_quat_xyzw[3:].tolist()} is not of unit length")
+    map_from_base = se3(rotation_from_quat_wxyz(position_quat_xyzw[[6, 3, 4, 5]]), position_quat_xyzw[:3])
     return PositionPrior(stamp_ns, map_from_base, reader.doubles(36).reshape(6, 6)[HALVES_SWAPPED])
 
 
@@ -261,13 +265,6 @@ def encode_frame_links(stamp_ns: int, links: Sequence[FrameLink]) -> bytes:
 def encode_text(text: str) -> bytes:
     """std_msgs/String."""
     return CdrWriter().text(text).message()
-
-
-def _target_from_source(position_quat_xyzw: Array) -> Array:
-    norm = float(np.linalg.norm(position_quat_xyzw[3:]))
-    if not np.isfinite(position_quat_xyzw).all() or abs(norm - 1) > 0.01:
-        raise ValueError(f"the quaternion {position_quat_xyzw[3:].tolist()} is not of unit length")
-    return se3(rotation_from_quat_wxyz(position_quat_xyzw[[6, 3, 4, 5]]), position_quat_xyzw[:3])
 
 
 def position_quat_xyzw(target_from_source: Array) -> Array:
