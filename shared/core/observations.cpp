@@ -7,8 +7,6 @@
 
 namespace fleetmap {
 
-constexpr double kUnknown = std::numeric_limits<double>::quiet_NaN();
-
 void Observations::add(int64_t frame, size_t camera, const int64_t* ids, const double* pixels, size_t count) {
   for (size_t n = 0; n < count; ++n) seen_.push_back({ids[n], frame, camera, {pixels[3 * n], pixels[3 * n + 1], pixels[3 * n + 2]}});
 }
@@ -40,16 +38,14 @@ const Tracks& Observations::take(const LivingPoints& living, const std::vector<i
       for (const size_t row : rows_) stays_[row] = !has_ended;
       continue;
     }
-    const auto has_disparity = [&](size_t row) { return std::isfinite(seen_[row].pixels[2]); };
-    const bool is_confirmed = std::count_if(rows_.begin(), rows_.end(), has_disparity) > 1;
     size_t nearest = rows_.back();
     double inverse_depth = -std::numeric_limits<double>::infinity(), depth = first_depth_m;
     for (const size_t row : rows_) {
       const auto& [track_id, frame, camera, pixels] = seen_[row];
       const double disparity = pixels[0] - pixels[2], scale = cameras[camera].lens.focal_baseline;
-      if (has_disparity(row) && disparity / scale > inverse_depth)
+      if (std::isfinite(pixels[2]) && disparity / scale > inverse_depth)
         nearest = row, inverse_depth = disparity / scale, depth = scale / disparity;
-      tracks_.sightings.push_back({clone_of(row), view_of(row), pixels[0], pixels[1], is_confirmed ? pixels[2] : kUnknown});
+      tracks_.sightings.push_back({clone_of(row), view_of(row), pixels[0], pixels[1], pixels[2]});
     }
     const StereoLens& lens = cameras[seen_[nearest].camera].lens;
     const double* const pixels = seen_[nearest].pixels;

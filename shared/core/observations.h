@@ -21,10 +21,8 @@ class Observations {
   void add(int64_t frame, size_t camera, const int64_t* ids, const double* pixels, size_t count);
 
   // Removes the tracks that ended, or are due, with two observations or more in the clones, frames in the window's order. Due tracks with
-  // one observation stay, ended ones are forgotten. View clone * C + camera is one of C cameras. A track's only disparity is left out: no
-  // other confirms it, and while the speed is unknown a wrong one, of a point that seems near, outweighs all other tracks. The first guess
-  // of a point is the stereo point of the nearest view, or first_depth_m along the last ray if no view has a disparity. The result is
-  // valid until the next call.
+  // one observation stay, ended ones are forgotten. View clone * C + camera is one of C cameras. The first guess of a point is the stereo
+  // point of the nearest view, or first_depth_m along the last ray if no view has a disparity. The result is valid until the next call.
   const Tracks& take(const LivingPoints& living, const std::vector<int64_t>& clones, const std::vector<RigCamera>& cameras,
                      double first_depth_m);
 
