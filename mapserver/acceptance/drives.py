@@ -172,9 +172,11 @@ def examined(
         numbers = spread(np.flatnonzero(known & reference.free), request.pictures)
         pictures = list(_pictures(recording, [(int(selected[n]), truths[n]) for n in numbers], version.view))
         starts = [_start(frames, reference.trajectory) for frames in report.starts]
-        poses = zip(localised.stamps_ns.tolist(), localised.frame_from_body, strict=True)
+        stamped = zip(localised.stamps_ns.tolist(), localised.frame_from_body, strict=True)
         compared = [
-            (pose, reference.trajectory.at(stamp)) for stamp, pose in poses if reference.trajectory is not localised
+            (map_from_body, reference.trajectory.at(stamp))
+            for stamp, map_from_body in stamped
+            if reference.trajectory is not localised
         ]
         errors_m = [_off(map_from_body, truth)[0] for map_from_body, truth in compared if truth is not None]
         docks_mm = [

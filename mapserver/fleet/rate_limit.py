@@ -24,16 +24,19 @@ class RateLimit:
         with self._lock:
             if key not in self._buckets and len(self._buckets) >= _MAX_KEYS:
                 if self._searched_ns is None or abs(now_ns - self._searched_ns) >= _SEARCHED_EVERY_NS:
-                    self._searched_ns = now_ns
-                    # Full buckets: a missing key counts as full
-                    self._buckets = {
-                        key: (level, then_ns)
-                        for key, (level, then_ns) in self._buckets.items()
-                        if level + abs(now_ns - then_ns) * self._per_ns < self._burst
-                    }
+                    self._forget(now_ns)
                 if len(self._buckets) >= _MAX_KEYS:
                     return False
             level, then_ns = self._buckets.get(key, (self._burst, now_ns))
             level = min(self._burst, level + max(0, now_ns - then_ns) * self._per_ns)
             self._buckets[key] = (max(0.0, level - 1.0) if level >= 1.0 else level, now_ns)
             return level >= 1.0
+
+    def _forget(self, now_ns: int) -> None:
+        """Drop full buckets: a missing key counts as full."""
+        self._searched_ns = now_ns
+        self._buckets = {
+            key: (level, then_ns)
+            for key, (level, then_ns) in self._buckets.items()
+            if level + abs(now_ns - then_ns) * self._per_ns < self._burst
+        }

@@ -1,6 +1,5 @@
 """Reads a stranger's recording in a process of its own, with limits: arguments RECORDING CALIBRATION TOPICS. Prints what `read` returns."""
 
-import json
 import os
 import resource
 import sys
@@ -8,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 
+from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError
 from fleetmap.recordings import OpenOptions, open_recording
 from fleetmap.sensors.source_settings import Topics
@@ -40,4 +40,5 @@ def why_unreadable(path: Path, error: Exception) -> str:
 
 if __name__ == "__main__":
     _calibration = Path(sys.argv[2]) if sys.argv[2] else None
-    print(json.dumps(read(Path(sys.argv[1]), OpenOptions(_calibration, msgspec.json.decode(sys.argv[3], type=Topics)))))
+    _options = OpenOptions(_calibration, msgspec.json.decode(sys.argv[3], type=Topics))
+    print(to_json(read(Path(sys.argv[1]), _options)).decode())

@@ -60,15 +60,15 @@ def calibration_of_options(options: OpenOptions, log: ReadLog) -> CalibrationFil
 
 def _sound_truth(truth: Trajectory, log: ReadLog) -> Trajectory | None:
     """The ground truth without rows that are no pose or too far away, which are noted; None if no row is left."""
-    poses = truth.frame_from_body
-    near = np.asarray((np.abs(poses) <= MOST).all(axis=(1, 2)))
-    rotations = np.where(near[:, None, None], poses[:, :3, :3], 0.0)
+    frame_from_body = truth.frame_from_body
+    near = np.asarray((np.abs(frame_from_body) <= MOST).all(axis=(1, 2)))
+    rotations = np.where(near[:, None, None], frame_from_body[:, :3, :3], 0.0)
     off = rotations @ rotations.transpose(0, 2, 1) - np.eye(3)
     kept = near & np.asarray((np.abs(off) < _ROTATION_OFF).all(axis=(1, 2)))
     if not kept.all():
         words = f"{int((~kept).sum())} of {len(kept)} left out: not finite, farther than {MOST:g} m, or no rotation"
         log.note("ground truth: rows that are no pose", words)
-    return Trajectory(truth.stamps_ns[kept], poses[kept]) if kept.any() else None
+    return Trajectory(truth.stamps_ns[kept], frame_from_body[kept]) if kept.any() else None
 
 
 def finalize(parts: RecordingParts, log: ReadLog) -> Recording:

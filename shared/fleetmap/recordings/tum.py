@@ -71,19 +71,19 @@ def read_truth(path: Path, log: ReadLog) -> Trajectory:
 
     RecordingError if the file cannot be read, or most of it cannot be used.
     """
-    poses, faults = list[Trajectory](), list[str]()
+    read, faults = list[Trajectory](), list[str]()
     for number, line in enumerate(read_text(path, "a TUM trajectory is expected").splitlines(), start=1):
         try:
-            poses.append(parse_tum(line, str(path), number))
+            read.append(parse_tum(line, str(path), number))
         except RecordingError as error:
             faults.append(str(error))
-    if len(faults) >= sum(map(len, poses)):
+    if len(faults) >= sum(map(len, read)):
         raise RecordingError(faults[0] if faults else f"{path} holds no pose; leave the file out")
     if faults:
         log.note("ground truth: unreadable lines", f"{len(faults)} left out; {faults[0]}")
-    stamps_ns = np.concatenate([pose.stamps_ns for pose in poses])
+    stamps_ns = np.concatenate([one.stamps_ns for one in read])
     kept = forward_only(stamps_ns, "ground truth", log)
-    return Trajectory(stamps_ns[kept], np.concatenate([pose.frame_from_body for pose in poses])[kept])
+    return Trajectory(stamps_ns[kept], np.concatenate([one.frame_from_body for one in read])[kept])
 
 
 class StampedLine(NamedTuple):

@@ -2,6 +2,7 @@
 
 import json
 import time
+from itertools import count
 
 import numpy as np
 import pytest
@@ -93,12 +94,14 @@ def test_images_come_under_bare_names(is_compressed: bool) -> None:
         queue, topics = intake(), Topics(left="/rig/left", right="/rig/right")
         handles = Ros2Source(bus, BridgedDdsKeys(), topics, calibration()).subscribe(queue)
         grey = np.arange(48, dtype=np.uint8).reshape(6, 8)
-        if is_compressed:
-            data, end = encode_compressed_image(5, "c", png_image(grey), "png"), "/compressed"
-        else:
-            data, end = encode_image(5, "c", grey_image(grey)), ""
+        stamps_ns = count(5)
 
         def arrives() -> bool:
+            stamp_ns = next(stamps_ns)
+            if is_compressed:
+                data, end = encode_compressed_image(stamp_ns, "c", png_image(grey), "png"), "/compressed"
+            else:
+                data, end = encode_image(stamp_ns, "c", grey_image(grey)), ""
             for side in ("left", "right"):
                 dds.put(f"rig/{side}{end}", data)
             return queue.counts.frames > 0

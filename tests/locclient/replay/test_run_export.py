@@ -85,7 +85,6 @@ def test_the_mcap_file_holds_the_same(room: tuple[Path, Path], tmp_path: Path) -
 @pytest.mark.parametrize(
     ("given", "said"),
     [
-        (["--foxglove", "0"], "`locclient replay --mcap FILE`"),
         (["--mcap", "run.txt"], "must end in .mcap"),
         (["--mcap", "run.mcap"], "pip install '.[foxglove]'"),
     ],

@@ -151,7 +151,7 @@ def test_surfels_and_pictures() -> None:
     everywhere = AreaCorrections((), [area(FORGET, (-1, -1), (17, 17))])
     assert everywhere.surfels_before(old).tiles == {}
     picture = SurveyPicture(
-        place_map_m=(2.0, 9.0, 1.0), looks_map=(1.0, 0.0, 0.0), stamp_ns=1, recording="a", sha256=sha256_hex(b""), bytes=1
+        place_map_m=(2.0, 9.0, 1.0), looks_map=(1.0, 0.0, 0.0), stamp_ns=1, kept_ns=1, recording="a", sha256=sha256_hex(b""), bytes=1
     )  # fmt: skip
     assert AreaCorrections((), [area(FORGET, (0, 8), (4, 16))]).pictures_before([picture]) == []
     assert corrections.pictures_before([picture]) == [picture]

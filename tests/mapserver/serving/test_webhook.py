@@ -224,7 +224,16 @@ def test_the_rules_of_prometheus_are_those_of_the_webhook() -> None:
         assert checked.returncode == 0, checked.stdout + checked.stderr
     (group,) = yaml.safe_load(RULES.read_text("utf-8"))["groups"]
     told = {rule["alert"] for rule in group["rules"]}
-    expected = {"FailureRate", "RobotLost", "RobotCopied", "NightFailed", "CanaryRolledBack", "DiskFills", "TrustFault"}
+    expected = {
+        "FailureRate",
+        "RobotLost",
+        "RobotCopied",
+        "RobotOverloaded",
+        "NightFailed",
+        "CanaryRolledBack",
+        "DiskFills",
+        "TrustFault",
+    }
     # A server cannot tell that it is down; days left are in the sentence of FleetmapTrustFault.
     expected |= {"ServerDown", "CertificateEnds", "ListEnds"}
     assert told == {f"Fleetmap{name}" for name in expected}
