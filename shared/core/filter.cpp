@@ -549,6 +549,14 @@ double Filter::correct_by_rest(Vec3 gyro_mean, double gyro_sigma, double gate) {
   return correct_with(m, gate);
 }
 
+void Filter::correct_by_speed(Vec3 velocity, double sigma_mps) {
+  Measurement m{3};
+  store(kIdentity, m.jacobian[0] + kVelocity, int(kNav));
+  store(velocity - state.velocity, m.residual);
+  for (int a = 0; a < 3; ++a) m.noise[a] = m.true_noise[a] = sigma_mps * sigma_mps;
+  correct_with(m, std::numeric_limits<double>::infinity());
+}
+
 bool Filter::inflate(size_t index, Vec3 seen_position, double gap_s) {
   // The position since the clone, as far as both turn about the origin together.
   const Mat3 lever = skew(state.position);

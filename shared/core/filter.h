@@ -92,6 +92,9 @@ class Filter {
   // By standstill: zero speed and rotation, the gyro's mean shows only its bias (ZUPT).
   double correct_by_rest(Vec3 gyro_mean, double gyro_sigma, double gate);
 
+  // By the speed (3,) that images show, in the state's axes; no prior speed makes it an outlier.
+  void correct_by_speed(Vec3 velocity, double sigma_mps);
+
   // Inflates position and velocity if vision contradicts the prediction since a clone beyond its covariance; true if it did.
   // Values that are not finite contradict nothing.
   // After seconds without images an IMU's error can exceed its noise figures; a filter that then rejects every image never recovers.

@@ -953,6 +953,9 @@ class Filter:
     def correct_by_rest(self, gyro_mean_radps: _Reals, gyro_sigma_radps: float, gate: float) -> float:
         """Correct by standstill, at which the gyro shows only its bias. Otherwise as correct_by_wheels."""
 
+    def correct_by_speed(self, velocity_odom_mps: _Reals, sigma_mps: float) -> None:
+        """Correct by the speed (3,) that images show, however far from the state's; it has the axes of `odom`."""
+
     def inflate(self, clone_id: int, seen_odom_from_body: _Reals, gap_s: float) -> bool:
         """Inflate position and velocity if vision contradicts the prediction since a clone; True if it did.
 

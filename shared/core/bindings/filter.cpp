@@ -236,6 +236,10 @@ void bind_filter(nb::module_& module) {
              return unlocked([&] { return filter.correct_by_rest(vec3(gyro.data()), sigma, most); });
            }),
            "gyro_mean_radps"_a.noconvert(), "gyro_sigma_radps"_a, gate)
+      .def("correct_by_speed", in_turn(+[](SharedFilter& filter, const Vector& velocity, double sigma_mps) {
+             filter.correct_by_speed(vec3(velocity.data()), sigma_mps);
+           }),
+           "velocity_odom_mps"_a.noconvert(), "sigma_mps"_a)
       .def("inflate", in_turn(+[](SharedFilter& filter, int64_t id, const Transform& seen, double gap_s) {
              return filter.inflate(index_of(filter, id), se3(seen.data()).translation, gap_s);
            }),
