@@ -13,6 +13,7 @@ from fleetmap.sensors.samples import INTEGRATED_NS, PAUSE_NS, ImuSamples, Stamps
 IMU_GAP_NS = 35_000_000  # a longer gap is bridged as without an IMU; an IMU of 30 Hz has no such gaps
 _WHEEL_REACH_NS = 30_000_000  # a sample serves a frame within half the period of slow wheel odometry
 _FOR_EVER_NS = 1 << 62
+_NOISY_SAMPLES = 100  # none equal to the one before: the gyro's noise exceeds its resolution, and one that repeats a sample is frozen
 
 
 def is_pause(imu_stamps_ns: Stamps, start_ns: int, end_ns: int) -> bool:
@@ -22,12 +23,16 @@ def is_pause(imu_stamps_ns: Stamps, start_ns: int, end_ns: int) -> bool:
 
 
 class SensorBuffer:
-    """Samples in order of their stamps, on the IMU's clock; spikes of the IMU are left out. The arrays of `imu` are never written again."""
+    """Samples in order of their stamps, on the IMU's clock, without spikes and a frozen gyro. The arrays of `imu` are never written again."""
 
     def __init__(self) -> None:
         self.imu = ImuSamples.empty()
         self._pending: list[ImuSamples] = []
         self._wheel: list[WheelSample] = []
+        self._last_gyro_radps = np.full((1, 3), np.nan)
+        self._unequal = (
+            0.0  # samples known to have no repeated one before them; never enough for a coarse gyro, which repeats some
+        )
 
     def add_imu(self, samples: ImuSamples) -> None:
         """Add samples newer than any before; `imu` has them after `absorb`."""
@@ -43,7 +48,7 @@ class SensorBuffer:
         Without an IMU wheels serve no start: all samples that serve no frame from needed_from_ns on are dropped.
         """
         if self._pending:
-            parts = [self.imu, *self._pending]
+            parts = [self.imu, *map(self._not_frozen, self._pending)]
             stamps_ns = np.concatenate([part.stamps_ns for part in parts])
             gyro_radps = np.concatenate([part.gyro_radps for part in parts])
             accel_mps2 = np.concatenate([part.accel_mps2 for part in parts])
@@ -56,6 +61,15 @@ class SensorBuffer:
         serves_ns = oldest if len(self.imu) else needed_from_ns - _WHEEL_REACH_NS
         if self._wheel and self._wheel[0].stamp_ns < serves_ns:
             self._wheel = [s for s in self._wheel if s.stamp_ns >= serves_ns]
+
+    def _not_frozen(self, samples: ImuSamples) -> ImuSamples:
+        """Samples without those that a frozen gyro repeats to the bit: it measures nothing, and the gap is bridged."""
+        gyro_radps = np.concatenate([self._last_gyro_radps, samples.gyro_radps])
+        self._last_gyro_radps, is_new = gyro_radps[-1:], (gyro_radps[1:] != gyro_radps[:-1]).any(axis=1)
+        if self._unequal >= _NOISY_SAMPLES:
+            return ImuSamples(samples.stamps_ns[is_new], samples.gyro_radps[is_new], samples.accel_mps2[is_new])
+        self._unequal += len(samples) if is_new.all() else -np.inf
+        return samples
 
     def rotation_between(self, start_ns: int, end_ns: int, noise: ImuNoise) -> Array | None:
         """earlier_from_later (3, 3) of the body by the gyro, its bias included; None if samples are missing."""

@@ -125,6 +125,16 @@ def with_imu_of(session: EstimatorSession, other: EstimatorSession, from_s: floa
     return EstimatorSession(replace(session.session, imu=mixed), field=session._field)
 
 
+def with_frozen_gyro(session: EstimatorSession, starts_s: Array, duration_s: float) -> EstimatorSession:
+    """The run with a gyro that repeats its sample at each start for a while."""
+    imu = session.session.imu
+    times_s, gyro_radps = (imu.stamps_ns - START_NS) * 1e-9, imu.gyro_radps.copy()
+    for start_s in starts_s:
+        frozen = np.flatnonzero((times_s >= start_s) & (times_s < start_s + duration_s))
+        gyro_radps[frozen] = gyro_radps[frozen[0]]
+    return EstimatorSession(replace(session.session, imu=replace(imu, gyro_radps=gyro_radps)), field=session._field)
+
+
 def _rms(errors: Array) -> float:
     return float(np.sqrt((errors**2).sum(axis=1).mean()))
 

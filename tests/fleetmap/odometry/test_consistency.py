@@ -80,12 +80,17 @@ def test_a_short_fault_leaves_the_speed_alone(site: consistency.Site, fault: str
 
 
 @pytest.mark.parametrize("settings", [OdometrySettings(), WITHOUT_WHEELS], ids=["wheels", "no wheels"])
+@pytest.mark.parametrize("is_frozen", [False, True], ids=["silent", "frozen"])
 def test_an_imu_that_falls_silent_again_and_again_leaves_an_honest_motion(
-    site: consistency.Site, settings: OdometrySettings
+    site: consistency.Site, settings: OdometrySettings, is_frozen: bool
 ) -> None:
-    """Half of the time without samples, straight on and in a turn: each step is as exact as it is said to be, up to the last."""
-    faults = tuple(Fault("imu-gap", start_s, start_s + 0.5) for start_s in np.arange(6.0, 12.0))
-    session = site.session(2032, "tote-1", faults=faults)
+    """Half of the time without samples, or with the gyro's last one, straight on and in a turn: each step is exact, up to the last."""
+    starts_s = [] if is_frozen else np.arange(6.0, 12.0)
+    session = site.session(
+        2032, "tote-1", faults=tuple(Fault("imu-gap", start_s, start_s + 0.5) for start_s in starts_s)
+    )
+    if is_frozen:
+        session = consistency.with_frozen_gyro(session, np.arange(6.0, 12.0), 0.5)
     estimates = estimator_loop.run_odometry(session, 182, settings=settings)
     first = next(k for k, e in enumerate(estimates) if e.inertial) + 1
     steps = np.array([e.previous_from_body for e in estimates[first:]])
