@@ -138,8 +138,9 @@ def _of_confirmed(
     radius_m = radius_95_m(confirmed.now_cov) if is_known else float("inf")
     age_s = (estimate.odometry.stamp_ns - confirmed.stamp_ns) * 1e-9
     cause = _cause(estimate, has_failed=has_failed)
-    # Its tracks or its IMU were lost, and the map has not confirmed its place since.
-    is_doubted = confirmed.has_broken or confirmed.lost_imu
+    is_told = any(h.speaks_against_others(settings) for h in elsewhere)
+    # Its tracks or its IMU were lost, and the map has not confirmed its place since; or frames, and the map shows another one since.
+    is_doubted = confirmed.has_broken or confirmed.lost_imu or (confirmed.missed and is_told)
     if radius_m > settings.lost_radius_m:
         status = Status.LOST
     elif (
@@ -152,7 +153,6 @@ def _of_confirmed(
     else:
         status, cause = Status.TRACKING, Cause.NONE
     estimate = replace(estimate, status=status, cause=cause)
-    is_told = any(h.speaks_against_others(settings) for h in elsewhere)
     if status is not Status.TRACKING and is_told:  # the robot may be at either
         places = _published([confirmed, *elsewhere])
         return replace(estimate, status=Status.AMBIGUOUS, hypotheses=places)

@@ -36,7 +36,8 @@ class PoseHypothesis:
     decayed. query_inliers, query_recall: of this query's fix, 0 without. recall_total, looks: landmark recall of all queries, 0
     for those without a fix, and their number. misses: queries since the last fix. told_log_odds: log odds that an operator who chose
     this place is right, 0 without one. has_broken: tracks were lost since the last fix, lost_imu: so was the IMU, for longer than
-    images alone are believed. is_by_vision: it moved without an IMU since its frame. floor: whose `map` it is, empty for the robot's own.
+    images alone are believed, missed: so were frames. is_by_vision: it moved without an IMU since its frame. floor: whose `map` it
+    is, empty for the robot's own.
     """
 
     frame_index: int
@@ -60,6 +61,7 @@ class PoseHypothesis:
     told_log_odds: float = 0.0
     has_broken: bool = False
     lost_imu: bool = False
+    missed: bool = False
     is_by_vision: bool = False
     floor: str = ""
     history: ObservationHistory = field(default_factory=ObservationHistory)
@@ -79,7 +81,7 @@ class PoseHypothesis:
         then = compose_end_cov(map_from_body, cov_rot_trans, query.map_from_body, query.cov_rot_trans)
         now = compose_end_cov(map_from_body, cov_rot_trans, query.now_map_from_body, query.now_cov)
         fresh = cls(query.frame_index, query.stamp_ns, *then, *now, has_broken=query.has_broken, floor=floor)
-        fresh.lost_imu, fresh.is_by_vision = query.lost_imu, query.is_by_vision
+        fresh.lost_imu, fresh.missed, fresh.is_by_vision = query.lost_imu, query.missed, query.is_by_vision
         return fresh
 
     @property

@@ -26,6 +26,7 @@ from locclient.localization.settings import LocalizerSettings
 
 _OWN_FIX_M = 0.3  # between a fix and the hypothesis that it supports
 _EARLIER = 3  # frames that a query may pool with its own: of a metre of a drive
+_MISSED_STEPS = 1.5  # shortest steps between frames: a longer one missed some
 NO_AGREEMENT = QueryResult(refused="nothing in the map matches this frame")
 ONE_OF_FLOORS = "another floor may look the same from here: drive a metre, pass a dock, or send a pose with its floor"
 OUTSIDE_PRIOR = QueryResult(refused="what the map matches lies outside the given initial pose")
@@ -97,6 +98,7 @@ class PoseTracker:
         self.lookalikes: LookAlikes | None = None
         self.alias_step_m = ALIAS_STEP_M
         self.odom_from_body: Array | None = None  # of the last frame
+        self._last_ns, self._period_ns = 0, 1 << 62  # of frames: the last stamp, and the shortest step
         self._imu_ns: int | None = None  # stamp of the last frame with an IMU, None once its loss is a doubt
         self._query_frame: PoseHypothesis | None = None  # of the running map query, as the identity
         self._query_index: int | None = None  # of the last map query's frame
@@ -195,6 +197,8 @@ class PoseTracker:
         # What friction allows a robot to do that images misread: about its weight accelerates it at most.
         lost_imu = 0.5 * GRAVITY_MPS2 * unheld_s**2 > self._track.degraded_radius_m
         self._imu_ns = None if lost_imu else self._imu_ns
+        step_ns, self._last_ns = odometry.stamp_ns - self._last_ns, odometry.stamp_ns
+        self._period_ns = min(self._period_ns, step_ns)
         if last is not None and change is not None:
             last = change @ last
         step = np.eye(4) if last is None else se3_inverse(last) @ odometry.odom_from_body
@@ -204,6 +208,7 @@ class PoseTracker:
             hypothesis.propagate(motions, odometry, step, self._track)
             hypothesis.has_broken |= has_broken
             hypothesis.lost_imu |= lost_imu
+            hypothesis.missed |= step_ns > _MISSED_STEPS * self._period_ns
             if change is not None:
                 hypothesis.history.redefine_odom(change)
         if change is not None:

@@ -529,10 +529,10 @@ class InertialMode(WindowMode):
         settings = self._rig.settings.filter
         is_unknown = window.filter.covariance[3, 3] > 0.5 * settings.initial_velocity_sigma_mps**2
         if is_unknown and not self.is_bridged and seen is not None:
-            off_mps = self._off_by_images_mps(seen)
-            if wheel is None and len(window.filter.clone_ids) == 1 and length(off_mps) > _NEAR_REST_MPS:
+            lacking_mps = self._lacking_mps(seen)
+            if wheel is None and len(window.filter.clone_ids) == 1 and length(lacking_mps) > _NEAR_REST_MPS:
                 return Step(self._begin_again(frame_index, tracked), np.zeros(0, np.int8), np.eye(4))  # it did not rest
-            self._take_speed(off_mps, tracked)
+            self._take_speed(lacking_mps, tracked)
         effort = (settings.chunk_frames_without_imu, 4) if self.is_bridged else (settings.chunk_frames, 1)
         used = window.update(frame_index, tracked, *effort)
         off_mps = 0.0 if seen is None else self._off_mps(frame_index - 1, seen)
@@ -547,7 +547,7 @@ class InertialMode(WindowMode):
         is_by_imu = self._rig.camera.baseline_m == 0 and window.stamp_ns - self._measured_ns > _BY_IMU_NS
         return Step(self, used, is_lost=tracked.lost or is_by_imu, is_lifted=is_lifted)
 
-    def _off_by_images_mps(self, seen: Array) -> Array:
+    def _lacking_mps(self, seen: Array) -> Array:
         """Speed (3,) in the axes of `odom` that the state lacks for the motion since the last frame, cam_from_previous (4, 4)."""
         window = self.window
         predicted = window.filter.cam_from_earlier(
@@ -557,7 +557,7 @@ class InertialMode(WindowMode):
         off_m = self._body_from_next(seen)[:3, 3] - since[:3, 3]
         return np.asarray(window.filter.state.rotation @ since[:3, :3].T @ off_m / self._step_s)
 
-    def _take_speed(self, off_mps: Array, tracked: Tracked) -> None:
+    def _take_speed(self, lacking_mps: Array, tracked: Tracked) -> None:
         """Correct a speed that is unknown, after a start or a gap of the IMU, by the motion of all points of the last two frames.
 
         Else the few tracks of an update decide it, of which none is an outlier then.
@@ -566,7 +566,7 @@ class InertialMode(WindowMode):
         if measured is not None:
             sigma_m = np.sqrt(np.trace(measured[3:, 3:]) / 3.0)
             self.window.filter.correct_by_speed(
-                self.window.filter.state.velocity_mps + off_mps, float(sigma_m) / self._step_s
+                self.window.filter.state.velocity_mps + lacking_mps, float(sigma_m) / self._step_s
             )
 
     def _off_mps(self, frame_index: int, seen: Array) -> float:

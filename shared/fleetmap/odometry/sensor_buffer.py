@@ -23,7 +23,7 @@ def is_pause(imu_stamps_ns: Stamps, start_ns: int, end_ns: int) -> bool:
 
 
 class SensorBuffer:
-    """Samples in order of their stamps, on the IMU's clock, without spikes and a frozen gyro. The arrays of `imu` are never written again."""
+    """Samples in order of their stamps, on the IMU's clock, without spikes and a frozen gyro. Arrays of `imu` are never written again."""
 
     def __init__(self) -> None:
         self.imu = ImuSamples.empty()
