@@ -1,0 +1,166 @@
+"""Whether maps and estimates are the same before and after a change: hashes of six recordings' tiles, manifests and estimates.
+
+`PYTHONPATH=tests python tests/golden/equality.py [NAME...] [--work FOLDER] [--out FILE.json] [--against FILE.json]`: a stereo pair, front
+and rear pairs, a pair and a depth camera, RGB-D, one camera with an IMU, and two floors. Exit status 1 where a hash differs from that of
+`--against`, which other code wrote on the same machine: other processors round otherwise. Recordings of the simulator are made once in
+the work folder; the two real ones are left out, loudly, where they are missing.
+"""
+
+import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
+
+# isort: split
+import argparse
+import hashlib
+import json
+import subprocess
+import sys
+import tempfile
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.common.recorded_runs import kept_folder, recorded, tool
+from fleetmap.mapformat.building import BuildingFrame
+from fleetmap.mapformat.floors import Building, FloorEntry
+from fleetmap.recordings import open_recording
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sources.replay_source import ReplaySource
+from fleetmap.sources.sensor_bundle import SensorBundle
+from locclient import LocalizeOptions, localize
+from locclient.localization.estimate import Estimate
+from locclient.localization.settings import LocalizerSettings
+from locclient.maps.floor_maps import FloorMaps
+from locclient.maps.map_source import LocalMapSource
+from locclient.replay.replay import load_map
+from locclient.robot.robot import Robot
+from locclient.robot.version_trial import TrialSettings
+from mapserver.fleet.floors import keep_building
+from mapserver.floor_plan.alignment import Alignment, encode_alignment
+from mapserver.store import NOBODY, MapStore
+from support.recordings.realdata import DATA
+
+RIGS = {"stereo": "pair", "front-rear": "front-rear", "front-depth": "front-depth"}
+REAL = {"rgbd": ("7scenes_redkitchen_200", "rgbd"), "mono-inertial": ("euroc_mh01_start", "mono-inertial")}
+FLOORS = "floors"
+
+
+def built(recording: Path, store: Path, site: str, *options: str) -> dict[str, str]:
+    """The hashes of the tiles and the manifest of a recording's map, which is published."""
+    to_store = ["--site", site, "--store", str(store)]
+    subprocess.run([*tool("mapserver"), "build", str(recording), *to_store, "--threads", "2", *options], check=True)
+    subprocess.run(
+        [*tool("mapserver"), "publish", *to_store, "--force", "--reason", "compared", "--actor", "golden"], check=True
+    )
+    with MapStore.open(store) as maps:
+        tiles = {f"tile {n}": entry.sha256 for n, entry in enumerate(maps.manifest(site, 1).tiles)}
+        return {"manifest": maps.version(site, 1).manifest_sha256, **tiles}
+
+
+def hashed(estimates: Iterable[Estimate]) -> dict[str, str]:
+    """How many frames had each status, and the hash of all of status, floor, pose and covariance, to the bit."""
+    digest, counts = hashlib.sha256(), Counter[str]()
+    for estimate in estimates:
+        counts[f"{estimate.status} {estimate.floor}".strip()] += 1
+        digest.update(
+            f"{estimate.stamp_ns} {estimate.status} {estimate.cause} {estimate.floor} {estimate.refused}".encode()
+        )
+        for numbers in (estimate.map_from_body, estimate.cov_rot_trans, estimate.odometry.odom_from_body):
+            digest.update(b"" if numbers is None else np.ascontiguousarray(numbers).tobytes())
+    return {
+        "frames": ", ".join(f"{status}: {count}" for status, count in sorted(counts.items())),
+        "estimates": digest.hexdigest(),
+    }
+
+
+def in_a_building(drive: Path, store: Path) -> Iterable[Estimate]:
+    """The estimates of a robot of the lower floor that drives on the upper one."""
+    with MapStore.open(store) as maps:
+        for site in ("low", "high"):
+            aligned = Alignment(
+                frame=BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0),
+                metres_per_unit=1.0,
+                method="pins",
+                plan=None,
+                off_m={},
+            )
+            maps.keep_site_files(site, {"alignment": encode_alignment(aligned)}, "")
+        floors = tuple(FloorEntry(site=site, level=site, height_m=4.0 * n) for n, site in enumerate(("low", "high")))
+        keep_building(maps, Building(name="tower", floors=floors), NOBODY)
+    own = LocalMapSource(store, "low")
+    held = FloorMaps(own, lambda other: LocalMapSource(store, other))
+    held.refresh()
+    change = held.changes.popleft()
+    with open_recording(drive) as recording:
+        robot = Robot(
+            recording.calibration, Rectifier(recording.calibration), LocalizerSettings(), TrialSettings(), lambda: 0.0
+        )
+        robot.use(load_map(own)[0])
+        robot.use_floors(change.floors, change.maps)
+        source = ReplaySource(recording, np.arange(len(recording.frame_stamps_ns)), reverse=False)
+        for number, imu in enumerate(source.imu_before_each()):
+            outcome = robot.handle(
+                SensorBundle(source.frame(number), imu, list(source.wheel_before(number)), source.priors_before(number))
+            )
+            if outcome is not None:
+                yield outcome.estimate
+
+
+def figures(name: str, work: Path, store: Path) -> dict[str, str] | None:
+    """The hashes of one recording; None where it is missing."""
+    if name == FLOORS:
+        tower = {
+            f"{site} {what}": sha256
+            for site, seed in (("low", "0"), ("high", "1"))
+            for what, sha256 in built(recorded(work, ("--seed", seed), "clip"), store, site).items()
+        }
+        return tower | hashed(
+            in_a_building(recorded(work, ("--seed", "1", "--robot", "tote-1", "--day", "1"), "clip"), store)
+        )
+    if name in REAL:
+        folder, sensors = REAL[name]
+        if not (DATA / folder).is_dir():
+            return None
+        map_of = built(DATA / folder, store, name, "--use", sensors, "--frames", "::2")
+        return map_of | hashed(
+            localize(DATA / folder, store, name, options=LocalizeOptions(frames="1:200:2")).estimates
+        )
+    rig = ("--rig", RIGS[name])
+    drive = recorded(work, ("--robot", "tote-1", "--day", "1", *rig), "clip")
+    return built(recorded(work, rig, "clip"), store, name) | hashed(localize(drive, store, name).estimates)
+
+
+def main() -> None:
+    """Print and write the hashes; compare them."""
+    names = [*RIGS, *REAL, FLOORS]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("names", nargs="*", choices=[[], *names])
+    parser.add_argument("--work", type=Path, default=kept_folder())
+    parser.add_argument("--out", type=Path)
+    parser.add_argument("--against", type=Path)
+    given = parser.parse_args()
+    given.work.mkdir(parents=True, exist_ok=True)
+    found, differ = dict[str, dict[str, str]](), list[str]()
+    before = json.loads(given.against.read_text("utf-8")) if given.against else {}
+    for name in given.names or names:
+        with tempfile.TemporaryDirectory() as folder:
+            figure = figures(name, given.work, Path(folder) / "store")
+        if figure is None:
+            print(f"{name}: NOT COMPARED, {REAL[name][0]} not found in {DATA}")
+            continue
+        found[name] = figure
+        if name in before:
+            differ += [
+                f"{name}: {what}" for what in before[name].keys() | figure if before[name].get(what) != figure.get(what)
+            ]
+    print(json.dumps(found, indent=1))
+    if given.out is not None:
+        given.out.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
+    if given.against is not None:
+        print("\n".join(sorted(differ)) or f"{len(found)} recordings: equal to the byte")
+    sys.exit(1 if differ else 0)
+
+
+if __name__ == "__main__":
+    main()
