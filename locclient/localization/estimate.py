@@ -137,10 +137,11 @@ def _of_confirmed(
     is_known = not np.isnan(confirmed.now_map_from_body).any()
     radius_m = radius_95_m(confirmed.now_cov) if is_known else float("inf")
     age_s = (estimate.odometry.stamp_ns - confirmed.stamp_ns) * 1e-9
-    cause = _cause(estimate, has_failed=has_failed)
+    is_broken = confirmed.has_broken or confirmed.lost_imu
+    cause = _cause(estimate, has_failed=has_failed) or (Cause.ODOMETRY if is_broken else Cause.NONE)
     is_told = any(h.speaks_against_others(settings) for h in elsewhere)
     # Its tracks or its IMU were lost, and the map has not confirmed its place since; or frames, and the map shows another one since.
-    is_doubted = confirmed.has_broken or confirmed.lost_imu or (confirmed.missed and is_told)
+    is_doubted = is_broken or (confirmed.missed and is_told)
     if radius_m > settings.lost_radius_m:
         status = Status.LOST
     elif (
