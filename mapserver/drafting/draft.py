@@ -22,16 +22,14 @@ from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import SensorSet
 from fleetmap.version_grid import encode_grid, grid_report
+from mapserver.drafting.accuracy import Accuracy, accuracy, estimated_trajectory
 from mapserver.drafting.area_corrections import AreaCorrections, driven_since, waiting
 from mapserver.drafting.draft_evidence import Before, DraftMap, JudgedSession, examine_draft, replayed_probes
 from mapserver.drafting.job_lock import Job, JobProgress, recorded_job
 from mapserver.drafting.mapped_images import MappedImageStore
 from mapserver.drafting.progress import ProgressView, StageTimes
 from mapserver.drafting.report import (
-    Accuracy,
     BuildReport,
-    accuracy,
-    estimated_trajectory,
     library_versions,
     loop_places,
     make_report,
@@ -68,10 +66,10 @@ from mapserver.surfels.survey_surfels import SurfelGrower
 from mapserver.survey.executor import Executor
 from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.loops.loops import Loops
-from mapserver.survey.loops.zones import Zones
 from mapserver.survey.merge.multi_session import MergedMap
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
+from mapserver.survey.zones import Zones
 from mapserver.tiles.tiling import TILE_SIZE_M
 from mapserver.trust.signing import check_base
 

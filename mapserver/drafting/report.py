@@ -5,17 +5,17 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import numpy as np
 
 from fleetmap.encoding import to_plain
-from fleetmap.errors import RecordingError, disk_errors
+from fleetmap.errors import disk_errors
 from fleetmap.geometry import Array
-from fleetmap.sensors.samples import Trajectory
 from fleetmap.version_grid import GridReport
-from mapserver.evaluation.trajectory_error import AteResult, absolute_trajectory_error, paired
+from mapserver.drafting.accuracy import Accuracy
+from mapserver.drafting.survey_recordings import Surveyed
 from mapserver.quality.directions import one_way_words
 from mapserver.quality.figures import Evidence, Starts, SurveyedViews, TileDirections
 from mapserver.quality.probes import lookalike_words
@@ -23,13 +23,8 @@ from mapserver.surfels.surfel_map import SurfelReport
 from mapserver.surfels.survey_pictures import PicturesReport
 from mapserver.survey.loops.loops import LoopRecord, LoopVerdict
 from mapserver.survey.merge.multi_session import MergedMap
-from mapserver.survey.survey_map import SurveyMap
-
-if TYPE_CHECKING:
-    from mapserver.drafting.survey_recordings import Surveyed
 
 MAX_REFUSED = 300  # loops of a build, the most alike first: those could have made a wrong map
-MIN_MATCHED = 3  # stamps with ground truth needed for an alignment
 
 _LIBRARIES = ("numpy", "opencv-python-headless", "gtsam", "scipy", "fleetmap")
 
@@ -70,47 +65,8 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     removed_landmarks: dict[str, int] = {}
 
 
-class Accuracy(msgspec.Struct, frozen=True):
-    """A survey against ground truth; all None without one, or if too few stamps have both (see MIN_MATCHED)."""
-
-    rigid: AteResult | None = None
-    similarity: AteResult | None = None
-    evaluated_share: float | None = None
-
-
-def estimated_trajectory(survey_map: SurveyMap) -> Trajectory:
-    """Return the selected frames whose poses are measured in the map."""
-    chosen = survey_map.trajectory_estimated
-    return Trajectory(survey_map.trajectory.stamps_ns[chosen], survey_map.trajectory.frame_from_body[chosen])
-
-
-def accuracy(survey_map: SurveyMap, truth: Trajectory | None) -> Accuracy:
-    """Return errors of all estimated frames with a known truth; interpolated poses are left out and counted."""
-    if truth is None:
-        return Accuracy()
-    estimate, frames = estimated_trajectory(survey_map), len(survey_map.trajectory)
-    matched = len(paired(estimate, truth)[0])
-    if matched < MIN_MATCHED:
-        return Accuracy(evaluated_share=matched / max(frames, 1))
-    rigid = absolute_trajectory_error(estimate, truth, frames=frames)
-    similarity = absolute_trajectory_error(estimate, truth, with_scale=True, frames=frames)
-    return Accuracy(rigid, similarity, rigid.evaluated_share)
-
-
-def check_truth(what: str, stamps_ns: Any, truth: Trajectory | None) -> None:
-    """Raise RecordingError unless enough of the stamps (F,) have a truth to align a survey to its frame."""
-    if truth is None:
-        raise RecordingError(f"{what} carries no ground truth; build it without --frame-from-ground-truth")
-    known = sum(truth.at(int(stamp)) is not None for stamp in stamps_ns)
-    if known < MIN_MATCHED:
-        raise RecordingError(
-            f"{what}: {known} of {len(stamps_ns)} selected frames have a ground truth, {MIN_MATCHED} are needed; "
-            "select others with --frames or build without --frame-from-ground-truth"
-        )
-
-
 def make_report(
-    recordings: "Sequence[Surveyed]",
+    recordings: Sequence[Surveyed],
     joined: MergedMap,
     found: Accuracy,
     evidence: Evidence,
@@ -166,7 +122,7 @@ def make_report(
 
 
 def report_details(
-    surveyed: "Sequence[Surveyed]", joined: MergedMap, found: Accuracy, stage_s: dict[str, float]
+    surveyed: Sequence[Surveyed], joined: MergedMap, found: Accuracy, stage_s: dict[str, float]
 ) -> dict[str, Any]:
     """Return keys of the full report beside the stable ones, for diagnosis; they may change.
 
@@ -220,7 +176,7 @@ def sentence(site: str, version: int, parent: int | None, report: BuildReport, s
     )
 
 
-def loop_places(taken: "Sequence[Surveyed]", joined: MergedMap) -> list[dict[str, Any]]:
+def loop_places(taken: Sequence[Surveyed], joined: MergedMap) -> list[dict[str, Any]]:
     """Return loops of the recordings in the map: accepted ones and the most similar refused ones.
 
     Each has its recording, both ends (x, y) in `map`, verdict, reason and score.

@@ -28,6 +28,7 @@ from mapserver.calibration.recordings import LONGEST_S, busiest_stretch
 from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES
 from mapserver.doctor.findings import summary
 from mapserver.doctor.run_checks import frames_to_check
+from mapserver.drafting.accuracy import check_truth
 from mapserver.drafting.admission import (
     DECISIVE,
     SAMPLED_FRAMES,
@@ -38,7 +39,6 @@ from mapserver.drafting.admission import (
 )
 from mapserver.drafting.draft_evidence import ProbedFrame, probed_frames
 from mapserver.drafting.mapped_images import KeptFrames
-from mapserver.drafting.report import check_truth
 from mapserver.drafting.sensor_subset import reduced, with_other_views
 from mapserver.drafting.trajectory import GivenPoses, OtherTrajectory, given_poses, with_depths
 from mapserver.drafting.worker import read_ahead
@@ -46,13 +46,13 @@ from mapserver.quality.figures import RigEvidence
 from mapserver.survey.bundle.stereo_yaw_check import StereoYaw
 from mapserver.survey.finish.dock_alignment import aligned_by_priors
 from mapserver.survey.finish.map_transform import scaled, scaled_state
-from mapserver.survey.loops.zones import Zones, zones_of
 from mapserver.survey.merge.multi_session import MergedMap, chained
 from mapserver.survey.odometry_pass import LEAD_NS, parts_between_lifts
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import Survey, begin_survey, finish_survey, survey
 from mapserver.survey.state import SurveyState
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools
+from mapserver.survey.zones import Zones, zones_of
 
 _log = logging.getLogger(__name__)
 

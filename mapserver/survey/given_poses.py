@@ -10,10 +10,10 @@ from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.tracking.tracker import MotionSince, Tracker
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Trajectory
-from mapserver.survey.bundle.odometry_factors import carried
 from mapserver.survey.keyframes.keyframes import KeyframePolicy, make_keyframes
 from mapserver.survey.keyframes.rig_views import other_views
 from mapserver.survey.odometry_pass import summary_of
+from mapserver.survey.pose_graph.odometry_factors import carried
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import FrameTracks, OdometryPass
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools

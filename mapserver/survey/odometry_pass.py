@@ -12,11 +12,11 @@ from fleetmap.odometry.lift_check import WINDOW_NS
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample, wheel_between
-from mapserver.survey.bundle.odometry_factors import carried
 from mapserver.survey.keyframes.keyframes import FrameSummary, KeyframePolicy, make_keyframes, sharpness
 from mapserver.survey.keyframes.rig_views import other_views
+from mapserver.survey.pose_graph.odometry_factors import carried, odometry_factors
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import FrameTracks, OdometryPass
+from mapserver.survey.state import FrameTracks, KeyframeMotion, Landmarks, OdometryPass, SurveyState, survey_camera
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 LEAD_NS = 30_000_000  # lead of IMU and wheels over a frame, whose stamp may be too early
@@ -112,6 +112,33 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
         FrameTracks.joined(seen),
     )
     return done if rectifier.camera.baseline_m > 0 else longest_run(done, rectifier.body_from_cam)
+
+
+def initial_state(odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:
+    """Return keyframes at their odometry poses, without landmarks."""
+    rectifier, numbers = inputs.rectifier, odometry.keyframe_frames
+    estimates = [odometry.estimates[n] for n in numbers]
+    map_from_body = odometry.odom_from_body[numbers]
+    body_velocities = [e.odom_from_body[:3, :3].T @ e.velocity_odom_mps for e in estimates]
+    motion = KeyframeMotion(
+        inertial=odometry.inertial,
+        imu=inputs.imu,
+        noise=inputs.calibration.imu,
+        imu_minus_cam_s=rectifier.imu_minus_cam_s,
+        velocities_mps=np.einsum("kij,kj->ki", map_from_body[:, :3, :3], np.array(body_velocities)),
+        gyro_bias_radps=np.array([e.gyro_bias_radps for e in estimates]),
+        accel_bias_mps2=np.array([e.accel_bias_mps2 for e in estimates]),
+        relative=[] if odometry.inertial else odometry_factors(odometry, map_from_body),
+    )
+    return SurveyState(
+        stamps_ns=np.array([k.stamp_ns for k in odometry.keyframes], np.int64),
+        map_from_body=map_from_body.copy(),
+        body_from_cam=rectifier.body_from_cam,
+        camera=survey_camera(rectifier.camera),
+        motion=motion,
+        landmarks=Landmarks.empty(),
+        depth_views=frozenset([0] if rectifier.has_depth else []),
+    )
 
 
 class FrameChain:

@@ -15,8 +15,9 @@ from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, Stamps, WheelSample, wheel_between
-from mapserver.survey.bundle.odometry_factors import blackout_factors, carried, edge_covariance, initial_state
 from mapserver.survey.keyframes.keyframes import set_aside
+from mapserver.survey.odometry_pass import initial_state
+from mapserver.survey.pose_graph.odometry_factors import blackout_factors, carried, edge_covariance
 from mapserver.survey.settings import SegmentSettings, SurveySettings
 from mapserver.survey.state import (
     Cut,

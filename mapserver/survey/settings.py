@@ -7,6 +7,8 @@ from fleetmap.config import Section
 from fleetmap.features.settings import AlignSettings, OrbSettings, StereoSettings
 from fleetmap.odometry import OdometrySettings
 
+MIN_SEEN = 8  # least landmarks of a keyframe that is not blind
+
 
 class KeyframeSettings(Section, frozen=True):
     """Selection of keyframes."""

@@ -25,13 +25,14 @@ from fleetmap.bow import Vocabulary
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3_inverse
 from mapserver.survey.bundle.bundle_rounds import bundle_rounds, local_windows
-from mapserver.survey.bundle.odometry_factors import blackout_factors, chain_edges, initial_state, odometry_factors
 from mapserver.survey.bundle.stereo_yaw_check import NO_YAW, StereoYaw, estimate_stereo_yaw, without_stereo_yaw
 from mapserver.survey.finish.culling import Culled
 from mapserver.survey.finish.frame_adjustment import place_frames
 from mapserver.survey.finish.map_assembly import assemble
+from mapserver.survey.finish.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
 from mapserver.survey.given_poses import poses_as_odometry
-from mapserver.survey.keyframes.connected_components import (
+from mapserver.survey.keyframes.rig_views import body_from_views, depth_views
+from mapserver.survey.loops.connected_components import (
     Component,
     Components,
     SigmaBetween,
@@ -40,12 +41,11 @@ from mapserver.survey.keyframes.connected_components import (
     find_groups,
     only_kept,
 )
-from mapserver.survey.keyframes.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
-from mapserver.survey.keyframes.rig_views import body_from_views, depth_views
 from mapserver.survey.loops.loops import LoopCloser, Loops
 from mapserver.survey.loops.sim3_loops import gate_covariances, solve_scaled
-from mapserver.survey.odometry_pass import run_odometry
+from mapserver.survey.odometry_pass import initial_state, run_odometry
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
+from mapserver.survey.pose_graph.odometry_factors import blackout_factors, chain_edges, odometry_factors
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
 from mapserver.survey.pose_graph.position_priors import (
     judged_priors,

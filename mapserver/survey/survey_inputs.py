@@ -9,10 +9,10 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Stamps, Trajectory, WheelSample
 from mapserver.survey.executor import SERIAL, Executor
-from mapserver.survey.loops.zones import Zones
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import ImageStore, OdometryPass, SurveyState
 from mapserver.survey.tracks.mono_depths import MonoDepths
+from mapserver.survey.zones import Zones
 
 _RELEASED_EVERY = 4096  # steps of a stage: they read far fewer features than a site has
 Progress = Callable[[str, int, int], None]  # stage, done, total

@@ -16,12 +16,11 @@ from fleetmap.odometry.sensor_buffer import is_pause
 from fleetmap.sensors.samples import Stamps
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import scaled_noise
-from mapserver.survey.bundle.odometry_factors import edge_covariance
 from mapserver.survey.bundle.problem import BundleProblem, InertialTerms, MotionPrior, continued
 from mapserver.survey.bundle.stereo_yaw_check import disparity_shift
 from mapserver.survey.executor import SERIAL, Executor, in_batches
-from mapserver.survey.keyframes.connected_components import MIN_SEEN
-from mapserver.survey.settings import BundleSettings, SurveySettings
+from mapserver.survey.pose_graph.odometry_factors import edge_covariance
+from mapserver.survey.settings import MIN_SEEN, BundleSettings, SurveySettings
 from mapserver.survey.state import OdometryPass, RelativeTerm, SurveyState
 
 Indices = NDArray[np.int64]

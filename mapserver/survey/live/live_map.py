@@ -17,9 +17,9 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import apply_result, bundle_problem
 from mapserver.survey.bundle.problem import MotionPrior
-from mapserver.survey.keyframes.connected_components import MIN_SHARED, SigmaBetween, bridges
 from mapserver.survey.keyframes.keyframes import make_keyframe
 from mapserver.survey.live.live_values import LiveEstimate, LiveLoops, LiveParts, LiveRig, NewKeyframe, joined_imu
+from mapserver.survey.loops.connected_components import MIN_SHARED, SigmaBetween, bridges
 from mapserver.survey.loops.keyframe_groups import KeyframeGroups
 from mapserver.survey.loops.loops import LoopCloser, LoopRecord, Loops, LoopVerdict, body_edge
 from mapserver.survey.loops.sim3_loops import gate_covariances, solve_scaled

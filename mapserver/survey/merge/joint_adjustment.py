@@ -17,11 +17,11 @@ from fleetmap.relocalization.landmark_visibility import Rows
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_problem, inertial_edges
 from mapserver.survey.bundle.measured_noise import measured_sigmas
-from mapserver.survey.bundle.odometry_factors import floor_of
 from mapserver.survey.bundle.problem import BundleProblem, BundleResult, InertialTerms, continued
 from mapserver.survey.merge.base_map import BaseMap, baseline_ratio, with_baseline
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.merge.merge import Change
+from mapserver.survey.pose_graph.odometry_factors import floor_of
 from mapserver.survey.pose_graph.position_priors import in_frame, judged_priors, level_fit
 from mapserver.survey.settings import BundleSettings, SessionSettings, SurveySettings
 from mapserver.survey.state import Landmarks, PriorTerm, RelativeTerm, SurveyState, poses_of_views

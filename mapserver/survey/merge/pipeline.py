@@ -6,9 +6,8 @@ import numpy as np
 
 from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Trajectory
-from mapserver.survey.bundle.odometry_factors import chain_edges
 from mapserver.survey.finish.frame_adjustment import frame_trajectory
-from mapserver.survey.keyframes.connected_components import find_groups
+from mapserver.survey.loops.connected_components import find_groups
 from mapserver.survey.merge.area_corrections import SurveyLimits
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import what_changes
@@ -24,6 +23,7 @@ from mapserver.survey.merge.membership import (
     contradicts,
 )
 from mapserver.survey.merge.merge import merged
+from mapserver.survey.pose_graph.odometry_factors import chain_edges
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import Survey
 from mapserver.survey.state import poses_of_views

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.sensors.samples import PositionPrior
-from mapserver.survey.bundle.odometry_factors import carried, edge_covariance
 from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMarginals
+from mapserver.survey.pose_graph.odometry_factors import carried, edge_covariance
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.state import OdometryPass, PriorTerm
 

@@ -19,11 +19,11 @@ from fleetsim.motion.routes import Route
 from fleetsim.scenarios import SCENARIOS, Run, Scenario, find_scenario
 from fleetsim.scene.world import World
 from mapserver.config import survey_settings
-from mapserver.survey.bundle.odometry_factors import chain_edges
 from mapserver.survey.merge.confirmation import firm_landmarks
 from mapserver.survey.merge.guided_matching import session_relocalization
 from mapserver.survey.merge.membership import MembershipTest, SessionKeyframes
 from mapserver.survey.odometry_pass import FrameChain
+from mapserver.survey.pose_graph.odometry_factors import chain_edges
 from support.estimator.landmarks import LandmarkField, Landmarks
 from support.estimator.simulated_run import EstimatorSession
 

@@ -11,9 +11,9 @@ from rich.console import Console
 from fleetmap.errors import RecordingError, UsageError
 from fleetmap.geometry import se3_exp, se3_inverse, transform_points
 from fleetmap.sensors.samples import Trajectory
+from mapserver.drafting.accuracy import accuracy, check_truth
 from mapserver.drafting.draft import read_zones
 from mapserver.drafting.progress import ProgressView, StageTimes
-from mapserver.drafting.report import accuracy, check_truth
 from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.survey_map import SurveyMap
 from support.storage.map_samples import random_survey

@@ -17,12 +17,12 @@ from fleetmap.pnp.pnp import Correspondences, refine_pnp
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from mapserver.survey.keyframes.keyframes import make_keyframe
 from mapserver.survey.loops.loops import LoopCloser, LoopRecord, Loops, LoopVerdict, by_disparity
-from mapserver.survey.loops.zones import Zones
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import LoopSettings, SurveySettings
 from mapserver.survey.state import Keyframe, PosedKeyframes
 from mapserver.survey.survey_inputs import SurveyConfig
+from mapserver.survey.zones import Zones
 from support.recordings.recording_samples import calibration
 from support.worlds.box_room import out_and_back, stereo_pair
 from support.worlds.vocabulary_training import train_vocabulary

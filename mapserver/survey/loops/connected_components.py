@@ -15,10 +15,10 @@ from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array
 from mapserver.survey.loops.keyframe_groups import KeyframeGroups
 from mapserver.survey.loops.loops import Loops
+from mapserver.survey.settings import MIN_SEEN
 from mapserver.survey.state import OdometryPass, SurveyState
 
 MIN_SHARED = 15  # landmarks; a loop needs as many matches
-MIN_SEEN = 8  # least landmarks of a keyframe that is not blind
 _MIN_KEYFRAMES = 2
 _SURE_SIGMAS = 3.0
 _LARGEST = "the largest part"

@@ -12,10 +12,10 @@ from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.survey.bundle.bundle_rounds import bundle_problem
-from mapserver.survey.bundle.odometry_factors import blackout_factors, chain_edges
-from mapserver.survey.keyframes.connected_components import SigmaBetween
+from mapserver.survey.loops.connected_components import SigmaBetween
 from mapserver.survey.odometry_pass import FrameChain
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
+from mapserver.survey.pose_graph.odometry_factors import blackout_factors, chain_edges
 from mapserver.survey.pose_graph.pose_graph import adjoint
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import OdometryPass

@@ -8,7 +8,7 @@ import pytest
 from fleetmap.errors import SurveyError
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
-from mapserver.survey.keyframes.connected_components import (
+from mapserver.survey.loops.connected_components import (
     SigmaBetween,
     between_kept,
     find_components,

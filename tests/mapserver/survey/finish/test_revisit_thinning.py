@@ -9,7 +9,7 @@ from fleetmap.features.orb import Features
 from fleetmap.geometry import se3_exp
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_rounds
-from mapserver.survey.keyframes.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
+from mapserver.survey.finish.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
 from mapserver.survey.settings import BundleSettings, CullSettings, SurveySettings
 from mapserver.survey.state import Keyframe, Landmarks, MemoryImageStore
 from mapserver.survey.tracks.tracks import Tracks

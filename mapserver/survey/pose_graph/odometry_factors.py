@@ -8,10 +8,9 @@ import numpy as np
 
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, skew
 from fleetmap.odometry.sensor_buffer import is_pause
-from mapserver.survey.keyframes.connected_components import MIN_SEEN
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
-from mapserver.survey.state import KeyframeMotion, Landmarks, OdometryPass, RelativeTerm, SurveyState, survey_camera
-from mapserver.survey.survey_inputs import SurveyInputs
+from mapserver.survey.settings import MIN_SEEN
+from mapserver.survey.state import OdometryPass, RelativeTerm, SurveyState
 
 
 class Floor(NamedTuple):
@@ -38,33 +37,6 @@ _INERTIAL_FLOOR = Floor(0.0005, 0.01, 0.002, 0.01)
 def floor_of(*, inertial: bool) -> Floor:
     """Return the floor for steps of a chain of keyframes that are adjusted with their neighbours."""
     return _INERTIAL_FLOOR if inertial else FLOOR
-
-
-def initial_state(odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:
-    """Return keyframes at their odometry poses, without landmarks."""
-    rectifier, numbers = inputs.rectifier, odometry.keyframe_frames
-    estimates = [odometry.estimates[n] for n in numbers]
-    map_from_body = odometry.odom_from_body[numbers]
-    body_velocities = [e.odom_from_body[:3, :3].T @ e.velocity_odom_mps for e in estimates]
-    motion = KeyframeMotion(
-        inertial=odometry.inertial,
-        imu=inputs.imu,
-        noise=inputs.calibration.imu,
-        imu_minus_cam_s=rectifier.imu_minus_cam_s,
-        velocities_mps=np.einsum("kij,kj->ki", map_from_body[:, :3, :3], np.array(body_velocities)),
-        gyro_bias_radps=np.array([e.gyro_bias_radps for e in estimates]),
-        accel_bias_mps2=np.array([e.accel_bias_mps2 for e in estimates]),
-        relative=[] if odometry.inertial else odometry_factors(odometry, map_from_body),
-    )
-    return SurveyState(
-        stamps_ns=np.array([k.stamp_ns for k in odometry.keyframes], np.int64),
-        map_from_body=map_from_body.copy(),
-        body_from_cam=rectifier.body_from_cam,
-        camera=survey_camera(rectifier.camera),
-        motion=motion,
-        landmarks=Landmarks.empty(),
-        depth_views=frozenset([0] if rectifier.has_depth else []),
-    )
 
 
 def odometry_factors(odometry: OdometryPass, map_from_body: Array) -> list[RelativeTerm]:
