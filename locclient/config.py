@@ -9,10 +9,10 @@ from fleetmap.cli_options import Commands, Options, command_defaults, file_type
 from fleetmap.config import Section, read_given, refuse_internal
 from fleetmap.recordings import Topics
 from fleetmap.sensors.source_settings import SourceSection
-from locclient.daemon.output_section import OutputSection
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import TileSelectionSettings
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
+from locclient.output_section import OutputSection
 from locclient.robot.version_trial import TrialSettings
 from locclient.vda5050.settings import Vda5050Section
 

@@ -19,8 +19,8 @@ from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import open_source
 from locclient.config import LocclientConfig, RunSection
-from locclient.daemon.output_section import check_for_ros2
-from locclient.daemon.publishers import Publisher, open_publisher
+from locclient.daemon.publisher import Publisher
+from locclient.daemon.publishers import open_publisher
 from locclient.daemon.runtime import RuntimeParts
 from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.failure_file import PICTURES
@@ -34,6 +34,7 @@ from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
+from locclient.output_section import check_for_ros2
 from locclient.prior_option import parse_prior
 from locclient.robot.failure_report import RobotProfile
 from locclient.robot.gc_freeze import gc_frozen

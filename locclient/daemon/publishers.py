@@ -1,39 +1,17 @@
 """Publishers of estimates to the robot's own programs. To add one: a class, and its format in `open_publisher`."""
 
-from abc import ABC, abstractmethod
-
 from fleetmap.bus import Bus
 from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.messages import EstimateMessage, Placement, covariance_entries, encode_message, robot_key
-from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sources.intake import Intake
-from locclient.daemon.output_section import OutputSection, check_for_ros2
+from locclient.daemon.publisher import Publisher
 from locclient.localization.estimate import Estimate
+from locclient.output_section import OutputSection, check_for_ros2
 from locclient.robot.continuous_odom import PublishedPose
 
 _MAX_HYPOTHESES = 16
-
-
-class Publisher(ABC):
-    """Sends estimates. An estimate that cannot be sent at once is dropped: the next one replaces it."""
-
-    grid_height_m: float | None = None
-    """Robot height in metres for the version's occupancy grid; None if no grid is published."""
-
-    @abstractmethod
-    def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
-        """Send this estimate."""
-
-    def alive(self, is_silent: bool) -> None:  # noqa: B027
-        """Publish a heartbeat, called once a second; is_silent: no frames are received."""
-
-    def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:  # noqa: B027
-        """Publish the grid of the version that runs now, or the reason `why` there is none; thread-safe."""
-
-    def close(self) -> None:  # noqa: B027
-        """Undeclare all publishers."""
 
 
 class MessagePackPublisher(Publisher):

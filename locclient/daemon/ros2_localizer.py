@@ -44,10 +44,10 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import PositionPrior
 from fleetmap.sources.intake import Intake
 from locclient.daemon.driver_odometry import DriverOdometry
-from locclient.daemon.output_section import OutputSection
-from locclient.daemon.publishers import Publisher
+from locclient.daemon.publisher import Publisher
 from locclient.localization.estimate import Estimate
 from locclient.localization.pose_covariance import transport_cov
+from locclient.output_section import OutputSection
 from locclient.robot.continuous_odom import PublishedPose
 
 

@@ -21,7 +21,7 @@ from fleetmap.messages import RobotHealth, WantedVersion, encode_message
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import Source
 from fleetmap.threads import Jobs, ended_by_threads
-from locclient.daemon.publishers import Publisher
+from locclient.daemon.publisher import Publisher
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.service_manager import ServiceManager
 from locclient.delivery.outbox import Outbox, QueuedReport

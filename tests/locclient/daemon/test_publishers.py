@@ -12,8 +12,8 @@ from fleetmap.recordings.ros2.graph import RmwZenohKeys
 from fleetmap.recordings.ros2.messages import decode_frame_links, decode_prior
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sources.intake import Intake
-from locclient.daemon.output_section import OutputSection
 from locclient.daemon.publishers import open_publisher
+from locclient.output_section import OutputSection
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
 from support.fleet.memory_bus import MemoryBus, MemoryHub

@@ -16,8 +16,8 @@ from fleetmap.recordings.ros2.graph import BridgedDdsKeys
 from fleetmap.recordings.ros2.messages import encode_compressed_image, encode_image
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.ros2 import Ros2Source
-from locclient.daemon.output_section import OutputSection
 from locclient.daemon.publishers import open_publisher
+from locclient.output_section import OutputSection
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
 from support.fleet.nav2_client import eventually, message_name, typestore

@@ -15,10 +15,10 @@ from fleetmap.messages import Status
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.recordings.ros2.graph import RmwZenohKeys
 from fleetmap.sources.intake import Intake
-from locclient.daemon.output_section import OutputSection
 from locclient.daemon.publishers import open_publisher
 from locclient.daemon.ros2_localizer import Ros2Localizer
 from locclient.localization.estimate import Estimate
+from locclient.output_section import OutputSection
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
 from support.fleet.memory_bus import MemoryBus, MemoryHub

@@ -26,9 +26,10 @@ from fleetmap.recordings.ros2.graph import RmwZenohKeys
 from fleetmap.sources.intake import Intake
 from locclient.config import read_config
 from locclient.daemon.driver_odometry import Missing, PoseHistory
-from locclient.daemon.output_section import OutputSection, check_for_ros2
-from locclient.daemon.publishers import Publisher, open_publisher
+from locclient.daemon.publisher import Publisher
+from locclient.daemon.publishers import open_publisher
 from locclient.localization.estimate import Estimate
+from locclient.output_section import OutputSection, check_for_ros2
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.contracts_documents import REPOSITORY
 from support.fleet.estimates import estimate
