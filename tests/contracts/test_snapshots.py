@@ -1,4 +1,4 @@
-"""Interfaces that change on purpose only: the HTTP API's description and the help of every command.
+"""Interfaces that change on purpose only: the HTTP API's description, the help of every command, what the compiled core refuses.
 
 `SNAPSHOTS=write python -m pytest tests/contracts/test_snapshots.py` writes them anew; the diff belongs into the same commit.
 """
@@ -16,12 +16,13 @@ from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore
+from support.core_arguments import CALLS, refusals
 from support.fleet.contracts_documents import REPOSITORY, click_command
 
 SNAPSHOTS = Path(__file__).parent / "snapshots"
 
 
-def _is_as_kept(name: str, text: str) -> bool:
+def is_as_kept(name: str, text: str) -> bool:
     if os.environ.get("SNAPSHOTS") == "write":
         (SNAPSHOTS / name).write_text(text, encoding="utf-8")
     return (SNAPSHOTS / name).read_text(encoding="utf-8") == text
@@ -31,13 +32,19 @@ def test_openapi(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         fleet = Fleet(store)
         document = create_app(store, fleet, Metrics(store, fleet), None).openapi()
-    assert _is_as_kept("openapi.json", json.dumps(document, indent=1, sort_keys=True) + "\n")
+    assert is_as_kept("openapi.json", json.dumps(document, indent=1, sort_keys=True) + "\n")
 
 
 def test_help() -> None:
     """Arguments and options with their types, defaults and texts, independent of the terminal."""
     scripts = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))["project"]["scripts"]
-    assert _is_as_kept("help.txt", "\n".join(line for script in sorted(scripts) for line in _help(script)) + "\n")
+    assert is_as_kept("help.txt", "\n".join(line for script in sorted(scripts) for line in _help(script)) + "\n")
+
+
+def test_refusals_of_the_core() -> None:
+    """An array that is too short, a number below or above what can be, or none, in each argument beside right ones."""
+    refused = {name: refusals(name) for name in sorted(CALLS)}
+    assert is_as_kept("refusals.txt", "".join(f"{name}: {words}\n" for name, words in refused.items() if words))
 
 
 def _help(path: str) -> Iterator[str]:

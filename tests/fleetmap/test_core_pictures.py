@@ -11,12 +11,7 @@ from fleetmap.geometry import Array
 NUMBERS = np.zeros(3, np.int32)
 POINTS, LEVELS, POSE, LENS = np.zeros((3, 3), np.float32), np.zeros(3, np.uint8), np.eye(4), np.ones(4)
 CENTRES, RAYS, DEPTHS = np.zeros((3, 3)), np.zeros((20, 30, 3)), np.ones((20, 30), np.float32)
-LOOKS = POINTS, LEVELS, DEPTHS, 4, 0.3, LENS, POSE, 3.0, 0.05
-CELLS, VOXELS = np.full((7, 8), 255, np.uint8), np.zeros((7, 8, 8), np.uint8)
-WINDOW = VOXELS.astype(np.uint16), VOXELS, np.zeros((7, 8, 2), np.uint8)
-TILE = *np.zeros((3, 5, 5, 8), np.uint8), np.zeros((5, 5, 4), np.uint8)
 SPOTS = np.zeros((3, 2))
-SPLATS = SPOTS, np.zeros((3, 3)), np.zeros((3, 2)), np.zeros(3), np.zeros(3)
 
 
 def drawn(numbers: Any = NUMBERS, pixels: Any = SPOTS, levels: Any = LEVELS, depths: Any = DEPTHS) -> Any:
@@ -87,10 +82,6 @@ def test_products_are_rounded_before_they_are_added() -> None:
 @pytest.mark.parametrize(
     ("call", "told"),
     [
-        (lambda: core.cast_view(DEPTHS, DEPTHS[:5], 0.3, LENS, np.eye(3), CENTRES[0], CELLS), "nearest_px"),
-        (lambda: core.add_view(*WINDOW[:2], WINDOW[2][:2], 0, 0, *TILE), "heights"),
-        (lambda: core.add_view(*WINDOW, 0, 0, *TILE[:2], TILE[2][:2], TILE[3]), "hidden"),
-        (lambda: core.add_view(*WINDOW, 0, 0, *TILE[:3], TILE[3][:2]), "tile_heights"),
         (lambda: painted(samples=5), "samples"),
         (lambda: painted(shape=(20, 29)), "radiance"),
         (lambda: painted(rays=np.zeros((9, 9, 4), np.float32)), "radiance"),
@@ -107,25 +98,14 @@ def test_products_are_rounded_before_they_are_added() -> None:
         (lambda: painted(**changed("decals", (0, 0), 4)), "decals"),
         (lambda: painted(floor=np.ones(2, np.int32)), "floor"),
         (lambda: core.ScenePainter(PLANE * 1e3, NO_LENS), "plane"),
-        (lambda: core.develop(CENTRES, 1.0, 0.1, 0.1, NORMALS[:7], 1, POINTS), "normals"),
         (lambda: core.develop(CENTRES, 1.0, 0.1, 0.1, NORMALS, 1, POINTS[:2]), "vignetting"),
         (lambda: core.BoxGrid(np.zeros((1, 8)), np.zeros(3), np.ones(3), 1e-3), "cells"),
-        (lambda: GRID.cast(CENTRES[0], CENTRES, np.ones(2)), "farthest"),
         (lambda: GRID.bake(*BAKED, np.zeros((1, 5)), 9.0, True, np.zeros((1, 7), np.float32)), "numbers"),
         (lambda: GRID.bake(*BAKED, np.ones((1, 5)), 9.0, True, np.zeros((1, 8), np.float32)), "lamps"),
-        (lambda: core.voxel_keys(POINTS, LEVELS + np.uint8(5)), "levels"),
-        (lambda: core.look_at(POINTS, LEVELS[:2], DEPTHS, 4, 0.3, LENS, POSE, 3.0, 0.05), "levels"),
-        (lambda: core.look_at(POINTS, LEVELS, DEPTHS, 0, 0.3, LENS, POSE, 3.0, 0.05), "step_px"),
-        (lambda: core.weigh(*LOOKS, CELLS, np.zeros(3), 0.0, np.zeros((2, 4))), "sums"),
-        (lambda: core.discs_before(POINTS, POINTS[:2], POSE, 0.3, 9.0, LENS, 30, 20), "normals_map"),
         (lambda: drawn(numbers=NUMBERS + 3), "numbers"),
         (lambda: drawn(pixels=np.zeros((2, 2))), "pixels"),
         (lambda: drawn(levels=LEVELS + np.uint8(5)), "levels"),
         (lambda: drawn(depths=DEPTHS[:5]), "pixels_per_rad"),
-        (lambda: core.blend(*SPLATS[:4], np.zeros(2), 30, 20), "greys"),
-        (lambda: core.blend(*SPLATS, -1, 20), "width"),
-        (lambda: core.blend_backward(*SPLATS, np.zeros(2), 0.3, RAYS[..., 0].copy(), RAYS[..., 0].copy()), "opacities"),
-        (lambda: core.blend_backward(*SPLATS, np.zeros(3), 0.3, np.zeros((2, 2)), RAYS[..., 0].copy()), "slopes"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_is_refused(call: object, told: str) -> None:

@@ -3,15 +3,19 @@
 import functools
 import inspect
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from functools import partial
 from types import CodeType, SimpleNamespace
+from typing import Any
 
 import numpy as np
 from msgspec.structs import asdict
 
+from fleetmap import _core  # type: ignore[attr-defined]
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.odometry.settings import FilterSettings, TrackerSettings
+from fleetmap.pnp.pnp import REFINEMENT
 from fleetmap.relocalization.settings import FixSettings
 
 SIZES = 0, 1, 2, 3, 4, 6, 9, 15, 40
@@ -120,3 +124,127 @@ def asked(function: object) -> list[tuple[str, CodeType]]:
     assert found, signature
     arguments = [argument.partition(": ") for argument in re.split(r", (?=\w+: )", found[1]) if argument]
     return [(name, compile(kind.partition(" = ")[0], name, "eval")) for name, _, kind in arguments]
+
+
+MEMBERS = {
+    name: getattr(_core, name) for name in dir(_core) if not name.startswith("_") and callable(getattr(_core, name))
+}
+CALLS = {name for name, member in MEMBERS.items() if not isinstance(member, type)} | {
+    f"{name}.{method}"
+    for name, member in MEMBERS.items()
+    if isinstance(member, type)
+    for method in dir(member)
+    if (method == "__init__" or not method.startswith("_")) and callable(getattr(member, method))
+}
+NUMBER, SINGLES = np.zeros(1, np.int32), np.ones((5, 3), np.float32)
+CONES, WORDS = (np.ones((5, 3)), SINGLES, SINGLES[:, 0].copy(), SINGLES[:, 0].copy()), np.zeros((5, 4), np.uint64)
+QUADS, SIXES, FACES = np.ones((0, 9)), np.zeros((0, 6)), np.zeros((0, 6), np.int32)
+TEXTURES = np.zeros(1 << 18, np.uint8), np.zeros((1, 14), np.int32), np.zeros((1, 1), np.int32), np.zeros(2, np.int32)
+PICTURE = np.zeros((4, 4)), np.zeros((4, 4), np.float32), np.zeros((4, 4), np.int32)
+# Arguments that hold together where those from signatures do not, of the object that a method belongs to.
+GIVEN: dict[str, Callable[[Any], tuple[object, ...]]] = {
+    "BlockCholesky.factorise": lambda pattern: (np.ones(pattern.size),),
+    "BlockCholesky.solve": lambda pattern: (np.ones(pattern.size), np.ones(len(pattern.order()))),
+    "BoxGrid.bake": lambda _: (QUADS, FACES, FACES[:, :2].copy(), 0, np.ones((0, 5)), 1.0, True, np.zeros((1, 4), np.float32)),
+    "BundleSolver.factorise_sparsely": lambda solver: (np.arange(len(solver.nodes()[0])),),
+    "FixFinder": lambda _: (
+        *(CONES, CONES[2], WORDS, np.eye(4)[None], np.arange(2), np.array([0, 2]), np.ones(6), 1.0, 1.2),
+        *(FixSettings(), StereoSettings(), 0.35, REFINEMENT),
+    ),
+    "FixFinder.by_projection": lambda _: ((np.ones((5, 3)), np.ones((5, 2)), np.zeros(5, np.int8), WORDS), None, np.eye(4), 9.0),
+    "ScenePainter": lambda _: (np.full(6, 4.0), np.zeros((0, 0, 4), np.float32)),
+    "ScenePainter.add": lambda _: (
+        *((QUADS, SIXES, FACES, SINGLES[0], np.ones(1)), (FACES[:, :2].copy(), SIXES), TEXTURES, np.eye(3), np.zeros(3)),
+        *(1, (0.0, 0.0), 1.0, 1, 1.0, np.zeros((0, 3)), False, *PICTURE),
+    ),
+    "descend": lambda _: (WORDS, WORDS[:1], NUMBER, NUMBER, NUMBER),
+    "draw_discs": lambda _: (
+        *(NUMBER[:0], np.zeros((0, 3)), np.zeros((0, 2)), np.eye(4), SINGLES[:0], TEXTURES[0][:0], TEXTURES[0][:0]),
+        *(1.0, 1.0, np.zeros((4, 4, 3)), PICTURE[1]),
+    ),
+    "register_depth": lambda _: (PICTURE[1], np.ones((16, 3)), np.eye(4), np.ones(4), np.zeros(8), 1.0, 9, 9),
+}  # fmt: skip
+
+
+def call_of(name: str, seed: int) -> partial[object] | None:
+    """A function or method with plain arguments, of an object that was made with such; None where that was refused."""
+    owner, _, method = name.rpartition(".")
+    made, arguments = MEMBERS[owner or name], Arguments(seed, plain_size=8)
+    call = partial(made, *given(owner or name, arguments, made.__init__ if owner else made))
+    if not owner or method == "__init__":
+        return call
+    try:
+        held: Any = call()
+    except ValueError:
+        return None
+    if owner == "Filter":
+        held.add_clone(0, np.zeros(3))
+    function = getattr(held, method)
+    return partial(function, *given(name, arguments, function, held))
+
+
+def given(name: str, arguments: Arguments, function: object, held: object = None) -> tuple[object, ...]:
+    """Arguments for a function, or a method of an object that is held."""
+    return GIVEN[name](held) if name in GIVEN else tuple(arguments.of(function))
+
+
+def refusals(name: str) -> str:
+    """What is refused where plain arguments are accepted: in each an array without its last row, or a number that cannot be."""
+    for seed in range(1000):
+        plain = call_of(name, seed)
+        if plain is not None and not is_refused(plain):
+            break
+    else:
+        return "all"
+    signature = MEMBERS[name.partition(".")[0]].__init__ if name.endswith("__init__") else plain.func
+    found: dict[str, list[str]] = {"short": [], "below": [], "above": [], "nan": []}
+    for place, (argument, _) in enumerate(asked(signature)[: len(plain.args)]):
+        for path, value in leaves(plain.args[place], argument):
+            for fault, wrong in faults(value):
+                call = call_of(name, seed)
+                assert call is not None
+                changed = replaced(call.args[place], argument, path, wrong)
+                if is_refused(partial(call.func, *call.args[:place], changed, *call.args[place + 1 :])):
+                    found[fault].append(path)
+    return "; ".join(f"{fault} {' '.join(paths)}" for fault, paths in found.items() if paths)
+
+
+def is_refused(call: Callable[[], object]) -> bool:
+    try:
+        call()
+    except (ValueError, TypeError):
+        return True
+    return False
+
+
+def leaves(value: object, name: str) -> Iterator[tuple[str, object]]:
+    """What a tuple of tuples holds, with its place."""
+    if not isinstance(value, tuple):
+        yield name, value
+        return
+    for number, part in enumerate(value):
+        yield from leaves(part, f"{name}.{number}")
+
+
+def replaced(value: object, name: str, path: str, wrong: object) -> object:
+    if name == path or not isinstance(value, tuple):
+        return wrong if name == path else value
+    return tuple(replaced(part, f"{name}.{number}", path, wrong) for number, part in enumerate(value))
+
+
+def faults(value: object) -> Iterator[tuple[str, object]]:
+    """Wrong values in place of a right one, by their kind."""
+    if isinstance(value, np.ndarray) and value.size:
+        yield "short", value[:-1].copy()
+        numbers = {"nan": np.nan} if value.dtype.kind == "f" else {}
+        if value.dtype.kind in "iu":
+            numbers = {"below": -1} if value.dtype.kind == "i" else {}
+            numbers["above"] = np.iinfo(value.dtype).max
+        for fault, number in numbers.items():
+            wrong = value.copy()
+            wrong[-1] = number
+            yield fault, wrong
+    elif isinstance(value, int) and not isinstance(value, bool):
+        yield from (("below", -1), ("above", 1 << 30))
+    elif isinstance(value, float):
+        yield "nan", np.nan

@@ -157,18 +157,6 @@ def test_what_was_put_off_is_offered_again_later(world: World) -> None:
     assert [wanted.version for wanted in world.sync.fetched] == [2]
 
 
-def test_an_announcement_is_heard_at_once(world: World) -> None:
-    world.step()
-    adopt(world)
-    number = world.publish(seed=1)
-    current = world.store.current("lab")
-    told = WantedVersion(site="lab", version=number, manifest_sha256=current.manifest_sha256)
-    with MemoryBus(world.hub) as server:
-        server.publish(robot_key("lab", "r1", "wanted"), encode_message(told))
-    world.step()
-    assert [wanted.version for wanted in world.sync.fetched] == [2]
-
-
 @pytest.mark.parametrize("damage", ["flipped", "truncated", "missing", "hostile"])
 def test_a_version_with_a_bad_tile_is_refused_and_the_good_one_goes_on(world: World, damage: str) -> None:
     world.step()
@@ -217,17 +205,6 @@ def _parts(data: bytes):  # type: ignore[no-untyped-def]
     return lambda _, question: part_of(data, question)
 
 
-def test_of_a_first_version_what_came_is_used(world: World) -> None:
-    entry = world.store.manifest("lab", 1).tiles[0]
-    victim = world.folder / blob_path(entry.sha256)
-    victim.chmod(0o644)
-    victim.write_bytes(b"x" * entry.bytes)
-    world.step()
-    assert [wanted.version for wanted in world.sync.fetched] == [1]
-    assert adopt(world).version == 1
-    assert world.client.active() is None, "it is not whole"
-
-
 def test_ten_minutes_without_a_network_cost_no_report_and_double_none(world: World) -> None:
     """Every report is in the server's table once, in order, though answers were lost and the robot was started again."""
     world.step()
@@ -269,17 +246,6 @@ def test_a_server_that_is_not_there_is_named_once_an_outage(world: World, caplog
     world.hub.reachable = False
     world.step(1.0)
     assert len(caplog.records) == 2, "a short gap is no news"
-
-
-def test_a_report_that_the_server_refuses_does_not_hold_up_the_others(world: World) -> None:
-    world.refuse = "the disk is full"
-    world.outbox.put(report("a"))
-    world.step()
-    assert world.outbox.counts()["waiting"] == 1
-    world.refuse = ""
-    world.step(60.0)
-    assert world.table == ["a"]
-    assert world.outbox.counts()["delivered"] == 1
 
 
 @pytest.mark.parametrize(

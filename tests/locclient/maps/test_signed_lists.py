@@ -134,19 +134,6 @@ def test_row_1_a_forged_wanted_and_map(world: World) -> None:
     assert running(victim) == 3
 
 
-def test_row_1_a_forged_wanted_alone(world: World) -> None:
-    """The lists are the honest ones, and name another manifest under that number."""
-    forged = world.folder / "forged"
-    with MapStore.open(forged, create=True) as other:
-        publish_samples(other, 1)
-        publish_samples(other, 2, first=7)
-        want(world, 2, other.version(SITE, 2).manifest_sha256)
-    client = world.client()
-    with pytest.raises(UntrustedError, match=r"^signature: version 2 "):
-        client.fetch(client.wanted())
-    assert running(client) is None
-
-
 @pytest.mark.parametrize("attempt", ["forged", "old serial", "unlisted", "site list of the thief"])
 def test_row_4_a_thief_of_the_online_key(world: World, attempt: str) -> None:
     """The online key and the folder, but not the site's key: nothing can be added to what it signed."""
@@ -178,14 +165,6 @@ def test_row_4_a_thief_of_the_online_key(world: World, attempt: str) -> None:
         assert world.client("victim", trusting=False).ready().wanted.version == 1  # the control
 
 
-def test_row_4_among_admitted_versions_the_server_chooses(world: World) -> None:
-    """The control, and what an operator's rollback needs."""
-    client = world.client()
-    assert client.ready().wanted.version == 2
-    want(world, 1)
-    assert client.ready().wanted.version == 1
-
-
 def test_row_10_mondays_folder_on_tuesday(world: World) -> None:
     client, victim = world.client(), world.client("victim", trusting=False)
     assert client.ready().wanted.version == 2
@@ -200,16 +179,6 @@ def test_row_10_mondays_folder_on_tuesday(world: World) -> None:
     assert victim.ready().wanted.version == running(victim) == 1  # the control: without lists Tuesday is forgotten
     late = world.client("late")  # and lists cannot tell a robot that never saw Tuesday
     assert late.ready().wanted.version == 1
-
-
-def test_an_operators_rollback_works(world: World) -> None:
-    client = world.client()
-    world.publish(seed=2)
-    assert client.ready().wanted.version == 3
-    releases.roll_back(world.store, SITE)
-    assert client.ready().wanted.version == 2
-    want(world, 3)
-    assert "version 2 stays active: signature: version 3 " in client.ready().note
 
 
 def test_row_12_news_are_held_back(world: World) -> None:

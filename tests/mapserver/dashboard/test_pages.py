@@ -22,7 +22,6 @@ from support.fleet.dashboard_scene import (
     fill_store,
     marks,
     opened,
-    overlapping,
     place_of,
     serving,
     talking,
@@ -152,15 +151,6 @@ def test_marks_are_read_and_opened_with_the_pointer(page: Page, served: Served) 
     page.mouse.click(x + 3, y - 3)
     expect(page.locator("h1")).to_have_text(name)
     assert seen.faults == []
-
-
-def test_names_do_not_overlap(page: Page, served: Served) -> None:
-    with talking(served.zenoh, ROBOTS):
-        opened(page, served, "")
-        expect(page.locator("#figures")).to_contain_text(f"{ROBOTS} of {ROBOTS}", timeout=15_000)
-        named = [mark["nameBox"] for mark in marks(page, ROBOTS) if mark["nameBox"]]
-        assert 1 < len(named) < ROBOTS / 2
-        assert not overlapping(named)
 
 
 def listed(page: Page) -> Locator:

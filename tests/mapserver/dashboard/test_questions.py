@@ -162,14 +162,6 @@ def test_what_happened_last(operator: Operator) -> None:
     assert moments == sorted(moments, reverse=True)
 
 
-def test_is_it_one_robot_or_one_place(operator: Operator) -> None:
-    """Seven robots failed twice each: none of them stands out, and none is named."""
-    operator.click(operator.page.get_by_role("link", name="Failures", exact=True))
-    expect(operator.page.get_by_role("status")).to_contain_text(
-        re.compile(r"of 8 robots\. Most: no match \(\d+\), in aisle 2 \(\d+\)\.$")
-    )
-
-
 def test_the_worst_failure_by_the_keyboard(operator: Operator) -> None:
     page = operator.page
     opened(page, operator.served, "failures")
@@ -247,23 +239,6 @@ def test_questions_that_a_page_answers(operator: Operator) -> None:
     expect(operator.page.get_by_role("dialog")).to_contain_text("The trial of version 1 ends.")
     with MapStore.open(operator.served.folder) as store:
         releases.end_canary(store, trial, promote=False, outcome="tried enough")
-
-
-def test_where_do_i_tell_a_robot_its_place(operator: Operator) -> None:
-    page = operator.page
-    operator.follow(page.get_by_role("link", name="tug-4", exact=True).last, "**/robots/tug-4*")
-    for label, metres in (("x (m)", "33"), ("y (m)", "14")):
-        page.get_by_label(label).fill(metres)
-    operator.click(page.get_by_role("button", name="tug-4 is here"))
-    expect(page.get_by_role("dialog")).to_contain_text("tug-4 will search for itself around 33, 14 m, looking any way.")
-
-
-def test_where_do_i_enrol_a_robot(operator: Operator) -> None:
-    operator.go("Robots")
-    operator.click(operator.page.get_by_role("button", name="Enrol a robot"))
-    dialog = operator.page.get_by_role("dialog")
-    expect(dialog).to_contain_text("It may connect to this server's bus as a robot of hall")
-    expect(dialog.get_by_label("Name of the robot")).to_be_visible()
 
 
 def test_what_would_promoting_do_and_undo_it(operator: Operator) -> None:

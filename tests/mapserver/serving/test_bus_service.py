@@ -139,21 +139,6 @@ def test_row_11_a_vocabulary_of_another_site(world: World) -> None:
     assert manifest.vocabulary.sha256 not in world.cache
 
 
-def test_a_known_version_is_read_with_the_server_away(world: World) -> None:
-    wanted = world.link.wanted()
-    manifest = world.link.manifest(wanted)
-    world.link.vocabulary(manifest)
-    world.link.tiles(manifest, [(0, 0)])
-    world.hub.reachable = False
-    with pytest.raises(UnreachableError):
-        world.link.wanted()
-    assert world.link.manifest(wanted) == manifest
-    assert world.link.vocabulary(manifest)
-    fetched = world.link.tiles(manifest)
-    assert sorted(fetched.tiles) == [(0, 0)]
-    assert "no reply" in fetched.refused[1, 0]
-
-
 def test_silence_is_waited_for_once(world: World) -> None:
     manifest = world.link.manifest(world.link.wanted())
     asked: list[str] = []
