@@ -14,18 +14,10 @@ from fleetmap.failure_definition import (
     is_found,
     is_outside_bound,
     is_usable,
-    is_wrong,
     may_be_mapped,
     radius_95_m,
 )
 from fleetmap.messages import Status
-
-
-def test_errors_at_their_limits() -> None:
-    assert not is_wrong(0.30)
-    assert is_wrong(0.301)
-    assert not is_wrong(0.1, np.radians(4.99))
-    assert is_wrong(0.1, np.radians(5.01))
 
 
 @pytest.mark.parametrize("status", [*Status, "UNKNOWN TO THIS VERSION"])
@@ -34,20 +26,6 @@ def test_a_position_is_usable_or_blind_or_neither(status: str, radius_m: float) 
     close = radius_m <= 0.30
     assert is_usable(status, radius_m) == (status == "TRACKING" or (status == "DEGRADED" and close))
     assert is_blind(status, radius_m) == (status in ("LOST", "AMBIGUOUS") or (status == "DEGRADED" and not close))
-
-
-@pytest.mark.parametrize(
-    ("driving", "seconds", "fails"),
-    [(True, 19.9, False), (True, 20.0, True), (False, 59.9, False), (False, 60.0, True)],
-)
-def test_a_search_is_over_after_its_time(driving: bool, seconds: float, fails: bool) -> None:
-    clock = SearchClock()
-    for stamp_ns in range(0, round(seconds * 1e9) + 1, 100_000_000):
-        over = clock.handle(stamp_ns, is_found=False, is_driving=driving)
-    assert over is fails
-    assert clock.began_ns == 0
-    assert not clock.handle(stamp_ns + 1, is_found=True, is_driving=driving)
-    assert clock.began_ns is None
 
 
 def test_where_there_is_no_map_nobody_searches() -> None:

@@ -107,16 +107,6 @@ def test_euroc_imu_that_is_not_the_body(tmp_path: Path) -> None:
     )
 
 
-def test_frames_without_partner_are_left_out_and_counted(tmp_path: Path) -> None:
-    folder = write_euroc(tmp_path / "r", SAMPLE)
-    (folder / "mav0/cam1/data/image1.png").unlink()
-    recording = open_recording(folder)
-    np.testing.assert_array_equal(recording.frame_stamps_ns, np.delete(SAMPLE.stamps_ns, 1))
-    np.testing.assert_array_equal(recording.read_frame(1).right, SAMPLE.right[2])
-    assert [issue.what for issue in recording.issues] == ["cam1: images missing", "images without their partner"]
-    assert "1 of 4" in recording.issues[0].detail
-
-
 def test_right_images_a_little_late_are_paired(tmp_path: Path) -> None:
     folder = write_euroc(tmp_path / "r", SAMPLE)
     rows = [f"{s + 1_000_000},image{i}.png" for i, s in enumerate(SAMPLE.stamps_ns)]

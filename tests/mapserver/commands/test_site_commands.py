@@ -142,13 +142,3 @@ def test_failures_and_figures_are_named_by_areas(run, site, tmp_path: Path) -> N
     assert json.loads(run("areas", "list", *site, "--json"))["frame"] == "map"
     run("areas", "remove", *site)
     assert run("areas", "list", *site) == "0 areas\n"
-
-
-def test_areas_that_are_none_change_nothing(run, site, tmp_path: Path) -> None:
-    run("areas", "import", write_areas(tmp_path / "good.json", "map", ("aisle 5", 0, 0, 8, 8)), *site)
-    degrees = write_areas(tmp_path / "wgs84.json", "wgs84", ("aisle 5", 13.4, 52.5, 13.5, 52.6))
-    crossed = write_areas(tmp_path / "crossed.json", "map", ("a", 0, 0, 1, 1), ("a", 0, 0, 1, 1))
-    for file, words in ((degrees, "frame"), (crossed, "twice"), (tmp_path / "none.json", "cannot be read")):
-        assert words in run("areas", "import", file, *site, status=2)
-    assert run("areas", "list", *site) == "aisle 5: 64.0 m2\n1 areas\n"
-    assert "has no site" in run("areas", "list", "--site", "hall", *site[2:], status=2)

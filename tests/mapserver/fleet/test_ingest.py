@@ -267,21 +267,6 @@ def test_names_that_robots_make_up_do_not_make_keys(site: Site) -> None:
         assert len(site.store.fleet.counters("lab", axis)) <= most, axis
 
 
-def test_a_disk_that_refuses_costs_nothing(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    add = site.store.fleet.add
-
-    def refuse(_: object) -> None:
-        raise StoreError("full")
-
-    monkeypatch.setattr(site.store.fleet, "add", refuse)
-    with pytest.raises(StoreError):
-        site.run(made(site, 2), 30)
-    monkeypatch.setattr(site.store.fleet, "add", add)
-    site.run(made(site, 2), 1, START_NS + 30 * NS)
-    total = site.store.fleet.counters("lab", "site")["lab", ""]
-    assert total.reports == site.known.health
-
-
 def test_a_trace_shows_the_way_and_every_change(site: Site) -> None:
     robots = made(site, 1, rate_per_robot_day=3000.0)
     site.run(robots, 300)

@@ -635,16 +635,3 @@ def test_the_command_says_how_it_ended(
     assert run("--report", str(hall / "night.json")) == 4
     assert json.loads((hall / "night.json").read_text())["state"] == "failed"
     assert "number of landmarks" in capsys.readouterr().err
-
-
-def test_a_full_disk_is_told(hall: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object) -> Draft:
-        raise StoreError("no space left; make space")
-
-    monkeypatch.setattr(night, "build_draft", full)
-    with pytest.raises(StoreError, match="no space"):
-        spend(hall)
-    assert names(hall / "inbox") == ["monday", "tuesday"]
-    report = last_report(hall / "store", "hall")
-    assert report is not None
-    assert "no space left" in report["message"]

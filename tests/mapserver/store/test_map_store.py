@@ -64,21 +64,6 @@ def test_equal_tiles_are_kept_once(store: MapStore) -> None:
     assert Content(store).count() == before + 1  # only the manifest is new
 
 
-def test_only_published_map_bytes_are_served(store: MapStore) -> None:
-    save_sample_draft(store)
-    info = store.version("lab", 1)
-    tile = store.manifest("lab", 1).tiles[0].sha256
-    assert store.served_kind(tile) is None
-    releases.publish(store, "lab")
-    assert store.served_kind(tile) == "tile"
-    assert store.served_kind(tile, "lab") == "tile"
-    assert store.served_kind(tile, "other") is None
-    assert store.served_kind(info.vocabulary_sha256) == "vocabulary"
-    assert store.served_kind(info.manifest_sha256) == "manifest"
-    assert store.served_kind(info.archive_sha256) is None
-    assert store.served_kind("0" * 64) is None
-
-
 def test_drafts_that_no_robot_could_use_are_refused(store: MapStore) -> None:
     empty = random_tile(np.random.default_rng(0), landmarks=0)
     for tiles in ([], [empty]):

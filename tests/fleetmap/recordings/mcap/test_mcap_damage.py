@@ -69,23 +69,11 @@ def test_cut_off(whole: bytes, tmp_path: Path, share: float) -> None:
         assert "the file" in recording.issues[0].what
 
 
-def test_cut_at_every_byte_around_a_message(whole: bytes, tmp_path: Path) -> None:
-    for size in range(1_200_000, 1_200_000 + 900, 150):
-        with open_recording(write_bytes(tmp_path, whole[:size])) as recording:
-            assert_nothing_is_invented(recording)
-
-
 def test_a_tail_of_zeros_as_a_power_loss_leaves_it(whole: bytes, tmp_path: Path) -> None:
     cut = len(whole) // 2
     with open_recording(write_bytes(tmp_path, whole[:cut] + bytes(len(whole) - cut))) as recording:
         assert_nothing_is_invented(recording)
         assert recording.issues
-
-
-@pytest.mark.parametrize("size", [0, 3, 8, 60, 3000])
-def test_cut_before_anything_usable(whole: bytes, tmp_path: Path, size: int) -> None:
-    with pytest.raises(RecordingError, match=r"damaged\.mcap"):
-        open_recording(write_bytes(tmp_path, whole[:size]))
 
 
 def test_single_flipped_bits_anywhere(whole: bytes, tmp_path: Path) -> None:
