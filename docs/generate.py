@@ -8,7 +8,8 @@ import importlib
 import re
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -18,16 +19,17 @@ import click  # noqa: E402
 import typer  # noqa: E402
 
 from fleetmap.config import Section, Tiers, settings_in, tier_of  # noqa: E402
-from locclient.config import TIERS as LOCCLIENT_TIERS  # noqa: E402
-from locclient.config import LocclientConfig  # noqa: E402
+from locclient.config import with_plugins  # noqa: E402
+from locclient.hooks import link_hooks  # noqa: E402
 from mapserver.config import TIERS as MAPSERVER_TIERS  # noqa: E402
 from mapserver.config import MapserverConfig  # noqa: E402
 
 COMMANDS, SETTINGS = REPOSITORY / "docs/command_line.md", REPOSITORY / "docs/settings.md"
 PROGRAMS: dict[str, tuple[Section, Tiers]] = {
     "mapserver": (MapserverConfig(), MAPSERVER_TIERS),
-    "locclient": (LocclientConfig(), LOCCLIENT_TIERS),
+    "locclient": with_plugins(),
 }
+PLUGINS = set(link_hooks())
 _TABLE = re.compile(r"^\| .*\n\|---.*\n((?:\|.*\n)*)", re.MULTILINE)
 Row = tuple[
     str, str, str
@@ -122,13 +124,14 @@ def command_page(page: str) -> str:
     return "".join(parts)
 
 
-def settings_page(page: str) -> str:
-    """docs/settings.md as it should be; ValueError where it lacks a section or has one that is gone."""
+def settings_page(page: str, plugin: str | None = None) -> str:
+    """docs/settings.md as it should be, or a plug-in's page; ValueError where it lacks a section or has one that is gone."""
     wanted = {
         (tier, program, setting.section)
         for program, (config, tiers) in PROGRAMS.items()
         for setting in settings_in(config)
         if (tier := tier_of(setting, tiers)) is not None
+        and (setting.section == plugin if plugin else setting.section not in PLUGINS)
     }
     seen = set()
     parts, tier = re.split(r"^(?=###? )", page, flags=re.MULTILINE), ""
@@ -140,15 +143,21 @@ def settings_page(page: str) -> str:
             seen |= {(tier, program, section) for program in programs}
             every = [list(_setting_rows(tier, [program], section)) for program in programs]
             if not every[0] or any(rows != every[0] for rows in every):
-                raise ValueError(f"{SETTINGS.name}: `[{section}]` of {programs} are no equal {tier} settings")
+                raise ValueError(f"settings: `[{section}]` of {programs} are no equal {tier} settings")
             parts[number] = with_table(part, "key", every[0])
     if wanted != seen:
-        raise ValueError(f"{SETTINGS.name} has other sections than the programs: {sorted(wanted ^ seen)}")
+        raise ValueError(f"settings: the page has other sections than the programs: {sorted(wanted ^ seen)}")
     return "".join(parts)
 
 
+PAGES: dict[Path, Callable[[str], str]] = {COMMANDS: command_page, SETTINGS: settings_page} | {
+    page: partial(settings_page, plugin=page.parent.name)
+    for page in REPOSITORY.glob("*/plugins/*/settings.md")
+    if page.parent.name in PLUGINS
+}
+
 if __name__ == "__main__":
-    for path, make in ((COMMANDS, command_page), (SETTINGS, settings_page)):
+    for path, make in PAGES.items():
         page = path.read_text("utf-8")
         made = make(page)
         if "--check" not in sys.argv:

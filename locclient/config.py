@@ -1,30 +1,29 @@
 """Configuration file of `locclient`: the robot, its sensors and outputs, and the localizer."""
 
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from fleetmap.cli_options import Commands, Options, command_defaults, file_type
-from fleetmap.config import Section, read_given, refuse_internal
+from fleetmap.config import Section, Tiers, over, read_given, refuse_internal
 from fleetmap.recordings import Topics
 from fleetmap.sensors.source_settings import SourceSection
+from locclient.hooks import LinkHook, link_hooks
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import TileSelectionSettings
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
 from locclient.output_section import OutputSection
 from locclient.robot.version_trial import TrialSettings
-from locclient.vda5050.settings import Vda5050Section
 
-TIERS = {
+TIERS: Tiers = {
     "user": {
         "": "site store server",
         "run": "server store site robot prior cache cache_bytes root identity insecure outbox failures replays surveys",
         "source": "kind sensors calibration endpoint recording device",
         "output": "format endpoint robot_height_m autostart",
         "topics": "*",
-        "vda5050": "broker version manufacturer serial_number interface username password_file ca map_id versions download_from "
-        "download_token_file download_ca robot_actions factsheet frame",
     },
     "tuning": {
         "run": "outbox_bytes replays_bytes frame_queue imu_wait_s",
@@ -33,7 +32,6 @@ TIERS = {
         "source": "domain keys speed width_px height_px rate_hz delay_s",
         "output": "domain keys namespace node pose_topic initial_pose_topic odom_topic status_topic map_topic tf_topic "
         "map_frame building_frame odom_frame base_frame sensor_frames publish_odom transform_tolerance_s",
-        "vda5050": "state_interval_s robot_silent_s initialize_s initial_sigma_m initial_sigma_rad",
         "localizer": "seed",
         "localizer.orb": "extractor count",
         "localizer.stereo": "min_depth_m depth_sigma_px",
@@ -81,7 +79,6 @@ class LocclientConfig(Section, frozen=True):
     source: SourceSection = SourceSection()
     output: OutputSection = OutputSection()
     topics: Topics = Topics()
-    vda5050: Vda5050Section = Vda5050Section()
     localizer: LocalizerSettings = LocalizerSettings()
 
 
@@ -92,10 +89,27 @@ def read_config(path: Path | None, commands: Commands) -> tuple[LocclientConfig,
     """
     if path is None:
         return LocclientConfig(), {}
-    given = with_common(read_given(path, file_type(LocclientConfig, commands)))
-    refuse_internal(path, given, LocclientConfig(), TIERS)
-    settings = {key: given[key] for key in LocclientConfig.__struct_fields__ if key in given}
-    return msgspec.convert(settings, LocclientConfig), command_defaults(given, commands)
+    defaults, tiers = with_plugins()
+    given = with_common(read_given(path, file_type(type(defaults), commands)))
+    refuse_internal(path, given, defaults, tiers)
+    settings = {key: given[key] for key in defaults.__struct_fields__ if key in given}
+    return msgspec.convert(settings, type(defaults)), command_defaults(given, commands)
+
+
+def with_plugins() -> tuple[LocclientConfig, Tiers]:
+    """Return the defaults of the whole file, with the sections of the installed plug-ins, and the tiers of its keys."""
+    hooks = link_hooks()
+    sections = [(name, hook.section, hook.section()) for name, hook in hooks.items()]
+    kind: type[LocclientConfig] = msgspec.defstruct(  # type: ignore[assignment]
+        "Config", sections, bases=(LocclientConfig,), frozen=True, kw_only=True
+    )
+    return kind(), reduce(over, (hook.tiers for hook in hooks.values()), TIERS)
+
+
+def links_of(config: LocclientConfig) -> list[tuple[LinkHook, Section]]:
+    """Return the links that the file asks for, with their sections."""
+    sections = ((hook, getattr(config, name, None)) for name, hook in link_hooks().items())
+    return [(hook, section) for hook, section in sections if section is not None and hook.is_on(section)]
 
 
 def with_common(given: dict[str, Any]) -> dict[str, Any]:

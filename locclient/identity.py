@@ -193,7 +193,7 @@ class GivenAddress:
     sign: str = ""  # before the names in messages
 
     def resolve(self, usual_robot: str | None = None, *, may_be_alone: bool = False) -> MapAddress:
-        """Return the address. usual_robot: the name of a robot that has none. may_be_alone: with neither, under a fleet manager.
+        """Return the address. usual_robot: the name of a robot that has none. may_be_alone: with neither, if a link brings its maps.
 
         UsageError for contradictions, and for a server on another machine that cannot authenticate the robot."""
         if self.server is not None and self.store is not None:

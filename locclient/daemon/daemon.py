@@ -18,7 +18,7 @@ from fleetmap.messages import WantedVersion
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import open_source
-from locclient.config import LocclientConfig, RunSection
+from locclient.config import LocclientConfig, RunSection, links_of
 from locclient.daemon.publisher import Publisher
 from locclient.daemon.publishers import open_publisher
 from locclient.daemon.runtime import RuntimeParts
@@ -27,6 +27,7 @@ from locclient.delivery.failure_file import PICTURES
 from locclient.delivery.outbox import Outbox
 from locclient.delivery.report_delivery import ReplayQueue
 from locclient.delivery.survey_drives import SurveyDrives
+from locclient.hooks import LinkedRobot, RobotLink
 from locclient.identity import GivenAddress, MapAddress, check_reach
 from locclient.maps.connection import cache_folder, open_bus, outbox_path, replay_outbox, trusted_map
 from locclient.maps.floor_maps import FloorMaps
@@ -39,12 +40,6 @@ from locclient.prior_option import parse_prior
 from locclient.robot.failure_report import RobotProfile
 from locclient.robot.gc_freeze import gc_frozen
 from locclient.robot.robot import Robot
-from locclient.vda5050.adapter import FleetAdapter
-from locclient.vda5050.dialects import dialect
-from locclient.vda5050.factsheet import read_factsheet
-from locclient.vda5050.fleet_maps import FleetMaps
-from locclient.vda5050.mqtt_link import MqttLink
-from locclient.vda5050.settings import check_section, origins_of
 
 _PATIENCE_S = 120.0  # without an answer during a download; the next attempt resumes it
 _log = logging.getLogger(__name__)
@@ -52,7 +47,7 @@ _log = logging.getLogger(__name__)
 
 def check_run(config: LocclientConfig) -> MapAddress:
     """Check the configuration and return the map's address; UsageError names missing or contradicting settings of [run]."""
-    run = config.run
+    run, links = config.run, links_of(config)
     try:
         address = GivenAddress(
             site=run.site,
@@ -62,7 +57,7 @@ def check_run(config: LocclientConfig) -> MapAddress:
             root=run.root,
             identity=run.identity,
             insecure=run.insecure,
-        ).resolve(may_be_alone=config.vda5050.broker is not None)
+        ).resolve(may_be_alone=bool(links))
     except UsageError as error:
         raise UsageError(f"[run] {error}") from error
     topics = None if config.source.kind == "recording" else config.source.endpoint
@@ -88,14 +83,8 @@ def check_run(config: LocclientConfig) -> MapAddress:
             f"[run.trial] contradicting_looks = {run.trial.contradicting_looks} must be below [localizer.track] kidnap_fixes = "
             f"{config.localizer.track.kidnap_fixes}: a new version must be dropped before the robot concludes that it was carried"
         )
-    if config.vda5050.broker is not None:
-        check_section(config.vda5050, insecure=run.insecure)
-        if address.store is not None:
-            raise UsageError(
-                "[vda5050] and store exclude each other: set server, whose signed lists define the admitted maps, or neither"
-            )
-        if address.server is None and config.vda5050.versions == "map server":
-            raise UsageError('[vda5050] versions = "map server" needs [run] server')
+    for hook, linked in links:
+        hook.check(linked, address, run.insecure)
     return address
 
 
@@ -162,9 +151,8 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             if server is not None:
                 server.client.takes_grids = publisher.grid_height_m is not None
         floors = _floor_maps(config, address, bus, caches, server, maps, publisher)
-        fleet_manager: MqttLink | None = None
-        if server is not None and config.vda5050.broker is not None:
-            fleet_manager = _fleet_manager(config, site, server, caches[0], intake)
+        if server is not None:
+            server.links = _links(config, site, server, caches[0], intake)
         mounting = (robot.base_from_body, rectifier.body_from_cam, rectifier.camera)
         clock = (calibration.imu, rectifier.imu_minus_cam_s)
         profile = RobotProfile(site, name, *mounting, config.localizer, *clock, run.replays, rectifier.mounted[1:])
@@ -187,7 +175,6 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             first=first,
             failures_folder=None if run.failures is None else Path(run.failures),
             caches=caches,
-            fleet_manager=fleet_manager,
             floors=floors,
             drives=None if server is None else server.drives,
         )
@@ -233,27 +220,19 @@ def _upkeep(address: MapAddress, bus: Bus) -> Callable[[], None]:
     return renew
 
 
-def _fleet_manager(
-    config: LocclientConfig, site: str, server: ServerSync, cache: TileCache, intake: Intake
-) -> MqttLink:
-    """Open the connection of [vda5050]; if set there, the fleet manager selects the version instead of the map server."""
-    section, insecure, client, maps = config.vda5050, config.run.insecure, server.client, None
-    if section.versions == "fleet manager":
-        server.follows = False
-        folder, admits = cache_folder(config.run.cache) / "incoming", None if server.is_alone else client.check_admitted
-        maps = FleetMaps(cache, site, folder, origins_of(section, insecure=insecure), admits)
-    adapter = FleetAdapter(
-        section,
-        site,
-        maps,
-        active=client.active,
+def _links(config: LocclientConfig, site: str, server: ServerSync, cache: TileCache, intake: Intake) -> list[RobotLink]:
+    robot = LinkedRobot(
+        site=site,
+        insecure=config.run.insecure,
+        lost_radius_m=config.localizer.track.lost_radius_m,
+        cache=cache,
+        folder=cache_folder(config.run.cache) / "incoming",
+        active=server.client.active,
+        check_admitted=None if server.is_alone else server.client.check_admitted,
         offer=server.fetched.append,
         put_prior=intake.put_prior,
-        lost_radius_m=config.localizer.track.lost_radius_m,
     )
-    server.on_change = adapter.changed_version
-    sheet = None if section.factsheet is None else read_factsheet(Path(section.factsheet), dialect(section.version))
-    return MqttLink(check_section(section, insecure=insecure), section, adapter, sheet)
+    return [hook.open(section, robot) for hook, section in links_of(config)]
 
 
 def configured_outbox(run: RunSection, site: str, robot: str) -> Path:

@@ -34,7 +34,6 @@ from locclient.maps.tile_loader import TileLoader
 from locclient.robot.failure_report import RobotProfile, failure_report
 from locclient.robot.health_report import Figure, HealthFigures
 from locclient.robot.robot import FailureContext, Outcome, Robot
-from locclient.vda5050.mqtt_link import MqttLink
 
 _TAKE_S, _IDLE_S = 0.2, 0.1
 _HEALTH_EVERY_S, _POSE_EVERY_NS = 1.0, 500_000_000
@@ -47,10 +46,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class RuntimeParts:
-    """Parts of a daemon. server: None for a robot that reads a store's folder. first: the version to start with.
-
-    fleet_manager: the VDA 5050 connection; only with a server.
-    """
+    """Parts of a daemon. server: None for a robot that reads a store's folder. first: the version to start with."""
 
     profile: RobotProfile
     source: Source
@@ -65,7 +61,6 @@ class RuntimeParts:
     failures_folder: Path | None = None
     drives: SurveyDrives | None = None
     caches: tuple[TileCache, ...] = ()
-    fleet_manager: MqttLink | None = None
     floors: FloorMaps | None = None
 
 
@@ -77,6 +72,7 @@ class Runtime:
     ) -> None:
         self._parts, self._manager, self._wall_ns = parts, manager, wall_ns
         self._robot, self._server, self._publisher = parts.robot, parts.server, parts.publisher
+        self._links = () if parts.server is None else parts.server.links
         self._stop, self._sensors_stop, self._disk_stop = (threading.Event() for _ in range(3))
         # Exchanged between threads: deques and plain values, which need no lock.
         self._bound = PositionBound()
@@ -111,8 +107,8 @@ class Runtime:
             threads = {name: threading.Thread(target=work, name=name, daemon=True) for name, work in works.items()}
             for thread in threads.values():
                 thread.start()
-            if self._parts.fleet_manager is not None:
-                self._parts.fleet_manager.start()
+            for link in self._links:
+                link.start()
             self._manager.ready()
             self._last_frame_s = time.monotonic()
             try:
@@ -140,8 +136,8 @@ class Runtime:
         self.stop()
         for thread in threads.values():
             thread.join(_DRAIN_S)
-        if self._parts.fleet_manager is not None:
-            self._parts.fleet_manager.stop()
+        for link in self._links:
+            link.stop()
         _log.info("stopped: %s", self._health())
         if words := self._figures.search.words:
             _log.warning("stopped: %s", words)
@@ -191,13 +187,13 @@ class Runtime:
         self._report(now_s)
 
     def _after_frame(self, outcome: Outcome) -> None:
-        estimate, fleet_manager = outcome.estimate, self._parts.fleet_manager
+        estimate = outcome.estimate
         self._floor = estimate.floor
         if self._publisher is not None:
             _send(partial(self._publisher.publish, estimate, outcome.published, self._robot.base_from_body))
-        if fleet_manager is not None:
+        for link in self._links:
             held = frozenset(loaded.version for loaded in self._robot.held)
-            fleet_manager.adapter.after_frame(outcome, held, self._robot.floors, self._robot.visited_versions)
+            link.after_frame(outcome, held, self._robot.floors, self._robot.visited_versions)
         was_lost = self._figures.search.is_long
         before = {} if self._figures.last is None else self._figures.last.left_out
         for flag in outcome.left_out.keys() - before.keys():
@@ -228,8 +224,8 @@ class Runtime:
             self._unreadable = self._parts.intake.counts.unreadable
             self._refusals.warning("message", "a sensor's message is not used: %s", self._parts.intake.unreadable_why)
         is_silent = self._is_silent()
-        if is_silent and self._parts.fleet_manager is not None:
-            self._parts.fleet_manager.adapter.silence()
+        for link in self._links if is_silent else ():
+            link.silence()
         if self._server is not None:
             self._server.health.append(self._health())
         if self._publisher is not None:
@@ -364,8 +360,7 @@ class Runtime:
                 _log.error("failure %s is lost: %s", report.id, error)
 
     def _run_network(self, server: ServerSync) -> None:
-        fleet_manager = self._parts.fleet_manager
-        jobs = Jobs(server.step, *([] if fleet_manager is None else [fleet_manager.adapter.work]))
+        jobs = Jobs(server.step, *(link.work for link in server.links))
         while not self._stop.wait(_IDLE_S):
             jobs.work()
         jobs.work()  # a last time: delivers the last version changes and failures if the server is reachable

@@ -3,7 +3,7 @@
 import logging
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
 from fleetmap.log_lines import LogLimit
@@ -14,6 +14,7 @@ from fleetmap.threads import Jobs
 from locclient.delivery.outbox import Outbox
 from locclient.delivery.report_delivery import deliver, deliver_replay_part
 from locclient.delivery.survey_drives import SurveyDrives
+from locclient.hooks import RobotLink
 from locclient.maps.floor_maps import FloorMaps
 from locclient.maps.map_client import MapClient
 from locclient.prior_option import told_prior
@@ -53,9 +54,8 @@ class ServerSync:
         # The upkeep first: after a renewal whose response was lost, the server admits no other request.
         jobs = (self._keep_up, self._publish_health, self._deliver, self._fetch_again, self._ask, self._send_recordings)
         self._jobs = Jobs(*jobs, passed=UnreachableError, clock_s=clock_s)
-        self.is_alone = False  # there is no server: the fleet manager brings versions
-        self.follows = True  # the server selects the version; False: the fleet manager does
-        self.on_change: Callable[[VersionChange], None] = lambda _: None
+        self.is_alone = False  # there is no server: a link brings versions
+        self.links: Sequence[RobotLink] = ()
         self._refusals = LogLimit(_log)  # repeated refusals would fill the log
         self._upkeep, self._upkeep_at_s = upkeep, 0.0
         self.client, self._outbox, self._retry_s = client, outbox, retry_s
@@ -149,9 +149,9 @@ class ServerSync:
             )
             self._refusals.warning("no version", words, wanted.site, wanted.site)
             return
-        if not self.follows:
+        if chooser := next((link.chooses for link in self.links if link.chooses), ""):
             running = None if self._running is None else self._running.version
-            self._last_ack = (running, "" if wanted == self._running else "the fleet manager chooses (VDA 5050)")
+            self._last_ack = (running, "" if wanted == self._running else f"{chooser} chooses")
             return self._acknowledge()
         if sha256 in self._offered or now_s < self._not_before_s.get(sha256, 0.0):
             return self._acknowledge_again()
@@ -203,7 +203,8 @@ class ServerSync:
                     self._offered.discard(sha256)
                     self._not_before_s[sha256] = self._clock_s() + self._retry_s
                 self._refuse(change.wanted, change.reason)
-            self.on_change(change)
+            for link in self.links:
+                link.changed_version(change)
 
     def _adopt(self, wanted: WantedVersion) -> None:
         self._running = wanted

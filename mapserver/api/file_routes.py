@@ -1,4 +1,4 @@
-"""Endpoints of a version as one file under a permanent address (VDA 5050 `downloadMap`), its grid, expected views and changes."""
+"""Endpoints of a version as one file under a permanent address, its grid, expected views and changes; those of plug-ins."""
 
 import base64
 import hashlib
@@ -22,6 +22,7 @@ from mapserver.api.guard import address_of
 from mapserver.api.parameters import NearPlace, Number, RobotHeight, Sha256, Site, Version, ViewPose
 from mapserver.api.views import PictureList, PictureView
 from mapserver.fleet.rate_limit import RateLimit
+from mapserver.hooks import route_hooks
 from mapserver.serving.expected_views import ExpectedViews, SurfelChanges, failure_camera, looking
 from mapserver.store import MapStore
 from mapserver.surfels.changes import Changes, changes_geojson, changes_png
@@ -141,12 +142,8 @@ def install_file_routes(app: FastAPI, store: MapStore) -> None:
         version, map_from_cam, camera = failure_camera(report)
         return answer(request, lambda: views.view(report.site, version, map_from_cam, camera))
 
-    @app.get("/v1/sites/{site}/versions/{version}/vda5050")
-    def vda5050(request: Request, site: Site, version: Version) -> dict[str, str]:
-        """The parameters of VDA 5050's `downloadMap` for this version."""
-        sha256 = offered(site, version)[1].hex()
-        link = str(request.url.replace(path=f"/v1/sites/{site}/versions/{version}/file", query=""))
-        return {"mapId": site, "mapVersion": str(version), "mapDownloadLink": link, "mapHash": sha256}
+    for install in route_hooks().values():
+        install(app, offered)
 
 
 def _picture_view(one: SurveyPicture, distance_m: float) -> PictureView:

@@ -7,8 +7,7 @@ import msgspec
 import pytest
 
 from fleetmap.config import Section, Setting, Tiers, settings_in
-from locclient.config import TIERS as LOCCLIENT_TIERS
-from locclient.config import LocclientConfig
+from locclient.config import with_plugins
 from mapserver.config import TIERS as MAPSERVER_TIERS
 from mapserver.config import MapserverConfig
 from support.fleet.contracts_documents import REPOSITORY
@@ -21,7 +20,7 @@ PACKAGES = {
 }
 PROGRAMS: dict[str, tuple[Section, Tiers]] = {
     "mapserver": (MapserverConfig(), MAPSERVER_TIERS),
-    "locclient": (LocclientConfig(), LOCCLIENT_TIERS),
+    "locclient": with_plugins(),
 }
 
 

@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import click
+import pytest
 import typer.core
 
 from mapserver.api.app import create_app
@@ -28,7 +29,8 @@ def is_as_kept(name: str, text: str) -> bool:
     return (SNAPSHOTS / name).read_text(encoding="utf-8") == text
 
 
-def test_openapi(tmp_path: Path) -> None:
+def test_openapi(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mapserver.api.file_routes.route_hooks", dict)  # without plug-ins
     with MapStore.open(tmp_path, create=True) as store:
         fleet = Fleet(store)
         document = create_app(store, fleet, Metrics(store, fleet), None).openapi()

@@ -7,9 +7,9 @@ from typing import Any
 import pytest
 
 from fleetmap.errors import UsageError
-from locclient.vda5050.dialects import dialect
-from locclient.vda5050.factsheet import read_factsheet
-from locclient.vda5050.messages import MAX_PAYLOAD_BYTES, InstantActions, RobotPart, decode, timestamp
+from locclient.plugins.vda5050.dialects import dialect
+from locclient.plugins.vda5050.factsheet import read_factsheet
+from locclient.plugins.vda5050.messages import MAX_PAYLOAD_BYTES, InstantActions, RobotPart, decode, timestamp
 from support.fleet_manager.vda5050_master import validator
 
 OLD = ("2.0.0", "2.1.0")

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from fleetmap.errors import LinkError
-from locclient.vda5050.messages import Action, ActionState, Error, Reference
+from locclient.plugins.vda5050.messages import Action, ActionState, Error, Reference
 
 PARAMETERS: Mapping[str, Mapping[str, str]] = {
     "downloadMap": {"mapId": "STRING", "mapVersion": "STRING", "mapDownloadLink": "STRING", "mapHash": "STRING?"},

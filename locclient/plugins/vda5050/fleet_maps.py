@@ -10,7 +10,7 @@ from fleetmap.mapformat.version_file import ExportReader, open_export
 from fleetmap.messages import WantedVersion
 from locclient.maps.map_source import addresses_of
 from locclient.maps.tile_cache import ActiveVersion, TileCache
-from locclient.maps.version_download import Origins, TooLargeError, download
+from locclient.plugins.vda5050.version_download import Origins, TooLargeError, download
 
 _TOGETHER = 2  # space for a file, and for its extracted blobs
 _log = logging.getLogger(__name__)

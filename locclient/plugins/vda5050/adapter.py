@@ -16,13 +16,14 @@ from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.mapformat.floors import Floor
 from fleetmap.messages import Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
+from locclient.hooks import LinkedRobot
+from locclient.plugins.vda5050.actions import MAP_ACTIONS, PARAMETERS, ActionBook, parameters
+from locclient.plugins.vda5050.fleet_maps import DuplicateMapError, FleetMaps, NoRoomError
+from locclient.plugins.vda5050.localization import Localization, Position
+from locclient.plugins.vda5050.messages import Action, Error, InstantActions, Order, RobotPart, decode
+from locclient.plugins.vda5050.settings import Vda5050Section
 from locclient.robot.robot import Outcome
 from locclient.robot.version_trial import Change, VersionChange
-from locclient.vda5050.actions import MAP_ACTIONS, PARAMETERS, ActionBook, parameters
-from locclient.vda5050.fleet_maps import DuplicateMapError, FleetMaps, NoRoomError
-from locclient.vda5050.localization import Localization, Position
-from locclient.vda5050.messages import Action, Error, InstantActions, Order, RobotPart, decode
-from locclient.vda5050.settings import Vda5050Section
 
 _MOST_JOBS = 16
 _ENABLE_S = 120.0  # for the trial of a version, and that of the previous one after a failure
@@ -53,23 +54,13 @@ class FleetAdapter:
     def __init__(
         self,
         section: Vda5050Section,
-        site: str,
         maps: FleetMaps | None,
-        *,
-        active: Callable[[], WantedVersion | None],
-        offer: Callable[[WantedVersion], None],
-        put_prior: Callable[[PositionPrior], None],
-        lost_radius_m: float,
+        robot: LinkedRobot,
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
-        """maps: None if the map server selects the version. offer: passes a version to the localizer; put_prior: a pose.
-
-        active: returns the robot's complete version, on the thread that calls `work`. lost_radius_m: 95 % radius beyond which it is LOST.
-        """
-        self._section, self._maps, self._clock_s = section, maps, clock_s
-        self._active, self._offer, self._put_prior = active, offer, put_prior
-        self._lost_radius_m = lost_radius_m
-        self.map_id = section.map_id or site
+        """maps: None if the map server selects the version."""
+        self._section, self._maps, self._robot, self._clock_s = section, maps, robot, clock_s
+        self.map_id = section.map_id or robot.site
         self.changed, self.factsheet_wanted = threading.Event(), threading.Event()
         self._lock = threading.RLock()
         self._book = ActionBook()
@@ -186,7 +177,7 @@ class FleetAdapter:
     def work(self) -> None:
         """Execute one action on maps, which may take as long as a download; on the thread that owns the cache."""
         maps = self._maps
-        active = self._active()
+        active = self._robot.active()
         versions = [] if active is None or active.version is None else [(active.version, True)]
         with self._lock:
             self._versions = versions if maps is None else maps.versions()
@@ -226,7 +217,7 @@ class FleetAdapter:
             wanted = maps.wanted(version)
             with self._lock:
                 self._enabling = (action, wanted, self._clock_s() + _ENABLE_S)
-            return self._offer(wanted)
+            return self._robot.offer(wanted)
         with self._lock:
             self._versions = maps.versions()  # before the action is finished, in any state
             self._book.set(action, "FINISHED")
@@ -277,7 +268,7 @@ class FleetAdapter:
         sigmas = [_TILT_SIGMA_RAD] * 2 + [section.initial_sigma_rad] + [section.initial_sigma_m] * 2 + [_HEIGHT_SIGMA_M]
         fleet_from_base = se3(so3_exp(np.array([0.0, 0.0, place.theta_rad])), np.array([place.x_m, place.y_m, 0.0]))
         map_from_base = se3_inverse(fleet_from_map) @ fleet_from_base
-        self._put_prior(PositionPrior(now.stamp_ns + 1, map_from_base, np.diag(np.square(sigmas)), floor=floor))
+        self._robot.put_prior(PositionPrior(now.stamp_ns + 1, map_from_base, np.diag(np.square(sigmas)), floor=floor))
         return None
 
     def after_frame(
@@ -296,7 +287,7 @@ class FleetAdapter:
             self._floor_versions = floor_versions or {}
             if self._section.frame == "building":
                 self._fleet_from_map = outcome.published.building_from_map
-            how = (outcome, self._lost_radius_m, self._fleet_from_map)
+            how = (outcome, self._robot.lost_radius_m, self._fleet_from_map)
             speed_mps = outcome.speed_mps  # an unknown one is no driving: nobody may rely on it
             self._see(self._localization.after(*how, is_driving=speed_mps is not None and is_driving(speed_mps)))
             self._judge_position()
@@ -358,7 +349,7 @@ class FleetAdapter:
                 {"mapId": map_id, "mapVersion": str(number), "mapStatus": "ENABLED" if on else "DISABLED"}
                 for map_id, number, on in [*((self.map_id, *own) for own in self._versions), *others]
             ]
-            place = now.mobile_robot_position(self.map_id, self._lost_radius_m)
+            place = now.mobile_robot_position(self.map_id, self._robot.lost_radius_m)
             if place is not None:
                 found["mobileRobotPosition"] = place
             found["errors"] = to_plain(errors) + found.get("errors", [])
@@ -368,7 +359,7 @@ class FleetAdapter:
     def position(self) -> dict[str, Any] | None:
         """Return what the topic visualization shows, without its header; None before the first pose."""
         with self._lock:
-            place = self._localization.mobile_robot_position(self.map_id, self._lost_radius_m)
+            place = self._localization.mobile_robot_position(self.map_id, self._robot.lost_radius_m)
             part = self._part if self._clock_s() - self._part_s <= self._section.robot_silent_s else None
             velocity = None if part is None else part.velocity
             if place is None:

@@ -6,9 +6,9 @@ from typing import Annotated, Any
 import msgspec
 
 from fleetmap.errors import UsageError, disk_errors
-from locclient.vda5050.actions import MAP_ACTIONS, PARAMETERS
-from locclient.vda5050.dialects import Dialect
-from locclient.vda5050.messages import MAX_PAYLOAD_BYTES
+from locclient.plugins.vda5050.actions import MAP_ACTIONS, PARAMETERS
+from locclient.plugins.vda5050.dialects import Dialect
+from locclient.plugins.vda5050.messages import MAX_PAYLOAD_BYTES
 
 _HEADER = ("headerId", "timestamp", "version", "manufacturer", "serialNumber")
 _LEAST = Annotated[float, msgspec.Meta(ge=0)]

@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 
 from fleetmap.encoding import to_json
-from locclient.vda5050.messages import MAX_PAYLOAD_BYTES, without_nulls
+from locclient.plugins.vda5050.messages import MAX_PAYLOAD_BYTES, without_nulls
 
 Message = dict[str, Any]
 _INITIALIZE = "initializePosition"

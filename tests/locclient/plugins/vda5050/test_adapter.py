@@ -18,13 +18,13 @@ from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.mapformat.floors import Floor, FloorEntry
 from fleetmap.messages import Cause, Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
+from locclient.plugins.vda5050.adapter import FleetAdapter
+from locclient.plugins.vda5050.dialects import dialect
+from locclient.plugins.vda5050.factsheet import read_factsheet
+from locclient.plugins.vda5050.localization import Localization, Position
+from locclient.plugins.vda5050.messages import MAX_PAYLOAD_BYTES, timestamp
+from locclient.plugins.vda5050.settings import Vda5050Section, check_section
 from locclient.robot.continuous_odom import PublishedPose
-from locclient.vda5050.adapter import FleetAdapter
-from locclient.vda5050.dialects import dialect
-from locclient.vda5050.factsheet import read_factsheet
-from locclient.vda5050.localization import Localization, Position
-from locclient.vda5050.messages import MAX_PAYLOAD_BYTES, timestamp
-from locclient.vda5050.settings import Vda5050Section, check_section
 from support.fleet_manager.vda5050_master import validator
 
 HEADER = {
@@ -72,10 +72,10 @@ class Adapter(FleetAdapter):
         self.now_s, self.offers, self.priors = 100.0, [], []
         self.schema = validator("state")
         self.older = [(dialect(version), validator("state", version)) for version in ("2.0.0", "2.1.0")]
-        super().__init__(
-            Vda5050Section(**settings), "hall", FakeMaps(), active=lambda: None, offer=self.offers.append,  # type: ignore[arg-type]
-            put_prior=self.priors.append, lost_radius_m=3.0, clock_s=lambda: self.now_s,
-        )  # fmt: skip
+        robot: Any = SimpleNamespace(
+            site="hall", active=lambda: None, offer=self.offers.append, put_prior=self.priors.append, lost_radius_m=3.0
+        )
+        super().__init__(Vda5050Section(**settings), FakeMaps(), robot, lambda: self.now_s)  # type: ignore[arg-type]
         self.work()
         self._see(TRACKING)
 
@@ -488,7 +488,7 @@ def test_settings_that_cannot_be_right(settings: dict[str, Any], words: str) -> 
 
 def test_the_session_in_the_manual_is_one() -> None:
     text = (
-        (Path(__file__).parents[3] / "docs/service.md")
+        (Path(__file__).parents[4] / "docs/service.md")
         .read_text("utf-8")
         .split("## The robot under a fleet manager")[1]
     )

@@ -12,10 +12,10 @@ import pytest
 
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StateError, UntrustedError, UsageError
 from fleetmap.messages import WantedVersion
-from locclient.maps import version_download
 from locclient.maps.tile_cache import TileCache
-from locclient.maps.version_download import Origins
-from locclient.vda5050.fleet_maps import DuplicateMapError, FleetMaps, NoRoomError
+from locclient.plugins.vda5050 import version_download
+from locclient.plugins.vda5050.fleet_maps import DuplicateMapError, FleetMaps, NoRoomError
+from locclient.plugins.vda5050.version_download import Origins
 from mapserver.store import MapStore
 from support.storage.map_samples import publish_samples
 

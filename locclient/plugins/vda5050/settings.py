@@ -7,7 +7,6 @@ from typing import Literal, NamedTuple
 from fleetmap.bus import is_loopback
 from fleetmap.config import Section
 from fleetmap.errors import UsageError, disk_errors
-from locclient.maps.version_download import Origins
 
 _LEVEL = re.compile(r"[^/+#\0]{1,128}")
 _BROKER = re.compile(r"(mqtts?)://([^/:@\s]+|\[[0-9a-fA-F:]+\])(?::(\d{1,5}))?/?")
@@ -84,15 +83,6 @@ def check_section(section: Vda5050Section, *, insecure: bool) -> Broker:
     ca = None if section.ca is None else Path(section.ca)
     password = None if section.password_file is None else read_secret(section.password_file)
     return Broker(host, port, scheme == "mqtts", ca, section.username, password)
-
-
-def origins_of(section: Vda5050Section, *, insecure: bool) -> Origins:
-    """Return the allowed servers of maps; UsageError if a file cannot be read or an origin is invalid."""
-    token = None if section.download_token_file is None else read_secret(section.download_token_file)
-    ca = None if section.download_ca is None else Path(section.download_ca)
-    origins = Origins(section.download_from, token, ca, insecure)
-    origins.check()
-    return origins
 
 
 def read_secret(path: str) -> str:

@@ -6,8 +6,8 @@ from math import atan2, hypot, pi
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.messages import Cause, Status
+from locclient.plugins.vda5050.messages import Error
 from locclient.robot.robot import Outcome
-from locclient.vda5050.messages import Error
 
 _NO_FRAMES = "no images come from the cameras; check them and their cables"
 _NO_MAP = "no map is enabled: the fleet manager must send enableMap, or the map server publish a version"

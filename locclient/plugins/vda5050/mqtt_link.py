@@ -6,15 +6,20 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.threads import Jobs
-from locclient.vda5050.adapter import FleetAdapter
-from locclient.vda5050.dialects import dialect
-from locclient.vda5050.messages import MAX_PAYLOAD_BYTES, timestamp
-from locclient.vda5050.settings import Broker, Vda5050Section
+from locclient.hooks import LinkedRobot, RobotLink
+from locclient.plugins.vda5050.adapter import FleetAdapter
+from locclient.plugins.vda5050.dialects import dialect
+from locclient.plugins.vda5050.factsheet import read_factsheet
+from locclient.plugins.vda5050.fleet_maps import FleetMaps
+from locclient.plugins.vda5050.messages import MAX_PAYLOAD_BYTES, timestamp
+from locclient.plugins.vda5050.settings import Broker, Vda5050Section, check_section, read_secret
+from locclient.plugins.vda5050.version_download import Origins
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client
@@ -178,3 +183,25 @@ class MqttLink:
             "serialNumber": self._section.serial_number,
         }
         return to_json({**header, **self._dialect.said(topic, content)})
+
+
+def open_link(section: Vda5050Section, robot: LinkedRobot) -> RobotLink:
+    """Return the link of a checked section; if set there, the fleet manager selects the version. UsageError for unusable files."""
+    maps = None
+    if section.versions == "fleet manager":
+        token = None if section.download_token_file is None else read_secret(section.download_token_file)
+        ca = None if section.download_ca is None else Path(section.download_ca)
+        origins = Origins(section.download_from, token, ca, robot.insecure)
+        maps = FleetMaps(robot.cache, robot.site, robot.folder, origins, robot.check_admitted)
+    adapter = FleetAdapter(section, maps, robot)
+    sheet = None if section.factsheet is None else read_factsheet(Path(section.factsheet), dialect(section.version))
+    mqtt = MqttLink(check_section(section, insecure=robot.insecure), section, adapter, sheet)
+    return RobotLink(
+        start=mqtt.start,
+        stop=mqtt.stop,
+        work=adapter.work,
+        after_frame=adapter.after_frame,
+        silence=adapter.silence,
+        changed_version=adapter.changed_version,
+        chooses="" if maps is None else "the fleet manager (VDA 5050)",
+    )

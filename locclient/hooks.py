@@ -1,0 +1,78 @@
+"""Hooks of a robot: what plug-ins add to it. Each registers by an entry point in a hook's group; nothing else imports it.
+
+| group | registered by the name of | as |
+|---|---|---|
+| `locclient.links` | its section in the configuration file | `LinkHook` |
+"""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from fleetmap.config import Section, Tiers
+from fleetmap.mapformat.floors import Floor
+from fleetmap.messages import WantedVersion
+from fleetmap.plugins import plugins
+from fleetmap.sensors.samples import PositionPrior
+from locclient.identity import MapAddress
+from locclient.maps.tile_cache import TileCache
+from locclient.robot.robot import Outcome
+from locclient.robot.version_trial import VersionChange
+
+
+@dataclass(frozen=True)
+class LinkedRobot:
+    """What a link may use of its robot. lost_radius_m: 95 % radius beyond which a pose is LOST.
+
+    cache, folder for files during download, and active, the robot's complete version: on the thread of `RobotLink.work`. check_admitted:
+    raises UntrustedError for versions outside the site's signed list; None without a map server. offer: passes a version to the localizer.
+    """
+
+    site: str
+    insecure: bool
+    lost_radius_m: float
+    cache: TileCache
+    folder: Path
+    active: Callable[[], WantedVersion | None]
+    check_admitted: Callable[[WantedVersion], None] | None
+    offer: Callable[[WantedVersion], None]
+    put_prior: Callable[[PositionPrior], None]
+
+
+@dataclass(frozen=True)
+class RobotLink:
+    """An open link, as the functions that the daemon calls: `start` and `stop` with its own threads.
+
+    work: what may block, repeatedly on the network's thread. after_frame: the results of a frame, the versions in use, the building's
+    floors, and the versions of the others' maps by their sites; on the localizing thread. silence: once a second while frames are missing.
+    changed_version: on the network's thread, after the change on the disk. chooses: who selects the version in place of the map server.
+    """
+
+    start: Callable[[], None]
+    stop: Callable[[], None]
+    work: Callable[[], None]
+    after_frame: Callable[[Outcome, frozenset[int], Mapping[str, Floor], Mapping[str, int]], None]
+    silence: Callable[[], None]
+    changed_version: Callable[[VersionChange], None]
+    chooses: str = ""
+
+
+@dataclass(frozen=True)
+class LinkHook:
+    """A link of the robot to another system. tiers: of the file's keys, by the section's name.
+
+    is_on: whether the section asks for it; the robot may then be without a map server. check: raises UsageError for invalid settings; the
+    last argument is [run] insecure. open: called after `check`, for a robot that is not confined to a store's folder.
+    """
+
+    section: type[Section]
+    tiers: Tiers
+    is_on: Callable[[Any], bool]
+    check: Callable[[Any, MapAddress, bool], None]
+    open: Callable[[Any, LinkedRobot], RobotLink]
+
+
+def link_hooks() -> dict[str, LinkHook]:
+    """Return the installed links by their sections' names."""
+    return plugins("locclient.links")

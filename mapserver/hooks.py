@@ -1,0 +1,23 @@
+"""Hooks of the map server: what plug-ins add to it. Each registers by an entry point in a hook's group; nothing else imports it.
+
+| group | registered by the name of | as |
+|---|---|---|
+| `mapserver.routes` | the plug-in | `RouteHook` |
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+from fleetmap.mapformat.version_file import ExportHead
+from fleetmap.plugins import plugins
+
+OfferedFile = Callable[[str, int], tuple[ExportHead, bytes]]
+"""Head and SHA-256 of the file of a published version, by site and number; FleetmapError as `GET .../file`."""
+
+RouteHook = Callable[[Any, OfferedFile], None]
+"""Adds endpoints to the application, a FastAPI."""
+
+
+def route_hooks() -> dict[str, RouteHook]:
+    """Return the installed parts of the HTTP API."""
+    return plugins("mapserver.routes")
