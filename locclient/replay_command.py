@@ -71,6 +71,7 @@ class PlaybackOptions:
         Path | None, typer.Option(help="Calibration file to use instead of the recording's own.")
     ] = None
     topic: TopicNames = None
+    use: Annotated[str | None, typer.Option(metavar="SENSORS", help="Use only these sensors of the recording.")] = None
     prior: Annotated[str | None, typer.Option(help="Start of the robot: X,Y,YAW,SIGMA_M (metres, radians).")] = None
     reverse: Annotated[bool, typer.Option("--reverse", help="Play backwards, with new stamps and without IMU.")] = False
     realtime: Annotated[
@@ -179,6 +180,7 @@ def _run(
     from fleetmap.encoding import to_json
     from fleetmap.foxglove import require_foxglove
     from fleetmap.recordings import FrameSelection, OpenOptions, named_topics, open_recording
+    from fleetmap.recordings.sensor_subset import named_sensor_set, reduced
     from fleetmap.recordings.tum import write_tum
     from fleetmap.sources.replay_source import ReplaySource
     from locclient.maps.connection import connected
@@ -191,10 +193,11 @@ def _run(
         require_foxglove("--mcap")
     prior = parse_prior(playback.prior, "--prior")
     selection = FrameSelection.parse(playback.frames)
+    use = None if playback.use is None else named_sensor_set(playback.use)
     opening = OpenOptions(playback.calibration, named_topics(playback.topic, settings.topics))
     console = plain_console(stderr=True)
     with ExitStack() as stack:
-        recording = stack.enter_context(open_recording(path, opening))
+        recording = reduced(stack.enter_context(open_recording(path, opening)), use)
         source = ReplaySource.of(recording, selection, reverse=playback.reverse)
         export: RunExport | None = None
         if files.mcap is not None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from fleetmap.errors import StateError
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Manifest, Tile, check_name, decode_tile
+from fleetmap.recordings.sensor_subset import sensor_set_of
 from fleetmap.sensors.samples import Trajectory
 from mapserver import releases
 from mapserver.config import survey_settings
@@ -30,7 +31,6 @@ from mapserver.drafting.draft import (
     picture_png,
 )
 from mapserver.drafting.report import write_file
-from mapserver.drafting.sensor_subset import sensor_set_of
 from mapserver.quality.gate import GateSettings
 from mapserver.store import NOBODY, Actor, MapStore
 from mapserver.survey.settings import SurveySettings

@@ -11,7 +11,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.mapformat.floors import Floor
 from fleetmap.messages import Cause, Status
-from fleetmap.odometry import Odometry, OdometryEstimate, is_away
+from fleetmap.odometry import OdometryEstimate, is_away, make_odometry
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.calibration import RigCalibration
@@ -69,7 +69,7 @@ class Localizer:
         self._clock, self._settings = clock, settings
         self._mounted = (MountedCamera(camera, body_from_cam), *others)
         rig = (calibration, camera, body_from_cam, imu_minus_cam_s)
-        self.odometry = Odometry(*rig, settings.odometry, settings.stereo, others)
+        self.odometry = make_odometry(*rig, settings.odometry, settings.stereo, others, by_wheels=True)
         self.percept: Percept | None = None  # of the last frame
         self._images = [ImageQualityMonitor(settings.image_quality) for _ in self._mounted]
         self._judged: tuple[RectifiedFrame, list[ImageQuality]] | None = None  # the last frame

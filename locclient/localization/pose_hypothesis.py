@@ -153,7 +153,11 @@ class PoseHypothesis:
         motion = motions.get(self.frame_index)
         if motion is None:
             # The odometry dropped the start frame in a long standstill, or restarted: one step by its estimates alone.
-            is_sure = odometry.new_odom_from_old_odom is None and odometry.status is not OdometryStatus.DEGRADED
+            is_sure = (
+                odometry.new_odom_from_old_odom is None
+                and odometry.status is not OdometryStatus.DEGRADED
+                and odometry.scale_known
+            )
             cov_step = _step_cov(_MEASURED_DRIFT if is_sure else _RESTARTED, step_m)
             self.now_map_from_body, self.now_cov = compose_cov(self.now_map_from_body, self.now_cov, step, cov_step)
         else:

@@ -15,6 +15,7 @@ from fleetmap.errors import LinkError, RecordingError, UsageError
 from fleetmap.free_memory import give_back_free_memory
 from fleetmap.geometry import Array, rotation_angle_rad
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording
+from fleetmap.recordings.sensor_subset import reduced
 from fleetmap.sensors.lens_fit import lens_of_frames
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import PositionPrior, SensorSet
@@ -163,13 +164,15 @@ def frame_record(outcome: Outcome, truth_map_from_body: Array | None, wall_s: fl
 class LocalizeOptions(ReplayOptions):
     """Options of `localize` in addition to those of every replay.
 
-    frames: Python slice of the recording's frames. reverse: backwards, with new stamps and without IMU. calibration, topics: for
-    opening a recording by its path. robot: name for the server; default: the identity's, else `replay`. root, identity,
-    insecure: as of the command. cache, cache_bytes: folder and size of the tile cache. version: in a store's folder, drafts included.
+    frames: Python slice of the recording's frames. reverse: backwards, with new stamps and without IMU. use: only the sensors of a
+    smaller set. calibration, topics: for opening a recording by its path. robot: name for the server; default: the identity's, else
+    `replay`. root, identity, insecure: as of the command. cache, cache_bytes: folder and size of the tile cache. version: in a store's
+    folder, drafts included.
     """
 
     frames: str = ":"
     reverse: bool = False
+    use: SensorSet | None = None
     calibration: Path | None = None
     topics: Topics = field(default_factory=Topics)
     robot: str | None = None
@@ -201,6 +204,7 @@ def localize(
         if not isinstance(recording, Recording):
             how = OpenOptions(calibration_file=options.calibration, topics=options.topics)
             recording = stack.enter_context(open_recording(Path(recording), how))
+        recording = reduced(recording, options.use)
         selection = FrameSelection.parse(options.frames)
         address = _address(maps, site, options)
         connection = stack.enter_context(connected(address, options.cache, options.cache_bytes))

@@ -57,8 +57,8 @@ def build(
         if not path.exists():
             raise UsageError(f"--replay {path} does not exist; name a recording of the current version")
     options.check()
+    from fleetmap.recordings.sensor_subset import named_sensor_set
     from mapserver import build_map
-    from mapserver.drafting.sensor_subset import named_sensor_set
 
     built = build_map(
         recordings,

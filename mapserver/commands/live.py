@@ -71,7 +71,7 @@ def live(
     if at is not None:
         require_foxglove("--foxglove")
         from mapserver.live.live_viewer import LiveViewer
-    from mapserver.drafting.sensor_subset import named_sensor_set
+    from fleetmap.recordings.sensor_subset import named_sensor_set
     from mapserver.live import LiveRequest, run_live
 
     use = None if options.use is None else named_sensor_set(options.use)

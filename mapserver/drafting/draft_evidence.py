@@ -16,13 +16,13 @@ from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Manifest, RecordingEntry, Tile, decode_tile, encode_tile
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
+from fleetmap.recordings.sensor_subset import reduced
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from fleetmap.version_grid import Tiles as Grid
 from fleetmap.version_grid import known_grid
-from mapserver.drafting.sensor_subset import reduced
 from mapserver.quality.directions import tile_directions
 from mapserver.quality.evidence import Probes, displaced, examine, trajectory_breaks
 from mapserver.quality.figures import Evidence, RigEvidence, TrajectoryBreaks

@@ -19,6 +19,7 @@ from fleetmap.geometry import Array
 from fleetmap.log_lines import printable
 from fleetmap.mapformat import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
+from fleetmap.recordings.sensor_subset import reduced, with_other_views
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps, Trajectory, wheel_between
@@ -39,7 +40,6 @@ from mapserver.drafting.admission import (
 )
 from mapserver.drafting.draft_evidence import ProbedFrame, probed_frames
 from mapserver.drafting.mapped_images import KeptFrames
-from mapserver.drafting.sensor_subset import reduced, with_other_views
 from mapserver.drafting.trajectory import GivenPoses, OtherTrajectory, given_poses, with_depths
 from mapserver.drafting.worker import read_ahead
 from mapserver.quality.figures import RigEvidence

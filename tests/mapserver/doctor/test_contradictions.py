@@ -14,11 +14,11 @@ from rosbags.typesys import Stores, get_typestore
 
 from fleetmap.geometry import Array
 from fleetmap.recordings import Recording, open_recording
+from fleetmap.recordings.sensor_subset import reduced
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet
 from mapserver.doctor import Verdict, camera_motion
 from mapserver.doctor.calibration import MeasuredCalibration
 from mapserver.doctor.images import fine_structure, fixed_pattern
-from mapserver.drafting.sensor_subset import reduced
 from support.recordings.bag_samples import write_rosbag1
 from support.recordings.calibration_faults import baseline
 from support.recordings.painted_room import Ride, write_ride

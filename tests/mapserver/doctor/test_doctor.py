@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 from fleetmap.errors import CalibrationError
 from fleetmap.geometry import so3_exp
 from fleetmap.recordings import Recording, format_calibration, open_recording, read_calibration
+from fleetmap.recordings.sensor_subset import reduced
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps
 from mapserver.calibration import CalibrationParameter
@@ -32,7 +33,6 @@ from mapserver.doctor.sensors import (
     rolling_shutter,
     stamp_order,
 )
-from mapserver.drafting.sensor_subset import reduced
 from support.recordings.realdata import real_data
 from support.recordings.recording_samples import make_sample, write_euroc
 

@@ -10,13 +10,13 @@ from rich.console import Console
 
 from fleetmap.geometry import se3_exp
 from fleetmap.recordings import Recording
+from fleetmap.recordings.sensor_subset import with_other_views
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RGBD_BASELINE_M, Rectifier
 from fleetmap.sensors.samples import SensorSet
 from mapserver.doctor import Finding
 from mapserver.drafting.admission import CheckedRecording
 from mapserver.drafting.draft_evidence import JudgedSession, ProbedFrame
-from mapserver.drafting.sensor_subset import with_other_views
 from mapserver.drafting.survey_recordings import OpenRecordings, RecordingOptions, _admission
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.keyframes.keyframes import make_keyframes

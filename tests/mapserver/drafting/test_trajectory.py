@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from fleetmap.errors import FleetmapError, RecordingError, UsageError
 from fleetmap.geometry import Array, quat_wxyz_from_rotation, se3, se3_exp, se3_inverse, so3_exp
 from fleetmap.recordings import Recording, open_recording
+from fleetmap.recordings.sensor_subset import reduced
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from mapserver import BuildOptions, build_map
-from mapserver.drafting.sensor_subset import reduced
 from mapserver.drafting.trajectory import GivenPoses, OtherTrajectory, given_poses
 from mapserver.drafting.trajectory import given as given_module
 from mapserver.drafting.trajectory.formats import WrittenPoses

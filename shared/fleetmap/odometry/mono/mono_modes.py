@@ -1,6 +1,6 @@
 """Odometry with one camera: metric once the IMU has determined the scale; before that, or without an IMU, up to scale and marked so."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -17,12 +17,13 @@ from fleetmap.odometry.init.imu_alignment import mono_inertial_initialization
 from fleetmap.odometry.init.static_initialization import static_initialization
 from fleetmap.odometry.modes import ImuInputs, InertialMode, Mode, StartingMode, Step, VisualMode, WindowMode
 from fleetmap.odometry.mono.mono_vo import VisualEstimate, VisualOdometry
+from fleetmap.odometry.mono.wheel_mode import WheelMode
 from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.odometry_checks import is_image_still
 from fleetmap.odometry.settings import OdometrySettings, TrackerSettings
 from fleetmap.odometry.tracking.tracker import MotionSince, Tracked, Tracker
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Trajectory
 
 _STILL_S = 0.5
@@ -106,6 +107,7 @@ class MonocularMode(Mode):
         self._unscaled: list[_UnscaledFrame] = []
         self._newest_pixels: tuple[Ids, Array] = (np.zeros(0, np.int64), np.zeros((0, 3)))
         self._still_since_ns: int | None = None
+        self._still_from, self._frame_index = 1, 0  # the first frame of the standstill; the present one
         self._tried_ns = 0
         self._not_before_ns = -(2**62)
 
@@ -136,15 +138,19 @@ class MonocularMode(Mode):
         return self._visual_odometry.motion_guess()
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
-        """See Mode: unknown in metres."""
-        return None
+        """See Mode: none while the image stands still, of any scale; else unknown in metres."""
+        if not self._still_from <= frame_index <= self._frame_index:
+            return None
+        sigma_rad = self._rig.settings.monocular.still_px / self._rig.camera.focal_px
+        sigmas = np.repeat([sigma_rad, sigma_rad * self._visual.depth], 3)
+        return np.eye(4), (self._frame_index - frame_index) * np.diag(sigmas**2)
 
     def will_forget(self, frame_index: int) -> bool:
-        return True
+        return frame_index < self._still_from
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
         """See Mode; switches to the filter once the scale is known, and revises earlier frames then."""
-        self._detect_standstill(tracked)
+        self._detect_standstill(frame_index, tracked)
         visual = self._visual = self._visual_odometry.add(frame_index, tracked.ids, tracked.pixels[:, :2])
         if self.imu is not None:
             self._keep_unscaled(frame_index, visual)
@@ -161,7 +167,7 @@ class MonocularMode(Mode):
         there = np.eye(4) if visual.vision_from_cam is None else visual.vision_from_cam
         turn = np.kron(np.eye(2), self._rig.body_from_cam[:3, :3])
         status = OdometryStatus.TRACKING
-        if visual.vision_from_cam is None:
+        if visual.vision_from_cam is None and self._still_since_ns is None:
             status = OdometryStatus.DEGRADED if visual.lost else OdometryStatus.INITIALISING
         return OdometryEstimate(
             stamp_ns=stamp_ns,
@@ -194,12 +200,13 @@ class MonocularMode(Mode):
         kept.append(_UnscaledFrame(frame_index, self._stamp_ns, visual.vision_from_cam))
         self._unscaled = kept[-_UNSCALED_FRAMES:]
 
-    def _detect_standstill(self, tracked: Tracked) -> None:
+    def _detect_standstill(self, frame_index: int, tracked: Tracked) -> None:
         """Track since when the image stands still."""
+        self._frame_index = frame_index
         still_px = self._rig.settings.monocular.still_px
         still = is_image_still(*self._newest_pixels, tracked.ids, tracked.pixels, still_px)
         if not still:
-            self._still_since_ns = None
+            self._still_since_ns, self._still_from = None, frame_index
         elif self._still_since_ns is None:
             self._still_since_ns = self._stamp_ns
         self._newest_pixels = (tracked.ids, tracked.pixels)
@@ -276,10 +283,16 @@ def make_odometry(
     imu_minus_cam_s: float,
     settings: OdometrySettings,
     stereo_settings: StereoSettings | None = None,
+    others: Sequence[MountedCamera] = (),
+    *,
+    by_wheels: bool = False,
 ) -> Odometry:
-    """Create the odometry for a rectified camera: `MonocularOdometry` for a single one without a depth sensor."""
-    kind = MonocularOdometry if camera.baseline_m == 0 else Odometry
-    return kind(calibration, camera, body_from_cam, imu_minus_cam_s, settings, stereo_settings)
+    """Create the odometry for a rectified camera: `MonocularOdometry` for a single one without a depth sensor; by_wheels: `WheelOdometry`
+    if that has no IMU either, for a robot, whose map has the scale."""
+    kind = (
+        Odometry if camera.baseline_m else WheelOdometry if by_wheels and calibration.imu is None else MonocularOdometry
+    )
+    return kind(calibration, camera, body_from_cam, imu_minus_cam_s, settings, stereo_settings, others)
 
 
 class MonocularTracker(Tracker):
@@ -336,3 +349,13 @@ class MonocularOdometry(Odometry):
         if isinstance(self._mode, WindowMode) and isinstance(self._mode.window, MonocularWindow):
             return self._mode.window.points_in_camera(ids)
         return self._vision.points_in_camera(ids)
+
+
+class WheelOdometry(Odometry):
+    """The class `Odometry` for one camera and wheels, see `WheelMode`."""
+
+    def _first_mode(self) -> Mode:
+        rig = self._rig
+        unknown = np.full(3, np.nan)
+        self._tracker = MonocularTracker(rig.camera, rig.settings.tracker, lambda ids: np.tile(unknown, (len(ids), 1)))
+        return WheelMode(rig, self._samples)

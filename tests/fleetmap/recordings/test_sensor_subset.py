@@ -8,11 +8,11 @@ from typer.testing import CliRunner
 
 from fleetmap.errors import GateRefusedError, RecordingError, SurveyError, UsageError
 from fleetmap.recordings import open_recording
+from fleetmap.recordings.sensor_subset import REDUCTIONS, named_sensor_set, reduced, sensor_set_of
 from fleetmap.sensors.samples import SensorSet
 from mapserver import releases
 from mapserver.cli import app
 from mapserver.config import survey_settings
-from mapserver.drafting.sensor_subset import REDUCTIONS, named_sensor_set, reduced, sensor_set_of
 from mapserver.store import DraftContent, MapStore
 from mapserver.survey.settings import SurveySettings
 from support.recordings.recording_samples import make_sample, write_euroc

@@ -1,0 +1,122 @@
+"""Odometry of one camera without an IMU, by wheels: its images measure no length, and correct the motion in a map alone."""
+
+from collections import deque
+from typing import NamedTuple
+
+import numpy as np
+
+from fleetmap.geometry import Array, length, rotation_angle_rad, se3_exp, se3_inverse
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.filter.sliding_window import OdometryRig
+from fleetmap.odometry.modes import Mode, Step
+from fleetmap.odometry.sensor_buffer import SensorBuffer
+from fleetmap.odometry.tracking.tracker import Tracked
+from fleetmap.sensors.samples import WheelSample
+
+_KEPT_FRAMES = 64
+_SILENT_NS = 200_000_000  # without samples the motion is unknown
+
+
+class _Rolled(NamedTuple):
+    """Sums until a frame: way, turn, time of motion, and each sample's sigmas over its time."""
+
+    way_m: float = 0.0
+    turn_rad: float = 0.0
+    moving_s: float = 0.0
+    sigma_m: float = 0.0
+    sigma_rad: float = 0.0
+
+
+class _Frame(NamedTuple):
+    frame_index: int
+    odom_from_body: Array
+    rolled: _Rolled
+
+
+class WheelMode(Mode):
+    """Dead reckoning. The errors of samples stay alike from one to the next, so that sigmas add up and variances do not."""
+
+    def __init__(self, rig: OdometryRig, samples: SensorBuffer) -> None:
+        self._rig, self._samples = rig, samples
+        self._frames = deque[_Frame](maxlen=_KEPT_FRAMES)
+        self._newest: WheelSample | None = None
+        self._stamp_ns, self._velocity_mps = 0, np.zeros(3)
+        self._is_silent = True
+
+    @property
+    def stamp_ns(self) -> int:
+        return self._stamp_ns
+
+    def predict(self, stamp_ns: int) -> None:
+        """See Mode: a sample counts until its stamp, the newest one also after it."""
+        at_ns = since_ns = self._stamp_ns or stamp_ns
+        samples = self._samples.wheel_between(at_ns + 1, stamp_ns)
+        self._newest, self._stamp_ns = samples[-1] if samples else self._newest, stamp_ns
+        self._is_silent = self._newest is None or stamp_ns - self._newest.stamp_ns > _SILENT_NS
+        parts = [(sample.stamp_ns, sample) for sample in samples]
+        if self._newest is not None and not self._is_silent:
+            parts.append((stamp_ns, self._newest))
+        number, before, rolled = self._frames[-1] if self._frames else _Frame(-1, np.eye(4), _Rolled())
+        odom_from_base = before @ se3_inverse(self._rig.base_from_body)
+        for until_ns, sample in parts:
+            duration_s, at_ns = (until_ns - at_ns) * 1e-9, until_ns
+            step = se3_exp(duration_s * np.array([0.0, 0.0, sample.yaw_rate_radps, *sample.velocity_base_mps]))
+            odom_from_base = odom_from_base @ step
+            way_m, turn_rad = length(step[:3, 3]), rotation_angle_rad(step[:3, :3])
+            moving_s = duration_s if way_m + turn_rad else 0.0
+            new = way_m, turn_rad, moving_s, sample.sigma_mps * duration_s, sample.sigma_radps * duration_s
+            rolled = _Rolled(*np.add(rolled, new).tolist())
+        odom_from_body = odom_from_base @ self._rig.base_from_body
+        self._velocity_mps = (odom_from_body - before)[:3, 3] / max((stamp_ns - since_ns) * 1e-9, 1e-3)
+        self._frames.append(_Frame(number + 1, odom_from_body, rolled))
+
+    def cam_from_earlier(self, frame_index: int) -> Array | None:
+        motion = self.motion_since(frame_index)
+        rig = self._rig
+        return None if motion is None else np.asarray(rig.cam_from_body @ se3_inverse(motion[0]) @ rig.body_from_cam)
+
+    def process(self, frame_index: int, tracked: Tracked) -> Step:
+        """See Mode: nothing corrects it."""
+        return Step(self, np.zeros(0, np.int8), is_lost=self._is_silent or tracked.lost)
+
+    def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
+        number = frame_index - self._frames[0].frame_index
+        if self._is_silent or not 0 <= number < len(self._frames):
+            return None
+        earlier, now = self._frames[number], self._frames[-1]
+        rolled = _Rolled(*np.subtract(now.rolled, earlier.rolled).tolist())
+        return se3_inverse(earlier.odom_from_body) @ now.odom_from_body, self._covariance(rolled)
+
+    def _covariance(self, rolled: _Rolled) -> Array:
+        settings = self._rig.settings.filter
+        sigma_rad = rolled.sigma_rad + settings.wheel_yaw_scale_sigma * rolled.turn_rad
+        sigma_m = (
+            rolled.sigma_m + settings.wheel_speed_scale_sigma * rolled.way_m + settings.wheel_slip_mps * rolled.moving_s
+        )
+        tilt_rad = settings.initial_tilt_sigma_rad if rolled.moving_s else 0.0  # by the floor, which wheels do not show
+        turns = [sigma_rad + tilt_rad, sigma_rad + tilt_rad, sigma_rad]
+        return np.diag(np.square([*turns, *[sigma_m + turns[0] * rolled.way_m] * 3]))
+
+    def will_forget(self, frame_index: int) -> bool:
+        return frame_index <= self._frames[0].frame_index
+
+    def estimate(self, stamp_ns: int, frame_index: int, tracked: Tracked, step: Step) -> OdometryEstimate:
+        """See Mode; biases are unknown, reported as zero."""
+        _, odom_from_body, rolled = self._frames[-1]
+        return OdometryEstimate(
+            stamp_ns=stamp_ns,
+            frame_index=frame_index,
+            odom_from_body=odom_from_body,
+            cov_rot_trans=self._covariance(rolled) + 1e-12 * np.eye(6),
+            velocity_odom_mps=self._velocity_mps,
+            gyro_bias_radps=np.zeros(3),
+            accel_bias_mps2=np.zeros(3),
+            status=OdometryStatus.DEGRADED if frame_index and step.is_lost else OdometryStatus.TRACKING,
+            track_ids=tracked.ids,
+            scene_depth_m=5.0,
+            inlier_share=tracked.inlier_share,
+            after_gap=tracked.by_descriptors,
+            inertial=False,
+            new_odom_from_old_odom=None,
+            track_pixels=tracked.pixels,
+        )
