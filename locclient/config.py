@@ -1,13 +1,12 @@
 """Configuration file of `locclient`: the robot, its sensors and outputs, and the localizer."""
 
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
 from fleetmap.cli_options import Commands, Options, command_defaults, file_type
-from fleetmap.config import Section, Tiers, over, read_given, refuse_internal
+from fleetmap.config import Section, Tiers, read_given, refuse_internal
 from fleetmap.recordings import Topics
 from fleetmap.sensors.source_settings import SourceSection
 from locclient.hooks import LinkHook, link_hooks
@@ -17,7 +16,7 @@ from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
 from locclient.output_section import OutputSection
 from locclient.robot.version_trial import TrialSettings
 
-TIERS: Tiers = {
+TIERS = {
     "user": {
         "": "site store server",
         "run": "server store site robot prior cache cache_bytes root identity insecure outbox failures replays surveys",
@@ -98,12 +97,11 @@ def read_config(path: Path | None, commands: Commands) -> tuple[LocclientConfig,
 
 def with_plugins() -> tuple[LocclientConfig, Tiers]:
     """Return the defaults of the whole file, with the sections of the installed plug-ins, and the tiers of its keys."""
-    hooks = link_hooks()
-    sections = [(name, hook.section, hook.section()) for name, hook in hooks.items()]
+    sections = [(name, hook.section, hook.section()) for name, hook in link_hooks().items()]
     kind: type[LocclientConfig] = msgspec.defstruct(  # type: ignore[assignment]
         "Config", sections, bases=(LocclientConfig,), frozen=True, kw_only=True
     )
-    return kind(), reduce(over, (hook.tiers for hook in hooks.values()), TIERS)
+    return kind(), TIERS | {"user": TIERS["user"] | {name: "*" for name, _, _ in sections}}
 
 
 def links_of(config: LocclientConfig) -> list[tuple[LinkHook, Section]]:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fleetmap.config import Section, Tiers
+from fleetmap.config import Section
 from fleetmap.mapformat.floors import Floor
 from fleetmap.messages import WantedVersion
 from fleetmap.plugins import plugins
@@ -60,14 +60,13 @@ class RobotLink:
 
 @dataclass(frozen=True)
 class LinkHook:
-    """A link of the robot to another system. tiers: of the file's keys, by the section's name.
+    """A link of the robot to another system. section: all its keys may be set.
 
     is_on: whether the section asks for it; the robot may then be without a map server. check: raises UsageError for invalid settings; the
     last argument is [run] insecure. open: called after `check`, for a robot that is not confined to a store's folder.
     """
 
     section: type[Section]
-    tiers: Tiers
     is_on: Callable[[Any], bool]
     check: Callable[[Any, MapAddress, bool], None]
     open: Callable[[Any, LinkedRobot], RobotLink]

@@ -218,7 +218,11 @@ class Ros2Localizer(Publisher):
         node.serve("~/change_state", "lifecycle_msgs/srv/ChangeState", self._change_state)
         node.serve("~/get_available_states", "lifecycle_msgs/srv/GetAvailableStates", lambda _: encode_states())
         transitions = "lifecycle_msgs/srv/GetAvailableTransitions"
-        node.serve("~/get_available_transitions", transitions, self._next_transitions)
+        node.serve(
+            "~/get_available_transitions",
+            transitions,
+            lambda _: encode_transitions([one for one in TRANSITIONS if one.start is self._state]),
+        )
         graph = encode_transitions(TRANSITIONS, with_success=True)
         node.serve("~/get_transition_graph", transitions, lambda _: graph)
         node.serve("set_initial_pose", "nav2_msgs/srv/SetInitialPose", self._take_initial_pose)
@@ -347,9 +351,6 @@ class Ros2Localizer(Publisher):
                 self._other_s, self._other = time.monotonic(), f"{link.parent} -> {link.child}"
         if not section.publish_odom:
             self._driver.handle_tf(links)
-
-    def _next_transitions(self, _: bytes) -> bytes:
-        return encode_transitions([transition for transition in TRANSITIONS if transition.start is self._state])
 
     def _change_state(self, request: bytes) -> bytes:
         with self._lock:

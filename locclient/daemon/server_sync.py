@@ -154,7 +154,9 @@ class ServerSync:
             self._last_ack = (running, "" if wanted == self._running else f"{chooser} chooses")
             return self._acknowledge()
         if sha256 in self._offered or now_s < self._not_before_s.get(sha256, 0.0):
-            return self._acknowledge_again()
+            if self._last_ack is None and self._running is not None:
+                self._last_ack = (self._running.version, "")
+            return self._acknowledge()  # again, for a restarted server or a lost message
         try:
             self.client.fetch(wanted)
         except (LinkError, MapFormatError, StoreError) as error:
@@ -222,12 +224,6 @@ class ServerSync:
         _log.warning("version %s is refused: %s", wanted.version, reason)
         running = None if self._running is None else self._running.version
         self._last_ack = (running, reason if is_untrusted else f"version {wanted.version}: {reason}")
-        self._acknowledge()
-
-    def _acknowledge_again(self) -> None:
-        """Repeat the acknowledgement, for a restarted server or a lost message."""
-        if self._last_ack is None and self._running is not None:
-            self._last_ack = (self._running.version, "")
         self._acknowledge()
 
     def _acknowledge(self) -> None:

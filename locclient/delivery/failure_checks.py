@@ -73,14 +73,6 @@ def _stereo_pixels(pixels: AnyArray, camera: StereoCamera) -> bool:
     return _within(pixels[:, :2], camera) and bool(np.all(is_column))
 
 
-def _clearance(clearance_px: AnyArray, camera: StereoCamera) -> bool:
-    return clearance_px.shape == (camera.height_px, camera.width_px)
-
-
-def _octaves(octaves: AnyArray, _: StereoCamera) -> bool:
-    return bool(np.all((octaves >= 0) & (octaves < 32)))
-
-
 _TRANSFORM, _COVARIANCE, _VECTOR = (
     Kind("<f8", (4, 4), _rigid),
     Kind("<f8", (6, 6), _covariance),
@@ -96,11 +88,11 @@ ARRAYS: Mapping[str, Kind] = {
     **dict.fromkeys(("velocity_odom_mps", "gyro_bias_radps", "accel_bias_mps2"), _VECTOR),
     "PositionPrior.cov_rot_trans": _COVARIANCE._replace(is_good=_prior_covariance),
     "Features.pixels": Kind("<f8", ("n", 2), _within),
-    "Features.octaves": Kind("|i1", ("n",), _octaves),
+    "Features.octaves": Kind("|i1", ("n",), lambda octaves, _: bool(np.all((octaves >= 0) & (octaves < 32)))),
     "Features.angles_deg": Kind("<f4", ("n",), _finite),
     "Features.descriptors": Kind("|u1", ("n", 32), _any),
     "FrameFeatures.pixels": Kind("<f8", ("n", 3), _stereo_pixels),
-    "clearance_px": Kind("|u1", ("h", "w"), _clearance),
+    "clearance_px": Kind("|u1", ("h", "w"), lambda px, camera: px.shape == (camera.height_px, camera.width_px)),
     "track_ids": Kind("<i8", (0,), _any),  # of the odometry; recordings do not keep its tracks
 }
 

@@ -24,13 +24,6 @@ def _open(section: Vda5050Section, robot: LinkedRobot) -> RobotLink:
 
 LINK = LinkHook(
     section=Vda5050Section,
-    tiers={
-        "user": {
-            "vda5050": "broker version manufacturer serial_number interface username password_file ca map_id versions "
-            "download_from download_token_file download_ca robot_actions factsheet frame",
-        },
-        "tuning": {"vda5050": "state_interval_s robot_silent_s initialize_s initial_sigma_m initial_sigma_rad"},
-    },
     is_on=lambda section: section.broker is not None,
     check=_check,
     open=_open,

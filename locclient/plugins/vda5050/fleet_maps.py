@@ -69,7 +69,8 @@ class FleetMaps:
         if self._needs_hash and not sha256:
             raise LinkError("without a map server no signed list admits a file; send its SHA-256 as mapHash")
         room_bytes = self._cache.room_bytes() // _TOGETHER
-        with disk_errors(f"{self._folder} cannot be written", "make space for the cache"), self._file() as file:
+        fault = disk_errors(f"{self._folder} cannot be written", "make space for the cache")
+        with fault, tempfile.NamedTemporaryFile(dir=self._folder, suffix=".fmex") as file:
             try:
                 got = download(link, self._origins, file, max_bytes=max(room_bytes, 1))
             except TooLargeError as error:
@@ -83,9 +84,6 @@ class FleetMaps:
                 )
             with open_export(Path(file.name)) as reader:
                 self._take(reader, version)
-
-    def _file(self) -> "tempfile._TemporaryFileWrapper[bytes]":
-        return tempfile.NamedTemporaryFile(dir=self._folder, suffix=".fmex")
 
     def _take(self, reader: ExportReader, version: int) -> None:
         head = reader.head
