@@ -29,24 +29,28 @@ def lines_by_file() -> dict[str, int]:
 
 
 def is_in(file: str, path: str) -> bool:
-    """True if the file lies in the folder, or directly beside a pattern's other files."""
+    """True if it is the file, if the file lies in the folder, or directly beside a pattern's other files."""
     if "*" not in path:
-        return file.startswith(f"{path}/")
+        return file == path or file.startswith(f"{path}/")
     return fnmatchcase(file, path) and file.count("/") == path.count("/")
 
 
 def rooms(budgets: dict[str, Any], lines: dict[str, int]) -> list[Room]:
-    """Every room with its lines. AssertionError if a file of the product or of the tests lies in no room or in two."""
-    counts, owners = Counter[tuple[str, str]](), Counter[str]()
-    for part, entries in budgets.items():
-        for name, entry in entries.items():
-            for file, count in lines.items():
-                if any(is_in(file, path) for path in entry.get("paths", ())):
-                    counts[part, name] += count
-                    owners[file] += 1
-    top = {path.split("/")[0] for entries in budgets.values() for e in entries.values() for path in e.get("paths", ())}
-    misplaced = {file: owners[file] for file in lines if file.split("/")[0] in top and owners[file] != 1}
-    assert not misplaced, f"in no room or in several: {misplaced}"
+    """Every room with its lines; a file lies in the room with the longest path to it. AssertionError if it lies in none."""
+    paths = {
+        path: (part, name)
+        for part, entries in budgets.items()
+        for name, e in entries.items()
+        for path in e.get("paths", ())
+    }
+    counts, homeless, top = Counter[tuple[str, str]](), list[str](), {path.split("/")[0] for path in paths}
+    for file, count in lines.items():
+        path = max((path for path in paths if is_in(file, path)), key=len, default=None)
+        if path is not None:
+            counts[paths[path]] += count
+        elif file.split("/")[0] in top:
+            homeless.append(file)
+    assert not homeless, f"in no room: {homeless}"
     found = []
     for part, entries in budgets.items():
         for name, entry in entries.items():
