@@ -25,6 +25,7 @@ from mapserver.store.files import is_plain_file
 
 _TRIES = 3  # copies of the database, each after another garbage collection
 _LEFT_OVER = ".backup-"
+Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +59,7 @@ def back_up(
     *,
     recipient: "pyrage.x25519.Recipient | None" = None,
     keep: int = 30,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = lambda done, total: None,
 ) -> BackupReport:
     """Write a snapshot of the store, and remove all but the newest `keep` ones; without a recipient it has no keys.
 
@@ -66,31 +67,26 @@ def back_up(
     backup of this store is under way.
     """
     folder = store.folder
-    with (
-        disk_errors(f"{folder} cannot be read", "check its rights and space"),
-        store.locked("backup.lock"),
-    ):
+    with disk_errors(f"{folder} cannot be read", "check its rights and space"), store.locked("backup.lock"):
         for path in folder.glob(f"{_LEFT_OVER}*"):  # of a killed backup
             shutil.rmtree(path)
         upload = _Upload(target)
         files, keys = _trusted(store, upload, recipient)
         for _ in range(_TRIES):
             with tempfile.TemporaryDirectory(prefix=_LEFT_OVER, dir=folder) as temporary:
-                copy = Path(temporary) / "store.sqlite3"
-                content = store.copy_database(copy)
+                named, versions = store.copy_database(copy := Path(temporary) / "store.sqlite3")
                 files["store.sqlite3"] = [upload.put(piece) for piece in _pieces(copy)]
                 store_format = format_of(copy)
-            blobs, missing = upload.blobs(store, content.blobs, progress)
-            if not missing & content.blobs - store.named_blobs():  # none of them was dropped since the copy
+            blobs, missing = upload.blobs(store, named, progress)
+            if not missing & named - store.named_blobs():  # none of them was dropped since the copy
                 break
         else:
             raise StateError(f"garbage was collected during each of {_TRIES} tries; back up at another time of day")
         snapshot = Snapshot(
-            store_format=store_format, versions=content.versions, files=files, blobs=blobs, keys=keys, missing=sorted(missing),
-        )  # fmt: skip
-        now = datetime.fromtimestamp(store.now_ns() / 1e9, UTC)
-        name = target.write(snapshot, now)
-        removed = [] if missing else target.prune(keep, now)  # an older one may have what is missing
+            store_format=store_format, versions=versions, files=files, blobs=blobs, keys=keys, missing=sorted(missing)
+        )
+        name = target.write(snapshot, datetime.fromtimestamp(store.now_ns() / 1e9, UTC))
+        removed = [] if missing else target.prune(keep, store.now_ns())  # an older one may have what is missing
     total = sum(upload.sizes[address] for address in snapshot.objects())
     return BackupReport(name, total, upload.count, upload.bytes, bool(keys), tuple(snapshot.missing), tuple(removed))
 
@@ -99,33 +95,32 @@ class _Upload:
     """Uploads what the target lacks. sizes: of all objects there, by address; count, bytes: of the uploaded ones."""
 
     def __init__(self, target: BackupTarget) -> None:
-        self._target, self.sizes = target, target.objects()
-        self.count = self.bytes = 0
+        self._target, self.sizes, self.count, self.bytes = target.blobs, target.blobs.sizes(), 0, 0
 
     def put(self, data: bytes) -> str:
         address = sha256_hex(data)
         if self.sizes.get(address) != len(data):
             self._target.put(data)
-            self.count, self.bytes, self.sizes[address] = self.count + 1, self.bytes + len(data), len(data)
+            self._note(address, len(data))
         return address
 
-    def blobs(
-        self, store: MapStore, addresses: set[str], progress: Callable[[int, int], None]
-    ) -> tuple[dict[str, int], set[str]]:
+    def blobs(self, store: MapStore, addresses: set[str], progress: Progress) -> tuple[dict[str, int], set[str]]:
         """Upload blobs. Return their sizes, and those that the store has lost or damaged and the target does not have either."""
         found, missing = dict[str, int](), set[str]()
         for number, address in enumerate(sorted(addresses), start=1):
             progress(number, len(addresses))
-            size = store.blob_size(address)
-            if address in self.sizes and size in (None, self.sizes[address]):
-                found[address] = self.sizes[address]
-            elif size is None or not store.is_whole(address):
-                missing.add(address)
-            else:
-                self._target.put(store.blob_chunks(address), address)
-                self.count, self.bytes = self.count + 1, self.bytes + size
-                found[address] = self.sizes[address] = size
+            size, there = store.blob_size(address), self.sizes.get(address)
+            if there is None or size not in (None, there):
+                if size is None or not store.is_whole(address):
+                    missing.add(address)
+                    continue
+                self._target.put_chunks(store.blob_chunks(address), address, size)
+                self._note(address, size)
+            found[address] = self.sizes[address]
         return found, missing
+
+    def _note(self, address: str, size: int) -> None:
+        self.count, self.bytes, self.sizes[address] = self.count + 1, self.bytes + size, size
 
 
 def _trusted(

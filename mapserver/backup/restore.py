@@ -4,7 +4,7 @@ import io
 import logging
 import shutil
 import tarfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,10 +14,11 @@ import pyrage
 
 from fleetmap.errors import FleetmapError, MapFormatError, StoreError, UsageError, disk_errors
 from fleetmap.files import sync_path, write_atomically
-from fleetmap.mapformat import blob_path
+from mapserver.backup.backup import Progress
 from mapserver.backup.snapshots import PIECE_BYTES, BackupTarget, Snapshot
 from mapserver.operators.operators import Operators
 from mapserver.store import Actor, MapStore
+from mapserver.store.blobs import Blobs, FolderObjects
 from mapserver.store.files import locked, make_folder
 from mapserver.trust import SignedLists
 from mapserver.trust.enrolment import RobotRegister
@@ -29,7 +30,6 @@ _ROOTS = 2  # beyond all that robots may know: one that the lost store made afte
 _MOST_ROOTS = 100  # more than a store makes between a backup and its restoration; a robot follows 1024 in all
 _LISTS_AHEAD = 100_000  # the same, of a timestamp each six hours and with each release
 _log = logging.getLogger(__name__)
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,31 +153,28 @@ def verify(target: BackupTarget, progress: Progress = lambda done, total: None) 
     for number, (address, (name, most_bytes)) in enumerate(sorted(wanted.items()), start=1):
         progress(number, len(wanted))
         try:
-            found.bytes += sum(map(len, target.chunks(address, most_bytes)))
-            found.objects += 1
-        except MapFormatError as error:
-            found.faults.append(
-                f"snapshot {name}: {error}; it is removed, and the next backup brings it if the store has it"
-            )
-            target.remove(address)
+            size = target.blobs.size(address) or 0
+            if size <= most_bytes and target.blobs.matches(address):
+                found.bytes += size
+                found.objects += 1
+                continue
+            words = f"{target.blobs.where(address)} is damaged; it is removed, and the next backup brings it if the store has it"
+            found.faults.append(f"snapshot {name}: {words}")
+            target.blobs.remove(address)
         except FleetmapError as error:
             found.faults.append(f"snapshot {name}: {error}")
     return found
 
 
 def _write(target: BackupTarget, snapshot: Snapshot, part: Path, keys: dict[str, bytes], progress: Progress) -> None:
-    for path, pieces in snapshot.files.items():
-        _write_file(part / path, (target.get(address) for address in pieces))
-    for file, data in keys.items():
-        _write_file(part / "keys" / file, [data])
+    files = {path: (target.blobs.get(a, PIECE_BYTES) for a in pieces) for path, pieces in snapshot.files.items()}
+    for path, chunks in {**files, **{f"keys/{file}": [data] for file, data in keys.items()}}.items():
+        make_folder((part / path).parent)
+        write_atomically(part / path, chunks)
+    blobs = Blobs(FolderObjects(part))
     for number, (address, size) in enumerate(snapshot.blobs.items(), start=1):
         progress(number, len(snapshot.blobs))
-        _write_file(part / blob_path(address), target.chunks(address, size))
-
-
-def _write_file(path: Path, chunks: Iterable[bytes]) -> None:
-    make_folder(path.parent)
-    write_atomically(path, chunks)
+        blobs.put_chunks(target.blobs.chunks(address), address, size)
 
 
 def _keys(target: BackupTarget, snapshot: Snapshot, identities: "list[pyrage.x25519.Identity]") -> dict[str, bytes]:
@@ -187,20 +184,18 @@ def _keys(target: BackupTarget, snapshot: Snapshot, identities: "list[pyrage.x25
     if not snapshot.keys:
         raise UsageError("the snapshot has no keys: it was made without --recipient; leave --identity out")
     try:
-        packed = pyrage.decrypt(target.get(snapshot.keys), identities)
+        packed = pyrage.decrypt(target.blobs.get(snapshot.keys, PIECE_BYTES), identities)
     except pyrage.DecryptError as error:
         raise UsageError(
             f"--identity is not the key for which this backup was made ({error}); name the right one"
         ) from error
+    found = {}
     with tarfile.open(fileobj=io.BytesIO(packed), mode="r:") as archive:
-        return dict(_members(archive))
-
-
-def _members(archive: tarfile.TarFile) -> Iterator[tuple[str, bytes]]:
-    for member in archive:
-        file = archive.extractfile(member) if member.isreg() else None
-        if file is None or "/" in member.name or member.name.startswith(".") or member.size > PIECE_BYTES:
-            raise StoreError(
-                f"the backup's keys hold {member.name[:200]!r}, which is no key file; take another snapshot"
-            )
-        yield member.name, file.read()
+        for member in archive:
+            file = archive.extractfile(member) if member.isreg() else None
+            if file is None or "/" in member.name or member.name.startswith(".") or member.size > PIECE_BYTES:
+                raise StoreError(
+                    f"the backup's keys hold {member.name[:200]!r}, which is no key file; take another snapshot"
+                )
+            found[member.name] = file.read()
+    return found

@@ -8,28 +8,22 @@ An object is uploaded once, however many snapshots name it. URL: a folder, or s3
 credentials and the endpoint of the environment (AWS_ACCESS_KEY_ID, AWS_ENDPOINT_URL, ...).
 """
 
-import hashlib
 import re
-from collections.abc import Iterator
-from contextlib import AbstractContextManager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
-from typing import Literal
 
 import msgspec
-import obstore
-from obstore.store import LocalStore, ObjectStore
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, MapFormatError, NewerFormatError, StoreError, UsageError
-from fleetmap.files import sync_path
-from fleetmap.mapformat import check_sha256, sha256_hex
-from mapserver.store.object_store import object_errors, open_objects
+from fleetmap.mapformat import check_sha256
+from mapserver.store.blobs import Blobs
+from mapserver.store.places import open_objects
 
 FORMAT = 2  # 1 has no enrolled robots
 PIECE_BYTES = 4 << 20
 """Size of a database's pieces, whose unchanged pages stay where they are, and the limit of other files'."""
-_OBJECTS, _SNAPSHOTS, _RESTORES = "objects", "snapshots", "restores"
+_SNAPSHOTS, _RESTORES = "snapshots", "restores"
 _NAME, _NAME_FORMAT = re.compile(r"[0-9]{8}T[0-9]{6}Z"), "%Y%m%dT%H%M%SZ"
 NAMED = re.compile(r"store\.sqlite3|keys/robots\.json|trust/[a-z0-9][a-z0-9._-]{0,120}\.json")
 """Files of a store that a snapshot names by their paths; all others in `keys` are encrypted."""
@@ -37,7 +31,7 @@ LEFT_OUT = re.compile(
     r"(.*/)?(lock|\..*)|[^/]+\.lock|store[.-].+|reserve|places\.json|job-[0-9]+\.log|(blobs|sites|refused)/.*"
 )
 """Files that no snapshot names: the database names the blobs, `sites` is made of it, the others are locks, logs, journals."""
-_LONGEST_BACKUP = timedelta(days=1)
+_LONGEST_BACKUP_NS = 86_400_000_000_000
 _MOST_BYTES = 1 << 30  # of a snapshot
 _MOST_RESTORES = 50_000  # signed lists count in ten digits
 
@@ -71,141 +65,75 @@ class BackupTarget:
     """Objects and snapshots under one URL or in one folder, created if needed. Raises StoreError if it cannot be reached."""
 
     def __init__(self, where: str, *, create: bool = False) -> None:
-        self.where = where
-        self._folder = None if "://" in where else Path(where).absolute()
-        with self._errors():
-            if self._folder is not None:
-                if not create and not (self._folder / _SNAPSHOTS).is_dir():
-                    raise UsageError(f"{where} holds no backups; `mapserver backup {where} --store DIR` makes one")
-                self._store: ObjectStore = LocalStore(self._folder, mkdir=True)
-            else:
-                self._store = open_objects(where)
-
-    def objects(self) -> dict[str, int]:
-        """Return the sizes of all objects by address."""
-        with self._errors():
-            return {name: size for name, size, _ in self._listed(_OBJECTS)}
-
-    def put(self, content: bytes | Iterator[bytes], address: str | None = None) -> None:
-        """Upload bytes, at once or in pieces, to their address."""
-        name = sha256_hex(content) if isinstance(content, bytes) else address
-        assert name is not None
-        self._put(_path(name), content)
-
-    def chunks(self, address: str, most_bytes: int) -> Iterator[bytes]:
-        """Yield the bytes of an address in pieces; StoreError if missing, MapFormatError, at the end at the latest, if damaged."""
-        with self._errors():
-            found, digest = obstore.get(self._store, _path(address)), hashlib.sha256()
-            if found.meta["size"] > most_bytes:
-                raise MapFormatError(f"object {address} has {found.meta['size']} bytes instead of at most {most_bytes}")
-            for chunk in found.stream():
-                data = bytes(chunk)
-                digest.update(data)
-                yield data
-            if digest.hexdigest() != address:
-                raise MapFormatError(f"object {address} is damaged: its SHA-256 is {digest.hexdigest()}")
-
-    def get(self, address: str, most_bytes: int = PIECE_BYTES) -> bytes:
-        """Return the bytes of an address at once; errors as of `chunks`."""
-        return b"".join(self.chunks(address, most_bytes))
-
-    def remove(self, address: str) -> None:
-        """Remove an object, which is damaged."""
-        with self._errors():
-            obstore.delete(self._store, _path(address))
+        if "://" not in where and not create and not (Path(where) / _SNAPSHOTS).is_dir():
+            raise UsageError(f"{where} holds no backups; `mapserver backup {where} --store DIR` makes one")
+        self.where, self._objects = where, open_objects(where)
+        self.blobs = Blobs(self._objects, "objects")
 
     def snapshots(self) -> list[str]:
         """Return the names of all snapshots, oldest first."""
-        with self._errors():
-            return sorted(name for name, _, _ in self._listed(_SNAPSHOTS) if _NAME.fullmatch(name))
+        return sorted(name for name in self._names(_SNAPSHOTS) if _NAME.fullmatch(name))
 
     def read(self, name: str | None = None) -> tuple[str, Snapshot]:
         """Return a snapshot, the newest for None, with its name. UsageError for an unknown one, MapFormatError for a damaged one."""
         names = self.snapshots()
-        if name is None and names:
-            name = names[-1]
+        name = names[-1] if name is None and names else name
         if name not in names:
             raise UsageError(
                 f"{self.where} has no snapshot {name or 'at all'}; it has {', '.join(names[-5:]) or 'none'}"
             )
-        with self._errors():
-            found = obstore.get(self._store, f"{_SNAPSHOTS}/{name}.json")
-            if found.meta["size"] > _MOST_BYTES:
-                raise MapFormatError(f"snapshot {name} has {found.meta['size']} bytes, the limit is {_MOST_BYTES}")
-            data = bytes(found.bytes())
-        return name, _decoded(name, data)
+        if (size := self._objects.size(path := f"{_SNAPSHOTS}/{name}.json") or 0) > _MOST_BYTES:
+            raise MapFormatError(f"snapshot {name} has {size} bytes, the limit is {_MOST_BYTES}")
+        return name, _decoded(name, b"".join(self._objects.chunks(path)))
 
     def write(self, snapshot: Snapshot, now: datetime) -> str:
         """Write a snapshot, whose objects are there, and return its name: the time, but later than all others, whatever the clock says."""
         moments = [datetime.strptime(name, _NAME_FORMAT).replace(tzinfo=UTC) for name in self.snapshots()[-1:]]
         name = max([now.astimezone(UTC), *(moment + timedelta(seconds=1) for moment in moments)]).strftime(_NAME_FORMAT)
-        self._put(f"{_SNAPSHOTS}/{name}.json", to_json(snapshot))
+        self._objects.put(f"{_SNAPSHOTS}/{name}.json", [to_json(snapshot)])
         return name
 
-    def prune(self, keep: int, now: datetime) -> list[str]:
+    def prune(self, keep: int, now_ns: int) -> list[str]:
         """Remove all but the newest `keep` snapshots, then objects that none names; return the names of the snapshots.
 
         Objects of the last day stay: they may belong to a backup under way. All of them stay beside a snapshot that cannot be read.
         """
         names = self.snapshots()
-        with self._errors():
-            obstore.delete(self._store, [f"{_SNAPSHOTS}/{name}.json" for name in names[:-keep]])
+        for name in names[:-keep]:
+            self._objects.remove(f"{_SNAPSHOTS}/{name}.json")
         try:
             kept = set[str]().union(*(self.read(name)[1].objects() for name in names[-keep:]))
         except FleetmapError:
             return names[:-keep]
-        with self._errors():
-            old = [name for name, _, changed in self._listed(_OBJECTS) if changed < now - _LONGEST_BACKUP]
-            obstore.delete(self._store, [_path(name) for name in old if name not in kept])
+        for address, changed_ns in self.blobs.changed_ns().items():
+            if address not in kept and changed_ns < now_ns - _LONGEST_BACKUP_NS:
+                self.blobs.remove(address)
         return names[:-keep]
 
     def count_restore(self) -> int:
         """Return the number of this restoration, from 1 on; no other one gets it. StoreError if the target cannot be written."""
-        with self._errors():
-            counted = [int(name) for name, _, _ in self._listed(_RESTORES) if re.fullmatch(r"[0-9]{1,6}", name)]
-        number = 1 + max(counted, default=0)
+        number = 1 + max((int(name) for name in self._names(_RESTORES) if re.fullmatch(r"[0-9]{1,6}", name)), default=0)
         if number > _MOST_RESTORES:
             raise StoreError(
                 f"{self.where} counts {number - 1} restorations, which cannot be; look at {_RESTORES} there"
             )
-        self._put(f"{_RESTORES}/{number:06}", b"", mode="create")
+        self._objects.put(f"{_RESTORES}/{number:06}", [b""], is_new=True)
         return number
 
     def note_root(self, number: int, root: int) -> None:
         """Keep the number of the newest root that a restoration signed."""
-        self._put(f"{_RESTORES}/{number:06}-root-{root}", b"")
+        self._objects.put(f"{_RESTORES}/{number:06}-root-{root}", [b""])
 
     def known_root(self, most: int) -> int:
         """Return the newest root of all restorations, 0 without any; StoreError for one above `most`."""
-        with self._errors():
-            found = [re.fullmatch(r"[0-9]{6}-root-([0-9]{1,4})", name) for name, _, _ in self._listed(_RESTORES)]
+        found = [re.fullmatch(r"[0-9]{6}-root-([0-9]{1,4})", name) for name in self._names(_RESTORES)]
         newest = max((int(name[1]) for name in found if name is not None), default=0)
         if newest > most:
             raise StoreError(f"{self.where} counts {newest} roots, which cannot be; look at {_RESTORES} there")
         return newest
 
-    def _listed(self, prefix: str) -> Iterator[tuple[str, int, datetime]]:
-        for batch in obstore.list(self._store, prefix):
-            for meta in batch:
-                yield meta["path"].rpartition("/")[2].removesuffix(".json"), meta["size"], meta["last_modified"]
-
-    def _put(
-        self, path: str, content: bytes | Iterator[bytes], *, mode: Literal["create", "overwrite"] = "overwrite"
-    ) -> None:
-        """Write an object durably: an object store answers once it is, files and their folders are synced."""
-        with self._errors():
-            obstore.put(self._store, path, content, mode=mode)
-            if self._folder is not None:
-                file = self._folder / path
-                for synced in (file, file.parent, file.parent.parent):
-                    sync_path(synced)
-
-    def _errors(self) -> AbstractContextManager[None]:
-        return object_errors(self.where)
-
-
-def _path(address: str) -> str:
-    return f"{_OBJECTS}/{address[:2]}/{address}"
+    def _names(self, prefix: str) -> list[str]:
+        return [path.rpartition("/")[2].removesuffix(".json") for path, _, _ in self._objects.listed(prefix)]
 
 
 def _decoded(name: str, data: bytes) -> Snapshot:

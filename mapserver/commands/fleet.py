@@ -156,7 +156,7 @@ def remove(
     with open_store(store) as maps:
         row = maps.fleet.failure(failure).failure
         maps.fleet.remove_failure(failure)
-        maps.log_event(row.site, "failure removed", f"{failure} of {row.robot}", actor=by.named())
+        maps.audit("failure removed", f"{failure} of {row.robot}", actor=by.named(), site=row.site)
     typer.echo(f"failure {failure} of {row.robot} is removed")
 
 

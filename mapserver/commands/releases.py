@@ -202,11 +202,10 @@ def publish(
     from mapserver import releases
     from mapserver.quality.directions import one_way_words
     from mapserver.quality.probes import lookalike_words
-    from mapserver.releases import rules
 
     gate = settings_of(context).gate
     with open_store(where.store) as maps:
-        draft = rules.chosen_draft(maps.releases(where.site), version)
+        draft = releases.chosen_draft(maps.releases(where.site), version)
         if trust:
             draft = releases.trust_calibration(maps, draft, by.named())
         published = releases.publish(maps, where.site, draft.version, actor=by.named(), force=force, gate=gate)

@@ -24,7 +24,7 @@ from mapserver.commands.options import (
 
 if TYPE_CHECKING:
     from mapserver.store import AuditLine, MapStore
-    from mapserver.store.garbage_collection import Garbage
+    from mapserver.store.upkeep import Garbage
 
 EXIT_STATUS_FAULTS = 3
 

@@ -95,7 +95,7 @@ class RobotDrives:
 
     def _ended(self, site: str, robot: str, part: ReplayPart) -> FailureAck:
         who = Actor(robot, f"{part.id}, {part.total_bytes / 1e6:.1f} MB")
-        self._store.log_event(site, f"{KIND}{part.survey}", f"{DRIVEN}{robot}", actor=who)
+        self._store.audit(f"{KIND}{part.survey}", f"{DRIVEN}{robot}", actor=who, site=site)
         return FailureAck(id=part.id, received_bytes=part.total_bytes)
 
     def _path(self, site: str, robot: str, part: ReplayPart) -> Path:

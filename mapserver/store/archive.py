@@ -6,7 +6,6 @@ order, little-endian.
 """
 
 import struct
-from dataclasses import asdict
 from math import prod
 from typing import Annotated, Any
 
@@ -61,27 +60,23 @@ class _ArrayHead(msgspec.Struct, frozen=True):
     shape: Annotated[tuple[Annotated[int, msgspec.Meta(ge=0, le=1 << 40)], ...], msgspec.Meta(max_length=8)]
 
 
-class _Head(msgspec.Struct, frozen=True):
+class _Head(msgspec.Struct, frozen=True, kw_only=True):
     camera: StereoCamera
-    arrays: tuple[_ArrayHead, ...]
+    scale_known: bool = True
     next_keyframe_id: int
     next_landmark_id: int
-    scale_known: bool = True
+    arrays: tuple[_ArrayHead, ...]
 
 
 def encode_archive(survey: SurveyMap) -> bytes:
     """Encode the survey without loss."""
     history = history_of(survey)
-    arrays = {name: np.ascontiguousarray(_array(survey, history, name), dtype) for name, (dtype, _) in _ARRAYS.items()}
-    head = to_json(
-        {
-            "camera": asdict(survey.camera),
-            "scale_known": survey.scale_known,
-            "next_keyframe_id": history.next_keyframe_id,
-            "next_landmark_id": history.next_landmark_id,
-            "arrays": [{"name": n, "dtype": _ARRAYS[n][0], "shape": list(a.shape)} for n, a in arrays.items()],
-        }
-    )
+    values = {name: getattr(history if name in _HISTORY else survey, name, None) for name in _ARRAYS}
+    values |= {f"trajectory_{name}": getattr(survey.trajectory, name) for name in ("stamps_ns", "frame_from_body")}
+    arrays = {name: np.ascontiguousarray(values[name], dtype) for name, (dtype, _) in _ARRAYS.items()}
+    heads = tuple(_ArrayHead(name, _ARRAYS[name][0], array.shape) for name, array in arrays.items())
+    ids = {name: getattr(history, name) for name in ("next_keyframe_id", "next_landmark_id")}
+    head = to_json(_Head(camera=survey.camera, scale_known=survey.scale_known, **ids, arrays=heads))
     size = _HEAD_SIZE.size + len(head) + sum(array.nbytes for array in arrays.values())
     if size > MAX_ARCHIVE_PAYLOAD_BYTES:
         reason = f"archive of {size} bytes, the limit is {MAX_ARCHIVE_PAYLOAD_BYTES}; survey in several parts"
@@ -138,14 +133,6 @@ def _check(arrays: dict[str, AnyArray]) -> None:
     for name, most in (("obs_keyframe", lengths["K"]), ("obs_landmark", lengths["N"]), ("obs_octave", 32)):
         if np.any((arrays[name] < 0) | (arrays[name] >= most)):
             raise MapFormatError(f"archive: {name} is beyond 0 to {most - 1}; it is damaged")
-
-
-def _array(survey: SurveyMap, history: History, name: str) -> AnyArray:
-    source: Any = history if name in _HISTORY else survey
-    if name in ("trajectory_stamps_ns", "trajectory_frame_from_body"):
-        source, name = survey.trajectory, name.removeprefix("trajectory_")
-    values: AnyArray = getattr(source, name)
-    return values
 
 
 def _read_head(payload: bytes) -> tuple[_Head, int]:

@@ -1,235 +1,364 @@
-"""The SQLite file of an open store: its migrations, reading, write transactions. All settings of SQLite are here."""
+"""The database of an open store: reading, write transactions, the log. Its SQL is the same in SQLite, here, and in `postgres`."""
 
+import json
 import os
 import sqlite3
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, closing, contextmanager, suppress
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import astuple
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar, TypeVar
 from urllib.parse import quote
 
-from sqlite_utils import Database
+import sqlite_utils
 
 from fleetmap.errors import NewerFormatError, StoreError, UsageError
 from fleetmap.files import sync_path
-from mapserver.store.files import locked
-from mapserver.store.schema import FORMAT, MIGRATIONS, TABLES
-from mapserver.store.transactions import Transactions
+from mapserver.store import files
+from mapserver.store.audit import line_sha256
+from mapserver.store.rows import NOBODY, UNLIMITED, Actor, AuditLine
+from mapserver.store.schema import FORMAT, MIGRATIONS, TABLES, names
 
 APPLICATION_ID = 0x464D4150  # "FMAP": identifies the file as a map store
-_BUSY_TIMEOUT_MS = 30_000
-_INCREMENTAL = 2
-_HEAD_BYTES, _FORMAT_AT, _APPLICATION_AT = 100, 60, 68  # SQLite header; its user_version and application_id
-_ROWS_AT_ONCE = 100
+NUL = r"\x00"
+"""Text in place of a NUL character, which PostgreSQL does not store."""
+_JSON = {"report", "last_report", "reasons"}
+"""Columns whose text is JSON."""
+_MOST_VALUES = 30_000  # of one statement
+ROWS_AT_ONCE = 20  # of tables with recordings of some megabytes
+
+Row = TypeVar("Row")
+Values = Sequence[Any]
 
 
-class SqliteTransactions(Transactions):
-    """The database at a path, created or migrated as needed. Methods may be called from any thread.
+def matching(wanted: Mapping[str, object]) -> tuple[str, list[object]]:
+    """Return a condition, and its values, on columns by name and, if not =, operator ("hour >="); None matches all."""
+    given = {name: value for name, value in wanted.items() if value is not None}
+    words = [f"{name} ?" if " " in name else f"{name} = ?" for name in given]
+    return " AND ".join(words) or "TRUE", list(given.values())
 
-    One connection writes and another one reads, each under its own lock: reading does not wait while a write is forced to the
-    disk. Within a transaction its own thread reads its own writes. read_only: nothing is created or migrated.
-    Raises NewerFormatError for a database of a newer fleetmap, StoreError for one that cannot be opened or belongs to another program.
+
+class Transaction:
+    """A write transaction."""
+
+    def __init__(self, database: "Database", session: Any) -> None:
+        self._database, self._session = database, session
+
+    def execute(self, sql: str, values: Values = ()) -> Any:
+        """Return the cursor of a statement."""
+        return self._database.run(self._session, sql, values)
+
+    def insert(self, table: str, rows: Iterable[Mapping[str, Any]], otherwise: str = "") -> Any:
+        """Insert rows that have the same columns; return the cursor of the last statement. otherwise: such as ON CONFLICT."""
+        every, cursor = list(rows), None
+        columns = list(every[0]) if every else []
+        group, at_once = f"({', '.join('?' * len(columns))})", _MOST_VALUES // max(1, len(columns))
+        for first in range(0, len(every), at_once):
+            some = every[first : first + at_once]
+            sql = f"INSERT INTO {table} ({', '.join(columns)}) VALUES {', '.join([group] * len(some))} {otherwise}"
+            cursor = self.execute(sql, [row[name] for row in some for name in columns])
+        return cursor
+
+    def log(self, site: str, kind: str, detail: str, version: int | None = None, actor: Actor = NOBODY) -> None:
+        """Write a line of the log, chained to the previous one; site: empty if not about one."""
+        last = self.execute("SELECT id, sha256 FROM events ORDER BY id DESC LIMIT 1").fetchone()
+        number, before = last or (0, "")
+        texts = [text.replace("\0", NUL) for text in (site, kind, detail, *astuple(actor))]
+        values = (number + 1, self._database.now_ns(), *texts[:3], version, *texts[3:])
+        row = dict(zip(AuditLine.__dataclass_fields__, (*values, line_sha256(before, values)), strict=True))
+        self.insert("events", [row])
+
+
+class Database(ABC):
+    """Methods may be called from any thread; within a transaction its own thread reads its own writes.
+
+    One transaction writes at a time, in all processes. Raises StoreError if the disk or the server refuses.
+    """
+
+    is_shared: ClassVar[bool]
+    """True if servers on several machines may use it."""
+
+    def __init__(self, clock_ns: Callable[[], int]) -> None:
+        self.now_ns = clock_ns
+        self._lock = threading.RLock()
+        self._writing: tuple[int, Any] | None = None  # thread and session of the running transaction
+
+    @contextmanager
+    def write(self, *, durable: bool = True) -> Iterator[Transaction]:
+        """Run the block as one transaction; a durable one is on the disk when it ends."""
+        with self._lock, self._errors("written"):
+            session = self._begin(durable)
+            try:
+                self._writing = threading.get_ident(), session
+                yield Transaction(self, session)
+                self._writing = None
+                self._commit(session)
+            except BaseException:
+                self._writing = None
+                with suppress(Exception):  # the first error says more
+                    self.run(session, "ROLLBACK")
+                raise
+
+    def query(self, sql: str, values: Values = ()) -> list[dict[str, Any]]:
+        """Return the rows by column."""
+        with self._errors("read"):
+            writing = self._writing
+            if writing is not None and writing[0] == threading.get_ident():
+                return self._dicts(writing[1], sql, values)
+            return self._read(sql, values)
+
+    def rows(self, kind: Callable[..., Row], sql: str, values: Values = ()) -> list[Row]:
+        """Return the rows, each as a `kind` with a field for every column."""
+        return [
+            kind(**{name: json.loads(value) if name in _JSON else value for name, value in row.items()})
+            for row in self.query(sql, values)
+        ]
+
+    def select(
+        self, kind: type[Row], table: str, wanted: Mapping[str, object], order: str, limit: int | None = None
+    ) -> list[Row]:
+        """Return the records of a table that match, as of `matching`, in order."""
+        words, values = matching(wanted)
+        sql = f"SELECT {names(kind)} FROM {table} WHERE {words} ORDER BY {order} LIMIT ?"
+        return self.rows(kind, sql, [*values, UNLIMITED if limit is None else limit])
+
+    def value(self, sql: str, values: Values = ()) -> Any:
+        """Return the first column of the first row, None without any."""
+        found = self.query(sql, values)
+        return next(iter(found[0].values())) if found else None
+
+    def column(self, sql: str, values: Values = ()) -> list[Any]:
+        """Return the first column."""
+        return [next(iter(row.values())) for row in self.query(sql, values)]
+
+    def audit_lines(self, last: int | None = None) -> list[AuditLine]:
+        return self.select(AuditLine, "events", {}, "id DESC", last)[::-1]
+
+    def copy_from(self, source: "Database") -> None:
+        """Fill the database, which is empty, with the rows of another one. StoreError if it holds something."""
+        with self.write() as change:
+            if any(self.query(f"SELECT 1 FROM {table} LIMIT 1") for table in TABLES):
+                raise StoreError("the database holds a store already; name an empty one")
+            for table, rows in source.tables():
+                change.insert(table, rows)
+
+    def leads(self) -> bool:
+        """True if this process is the one of all servers that does what one alone may do, until it ends or loses the database."""
+        return True
+
+    def run(self, session: Any, sql: str, values: Values = ()) -> Any:
+        """Return the cursor of a statement in a session."""
+        return session.execute(sql, values)
+
+    def _dicts(self, session: Any, sql: str, values: Values) -> list[dict[str, Any]]:
+        cursor = self.run(session, sql, values)
+        return [dict(zip([column[0] for column in cursor.description], row, strict=True)) for row in cursor.fetchall()]
+
+    def shrink(self, pages: int) -> None:
+        """Return up to `pages` unused pages of a file to the disk."""
+        return
+
+    def faults(self) -> list[str]:
+        """Return what the database itself finds wrong, each a sentence."""
+        return []
+
+    @abstractmethod
+    def close(self) -> None: ...
+
+    @abstractmethod
+    def tables(self) -> Iterator[tuple[str, list[dict[str, Any]]]]:
+        """Yield table and some rows, as of one moment; a table is yielded as often as it has so many rows."""
+
+    @abstractmethod
+    def copy_to(self, path: Path) -> None:
+        """Copy the database, as of one moment, into a new file of SQLite."""
+
+    @abstractmethod
+    def total_bytes(self) -> int: ...
+
+    @abstractmethod
+    def locked(self, name: str, *, shared: bool = False, waits: bool = True) -> AbstractContextManager[None]:
+        """Hold a lock in the block: shared or exclusive, in all processes that have this store open. That of a dead process is released.
+
+        Raises StoreError if it is not free within a minute, BusyError at once without `waits`.
+        """
+
+    @abstractmethod
+    def _begin(self, durable: bool) -> Any:
+        """Begin a transaction and return its session."""
+
+    def _commit(self, session: Any) -> None:
+        self.run(session, "COMMIT")
+
+    @abstractmethod
+    def _read(self, sql: str, values: Values) -> list[dict[str, Any]]: ...
+
+    @abstractmethod
+    def _errors(self, done: str) -> AbstractContextManager[None]:
+        """Turn errors of the driver into StoreError: the database cannot be `done`."""
+
+
+class SqliteDatabase(Database):
+    """The database at a path, created or migrated as needed.
+
+    One connection writes and another one reads, each under its own lock: reading does not wait while a write is forced to the disk.
+    read_only: nothing is created or migrated. Raises NewerFormatError for a database of a newer fleetmap, StoreError for one that
+    cannot be opened or belongs to another program.
     """
 
     is_shared = False
 
     def __init__(self, path: Path, clock_ns: Callable[[], int], *, read_only: bool = False) -> None:
         super().__init__(clock_ns)
-        self._path = path
-        self._lock, self._reading = threading.RLock(), threading.Lock()
-        self._writing_thread: int | None = None
+        self._path, self._reading = path, threading.Lock()
         if read_only:
-            self._database, self._reader = _opened_for_reading(path), _opened_for_reading(path)
+            self._connection = self._reader = _for_reading(path)
             return
-        self._database = _opened(path, _prepare)
+        self._connection = _connected(path, "mode=rwc")
         try:
-            self._reader = _opened(path, lambda reader, _: reader.conn.execute("PRAGMA query_only = ON"))
-        except sqlite3.Error as error:
-            self._database.close()
-            raise StoreError(f"the store {path} cannot be read ({error}); check its disk") from error
+            found = _check_ours(self._connection, path)
+            for setting in ("auto_vacuum = INCREMENTAL", "journal_mode = WAL", "foreign_keys = ON"):
+                self._connection.execute(f"PRAGMA {setting}")
+            if 0 < found < FORMAT:
+                _copy(self._connection, path, path.with_name(f"{path.stem}-format-{found}{path.suffix}"))
+            if found < FORMAT:
+                with self.write():
+                    _migrate(self._connection)
+            with self._errors("read"):
+                self._reader = _connected(path, "mode=rwc")
+                self._reader.execute("PRAGMA query_only = ON")
+        except BaseException:
+            self._connection.close()
+            raise
 
     def close(self) -> None:
         with self._lock, self._reading:
             self._reader.close()
-            self._database.close()  # the last one checkpoints the write-ahead log
+            self._connection.close()  # the last one checkpoints the write-ahead log
 
-    @contextmanager
-    def write(self, *, durable: bool = True) -> Iterator[sqlite3.Connection]:
-        with self._lock:
-            self._writing_thread = threading.get_ident()
-            try:
-                with _transaction(self._database, durable=durable) as connection:
-                    yield connection
-            except sqlite3.Error as error:
-                raise StoreError(f"the store {self._path} cannot be written ({error}); check its disk") from error
-            finally:
-                self._writing_thread = None
-
-    def query(self, sql: str, values: tuple[object, ...] = ()) -> list[dict[str, Any]]:
-        try:
-            if self._writing_thread == threading.get_ident():
-                return list(self._database.query(sql, values))
-            with self._reading:
-                return list(self._reader.query(sql, values))
-        except OverflowError as error:
-            raise UsageError("a number of more than 64 bits; nothing in a store has one") from error
-        except sqlite3.Error as error:
-            raise StoreError(f"the store {self._path} cannot be read ({error}); check its disk") from error
-
-    def copy_to(self, path: Path) -> None:
-        try:
-            with self._reading, closing(sqlite3.connect(path)) as target:
-                self._reader.conn.backup(target)
-        except sqlite3.Error as error:
-            raise StoreError(f"{self._path} cannot be copied to {path} ({error}); check its disk and space") from error
-
-    def shrink(self, pages: int) -> None:
-        with self._lock, suppress(sqlite3.Error):  # a busy file is shrunk the next time
-            # One step of `execute` frees one page
-            self._database.conn.executescript(f"PRAGMA incremental_vacuum({pages:d})")
-
-    def tables(self) -> Iterator[tuple[str, list[str], list[Any]]]:
+    def tables(self) -> Iterator[tuple[str, list[dict[str, Any]]]]:
         with self._reading:
             self._reader.execute("BEGIN")
             try:
                 for table in TABLES:
                     found = self._reader.execute(f"SELECT * FROM {table}")
                     columns = [column[0] for column in found.description]
-                    while rows := found.fetchmany(_ROWS_AT_ONCE):
-                        yield table, columns, rows
+                    while rows := found.fetchmany(ROWS_AT_ONCE):
+                        yield table, [dict(zip(columns, row, strict=True)) for row in rows]
             finally:
                 self._reader.execute("COMMIT")
 
+    def copy_to(self, path: Path) -> None:
+        target = sqlite3.connect(path)
+        try:
+            with self._reading, self._errors(f"copied to {path}"):
+                self._reader.backup(target)
+        finally:
+            target.close()
+
+    def shrink(self, pages: int) -> None:
+        with self._lock, suppress(sqlite3.Error):  # a busy file is shrunk the next time
+            # One step of `execute` frees one page
+            self._connection.executescript(f"PRAGMA incremental_vacuum({pages:d})")
+
     def faults(self) -> list[str]:
-        found = [row["integrity_check"] for row in self.query("PRAGMA integrity_check")]
-        foreign = self.query("PRAGMA foreign_key_check")
-        return [text for text in found if text != "ok"] + [
-            f"a row of {row['table']} refers to nothing" for row in foreign
-        ]
+        found = [text for text in self.column("PRAGMA integrity_check") if text != "ok"]
+        return found + [f"a row of {table} refers to nothing" for table in self.column("PRAGMA foreign_key_check")]
 
     def total_bytes(self) -> int:
         return sum(path.stat().st_size for path in self._path.parent.glob("store*.sqlite3*"))
 
     def locked(self, name: str, *, shared: bool = False, waits: bool = True) -> AbstractContextManager[None]:
-        return locked(self._path.parent / name, shared=shared, waits=waits)
+        return files.locked(self._path.parent / name, shared=shared, waits=waits)
+
+    def _begin(self, durable: bool) -> sqlite3.Connection:
+        # NORMAL may lose the last commits when the power fails, never the file's integrity: enough for robots' reports.
+        self._connection.execute(f"PRAGMA synchronous = {'FULL' if durable else 'NORMAL'}")
+        self._connection.execute("BEGIN IMMEDIATE")
+        return self._connection
+
+    def _read(self, sql: str, values: Values) -> list[dict[str, Any]]:
+        with self._reading:
+            return self._dicts(self._reader, sql, values)
+
+    @contextmanager
+    def _errors(self, done: str) -> Iterator[None]:
+        try:
+            yield
+        except OverflowError as error:
+            raise UsageError("a number of more than 64 bits; nothing in a store has one") from error
+        except sqlite3.Error as error:
+            raise StoreError(f"the store {self._path} cannot be {done} ({error}); check its disk and space") from error
 
 
-def _opened(path: Path, prepare: Callable[[Database, Path], object], options: str = "mode=rwc") -> Database:
-    connection = sqlite3.connect(
-        f"file:{quote(str(path.absolute()))}?{options}",
-        timeout=_BUSY_TIMEOUT_MS / 1000,
-        isolation_level=None,
-        check_same_thread=False,
-        uri=True,
-    )
+def format_of(path: Path) -> int:
+    """Return the format of a store's database, 0 if it is not one; reads only the header of its file, without SQLite."""
     try:
-        database = Database(connection, execute_plugins=False)
-        prepare(database, path)
-    except BaseException:
-        connection.close()
-        raise
-    return database
+        with path.open("rb") as file:
+            head = file.read(100)
+    except OSError:
+        return 0
+    return int.from_bytes(head[60:64], "big") if head[68:72] == APPLICATION_ID.to_bytes(4, "big") else 0
 
 
-def _opened_for_reading(path: Path) -> Database:
+def _connected(path: Path, options: str) -> sqlite3.Connection:
+    address = f"file:{quote(str(path.absolute()))}?{options}"
+    return sqlite3.connect(address, timeout=30, isolation_level=None, check_same_thread=False, uri=True)
+
+
+def _for_reading(path: Path) -> sqlite3.Connection:
     """Open a connection that does not change the disk.
 
     If the folder is not writable, SQLite reads the database file alone, which is complete unless the last writing process was killed. An
     older format is migrated in a copy in memory. Raises StoreError after a killed process, and for an invalid database.
     """
     log = path.with_name(f"{path.name}-wal")
-    try:
+    has_log = log.is_file() and log.stat().st_size > 0
+    for options in ("mode=ro",) if has_log else ("mode=ro", "mode=ro&immutable=1"):
+        connection = _connected(path, options)
         try:
-            return _current(_opened(path, _check_ours, "mode=ro"))
-        except sqlite3.OperationalError:
-            if log.is_file() and log.stat().st_size > 0:
-                raise
-            return _current(_opened(path, _check_ours, "mode=ro&immutable=1"))
-    except sqlite3.Error as error:
-        raise StoreError(
-            f"the store {path.parent} cannot be read without writing ({error}); copy it to a writable folder"
-        ) from error
+            if _check_ours(connection, path) == FORMAT:
+                return connection
+            copy = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
+            connection.backup(copy)
+            connection.close()
+            _migrate(copy)
+            copy.execute("PRAGMA query_only = ON")
+            return copy
+        except sqlite3.OperationalError as error:
+            connection.close()
+            reason = error
+        except BaseException:
+            connection.close()
+            raise
+    raise StoreError(
+        f"the store {path.parent} cannot be read without writing ({reason}); copy it to a writable folder"
+    ) from reason
 
 
-def format_of(path: Path) -> int:
-    """Return the format of a store's database, 0 if it is not one; reads only the file header, without SQLite."""
-    try:
-        with path.open("rb") as file:
-            head = file.read(_HEAD_BYTES).ljust(_HEAD_BYTES, b"\0")
-    except OSError:
-        return 0
-    number, application = (int.from_bytes(head[at : at + 4], "big") for at in (_FORMAT_AT, _APPLICATION_AT))
-    return number if application == APPLICATION_ID else 0
-
-
-def is_older(path: Path) -> bool:
-    """True if the database would be migrated when opened for writing."""
-    return 0 < format_of(path) < FORMAT
-
-
-def _current(database: Database) -> Database:
-    if int(database.conn.execute("PRAGMA user_version").fetchone()[0]) == FORMAT:
-        return database
-    connection = sqlite3.connect(":memory:", isolation_level=None, check_same_thread=False)
-    with closing(database.conn):
-        database.conn.backup(connection)
-    migrated = Database(connection, execute_plugins=False)
-    _migrate(migrated)
-    connection.execute("PRAGMA query_only = ON")
-    return migrated
-
-
-def _prepare(database: Database, path: Path) -> None:
-    _check_ours(database, path)
-    database.conn.execute(f"PRAGMA auto_vacuum = {_INCREMENTAL}")  # of a file that is still empty
-    database.conn.execute("PRAGMA journal_mode = WAL")
-    database.conn.execute("PRAGMA foreign_keys = ON")
-    done = int(database.conn.execute("PRAGMA user_version").fetchone()[0])
-    if 0 < done < FORMAT:
-        _copy(database.conn, path, path.with_name(f"{path.stem}-format-{done}{path.suffix}"))
-    _migrate(database)
-
-
-@contextmanager
-def _transaction(database: Database, *, durable: bool) -> Iterator[sqlite3.Connection]:
-    """Run one write transaction; a durable one is on the disk when it ends."""
-    connection = database.conn
-    # NORMAL may lose the last commits when the power fails, never the file's integrity: enough for robots' reports.
-    connection.execute(f"PRAGMA synchronous = {'FULL' if durable else 'NORMAL'}")
-    connection.execute("BEGIN IMMEDIATE")
-    try:
-        yield connection
-        connection.execute("COMMIT")
-    except BaseException:
-        if connection.in_transaction:
-            with suppress(sqlite3.Error):  # the first error says more
-                connection.execute("ROLLBACK")
-        raise
-
-
-def _check_ours(database: Database, path: Path) -> None:
-    connection = database.conn
-    application = connection.execute("PRAGMA application_id").fetchone()[0]
-    number = connection.execute("PRAGMA user_version").fetchone()[0]
+def _check_ours(connection: sqlite3.Connection, path: Path) -> int:
+    """Return the format, 0 for an empty database. Raises StoreError for the database of another program."""
+    application, number = (connection.execute(f"PRAGMA {n}").fetchone()[0] for n in ("application_id", "user_version"))
     tables = connection.execute("SELECT count(*) FROM sqlite_schema").fetchone()[0]
-    if application != APPLICATION_ID and (application != 0 or number != 0 or tables != 0):
-        reason = f"{path} is not the database of a map store (application id {application}); choose another --store"
-        raise StoreError(reason)
+    if application != APPLICATION_ID and (application, number, tables) != (0, 0, 0):
+        raise StoreError(
+            f"{path} is not the database of a map store (application id {application}); choose another --store"
+        )
     if number > FORMAT:
         raise NewerFormatError(
             f"{path} has store format {number}, this fleetmap reads up to {FORMAT}; update fleetmap to open it"
         )
+    return int(number)
 
 
-def _migrate(database: Database) -> None:
-    if database.conn.execute("PRAGMA user_version").fetchone()[0] == FORMAT:
-        return
-    with _transaction(database, durable=True) as connection:
-        # Pending migrations are listed under the lock: another process may have run them.
-        MIGRATIONS.apply(database)
-        connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-        connection.execute(f"PRAGMA user_version = {FORMAT}")
+def _migrate(connection: sqlite3.Connection) -> None:
+    MIGRATIONS.apply(
+        sqlite_utils.Database(connection, execute_plugins=False)
+    )  # the pending ones: another process may have run some
+    connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+    connection.execute(f"PRAGMA user_version = {FORMAT}")
 
 
 def _copy(connection: sqlite3.Connection, path: Path, target: Path) -> None:
@@ -242,8 +371,7 @@ def _copy(connection: sqlite3.Connection, path: Path, target: Path) -> None:
         fresh.replace(target)
         sync_path(target.parent)
     except (OSError, sqlite3.Error) as error:
-        with suppress(OSError):
-            fresh.unlink()
+        fresh.unlink(missing_ok=True)
         raise StoreError(
             f"{path} has an older format, and its copy {target.name} cannot be written before it is migrated ({error}); free some space: "
             "the store is unchanged"

@@ -63,13 +63,13 @@ def is_plain_file(path: Path) -> bool:
 
 def make_own_file(path: Path) -> None:
     """Create an empty private file, unless it exists."""
-    os.close(_open_own(path, os.O_RDWR))
+    os.close(_open_own(path))
 
 
 def keep_reserve(root: Path) -> None:
     """Reserve space for `release_reserve`, so that garbage can be collected on a full disk. On a full disk nothing is reserved."""
     with suppress(OSError):
-        descriptor = _open_own(root / "reserve", os.O_RDWR | os.O_NOFOLLOW)
+        descriptor = _open_own(root / "reserve")
         try:
             os.posix_fallocate(descriptor, 0, _RESERVE_BYTES)
         finally:
@@ -78,20 +78,19 @@ def keep_reserve(root: Path) -> None:
 
 def release_reserve(root: Path) -> bool:
     """Free the reserved space; False if there was none."""
-    try:
+    with suppress(OSError):
         os.unlink(root / "reserve")  # noqa: PTH108
-    except OSError:
-        return False
-    return True
+        return True
+    return False
 
 
 @contextmanager
 def locked(path: Path, *, shared: bool = False, waits: bool = True) -> Iterator[None]:
     """Hold the lock file at `path` during the block: shared or exclusive. The lock of a dead process is released.
 
-    Raises StoreError if the lock is not free within a minute, BusyError at once without `waits`, OSError if the file cannot be created.
+    Errors as of `take_lock`, OSError if the file cannot be created.
     """
-    descriptor = _open_own(path, os.O_RDWR | os.O_NOFOLLOW)
+    descriptor = _open_own(path)
     try:
         kind = fcntl.LOCK_NB | (fcntl.LOCK_SH if shared else fcntl.LOCK_EX)
         take_lock(lambda: fcntl.flock(descriptor, kind), str(path), waits=waits)
@@ -100,21 +99,19 @@ def locked(path: Path, *, shared: bool = False, waits: bool = True) -> Iterator[
         os.close(descriptor)
 
 
-def _open_own(path: Path, flags: int) -> int:
-    return os.open(path, flags | os.O_CREAT | os.O_CLOEXEC, OWN_FILE)
-
-
 def take_lock(take: Callable[[], None], name: str, *, waits: bool) -> None:
     """Call `take` until it raises no BlockingIOError. Raises StoreError after a minute, BusyError at once without `waits`."""
     give_up_s = time.monotonic() + _LOCK_WITHIN_S
     while True:
         try:
-            take()
+            return take()
         except BlockingIOError as error:
             if not waits:
                 raise BusyError(f"{name} is held by another process; it ends by itself; try later") from error
             if time.monotonic() > give_up_s:
                 raise StoreError(f"{name} is held by another process for {_LOCK_WITHIN_S:.0f} s; try later") from error
-            time.sleep(0.05)
-        else:
-            return
+        time.sleep(0.05)
+
+
+def _open_own(path: Path) -> int:
+    return os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_CREAT | os.O_CLOEXEC, OWN_FILE)

@@ -1,4 +1,4 @@
-"""Content-addressed bytes in an object store: S3 and what else obstore opens, with credentials and endpoint of the environment."""
+"""Bytes in an object store: S3 and what else obstore opens, with credentials and endpoint of the environment."""
 
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -10,10 +10,7 @@ from obstore.exceptions import BaseError
 from obstore.store import ObjectStore, from_url
 
 from fleetmap.errors import StoreError, UsageError
-from fleetmap.mapformat import blob_path
-from mapserver.store.blobs import Blobs
-
-_FOLDER = "blobs"
+from mapserver.store.blobs import Listed, Objects
 
 
 def open_objects(url: str) -> ObjectStore:
@@ -43,63 +40,44 @@ def object_errors(where: str) -> Iterator[None]:
         raise StoreError(f"{where}: {reason}; check the URL, its rights, and the credentials") from error
 
 
-class BlobBucket(Blobs):
-    """Objects under a URL, by the paths that files of a store's folder have."""
+class BucketObjects(Objects):
+    """Objects under a URL. Each appears once it is complete."""
 
     is_folder = False
 
     def __init__(self, url: str) -> None:
-        self._url = url.rstrip("/")
-        self._objects = open_objects(self._url)
+        self.place = url.rstrip("/")
+        self._store = open_objects(self.place)
 
-    def where(self, sha256: str) -> str:
-        return f"{self._url}/{blob_path(sha256)}"
+    def put(self, path: str, chunks: Iterable[bytes], *, is_new: bool = False) -> None:
+        with object_errors(self.place):
+            content = b"".join(chunks) if isinstance(chunks, list) else iter(chunks)
+            obstore.put(self._store, path, content, mode="create" if is_new else "overwrite")
 
-    def chunks(self, sha256: str) -> Iterator[bytes]:
+    def chunks(self, path: str) -> Iterator[bytes]:
         try:
             # In a thread: an upload of these pieces reads them within obstore, which then cannot be called again in its own thread.
-            with object_errors(self._url), ThreadPoolExecutor(1) as thread:
-                pieces = thread.submit(lambda: iter(obstore.get(self._objects, blob_path(sha256)).stream())).result()
+            with object_errors(self.place), ThreadPoolExecutor(1) as thread:
+                pieces = thread.submit(lambda: iter(obstore.get(self._store, path).stream())).result()
                 while (piece := thread.submit(next, pieces, None).result()) is not None:
                     yield bytes(piece)
         except StoreError as error:
             if not isinstance(error.__cause__, FileNotFoundError):
                 raise
-            raise StoreError(f"{self.where(sha256)} is missing; the store is incomplete, restore it") from error
+            raise StoreError(f"{self.place}/{path} is missing; the store is incomplete, restore it") from error
 
-    def size(self, sha256: str) -> int | None:
-        with object_errors(self._url):
+    def size(self, path: str) -> int | None:
+        with object_errors(self.place):
             try:
-                return int(obstore.head(self._objects, blob_path(sha256))["size"])
+                return int(obstore.head(self._store, path)["size"])
             except FileNotFoundError:
                 return None
 
-    def is_whole(self, sha256: str) -> bool:
-        """As of `Blobs`; StoreError if the object store does not answer, which is no damage."""
-        return self.size(sha256) is not None and self._matches(sha256)
+    def listed(self, prefix: str) -> Iterator[Listed]:
+        with object_errors(self.place):
+            for meta in (meta for batch in obstore.list(self._store, prefix) for meta in batch):
+                yield meta["path"], meta["size"], int(meta["last_modified"].timestamp() * 1e9)
 
-    def sizes(self) -> dict[str, int]:
-        with object_errors(self._url):
-            found = [meta for batch in obstore.list(self._objects, _FOLDER) for meta in batch]
-        names = {meta["path"].rpartition("/")[2]: meta["size"] for meta in found}
-        return {name: size for name, size in names.items() if len(name) == 64}
-
-    def remove(self, sha256: str) -> None:
-        with object_errors(self._url):
-            obstore.delete(self._objects, blob_path(sha256))
-
-    def leftovers(self) -> dict[str, int]:
-        return {}  # an object appears once it is complete
-
-    def remove_leftover(self, name: str) -> None:
-        raise NotImplementedError(name)
-
-    def links(self) -> list[str]:
-        return []
-
-    def _keep(self, sha256: str, size_bytes: int, chunks: Iterable[bytes]) -> None:
-        if self.size(sha256) == size_bytes and self._matches(sha256):
-            return
-        with object_errors(self._url):
-            content = b"".join(chunks) if isinstance(chunks, list) else iter(chunks)
-            obstore.put(self._objects, blob_path(sha256), content)
+    def remove(self, path: str) -> None:
+        with object_errors(self.place):
+            obstore.delete(self._store, path)

@@ -8,11 +8,11 @@ import msgspec
 from fleetmap.encoding import to_json
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.files import write_atomically
-from mapserver.store.blobs import BlobFolder, Blobs
-from mapserver.store.database import SqliteTransactions
-from mapserver.store.transactions import Transactions
+from mapserver.store.blobs import FolderObjects, Objects
+from mapserver.store.database import Database, SqliteDatabase
 
-_FILE, DATABASE = "places.json", "store.sqlite3"
+DATABASE = "store.sqlite3"
+_FILE = "places.json"
 
 
 class Places(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -26,9 +26,7 @@ def read_places(root: Path) -> Places:
     """Return the places of the store in a folder; UsageError for an unreadable file."""
     path = root / _FILE
     with disk_errors(f"{path} cannot be read", "check its rights"):
-        if not path.is_file():
-            return Places()
-        data = path.read_bytes()
+        data = path.read_bytes() if path.is_file() else b"{}"
     try:
         return msgspec.json.decode(data, type=Places)
     except (msgspec.MsgspecError, UnicodeDecodeError) as error:
@@ -41,23 +39,23 @@ def write_places(root: Path, places: Places) -> None:
         write_atomically(root / _FILE, [to_json(places, indent=2)])
 
 
-def open_blobs(root: Path, places: Places) -> Blobs:
-    """Return the content of a store. Raises StoreError for a URL that cannot be opened."""
-    if places.content is None:
-        return BlobFolder(root)
-    from mapserver.store.object_store import BlobBucket  # late: a store in a folder does not need obstore
+def open_objects(where: str | Path) -> Objects:
+    """Return the objects in a folder or under a URL. Raises StoreError for a URL that cannot be opened."""
+    if isinstance(where, Path) or "://" not in where:
+        return FolderObjects(Path(where).absolute())
+    from mapserver.store.object_store import BucketObjects  # late: a store in a folder does not need obstore
 
-    return BlobBucket(places.content)
+    return BucketObjects(where)
 
 
 def open_database(
     root: Path, places: Places, clock_ns: Callable[[], int], *, create: bool, read_only: bool
-) -> Transactions:
-    """Return the database of a store, in its folder or in PostgreSQL; errors as of SqliteTransactions and PostgresTransactions."""
+) -> Database:
+    """Return the database of a store, in its folder or in PostgreSQL; errors as of these."""
     if places.database is None:
-        return SqliteTransactions(root / DATABASE, clock_ns, read_only=read_only)
+        return SqliteDatabase(root / DATABASE, clock_ns, read_only=read_only)
     try:
-        from mapserver.store.postgres import PostgresTransactions
+        from mapserver.store.postgres import PostgresDatabase
     except ImportError as error:
         raise UsageError(f"a database in PostgreSQL needs {error.name}; install fleetmap[server,postgres]") from error
-    return PostgresTransactions(places.database, clock_ns, create=create)
+    return PostgresDatabase(places.database, clock_ns, create=create)

@@ -1,10 +1,10 @@
-"""Queries of a store, and writes that change no version: robots' reports, jobs, events."""
+"""Queries of a store, and writes that change no version: robots' reports, jobs, the log."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence, Set
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import msgspec
 
@@ -17,19 +17,17 @@ from mapserver.floor_plan.alignment import Alignment, decode_alignment
 from mapserver.floor_plan.areas import Areas, read_areas
 from mapserver.floor_plan.survey_requests import KIND, SurveyRequest, read_request
 from mapserver.quality.figures import Evidence, TrustedCalibration, carried_evidence, trusted_calibrations
-from mapserver.store.access.chain import AuditLine
-from mapserver.store.access.operators import OperatorQueries
-from mapserver.store.database import SqliteTransactions
+from mapserver.store.blobs import Blobs
+from mapserver.store.database import Database, SqliteDatabase, matching
 from mapserver.store.fleet_queries import FleetQueries, keep_last_reports
-from mapserver.store.places import open_blobs, open_database, read_places
+from mapserver.store.operators import OperatorQueries
+from mapserver.store.places import open_database, open_objects, read_places
 from mapserver.store.rows import (
     NOBODY,
-    UNLIMITED,
     Actor,
     CanaryRow,
     Event,
     JobInfo,
-    LogEntry,
     RobotInfo,
     SiteInfo,
     SiteReleases,
@@ -38,215 +36,176 @@ from mapserver.store.rows import (
 )
 from mapserver.store.shared_files import SharedFiles
 from mapserver.store.usage import DiskMeter, DiskSpace, StoreUsage, UsageMeter
-from mapserver.store.version_rows import canaries, mentioned, site_releases
 
 if TYPE_CHECKING:
     from mapserver.surfels.survey_pictures import SurveyPicture
 
-_EVENT = "id, stamp_ns, site, kind, detail, version, actor, reason"
+EXTRA_TABLES = {"grid": "grid_blobs", "surfel": "surfel_blobs"}
+"""By kind: table of the bytes of a version not needed by its robots; pictures of surveys are among the surfels."""
 _OF_VERSIONS = ("manifest", "tile", "vocabulary")
 _RESTORED = "restored"
-_SERVED_KINDS = (*_OF_VERSIONS, "grid", *FOR_ROBOTS)
-
-
-class DatabaseCopy(NamedTuple):
-    """Content of a copied database: addresses of the blobs that it names, number of versions."""
-
-    blobs: set[str]
-    versions: int
+Span = tuple[int | None, int | None]
 
 
 class StoreQueries:
-    """Methods of an open store that change no version."""
+    """Methods of an open store that change no version. Those with a site raise UsageError for an unknown one, all StoreError."""
 
     def __init__(
         self, root: Path, clock_ns: Callable[[], int], *, create: bool = False, read_only: bool = False
     ) -> None:
-        self._root = root
-        self._clock_ns = clock_ns
         places = read_places(root)
-        self._blobs = open_blobs(root, places)
-        self._transactions = open_database(root, places, clock_ns, create=create, read_only=read_only)
-        self.fleet = FleetQueries(self._transactions)
-        self._areas: dict[str, tuple[tuple[str, ...], Areas]] = {}  # by the addresses of their source files
-        self._requests: dict[str, dict[tuple[str, str], SurveyRequest]] = {}
-        self.operators = OperatorQueries(self._transactions)
-        self.files = SharedFiles(root, self._transactions)
-        self.locked, self.leads = self._transactions.locked, self._transactions.leads
-        self.is_shared = self._transactions.is_shared
-        self._disk = DiskMeter(root, self._transactions.now_ns)
-        self._usage = UsageMeter(root, self._transactions, self._blobs)
+        self.folder, self.now_ns = root, clock_ns
+        self._blobs = Blobs(open_objects(places.content or root))
+        self._database = open_database(root, places, clock_ns, create=create, read_only=read_only)
+        self.fleet, self.operators = FleetQueries(self._database), OperatorQueries(self._database)
+        self.files = SharedFiles(root, self._database)
+        self.locked, self.leads, self.is_shared = self._database.locked, self._database.leads, self._database.is_shared
+        self.audit_lines = self._database.audit_lines
+        self.blob_size, self.blob_chunks, self.is_whole = self._blobs.size, self._blobs.chunks, self._blobs.is_whole
+        self.disk_space: Callable[[], DiskSpace] = DiskMeter(root, clock_ns).look
+        self.usage: Callable[[], StoreUsage | None] = UsageMeter(root, self._database, self._blobs).look
+        self._areas: dict[str, tuple[list[str], Areas]] = {}  # by the addresses of their source files
+        self._requests: dict[str, dict[tuple[str, str], SurveyRequest]] = {}  # by the addresses of their files
 
-    @property
-    def folder(self) -> Path:
-        return self._root
-
-    def disk_space(self) -> DiskSpace:
-        return self._disk.look()
-
-    def usage(self) -> StoreUsage | None:
-        """Return the size of the store, at most ten minutes old; None while it is measured for the first time."""
-        return self._usage.look()
-
-    def now_ns(self) -> int:
-        return self._clock_ns()
-
-    def robot_names(self) -> set[tuple[str, str]]:
-        return {(row["site"], row["robot"]) for row in self._transactions.query("SELECT site, robot FROM robots")}
-
-    def remove_robots(self, site: str, robots: Sequence[str], *, actor: Actor = NOBODY) -> list[str]:
-        """Remove the last reports of a site's robots, and return the known ones; their counts and failures stay.
-
-        Raises UsageError for an unknown site, StoreError on a disk error.
-        """
-        self._check_site(site)
-        removed = []
-        with self._transactions.write() as connection:
-            for robot in robots:
-                done = connection.execute("DELETE FROM robots WHERE site = ? AND robot = ?", (site, robot))
-                if done.rowcount:
-                    removed.append(robot)
-                    self._transactions.log(connection, site, LogEntry("robot removed", robot, None, actor))
-        return removed
-
-    def named_blobs(self) -> set[str]:
-        """Return the addresses of all blobs that the database names."""
-        return mentioned(self._transactions)
-
-    def blob_size(self, sha256: str) -> int | None:
-        """Return the size of a blob in bytes, None if it is missing; StoreError behind a symbolic link."""
-        return self._blobs.size(sha256)
-
-    def blob_chunks(self, sha256: str) -> Iterator[bytes]:
-        """Yield the bytes of a blob in pieces, unverified; raises StoreError for a missing one."""
-        return self._blobs.chunks(sha256)
-
-    def is_whole(self, sha256: str) -> bool:
-        """True if a blob exists and matches its address; reads it in pieces."""
-        return self._blobs.is_whole(sha256)
-
-    def copy_database(self, path: Path) -> DatabaseCopy:
-        """Copy the database into a new file, as of one moment, and return what the copy names. Raises StoreError on a disk error."""
-        self._transactions.copy_to(path)
-        copy = SqliteTransactions(path, self._clock_ns, read_only=True)
-        try:
-            versions = copy.query("SELECT count(*) n FROM versions")[0]["n"]
-            return DatabaseCopy(mentioned(copy), versions)
-        finally:
-            copy.close()
-
-    def log_event(self, site: str, kind: str, detail: str, *, actor: Actor = NOBODY) -> None:
-        """Write a line into a site's log."""
-        with self._transactions.write() as connection:
-            self._transactions.log(connection, site, LogEntry(kind, detail, None, actor))
-
-    def note_restored(self, detail: str, ahead: int, actor: Actor) -> None:
-        """Log the restoration of this store, and let its sites' versions go on `ahead` numbers later: the lost store gave the next ones."""
-        with self._transactions.write() as connection:
-            connection.execute("UPDATE sites SET last_version = last_version + ?", (ahead,))
-            self._transactions.log(connection, "", LogEntry(_RESTORED, detail, None, actor))
+    # ---------------------------------------------------------------------------------------------- sites and versions
 
     def sites(self) -> list[SiteInfo]:
-        return self._transactions.rows(
+        return self._database.rows(
             SiteInfo,
             """SELECT s.site, (SELECT version FROM versions v WHERE v.site = s.site AND state = 'current') current_version,
-               (SELECT count(*) FROM versions v WHERE v.site = s.site) versions
-               FROM sites s ORDER BY s.site""",
+               (SELECT count(*) FROM versions v WHERE v.site = s.site) versions FROM sites s ORDER BY s.site""",
         )
 
-    def versions(self, site: str, *, after: int = 0, limit: int = UNLIMITED) -> list[VersionInfo]:
-        """Return versions of a site, oldest first, after number `after`; raises UsageError for an unknown site."""
+    def versions(self, site: str, *, after: int = 0, limit: int | None = None) -> list[VersionInfo]:
+        """Return versions of a site, oldest first, after number `after`."""
         self._check_site(site)
-        return self._transactions.rows(
-            VersionInfo,
-            "SELECT * FROM versions WHERE site = ? AND version > ? ORDER BY version LIMIT ?",
-            (site, after, limit),
-        )
+        wanted = {"site": site, "version >": after}
+        return self._database.select(VersionInfo, "versions", wanted, "version", limit)
 
     def version(self, site: str, version: int) -> VersionInfo:
-        """Return one version; raises UsageError if it does not exist."""
+        """Return one version; UsageError if it does not exist."""
         self._check_site(site)
-        found = self._find_version(site, version)
-        if found is None:
+        if (found := self._version(site, version=version)) is None:
             raise UsageError(f"site {site} has no version {version}; `mapserver versions --site {site}` lists them")
         return found
 
     def current(self, site: str) -> VersionInfo | None:
-        """Return the site's current version, None before the first publication; raises UsageError for an unknown site."""
-        row = self._current_row(site)
-        if row is None:
+        """Return the site's current version, None before the first publication."""
+        if (found := self._version(site, state="current")) is None:
             self._check_site(site)
-        return row
+        return found
 
     def releases(self, site: str) -> SiteReleases:
-        """Return the present state of a site's releases, for decisions; raises UsageError for an unknown site."""
+        """Return the present state of a site's releases, for decisions."""
         self._check_site(site)
-        return site_releases(self._transactions, site)
+        return site_releases(self._database, site)
+
+    def canaries(self, site: str | None = None, *, running: bool = False) -> list[CanaryRow]:
+        """Return canaries (of a site), latest first; with `running` only running ones."""
+        wanted = {"site": site, "state": "running" if running else None}
+        return self._database.select(CanaryRow, "canaries", wanted, "id DESC")
+
+    def verdicts(self, site: str, version: int) -> list[VerdictRow]:
+        """Return the gate's verdicts on a version, oldest first; UsageError if it does not exist."""
+        self.version(site, version)
+        return [verdict for _, verdict in self._verdicts("site = ? AND version = ?", site, version)]
+
+    def last_verdicts(self, site: str) -> dict[int, VerdictRow]:
+        """Return the gate's last verdict on each version of a site that it judged."""
+        return dict(self._verdicts("id IN (SELECT max(id) FROM verdicts WHERE site = ? GROUP BY version)", site))
+
+    def _verdicts(self, condition: str, *values: object) -> list[tuple[int, VerdictRow]]:
+        """Return version and verdict, oldest first."""
+        columns = "version, stamp_ns, accepted, forced, reasons, report"
+        rows: list[dict[str, Any]] = self._database.rows(
+            dict, f"SELECT {columns} FROM verdicts WHERE {condition} ORDER BY id", values
+        )
+        return [(row["version"], msgspec.convert(row, VerdictRow, strict=False)) for row in rows]
+
+    def evidence(self, site: str, version: int) -> Evidence | None:
+        """Return the measurements of a version from its build, None if absent; errors as of `manifest`.
+
+        For an imported one those in its manifest.
+        """
+        self.version(site, version)
+        query = "SELECT figures FROM evidence WHERE site = ? AND version = ?"
+        if (figures := self._database.value(query, (site, version))) is None:
+            return carried_evidence(self.manifest(site, version))
+        return msgspec.json.decode(figures, type=Evidence)
+
+    def trusted(self, info: VersionInfo) -> list[TrustedCalibration]:
+        """Return the calibrations of a version trusted by an operator; empty for a damaged manifest, which `verify` reports."""
+        try:
+            return trusted_calibrations(self.manifest(info.site, info.version))
+        except (StoreError, MapFormatError):
+            return []
+
+    # --------------------------------------------------------------------------------------------------------- content
 
     def manifest(self, site: str, version: int) -> Manifest:
         """Return the manifest of a version; errors as of `version` and `blob`."""
         return decode_manifest(self._blobs.get(self.version(site, version).manifest_sha256))
-
-    def blob(self, sha256: str) -> bytes:
-        """Return the bytes of an address, verified; raises StoreError for missing ones, MapFormatError for damaged ones."""
-        return self._blobs.get(check_sha256(sha256))
-
-    def served_kind(self, sha256: str, site: str | None = None) -> str | None:
-        """Return the kind that robots (of a site) may fetch under this address: manifest, tile, vocabulary, grid, or a site's file.
-
-        None for all others: archives, and bytes referenced only by drafts.
-        """
-        rows = self._transactions.query(
-            """SELECT kind FROM version_blobs JOIN versions USING (site, version)
-               WHERE sha256 = ?1 AND state <> 'draft' AND (?2 IS NULL OR site = ?2)
-               UNION SELECT 'grid' FROM grid_blobs JOIN versions USING (site, version)
-               WHERE sha256 = ?1 AND state <> 'draft' AND (?2 IS NULL OR site = ?2)
-               UNION SELECT kind FROM site_files WHERE sha256 = ?1 AND (?2 IS NULL OR site = ?2)""",
-            (check_sha256(sha256), site),
-        )
-        kinds = {row["kind"] for row in rows}
-        return next((kind for kind in _SERVED_KINDS if kind in kinds), None)
 
     def archive(self, site: str, version: int) -> bytes | None:
         """Return the archive of a version, if it has one; errors as of `version` and `blob`."""
         sha256 = self.version(site, version).archive_sha256
         return None if sha256 is None else self._blobs.get(sha256)
 
+    def blob(self, sha256: str) -> bytes:
+        """Return the bytes of an address, verified; StoreError for missing ones, MapFormatError for damaged ones."""
+        return self._blobs.get(check_sha256(sha256))
+
+    def named_blobs(self) -> set[str]:
+        """Return the addresses of all blobs that the database names."""
+        return mentioned(self._database)
+
+    def served_kind(self, sha256: str, site: str | None = None) -> str | None:
+        """Return the kind that robots (of a site) may fetch under this address: manifest, tile, vocabulary, grid, or a site's file.
+
+        None for all others: archives, and bytes referenced only by drafts.
+        """
+        words, values = matching({"sha256": check_sha256(sha256), "site": site})
+        of_versions = f"JOIN versions USING (site, version) WHERE state <> 'draft' AND {words}"
+        kinds = self._database.column(
+            f"""SELECT kind FROM version_blobs {of_versions} UNION SELECT 'grid' kind FROM grid_blobs {of_versions}
+                UNION SELECT kind FROM site_files WHERE {words}""",
+            values * 3,
+        )
+        return next((kind for kind in (*_OF_VERSIONS, "grid", *FOR_ROBOTS) if kind in kinds), None)
+
     def survey_pictures(self, site: str, version: int) -> "tuple[SurveyPicture, ...]":
         """Return the surveys' pictures of a version that are still kept; errors as of `manifest` and `pictures_of`."""
         from mapserver.surfels.survey_pictures import pictures_of  # loads OpenCV, which few commands need
 
         query = "SELECT sha256 FROM surfel_blobs WHERE site = ? AND version = ?"
-        known = {row["sha256"] for row in self._transactions.query(query, (site, version))}
-        pictures = pictures_of(self.manifest(site, version), self._blobs.get)
-        found = tuple(one for one in pictures if one.sha256 in known)
+        kept = set(self._database.column(query, (site, version)))
+        found = tuple(p for p in pictures_of(self.manifest(site, version), self._blobs.get) if p.sha256 in kept)
         if not found:
             raise StateError(
                 f"the surveys' pictures of version {version} of site {site} were removed after their period"
             )
         return found
 
+    def copy_database(self, path: Path) -> tuple[set[str], int]:
+        """Copy the database into a new file, as of one moment; return the blobs that the copy names, and its number of versions."""
+        self._database.copy_to(path)
+        copy = SqliteDatabase(path, self.now_ns, read_only=True)
+        try:
+            return mentioned(copy), copy.value("SELECT count(*) FROM versions")
+        finally:
+            copy.close()
+
+    # -------------------------------------------------------------------------------------------------- files of a site
+
+    def site_file_sha256(self, site: str, kind: str) -> str | None:
+        query = "SELECT sha256 FROM site_files WHERE site = ? AND kind = ?"
+        found: str | None = self._database.value(query, (site, kind))
+        return found
+
     def site_file(self, site: str, kind: str) -> bytes | None:
         """Return a site's file of this kind, such as `plan`; None if absent. Errors as of `blob`."""
         sha256 = self.site_file_sha256(site, kind)
         return None if sha256 is None else self._blobs.get(sha256)
-
-    def survey_requests(self, site: str) -> list[SurveyRequest]:
-        """Return the open survey requests, oldest first; empty for an unknown site."""
-        query = "SELECT kind, sha256 FROM site_files WHERE site = ? AND substr(kind, 1, ?) = ?"
-        rows = self._transactions.query(query, (site, len(KIND), KIND))
-        known = self._requests.get(site, {})  # every robot asks every few seconds, and an object store answers slowly
-        found = {
-            key: known.get(key) or read_request(row["kind"], self._blobs.get(row["sha256"]))
-            for row in rows
-            for key in [(row["kind"], row["sha256"])]
-        }
-        self._requests[site] = found
-        return sorted(found.values(), key=lambda request: (request.asked_ns, request.id))
-
-    def site_file_sha256(self, site: str, kind: str) -> str | None:
-        rows = self._transactions.query("SELECT sha256 FROM site_files WHERE site = ? AND kind = ?", (site, kind))
-        return rows[0]["sha256"] if rows else None
 
     def alignment(self, site: str) -> Alignment | None:
         """Return the pose of the site's map in the drawing of its building; None if not aligned."""
@@ -260,192 +219,174 @@ class StoreQueries:
 
     def areas(self, site: str) -> Areas:
         """Return the named areas of a site, in `map` by the present alignment; empty if absent. UsageError if an alignment is missing."""
-        key, known = self._area_files(site), self._areas.get(site)
-        if known is None or known[0] != key:
+        source = self._area_files(site)
+        if site not in self._areas or self._areas[site][0] != source:
             data, alignment = self.site_file(site, AREAS), self.alignment(site)
-            frame = None if alignment is None else alignment.frame
-            known = self._areas[site] = (key, Areas() if data is None else read_areas(data, frame))
-        return known[1]
+            areas = Areas() if data is None else read_areas(data, None if alignment is None else alignment.frame)
+            self._areas[site] = source, areas
+        return self._areas[site][1]
 
     def areas_tag(self, site: str) -> str:
         """Return a hash that changes with the areas of a site and with their place in `map`."""
         return sha256_hex(" ".join(self._area_files(site)).encode())
 
-    def _area_files(self, site: str) -> tuple[str, ...]:
+    def _area_files(self, site: str) -> list[str]:
         query = "SELECT sha256 FROM site_files WHERE site = ? AND kind IN (?, ?) ORDER BY kind"
-        return tuple(row["sha256"] for row in self._transactions.query(query, (site, AREAS, ALIGNMENT)))
+        return self._database.column(query, (site, AREAS, ALIGNMENT))
 
-    def verdicts(self, site: str, version: int) -> list[VerdictRow]:
-        """Return the gate's verdicts on a version, oldest first; raises UsageError if it does not exist."""
-        self.version(site, version)
-        return [verdict for _, verdict in self._verdicts("site = ? AND version = ?", site, version)]
+    def survey_requests(self, site: str) -> list[SurveyRequest]:
+        """Return the open survey requests, oldest first; empty for an unknown site."""
+        query = "SELECT kind, sha256 FROM site_files WHERE site = ? AND substr(kind, 1, ?) = ?"
+        rows = self._database.query(query, (site, len(KIND), KIND))
+        known = self._requests.get(site, {})  # every robot asks every few seconds, and an object store answers slowly
+        found = {
+            key: known.get(key) or read_request(key[0], self._blobs.get(key[1]))
+            for key in [(row["kind"], row["sha256"]) for row in rows]
+        }
+        if found or known:  # no name that has none is remembered: it may be made up
+            self._requests[site] = found
+        return sorted(found.values(), key=lambda request: (request.asked_ns, request.id))
 
-    def last_verdicts(self, site: str) -> dict[int, VerdictRow]:
-        """Return the gate's last verdict on each version of a site that it judged."""
-        return dict(self._verdicts("id IN (SELECT max(id) FROM verdicts WHERE site = ? GROUP BY version)", site))
-
-    def _verdicts(self, condition: str, *values: object) -> list[tuple[int, VerdictRow]]:
-        """Return version and verdict, oldest first."""
-        rows = self._transactions.query(
-            f"SELECT version, stamp_ns, accepted, forced, reasons, report FROM verdicts WHERE {condition} ORDER BY id",
-            values,
-        )
-        parsed = (row | {name: json.loads(row[name]) for name in ("reasons", "report")} for row in rows)
-        return [(row["version"], msgspec.convert(row, VerdictRow, strict=False)) for row in parsed]
-
-    def evidence(self, site: str, version: int) -> Evidence | None:
-        """Return the measurements of a version from its build, None if absent; errors as of `manifest`.
-
-        For an imported one those in its manifest.
-        """
-        self.version(site, version)
-        rows = self._transactions.query("SELECT figures FROM evidence WHERE site = ? AND version = ?", (site, version))
-        return (
-            msgspec.json.decode(rows[0]["figures"], type=Evidence)
-            if rows
-            else carried_evidence(self.manifest(site, version))
-        )
-
-    def trusted(self, info: VersionInfo) -> list[TrustedCalibration]:
-        """Return the calibrations of a version trusted by an operator; empty for a damaged manifest, which `verify` reports."""
-        try:
-            return trusted_calibrations(self.manifest(info.site, info.version))
-        except (StoreError, MapFormatError):
-            return []
-
-    def events(
-        self,
-        site: str,
-        span_ns: tuple[int | None, int | None] = (None, None),
-        *,
-        after: int = 0,
-        limit: int = UNLIMITED,
-    ) -> list[Event]:
-        """Return a site's history, oldest first, after event `after`; span_ns: start and end, None for open."""
-        return self._transactions.rows(
-            Event,
-            f"""SELECT {_EVENT} FROM events WHERE site = ?1 AND id > ?2 AND (?3 IS NULL OR stamp_ns >= ?3)
-                AND (?4 IS NULL OR stamp_ns < ?4) ORDER BY id LIMIT ?5""",
-            (site, after, *span_ns, limit),
-        )
+    # ---------------------------------------------------------------------------------------------------------- the log
 
     def audit(self, kind: str, detail: str, *, actor: Actor = NOBODY, site: str = "") -> None:
         """Log an event that no other method writes, such as an enrolment, a signature or a refusal."""
-        with self._transactions.write() as connection:
-            self._transactions.log(connection, site, LogEntry(kind, detail, None, actor))
+        with self._database.write() as change:
+            change.log(site, kind, detail, actor=actor)
+
+    def events(
+        self, site: str, span_ns: Span = (None, None), *, after: int = 0, limit: int | None = None
+    ) -> list[Event]:
+        """Return a site's history, oldest first, after event `after`; span_ns: start and end, None for open."""
+        wanted = {"site": site, "id >": after, "stamp_ns >=": span_ns[0], "stamp_ns <": span_ns[1]}
+        return self._database.select(Event, "events", wanted, "id", limit)
+
+    def last_events(self, site: str, limit: int) -> list[Event]:
+        return self._database.select(Event, "events", {"site": site}, "id DESC", limit)
+
+    def note_restored(self, detail: str, ahead: int, actor: Actor) -> None:
+        """Log the restoration of this store, and let its sites' versions go on `ahead` numbers later: the lost store gave the next ones."""
+        with self._database.write() as change:
+            change.execute("UPDATE sites SET last_version = last_version + ?", (ahead,))
+            change.log("", _RESTORED, detail, actor=actor)
 
     def restored_ns(self) -> int:
         """Return when the store was last restored from a backup, 0 if never."""
-        rows = self._transactions.query("SELECT max(stamp_ns) stamp_ns FROM events WHERE kind = ?", (_RESTORED,))
-        return int(rows[0]["stamp_ns"] or 0)
+        return self._database.value("SELECT max(stamp_ns) FROM events WHERE kind = ?", (_RESTORED,)) or 0
 
-    def audit_lines(self, last: int | None = None) -> list[AuditLine]:
-        """Return the log of all sites and of the store itself, oldest line first, or its last lines."""
-        return self._transactions.audit_lines(last)
-
-    def canaries(self, site: str | None = None, *, running: bool = False) -> list[CanaryRow]:
-        """Return canaries (of a site), latest first; with `running` only running ones."""
-        return canaries(self._transactions, site, running=running)
-
-    def last_events(self, site: str, limit: int) -> list[Event]:
-        return self._transactions.rows(
-            Event, f"SELECT {_EVENT} FROM events WHERE site = ? ORDER BY id DESC LIMIT ?", (site, limit)
-        )
+    # ----------------------------------------------------------------------------------------------------------- robots
 
     def robots(self, site: str | None = None) -> list[RobotInfo]:
         """Return the last report of every robot (of a site)."""
-        rows = self._transactions.query(
-            "SELECT * FROM robots WHERE (?1 IS NULL OR site = ?1) ORDER BY site, robot", (site,)
-        )
-        return [RobotInfo(**row | {"last_report": json.loads(row["last_report"])}) for row in rows]
+        return self._database.select(RobotInfo, "robots", {"site": site}, "site, robot")
 
-    def jobs(
-        self,
-        site: str | None = None,
-        span_ns: tuple[int | None, int | None] = (None, None),
-        *,
-        before: int | None = None,
-        limit: int = UNLIMITED,
-    ) -> list[JobInfo]:
-        """Return jobs (of a site), newest first, older than job `before`; span_ns: range of their start, by the second."""
-        since, until = (None if ns is None else _iso(ns + 999_999_999) for ns in span_ns)
-        return self._jobs(
-            """WHERE (?1 IS NULL OR site = ?1) AND (?2 IS NULL OR id < ?2) AND (?3 IS NULL OR started >= ?3)
-               AND (?4 IS NULL OR started < ?4) ORDER BY id DESC LIMIT ?5""",
-            (site, before, since, until, limit),
-        )
-
-    def sites_with_jobs(self) -> list[str]:
-        """Return the sites with a job, also those without a version."""
-        rows = self._transactions.query("SELECT DISTINCT site FROM jobs ORDER BY site")
-        return [row["site"] for row in rows]
-
-    def tell_progress(self, job: int, progress: object, key: str = "progress") -> None:
-        """Store the progress of a running job under a key of its report; ignored for an ended one. A power cut may lose it."""
-        with self._transactions.write(durable=False) as connection:
-            found = connection.execute("SELECT report FROM jobs WHERE id = ? AND state = 'running'", (job,)).fetchone()
-            if found is not None:
-                report = to_json(json.loads(found[0]) | {key: progress}).decode()
-                connection.execute("UPDATE jobs SET report = ? WHERE id = ?", (report, job))
-
-    def running_jobs(self) -> list[JobInfo]:
-        return self._jobs("WHERE state = 'running' ORDER BY id", ())
-
-    def last_night(self, site: str) -> JobInfo | None:
-        """Return the site's last ended nightly job; None before the first."""
-        found = self._jobs(
-            "WHERE site = ? AND kind = 'nightly' AND state <> 'running' ORDER BY id DESC LIMIT 1", (site,)
-        )
-        return found[0] if found else None
-
-    def job(self, number: int) -> JobInfo:
-        """Return one job; raises UsageError if it does not exist."""
-        found = self._jobs("WHERE id = ?", (number,))
-        if not found:
-            raise UsageError(f"job {number} does not exist; the list of jobs shows the stored ones")
-        return found[0]
-
-    def _jobs(self, which: str, values: tuple[object, ...]) -> list[JobInfo]:
-        rows = self._transactions.query(f"SELECT * FROM jobs {which}", values)
-        return [JobInfo(**row | {"report": json.loads(row["report"])}) for row in rows]
+    def robot_names(self) -> set[tuple[str, str]]:
+        return {(row["site"], row["robot"]) for row in self._database.query("SELECT site, robot FROM robots")}
 
     def record_robot_report(self, site: str, robot: str, report: dict[str, Any], version: int | None = None) -> None:
         """Store a robot's report; `version` is its running version, None if not reported."""
         check_name(site, "site")
         check_name(robot, "robot")
-        with self._transactions.write(durable=False) as connection:
-            keep_last_reports(connection, {(site, robot): (version, self._clock_ns(), report)})
+        with self._database.write(durable=False) as change:
+            keep_last_reports(change, {(site, robot): (version, self.now_ns(), report)})
+
+    def remove_robots(self, site: str, robots: Sequence[str], *, actor: Actor = NOBODY) -> list[str]:
+        """Remove the last reports of a site's robots, and return the known ones; their counts and failures stay."""
+        self._check_site(site)
+        removed = []
+        with self._database.write() as change:
+            for robot in robots:
+                if change.execute("DELETE FROM robots WHERE site = ? AND robot = ?", (site, robot)).rowcount:
+                    removed.append(robot)
+                    change.log(site, "robot removed", robot, actor=actor)
+        return removed
+
+    # ------------------------------------------------------------------------------------------------------------- jobs
+
+    def jobs(
+        self,
+        site: str | None = None,
+        span_ns: Span = (None, None),
+        *,
+        before: int | None = None,
+        limit: int | None = None,
+    ) -> list[JobInfo]:
+        """Return jobs (of a site), newest first, older than job `before`; span_ns: range of their start, by the second."""
+        since, until = (None if ns is None else _iso(ns + 999_999_999) for ns in span_ns)
+        wanted = {"site": site, "id <": before, "started >=": since, "started <": until}
+        return self._database.select(JobInfo, "jobs", wanted, "id DESC", limit)
+
+    def job(self, number: int) -> JobInfo:
+        """Return one job; UsageError if it does not exist."""
+        if found := self._database.select(JobInfo, "jobs", {"id": number}, "id"):
+            return found[0]
+        raise UsageError(f"job {number} does not exist; the list of jobs shows the stored ones")
+
+    def running_jobs(self) -> list[JobInfo]:
+        return self._database.select(JobInfo, "jobs", {"state": "running"}, "id")
+
+    def last_night(self, site: str) -> JobInfo | None:
+        """Return the site's last ended nightly job; None before the first."""
+        wanted = {"site": site, "kind": "nightly", "state <>": "running"}
+        return next(iter(self._database.select(JobInfo, "jobs", wanted, "id DESC", 1)), None)
+
+    def sites_with_jobs(self) -> list[str]:
+        """Return the sites with a job, also those without a version."""
+        return self._database.column("SELECT DISTINCT site FROM jobs ORDER BY site")
 
     def begin_job(self, site: str, kind: str) -> int:
-        with self._transactions.write() as connection:
-            done = connection.execute(
-                """INSERT INTO jobs (site, kind, state, started, message, report) VALUES (?, ?, 'running', ?, '', '{}')
-                   RETURNING id""",
-                (check_name(site, "site"), kind, _iso(self._clock_ns())),
-            )
+        row = {"site": check_name(site, "site"), "kind": kind, "state": "running", "started": _iso(self.now_ns())}
+        with self._database.write() as change:
+            done = change.insert("jobs", [row | {"message": "", "report": "{}"}], "RETURNING id")
             return int(done.fetchone()[0])
 
     def update_job(self, job: int, state: str, message: str, report: dict[str, Any]) -> None:
         """Store the state of a job: running, or ended (done or failed)."""
-        with self._transactions.write() as connection:
-            connection.execute(
-                "UPDATE jobs SET state = ?, finished = ?, message = ?, report = ? WHERE id = ?",
-                (state, None if state == "running" else _iso(self._clock_ns()), message, to_json(report).decode(), job),
-            )
+        finished = None if state == "running" else _iso(self.now_ns())
+        with self._database.write() as change:
+            query = "UPDATE jobs SET state = ?, finished = ?, message = ?, report = ? WHERE id = ?"
+            change.execute(query, (state, finished, message, to_json(report).decode(), job))
+
+    def tell_progress(self, job: int, progress: object, key: str = "progress") -> None:
+        """Store the progress of a running job under a key of its report; ignored for an ended one. A power cut may lose it."""
+        with self._database.write(durable=False) as change:
+            found = change.execute("SELECT report FROM jobs WHERE id = ? AND state = 'running'", (job,)).fetchone()
+            if found is not None:
+                report = to_json(json.loads(found[0]) | {key: progress}).decode()
+                change.execute("UPDATE jobs SET report = ? WHERE id = ?", (report, job))
 
     def _check_site(self, site: str) -> None:
         check_name(site, "site")
-        if not self._transactions.query("SELECT 1 FROM sites WHERE site = ?", (site,)):
+        if self._database.value("SELECT 1 FROM sites WHERE site = ?", (site,)) is None:
             known = ", ".join(info.site for info in self.sites()) or "none"
             raise UsageError(f"the store has no site {site}; it has: {known}")
 
-    def _find_version(self, site: str, version: int) -> VersionInfo | None:
-        query = "SELECT * FROM versions WHERE site = ? AND version = ?"
-        return self._transactions.first(VersionInfo, query, (site, version))
+    def _version(self, site: str, **wanted: object) -> VersionInfo | None:
+        return next(iter(self._database.select(VersionInfo, "versions", {"site": site, **wanted}, "version")), None)
 
-    def _current_row(self, site: str) -> VersionInfo | None:
-        query = "SELECT * FROM versions WHERE site = ? AND state = 'current'"
-        return self._transactions.first(VersionInfo, query, (site,))
+
+def site_releases(database: Database, site: str) -> SiteReleases:
+    """Return the state of a site's releases; empty for an unknown site."""
+    versions = database.select(VersionInfo, "versions", {"site": site}, "version")
+    running = database.select(CanaryRow, "canaries", {"site": site, "state": "running"}, "id DESC")
+    current = next((info.version for info in versions if info.state == "current"), None)
+    query = "SELECT version FROM currents WHERE site = ? AND version <> ? ORDER BY id DESC LIMIT 1"
+    files = database.query("SELECT kind, sha256 FROM site_files WHERE site = ? ORDER BY kind", (site,))
+    return SiteReleases(
+        site=site,
+        versions={info.version: info for info in versions},
+        rollback_target=None if current is None else database.value(query, (site, current)),
+        canary=running[0] if running else None,
+        files={row["kind"]: row["sha256"] for row in files if row["kind"] in FOR_ROBOTS},
+    )
+
+
+def mentioned(database: Database, leaving: Set[tuple[str, int]] = frozenset()) -> set[str]:
+    """Return the addresses that the database names, but for versions that leave."""
+    tables = ("version_blobs", *EXTRA_TABLES.values())
+    rows = [row for table in tables for row in database.query(f"SELECT site, version, sha256 FROM {table}")]
+    kept = {row["sha256"] for row in rows if (row["site"], row["version"]) not in leaving}
+    return kept | set(database.column("SELECT sha256 FROM site_files"))
 
 
 def _iso(stamp_ns: int) -> str:

@@ -1,14 +1,20 @@
-"""Rows of the store: versions, verdicts, canaries, jobs, robots, failures, and changes by a release."""
+"""Records of a store. Most are rows of a table that `schema` makes of their fields."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 
 from fleetmap.mapformat import CameraEntry, RecordingEntry, Tile
 from fleetmap.messages import FailureReport
 from mapserver.quality.figures import Evidence
+
+UNLIMITED = 1 << 62
+"""As limit of a number of rows: all."""
+
+AXES = ("site", "robot", "version", "tile", "area", "cause", "arm")
+"""Keys of the sums, each separate: never robot and tile together, so that they stay few."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +96,15 @@ class Event:
 
 
 @dataclass(frozen=True, slots=True)
+class AuditLine(Event):
+    """One line of the log. operator: the authenticated name, empty if none; address: of the request; sha256: chains the lines."""
+
+    operator: str
+    address: str
+    sha256: str
+
+
+@dataclass(frozen=True, slots=True)
 class VerdictRow:
     """The gate's verdict on a version: reasons to refuse it (none if accepted), and the checked figures."""
 
@@ -143,13 +158,6 @@ class DraftContent:
     pictures: Sequence[bytes] = ()
     evidence: Evidence | None = None
     job: int | None = None
-
-
-UNLIMITED = 1 << 62
-"""As limit of a number of rows: all."""
-
-AXES = ("site", "robot", "version", "tile", "area", "cause", "arm")
-"""Keys of the sums, each separate: never robot and tile together, so that they stay few."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,17 +277,48 @@ class CanaryRow:
 
 
 @dataclass(frozen=True, slots=True)
+class OperatorRow:
+    """One operator. role: viewer, operator, admin, or program for a name that has only tokens; password: its argon2 hash."""
+
+    name: str
+    role: str
+    password: str | None
+    is_disabled: int
+    tokens: int = 0
+    sessions: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class SessionRow:
+    """A session, with the present role of its operator."""
+
+    name: str
+    role: str
+    begun_ns: int
+    used_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class TokenRow:
+    """A token: its owner, its scopes (separated by spaces), its end and its hash."""
+
+    name: str
+    role: str
+    scopes: str
+    ends_ns: int
+    sha256: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class SiteReleases:
     """State of a site's releases: its versions by number, and the running canary, if any.
 
-    rollback_target: the previous current version, None if absent; rollback_row: its row in the history of current versions.
-    files: addresses of the site's files for robots, by kind.
+    rollback_target: the previous current version, None if absent. files: addresses of the site's files for robots, by kind.
     """
 
     site: str
     versions: dict[int, VersionInfo]
     rollback_target: int | None
-    rollback_row: int | None
     canary: CanaryRow | None
     files: dict[str, str] = field(default_factory=dict)
 
@@ -289,47 +328,18 @@ class SiteReleases:
         return next((info for info in self.versions.values() if info.state == "current"), None)
 
 
-class LogEntry(NamedTuple):
-    """A line of a site's history to be written."""
+@dataclass(frozen=True, slots=True)
+class Retention:
+    """Retention rules of versions. keep_versions, keep_drafts: the newest of each site, besides protected ones.
 
-    kind: str
-    detail: str
-    version: int | None = None
-    actor: Actor = NOBODY
-
-
-class NewCanary(NamedTuple):
-    """A canary to be started."""
-
-    version: int
-    base_version: int
-    share: float
-    threshold: float
-    actor: Actor
-
-
-class CanaryEnd(NamedTuple):
-    """End of the canary of this row: promoted, rolled_back or stopped, and the reason."""
-
-    id: int
-    state: str
-    outcome: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReleaseChanges:
-    """Rows changed by one decision, all in one transaction.
-
-    states: versions and their new states, in this order: a site never has two current versions. new_current: appended to the
-    history of current versions; drop_currents_after: rows of that history after this one are deleted.
+    keep_days: time for which a retired version or superfluous draft is kept; robot_days: time for which a silent robot counts as
+    using the version that it reported.
     """
 
-    states: tuple[tuple[int, str], ...] = ()
-    new_current: int | None = None
-    drop_currents_after: int | None = None
-    new_canary: NewCanary | None = None
-    ended_canary: CanaryEnd | None = None
-    log: tuple[LogEntry, ...] = ()
+    keep_versions: int = 5
+    keep_drafts: int = 3
+    keep_days: float = 7.0
+    robot_days: float = 30.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,8 +16,8 @@ from fleetmap.encoding import to_json
 from fleetmap.errors import BusyError, disk_errors
 from fleetmap.files import write_atomically
 from fleetmap.mapformat import sha256_hex
+from mapserver.store.database import Database, Transaction
 from mapserver.store.files import is_plain_file, make_folder
-from mapserver.store.transactions import Connection, Transactions
 
 SHARED = {"trust": "*.json", "keys": "robots.json"}
 """By folder, what its files are called."""
@@ -26,16 +26,11 @@ _CONNECTIONS = "connections"  # under each server's own name
 _PRESENT_NS = 12_000_000_000  # two of its turns; then the server is gone
 
 
-class _Connections(msgspec.Struct, frozen=True):
-    stamp_ns: int
-    certificates: list[str]
-
-
 class SharedFiles:
-    """Files of a store's folder. With its database there, too, nothing is copied."""
+    """Files of a store's folder. With its database there, too, nothing is copied. Raises StoreError if disk or database refuse."""
 
-    def __init__(self, root: Path, transactions: Transactions) -> None:
-        self._root, self._transactions = root, transactions
+    def __init__(self, root: Path, database: Database) -> None:
+        self._root, self._database = root, database
         self._server = f"{_CONNECTIONS}/{secrets.token_hex(8)}"
 
     @contextmanager
@@ -44,8 +39,8 @@ class SharedFiles:
 
         With several servers the change is that of all of them, or of none: robots see nothing of it before the database has it.
         """
-        with self._transactions.locked(f"{folder}/lock"):
-            if not self._transactions.is_shared:
+        with self._database.locked(f"{folder}/lock"):
+            if not self._database.is_shared:
                 yield self._root
                 return
             self._take(folder)
@@ -55,38 +50,39 @@ class SharedFiles:
                     shutil.copy(self._root / folder / name, Path(draft) / folder)
                 yield Path(draft)
                 here, there = self._hashes(Path(draft), folder), self._there(folder)
-                with self._transactions.write() as connection:
+                with self._database.write() as change:
                     for name in there.keys() - here.keys():
-                        connection.execute("DELETE FROM shared_files WHERE name = ?", (f"{folder}/{name}",))
+                        change.execute("DELETE FROM shared_files WHERE name = ?", (f"{folder}/{name}",))
                     for name in (name for name in here if here[name] != there.get(name)):
-                        _keep(connection, f"{folder}/{name}", (Path(draft) / folder / name).read_bytes())
+                        _keep(change, f"{folder}/{name}", (Path(draft) / folder / name).read_bytes())
             self._take(folder)
 
     def follow(self) -> None:
-        """Take what other servers changed. Raises StoreError if disk or database refuse."""
-        for folder in SHARED:
+        """Take what other servers changed."""
+        for folder in SHARED if self._database.is_shared else ():
             if self._differing(folder):
-                with suppress(BusyError), self._transactions.locked(f"{folder}/lock", waits=False):
+                with suppress(BusyError), self._database.locked(f"{folder}/lock", waits=False):
                     self._take(folder)
 
     def connected(self, here: Sequence[str]) -> list[str]:
         """Tell the other servers which certificates are connected to this one; return those of their connections.
 
-        To be called every five seconds; a server that does not is one without connections. Raises StoreError.
+        To be called every five seconds; a server that does not is one without connections.
         """
-        if not self._transactions.is_shared:
+        if not self._database.is_shared:
             return []
-        now_ns, found, gone = self._transactions.now_ns(), list[str](), list[tuple[str]]()
-        query = "SELECT name, data FROM shared_files WHERE name LIKE ? AND name != ?"
-        for row in self._transactions.query(query, (f"{_CONNECTIONS}/%", self._server)):
-            told = msgspec.json.decode(bytes(row["data"]), type=_Connections)
-            if abs(now_ns - told.stamp_ns) <= _PRESENT_NS:
-                found += told.certificates
+        now_ns, found, gone = self._database.now_ns(), list[str](), list[str]()
+        query = "SELECT name, data FROM shared_files WHERE name LIKE ? AND name <> ?"
+        for row in self._database.query(query, (f"{_CONNECTIONS}/%", self._server)):
+            stamp_ns, certificates = msgspec.json.decode(row["data"], type=tuple[int, list[str]])
+            if abs(now_ns - stamp_ns) <= _PRESENT_NS:
+                found += certificates
             else:
-                gone.append((row["name"],))
-        with self._transactions.write(durable=False) as connection:
-            _keep(connection, self._server, to_json(_Connections(now_ns, list(here))))
-            connection.executemany("DELETE FROM shared_files WHERE name = ?", gone)
+                gone.append(row["name"])
+        with self._database.write(durable=False) as change:
+            _keep(change, self._server, to_json((now_ns, list(here))))
+            for name in gone:
+                change.execute("DELETE FROM shared_files WHERE name = ?", (name,))
         return found
 
     def _take(self, folder: str) -> None:
@@ -97,13 +93,13 @@ class SharedFiles:
                 if differing[name]:
                     make_folder(path.parent)
                     query = "SELECT data FROM shared_files WHERE name = ?"
-                    write_atomically(path, [bytes(self._transactions.query(query, (f"{folder}/{name}",))[0]["data"])])
+                    write_atomically(path, [bytes(self._database.value(query, (f"{folder}/{name}",)))])
                 else:
                     path.unlink(missing_ok=True)
 
     def _differing(self, folder: str) -> dict[str, bool]:
         """Return names of files that are not as in the database, and whether they are there; none before the first change."""
-        there = self._there(folder) if self._transactions.is_shared else {}
+        there = self._there(folder)
         here = self._hashes(self._root, folder) if there else {}
         return {name: name in there for name in here.keys() | there.keys() if here.get(name) != there.get(name)}
 
@@ -113,13 +109,10 @@ class SharedFiles:
             return {path.name: sha256_hex(path.read_bytes()) for path in paths if not path.name.startswith(".")}
 
     def _there(self, folder: str) -> dict[str, str]:
-        rows = self._transactions.query("SELECT name, sha256 FROM shared_files")
-        return {name: row["sha256"] for row in rows for at, _, name in [row["name"].partition("/")] if at == folder}
+        rows = self._database.query("SELECT name, sha256 FROM shared_files WHERE name LIKE ?", (f"{folder}/%",))
+        return {row["name"].partition("/")[2]: row["sha256"] for row in rows}
 
 
-def _keep(connection: Connection, name: str, data: bytes) -> None:
-    connection.execute(
-        """INSERT INTO shared_files (name, sha256, data) VALUES (?, ?, ?)
-           ON CONFLICT (name) DO UPDATE SET sha256 = excluded.sha256, data = excluded.data""",
-        (name, sha256_hex(data), data),
-    )
+def _keep(change: Transaction, name: str, data: bytes) -> None:
+    otherwise = "ON CONFLICT (name) DO UPDATE SET sha256 = excluded.sha256, data = excluded.data"
+    change.insert("shared_files", [{"name": name, "sha256": sha256_hex(data), "data": data}], otherwise)

@@ -12,7 +12,7 @@ from statistics import median
 
 from fleetmap.errors import FleetmapError, disk_errors
 from mapserver.store.blobs import Blobs
-from mapserver.store.transactions import Transactions
+from mapserver.store.database import Database
 
 _EVERY_S, _DAY_S = 600.0, 86_400.0
 _WAIT_S = 0.5  # for a measurement under way: that of a small store is done by then
@@ -33,11 +33,10 @@ class StoreUsage:
 class UsageMeter:
     """Measures a store when asked, at most every ten minutes. Thread-safe."""
 
-    def __init__(self, root: Path, transactions: Transactions, blobs: Blobs) -> None:
-        self._root, self._transactions, self._blobs = root, transactions, blobs
-        self._lock = threading.Lock()
+    def __init__(self, root: Path, database: Database, blobs: Blobs) -> None:
+        self._root, self._database, self._blobs = root, database, blobs
+        self._lock, self._due_s = threading.Lock(), 0.0
         self._thread: threading.Thread | None = None
-        self._due_s = 0.0
         self._last: StoreUsage | None = None
 
     def look(self) -> StoreUsage | None:
@@ -54,21 +53,18 @@ class UsageMeter:
     def _measure(self) -> None:
         try:
             with disk_errors(f"{self._root} cannot be measured", "check the disk"):
-                self._last = self._measured()
+                pictures, recordings = (
+                    self._database.value(f"SELECT coalesce(sum(length({column})), 0) FROM {table}")
+                    for table, column in (("failure_pictures", "jpeg"), ("failure_replays", "mcap"))
+                )
+                database_bytes = max(0, self._database.total_bytes() - pictures - recordings)
+                sizes = (self._blobs.total_bytes(), pictures, recordings, database_bytes)
+                self._last = StoreUsage(self._database.now_ns(), *sizes)
         except FleetmapError as error:
             _log.warning("%s", error)
         finally:
             with self._lock:
                 self._thread, self._due_s = None, time.monotonic() + _EVERY_S
-
-    def _measured(self) -> StoreUsage:
-        (kept,) = self._transactions.query(
-            """SELECT (SELECT coalesce(sum(length(jpeg)), 0) FROM failure_pictures) pictures,
-                      (SELECT coalesce(sum(length(mcap)), 0) FROM failure_replays) recordings"""
-        )
-        database_bytes = max(0, self._transactions.total_bytes() - kept["pictures"] - kept["recordings"])
-        now_ns, maps_bytes = self._transactions.now_ns(), self._blobs.total_bytes()
-        return StoreUsage(now_ns, maps_bytes, kept["pictures"], kept["recordings"], database_bytes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,8 +85,7 @@ class DiskMeter:
     """Measures the disk of a folder, and its growth since the process began, over a week at most. Thread-safe."""
 
     def __init__(self, root: Path, now_ns: Callable[[], int]) -> None:
-        self._root, self._now_ns = root, now_ns
-        self._lock = threading.Lock()
+        self._root, self._now_ns, self._lock = root, now_ns, threading.Lock()
         self._samples = deque[tuple[int, int]](maxlen=round(7 * _DAY_S / _EVERY_S))  # stamps and free bytes
 
     def look(self) -> DiskSpace:
@@ -103,18 +98,13 @@ class DiskMeter:
                 self._samples.clear()  # the clock was set back
             if not self._samples or now_ns - self._samples[-1][0] >= _EVERY_S * 1e9:
                 self._samples.append((now_ns, found.free))
-            grows = self._growth()
-        return DiskSpace(
-            found.total, found.free, grows, found.free / grows if grows is not None and grows > 0 else None
-        )
-
-    def _growth(self) -> float | None:
-        """Return bytes a day: of the first and the last quarter the medians, as a build's temporary files come and go."""
-        samples = list(self._samples)
+            samples = list(self._samples)
         if not samples or samples[-1][0] - samples[0][0] < _DAY_S * 1e9:
-            return None
+            return DiskSpace(found.total, found.free)
+        # Medians of the first and the last quarter, as a build's temporary files come and go
         quarter = max(1, len(samples) // 4)
-        (first_ns, before), (last_ns, after) = (
+        ends = [
             [median(column) for column in zip(*part, strict=True)] for part in (samples[:quarter], samples[-quarter:])
-        )
-        return float((before - after) / (last_ns - first_ns) * _DAY_S * 1e9)
+        ]
+        grows = float((ends[0][1] - ends[1][1]) / (ends[1][0] - ends[0][0]) * _DAY_S * 1e9)
+        return DiskSpace(found.total, found.free, grows, found.free / grows if grows > 0 else None)

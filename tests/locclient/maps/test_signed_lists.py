@@ -313,7 +313,7 @@ def test_a_robot_learns_an_alignment_without_another_version(world: World) -> No
     assert running(client) == 2
     received = client.received_bytes
     assert (learned(client), client.received_bytes) == (7.0, received)
-    plan = world.store._transactions.query("SELECT sha256 FROM site_files WHERE kind = 'plan'", ())[0]["sha256"]
+    plan = world.store._database.query("SELECT sha256 FROM site_files WHERE kind = 'plan'", ())[0]["sha256"]
     with pytest.raises(LinkError, match="no published bytes"):
         client.blob(plan, 1000)
     # It is there at the next start, before the server answers, and goes to the robot itself.

@@ -157,7 +157,7 @@ def test_row_29_quotes_in_every_filter(server: Server, words: str) -> None:
     assert [row["robot"] for row in found] == ["r1"]
     # The control: where the words become part of the statement, they find it.
     if "OR 1=1" in words:
-        rows = server.store._transactions.query(f"SELECT robot FROM failures WHERE cause = '{words}'")
+        rows = server.store._database.query(f"SELECT robot FROM failures WHERE cause = '{words}'")
         assert rows == [{"robot": "r1"}]
 
 

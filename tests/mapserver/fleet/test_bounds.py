@@ -165,18 +165,18 @@ def test_pictures_have_a_bound_at_once(store: MapStore, clock: Clock) -> None:
     fleet = Fleet(store, clock_ns=clock, settings=IngestSettings(picture_bytes=100_000))
     for number in range(50):
         assert send(fleet, clock, number, jpeg=picture)
-        kept = store._transactions.query("SELECT sum(length(jpeg)) size, max(number) last FROM failure_pictures")[0]
+        kept = store._database.query("SELECT sum(length(jpeg)) size, max(number) last FROM failure_pictures")[0]
         assert kept["size"] <= 100_000
         assert kept["last"] == number + 1, "the oldest go"
     assert len(store.fleet.failures(FailureFilter())) == 50
     other = Fleet(store, clock_ns=clock)
     assert all(send(other, clock, number, "r2", picture) for number in range(50))
-    assert store._transactions.query("SELECT sum(length(jpeg)) size FROM failure_pictures")[0]["size"] > 500_000, (
+    assert store._database.query("SELECT sum(length(jpeg)) size FROM failure_pictures")[0]["size"] > 500_000, (
         "the control"
     )
     again = Fleet(store, clock_ns=clock, settings=IngestSettings(picture_bytes=100_000))
     send(again, clock, 0, "r3", picture)
-    assert store._transactions.query("SELECT sum(length(jpeg)) size FROM failure_pictures")[0]["size"] <= 100_000
+    assert store._database.query("SELECT sum(length(jpeg)) size FROM failure_pictures")[0]["size"] <= 100_000
 
 
 def test_failures_of_a_robot_have_a_number(store: MapStore, clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -245,7 +245,7 @@ def test_the_database_shrinks_again(tmp_path: Path, clock: Clock) -> None:
     assert full > 700
     clock.now_ns += 2 * 86_400 * SECOND_NS
     with MapStore.open(root, clock_ns=clock) as store:
-        store._transactions.shrink = lambda _: None  # type: ignore[method-assign]  # the control
+        store._database.shrink = lambda _: None  # type: ignore[method-assign]  # the control
         Fleet(store, clock_ns=clock, settings=IngestSettings(failure_days=1.0)).prune()
     assert pages() >= full
     with MapStore.open(root, clock_ns=clock) as store:

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters, kpis, poisson_interval, rate, share
-from mapserver.store.database import SqliteTransactions
+from mapserver.store.database import SqliteDatabase
 
 
 @pytest.mark.parametrize("events", [0, 1, 2, 7, 40, 1000])
@@ -61,7 +61,7 @@ def test_silent_failures_are_estimates_apart() -> None:
 
 
 def test_every_sum_has_its_column(tmp_path: Path) -> None:
-    made = SqliteTransactions(tmp_path / "store.sqlite3", lambda: 1)
+    made = SqliteDatabase(tmp_path / "store.sqlite3", lambda: 1)
     kinds = {row["name"]: row["type"] for row in made.query("PRAGMA table_info(tallies)")[2:]}
     made.close()
     assert tuple(kinds) == COUNTER_COLUMNS

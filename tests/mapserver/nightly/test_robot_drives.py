@@ -104,14 +104,14 @@ def test_a_lost_last_answer_sends_nothing_again(scene: Scene, monkeypatch: pytes
     next(scene.inbox.rglob("survey-*")).unlink()
     assert scene.server().take(SITE, "r1", last).received_bytes == len(DATA)
     assert scene.send("r2", until=4096) == [4096], "the same id of another robot is another drive"
-    log, away = scene.store.log_event, iter([True])
+    log, away = scene.store.audit, iter([True])
 
     def lost(*words: Any, **more: Any) -> None:
         if next(away, False):
             raise StoreError("the database does not answer")
         log(*words, **more)
 
-    monkeypatch.setattr(scene.store, "log_event", lost)
+    monkeypatch.setattr(scene.store, "audit", lost)
     with pytest.raises(StoreError):
         scene.send("r3")
     assert scene.drives.take(SITE, "r3", last).received_bytes == len(DATA)

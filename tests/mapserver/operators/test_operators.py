@@ -189,7 +189,7 @@ def test_sign_in_is_on_from_the_first_name_to_the_end_of_days(tmp_path: Path, cl
 
 
 def test_a_damaged_hash_lets_nobody_in(operators: Operators) -> None:
-    with operators._store._transactions.write() as connection:
+    with operators._store._database.write() as connection:
         connection.execute("UPDATE operators SET password = 'nonsense'")
     for name, password in (("ada", PASSWORD), ("ada", "nonsense"), ("\ud800" * 99, "\ud800")):
         assert operators.sign_in(name, password, "").refusal

@@ -3,7 +3,6 @@
 import json
 import shutil
 import sqlite3
-from dataclasses import astuple
 from pathlib import Path
 
 import pytest
@@ -11,7 +10,6 @@ from typer.testing import CliRunner
 
 from mapserver import cli, releases
 from mapserver.store import Actor, MapStore
-from mapserver.store.access.chain import line_sha256
 from mapserver.trust import init_here
 from support.storage.map_samples import save_sample_draft
 
@@ -59,21 +57,6 @@ def test_an_honest_log_is_clean(folder: Path) -> None:
     assert (status, len(printed.splitlines())) == (0, 6)
     assert "enrolled, 'tug-7', by 'ada' (signed in), from '10.0.0.1'" in printed
     assert len(json.loads(run("--store", str(folder), "--last", "2", "--json")[1])) == 2
-
-
-def test_a_chain_that_an_older_fleetmap_began_behind_unchained_lines_is_clean(folder: Path) -> None:
-    """It took the first chained line for the first of all."""
-    with MapStore.open(folder) as store:
-        lines = store.audit_lines()
-    chained, before = [], ""
-    for line in lines[2:]:
-        before = line_sha256(before, astuple(line)[:-1])
-        chained.append(f"UPDATE events SET sha256 = '{before}' WHERE id = {line.id}")
-    rewrite(folder, "UPDATE events SET sha256 = '' WHERE id <= 2", *chained)
-    assert run("--store", str(folder), "--verify") == (0, "6 lines, clean\n")
-    with sqlite3.connect(folder / "store.sqlite3") as connection:
-        connection.execute("UPDATE events SET actor = 'bob' WHERE id = 3")
-    assert "line 3 was changed" in run("--store", str(folder), "--verify")[1]
 
 
 @pytest.mark.parametrize(

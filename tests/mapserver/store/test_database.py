@@ -12,9 +12,9 @@ import pytest
 from sqlite_utils import Database, Migrations
 
 from fleetmap.errors import StoreError
-from mapserver.store import MapStore, schema
+from mapserver.store import MapStore, map_store, schema
 from mapserver.store import database as database_module
-from mapserver.store.database import SqliteTransactions
+from mapserver.store.database import SqliteDatabase
 from mapserver.store.schema import FORMAT
 from support.storage.map_samples import save_sample_draft
 
@@ -23,13 +23,13 @@ _LINE = "INSERT INTO events (stamp_ns, site, kind, detail) VALUES (1, 'hall', 'n
 
 
 @pytest.fixture
-def ledger(tmp_path: Path) -> Iterator[SqliteTransactions]:
-    opened = SqliteTransactions(tmp_path / "store.sqlite3", lambda: 1)
+def ledger(tmp_path: Path) -> Iterator[SqliteDatabase]:
+    opened = SqliteDatabase(tmp_path / "store.sqlite3", lambda: 1)
     yield opened
     opened.close()
 
 
-def _read_elsewhere(ledger: SqliteTransactions) -> int:
+def _read_elsewhere(ledger: SqliteDatabase) -> int:
     found: list[int] = []
     thread = threading.Thread(target=lambda: found.append(ledger.query(COUNT)[0]["n"]), daemon=True)
     thread.start()
@@ -38,7 +38,7 @@ def _read_elsewhere(ledger: SqliteTransactions) -> int:
     return found[0]
 
 
-def test_others_read_on_while_a_transaction_is_open(ledger: SqliteTransactions) -> None:
+def test_others_read_on_while_a_transaction_is_open(ledger: SqliteDatabase) -> None:
     with ledger.write() as connection:
         connection.execute(_LINE)
         assert ledger.query(COUNT)[0]["n"] == 1, "its own thread sees what it wrote"
@@ -46,21 +46,21 @@ def test_others_read_on_while_a_transaction_is_open(ledger: SqliteTransactions) 
     assert _read_elsewhere(ledger) == ledger.query(COUNT)[0]["n"] == 1
 
 
-def test_what_is_taken_back_was_never_there(ledger: SqliteTransactions) -> None:
+def test_what_is_taken_back_was_never_there(ledger: SqliteDatabase) -> None:
     with pytest.raises(RuntimeError), ledger.write() as connection:
         connection.execute(_LINE)
         raise RuntimeError
     assert ledger.query(COUNT)[0]["n"] == 0
 
 
-def test_reading_cannot_write(ledger: SqliteTransactions) -> None:
+def test_reading_cannot_write(ledger: SqliteDatabase) -> None:
     with pytest.raises(StoreError, match="cannot be read"):
         ledger.query(_LINE)
 
 
 def test_closing_leaves_one_file(tmp_path: Path) -> None:
     """The write-ahead log is folded in by the last connection; a copy of the file is then the whole database."""
-    opened = SqliteTransactions(tmp_path / "store.sqlite3", lambda: 1)
+    opened = SqliteDatabase(tmp_path / "store.sqlite3", lambda: 1)
     with opened.write() as connection:
         connection.execute(_LINE)
     opened.query(COUNT)
@@ -89,11 +89,12 @@ def test_a_store_is_copied_before_it_is_migrated_and_never_by_who_only_looks(
         database.execute("ALTER TABLE sites ADD COLUMN wing TEXT")
 
     monkeypatch.setattr(database_module, "MIGRATIONS", later)
-    monkeypatch.setattr(database_module, "FORMAT", FORMAT + 1)
+    for module in (database_module, map_store):
+        monkeypatch.setattr(module, "FORMAT", FORMAT + 1)
     path, copy = tmp_path / "store.sqlite3", tmp_path / f"store-format-{FORMAT}.sqlite3"
     before = path.read_bytes()
     with MapStore.open(tmp_path, read_only=True) as store:
-        assert store._transactions.query("SELECT site, wing FROM sites") == [{"site": "lab", "wing": None}]
+        assert store._database.query("SELECT site, wing FROM sites") == [{"site": "lab", "wing": None}]
         with pytest.raises(StoreError, match="cannot be written"):
             store.record_robot_report("lab", "r1", {}, 1)
     assert (path.read_bytes(), copy.exists()) == (before, False)
@@ -113,8 +114,8 @@ def test_a_store_is_copied_before_it_is_migrated_and_never_by_who_only_looks(
     copied = copy.read_bytes()
     with MapStore.open(tmp_path) as store:
         assert [info.version for info in store.versions("lab")] == [1]
-        applied = store._transactions.query("SELECT name FROM _sqlite_migrations ORDER BY rowid")
-    assert [row["name"] for row in applied] == ["tables", "wings"]
+        applied = store._database.column("SELECT name FROM _sqlite_migrations ORDER BY rowid")
+    assert applied == ["tables", "wings"]
     assert copy.read_bytes() == copied, "once"
 
 

@@ -12,20 +12,18 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from sqlalchemy import Connection as Session
-from sqlalchemy.exc import OperationalError
+from pg8000.dbapi import InterfaceError
 
 from fleetmap.access import Access, Holder
 from fleetmap.errors import BusyError, NewerFormatError, StoreError, UsageError
 from fleetmap.messages import RobotHealth
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_access import BusGuard
-from mapserver.store import MapStore, chain_faults
+from mapserver.store import MapStore, chain_faults, postgres
+from mapserver.store.database import Database
 from mapserver.store.places import Places, read_places, write_places
-from mapserver.store.postgres import PostgresTransactions
-from mapserver.store.rows import NOBODY, LogEntry
+from mapserver.store.postgres import PostgresDatabase, Session
 from mapserver.store.schema import FORMAT
-from mapserver.store.transactions import Transactions
 from mapserver.trust import SignedLists, init_here
 from mapserver.trust.authorities import Authorities
 from mapserver.trust.enrolment import RobotRegister
@@ -96,31 +94,31 @@ def test_a_commit_without_an_answer_counts_once(
     folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch, end: str
 ) -> None:
     with MapStore.open(folders[0]) as store, ThreadPoolExecutor(1) as thread:
-        session = store._transactions._connected()
-        real = type(session).exec_driver_sql
+        real = PostgresDatabase.run
         asked = threading.Event()
 
-        def finish(ended: Session) -> None:
+        def finish(database: PostgresDatabase, ended: Session) -> None:
             if end == "COMMIT later":
                 asked.wait(30)
                 time.sleep(0.3)
-            real(ended, end.partition(" ")[0])
-            ended.invalidate()
+            real(database, ended, end.partition(" ")[0])
+            ended.end()
 
-        def cut(self: Session, sql: str, values: tuple[object, ...] = ()) -> object:
+        def cut(self: PostgresDatabase, session: Session, sql: str, values: tuple[object, ...] = ()) -> object:
             if sql.startswith("SELECT pg_advisory_xact_lock"):
                 asked.set()
             if sql.startswith("SELECT pg_xact_status") and end.endswith("database"):
-                values = ("99999999",)
+                sql = "SELECT pg_xact_status('99999999'::xid8)"
             if sql != "COMMIT":
-                return real(self, sql, values)
-            done = thread.submit(finish, self)
+                return real(self, session, sql, values)
+            done = thread.submit(finish, self, session)
             if end != "COMMIT later":
                 done.result()
-            raise OperationalError(sql, (), OSError("network error"), connection_invalidated=True)
+            session.is_lost = True
+            raise InterfaceError("network error")
 
         with monkeypatch.context() as patch:
-            patch.setattr(type(session), "exec_driver_sql", cut)
+            patch.setattr(PostgresDatabase, "run", cut)
             if end in ("COMMIT", "COMMIT later"):
                 store.audit("note", "x")
             else:
@@ -134,15 +132,15 @@ def test_a_write_does_not_wait_for_the_leader(folders: tuple[Path, Path], monkey
     """The network of the session that leads is slow."""
     with MapStore.open(folders[0]) as store, ThreadPoolExecutor(1) as thread:
         assert store.leads()
-        real, asked, written = Session.exec_driver_sql, threading.Event(), threading.Event()
+        real, asked, written = PostgresDatabase.run, threading.Event(), threading.Event()
 
-        def slow(self: Session, sql: str, *more: object) -> object:
+        def slow(self: PostgresDatabase, session: Session, sql: str, *more: object) -> object:
             if sql == "SELECT 1":
                 asked.set()
                 assert written.wait(20), "a write waits"
-            return real(self, sql, *more)
+            return real(self, session, sql, *more)
 
-        monkeypatch.setattr(Session, "exec_driver_sql", slow)
+        monkeypatch.setattr(PostgresDatabase, "run", slow)
         led = thread.submit(store.leads)
         assert asked.wait(20)
         store.audit("note", "x")
@@ -189,7 +187,7 @@ def test_a_certificate_on_two_servers_is_told_by_both(folders: tuple[Path, Path]
         access, clock = Access([Holder("r1.0123", "lab", "r1")]), {"s": 0.0}
         stores, hubs = (store, other), (MemoryHub(), MemoryHub())
         for each in stores:
-            each._transactions.now_ns = lambda: round(clock["s"] * 1e9)
+            each._database.now_ns = lambda: round(clock["s"] * 1e9)
 
         def guard(number: int) -> BusGuard:
             found = BusGuard(RobotRegister(stores[number]), MemoryBus(hubs[number]), lambda: clock["s"])
@@ -240,12 +238,15 @@ def test_counts_go_to_no_other_key(folders: tuple[Path, Path]) -> None:
     with MapStore.open(folders[0]) as store, MapStore.open(folders[1]) as other:
         here, there = Fleet(store), Fleet(other)
         report(here, "r1")
-        with other._transactions.write() as connection:
+        with other._database.write() as connection:
             connection.execute("TRUNCATE tally_keys, tallies, traces RESTART IDENTITY")
         report(there, "r2")
         report(here, "r1")
+        report(here, "r1")
+        keys = store._database.column("SELECT id FROM tally_keys ORDER BY id")
+        assert keys == list(range(1, len(keys) + 1)), "known ones are not inserted again"
         counted = {key: counts.reports for (_, key), counts in store.fleet.counters("lab", "robot").items()}
-        assert counted == {"r1": 3, "r2": 3}
+        assert counted == {"r1": 6, "r2": 3}
 
 
 def test_all_writers_get_their_turn(folders: tuple[Path, Path]) -> None:
@@ -257,25 +258,34 @@ def test_all_writers_get_their_turn(folders: tuple[Path, Path]) -> None:
         assert chain_faults(lines) == []
 
 
+def test_who_waited_in_vain_for_its_turn_leaves_no_transaction(
+    folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(postgres, "_OPTIONS", f"{postgres._OPTIONS} -c lock_timeout=100ms")
+    with MapStore.open(folders[0]) as store, MapStore.open(folders[1]) as other:
+        with store._database.write(), pytest.raises(StoreError, match="lock timeout"):
+            other.audit("note", "in vain")
+        open_ones = "SELECT count(*) FROM pg_stat_activity WHERE state LIKE 'idle in transaction%'"
+        assert store._database.value(open_ones) == 0
+        other.audit("note", "now")
+        assert [line.detail for line in store.audit_lines()][-1:] == ["now"]
+
+
 def test_a_writer_that_waited_sees_what_the_other_wrote(folders: tuple[Path, Path]) -> None:
     """Also where the database gives every transaction the state at its beginning."""
     with MapStore.open(folders[0]) as store, ThreadPoolExecutor(1) as pool:
-        with store._transactions.write() as connection:
+        with store._database.write() as connection:
             connection.execute("ALTER ROLE fleet SET default_transaction_isolation = 'repeatable read'")
         try:
             with MapStore.open(folders[1]) as other:
-                with store._transactions.write() as connection:
+                with store._database.write() as connection:
                     waits = pool.submit(other.audit, "note", "second")
-                    while (
-                        not store._transactions._engine.connect()
-                        .exec_driver_sql("SELECT 1 FROM pg_stat_activity WHERE wait_event = 'advisory'")
-                        .all()
-                    ):
+                    while not other._database.query("SELECT 1 FROM pg_stat_activity WHERE wait_event = 'advisory'"):
                         time.sleep(0.01)
-                    store._transactions.log(connection, "", LogEntry("note", "first", None, NOBODY))
+                    connection.log("", "note", "first")
                 waits.result()
         finally:
-            with store._transactions.write() as connection:
+            with store._database.write() as connection:
                 connection.execute("ALTER ROLE fleet RESET default_transaction_isolation")
         assert [line.detail for line in store.audit_lines()][-2:] == ["first", "second"]
         assert chain_faults(store.audit_lines()) == []
@@ -293,19 +303,17 @@ def test_wrong_words_get_a_next_step(tmp_path: Path, postgres: PostgresServer) -
         ("mysql://a:secret@b/c?password=secret", "PostgreSQL alone"),
     ):
         with pytest.raises(UsageError, match=words) as refused:
-            PostgresTransactions(wrong, lambda: 1)
+            PostgresDatabase(wrong, lambda: 1)
         assert "secret" not in str(refused.value)
     with pytest.raises(StoreError, match="mapserver attach"):
-        PostgresTransactions(url, lambda: 1)
+        PostgresDatabase(url, lambda: 1)
     with pytest.raises(UsageError, match="ENCODING 'UTF8'"):
-        PostgresTransactions(
-            postgres.database("-E", "SQL_ASCII", "-T", "template0", "--locale=C"), lambda: 1, create=True
-        )
+        PostgresDatabase(postgres.database("-E", "SQL_ASCII", "-T", "template0", "--locale=C"), lambda: 1, create=True)
     with pytest.raises(StoreError, match="check the database") as error:
-        PostgresTransactions("postgresql://fleet:secret@127.0.0.1:9/none", lambda: 1)
+        PostgresDatabase("postgresql://fleet:secret@127.0.0.1:9/none", lambda: 1)
     assert "secret" not in str(error.value)
     write_places(tmp_path, Places(database=url))
-    with MapStore.open(tmp_path, create=True) as store, store._transactions.write() as connection:
+    with MapStore.open(tmp_path, create=True) as store, store._database.write() as connection:
         connection.execute("UPDATE store_format SET number = ?", (FORMAT + 1,))
     with pytest.raises(NewerFormatError, match=f"format {FORMAT + 1}"):
         MapStore.open(tmp_path)
@@ -343,16 +351,16 @@ def test_nobody_writes_what_is_not_copied(
 ) -> None:
     with MapStore.open(tmp_path, create=True):
         pass
-    copy, tried = PostgresTransactions.copy_from, list[str]()
+    copy, tried = PostgresDatabase.copy_from, list[str]()
 
-    def copied(self: PostgresTransactions, source: Transactions) -> None:
+    def copied(self: PostgresDatabase, source: Database) -> None:
         copy(self, source)
         with closing(sqlite3.connect(tmp_path / "store.sqlite3", timeout=0)) as other:
             with pytest.raises(sqlite3.OperationalError, match="locked"):
                 other.execute("DELETE FROM jobs")
             tried.append("an operator's command")
 
-    monkeypatch.setattr(PostgresTransactions, "copy_from", copied)
+    monkeypatch.setattr(PostgresDatabase, "copy_from", copied)
     MapStore.attach(tmp_path, Places(database=postgres.database()))
     assert tried
 
@@ -361,7 +369,7 @@ def test_a_killed_writer_holds_nothing(folders: tuple[Path, Path]) -> None:
     program = (
         "import os, sys\nfrom pathlib import Path\nfrom mapserver.store import MapStore\n"
         "store = MapStore.open(Path(sys.argv[1]))\n"
-        "with store.locked('lock'), store._transactions.write() as connection:\n"
+        "with store.locked('lock'), store._database.write() as connection:\n"
         '    connection.execute("UPDATE sites SET last_version = 99")\n    os._exit(9)\n'
     )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
@@ -379,7 +387,7 @@ def test_a_connection_by_tls_is_checked_when_asked_for(tmp_path: Path, postgres:
     url, right = postgres.database(), f"sslrootcert={tmp_path}/right/servers-ca.crt"
 
     def ciphers(words: str, address: str = url) -> list[object]:
-        with closing(PostgresTransactions(f"{address}?{words}", lambda: 1, create=True)) as opened:
+        with closing(PostgresDatabase(f"{address}?{words}", lambda: 1, create=True)) as opened:
             return [
                 row["cipher"] for row in opened.query("SELECT cipher FROM pg_stat_ssl WHERE pid = pg_backend_pid()")
             ]
@@ -406,7 +414,7 @@ def test_a_connection_by_tls_is_checked_when_asked_for(tmp_path: Path, postgres:
                 ciphers(words)
         with pytest.raises(UsageError, match="sslmode=verify-full"):
             ciphers(right)
-        with closing(PostgresTransactions(f"{url}?sslmode=verify-full&{right}", lambda: 1)) as opened:
+        with closing(PostgresDatabase(f"{url}?sslmode=verify-full&{right}", lambda: 1)) as opened:
             postgres.stop()
             with pytest.raises(StoreError, match="check the database"):
                 opened.query("SELECT 1")

@@ -17,8 +17,8 @@ from mapserver.backup.backup import back_up
 from mapserver.backup.restore import restore
 from mapserver.backup.snapshots import BackupTarget
 from mapserver.store import Actor, MapStore, Retention, chain_faults, object_store
-from mapserver.store.object_store import BlobBucket
-from mapserver.store.places import Places, read_places
+from mapserver.store.blobs import Blobs
+from mapserver.store.places import Places, open_objects, read_places
 from support.storage.clock import Clock
 from support.storage.map_samples import publish_samples, save_sample_draft
 from support.storage.postgres_server import PostgresServer
@@ -46,7 +46,7 @@ def states(store: MapStore) -> dict[int, str]:
 def test_the_log_is_never_changed(store: MapStore) -> None:
     publish_samples(store, 1)
     for statement in ("DELETE FROM events", "UPDATE events SET actor = 'nobody'"):
-        with pytest.raises(StoreError, match="never"), store._transactions.write() as connection:
+        with pytest.raises(StoreError, match="never"), store._database.write() as connection:
             connection.execute(statement)
     assert len(store.audit_lines()) == 2
     assert chain_faults(store.audit_lines()) == []
@@ -63,7 +63,7 @@ def test_verify_names_what_is_wrong(store: MapStore, tmp_path: Path) -> None:
     if is_folder:
         (root / current_path("lab")).write_text("wrong")
         (root / "blobs" / first[:2] / ".leftover.tmp").write_bytes(b"x")
-    with store._transactions.write() as connection:
+    with store._database.write() as connection:
         connection.execute("UPDATE versions SET landmarks = 7 WHERE version = 1")
         connection.execute("DELETE FROM version_blobs WHERE version = 1 AND kind = 'tile'")
     found = store.verify()
@@ -108,24 +108,28 @@ def test_leftovers_are_removed(store: MapStore) -> None:
         folder = next((store.folder / "blobs").iterdir())
         (folder / f".{'ab' * 8}.0011.tmp").write_bytes(b"half")
     store._blobs.put(b"nobody mentions this")
+    foreign = ["blobs/README", "others/README"] if is_folder else ["blobs/README", "blobs/ab/README", "others/README"]
+    for path in foreign:
+        store._blobs._objects.put(path, [b"of somebody else"])
     found = store.verify()
     assert (found.faults, found.orphans, found.leftovers) == ([], 1, int(is_folder))
     garbage = store.collect_garbage()
     assert (garbage.files, garbage.freed_bytes) == ((2, 24) if is_folder else (1, 20))
+    assert [store._blobs._objects.size(path) for path in foreign] == [16] * len(foreign)
     assert store.verify().orphans == 0
 
 
 def test_garbage_waits_for_those_who_bring_bytes(store: MapStore, tmp_path: Path, monkeypatch) -> None:
     publish_samples(store, 1)
     monkeypatch.setattr("mapserver.store.files._LOCK_WITHIN_S", 0.1)
-    with MapStore.open(tmp_path / "store") as other, other._transactions.locked("lock", shared=True):
+    with MapStore.open(tmp_path / "store") as other, other._database.locked("lock", shared=True):
         save_sample_draft(store, seed=7)
         with pytest.raises(StoreError, match="held by another process"):
             store.collect_garbage()
     # A process that was killed holds nothing.
     program = (
         "import os, sys\nfrom pathlib import Path\nfrom mapserver.store import MapStore\n"
-        "with MapStore.open(Path(sys.argv[1]))._transactions.locked('lock'): os._exit(9)\n"
+        "with MapStore.open(Path(sys.argv[1]))._database.locked('lock'): os._exit(9)\n"
     )
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     folder = str(tmp_path / "store")
@@ -247,7 +251,7 @@ def test_damaged_content_is_not_moved(store: MapStore, s3: str) -> None:
     Content(store).remove(tile)
     with pytest.raises(StoreError, match=f"{tile} is missing"):
         MapStore.attach(folder, Places(other))
-    assert tile not in BlobBucket(other).sizes()
+    assert tile not in Blobs(open_objects(other)).sizes()
     assert read_places(folder).content != other
 
 

@@ -220,7 +220,7 @@ def test_row_33_an_archive_swapped_in_the_database(store: MapStore) -> None:
 
 
 def set_archive(store: MapStore, sha256: str | None) -> None:
-    with store._transactions.write() as connection:
+    with store._database.write() as connection:
         connection.execute("UPDATE versions SET archive_sha256 = ? WHERE version = 1", (sha256,))
 
 
@@ -297,7 +297,7 @@ def test_one_sites_fault_does_not_stop_the_others(store: MapStore, clock: Clock)
     """Somebody wrote into the database: the other sites' lists and the timestamp are signed all the same."""
     publish_samples(store, 1, first=5, site="yard")
     lists = SignedLists(store.folder)
-    with store._transactions.write() as connection:
+    with store._database.write() as connection:
         connection.execute("UPDATE versions SET vocabulary_sha256 = ? WHERE site = 'lab'", ("0" * 64,))
     before = lists.newest("site-lab"), lists.newest("site-yard"), lists.read("timestamp").version
     clock.now_ns += 30 * HOUR_NS
