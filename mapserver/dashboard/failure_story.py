@@ -68,8 +68,9 @@ def pictures_near(pictures: Sequence[PictureRow], began_ns: int) -> list[Picture
 
 def blind_time(moments: Sequence[Moment], began_ns: int) -> BlindTime | None:
     """The parts without a position to rely upon that end at or after the beginning, as one; None where there are none."""
+    without = [m.status == Status.INITIALISING or is_blind(m.status, _radius_m(m)) for m in moments]
     parts, first = [], 0
-    for is_without, group in groupby(moments, key=_is_without):
+    for is_without, group in groupby(without):
         end = first + len(list(group))
         if is_without and moments[end - 1].stamp_ns >= began_ns:
             parts.append((first, end))
@@ -92,10 +93,6 @@ def blind_time(moments: Sequence[Moment], began_ns: int) -> BlindTime | None:
 
 def _radius_m(moment: Moment) -> float:
     return float("inf") if moment.radius_95_m is None else moment.radius_95_m
-
-
-def _is_without(moment: Moment) -> bool:
-    return moment.status == Status.INITIALISING or is_blind(moment.status, _radius_m(moment))
 
 
 def answer(detail: FailureDetail, moments: Sequence[Moment], clock: FailureClock) -> str:

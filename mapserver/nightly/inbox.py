@@ -49,6 +49,7 @@ _MOST_FILES, _DEEPEST = 2_000_000, 32
 _READ_S, _SLOWEST_BYTES_PER_S = 600, 4 << 20
 _LEAST_MEMORY_BYTES, _OPEN_FILES = 4 << 30, 1024
 _DAY_S = 86_400
+_FOR_READING = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,14 +174,12 @@ def _parts(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
 def _state(path: Path) -> tuple[object, float]:
     """Return the files of an entry, to detect changes, and the time limit to read it in seconds."""
     parts = list(_parts(path))
-    stored_bytes = sum(512 * status.st_blocks for _, status in parts)
     state = {(part, status.st_ino, status.st_size, status.st_ctime_ns) for part, status in parts}
-    return state, _READ_S + stored_bytes / _SLOWEST_BYTES_PER_S
+    return state, _READ_S + sum(512 * status.st_blocks for _, status in parts) / _SLOWEST_BYTES_PER_S
 
 
 def _most_memory_bytes() -> int:
-    machine_bytes = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return max(_LEAST_MEMORY_BYTES, machine_bytes // 2)
+    return max(_LEAST_MEMORY_BYTES, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2)
 
 
 def _unfinished(path: Path, settle_s: float, now_ns: int) -> str | None:
@@ -202,17 +201,15 @@ def _unfinished(path: Path, settle_s: float, now_ns: int) -> str | None:
 def _is_being_written(path: Path) -> bool:
     """True if a process has it open for writing; False also if the system does not show it (other users' files, network disks)."""
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+        descriptor = os.open(path, _FOR_READING)
     except PermissionError:
         return False
     try:
         fcntl.fcntl(descriptor, fcntl.F_SETSIG, signal.SIGURG)  # not SIGIO, which ends a process, if it is opened now
         fcntl.fcntl(descriptor, fcntl.F_SETLEASE, fcntl.F_RDLCK)
         fcntl.fcntl(descriptor, fcntl.F_SETLEASE, fcntl.F_UNLCK)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
+    except OSError as error:
+        return isinstance(error, BlockingIOError)
     finally:
         os.close(descriptor)
     return False
@@ -227,12 +224,16 @@ def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> 
     """
     folder = path.parent / where
     prefix = "" if sha256 is None or path.name.startswith(sha256[:_HASH_SIGNS]) else f"{sha256[:_HASH_SIGNS]}-"
+    name = f"{prefix}{path.name}"
+    if not is_safe_name(f"99-{name}"):
+        digest = hashlib.sha256(os.fsencode(path.name)).hexdigest()[:_HASH_SIGNS]
+        name = f"{prefix}unnamed-{digest}{path.suffix if path.suffix in FILE_SUFFIXES else ''}"
     check_no_link(path.parent, folder)
     with disk_errors(f"{path} cannot be moved to {folder}", "check the rights and space of the inbox"):
         make_folder(folder)
-        named = f"{prefix}{path.name}"
-        target = _free(folder, named if is_safe_name(f"99-{named}") else f"{prefix}{_safe_name(path)}")
-        reason_file = folder / f"{target.name}{_REASON}"
+        names = chain([name], (f"{number}-{name}" for number in count(2)))
+        target = next(folder / free for free in names if not os.path.lexists(folder / free))
+        reason_file = Path(f"{target}{_REASON}")
         if reason is not None:
             write_atomically(reason_file, [f"{printable(reason)}\n".encode()])
         try:
@@ -302,22 +303,18 @@ def _names(folder: Path) -> list[str]:
 
 
 def _entry(path: Path, reason: str) -> InboxEntry:
-    try:
+    size_bytes = None
+    with suppress(OSError):
         status = path.lstat()
-    except OSError:
-        return InboxEntry(path.name, None, reason)
-    return InboxEntry(path.name, status.st_size if stat.S_ISREG(status.st_mode) else None, printable(reason))
+        size_bytes = status.st_size if stat.S_ISREG(status.st_mode) else None
+    return InboxEntry(path.name, size_bytes, printable(reason))
 
 
 def _kept_reason(path: Path) -> str:
     """Return the first 2000 bytes of the reason beside a held or bad recording; empty if there is none."""
-    with suppress(OSError):
-        descriptor = os.open(f"{path}{_REASON}", os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
-        try:
-            reason = os.read(descriptor, _REASON_BYTES).decode("utf-8", "replace").strip()
-            return reason.replace(f"{path.parent.parent}/", "")
-        finally:
-            os.close(descriptor)
+    with suppress(OSError), os.fdopen(os.open(f"{path}{_REASON}", _FOR_READING), "rb") as file:
+        reason = (file.read(_REASON_BYTES) or b"").decode("utf-8", "replace").strip()
+        return reason.replace(f"{path.parent.parent}/", "")
     return ""
 
 
@@ -334,8 +331,7 @@ def put_back(inbox: Path, where: str, name: str) -> None:
         raise StateError(f"the inbox has another {name}; wait for the next night, or rename one of them")
     with disk_errors(f"{path} cannot be moved to {inbox}", "check the rights of the inbox"):
         os.replace(path, target)  # noqa: PTH105
-        with suppress(FileNotFoundError):
-            os.unlink(f"{path}{_REASON}")  # noqa: PTH108
+        Path(f"{path}{_REASON}").unlink(missing_ok=True)
         sync_path(inbox)
 
 
@@ -358,11 +354,6 @@ def is_safe_name(name: str) -> bool:
     return is_plain and 0 < len(os.fsencode(name)) <= _MAX_NAME_BYTES
 
 
-def _safe_name(path: Path) -> str:
-    suffix = path.suffix if path.suffix in FILE_SUFFIXES else ""
-    return f"unnamed-{hashlib.sha256(os.fsencode(path.name)).hexdigest()[:_HASH_SIGNS]}{suffix}"
-
-
 def remove_old(inbox: Path, days: float, now_ns: int, *, dry_run: bool = False) -> int:
     """Remove recordings that were put away longer ago, with their reasons, and return their number. StoreError if the disk refuses.
 
@@ -381,12 +372,6 @@ def remove_old(inbox: Path, days: float, now_ns: int, *, dry_run: bool = False) 
                         Path(f"{path}{_REASON}").unlink(missing_ok=True)
                     found += 1
     return found
-
-
-def _free(folder: Path, name: str) -> Path:
-    """Return the first unused name."""
-    names = chain([name], (f"{number}-{name}" for number in count(2)))
-    return next(folder / free for free in names if not os.path.lexists(folder / free))
 
 
 def kept(inbox: Path, sha256s: list[str]) -> list[Path]:

@@ -42,7 +42,7 @@ def tile_directions(places: Mapping[tuple[int, int], Array]) -> list[TileDirecti
         missing = {}
         for sector in sorted(seen):
             alone = mine & one_way & (sectors == sector)
-            if _extent_m(positions_map[alone]) >= _LEAST_M:
+            if alone.any() and np.linalg.norm(np.ptp(positions_map[alone, :2], axis=0)) >= _LEAST_M:
                 missing[HEADINGS[(sector + 4) % len(HEADINGS)]] = int(alone.sum())
         by_heading = {HEADINGS[sector]: seen[sector] for sector in sorted(seen)}
         found.append(TileDirections(tile, by_heading, missing))
@@ -77,8 +77,3 @@ def _met(positions_map: Array, headings: Array, level: NDArray[np.bool_]) -> NDA
         opposed = level[first] & level[second] & ((headings[first] * headings[second]).sum(axis=1) < _OTHER_WAY)
         met[first[opposed]] = met[second[opposed]] = True
     return met
-
-
-def _extent_m(positions_map: Array) -> float:
-    """Return the diagonal of the bounding box of the places."""
-    return float(np.linalg.norm(np.ptp(positions_map[:, :2], axis=0))) if len(positions_map) else 0.0
