@@ -47,8 +47,7 @@ from fleetmap.sensors.calibration import (
     check_camera,
     hidden_pixels,
 )
-from fleetmap.sensors.cameras import lens_of
-from fleetmap.sensors.cameras.spheres import LENSES, PLANE
+from fleetmap.sensors.cameras import LENSES, PLANE, lens_of
 
 _SAFE_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _MAX_WORD, _MAX_DEPTH, _MAX_EVENTS = 1000, 16, 80_000
@@ -63,32 +62,77 @@ _NOISE_KEYS = {
 _MOUNTINGS = ("body_from_cam", "T_cam_imu", "T_imu_cam")
 # IMU parameters of Kalibr and OpenVINS besides noise, and their neutral values
 _IMU_INTRINSICS: dict[str, Any] = {
+    **dict.fromkeys(("Tw", "Ta", "R_IMUtoGYRO", "R_IMUtoACC"), np.eye(3)),
     "T_i_b": np.eye(4),
-    "Tw": np.eye(3),
-    "Ta": np.eye(3),
-    "R_IMUtoGYRO": np.eye(3),
-    "R_IMUtoACC": np.eye(3),
     "Tg": np.zeros((3, 3)),
     "time_offset": 0.0,
 }
 _LARGEST_PX = 32_768
 _MOST_CORNERS = 1000  # of a mask's polygons: those of 16 cameras are 64,000 values
-Values = Mapping[str, Any]
 
 
-class _RepeatedKeyError(ValueError):
-    """A repeated key, which is the message."""
+class Section(dict[str, Any]):
+    """A mapping in a file, whose values are checked where they are taken: CalibrationError with the place, the value and what to write.
 
+    folder: of images of masks, None for a text without files.
+    """
 
-class _Loader(_SAFE_LOADER):  # type: ignore[misc]
-    """Refuses repeated keys in a mapping; YAML's own loader takes the last."""
+    def __init__(self, values: Mapping[str, Any], where: str, folder: Path | None = None) -> None:
+        super().__init__(values)
+        self.where, self.folder = where, folder
 
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
-        for key, count in keys.items():
-            if count > 1:
-                raise _RepeatedKeyError(_brief(key))
-        return dict(super().construct_mapping(node, deep))
+    def __missing__(self, key: str) -> Any:
+        none = "; images without distortion have distortion_model: none" if key.startswith("distortion") else ""
+        raise self.error(f"{key} is missing; it holds {', '.join(map(str, self))[:200]}{none}")
+
+    def error(self, words: str) -> CalibrationError:
+        """An error of this section."""
+        return CalibrationError(f"{self.where}: {words}")
+
+    def section(self, key: str) -> "Section":
+        """The mapping in it."""
+        if not isinstance(self[key], dict):
+            mapping = "a mapping with camera_model, intrinsics, ... is expected"
+            raise self.error(f"{key} is {_brief(self[key])}; {mapping}")
+        return Section(self[key], f"{self.where}: {key}", self.folder)
+
+    def numbers(self, key: str, count: int | None, names: str = "", default: Any = None) -> Array:
+        """Finite numbers, (count,) unless None, in a list or in OpenCV's and ROS's {rows, cols, data}."""
+        value = self[key] if default is None else self.get(key, default)
+        data: Any = value.get("data") if isinstance(value, dict) else value
+        key += f" ({names})" if names else ""
+        try:
+            if isinstance(data, str) or any(isinstance(each, bool) for each in data):
+                raise ValueError
+            numbers = np.array([float(each) for each in data], np.float64)  # YAML 1.1 reads 1e-5 as text
+        except (TypeError, ValueError, OverflowError):
+            raise self.error(f"{key}: {_brief(value)} are not numbers") from None
+        if (count is not None and len(numbers) != count) or not np.isfinite(numbers).all():
+            raise self.error(f"{key}: {_brief(value)}; {count or 'finite'} numbers are expected")
+        return numbers
+
+    def number(self, key: str, default: float) -> float:
+        """One finite number."""
+        wrapped = Section({key: [self.get(key, default)]}, self.where)
+        return float(wrapped.numbers(key, 1)[0])
+
+    def matrix(self, key: str) -> Array:
+        """(4, 4) rigid transform from nested rows, 16 numbers or EuRoC's {rows, cols, data}."""
+        value = self[key]
+        data, shape = value, tuple[Any, ...]((4, 4))
+        if isinstance(value, dict):
+            data, shape = value.get("data"), (value.get("rows"), value.get("cols"))
+        try:
+            matrix = np.array(data, dtype=np.float64)
+            if matrix.shape not in ((4, 4), (16,)) or shape != (4, 4):
+                raise ValueError
+            matrix = matrix.reshape(4, 4)
+        except (TypeError, ValueError, OverflowError):
+            raise self.error(f"{key}: {_brief(value)} is not a 4x4 matrix; write four rows of four") from None
+        if fault := _fault_of(matrix):
+            rows = np.round(matrix, 4).tolist()
+            raise self.error(f"{key}: {rows} is not a rigid transform: {fault}; check its rows")
+        return matrix
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,10 +150,9 @@ def load_calibration(path: Path) -> CalibrationFile:
     CalibrationError for missing files and invalid values.
     """
     found = parse_calibration(_read(path), str(path), path.parent)
-    if found.calibration.imu is not None and not found.topics.get("noise"):
+    if "imu" in found.calibration.assumed:
         for candidate in sorted([*path.parent.glob("imu*.yaml"), *path.parent.glob("kalibr_imu_chain.yaml")]):
-            noise = _imu_noise(read_yaml(candidate), str(candidate))
-            if noise is not None:
+            if noise := _imu_noise(read_yaml(candidate)):
                 rest = tuple(name for name in found.calibration.assumed if name != "imu")
                 return replace(found, calibration=replace(found.calibration, imu=noise, assumed=rest))
     return found
@@ -129,54 +172,43 @@ def calibration_files(path: Path) -> list[Path]:
 
 def parse_calibration(text: str, where: str, folder: Path | None = None) -> CalibrationFile:
     """Parse the text of a camchain; `where` names it in error messages. folder: of images of masks, None for a text without files."""
-    values = _parse_yaml(text, where)
-    if "camera_matrix" in values:
-        return CalibrationFile(RigCalibration((_ros_camera(values, where),), assumed=("base_from_body",)), {})
-    names = sorted(
-        (key for key in values if key.startswith("cam") and key[3:].isdecimal()), key=lambda key: int(key[3:])
-    )
+    file = Section(_parse_yaml(text, where), where, folder)
+    if "camera_matrix" in file:
+        return CalibrationFile(RigCalibration((_ros_camera(file),), assumed=("base_from_body",)), {})
+    names = sorted((key for key in file if key[:3] == "cam" and key[3:].isdecimal()), key=lambda key: int(key[3:]))
     if not names:
-        raise CalibrationError(
-            f"{where}: no cam0 in it; the file must be a Kalibr camchain (cam0: camera_model, intrinsics, ...), or for a "
+        raise file.error(
+            "no cam0 in it; the file must be a Kalibr camchain (cam0: camera_model, intrinsics, ...), or for a "
             "single camera ROS's camera_info file"
         )
     for number, name in enumerate(names):
         if name != f"cam{number}":
-            raise CalibrationError(
-                f"{where}: cam{number} is missing, there is {', '.join(names)[:80]}; number cameras from cam0"
-            )
-    noise = _imu_noise(values, where)
-    is_mounted = any(key in _section(values, "cam0", where) for key in _MOUNTINGS)
-    has_imu = bool(values.get("has_imu", noise is not None or is_mounted))
+            there = f"there is {', '.join(names)[:80]}"
+            raise file.error(f"cam{number} is missing, {there}; number cameras from cam0")
+    noise = _imu_noise(file)
+    sections = [file.section(name) for name in names]
+    is_mounted = any(key in sections[0] for key in _MOUNTINGS)
+    has_imu = bool(file.get("has_imu", noise is not None or is_mounted))
     if has_imu and not is_mounted:
-        raise CalibrationError(
-            f"{where}: cam0: the mounting of the IMU is missing; add T_cam_imu (Kalibr's) or T_imu_cam (OpenVINS'), or take the "
+        raise file.error(
+            "cam0: the mounting of the IMU is missing; add T_cam_imu (Kalibr's) or T_imu_cam (OpenVINS'), or take the "
             "IMU's noise out, to use the cameras alone"
         )
     cameras: list[CameraCalibration] = []
-    topics: dict[str, str] = {"noise": "given"} if noise is not None else {}
-    for name in names:
-        camera = _section(values, name, where)
-        previous = cameras[-1] if cameras else None
-        cameras.append(_kalibr_camera(camera, previous, f"{where}: {name}", folder))
-        topics[name] = str(camera.get("rostopic", ""))
+    for section in sections:
+        cameras.append(_kalibr_camera(section, cameras[-1] if cameras else None))
     if cameras[0].has_depth:
-        raise CalibrationError(
-            f"{where}: cam0: has_depth is for cameras beside the rig's first view; number a stereo pair cam0 and cam1. A depth camera "
+        raise file.error(
+            "cam0: has_depth is for cameras beside the rig's first view; number a stereo pair cam0 and cam1. A depth camera "
             'without a pair needs no word here: its recording tells it, or [source] sensors = "rgbd"'
         )
+    told = {"imu": noise or not has_imu, "base_from_body": "base_from_body" in file}
+    base = file.matrix("base_from_body") if told["base_from_body"] else np.eye(4)
     imu = (noise or ImuNoise()) if has_imu else None
-    base = matrix_4x4(values["base_from_body"], f"{where}: base_from_body") if "base_from_body" in values else np.eye(4)
-    if isinstance(values.get("imu0"), dict):
-        topics["imu0"] = str(values["imu0"].get("rostopic", ""))
-    assumed = [
-        name
-        for name, told in (("imu", noise or not has_imu), ("base_from_body", "base_from_body" in values))
-        if not told
-    ]
-    return CalibrationFile(
-        RigCalibration(tuple(cameras), imu, base, tuple(assumed)), {k: v for k, v in topics.items() if v}
-    )
+    named = (*sections, *([file.section("imu0")] if isinstance(file.get("imu0"), dict) else []))
+    topics = dict(zip((*names, "imu0"), (str(section.get("rostopic", "")) for section in named), strict=False))
+    assumed = tuple(name for name, is_told in told.items() if not is_told)
+    return CalibrationFile(RigCalibration(tuple(cameras), imu, base, assumed), {k: v for k, v in topics.items() if v})
 
 
 def format_calibration(calibration: RigCalibration) -> str:
@@ -216,11 +248,8 @@ def format_calibration(calibration: RigCalibration) -> str:
 
 def read_euroc_camera(path: Path) -> CameraCalibration:
     """Read the camera of a EuRoC `sensor.yaml`, mounted on the frame that the file calls body (`T_BS`)."""
-    where, values = str(path), read_yaml(path)
-    camera = _camera(values, "distortion_coefficients", where, path.parent)
-    return check_camera(
-        replace(camera, body_from_cam=matrix_4x4(_need(values, "T_BS", where), f"{where}: T_BS")), where
-    )
+    file = read_yaml(path)
+    return check_camera(_camera(file, "distortion_coefficients", file.matrix("T_BS")), str(path))
 
 
 def read_euroc_imu(path: Path) -> tuple[Array, ImuNoise]:
@@ -228,38 +257,16 @@ def read_euroc_imu(path: Path) -> tuple[Array, ImuNoise]:
 
     Defaults for missing values.
     """
-    where, values = str(path), read_yaml(path)
-    body_from_imu = matrix_4x4(_need(values, "T_BS", where), f"{where}: T_BS")
-    return body_from_imu, _imu_noise(values, where) or ImuNoise()
+    file = read_yaml(path)
+    return file.matrix("T_BS"), _imu_noise(file) or ImuNoise()
 
 
-def read_yaml(path: Path) -> Values:
+def read_yaml(path: Path) -> Section:
     """Read the mapping in a YAML file, with or without OpenCV's `%YAML:1.0` first line.
 
     CalibrationError for anything else.
     """
-    return _parse_yaml(_read(path), str(path))
-
-
-def matrix_4x4(value: object, where: str) -> Array:
-    """(4, 4) from nested rows, 16 numbers or EuRoC's {rows, cols, data}.
-
-    CalibrationError unless it is a rigid transform.
-    """
-    data = value.get("data") if isinstance(value, dict) else value
-    shape = (value.get("rows"), value.get("cols")) if isinstance(value, dict) else (4, 4)
-    try:
-        matrix = np.array(data, dtype=np.float64)
-        if matrix.shape not in ((4, 4), (16,)) or shape != (4, 4):
-            raise ValueError
-        matrix = matrix.reshape(4, 4)
-    except (TypeError, ValueError, OverflowError):
-        raise CalibrationError(f"{where}: {_brief(value)} is not a 4x4 matrix; write four rows of four") from None
-    if fault := _fault_of(matrix):
-        raise CalibrationError(
-            f"{where}: {np.round(matrix, 4).tolist()} is not a rigid transform: {fault}; check its rows"
-        )
-    return matrix
+    return Section(_parse_yaml(_read(path), str(path)), str(path), path.parent)
 
 
 def _fault_of(matrix: Array) -> str:
@@ -269,118 +276,100 @@ def _fault_of(matrix: Array) -> str:
     if not np.array_equal(matrix[3], [0, 0, 0, 1]):
         is_turned = np.array_equal(matrix[:, 3], [0, 0, 0, 1])
         return "it is transposed" if is_turned else "its last row is not 0 0 0 1"
-    rotation = matrix[:3, :3]
+    rotation, scale = matrix[:3, :3], float(np.cbrt(abs(np.linalg.det(matrix[:3, :3]))))
     if np.allclose(rotation @ rotation.T, np.eye(3), atol=2e-3):
         return "" if np.linalg.det(rotation) > 0 else "it mirrors, an axis has the wrong sign"
-    scale = float(np.cbrt(abs(np.linalg.det(rotation))))
     if scale > 0 and np.allclose(rotation @ rotation.T, scale**2 * np.eye(3), atol=2e-3 * scale**2):
         return f"its rotation is scaled by {scale:.4g}"
     return "the rows of its rotation are not of unit length and at right angles"
 
 
-def _kalibr_camera(
-    values: Values, previous: CameraCalibration | None, where: str, folder: Path | None
-) -> CameraCalibration:
-    camera = _camera(values, "distortion_coeffs", where, folder)
-    shift = values.get("timeshift_cam_imu", previous.imu_minus_cam_s if previous else 0.0)
-    body_from_cam = _body_from_cam(values, previous, where)
-    return check_camera(
-        replace(camera, body_from_cam=body_from_cam, imu_minus_cam_s=_numbers([shift], 1, where)[0]), where
-    )
+def _kalibr_camera(values: Section, previous: CameraCalibration | None) -> CameraCalibration:
+    camera = _camera(values, "distortion_coeffs", _body_from_cam(values, previous))
+    shift_s = values.number("timeshift_cam_imu", previous.imu_minus_cam_s if previous else 0.0)
+    return check_camera(replace(camera, imu_minus_cam_s=shift_s), values.where)
 
 
-def _ros_camera(values: Values, where: str) -> CameraCalibration:
+def _ros_camera(values: Section) -> CameraCalibration:
     """The camera in a file of ROS's camera_calibration: for its raw images, not the rectified ones."""
-    fx, _, cx, _, fy, cy, *_ = _numbers(_need(values, "camera_matrix", where), 9, f"{where}: camera_matrix")
-    translated = {
-        "camera_model": "pinhole",
-        "resolution": [_need(values, "image_width", where), _need(values, "image_height", where)],
-        "intrinsics": [fx, fy, cx, cy],
-        "distortion_model": values.get("distortion_model"),
-        "distortion_coefficients": values.get("distortion_coefficients"),
-    }
-    present = {key: value for key, value in translated.items() if value is not None}
-    return check_camera(_camera(present, "distortion_coefficients", where), where)
+    fx, _, cx, _, fy, cy, *_ = values.numbers("camera_matrix", 9).tolist()
+    translated = {"camera_model": "pinhole", "intrinsics": [fx, fy, cx, cy]}
+    translated["resolution"] = [values["image_width"], values["image_height"]]
+    lens = {key: value for key, value in values.items() if key.startswith("distortion") and value is not None}
+    return check_camera(_camera(Section(translated | lens, values.where), "distortion_coefficients"), values.where)
 
 
-def _body_from_cam(values: Values, previous: CameraCalibration | None, where: str) -> Array:
+def _body_from_cam(values: Section, previous: CameraCalibration | None) -> Array:
     if "body_from_cam" in values:
-        return matrix_4x4(values["body_from_cam"], f"{where}: body_from_cam")
+        return values.matrix("body_from_cam")
     mountings = []
     if "T_imu_cam" in values:  # OpenVINS: rotation from the camera to the IMU, position of the camera in the IMU
-        mountings.append(matrix_4x4(values["T_imu_cam"], f"{where}: T_imu_cam"))
+        mountings.append(values.matrix("T_imu_cam"))
     if "T_cam_imu" in values:
-        mountings.append(se3_inverse(matrix_4x4(values["T_cam_imu"], f"{where}: T_cam_imu")))
+        mountings.append(se3_inverse(values.matrix("T_cam_imu")))
     if mountings:
         if not np.allclose(mountings[0], mountings[-1], atol=1e-3):
-            raise CalibrationError(f"{where}: T_cam_imu is not the inverse of T_imu_cam; keep the one that is right")
+            raise values.error("T_cam_imu is not the inverse of T_imu_cam; keep the one that is right")
         return mountings[-1]
     if previous is None:
         return np.eye(4)
     if "T_cn_cnm1" not in values:
-        raise CalibrationError(
-            f"{where}: neither T_cam_imu, T_imu_cam nor T_cn_cnm1 gives the pose of the camera; add one of them"
-        )
-    return previous.body_from_cam @ se3_inverse(matrix_4x4(values["T_cn_cnm1"], f"{where}: T_cn_cnm1"))
+        raise values.error("neither T_cam_imu, T_imu_cam nor T_cn_cnm1 gives the pose of the camera; add one of them")
+    return previous.body_from_cam @ se3_inverse(values.matrix("T_cn_cnm1"))
 
 
-def _camera(values: Values, distortion_key: str, where: str, folder: Path | None = None) -> CameraCalibration:
-    camera_model, name = str(_need(values, "camera_model", where))[:80], str(values.get("distortion_model"))[:80]
-    spheres = {lens.kalibr: (model, lens) for model, lens in LENSES.items()}
-    if camera_model.lower() not in ("pinhole", *spheres):
-        raise CalibrationError(
-            f"{where}: camera model {camera_model} with distortion {name} is not known; calibrate as pinhole with radtan, or "
+def _camera(values: Section, distortion_key: str, body_from_cam: Array | None = None) -> CameraCalibration:
+    camera_model, name = str(values["camera_model"])[:80], str(values.get("distortion_model"))[:80]
+    sphere_model = next((model for model, lens in LENSES.items() if lens.kalibr == camera_model.lower()), "")
+    shape_names = tuple(LENSES[sphere_model].ranges) if sphere_model else ()
+    if not sphere_model and camera_model.lower() != "pinhole":
+        raise values.error(
+            f"camera model {camera_model} with distortion {name} is not known; calibrate as pinhole with radtan, or "
             "a fisheye as pinhole with equidistant, omni with radtan, ds or eucm"
         )
-    sphere_model, sphere = spheres.get(camera_model.lower(), ("", None))
-    shape_names = tuple(sphere.ranges) if sphere else ()
-    width, height = _numbers(_need(values, "resolution", where), 2, f"{where}: resolution")
+    width, height = values.numbers("resolution", 2).tolist()
     if any(side != int(side) or not 0 < side <= _LARGEST_PX for side in (width, height)):
-        raise CalibrationError(
-            f"{where}: resolution is {width:g} x {height:g}; write the images' width and height in pixels"
-        )
+        raise values.error(f"resolution is {width:g} x {height:g}; write the images' width and height in pixels")
     order = " ".join((*shape_names, "fx fy cx cy"))
-    numbers = _numbers(_need(values, "intrinsics", where), 4 + len(shape_names), f"{where}: intrinsics ({order})")
-    shape, intrinsics = numbers[: len(shape_names)], numbers[len(shape_names) :]
-    if _need(values, "distortion_model", where) != "none":
-        _need(values, distortion_key, where)
-    coefficients = _numbers(values.get(distortion_key, []), None, f"{where}: {distortion_key}")
-    model, distortion = lens_of(name, coefficients, where)
-    if sphere:
+    shape, intrinsics = np.split(values.numbers("intrinsics", 4 + len(shape_names), order), [len(shape_names)])
+    if values["distortion_model"] != "none":
+        _ = values[distortion_key]
+    model, distortion = lens_of(name, values.numbers(distortion_key, None, default=[]), values.where)
+    if sphere_model:
         if model != "radial-tangential" or len(distortion) > PLANE:
-            raise CalibrationError(
-                f"{where}: {camera_model} with {name} of {len(distortion)} coefficients is not supported; calibrate it as "
-                f"{sphere.kalibr} with radtan of {PLANE}, or without"
+            raise values.error(
+                f"{camera_model} with {name} of {len(distortion)} coefficients is not supported; calibrate it as "
+                f"{camera_model.lower()} with radtan of {PLANE}, or without"
             )
         model, distortion = sphere_model, np.concatenate([distortion, np.zeros(PLANE - len(distortion)), shape])
-    line_delay_s = float(_numbers([values.get("line_delay", 0.0)], 1, f"{where}: line_delay")[0])
-    if not 0 <= line_delay_s * height < 1.0:
-        raise CalibrationError(
-            f"{where}: line_delay is {line_delay_s:g} s, {line_delay_s * height:g} s for {height:g} rows; write the seconds from row to row"
-        )
-    mask = _mask(values.get("mask", []), (int(width), int(height)), f"{where}: mask", folder)
+    delay_s = values.number("line_delay", 0.0)
+    if not 0 <= delay_s * height < 1.0:
+        rows = f"{delay_s * height:g} s for {height:g} rows"
+        raise values.error(f"line_delay is {delay_s:g} s, {rows}; write the seconds from row to row")
     has_depth = values.get("has_depth", False)
     if not isinstance(has_depth, bool):
-        raise CalibrationError(f"{where}: has_depth is {_brief(has_depth)}; write true or false")
-    lens = model, int(width), int(height), intrinsics, distortion
-    return CameraCalibration(*lens, np.eye(4), line_delay_s=line_delay_s, mask=mask, has_depth=has_depth)
+        raise values.error(f"has_depth is {_brief(has_depth)}; write true or false")
+    size_px = int(width), int(height)
+    mounting = np.eye(4) if body_from_cam is None else body_from_cam
+    mask = _mask(values, size_px)
+    lens = model, *size_px, intrinsics, distortion, mounting
+    return CameraCalibration(*lens, line_delay_s=delay_s, mask=mask, has_depth=has_depth)
 
 
-def _mask(value: object, size_px: tuple[int, int], where: str, folder: Path | None) -> tuple[Polygon, ...]:
+def _mask(values: Section, size_px: tuple[int, int]) -> tuple[Polygon, ...]:
+    value, where = values.get("mask", []), f"{values.where}: mask"
     if isinstance(value, str):
-        polygons = _outlines(value, size_px, where, folder)
+        polygons = _outlines(value, size_px, where, values.folder)
     else:
         try:
-            polygons = tuple(tuple((float(u), float(v)) for u, v in polygon) for polygon in value)  # type: ignore[attr-defined]
+            polygons = tuple(tuple((float(u), float(v)) for u, v in polygon) for polygon in value)
         except (TypeError, ValueError):
-            raise CalibrationError(
-                f"{where} is {_brief(value)}; write polygons [[[u, v], [u, v], [u, v]]] in pixels, or the name of a PNG"
-            ) from None
+            form = "write polygons [[[u, v], [u, v], [u, v]]] in pixels, or the name of a PNG"
+            raise CalibrationError(f"{where} is {_brief(value)}; {form}") from None
     corners = np.array([corner for polygon in polygons for corner in polygon]).reshape(-1, 2)
     if len(corners) > _MOST_CORNERS:
-        raise CalibrationError(
-            f"{where} has {len(corners)} corners; the limit is {_MOST_CORNERS}, simplify its outline"
-        )
+        limit = f"the limit is {_MOST_CORNERS}, simplify its outline"
+        raise CalibrationError(f"{where} has {len(corners)} corners; {limit}")
     if any(len(polygon) < 3 for polygon in polygons) or not (np.abs(corners) <= _LARGEST_PX).all():
         raise CalibrationError(f"{where} is {_brief(value)}; a polygon has three corners or more, near the image")
     for polygon in polygons:
@@ -430,33 +419,29 @@ def _simplified(contour: NDArray[np.int32]) -> NDArray[np.int32]:
     return np.concatenate([kept, np.repeat(kept[-1:], max(0, 3 - len(kept)), axis=0)])
 
 
-def _imu_noise(values: Values, where: str) -> ImuNoise | None:
-    inner = values.get("imu0", values.get("imu", values))
+def _imu_noise(file: Section) -> ImuNoise | None:
+    inner = file.get("imu0", file.get("imu", file))
     if not isinstance(inner, dict) or not any(key in inner for key in _NOISE_KEYS.values()):
         return None
-    given = {
-        name: float(_numbers([inner[key]], 1, f"{where}: {key}")[0])
-        for name, key in _NOISE_KEYS.items()
-        if key in inner
+    given = Section(inner, file.where)
+    used = {name: given.number(key, 0.0) for name, key in _NOISE_KEYS.items() if key in given}
+    unused = {key: (inner[key], neutral) for key, neutral in _IMU_INTRINSICS.items() if key in inner}
+    unused |= {
+        f"{key}: M": (inner[key].get("M"), np.eye(3))
+        for key in ("gyroscopes", "accelerometers")
+        if isinstance(inner.get(key), dict)
     }
-    for key, neutral in _IMU_INTRINSICS.items():
-        if key in inner and not _is_near(inner[key], neutral):
-            raise CalibrationError(
-                f"{where}: {key} of the IMU is {_brief(inner[key])}, which is not supported; correct the samples by it, and write "
-                f"{np.asarray(neutral).tolist()}"
+    for key, (value, neutral) in unused.items():
+        if not _is_near(value, neutral):
+            raise given.error(
+                f"{key} of the IMU is {_brief(value)}, which is not supported; correct the samples by it, and write "
+                f"{np.asarray(neutral).tolist()}, or calibrate with --imu-models calibrated"
             )
-    for key in ("gyroscopes", "accelerometers"):
-        if isinstance(inner.get(key), dict) and not _is_near(inner[key].get("M"), np.eye(3)):
-            raise CalibrationError(
-                f"{where}: {key}: M of the IMU is {_brief(inner[key].get('M'))}, which is not supported; correct the samples by it, "
-                "or calibrate with --imu-models calibrated"
-            )
-    for name, value in given.items():
+    for name, value in used.items():
         if not 0 < value < 10:
-            raise CalibrationError(
-                f"{where}: {_NOISE_KEYS[name]} is {value}; noise densities in SI units are small and positive"
-            )
-    return ImuNoise(**given)
+            fault = f"{_NOISE_KEYS[name]} is {value}; noise densities in SI units are small and positive"
+            raise given.error(fault)
+    return ImuNoise(**used)
 
 
 def _is_near(value: object, wanted: Any) -> bool:
@@ -467,33 +452,18 @@ def _is_near(value: object, wanted: Any) -> bool:
     return found.shape == np.shape(wanted) and bool(np.allclose(found, np.asarray(wanted), atol=1e-3))
 
 
-def _numbers(value: object, count: int | None, where: str) -> Array:
-    data: Any = value.get("data") if isinstance(value, dict) else value  # OpenCV's and ROS's {rows, cols, data}
-    try:
-        if isinstance(data, str) or any(isinstance(v, bool) for v in data):
-            raise ValueError
-        numbers = np.array([float(v) for v in data], np.float64)  # YAML 1.1 reads 1e-5 as text
-    except (TypeError, ValueError, OverflowError):
-        raise CalibrationError(f"{where}: {_brief(value)} are not numbers") from None
-    if (count is not None and len(numbers) != count) or not np.isfinite(numbers).all():
-        raise CalibrationError(f"{where}: {_brief(value)}; {count or 'finite'} numbers are expected")
-    return numbers
+class _RepeatedKeyError(ValueError):
+    """A repeated key, which is the message."""
 
 
-def _need(values: Values, key: str, where: str) -> Any:
-    if key not in values:
-        none = "; images without distortion have distortion_model: none" if key.startswith("distortion") else ""
-        raise CalibrationError(f"{where}: {key} is missing; it holds {', '.join(map(str, values))[:200]}{none}")
-    return values[key]
+class _Loader(_SAFE_LOADER):  # type: ignore[misc]
+    """Refuses repeated keys in a mapping; YAML's own loader takes the last."""
 
-
-def _section(values: Values, name: str, where: str) -> Values:
-    section = values[name]
-    if not isinstance(section, dict):
-        raise CalibrationError(
-            f"{where}: {name} is {_brief(section)}; a mapping with camera_model, intrinsics, ... is expected"
-        )
-    return section
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        keys = Counter(key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode))
+        if repeated := [key for key, count in keys.items() if count > 1]:
+            raise _RepeatedKeyError(_brief(repeated[0]))
+        return dict(super().construct_mapping(node, deep))
 
 
 def _brief(value: object) -> str:
@@ -506,7 +476,7 @@ def _read(path: Path) -> str:
     return read_text(path, expected, most_bytes=MAX_CALIBRATION_BYTES, error_type=CalibrationError)
 
 
-def _parse_yaml(text: str, where: str) -> Values:
+def _parse_yaml(text: str, where: str) -> dict[str, Any]:
     if len(text) > MAX_CALIBRATION_BYTES:
         raise CalibrationError(f"{where} has more than {MAX_CALIBRATION_BYTES} bytes; a calibration has a few thousand")
     lines = text.replace("!!opencv-matrix", "").splitlines()

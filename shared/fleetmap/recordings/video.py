@@ -10,9 +10,10 @@ import hashlib
 import re
 import struct
 from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -25,9 +26,6 @@ from fleetmap.recordings.limits import MAX_PIXELS, MAX_VIDEO_TABLE_BYTES
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS, ReadLog
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.samples import Image
-
-if TYPE_CHECKING:
-    import av
 
 SUFFIXES = (".mp4", ".m4v", ".mov")
 _PLANES = ("yuv4", "yuvj4", "nv12", "nv21", "gray")  # pixel formats whose first plane is luma
@@ -69,8 +67,8 @@ class VideoReader:
 
     def __init__(self, read_files: Sequence[Path], keys: Sequence[int]) -> None:
         self._read_files, self._keys = read_files, keys
-        self._video: _Video | None = None
-        self._is_closed = False
+        self._open: tuple[Any, Any] | None = None  # container and stream
+        self._files, self._is_closed = ExitStack(), False
         self._decoded: Iterator[Any] = iter(())
         self._last: Any = None
 
@@ -91,16 +89,14 @@ class VideoReader:
             hash_file(path, digest)
 
     def close(self) -> None:
-        if self._video is not None:
-            self._video.close()
-        self._video, self._last, self._is_closed = None, None, True
+        self._files.close()
+        self._open, self._last, self._is_closed = None, None, True
 
     def _at(self, wanted: int, stamp_ns: int) -> Any:
         where = f"{self._read_files[0]}: the frame at {stamp_ns}"
         if self._is_closed:
-            raise RecordingError(
-                f"{where} was asked for after the recording was closed; keep it open while frames are read"
-            )
+            closed = "was asked for after the recording was closed; keep it open while frames are read"
+            raise RecordingError(f"{where} {closed}")
         if self._last is None or self._last.pts != wanted:
             try:
                 self._last = self._decode(wanted)
@@ -113,61 +109,41 @@ class VideoReader:
 
     def _decode(self, wanted: int) -> Any:
         """Decode the frame of that time; None if absent."""
-        if self._video is None:
-            self._video = _opened(self._read_files[0])
-        container, stream, _ = self._video
+        if self._open is None:
+            self._open = _opened(self._read_files[0], self._files)
+        container, stream = self._open
         last = -1 if self._last is None else self._last.pts
         if not (last < wanted and bisect.bisect(self._keys, last) == bisect.bisect(self._keys, wanted) > 0):
             container.seek(wanted, stream=stream)
             self._decoded = iter(container.decode(stream))
-        for frame in self._decoded:
-            if frame.pts is not None and frame.pts >= wanted:
-                return frame if frame.pts == wanted else None
-        return None
+        found = next((frame for frame in self._decoded if frame.pts is not None and frame.pts >= wanted), None)
+        return found if found is not None and found.pts == wanted else None
 
 
-class _Video(NamedTuple):
-    """An open video and its file."""
-
-    container: "av.container.InputContainer"
-    stream: "av.VideoStream"
-    file: BinaryIO
-
-    def close(self) -> None:
-        """Close both."""
-        self.container.close()
-        self.file.close()
-
-
-def _opened(path: Path) -> _Video:
-    """Open the file with MP4's demuxer, which gets bytes and no path that it could follow."""
+def _opened(path: Path, files: ExitStack) -> tuple[Any, Any]:
+    """Container and stream by MP4's demuxer, which gets bytes and no path that it could follow; files: closes them."""
     try:
         import av
     except ImportError as error:
-        raise RecordingError(
-            f"{path} needs another library: pip install '.[video]' in fleetmap's source folder"
-        ) from error
-    file = path.open("rb")
-    try:
-        _check_tables(path, file)
-        container = av.open(file, mode="r", format="mp4")
-    except RecordingError:
-        file.close()
-        raise
-    except _errors() as error:
-        file.close()
-        raise _no_video(path) from error
-    streams = container.streams.video
-    codec = streams[0].codec_context if streams else None
-    if codec is not None and codec.width * codec.height <= MAX_PIXELS:
-        codec.options = {"max_pixels": str(MAX_PIXELS)}
-        return _Video(container, streams[0], file)
-    problem = "it holds no pictures" if not streams else "its codec is not known"
-    if codec is not None:
-        problem = f"pictures of {codec.width}x{codec.height} are larger than the limit of {MAX_PIXELS} pixels"
-    container.close()
-    file.close()
-    raise RecordingError(f"{path} cannot be read as a video: {problem}; {_conversion(path)}")
+        install = "pip install '.[video]' in fleetmap's source folder"
+        raise RecordingError(f"{path} needs another library: {install}") from error
+    with ExitStack() as opened:
+        file = opened.enter_context(path.open("rb"))
+        try:
+            _check_tables(path, file)
+            container = opened.enter_context(av.open(file, mode="r", format="mp4"))
+        except _errors() as error:
+            raise _no_video(path) from error
+        stream = next(iter(container.streams.video), None)
+        codec = stream.codec_context if stream else None
+        problem = "its codec is not known" if stream else "it holds no pictures"
+        if codec is not None and codec.width * codec.height > MAX_PIXELS:
+            problem = f"pictures of {codec.width}x{codec.height} are larger than the limit of {MAX_PIXELS} pixels"
+        elif codec is not None:
+            codec.options = {"max_pixels": str(MAX_PIXELS)}
+            files.push(opened.pop_all())
+            return container, stream
+        raise RecordingError(f"{path} cannot be read as a video: {problem}; {_conversion(path)}")
 
 
 def _check_tables(path: Path, file: BinaryIO) -> None:
@@ -184,9 +160,8 @@ def _check_tables(path: Path, file: BinaryIO) -> None:
         length = min(length if length >= _BOX.size else size, size - at)
         if kind not in _NO_TABLES:
             if length > MAX_VIDEO_TABLE_BYTES:
-                raise RecordingError(
-                    f"{path}: a table of {length} bytes; the limit is {MAX_VIDEO_TABLE_BYTES}. {_conversion(path)}"
-                )
+                limit = f"a table of {length} bytes; the limit is {MAX_VIDEO_TABLE_BYTES}"
+                raise RecordingError(f"{path}: {limit}. {_conversion(path)}")
             content = file.read(length)
             told += sum(int.from_bytes(found[1] or found[2], "big") for found in _COUNTS.finditer(content))
             told += size * (b"cmov" in content)  # compressed tables
@@ -197,9 +172,12 @@ def _check_tables(path: Path, file: BinaryIO) -> None:
 
 
 def _conversion(path: Path) -> str:
-    return (
-        f"copy it again, or make one that can be read with `ffmpeg -i {path} -c:v libx264 -crf 12 {path.stem}-new.mp4`"
-    )
+    command = f"ffmpeg -i {path} -c:v libx264 -crf 12 {path.stem}-new.mp4"
+    return f"copy it again, or make one that can be read with `{command}`"
+
+
+def _no_video(path: Path) -> RecordingError:
+    return RecordingError(f"{path} cannot be read as a video (no MP4, cut off or damaged); {_conversion(path)}")
 
 
 def _errors() -> tuple[type[Exception], ...]:
@@ -211,32 +189,25 @@ def _errors() -> tuple[type[Exception], ...]:
 
 def _index(path: Path, log: ReadLog) -> tuple[ImageSeries[int], list[int]]:
     """Index the frames by the container's packets, and the times of its key frames; RecordingError if there are none."""
-    video = _opened(path)
-    try:
-        container, stream, _ = video
-        packets = [(p.pts, p.is_keyframe) for p in container.demux(stream) if p.size and not p.is_discard]
-        told, unit = stream.frames, stream.time_base
-    except _errors() as error:
-        raise _no_video(path) from error
-    finally:
-        video.close()
-    stamped = {pts: is_key for pts, is_key in packets if pts is not None}
-    if not stamped or unit is None:
+    with ExitStack() as files:
+        container, stream = _opened(path, files)
+        try:
+            packets = [(p.pts, p.is_keyframe) for p in container.demux(stream) if p.size and not p.is_discard]
+            told, unit = stream.frames, stream.time_base
+        except _errors() as error:
+            raise _no_video(path) from error
+    pts = tuple(sorted({time for time, _ in packets if time is not None}))
+    if not pts or unit is None:
         raise RecordingError(f"{path} holds no frame; {_conversion(path)}")
-    if len(stamped) < len(packets):
-        log.note("frames without a stamp of their own", f"{len(packets) - len(stamped)} of {len(packets)} left out")
+    if len(pts) < len(packets):
+        log.note("frames without a stamp of their own", f"{len(packets) - len(pts)} of {len(packets)} left out")
     if told > len(packets):
         log.note("the video ends early", f"{len(packets)} of {told} frames are there")
-    pts = tuple(sorted(stamped))
-    stamps_ns = np.array([round(p * unit * 1_000_000_000) for p in pts], np.int64)
+    stamps_ns = np.array([round(time * unit * 1_000_000_000) for time in pts], np.int64)
     steps_ms = np.diff(stamps_ns) * 1e-6
     if len(steps_ms) and steps_ms.max() > _UNEVEN * np.median(steps_ms):
         log.note("variable frame rate", f"steps of {steps_ms.min():.1f} to {steps_ms.max():.1f} ms")
     return ImageSeries(stamps_ns, pts), sorted(time for time, is_key in packets if is_key and time is not None)
-
-
-def _no_video(path: Path) -> RecordingError:
-    return RecordingError(f"{path} cannot be read as a video (no MP4, cut off or damaged); {_conversion(path)}")
 
 
 def _luma(frame: Any) -> Image:

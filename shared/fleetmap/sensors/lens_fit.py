@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.calibration import CameraCalibration, Polygon, RigCalibration, hidden_pixels
-from fleetmap.sensors.cameras.spheres import LENSES
+from fleetmap.sensors.cameras import LENSES
 from fleetmap.sensors.samples import CameraFrame, Image, Stamps
 
 _CORNERS, _LEAST_POINTS, _LEAST_ALL, _LEAST_MOTION_PX = 300, 20, 150, 1.0

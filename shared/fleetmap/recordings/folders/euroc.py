@@ -10,7 +10,6 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.recordings.calibration_files import (
     calibration_files,
     load_calibration,
-    matrix_4x4,
     read_euroc_camera,
     read_euroc_imu,
     read_yaml,
@@ -95,8 +94,8 @@ def _ground_truth(root: Path, euroc_from_imu: Array, log: ReadLog) -> Trajectory
     if file is None or trajectory is None:
         return None
     sensor_file = file.with_name("sensor.yaml")
-    sensor = read_yaml(sensor_file) if sensor_file.is_file() else {}
-    euroc_from_sensor = matrix_4x4(sensor["T_BS"], f"{sensor_file}: T_BS") if "T_BS" in sensor else np.eye(4)
+    sensor = read_yaml(sensor_file) if sensor_file.is_file() else None
+    euroc_from_sensor = sensor.matrix("T_BS") if sensor and "T_BS" in sensor else np.eye(4)
     imu_from_sensor = se3_inverse(euroc_from_imu) @ euroc_from_sensor
     if np.array_equal(imu_from_sensor, np.eye(4)):
         return trajectory
