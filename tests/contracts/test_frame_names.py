@@ -16,7 +16,6 @@ ALLOWED = {
     "shared/fleetmap/recordings/bags/decoders.py": {
         "pose"
     },  # the decoder of PoseStamped, beside those of image and imu
-    "shared/fleetmap/recordings/bags/foxglove.py": {"pose"},
 }
 # Products are checked where both names say one of the project's own frames; others may be the same by another name.
 KNOWN = {"map", "survey", "odom", "body", "base", "cam"}

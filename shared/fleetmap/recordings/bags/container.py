@@ -3,8 +3,8 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
+from fleetmap.recordings.limits import KeptBytes
 from fleetmap.sensors.samples import DataIssue
 
 CALIBRATION_ATTACHMENT = "calibration.yaml"
@@ -25,26 +25,29 @@ class Channel:
 Message = tuple[Channel, int, Place, memoryview]
 
 
-class Container(Protocol):
-    """An open recording of messages. path: named in errors; files: covered by its hash; name: its own name, or empty."""
+class Container(KeptBytes):
+    """Base of the open files of a recording of messages. files: covered by its hash; name: its own name, or empty."""
 
-    path: Path
-    files: Sequence[Path]
-    name: str
-    attachments: dict[str, bytes]
-    issues: list[DataIssue]
+    def __init__(self, files: Sequence[Path]) -> None:
+        super().__init__(files[0], sum(file.stat().st_size for file in files))
+        self.files, self.name = files, ""
+        self.attachments: dict[str, bytes] = {}
+        self.issues: list[DataIssue] = []
 
     def messages(self) -> Iterator[Message]:
         """Yield channel, log time in ns, place and bytes of every complete message, in the order of writing.
 
         After that, name, attachments and issues (unreadable parts) are complete.
         """
-
-    def keep(self, size: int) -> None:
-        """See `KeptBytes`."""
+        raise NotImplementedError
 
     def read(self, place: Place) -> bytes:
         """Read one message again; ValueError if it is damaged, RecordingError if the file has changed."""
+        raise NotImplementedError
 
     def close(self) -> None:
         """Close the files."""
+
+    def note(self, what: str, detail: str) -> None:
+        """Note an unreadable part."""
+        self.issues.append(DataIssue(what, detail))

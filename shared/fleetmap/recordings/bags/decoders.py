@@ -1,104 +1,85 @@
-"""Decoding of the messages of one channel: ROS 2's CDR, ROS 1 converted to it, Foxglove's protobuf."""
+"""From the bytes of a message to its value: ROS 2's CDR, ROS 1 converted to it, Foxglove's protobuf.
+
+Foxglove has no inertial message; the convention here is any message on the IMU topic with the fields `timestamp`
+(google.protobuf.Timestamp), `frame_id`, `angular_velocity` {x y z} in rad/s and `linear_acceleration` {x y z} in
+m/s^2, of one of IMU_TYPES. Wheel odometry and priors have no convention in protobuf and are read from ROS 2 messages only.
+"""
 
 import struct
-from collections.abc import Sequence
-from functools import cache
+from collections.abc import Callable, Sequence
+from functools import cache, lru_cache, partial
 from typing import Any
+
+import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array
 from fleetmap.recordings.bags.container import Channel
-from fleetmap.recordings.bags.foxglove import FoxgloveDecoder
 from fleetmap.recordings.images import StoredImage
-from fleetmap.recordings.ros2 import messages as ros_messages
+from fleetmap.recordings.ros2 import messages as ros
 from fleetmap.recordings.ros2.cdr import CdrReader
-from fleetmap.recordings.ros2.messages import CameraInfo, FrameLink
-from fleetmap.sensors.samples import PositionPrior, Stamps, WheelSample
+from fleetmap.sensors.samples import Stamps
+
+ENCODINGS = ("cdr", "ros1", "protobuf")
+IMU_TYPES = ("sensor_msgs/Imu", "foxglove.Imu", "foxglove.IMU", "fleetmap.Imu")
+UNDECODABLE = (ValueError, AttributeError)  # the second: a field that a schema in the file lacks
 
 
-class RosDecoder:
-    """ROS 2 messages in CDR. Methods raise ValueError for invalid messages."""
+def decode(channel: Channel, data: bytes) -> Any:
+    """The value of a message, by its type: StoredImage, CameraInfo, WheelSample, PositionPrior, stamp and pose, or FrameLinks.
 
-    def __init__(self, channel: Channel) -> None:
-        self.channel = channel
+    As `decode_imu` of one message for an Imu. UNDECODABLE for invalid messages; RecordingError if a library is missing.
+    """
+    if channel.type_name in IMU_TYPES:
+        return decode_imu(channel, [data])
+    values, message_of = (_FOXGLOVE, _parsed) if channel.encoding == "protobuf" else (_ROS, _cdr)
+    if channel.type_name not in values:
+        raise ValueError(f"{channel.type_name} is not known in {channel.encoding}")
+    return values[channel.type_name](message_of(channel, data))
 
-    def cdr(self, data: bytes) -> bytes:
-        """The message in CDR."""
-        return data
 
-    def stamp_ns(self, data: bytes) -> int:
-        """Stamp of the measurement, from the message's header; 0 where the sender set none."""
+def decode_imu(channel: Channel, messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
+    """Stamps (N,), gyro (N, 3), accelerometer (N, 3), frame of the sensor. Errors as of `decode`, for any of the messages."""
+    if channel.encoding != "protobuf":
+        return ros.decode_imu([_cdr(channel, data) for data in messages])
+    found = [_parsed(channel, data) for data in messages]
+    gyro, accel = ([_xyz(getattr(m, name)) for m in found] for name in ("angular_velocity", "linear_acceleration"))
+    stamps_ns = np.array([_stamp_ns(message) for message in found], np.int64)
+    return stamps_ns, np.array(gyro), np.array(accel), str(getattr(found[0], "frame_id", ""))
+
+
+def stamp_of(channel: Channel, data: bytes) -> int:
+    """Stamp of a message with a header, 0 where the sender set none; UNDECODABLE without one."""
+    if channel.encoding == "protobuf":
+        return _stamp_ns(_parsed(channel, data))
+    if channel.encoding == "cdr":
         return CdrReader(data[:16]).stamp_ns()
-
-    def image(self, data: bytes, where: str) -> StoredImage:
-        """Image or CompressedImage, still encoded."""
-        if self.channel.type_name.endswith("CompressedImage"):
-            return ros_messages.decode_compressed_image(self.cdr(data), where)
-        return ros_messages.decode_image(self.cdr(data), where)
-
-    def imu(self, messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
-        """Stamps (N,), gyro (N, 3), accelerometer (N, 3), frame of the sensor."""
-        return ros_messages.decode_imu([self.cdr(data) for data in messages])
-
-    def pose(self, data: bytes) -> tuple[int, Array]:
-        """Stamp and x y z qw qx qy qz (7,) of a PoseStamped."""
-        return ros_messages.decode_pose(self.cdr(data))
-
-    def links(self, data: bytes) -> list[FrameLink]:
-        """Transforms between named frames, of a TFMessage."""
-        return ros_messages.decode_frame_links(self.cdr(data))
-
-    def camera_info(self, data: bytes) -> CameraInfo:
-        return ros_messages.decode_camera_info(self.cdr(data))
-
-    def wheel(self, data: bytes) -> WheelSample:
-        return ros_messages.decode_odometry(self.cdr(data))
-
-    def prior(self, data: bytes) -> PositionPrior:
-        return ros_messages.decode_prior(self.cdr(data))
+    if len(data) < 12:
+        raise ValueError(f"a message of {len(data)} bytes has no header")
+    seconds, nanoseconds = struct.unpack_from("<II", data, 4)  # behind its sequence number
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
-class Ros1Decoder(RosDecoder):
-    """ROS 1 messages, which rosbags turns into CDR."""
+def _cdr(channel: Channel, data: bytes) -> bytes:
+    if channel.encoding == "cdr":
+        return data
+    store = _ros1_store("ROS2_JAZZY")
+    from rosbags.serde import SerdeError
 
-    def cdr(self, data: bytes) -> bytes:
-        from rosbags.serde import SerdeError
-
-        name = self.channel.type_name
-        try:
-            # By ROS 2's definitions: among the types decoded here only the header differs, which rosbags handles
-            return bytes(_store("ROS2_JAZZY").ros1_to_cdr(data, name.replace("/", "/msg/")))
-        except (SerdeError, struct.error, ArithmeticError, LookupError, MemoryError) as error:
-            raise ValueError(f"the {len(data)} bytes are not a valid {name}") from error
-
-    def stamp_ns(self, data: bytes) -> int:
-        """From the message's header, behind its sequence number."""
-        if len(data) < 12:
-            raise ValueError(f"a message of {len(data)} bytes has no header")
-        seconds, nanoseconds = struct.unpack_from("<II", data, 4)
-        return int(seconds) * 1_000_000_000 + int(nanoseconds)
-
-
-Decoder = RosDecoder | FoxgloveDecoder
-_DECODERS: dict[str, type[Decoder]] = {"cdr": RosDecoder, "ros1": Ros1Decoder, "protobuf": FoxgloveDecoder}
-ENCODINGS = tuple(_DECODERS)
-
-
-def decoder_of(channel: Channel) -> Decoder:
-    """Create the decoder of a channel with one of ENCODINGS; RecordingError if a library is missing."""
-    if channel.encoding == "ros1":
-        _store("ROS2_JAZZY")
-    return _DECODERS[channel.encoding](channel)
+    try:
+        # By ROS 2's definitions: among the types decoded here only the header differs, which rosbags handles
+        return bytes(store.ros1_to_cdr(data, channel.type_name.replace("/", "/msg/")))
+    except (SerdeError, struct.error, ArithmeticError, LookupError, MemoryError) as error:
+        raise ValueError(f"the {len(data)} bytes are not a valid {channel.type_name}") from error
 
 
 @cache
-def _store(name: str) -> Any:
+def _ros1_store(name: str) -> Any:
     try:
         from rosbags.typesys import Stores, get_types_from_msg, get_typestore
     except ImportError as error:
-        raise RecordingError(
-            "ROS 1 messages need another library: pip install '.[bags]' in fleetmap's source folder"
-        ) from error
+        install = "pip install '.[bags]' in fleetmap's source folder"
+        raise RecordingError(f"ROS 1 messages need another library: {install}") from error
     store = get_typestore(Stores[name])
     if name == "ROS1_NOETIC":  # missing in rosbags
         store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
@@ -108,4 +89,82 @@ def _store(name: str) -> Any:
 @cache
 def ros1_digest(type_name: str) -> str:
     """ROS 1's MD5 of the definition of a type decoded here, such as sensor_msgs/Imu."""
-    return str(_store("ROS1_NOETIC").generate_msgdef(type_name.replace("/", "/msg/"))[1])
+    return str(_ros1_store("ROS1_NOETIC").generate_msgdef(type_name.replace("/", "/msg/"))[1])
+
+
+def _parsed(channel: Channel, data: bytes) -> Any:
+    """A message of Foxglove's, by the descriptors that the file contains; ValueError for invalid bytes."""
+    try:
+        from google.protobuf.message import DecodeError  # type: ignore[import-untyped]
+    except ImportError as error:
+        library = "which needs another library: pip install protobuf"
+        raise RecordingError(f"{channel.topic} is in protobuf ({channel.type_name}), {library}") from error
+    try:
+        message = _message_class(channel)()
+        message.ParseFromString(data)
+    except (DecodeError, KeyError, TypeError) as error:
+        raise ValueError(f"{len(data)} bytes are not a valid {channel.type_name}, or its schema is damaged") from error
+    return message
+
+
+@lru_cache(100)
+def _message_class(channel: Channel) -> Any:
+    from google.protobuf.descriptor_pb2 import FileDescriptorSet  # type: ignore[import-untyped]
+    from google.protobuf.descriptor_pool import DescriptorPool  # type: ignore[import-untyped]
+    from google.protobuf.message_factory import GetMessageClass  # type: ignore[import-untyped]
+
+    pool = DescriptorPool()
+    for file in FileDescriptorSet.FromString(channel.schema).file:
+        pool.Add(file)
+    return GetMessageClass(pool.FindMessageTypeByName(channel.type_name))
+
+
+def _stamp_ns(message: Any) -> int:
+    stamp = int(message.timestamp.seconds) * 1_000_000_000 + int(message.timestamp.nanos)
+    if abs(stamp) >= 2**63:
+        raise ValueError(f"a stamp of {message.timestamp.seconds} s is beyond 64 bits of nanoseconds")
+    return stamp
+
+
+def _camera_info(m: Any) -> ros.CameraInfo:
+    if len(m.K) != 9:
+        raise ValueError(f"CameraCalibration with {len(m.K)} numbers in K")
+    matrix = np.array(m.K).reshape(3, 3)
+    rect = np.array(m.R).reshape(3, 3) if len(m.R) == 9 else np.eye(3)
+    projection = np.array(m.P).reshape(3, 4) if len(m.P) == 12 else np.pad(matrix, ((0, 0), (0, 1)))
+    lens = m.distortion_model, np.array(m.D)
+    return ros.CameraInfo(m.frame_id, m.width, m.height, *lens, matrix, rect, projection, stamp_ns=_stamp_ns(m))
+
+
+def _links(items: Sequence[Any]) -> list[ros.FrameLink]:
+    return [
+        ros.frame_link(t.parent_frame_id, t.child_frame_id, np.array(_xyz(t.translation)), np.array(_wxyz(t.rotation)))
+        for t in items
+    ]
+
+
+def _xyz(vector: Any) -> tuple[float, float, float]:
+    return vector.x, vector.y, vector.z
+
+
+def _wxyz(quaternion: Any) -> tuple[float, float, float, float]:
+    return quaternion.w, quaternion.x, quaternion.y, quaternion.z
+
+
+_ROS: dict[str, Callable[[Any], Any]] = {
+    "sensor_msgs/Image": partial(ros.decode_image, where=""),
+    "sensor_msgs/CompressedImage": partial(ros.decode_compressed_image, where=""),
+    "sensor_msgs/CameraInfo": ros.decode_camera_info,
+    "nav_msgs/Odometry": ros.decode_odometry,
+    "geometry_msgs/PoseWithCovarianceStamped": ros.decode_prior,
+    "geometry_msgs/PoseStamped": ros.decode_pose,
+    "tf2_msgs/TFMessage": ros.decode_frame_links,
+}
+_FOXGLOVE: dict[str, Callable[[Any], Any]] = {
+    "foxglove.RawImage": lambda m: StoredImage(m.encoding, m.data, "", m.width, m.height, m.step),
+    "foxglove.CompressedImage": lambda m: StoredImage("file", m.data, "", form=m.format),
+    "foxglove.CameraCalibration": _camera_info,
+    "foxglove.PoseInFrame": lambda m: (_stamp_ns(m), np.array([*_xyz(m.pose.position), *_wxyz(m.pose.orientation)])),
+    "foxglove.FrameTransform": lambda m: _links([m]),
+    "foxglove.FrameTransforms": lambda m: _links(m.transforms),
+}

@@ -4,7 +4,7 @@ Files may be hostile: the sizes of an index and of an unpacked chunk are limited
 """
 
 import struct
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import cache, partial
 from io import BufferedReader, FileIO
 from itertools import islice
@@ -12,14 +12,13 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings.bags.container import Channel, Message, Place
+from fleetmap.recordings.bags.container import Channel, Container, Message, Place
 from fleetmap.recordings.bags.decoders import ros1_digest
 from fleetmap.recordings.bags.streams import open_messages
-from fleetmap.recordings.bags.topics import KNOWN_TYPES, video_issues
+from fleetmap.recordings.bags.topics import KNOWN_TYPES, note_videos
 from fleetmap.recordings.files import file_head
-from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, KeptBytes
+from fleetmap.recordings.limits import MAX_MESSAGE_BYTES
 from fleetmap.recordings.recording import OpenOptions, Recording
-from fleetmap.sensors.samples import DataIssue
 
 _MAGIC = b"#ROSBAG V"
 _ADVICE = {"not indexed": "rosbag reindex", "encryption": "rosbag decrypt", "Compression": "rosbag decompress"}
@@ -37,15 +36,11 @@ def open_bag(path: Path, options: OpenOptions) -> Recording:
     return open_messages(path, "rosbag1", partial(BagFile, path), options)
 
 
-class BagFile(KeptBytes):
+class BagFile(Container):
     """An open bag as a Container. A place: connection, log time in ns, index among its messages at that time."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, path.stat().st_size)
-        self.files: Sequence[Path] = (path,)
-        self.name = ""
-        self.attachments: dict[str, bytes] = {}
-        self.issues: list[DataIssue] = []
+        super().__init__((path,))
         self._reader = _bounded_reader()(_BagPath(path))
         self._reader.file_bytes, self._reader.unpack = self.size, self.unpack
         try:
@@ -64,11 +59,11 @@ class BagFile(KeptBytes):
         strange = [c for c in known if c.digest not in ("*", ros1_digest(channels[c.id].type_name))]
         if strange:
             there = ", ".join(f"{c.topic} ({c.msgtype}, {c.digest})" for c in strange)
-            self.issues.append(DataIssue("messages of another definition than ROS's", f"{there} left out"))
+            self.note("messages of another definition than ROS's", f"{there} left out")
         if not known:
             there = ", ".join(f"{c.topic} ({c.msgtype})" for c in self._connections.values()) or "none"
-            self.issues.append(DataIssue("no topic of a known type", there[:500]))
-        self.issues += video_issues(channels.values())
+            self.note("no topic of a known type", there[:500])
+        note_videos(channels.values(), self)
         last: dict[int, tuple[int, int]] = {}
         wanted = [c for c in known if c not in strange]
         try:
@@ -79,8 +74,7 @@ class BagFile(KeptBytes):
                 found = memoryview(self.unpack("", data))  # an index may count a message again and again
                 yield channels[connection.id], stamp_ns, (connection.id, stamp_ns, count), found
         except (self._reader.error, *_DAMAGED) as error:
-            reason = _reason(error, self.path)
-            self.issues.append(DataIssue("the bag is damaged", f"what follows is not read: {reason}"))
+            self.note("the bag is damaged", f"what follows is not read: {_reason(error, self.path)}")
 
     def read(self, place: Place) -> bytes:
         number, stamp_ns, count = place

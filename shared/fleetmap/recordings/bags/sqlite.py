@@ -11,12 +11,11 @@ from functools import partial
 from pathlib import Path
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings.bags.container import Channel, Message, Place
+from fleetmap.recordings.bags.container import Channel, Container, Message, Place
 from fleetmap.recordings.bags.streams import open_messages
 from fleetmap.recordings.files import file_head, natural_key, what_file_instead
-from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, KeptBytes, unpack_message
+from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, unpack_message
 from fleetmap.recordings.recording import OpenOptions, Recording
-from fleetmap.sensors.samples import DataIssue
 
 _MAGIC = b"SQLite format 3\0"
 _PACKED = ".db3.zstd"
@@ -42,15 +41,11 @@ def open_sqlite(path: Path, options: OpenOptions) -> Recording:
     return open_messages(path, "rosbag2-sqlite", partial(SqliteFiles, tuple(files)), options)
 
 
-class SqliteFiles(KeptBytes):
+class SqliteFiles(Container):
     """Open .db3 files of one recording, in the order of their names, as a Container. A place: number of the file, row, 0."""
 
     def __init__(self, files: Sequence[Path]) -> None:
-        super().__init__(files[0], sum(file.stat().st_size for file in files))
-        self.files = files
-        self.name = ""
-        self.attachments: dict[str, bytes] = {}
-        self.issues: list[DataIssue] = []
+        super().__init__(files)
         self._databases: list[sqlite3.Connection] = []
         try:
             for file in files:
@@ -65,7 +60,7 @@ class SqliteFiles(KeptBytes):
         for number, (file, database) in enumerate(zip(self.files, self._databases, strict=True)):
             if file.with_name(f"{file.name}-wal").exists():
                 how = f"`sqlite3 {file} 'PRAGMA wal_checkpoint'` merges them"
-                self._note("the recorder was stopped hard", f"messages in {file.name}-wal are not read; {how}")
+                self.note("the recorder was stopped hard", f"messages in {file.name}-wal are not read; {how}")
             try:
                 topics = {}
                 for key, *names in database.execute(_TOPICS):
@@ -77,7 +72,7 @@ class SqliteFiles(KeptBytes):
             except (sqlite3.Error, UnicodeDecodeError) as error:
                 too_big = f"a value is too big, {MAX_MESSAGE_BYTES} bytes are the limit; "
                 fault = too_big if "too big" in str(error) else ""
-                self._note(f"{file.name} is damaged", f"{fault}what follows is not read; {_recovery(file)}")
+                self.note(f"{file.name} is damaged", f"{fault}what follows is not read; {_recovery(file)}")
 
     def _rows(self, number: int, topics: Mapping[object, Channel]) -> Iterator[Message]:
         odd = 0
@@ -93,7 +88,7 @@ class SqliteFiles(KeptBytes):
             except ValueError:
                 odd += 1
         if odd:
-            self._note(f"{self.files[number].name}: damaged messages", f"{odd} rows left out")
+            self.note(f"{self.files[number].name}: damaged messages", f"{odd} rows left out")
 
     def read(self, place: Place) -> bytes:
         number, row, _ = place
@@ -111,9 +106,6 @@ class SqliteFiles(KeptBytes):
     def close(self) -> None:
         for database in self._databases:
             database.close()
-
-    def _note(self, what: str, detail: str) -> None:
-        self.issues.append(DataIssue(what, detail))
 
 
 def _opened(file: Path) -> sqlite3.Connection:

@@ -5,8 +5,9 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import TypeVar
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -25,15 +26,16 @@ from fleetmap.recordings.bags.calibration import (
     setting_of,
 )
 from fleetmap.recordings.bags.container import CALIBRATION_ATTACHMENT, Channel, Container, Place
-from fleetmap.recordings.bags.decoders import ENCODINGS, Decoder, decoder_of
+from fleetmap.recordings.bags.decoders import ENCODINGS, UNDECODABLE, decode, decode_imu, stamp_of
 from fleetmap.recordings.bags.topics import (
     IMAGE_TYPES,
     INFO_TYPES,
     KNOWN_TYPES,
+    TF_TYPES,
     choose_topics,
     info_topics,
+    note_videos,
     transports,
-    video_issues,
 )
 from fleetmap.recordings.calibration_files import CalibrationFile, parse_calibration
 from fleetmap.recordings.files import hash_file
@@ -62,21 +64,18 @@ _HEADER_BYTES = (
     12  # CDR's head and a stamp, or ROS 1's sequence number and stamp: the difference between messages of equal content
 )
 _RECTIFIED = re.compile(r"(?<![a-z])(rect(?![a-z])|rectified)")  # image_rect, rect/image; not direct, image_unrect
-_UNDECODABLE = (ValueError, AttributeError)  # the second: a field that a schema in the file lacks
-V = TypeVar("V")
-Sample = TypeVar("Sample", WheelSample, PositionPrior)
-_Source = tuple[Decoder, Place]
+_Source = tuple[Channel, Place]
 _Images = ImageSeries[_Source]
 
 
-@dataclass
+@dataclass(eq=False)
 class _Stream:
     """The messages of one channel with their log times: images by their place and size, everything else by its bytes.
 
     damaged: number of messages left out; why_damaged: the reason for the first image.
     """
 
-    decoder: Decoder
+    channel: Channel
     log_times_ns: list[int] = field(default_factory=list)
     stamps_ns: list[int] = field(default_factory=list)
     places: list[Place] = field(default_factory=list)
@@ -87,20 +86,17 @@ class _Stream:
     why_damaged: str = ""
 
     @property
-    def channel(self) -> Channel:
-        return self.decoder.channel
-
-    @property
     def is_of_images(self) -> bool:
         return self.channel.type_name in IMAGE_TYPES
 
-    def values(self, decode: Callable[[bytes], V]) -> list[tuple[int, V]]:
+    @cached_property
+    def values(self) -> list[tuple[int, Any]]:
         """Log times and values of all messages that can be decoded; the others are counted."""
         found = []
         for log_time_ns, data in zip(self.log_times_ns, self.messages, strict=True):
             try:
-                found.append((log_time_ns, decode(data)))
-            except _UNDECODABLE:
+                found.append((log_time_ns, decode(self.channel, data)))
+            except UNDECODABLE:
                 self.damaged += 1
         return found
 
@@ -150,8 +146,8 @@ class MessageReader:
         self._is_closed = False
 
     def read(self, source: _Source, stamp_ns: int) -> StoredImage:
-        decoder, place = source
-        where = f"{self._read_files[0]}: {decoder.channel.topic} at {stamp_ns}"
+        channel, place = source
+        where = f"{self._read_files[0]}: {channel.topic} at {stamp_ns}"
         if self._is_closed:
             raise RecordingError(
                 f"{where} was asked for after the recording was closed; keep it open while frames are read"
@@ -159,8 +155,9 @@ class MessageReader:
         try:
             if self._container is None:
                 self._container = self._opener()
-            return decoder.image(self._container.read(place), where)
-        except _UNDECODABLE as error:
+            image: StoredImage = decode(channel, self._container.read(place))
+            return replace(image, where=where)
+        except UNDECODABLE as error:
             raise RecordingError(
                 f"{where}: {error}; the message is damaged, leave the frame out with --frames"
             ) from error
@@ -191,7 +188,8 @@ def _parts(
     log: ReadLog,
 ) -> RecordingParts:
     streams, others = _collect(container, options.topics, log)
-    log.issues += [*container.issues, *video_issues(others)]
+    log.issues += container.issues
+    note_videos(others, log)
     log.files[:0] = container.files
     channels = [stream.channel for stream in streams if stream.messages or stream.is_of_images]
     if not channels:
@@ -204,7 +202,7 @@ def _parts(
     topics = _with_hints(options.topics, given, {channel.topic for channel in channels})
     chosen = choose_topics(channels, topics, str(container.path), log)
     by_id = {stream.channel.id: stream for stream in streams}
-    roles = {role: [by_id[channel_id] for channel_id in ids] for role, ids in chosen.items()}
+    roles = {role: [by_id[channel.id] for channel in chosen[role]] for role in chosen}
     imu, imu_frame = _imu(roles.get("imu", ()), log)
     lenses: dict[str, _Lenses] = {}
     if given is None and CALIBRATION_ATTACHMENT not in container.attachments:
@@ -259,8 +257,8 @@ def _parts(
                 "images not used", f"{', '.join(beside)}: beside a depth camera as first view no other is used; {how}"
             )
         _note_unregistered(streams, roles, calibration.cameras[0], log)
-    wheel = _samples([v for s in roles.get("wheel", ()) for v in s.values(s.decoder.wheel)], "wheel odometry", log)
-    priors = _samples([v for s in roles.get("prior", ()) for v in s.values(s.decoder.prior)], "position priors", log)
+    wheel: tuple[WheelSample, ...] = _samples(roles.get("wheel", ()), "wheel odometry", log)
+    priors: tuple[PositionPrior, ...] = _samples(roles.get("prior", ()), "position priors", log)
     ground_truth = _ground_truth(roles.get("ground_truth", ()), log)
     for stream in streams:
         if stream.damaged and not stream.is_of_images:
@@ -282,12 +280,16 @@ def _collect(container: Container, topics: Topics, log: ReadLog) -> tuple[list[_
     streams: dict[int, _Stream] = {}
     unused: dict[int, Channel] = {}
     for channel, logged_ns, place, data in container.messages():
+        if channel.id in unused:
+            continue
         stream = streams.get(channel.id)
         if stream is None:
-            if channel.id in unused or not _may_be_needed(channel, topics):
+            is_known = channel.encoding in ENCODINGS and channel.type_name in KNOWN_TYPES
+            is_other_tf = channel.type_name in TF_TYPES and channel.topic != topics.tf_static
+            if is_other_tf or not is_known:
                 unused[channel.id] = channel
                 continue
-            stream = streams[channel.id] = _Stream(decoder_of(channel))
+            stream = streams[channel.id] = _Stream(channel)
         if stream.is_of_images:
             if not _takes_image(stream, bytes(data), f"{container.path}: {channel.topic}", log):
                 continue
@@ -302,20 +304,14 @@ def _collect(container: Container, topics: Topics, log: ReadLog) -> tuple[list[_
     return list(streams.values()), list(unused.values())
 
 
-def _may_be_needed(channel: Channel, topics: Topics) -> bool:
-    if channel.encoding not in ENCODINGS or channel.type_name not in KNOWN_TYPES:
-        return False
-    has_links = "Transform" in channel.type_name or channel.type_name.endswith("TFMessage")
-    return channel.topic == topics.tf_static or not has_links
-
-
 def _takes_image(stream: _Stream, data: bytes, topic: str, log: ReadLog) -> bool:
     """Add an image with stamp and size to the stream if it is whole and return True; else keep the reason."""
     stamp_ns = None
     try:
-        stamp_ns = stream.decoder.stamp_ns(data)
-        size_px = check_image(stream.decoder.image(data, f"{topic} at {stamp_ns}"))
-    except (*_UNDECODABLE, RecordingError) as error:
+        stamp_ns = stamp_of(stream.channel, data)
+        image: StoredImage = decode(stream.channel, data)
+        size_px = check_image(replace(image, where=f"{topic} at {stamp_ns}"))
+    except (*UNDECODABLE, RecordingError) as error:
         stream.damaged += 1
         why = str(error) if isinstance(error, RecordingError) else f"{topic}: {error}; the message is damaged"
         stream.why_damaged = stream.why_damaged or why
@@ -334,9 +330,9 @@ def _takes_lens(stream: _Stream, data: bytes) -> bool:
     if stream.lens is not None and data[_HEADER_BYTES:] == stream.messages[-1][_HEADER_BYTES:]:
         return False
     try:
-        info = stream.decoder.camera_info(data)
+        info: CameraInfo = decode(stream.channel, data)
         lens = info if info.matrix[0, 0] > 0 else None
-    except _UNDECODABLE:
+    except UNDECODABLE:
         lens = None
     if stream.lens is None:
         stream.messages, stream.log_times_ns = [], []
@@ -360,14 +356,10 @@ def _with_hints(topics: Topics, given: CalibrationFile | None, present: set[str]
 
 def _lenses(images: Sequence[_Stream], streams: Sequence[_Stream]) -> _Lenses:
     """CalibrationError if the number of lenses keeps growing, as with autofocus."""
-
-    def stamped(stream: _Stream) -> list[tuple[int, tuple[int, CameraInfo]]]:
-        return stream.values(lambda data: (stream.decoder.stamp_ns(data), stream.decoder.camera_info(data)))
-
-    told = [
-        (stamp_ns or log_time_ns, info)
+    told: list[tuple[int, CameraInfo]] = [
+        (info.stamp_ns or log_time_ns, info)
         for stream in streams
-        for log_time_ns, (stamp_ns, info) in stamped(stream)
+        for log_time_ns, info in stream.values
         if info.matrix[0, 0] > 0
     ]
     told.sort(key=lambda each: each[0])
@@ -399,29 +391,22 @@ def _images(streams: Sequence[_Stream], what: str, log: ReadLog, lenses: _Lenses
         if not len(stamps_ns):
             raise RecordingError(f"{why} (none of {damaged} {what} can be read)")
         log.note(f"{what} left out", f"{damaged} of {damaged + len(stamps_ns)}; the first: {why}")
-    sources = tuple((stream.decoder, place) for stream in streams for place in stream.places)
+    sources = tuple((stream.channel, place) for stream in streams for place in stream.places)
     stamps_ns, order = as_logged(stamps_ns, log_times_ns, what, log)
     kept = usual_size([size for stream in streams for size in stream.sizes_px], what, log)
-    if lenses is not None:
-        kept &= _of_usual_lens(lenses, what, log)
+    if lenses is not None and not (of_usual := np.asarray(lenses.numbers == lenses.usual)).all():
+        kept &= of_usual
+        log.note(
+            f"{what}: the CameraInfo changes",
+            f"{int((~of_usual).sum())} of {len(kept)} left out, which have {setting_of(lenses.infos[int(lenses.numbers[~of_usual][0])])}; "
+            f"{setting_of(lenses.infos[lenses.usual])} is used: keep zoom, focus, binning and roi as they are while you record",
+        )
     return ImageSeries(stamps_ns, sources).take(order[kept[order]]).forward(what, log)
 
 
-def _of_usual_lens(lenses: _Lenses, what: str, log: ReadLog) -> NDArray[np.bool_]:
-    """(N,) mask of the images with the most frequent lens; the others are noted in `log`."""
-    kept = np.asarray(lenses.numbers == lenses.usual)
-    if not kept.all():
-        other = lenses.infos[int(lenses.numbers[~kept][0])]
-        log.note(
-            f"{what}: the CameraInfo changes",
-            f"{int((~kept).sum())} of {len(kept)} left out, which have {setting_of(other)}; "
-            f"{setting_of(lenses.infos[lenses.usual])} is used: keep zoom, focus, binning and roi as they are while you record",
-        )
-    return kept
-
-
-def _samples(samples: Sequence[tuple[int, Sample]], what: str, log: ReadLog) -> tuple[Sample, ...]:
-    """The samples, with their log times, whose stamps increase as they arrived."""
+def _samples(streams: Sequence[_Stream], what: str, log: ReadLog) -> tuple[Any, ...]:
+    """The samples whose stamps increase as they arrived."""
+    samples = [value for stream in streams for value in stream.values]
     stamps_ns = np.array([sample.stamp_ns for _, sample in samples], np.int64)
     stamps_ns, order = as_logged(stamps_ns, np.array([at for at, _ in samples], np.int64), what, log)
     stamped = [replace(samples[k][1], stamp_ns=int(stamps_ns[k])) for k in order.tolist()]
@@ -432,14 +417,12 @@ def _imu(streams: Sequence[_Stream], log: ReadLog) -> tuple[ImuSamples, str | No
     parts: list[tuple[Stamps, Array, Array, str]] = []
     log_times_ns: list[int] = []
     for stream in streams:
-        decode = stream.decoder.imu
         try:
-            parts.append(decode(stream.messages))
+            parts.append(decode_imu(stream.channel, stream.messages))
             log_times_ns += stream.log_times_ns
-        except _UNDECODABLE:  # one of them is damaged
-            singly = stream.values(lambda data, decode=decode: decode([data]))  # type: ignore[misc]
-            parts += [part for _, part in singly]
-            log_times_ns += [at for at, _ in singly]
+        except UNDECODABLE:  # one of them is damaged
+            parts += [part for _, part in stream.values]
+            log_times_ns += [at for at, _ in stream.values]
     if not parts:
         return ImuSamples.empty(), None
     stamps_ns, gyro, accel = (np.concatenate([part[i] for part in parts]) for i in range(3))
@@ -448,7 +431,7 @@ def _imu(streams: Sequence[_Stream], log: ReadLog) -> tuple[ImuSamples, str | No
 
 
 def _ground_truth(streams: Sequence[_Stream], log: ReadLog) -> Trajectory | None:
-    values = [value for stream in streams for value in stream.values(stream.decoder.pose)]
+    values = [value for stream in streams for value in stream.values]
     if not values:
         return None
     stamps_ns = np.array([stamp_ns for _, (stamp_ns, _) in values], np.int64)
@@ -463,7 +446,7 @@ def _note_unregistered(streams: Iterable[_Stream], roles: _Roles, camera: Camera
     left, depth = (roles[role][0].channel.topic for role in ("left", "depth"))
     fx, _, cx, cy = camera.intrinsics_px
     beside = [stream for stream in streams if stream.channel.topic in info_topics(depth)]
-    infos = [info for stream in beside for _, info in stream.values(stream.decoder.camera_info)]
+    infos = [info for stream in beside for _, info in stream.values]
     if not infos or not infos[0].matrix.any():
         return
     own = np.array([infos[0].matrix[0, 0], infos[0].matrix[0, 2], infos[0].matrix[1, 2]])
@@ -502,7 +485,7 @@ def _calibration(
             setting = f"{setting_of(info)}, of images of just that size; the calibration is used as it is"
             log.note("binning or roi not used", f"the CameraInfo beside {image_topic} says {setting}")
         cameras.append(InfoCamera(info, bool(_RECTIFIED.search(image_topic.lower()))))
-    said = [value for stream in roles.get("tf_static", ()) for value in stream.values(stream.decoder.links)]
+    said = [value for stream in roles.get("tf_static", ()) for value in stream.values]
     said.sort(key=lambda value: value[0])
     links, changes = last_links([link for _, found in said for link in found])
     for words in changes:

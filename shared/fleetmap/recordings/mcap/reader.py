@@ -22,10 +22,10 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings.bags.container import Channel, Message, Place
+from fleetmap.recordings.bags.container import Channel, Container, Message, Place
 from fleetmap.recordings.bags.streams import open_messages
 from fleetmap.recordings.files import file_head, natural_key, what_file_instead
-from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, KeptBytes, unpack, unpack_message
+from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, unpack, unpack_message
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.samples import DataIssue
@@ -67,15 +67,11 @@ def open_mcap(path: Path, options: OpenOptions) -> Recording:
     return open_messages(path, "mcap", partial(McapFiles, tuple(files)), options)
 
 
-class McapFiles(KeptBytes):
+class McapFiles(Container):
     """The parts of one recording, in the order of their names, as a Container. A place: number of the part, then as in McapFile."""
 
     def __init__(self, files: Sequence[Path]) -> None:
-        super().__init__(files[0], sum(file.stat().st_size for file in files))
-        self.files = files
-        self.name = ""
-        self.attachments: dict[str, bytes] = {}
-        self.issues: list[DataIssue] = []
+        super().__init__(files)
         self._parts = [McapFile(file) for file in files]
 
     def messages(self) -> Iterator[Message]:
@@ -100,15 +96,11 @@ class McapFiles(KeptBytes):
             part.close()
 
 
-class McapFile(KeptBytes):
+class McapFile(Container):
     """An open MCAP file as a Container. A place: byte, length, and -1, or the byte of the compressed chunk in whose content they lie."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, path.stat().st_size)
-        self.files: Sequence[Path] = (path,)
-        self.attachments: dict[str, bytes] = {}
-        self.issues: list[DataIssue] = []
-        self.name = ""
+        super().__init__((path,))
         self._file = path.open("rb")
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, tuple[str, bytes]] = {}

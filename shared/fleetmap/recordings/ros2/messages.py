@@ -40,6 +40,7 @@ class CameraInfo:
     projection: Array
     binning: tuple[int, int] = (1, 1)
     roi: tuple[int, int, int, int] = (0, 0, 0, 0)
+    stamp_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,24 +104,15 @@ def encode_compressed_image(stamp_ns: int, frame_id: str, image: StoredImage, fo
 def decode_camera_info(data: bytes) -> CameraInfo:
     """sensor_msgs/CameraInfo."""
     reader = CdrReader(data)
-    _, frame_id = reader.stamp_ns(), reader.text()
+    stamp_ns, frame_id = reader.stamp_ns(), reader.text()
     height, width, lens = reader.unsigned(), reader.unsigned(), reader.text()
     distortion = reader.doubles(reader.unsigned())
     matrix, rect, projection = reader.doubles(9), reader.doubles(9), reader.doubles(12)
     binning = reader.unsigned() or 1, reader.unsigned() or 1
     x, y, roi_height, roi_width = (reader.unsigned() for _ in range(4))
-    return CameraInfo(
-        frame_id,
-        width,
-        height,
-        lens,
-        distortion,
-        matrix.reshape(3, 3),
-        rect.reshape(3, 3),
-        projection.reshape(3, 4),
-        binning,
-        (x, y, roi_width, roi_height),
-    )
+    matrices = matrix.reshape(3, 3), rect.reshape(3, 3), projection.reshape(3, 4)
+    roi = x, y, roi_width, roi_height
+    return CameraInfo(frame_id, width, height, lens, distortion, *matrices, binning, roi, stamp_ns)
 
 
 def encode_camera_info(stamp_ns: int, frame_id: str, camera: CameraCalibration) -> bytes:
