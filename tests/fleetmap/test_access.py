@@ -19,6 +19,7 @@ from fleetmap.bus.zenoh_bus import _config
 from fleetmap.errors import LinkError, UnreachableError
 from mapserver.trust.authorities import Authorities
 from support.fleet.memory_bus import MemoryBus, MemoryHub, permits
+from support.fleet.nav2_client import eventually
 
 OWN, OTHERS = "fleetmap/hall/robots/a/", "fleetmap/hall/robots/b/"
 ACCESS = Access(
@@ -29,15 +30,6 @@ ACCESS = Access(
         Holder("live.survey", purpose=Purpose.SURVEY),
     ]
 )
-
-
-def eventually(condition: Callable[[], bool], within_s: float = 15.0) -> bool:
-    deadline = time.monotonic() + within_s
-    while not condition():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.02)
-    return True
 
 
 class Keys:

@@ -3,7 +3,7 @@
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack
 
 import pytest
@@ -12,6 +12,7 @@ import zenoh
 from fleetmap.bus import MAX_MESSAGE_BYTES, Bus, check_endpoint
 from fleetmap.errors import LinkError, StoreError, UnreachableError, UsageError
 from support.fleet.memory_bus import MemoryBus, MemoryHub
+from support.fleet.nav2_client import eventually
 
 
 @pytest.fixture(params=["memory", "zenoh"])
@@ -27,15 +28,6 @@ def pair(request: pytest.FixtureRequest) -> Iterator[tuple[Bus, Bus]]:
         yield server, robot
     assert server.closed()
     assert robot.closed()
-
-
-def eventually(condition: Callable[[], bool], within_s: float = 5.0) -> bool:
-    deadline = time.monotonic() + within_s
-    while time.monotonic() < deadline:
-        if condition():
-            return True
-        time.sleep(0.01)
-    return condition()
 
 
 def test_questions_are_answered(pair: tuple[Bus, Bus]) -> None:

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from fleetmap.errors import LinkError
 from fleetmap.failure_summary import ReplayPart
 from fleetmap.messages import PART_BYTES, FailureAck
 from locclient.delivery.outbox import Outbox, QueuedReport
@@ -24,12 +23,9 @@ class Server:
     data: bytes = b""
     forgets: int = -1
     refuses: str = ""
-    is_old: bool = False
     parts: list[int] = field(default_factory=list)
 
     def send_replay_part(self, part: ReplayPart) -> FailureAck:
-        if self.is_old:
-            raise LinkError("nobody answers")
         self.parts.append(part.offset)
         assert len(part.data) <= PART_BYTES
         if part.offset == self.forgets:
@@ -69,11 +65,6 @@ def test_what_the_server_refuses_is_not_sent_again(outbox: Outbox) -> None:
     assert sent(server, outbox) == 1
     assert server.parts == [0]
     assert outbox.counts()["refused"] == 1
-
-
-def test_a_server_that_knows_no_recordings_leaves_them_waiting(outbox: Outbox) -> None:
-    assert sent(Server(is_old=True), outbox) == 0
-    assert [report.id for report in outbox.waiting()] == ["f1"]
 
 
 def test_more_failures_than_are_held_are_named(outbox: Outbox, caplog: pytest.LogCaptureFixture) -> None:

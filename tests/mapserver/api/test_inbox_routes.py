@@ -20,10 +20,8 @@ from mapserver.api import request_limits
 from mapserver.drafting.job_lock import log_path
 from mapserver.nightly.inbox import put_away
 from mapserver.nightly.upload import MOST_BYTES, remove_unfinished
-from mapserver.operators.operators import Operators
 from mapserver.serving import night_runs
-from mapserver.store import Actor, MapStore
-from support.fleet.quick_passwords import use_quick_passwords
+from mapserver.store import MapStore
 from support.fleet.served_api import Server, check_problem, raw_put, served_api
 
 INBOX = "/v1/sites/lab/inbox"
@@ -215,26 +213,6 @@ def test_a_long_name_is_found_again(server: Server, lab: Path) -> None:
     (lab / ("b" * 215 + ".mcap")).touch()
     put_away(lab / ("b" * 215 + ".mcap"), "done", "5fa9" * 16, None)
     assert server.client.get(INBOX).json()["done"] == 1
-
-
-def test_who_may_only_look_changes_nothing(server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    use_quick_passwords(monkeypatch)
-    operators = Operators(server.store)
-    keys = {}
-    for name, role in (("vic", "viewer"), ("olga", "operator")):
-        operators.add(name, role, "a password of the test", Actor("root"))
-        session = operators.sign_in(name, "a password of the test", name).session
-        keys[name] = {"Cookie": f"fleetmap={session}"}
-    lab.mkdir()
-    put, client = f"{INBOX}/monday.mcap", server.client
-    assert client.get(INBOX, headers=keys["vic"]).status_code == 200
-    for headers, status in ((keys["vic"], 403), ({}, 401), (keys["olga"] | {"Origin": "http://evil.example"}, 403)):
-        assert client.put(put, content=b"x", headers=headers).status_code == status
-        assert client.post("/v1/sites/lab/build", json={}, headers=headers).status_code == status
-    assert files(lab) == []
-    assert client.put(put, content=b"x", headers=keys["olga"]).status_code == 201
-    assert server.store.last_events("lab", 1)[0].actor == "olga"
-    assert client.put(f"{put}?actor=ada", content=b"x", headers=keys["olga"]).status_code == 403
 
 
 def test_a_build_without_space_is_an_answer_and_in_no_log(

@@ -13,9 +13,7 @@ import typer
 from fleetmap.cli_options import Group, file_type
 from fleetmap.config import Section
 from fleetmap.errors import UsageError
-from fleetmap.geometry import se3_exp
-from fleetmap.recordings.tum import write_tum
-from fleetmap.sensors.samples import SensorSet, Trajectory
+from fleetmap.sensors.samples import SensorSet
 from mapserver import cli
 from mapserver.config import MapserverConfig, read_config
 from mapserver.drafting.draft import BuildRequest, Draft
@@ -193,22 +191,3 @@ def test_a_wrong_file_is_a_usage_error(
 
 def test_no_file_sets_nothing() -> None:
     assert read_config(None, cli.COMMANDS) == (MapserverConfig(), {})
-
-
-def test_evaluate_prints_the_errors(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """An estimate in another frame, one position of ten off by 0.1 m: errors follow by hand."""
-    rng = np.random.default_rng(5)
-    stamps = np.arange(10, dtype=np.int64) * 50_000_000
-    true = np.array([se3_exp(np.concatenate([rng.normal(0, 0.3, 3), rng.uniform(-5, 5, 3)])) for _ in stamps])
-    shift = se3_exp(np.array([0, 0, 0, 3.0, 4.0, 0]))
-    write_tum(tmp_path / "truth.tum", Trajectory(stamps, true))
-    write_tum(tmp_path / "estimate.tum", Trajectory(stamps, shift @ true))
-    both = ("evaluate", tmp_path / "estimate.tum", "--ground-truth", tmp_path / "truth.tum")
-    assert status("mapserver", *both, "--json") == 0
-    found = json.loads(capsys.readouterr().out)
-    assert found["ate_rmse_m"] < 1e-6
-    assert found["unaligned_median_m"] == pytest.approx(5.0, abs=1e-6)
-    assert (found["stamps"], found["matched"], found["evaluated_share"]) == (10, 10, 1.0)
-    assert status("mapserver", *both) == 0
-    assert "ate_rmse_m" in capsys.readouterr().out
-    assert status("mapserver", "evaluate", tmp_path / "no.tum", "--ground-truth", tmp_path / "truth.tum") == 3

@@ -23,7 +23,6 @@ from mapserver.store import Actor, DraftContent, MapStore
 from mapserver.trust import init_here
 from mapserver.trust.enrolment import RobotRegister
 from support.fleet.dashboard_scene import SITE, Served, change, fill_store, hall_tiles, marks, opened, serving, talking
-from support.fleet.webhook_receiver import receiver
 from support.pages.browser import box_of
 from support.pages.whole_page import assert_whole
 from support.storage.map_samples import draft_details
@@ -226,24 +225,6 @@ def test_an_area_is_drawn_named_changed_and_removed(page: Page, tmp_path: Path) 
         assert listed() == "0 areas\n"
         refused = [fault for fault in seen.faults if "412" not in fault]
         assert refused == []
-
-
-def test_a_test_alert_is_sent_and_its_answer_told(page: Page, tmp_path: Path) -> None:
-    (tmp_path / "store").mkdir()
-    MapStore.open(tmp_path / "store", create=True).close()
-    with receiver(204) as (address, got):
-        (tmp_path / "mapserver.toml").write_text(f'[alerts]\nwebhook = "{address}"\n')
-        with serving(tmp_path / "store", "--config", str(tmp_path / "mapserver.toml")) as served:
-            seen = opened(page, served, "administration", site="nowhere")
-            expect(page.get_by_role("list", name="Active alerts")).to_be_visible()
-            change(page, "Send a test alert")
-            dialog = page.get_by_role("dialog")
-            expect(dialog.get_by_role("alert")).to_have_text("127.0.0.1 accepted the test alert: status 204")
-            expect(dialog.get_by_role("button")).to_have_text(["Close"])
-            dialog.get_by_role("button", name="Close").click()
-            expect(dialog).to_have_count(0)
-    assert len(got) == 1
-    assert seen.faults == []
 
 
 def test_a_recording_is_uploaded_built_and_tried_again(page: Page, tmp_path: Path) -> None:

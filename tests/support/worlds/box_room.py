@@ -71,8 +71,7 @@ def _render(map_from_cam: Array) -> NDArray[np.uint8]:
     rays = _rays() @ map_from_cam[:3, :3].T
     origin = map_from_cam[:3, 3]
     image = np.zeros((HEIGHT, WIDTH), np.uint8)
-    with np.errstate(divide="ignore"):
-        reach = np.where(rays > 0, ROOM_M[1] - origin, ROOM_M[0] - origin) / rays
+    reach = _reach(rays, origin)
     axis = np.argmin(reach, axis=2)
     hits = origin + rays * np.min(reach, axis=2)[..., None]
     for face in range(6):
@@ -134,9 +133,18 @@ def points_seen(map_from_cam: Array, pixels: Array) -> Array:
     rays_cam = np.column_stack([(pixels - [WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5]) / FOCAL, np.ones(len(pixels))])
     rays = rays_cam @ map_from_cam[:3, :3].T
     origin = map_from_cam[:3, 3]
+    return origin + rays * _reach(rays, origin).min(axis=1)[:, None]
+
+
+def depth_of(map_from_cam: Array) -> NDArray[np.float32]:
+    """(H, W) metres along the camera's axis."""
+    return _reach(_rays() @ map_from_cam[:3, :3].T, map_from_cam[:3, 3]).min(axis=2).astype(np.float32)
+
+
+def _reach(rays: Array, origin: Array) -> Array:
+    """How many times each ray (..., 3) goes to the room's faces across each axis."""
     with np.errstate(divide="ignore"):
-        reach = np.where(rays > 0, ROOM_M[1] - origin, ROOM_M[0] - origin) / rays
-    return origin + rays * reach.min(axis=1)[:, None]
+        return np.asarray(np.where(rays > 0, ROOM_M[1] - origin, ROOM_M[0] - origin) / rays)
 
 
 def stereo_pair(map_from_body: Array, stamp_ns: int) -> CameraFrame:
