@@ -10,6 +10,7 @@ import sys
 import tomllib
 from collections.abc import Callable, Iterator
 from functools import partial
+from importlib.metadata import entry_points
 from pathlib import Path
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -23,13 +24,15 @@ from locclient.config import with_plugins  # noqa: E402
 from locclient.hooks import link_hooks  # noqa: E402
 from mapserver.config import TIERS as MAPSERVER_TIERS  # noqa: E402
 from mapserver.config import MapserverConfig  # noqa: E402
+from mapserver.hooks import command_hooks  # noqa: E402
 
 COMMANDS, SETTINGS = REPOSITORY / "docs/command_line.md", REPOSITORY / "docs/settings.md"
 PROGRAMS: dict[str, tuple[Section, Tiers]] = {
     "mapserver": (MapserverConfig(), MAPSERVER_TIERS),
     "locclient": with_plugins(),
 }
-PLUGINS = set(link_hooks())
+PROJECT = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))["project"]
+INSTALLED = {point.module.split(".")[2] for group in PROJECT["entry-points"] for point in entry_points(group=group)}
 _TABLE = re.compile(r"^\| .*\n\|---.*\n((?:\|.*\n)*)", re.MULTILINE)
 Row = tuple[
     str, str, str
@@ -38,7 +41,6 @@ Row = tuple[
 
 def commands() -> dict[str, click.Command]:
     """All commands of all programs by their words, such as "mapserver build", groups left out."""
-    scripts = tomllib.loads((REPOSITORY / "pyproject.toml").read_text("utf-8"))["project"]["scripts"]
     found: dict[str, click.Command] = {}
 
     def add(words: str, command: click.Command) -> None:
@@ -48,7 +50,7 @@ def commands() -> dict[str, click.Command]:
         if groups is None:
             found[words] = command
 
-    for script, target in sorted(scripts.items()):
+    for script, target in sorted(PROJECT["scripts"].items()):
         add(script, typer.main.get_command(importlib.import_module(target.partition(":")[0]).app))
     return found
 
@@ -107,8 +109,8 @@ def _key(cell: str) -> str:
     return cell.strip().strip("`").split()[0].rstrip(".`")
 
 
-def command_page(page: str) -> str:
-    """docs/command_line.md as it should be; ValueError where it lacks a command or has one that is gone."""
+def command_page(page: str, plugin: str | None = None) -> str:
+    """docs/command_line.md as it should be, or a plug-in's page; ValueError where it lacks a command or has one that is gone."""
     known, seen = commands(), set()
     parts = re.split(r"^(?=## )", page, flags=re.MULTILINE)
     for number, part in enumerate(parts):
@@ -119,7 +121,8 @@ def command_page(page: str) -> str:
         seen.add(heading[1])
         if rows := list(_command_rows(known[heading[1]])):
             parts[number] = with_table(part, "argument or option", rows)
-    if missing := sorted(set(known) - seen):
+    own = set(known) - {f"mapserver {name}" for name in command_hooks()}
+    if plugin is None and (missing := sorted(own - seen)):
         raise ValueError(f"{COMMANDS.name} lacks {', '.join(missing)}; give each a heading and a sentence")
     return "".join(parts)
 
@@ -131,7 +134,7 @@ def settings_page(page: str, plugin: str | None = None) -> str:
         for program, (config, tiers) in PROGRAMS.items()
         for setting in settings_in(config)
         if (tier := tier_of(setting, tiers)) is not None
-        and (setting.section == plugin if plugin else setting.section not in PLUGINS)
+        and (setting.section == plugin if plugin else setting.section not in link_hooks())
     }
     seen = set()
     parts, tier = re.split(r"^(?=###? )", page, flags=re.MULTILINE), ""
@@ -151,9 +154,10 @@ def settings_page(page: str, plugin: str | None = None) -> str:
 
 
 PAGES: dict[Path, Callable[[str], str]] = {COMMANDS: command_page, SETTINGS: settings_page} | {
-    page: partial(settings_page, plugin=page.parent.name)
-    for page in REPOSITORY.glob("*/plugins/*/settings.md")
-    if page.parent.name in PLUGINS
+    page: partial(make, plugin=page.parent.name)
+    for make, name in ((command_page, COMMANDS.name), (settings_page, SETTINGS.name))
+    for page in REPOSITORY.glob(f"*/plugins/*/{name}")
+    if page.parent.name in INSTALLED
 }
 
 if __name__ == "__main__":

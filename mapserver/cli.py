@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING
 
 from fleetmap.cli_exit import require_extra, run_cli
 from fleetmap.cli_options import Commands, ConfigFile, Options, Version, make_app
-from mapserver.commands.accept import accept
 from mapserver.commands.align import align
 from mapserver.commands.areas import AREAS_GROUP
 from mapserver.commands.backup import attach, backup, backups, restore
@@ -28,6 +27,7 @@ from mapserver.commands.serve import serve
 from mapserver.commands.store import audit, export, gc, import_, retention, verify
 from mapserver.commands.surfels import MAP
 from mapserver.commands.trust import TRUST
+from mapserver.hooks import command_hooks
 
 if TYPE_CHECKING:
     from mapserver.config import MapserverConfig
@@ -56,7 +56,6 @@ COMMANDS: Commands = {
     "doctor": doctor,
     "calibrate": calibrate,
     "evaluate": evaluate,
-    "accept": accept,
     "align": align,
     "areas": AREAS_GROUP,
     "building": BUILDING,
@@ -67,6 +66,7 @@ COMMANDS: Commands = {
     "operators": OPERATORS,
     "audit": audit,
     "trust": TRUST,
+    **command_hooks(),
 }
 
 

@@ -2,16 +2,20 @@
 
 | group | registered by the name of | as |
 |---|---|---|
+| `mapserver.commands` | the command | a function as those of `COMMANDS` in `mapserver/cli.py`, in a module that is quick to import |
 | `mapserver.routes` | the plug-in | `RouteHook` |
 """
 
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from fleetmap.mapformat.version_file import ExportHead
+from fleetmap.cli_options import Command
 from fleetmap.plugins import plugins
 
-OfferedFile = Callable[[str, int], tuple[ExportHead, bytes]]
+if TYPE_CHECKING:
+    from fleetmap.mapformat.version_file import ExportHead
+
+OfferedFile = Callable[[str, int], tuple["ExportHead", bytes]]
 """Head and SHA-256 of the file of a published version, by site and number; FleetmapError as `GET .../file`."""
 
 RouteHook = Callable[[Any, OfferedFile], None]
@@ -21,3 +25,8 @@ RouteHook = Callable[[Any, OfferedFile], None]
 def route_hooks() -> dict[str, RouteHook]:
     """Return the installed parts of the HTTP API."""
     return plugins("mapserver.routes")
+
+
+def command_hooks() -> dict[str, Command]:
+    """Return the installed commands beside those of the road."""
+    return plugins("mapserver.commands")

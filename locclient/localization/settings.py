@@ -18,7 +18,7 @@ class TrackSettings(Section, frozen=True):
     confirming_distance_m: float = 1.0  # motion between them
     strong_inliers: int = STRONG_INLIERS
     strong_share: float = 0.55  # inlier share of a fix that is accepted at once
-    # Votes of another place, relative to the best one's, that forbid acceptance; chance reaches 0.36
+    # Votes of another place, relative to the best one's, that forbid it; chance reaches 0.36
     strong_alias_share: float = 0.5
     tight_prior_sigma_m: float = 0.6  # a prior this tight confirms the first fix
     # Error rate of operators' poses, which are weighed against aliases of the place. An assumption

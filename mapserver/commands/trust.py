@@ -178,16 +178,17 @@ def status(store: StoreFolder, json: Json = False) -> None:
 
 
 def verify(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `mapserver accept` wrote.")],
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder of a report, with its signature.")],
     store: StoreFolder,
 ) -> None:
-    """Check that an acceptance report was signed by this store and is unchanged; status 3 otherwise."""
+    """Check that a report was signed by this store and is unchanged; status 3 otherwise."""
     from fleetmap.errors import disk_errors
     from mapserver.trust.documents import verify as verified
 
     with disk_errors(f"{folder} cannot be read", "name the folder of a report", UsageError):
-        signature = (folder / "acceptance.sig").read_bytes()
-        files = {path.name: path.read_bytes() for path in folder.glob("acceptance.*") if path.suffix != ".sig"}
+        signed = min(folder.glob("*.sig"), default=folder / "report.sig")
+        signature = signed.read_bytes()
+        files = {path.name: path.read_bytes() for path in folder.glob(f"{signed.stem}.*") if path != signed}
     with open_store(store, read_only=True) as maps:
         typer.echo(f"signed on {verified(maps, signature, files)} by this store, and unchanged")
 

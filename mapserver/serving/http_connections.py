@@ -42,7 +42,7 @@ class BoundedListener(socket.socket):
         """proxies: addresses of proxies, which carry the requests of all users and have no limit of their own."""
         super().__init__(family, socket.SOCK_STREAM)
         self._proxies = proxies
-        self._open: list[tuple[socket.socket, str, float]] = []  # with address and time of acceptance
+        self._open: list[tuple[socket.socket, str, float]] = []  # with address, and time when it was opened
         self._refusals = LogLimit(_log)
 
     def accept(self) -> tuple[socket.socket, Any]:

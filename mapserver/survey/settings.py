@@ -39,7 +39,7 @@ class PairSettings(Section, frozen=True):
 
 
 class LoopSettings(Section, frozen=True):
-    """Search and acceptance of revisits."""
+    """Search for revisits, and what they must fulfil."""
 
     top: int = 8
     depth: int = 128  # earlier keyframes, by similarity, that pass through the position gate

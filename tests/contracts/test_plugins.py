@@ -10,7 +10,7 @@ import pytest
 
 from fleetmap.errors import UsageError
 from locclient.config import LocclientConfig, read_config, with_plugins
-from mapserver.hooks import route_hooks
+from mapserver.hooks import command_hooks, route_hooks
 from support.fleet.contracts_documents import REPOSITORY, text
 
 FOLDERS = sorted(path.parent for path in REPOSITORY.glob("*/plugins/*/README.md"))
@@ -49,7 +49,7 @@ def test_without_plugins_a_robot_reads_its_file_and_refuses_their_sections(
     monkeypatch.setitem(sys.modules, "locclient.plugins", None)
     monkeypatch.setitem(sys.modules, "mapserver.plugins", None)
     assert with_plugins()[0].__struct_fields__ == LocclientConfig.__struct_fields__
-    assert route_hooks() == {}
+    assert route_hooks() == command_hooks() == {}
     file = tmp_path / "robot.toml"
     file.write_text('[vda5050]\nbroker = "mqtts://host"\n')
     with pytest.raises(UsageError, match="vda5050"):

@@ -16,6 +16,7 @@ import typer.core
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
 from mapserver.fleet.fleet import Fleet
+from mapserver.hooks import command_hooks
 from mapserver.store import MapStore
 from support.core_arguments import CALLS, refusals
 from support.fleet.contracts_documents import REPOSITORY, click_command
@@ -53,7 +54,7 @@ def _help(path: str) -> Iterator[str]:
     command = click_command(path)
     yield f"{path}: {' '.join((command.help or '').split())}"
     if isinstance(command, click.Group | typer.core.TyperGroup):
-        for name in sorted(command.commands):
+        for name in sorted(command.commands.keys() - command_hooks().keys()):  # without plug-ins
             yield from _help(f"{path} {name}")
         return
     for parameter in command.params:

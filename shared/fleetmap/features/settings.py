@@ -33,7 +33,7 @@ class StereoSettings(Section, frozen=True):
 
 
 class AlignSettings(Section, frozen=True):
-    """Window and acceptance of patch alignment."""
+    """Window of patch alignment, and what its result must fulfil."""
 
     half_window_px: Annotated[int, Meta(ge=1, le=15)] = 4  # half of the patch
     max_shift_px: float = 3.0  # from the initial position

@@ -15,8 +15,8 @@ from reportlab.pdfbase import pdfmetrics
 from reportlab.pdfbase.ttfonts import TTFont
 from reportlab.platypus import Flowable, Image, ListFlowable, Paragraph, SimpleDocTemplate, Spacer, Table, TableStyle
 
-from mapserver.acceptance.document import Section
-from mapserver.acceptance.figures import Report
+from mapserver.plugins.acceptance.document import Section
+from mapserver.plugins.acceptance.figures import Report
 
 _MARGIN = 18 * mm
 _WIDTH = A4[0] - 2 * _MARGIN

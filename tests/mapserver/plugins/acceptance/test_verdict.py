@@ -11,16 +11,24 @@ import pytest
 
 from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, se3, so3_exp
-from mapserver.acceptance.document import drawn, sections
-from mapserver.acceptance.drives import Drive, Picture, Start
-from mapserver.acceptance.examine import area_name, areas_of, similar
-from mapserver.acceptance.figures import UNKNOWN_PLACE, AreaFigures, Count, DriveFigures, Incidents, Report, StartCounts
-from mapserver.acceptance.ladders import BLUR_PX, STOPS
-from mapserver.acceptance.pdf import pdf
-from mapserver.acceptance.verdict import KNOWN_STARTS, ONE_WAY, compared, judged
-from mapserver.commands.accept import _before
-from mapserver.dashboard.acceptance_page import html_page
 from mapserver.floor_plan.areas import Area, Areas
+from mapserver.plugins.acceptance.command import _before
+from mapserver.plugins.acceptance.document import drawn, sections
+from mapserver.plugins.acceptance.drives import Drive, Picture, Start
+from mapserver.plugins.acceptance.examine import area_name, areas_of, similar
+from mapserver.plugins.acceptance.figures import (
+    UNKNOWN_PLACE,
+    AreaFigures,
+    Count,
+    DriveFigures,
+    Incidents,
+    Report,
+    StartCounts,
+)
+from mapserver.plugins.acceptance.html_page import html_page
+from mapserver.plugins.acceptance.ladders import BLUR_PX, STOPS
+from mapserver.plugins.acceptance.pdf import pdf
+from mapserver.plugins.acceptance.verdict import KNOWN_STARTS, ONE_WAY, compared, judged
 from mapserver.quality.figures import Evidence, RigEvidence, SurveyedViews
 from mapserver.quality.gate import GateSettings
 from mapserver.quality.probes import Probe, aliases, relocalized

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fleetmap.sensors.samples import CameraFrame
-from mapserver.acceptance.ladders import BLUR_PX, STOPS, blurred, darker, darkest_grey, ladders, noise_sigma
+from mapserver.plugins.acceptance.ladders import BLUR_PX, STOPS, blurred, darker, darkest_grey, ladders, noise_sigma
 
 
 def noisy(sigma: float) -> np.ndarray:

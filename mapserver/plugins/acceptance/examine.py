@@ -10,15 +10,15 @@ import numpy as np
 
 from fleetmap.geometry import Array
 from fleetmap.relocalization.map_view import MapView
-from mapserver.acceptance.document import drawn
-from mapserver.acceptance.drives import Drive, DriveRequest, MapUnderTest, checked, examined, replayed
-from mapserver.acceptance.figures import UNKNOWN_PLACE, AreaFigures, Count, Incidents, Report, Similar
-from mapserver.acceptance.ladders import darkest_grey
 from mapserver.drafting.draft_evidence import PROBES
 from mapserver.drafting.worker import single_threaded_libraries
 from mapserver.fleet_statistics.day_rate import Stratum, day_rate
 from mapserver.fleet_statistics.kpis import ROBOT_DAY_S, Counters, format_rate, rate
 from mapserver.floor_plan.areas import Areas
+from mapserver.plugins.acceptance.document import drawn
+from mapserver.plugins.acceptance.drives import Drive, DriveRequest, MapUnderTest, checked, examined, replayed
+from mapserver.plugins.acceptance.figures import UNKNOWN_PLACE, AreaFigures, Count, Incidents, Report, Similar
+from mapserver.plugins.acceptance.ladders import darkest_grey
 from mapserver.quality.directions import tile_directions
 from mapserver.quality.figures import merged
 from mapserver.quality.probes import Probe, aliases, spread

@@ -8,8 +8,8 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from fleetmap.geometry import Array
-from mapserver.acceptance.figures import ALL, UNKNOWN_PLACE, AreaFigures, Count, Report, percentile
 from mapserver.fleet_statistics.kpis import figure
+from mapserver.plugins.acceptance.figures import ALL, UNKNOWN_PLACE, AreaFigures, Count, Report, percentile
 
 
 @dataclass(frozen=True, slots=True)

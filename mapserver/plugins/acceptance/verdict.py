@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import scipy
 
-from mapserver.acceptance.figures import ALL, UNKNOWN_PLACE, AreaFigures, Count, Report, percentile
+from mapserver.plugins.acceptance.figures import ALL, UNKNOWN_PLACE, AreaFigures, Count, Report, percentile
 from mapserver.quality.directions import missing_words
 from mapserver.quality.figures import Evidence, TileDirections
 from mapserver.quality.gate import GateSettings

@@ -24,11 +24,11 @@ from fleetmap.recordings.tum import read_tum
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet, Trajectory
-from mapserver.acceptance.figures import DriveFigures, percentile
-from mapserver.acceptance.ladders import ladders
 from mapserver.doctor import Finding, Verdict, run_checks
 from mapserver.drafting.admission import fingerprint, rig_evidence
 from mapserver.drafting.draft_evidence import Before
+from mapserver.plugins.acceptance.figures import DriveFigures, percentile
+from mapserver.plugins.acceptance.ladders import ladders
 from mapserver.quality.probes import Probe, probe_features, relocalized, spread
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive

@@ -12,8 +12,8 @@ from fleetmap.errors import RecordingError, UsageError
 from mapserver.commands.options import Calibration, SiteOptions, open_store, topics_of, version_named, write_output
 
 if TYPE_CHECKING:
-    from mapserver.acceptance.figures import Report
     from mapserver.config import MapserverConfig
+    from mapserver.plugins.acceptance.figures import Report
     from mapserver.store import MapStore
 
 EXIT_STATUS_NOT_ACCEPTED = 1
@@ -56,10 +56,10 @@ def accept(
     The first line is the verdict. Status 1 if the site is not accepted.
     """
     from fleetmap.encoding import to_json
-    from mapserver.acceptance.document import sections
-    from mapserver.acceptance.pdf import pdf
-    from mapserver.acceptance.verdict import compared
-    from mapserver.dashboard.acceptance_page import html_page
+    from mapserver.plugins.acceptance.document import sections
+    from mapserver.plugins.acceptance.html_page import html_page
+    from mapserver.plugins.acceptance.pdf import pdf
+    from mapserver.plugins.acceptance.verdict import compared
     from mapserver.trust.documents import sign
 
     if not options.out.is_dir():
@@ -106,10 +106,10 @@ def _report(
     settings: "MapserverConfig",
 ) -> "tuple[Report, bytes]":
     from fleetmap.recordings import OpenOptions
-    from mapserver.acceptance.drives import DriveRequest
-    from mapserver.acceptance.examine import PICTURES, STARTS, examine
-    from mapserver.acceptance.verdict import KNOWN_STARTS, ONE_WAY, judged
     from mapserver.fleet.resurvey_list import resurvey_list
+    from mapserver.plugins.acceptance.drives import DriveRequest
+    from mapserver.plugins.acceptance.examine import PICTURES, STARTS, examine
+    from mapserver.plugins.acceptance.verdict import KNOWN_STARTS, ONE_WAY, judged
 
     opening = OpenOptions(options.calibration, topics_of(context, options.topic))
     counts = (-(-number // len(recordings)) for number in (STARTS, PICTURES))
@@ -135,7 +135,7 @@ def _before(
     import msgspec
 
     from fleetmap.errors import disk_errors
-    from mapserver.acceptance.figures import FORMAT, Report
+    from mapserver.plugins.acceptance.figures import FORMAT, Report
 
     assert options.before is not None
     if options.before.isdecimal():
