@@ -18,6 +18,7 @@ from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.mapformat.floors import Floor, FloorEntry
 from fleetmap.messages import Cause, Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
+from locclient import hooks
 from locclient.plugins.vda5050.adapter import FleetAdapter
 from locclient.plugins.vda5050.dialects import dialect
 from locclient.plugins.vda5050.factsheet import read_factsheet
@@ -487,11 +488,7 @@ def test_settings_that_cannot_be_right(settings: dict[str, Any], words: str) -> 
 
 
 def test_the_session_in_the_manual_is_one() -> None:
-    text = (
-        (Path(__file__).parents[4] / "docs/service.md")
-        .read_text("utf-8")
-        .split("## The robot under a fleet manager")[1]
-    )
+    text = (Path(hooks.__file__).parent / "plugins/vda5050/service.md").read_text("utf-8")
     part, *asked, state = (json.loads(block.split("```")[0]) for block in text.split("```json\n")[1:])
     adapter = Adapter()
     adapter.robot_part(json.dumps(part).encode())
