@@ -12,6 +12,7 @@ import socket
 import tempfile
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -23,7 +24,6 @@ from rich.console import Console
 
 from fleetmap.errors import (
     BusyError,
-    FleetmapError,
     GateRefusedError,
     RecordingError,
     StoreError,
@@ -47,7 +47,7 @@ from mapserver.store import DraftContent, FleetRetention, MapStore
 from mapserver.survey.settings import SurveySettings
 from support.command_line import status
 from support.recordings.recording_samples import make_sample, write_euroc
-from support.storage.faulty_disk import Disk, install
+from support.storage.faulty_disk import Disk, in_child
 from support.storage.map_samples import draft_details, random_tile
 
 LATER_NS = 3_600 * 10**9
@@ -448,7 +448,7 @@ def test_what_ended_two_nights_is_set_aside_by_the_third_and_nothing_beside_it(
 
     monkeypatch.setattr(*((reading, "open_recording", reads) if where == "read" else (night, "build_draft", builds)))
     for _ in range({"broken": 0, "joined": 3}.get(where, 2)):
-        assert in_child(hall, Disk("/nowhere"))[0] == -signal.SIGKILL
+        assert in_child(lambda: spend(hall), Disk("/nowhere"), hall / "told")[0] == -signal.SIGKILL
         assert (hall / "inbox/fatal").is_dir()
     assert "1 bad" in spend(hall)
     reason = {"broken": "LinAlgError: SVD did not converge; a bug"}.get(
@@ -544,44 +544,20 @@ def test_one_night_at_a_time_and_a_dead_one_holds_nothing(hall: Path) -> None:
     assert "version 1 published" in spend(hall)
 
 
-def in_child(folder: Path, disk: Disk) -> tuple[int, bool]:
-    """How a night on a failing disk ends (0 done, 3 an error that is told, 9 killed), and whether the fault struck."""
-    read, write = os.pipe()
-    child = os.fork()
-    if child == 0:
-        os.close(read)
-        status = 4
-        try:
-            signal.alarm(60)
-            install(disk)
-            spend(folder)
-            status = 0
-        except FleetmapError:
-            status = 3
-        finally:
-            os.write(write, b"1" if disk.struck else b"0")
-            os._exit(status)
-    os.close(write)
-    _, status = os.waitpid(child, 0)
-    struck = os.read(read, 1)
-    os.close(read)
-    return os.waitstatus_to_exitcode(status), struck != b"0"
-
-
 @pytest.mark.parametrize("how", ["kill", "ENOSPC"])
 def test_a_night_that_was_killed_or_ran_out_of_space_is_gone_on_with(hall: Path, how: str, tmp_path_factory) -> None:
     """At every 23rd file-system call, SQLite's too: the next night makes one version of both recordings, and loses nothing."""
     import shutil
 
-    number, struck = 4 if how == "kill" else 7, True
-    tries = resumed = 0
-    while struck:
+    number, tries, resumed = 4 if how == "kill" else 7, 0, 0
+    while True:
         folder = tmp_path_factory.mktemp("night")
         shutil.copytree(hall / "inbox", folder / "inbox")
-        status, struck = in_child(folder, Disk(f"{folder}/", number, how, is_lasting=how == "ENOSPC"))
+        disk = Disk(f"{folder}/", number, how, is_lasting=how == "ENOSPC")
+        status, disk = in_child(partial(spend, folder), disk, folder.with_suffix(".told"))
         assert status in ((9, 0) if how == "kill" else (3, 0)), (status, number)
         number += 23
-        if not struck:
+        if status != 9 and not disk.struck:
             break
         tries += 1
         if (folder / "store/store.sqlite3").is_file():

@@ -5,9 +5,8 @@ import shutil
 import stat
 import subprocess
 import sys
-import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import pytest
@@ -17,10 +16,10 @@ from fleetmap.mapformat import blob_path, current_path
 from mapserver.store import MapStore, Retention
 from mapserver.store.files import keep_reserve, locked
 from support.command_line import status
+from support.storage.bad_disks import on_bad_disk, open_folder
 from support.storage.map_samples import publish_samples, save_sample_draft
 
 TESTS = Path(__file__).resolve().parents[2]
-NOBODY = 65534
 
 
 @pytest.fixture
@@ -143,31 +142,6 @@ def test_a_store_is_for_its_owner_alone(tmp_path: Path, capsys: pytest.CaptureFi
 # --------------------------------------------------------------------------------------- read only, and a full disk
 
 
-@contextmanager
-def as_somebody_else() -> Iterator[None]:
-    """Without the rights of root, where the tests run as root."""
-    own = os.geteuid()
-    if own == 0:
-        os.seteuid(NOBODY)
-    try:
-        yield
-    finally:
-        os.seteuid(own)
-
-
-@pytest.fixture
-def read_only_root(root: Path) -> Iterator[Path]:
-    """A copy that everybody may read and nobody may write, where everybody may go to."""
-    folder = Path(tempfile.mkdtemp())
-    shutil.copytree(root, folder / "store")
-    for path in (folder, *folder.rglob("*")):
-        path.chmod(0o555 if path.is_dir() else 0o444)
-    yield folder / "store"
-    for path in (folder, *folder.rglob("*")):
-        path.chmod(0o700)
-    shutil.rmtree(folder)
-
-
 READING = (
     ("versions", "--site", "lab"),
     ("inspect", "--site", "lab", "--version", 1),
@@ -177,25 +151,26 @@ READING = (
 )
 
 
-def test_commands_that_read_work_where_nothing_may_be_written(
-    read_only_root: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def read_all(root: Path) -> list[tuple[int, bool]]:
+    """How the commands that read end, and whether they say something; and what may not be."""
+    ended = []
     for command in READING:
-        with as_somebody_else():
-            ended = status("mapserver", *command, "--store", read_only_root)
-        told = capsys.readouterr()
-        assert ended == 0, told.err
-        assert told.out, command
-    with as_somebody_else(), pytest.raises(StoreError, match="cannot be opened"):
-        MapStore.open(read_only_root)  # the control
-
-
-def test_what_was_opened_for_reading_is_not_written(read_only_root: Path) -> None:
-    with as_somebody_else(), MapStore.open(read_only_root, read_only=True) as store:
+        with redirect_stdout(StringIO()) as said:
+            ended.append((status("mapserver", *command, "--store", root), bool(said.getvalue())))
+    with pytest.raises(StoreError, match="cannot be opened"):
+        MapStore.open(root)  # the control
+    with MapStore.open(root, read_only=True) as store, pytest.raises(StoreError, match="cannot be written"):
         assert store.current("lab") is not None
-        with pytest.raises(StoreError, match="cannot be written"):
-            store.record_robot_report("lab", "r1", {}, 2)
-    assert sorted(path.name for path in read_only_root.glob("store.sqlite3*")) == ["store.sqlite3"]
+        store.record_robot_report("lab", "r1", {}, 2)
+    return ended
+
+
+@pytest.mark.parametrize("kind", ["read-only", "another account"])
+def test_commands_that_read_work_where_nothing_may_be_written(root: Path, kind: str) -> None:
+    with open_folder() as folder:
+        shutil.copytree(root, folder / "store")
+        assert on_bad_disk(kind, folder, lambda: read_all(folder / "store")) == [(0, True)] * len(READING)
+        assert sorted(path.name for path in (folder / "store").glob("store.sqlite3*")) == ["store.sqlite3"]
 
 
 ON_A_FULL_DISK = """

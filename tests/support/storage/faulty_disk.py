@@ -7,18 +7,23 @@ the very library that Python's `sqlite3` uses, whose files ask here first. Meant
 import ctypes
 import errno
 import os
+import pickle
+import signal
 import stat
 import sys
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
+
+from fleetmap.errors import FleetmapError
 
 _real = {
     name: getattr(os, name)
     for name in ("open", "close", "read", "pread", "write", "fsync", "replace", "unlink", "mkdir", "stat", "scandir")
 }
-_KILLED = 9
+_KILLED, _CHILD_WITHIN_S = 9, 60
 _WRITING = {"create", "write", "truncate", "sync", "sync_folder", "rename", "unlink", "mkdir", "map"}
 
 Call = tuple[Any, ...]
@@ -89,6 +94,28 @@ class FullDisk(Disk):
 def folder_of(path: str) -> str:
     """The folder that a path's name is in."""
     return path.rpartition("/")[0]
+
+
+def in_child(act: Callable[[], object], disk: Disk, told: Path) -> tuple[int, Disk]:
+    """How a forked process ends that acts on this disk (0 done, 3 refused, 4 another error, 9 killed), and the disk by way of `told`."""
+    told.unlink(missing_ok=True)
+    child = os.fork()
+    if child == 0:
+        status = 4
+        try:
+            signal.alarm(_CHILD_WITHIN_S)
+            install(disk)
+            act()
+            status = 0
+        except FleetmapError:
+            status = 3
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            told.write_bytes(pickle.dumps(disk))
+            os._exit(status)
+    _, status = os.waitpid(child, 0)
+    return os.waitstatus_to_exitcode(status), pickle.loads(told.read_bytes()) if told.exists() else disk
 
 
 def install(disk: Disk) -> None:

@@ -9,15 +9,11 @@ file.
 
 import argparse
 import json
-import os
-import pickle
 import random
 import shutil
-import signal
 import sys
 import tempfile
 import time
-import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -28,17 +24,15 @@ sys.path[:0] = [str(REPOSITORY / part) for part in ("shared", "", "tests")]
 
 import numpy as np  # noqa: E402
 
-from fleetmap.errors import FleetmapError  # noqa: E402
 from fleetmap.mapformat import current_path  # noqa: E402
 from mapserver import releases  # noqa: E402
 from mapserver.store import Actor, DraftContent, MapStore, Retention  # noqa: E402
-from support.storage.faulty_disk import Disk, install  # noqa: E402
+from support.storage.faulty_disk import Disk, in_child  # noqa: E402
 from support.storage.lost_writes import POLICIES, DiskImage  # noqa: E402
 from support.storage.map_samples import draft_details, random_tile  # noqa: E402
 
 ADA = Actor("ada", "a fault")
 MODES = ("kill", "tear", "ENOSPC", "EIO", "ENOSPC from then on", "EIO from then on", "power cut")
-CHILD_WITHIN_S = 30
 Act = Callable[[MapStore], object]
 State = tuple[tuple[str, int, str, str], ...]
 """Site, number, state and manifest's address of every version."""
@@ -124,32 +118,14 @@ def copy(source: Path, target: Path) -> None:
     shutil.copytree(source, target)
 
 
-def in_child(folder: Path, act: Act, disk: Disk) -> tuple[int, Disk]:
-    """The exit status of the operation on a failing disk (0 done, 3 refused, 9 killed), and the disk afterwards."""
-    told = folder.with_suffix(".told")
-    told.unlink(missing_ok=True)
-    child = os.fork()
-    if child == 0:
-        _be_child(folder, act, disk, told)
-    _, status = os.waitpid(child, 0)
-    return os.waitstatus_to_exitcode(status), pickle.loads(told.read_bytes()) if told.exists() else disk
+def acted(folder: Path, act: Act, disk: Disk) -> tuple[int, Disk]:
+    """How the operation ends on a failing disk, and the disk afterwards."""
 
-
-def _be_child(folder: Path, act: Act, disk: Disk, told: Path) -> None:
-    status = 4
-    try:
-        signal.alarm(CHILD_WITHIN_S)
-        install(disk)
+    def operate() -> None:
         with MapStore.open(folder, clock_ns=clock_ns) as store:
             act(store)
-        status = 0
-    except FleetmapError:
-        status = 3
-    except BaseException:
-        traceback.print_exc()
-    finally:
-        told.write_bytes(pickle.dumps(disk))
-        os._exit(status)
+
+    return in_child(operate, disk, folder.with_suffix(".told"))
 
 
 def faults_after(folder: Path, scenario: Scenario, is_done: bool) -> list[str]:
@@ -185,7 +161,7 @@ def strikes(scenario: Scenario, folder: Path, mode: str, every: int) -> Iterator
     number = hash_of(scenario.name, mode) % every
     while True:
         copy(scenario.start, folder)
-        status, disk = in_child(folder, scenario.act, Disk(f"{folder}/", number, how, is_lasting))
+        status, disk = acted(folder, scenario.act, Disk(f"{folder}/", number, how, is_lasting))
         if status != 9 and disk.count <= number:
             return
         if status == 9 or disk.struck:
@@ -200,7 +176,7 @@ def power_cuts(scenario: Scenario, folder: Path, every: int) -> Iterator[tuple[i
     """The same with everything lost that was not synced, in several ways, after every call."""
     copy(scenario.start, folder)
     image = DiskImage(folder)
-    status, disk = in_child(folder, scenario.act, Disk(f"{folder}/"))
+    status, disk = acted(folder, scenario.act, Disk(f"{folder}/"))
     assert status == 0, f"{scenario.name} fails on a sound disk"
     rng = random.Random(hash_of(scenario.name, "power cut"))
     for number, call in enumerate([*disk.journal, None]):
