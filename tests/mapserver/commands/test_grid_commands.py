@@ -1,6 +1,5 @@
 """The grid of a version: on its way through the store, written for planners, and refused where there is none."""
 
-import re
 from pathlib import Path
 
 import cv2
@@ -111,26 +110,6 @@ def test_masks_stay_with_the_site_and_are_written_for_costmap_filters(run, site,
     run("areas", "remove", *site)
     assert "0 areas" in run("areas", "list", *site)
     assert "no area with a speed mask" in run("areas", "export", *site, "--speed", tmp_path / "s.yaml", status=2)
-
-
-@pytest.mark.parametrize(
-    ("data", "words"),
-    [
-        (geojson(DOCK | {"box": (900.0, 2.0, 901.0, 3.0)}), "'dock' from .* outside of version 1"),
-        (geojson(DOCK | {"mask": "slow"}), "slow.*keep-out"),
-        (geojson(DOCK | {"percent": 30}), "mask keep-out with percent 30"),
-        (geojson(SLOW | {"percent": None}), "mask speed with percent None"),
-        (geojson(SLOW | {"percent": 100}), "percent"),
-        (geojson(DOCK, frame="building"), "mapserver align"),
-        (b"{}", "FeatureCollection"),
-    ],
-)
-def test_wrong_masks_are_refused_and_the_old_ones_stay(run, site, tmp_path: Path, data: bytes, words: str) -> None:
-    (tmp_path / "good.json").write_bytes(geojson(DOCK))
-    run("areas", "import", tmp_path / "good.json", *site)
-    (tmp_path / "masks.json").write_bytes(data)
-    assert re.search(words, run("areas", "import", tmp_path / "masks.json", *site, status=2))
-    assert "1 areas" in run("areas", "list", *site)
 
 
 def test_masks_over_half_a_country_are_refused(run, site, tmp_path: Path) -> None:

@@ -88,7 +88,9 @@ def test_gc_leaves_a_store_that_it_refuses_as_it_is(run, tmp_path: Path) -> None
     MapStore.open(tmp_path, create=True).close()
     with closing(sqlite3.connect(tmp_path / "store.sqlite3")) as connection:
         connection.execute("PRAGMA user_version = 99")
+    before = (tmp_path / "store.sqlite3").read_bytes()
     assert "store format 99" in run("gc", "--store", tmp_path, status=3)
+    assert (tmp_path / "store.sqlite3").read_bytes() == before
     assert (tmp_path / "reserve").is_file()
 
 

@@ -26,7 +26,7 @@ from mapserver.dashboard.fleet_health import HealthData, trend_words
 from mapserver.dashboard.live import LiveRobots, live_robot
 from mapserver.dashboard.map_page import one_way
 from mapserver.dashboard.plan import make_plan
-from mapserver.dashboard.rendering import TEMPLATES, age, size
+from mapserver.dashboard.rendering import TEMPLATES
 from mapserver.dashboard.robot_history import band, curve, stretches, way
 from mapserver.dashboard.underlays import grid_picture
 from mapserver.fleet.fleet import Fleet, RobotStatus
@@ -54,17 +54,6 @@ def test_words_from_elsewhere_never_become_markup() -> None:
     assert "<script" not in made
     assert made.count("&lt;script&gt;") > 10
     assert "\"'" not in made
-
-
-def test_words_for_people() -> None:
-    assert [size(n) for n in (None, 999, 1000, 2_500_000, 3_000_000_000)] == [
-        None,
-        "999 B",
-        "1.0 kB",
-        "2.5 MB",
-        "3.00 GB",
-    ]
-    assert [age(s) for s in (3, 119, 180, 7300, 200_000)] == ["3 s", "119 s", "3 min", "2 h", "2 days"]
 
 
 @pytest.fixture

@@ -27,6 +27,7 @@ from mapserver.serving import webhook
 from mapserver.serving.webhook import AlertWatch, Webhook, check_address
 from mapserver.store import DiskSpace, MapStore
 from support.fleet.contracts_documents import REPOSITORY
+from support.fleet.nav2_client import eventually
 from support.fleet.reports import blindness
 from support.fleet.webhook_receiver import receiver
 from support.storage.clock import Clock
@@ -34,13 +35,6 @@ from support.storage.map_samples import publish_samples
 
 HOUR_NS = 3_600_000_000_000
 RULES = REPOSITORY / "deploy" / "prometheus-alerts.yml"
-
-
-def wait_for(what: object, seconds: float = 15.0) -> None:
-    deadline_s = time.monotonic() + seconds
-    while not what():  # type: ignore[operator]
-        assert time.monotonic() < deadline_s
-        time.sleep(0.01)
 
 
 @pytest.fixture
@@ -121,7 +115,7 @@ def test_it_is_told_once_and_once_more_when_it_is_over(clock: Clock, tmp_path: P
         held = []
         for _ in range(3):
             watch.look()
-        wait_for(lambda: len(got) == 2)
+        assert eventually(lambda: len(got) == 2)
         sender.close()
     assert {headers["Authorization"] for headers, _ in got} == {"Bearer secret"}
     begun, ended = (json.loads(body) for _, body in got)
@@ -140,7 +134,7 @@ def test_no_redirect_is_followed_and_attempts_end(
     with receiver() as (elsewhere, led), receiver(status, elsewhere) as (address, got):
         sender = Webhook(AlertSettings(webhook=address))
         sender.put({"alerts": []})
-        wait_for(lambda: "is dropped" in caplog.text)
+        assert eventually(lambda: "is dropped" in caplog.text)
         sender.close()
     assert (len(got), led) == (4, [])
 

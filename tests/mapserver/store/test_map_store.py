@@ -12,12 +12,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleetmap.errors import GateRefusedError, MapFormatError, NewerFormatError, StoreError
+from fleetmap.errors import GateRefusedError, MapFormatError, StoreError
 from fleetmap.mapformat import current_path, decode_tile, sha256_hex
 from mapserver import releases
 from mapserver.store import Actor, DraftContent, MapStore, chain_faults, queries, schema
 from mapserver.store.places import read_places
-from mapserver.store.schema import FORMAT
 from support.storage.map_samples import draft_details, publish_samples, random_tile, save_sample_draft
 from support.storage.s3_server import Content
 
@@ -134,18 +133,6 @@ def test_readers_see_whole_versions_while_another_process_publishes(store: MapSt
         stop.set()
         assert all(future.result(timeout=30) >= 1 for future in reading)
     assert store.current("lab").version == 6
-
-
-def test_a_store_of_a_newer_format_is_refused(tmp_path: Path) -> None:
-    with MapStore.open(tmp_path, create=True) as store:
-        save_sample_draft(store)
-    connection = sqlite3.connect(tmp_path / "store.sqlite3")
-    connection.execute(f"PRAGMA user_version = {FORMAT + 1}")
-    connection.close()
-    before = (tmp_path / "store.sqlite3").read_bytes()
-    with pytest.raises(NewerFormatError, match=rf"format {FORMAT + 1}.*up to {FORMAT}"):
-        MapStore.open(tmp_path)
-    assert (tmp_path / "store.sqlite3").read_bytes() == before
 
 
 def test_other_files_are_refused(tmp_path: Path) -> None:

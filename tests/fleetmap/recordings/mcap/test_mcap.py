@@ -16,7 +16,7 @@ from mcap_ros2.decoder import DecoderFactory
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import se3, se3_exp, so3_exp
 from fleetmap.recordings import OpenOptions, Recording, open_recording
-from fleetmap.recordings.images import StoredFrame, StoredImage
+from fleetmap.recordings.images import StoredImage
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.recordings.ros2 import messages as ros_messages
 from fleetmap.sensors.calibration import RigCalibration
@@ -102,16 +102,6 @@ def test_a_full_disk_is_named_and_leaves_no_part(tmp_path: Path, count: int) -> 
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert list(tmp_path.iterdir()) == [in_place]
-
-
-def test_encoded_images_keep_their_bytes(tmp_path: Path) -> None:
-    jpeg = cv2.imencode(".jpg", SAMPLE.left[0])[1].tobytes()
-    png = cv2.imencode(".png", SAMPLE.right[0])[1].tobytes()
-    with McapRecordingWriter(tmp_path / "a.mcap", calibration()) as writer:
-        writer.write_frame(StoredFrame(5, StoredImage("file", jpeg), StoredImage("file", png)))
-    stored = open_recording(tmp_path / "a.mcap").stored_frame(0)
-    assert stored.right is not None
-    assert (stored.left.data, stored.right.data) == (jpeg, png)
 
 
 def decoded(path: Path) -> Iterator[tuple[str, str, Any]]:
