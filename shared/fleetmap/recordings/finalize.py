@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -44,18 +45,26 @@ class RecordingParts:
     ground_truth: Trajectory | None = None
 
 
-def image_parts(path: Path, format_: str, calibration: RigCalibration, frames: SeriesFrames[T]) -> RecordingParts:
-    """The parts of a format that pairs series of images, without other sensors."""
-    parts = RecordingParts(path, format_, calibration, frames.left.stamps_ns, frames, others=frames.other_numbers)
-    return replace(parts, has_right=frames.right is not None, has_depth=frames.depth is not None)
+def image_parts(
+    path: Path, format_: str, calibration: RigCalibration, frames: SeriesFrames[T], **others: Any
+) -> RecordingParts:
+    """The parts of a format that pairs series of images. others: fields of RecordingParts, as of other sensors."""
+    has_right, has_depth = frames.right is not None, frames.depth is not None
+    stamps_ns, numbers = frames.left.stamps_ns, frames.other_numbers
+    return RecordingParts(path, format_, calibration, stamps_ns, frames, has_right, has_depth, numbers, **others)
 
 
 def calibration_of_options(options: OpenOptions, log: ReadLog) -> CalibrationFile | None:
     """The calibration chosen by the caller, None to use the recording's own."""
     if options.calibration_file is None:
         return None
-    log.files += calibration_files(options.calibration_file)
-    return load_calibration(options.calibration_file)
+    return logged_calibration(options.calibration_file, log)
+
+
+def logged_calibration(file: Path, log: ReadLog) -> CalibrationFile:
+    """A calibration file, which with all that it names is part of the recording's content."""
+    log.files += calibration_files(file)
+    return load_calibration(file)
 
 
 def _sound_truth(truth: Trajectory, log: ReadLog) -> Trajectory | None:
@@ -78,8 +87,7 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
     CalibrationError for too few cameras in the calibration.
     """
     if len(parts.frame_stamps_ns) == 0:
-        issues = "; ".join(f"{issue.what}: {issue.detail}" for issue in log.issues)
-        raise RecordingError(f"{parts.path}: no frame is complete; {issues or 'the recording is empty'}")
+        raise RecordingError(f"{parts.path}: no frame is complete; {log.told() or 'the recording is empty'}")
     cameras, count = parts.calibration.cameras, 2 if parts.has_right else 1
     if len(cameras) < count:
         raise CalibrationError(
@@ -111,12 +119,7 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
         name=(parts.name or parts.path.resolve().name).encode("utf-8", "backslashreplace").decode(),
         format=parts.format,
         sensor_set=_sensor_set(parts, imu),
-        calibration=RigCalibration(
-            recorded,
-            parts.calibration.imu if len(imu) else None,
-            parts.calibration.base_from_body,
-            parts.calibration.assumed,
-        ),
+        calibration=replace(parts.calibration, cameras=recorded, imu=parts.calibration.imu if len(imu) else None),
         frame_stamps_ns=np.ascontiguousarray(parts.frame_stamps_ns, np.int64),
         imu=imu,
         frames=parts.frames,
@@ -164,14 +167,13 @@ def _damaged_moments(damaged_ns: list[int], frame_stamps_ns: Stamps) -> Stamps:
 
 def _first_frame(recording: Recording) -> CameraFrame:
     """The first of a few frames that can be decoded; RecordingError of the first one if none can."""
-    fault: RecordingError | None = None
+    faults = []
     for index in range(min(_TRIED_FRAMES, len(recording))):
         try:
             return recording.read_frame(index)
         except RecordingError as error:
-            fault = fault or error
-    assert fault is not None
-    raise fault
+            faults.append(error)
+    raise faults[0]
 
 
 def _grey_bits(frames: SeriesFrames) -> int:  # type: ignore[type-arg]

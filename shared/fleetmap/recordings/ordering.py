@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from fleetmap.encoding import MOST
 from fleetmap.errors import RecordingError
@@ -17,6 +17,7 @@ from fleetmap.sensors.samples import PAUSE_NS, DataIssue, ImuSamples, Stamps, Tr
 
 PAIR_TOLERANCE_NS = 5_000_000  # images of one rig that are further apart were not taken simultaneously
 DEPTH_TOLERANCE_NS = 20_000_000  # depth and colour of consumer sensors are not triggered together
+LAST_NS = 2**63 - 1
 # For recordings whose stamps were not taken at the exposure of the images
 UNCERTAIN_STAMPS = DataIssue("stamps uncertain", "they are a video's: not set by the exposure, not shared with sensors")
 UNITS = {1_000: "microseconds", 1_000_000: "milliseconds", 1_000_000_000: "seconds"}  # by the nanoseconds in each
@@ -47,13 +48,18 @@ class ReadLog:
         """Add an issue."""
         self.issues.append(DataIssue(what, detail))
 
+    def told(self) -> str:
+        """All issues as words of an error."""
+        return "; ".join(f"{issue.what}: {issue.detail}" for issue in self.issues)
 
-def as_logged(stamps_ns: Stamps, log_times_ns: Stamps, what: str, log: ReadLog) -> tuple[Stamps, NDArray[np.int64]]:
+
+def as_logged(stamps: ArrayLike, log_times: ArrayLike, what: str, log: ReadLog) -> tuple[Stamps, NDArray[np.int64]]:
     """Stamps (N,), and indices (N,) of the order in which they were logged: files hold chunks, parts and channels one after the other.
 
     The order of the file is kept where more stamps increase in it: the recorder's clock may have been set. Unset stamps (0) are replaced by
     log times (N,) minus the logging delay of the others; noted in `log`.
     """
+    stamps_ns, log_times_ns = np.array(stamps, np.int64), np.array(log_times, np.int64)
     unset = (stamps_ns == 0) & (log_times_ns != 0)
     if unset.any():
         delay_ns = 0 if unset.all() else int(np.median((log_times_ns - stamps_ns)[~unset]))
@@ -66,13 +72,13 @@ def as_logged(stamps_ns: Stamps, log_times_ns: Stamps, what: str, log: ReadLog) 
 
 def usual_size(sizes_px: Sequence[tuple[int, int] | None], what: str, log: ReadLog) -> NDArray[np.bool_]:
     """(N,) mask of the images with the most frequent size (width, height) or an unknown one; the others are noted in `log`."""
-    counts = Counter(size for size in sizes_px if size is not None)
-    if len(counts) <= 1:
+    counts = Counter(size for size in sizes_px if size).most_common()
+    if len(counts) < 2:
         return np.ones(len(sizes_px), np.bool_)
-    (width, height), most = counts.most_common(1)[0]
-    others = ", ".join(f"{count} of {w}x{h}" for (w, h), count in counts.most_common()[1:5])
-    log.note(f"{what}: images of another size", f"{others} left out, {most} have {width}x{height} px")
-    return np.array([size in (None, (width, height)) for size in sizes_px], np.bool_)
+    (usual, most), *rest = counts
+    others = ", ".join(f"{count} of {width}x{height}" for (width, height), count in rest[:4])
+    log.note(f"{what}: images of another size", f"{others} left out, {most} have {usual[0]}x{usual[1]} px")
+    return np.array([size in (None, usual) for size in sizes_px], np.bool_)
 
 
 def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
@@ -84,45 +90,35 @@ def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_
     """
     _check_steps(stamps_ns, what)
     kept = _longest_increasing(stamps_ns)
-    _note_dropped(stamps_ns, kept, what, log)
+    if dropped := int((~kept).sum()):
+        steps, share = np.diff(stamps_ns), f"{dropped} of {len(kept)}"
+        if (steps >= 0).all():
+            first_ns = stamps_ns[np.flatnonzero(steps == 0)[0]]
+            what_is_wrong = "stamps repeated", f"are that of the one before and left out; the first is {first_ns}"
+            fault = (
+                f"{share} stamps repeat the one before, the first is {first_ns}; the driver stamps several alike, or rounds: "
+                "let it stamp each one when it is measured"
+            )
+        else:
+            back = int(np.flatnonzero(steps < 0)[0])
+            from_to = f"{steps[back] * 1e-9:.3f} s, from {stamps_ns[back]} to {stamps_ns[back + 1]}"
+            what_is_wrong = "stamps not increasing", f"left out; the first step back is {from_to}"
+            fault = f"stamps go backwards, {share} do not fit; the sensor's clock is broken, record again"
+        log.note(f"{what}: {what_is_wrong[0]}", f"{share} {what_is_wrong[1]}")
+        if dropped > len(kept) // 2:
+            raise RecordingError(f"{what}: {fault}")
     if what not in ("position priors", "ground truth"):  # which arrive irregularly
         rows = np.flatnonzero(kept)
         kept[rows[_strays(stamps_ns[rows], what, log)]] = False
     return kept
 
 
-def _note_dropped(stamps_ns: Stamps, kept: NDArray[np.bool_], what: str, log: ReadLog) -> None:
-    dropped = np.flatnonzero(~kept)
-    if not len(dropped):
-        return
-    steps = np.diff(stamps_ns)
-    share = f"{len(dropped)} of {len(kept)}"
-    if (steps >= 0).all():
-        first_ns = stamps_ns[np.flatnonzero(steps == 0)[0]]
-        log.note(
-            f"{what}: stamps repeated", f"{share} are that of the one before and left out; the first is {first_ns}"
-        )
-        fault = (
-            f"{share} stamps repeat the one before, the first is {first_ns}; the driver stamps several alike, or rounds: "
-            "let it stamp each one when it is measured"
-        )
-    else:
-        back = int(np.flatnonzero(steps < 0)[0])
-        log.note(
-            f"{what}: stamps not increasing",
-            f"{share} left out; the first step back is {steps[back] * 1e-9:.3f} s, from {stamps_ns[back]} to {stamps_ns[back + 1]}",
-        )
-        fault = f"stamps go backwards, {share} do not fit; the sensor's clock is broken, record again"
-    if len(dropped) > len(kept) // 2:
-        raise RecordingError(f"{what}: {fault}")
-
-
 def _strays(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
     """(N,) mask of the few isolated increasing stamps, a pause away from all others; noted in `log`."""
-    strays = np.zeros(len(stamps_ns), np.bool_)
-    steps = np.diff(stamps_ns)
+    none, steps = np.zeros(len(stamps_ns), np.bool_), np.diff(stamps_ns)
     if len(steps) == 0:
-        return strays
+        return none
+    strays = none.copy()
     pause_ns = max(PAUSE_NS, _PAUSE_STEPS * int(np.median(steps)))
     parts = np.split(np.arange(len(stamps_ns)), np.flatnonzero(steps > pause_ns) + 1)
     largest = max(parts, key=len)
@@ -130,15 +126,12 @@ def _strays(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
         strays[part] = part is not largest and stamps_ns[part[-1]] - stamps_ns[part[0]] < _SHORTEST_PART_NS
     count = int(strays.sum())
     if not 0 < count <= max(1, _STRAY_SHARE * len(stamps_ns)):
-        return np.zeros(len(stamps_ns), np.bool_)
+        return none
     first_ns, others = stamps_ns[strays][:3], stamps_ns[~strays]
     away_s = (first_ns - others[nearest(others, first_ns)]) * 1e-9
     named = ", ".join(f"{stamp} ({seconds:+.1f} s)" for stamp, seconds in zip(first_ns, away_s, strict=True))
-    more = ", ..." if count > 3 else ""
-    log.note(
-        f"{what}: stamps far apart",
-        f"{count} of {len(stamps_ns)} left out: {named}{more} from the nearest other; was the clock set?",
-    )
+    where = f"{named}{', ...' if count > 3 else ''} from the nearest other; was the clock set?"
+    log.note(f"{what}: stamps far apart", f"{count} of {len(stamps_ns)} left out: {where}")
     return strays
 
 

@@ -11,7 +11,6 @@ import re
 import struct
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -52,8 +51,8 @@ def open_video(path: Path, options: OpenOptions) -> Recording:
     try:
         if rotation := reader.rotation(series.sources[0], int(series.stamps_ns[0])):
             log.note("video turned", f"players turn it by {rotation} degrees; images are used as the sensor gave them")
-        parts = image_parts(path, "video", given.calibration, SeriesFrames(reader, series))
-        return finalize(replace(parts, name=path.stem), log)
+        frames = SeriesFrames(reader, series)
+        return finalize(image_parts(path, "video", given.calibration, frames, name=path.stem), log)
     except BaseException:
         reader.close()
         raise

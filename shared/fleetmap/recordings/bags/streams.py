@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -54,7 +55,7 @@ from fleetmap.recordings.ordering import (
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.recordings.ros2.messages import CameraInfo
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
-from fleetmap.sensors.samples import ImuSamples, PositionPrior, Stamps, Trajectory, WheelSample
+from fleetmap.sensors.samples import ImuSamples, Stamps, Trajectory
 from fleetmap.sensors.source_settings import CAMERA_ROLES, Topics
 
 _LAST_NS = 2**63 - 1  # MCAP's times have a bit more
@@ -193,12 +194,10 @@ def _parts(
     log.files[:0] = container.files
     channels = [stream.channel for stream in streams if stream.messages or stream.is_of_images]
     if not channels:
-        issues = "; ".join(f"{issue.what}: {issue.detail}" for issue in log.issues)
         there = ", ".join(f"{c.topic} ({c.type_name} in {c.encoding or 'no encoding'})" for c in others[:8])
         known = f"; known encodings are {', '.join(ENCODINGS)}" if others else ""
-        raise RecordingError(
-            f"{container.path} holds no message that can be read ({issues or there or 'it is empty'}{known})"
-        )
+        why = f"{log.told() or there or 'it is empty'}{known}"
+        raise RecordingError(f"{container.path} holds no message that can be read ({why})")
     topics = _with_hints(options.topics, given, {channel.topic for channel in channels})
     chosen = choose_topics(channels, topics, str(container.path), log)
     by_id = {stream.channel.id: stream for stream in streams}
@@ -257,22 +256,16 @@ def _parts(
                 "images not used", f"{', '.join(beside)}: beside a depth camera as first view no other is used; {how}"
             )
         _note_unregistered(streams, roles, calibration.cameras[0], log)
-    wheel: tuple[WheelSample, ...] = _samples(roles.get("wheel", ()), "wheel odometry", log)
-    priors: tuple[PositionPrior, ...] = _samples(roles.get("prior", ()), "position priors", log)
+    wheel = _samples(roles.get("wheel", ()), "wheel odometry", log)
+    priors = _samples(roles.get("prior", ()), "position priors", log)
     ground_truth = _ground_truth(roles.get("ground_truth", ()), log)
     for stream in streams:
         if stream.damaged and not stream.is_of_images:
             what = f"{stream.channel.topic}: damaged messages"
             log.note(what, f"{stream.damaged} left out, {len(stream.messages)} were found")
     frames = SeriesFrames(MessageReader(opener, container, log.files), left, right, depth, others=views)
-    return replace(
-        image_parts(container.path, "", calibration, frames),
-        name=container.name,
-        imu=imu,
-        wheel=wheel,
-        priors=priors,
-        ground_truth=ground_truth,
-    )
+    sensors = {"imu": imu, "wheel": wheel, "priors": priors, "ground_truth": ground_truth}
+    return image_parts(container.path, "", calibration, frames, name=container.name, **sensors)
 
 
 def _collect(container: Container, topics: Topics, log: ReadLog) -> tuple[list[_Stream], list[Channel]]:
@@ -384,15 +377,14 @@ def _lenses(images: Sequence[_Stream], streams: Sequence[_Stream]) -> _Lenses:
 
 def _images(streams: Sequence[_Stream], what: str, log: ReadLog, lenses: _Lenses | None = None) -> _Images:
     damaged = sum(stream.damaged for stream in streams)
-    stamps_ns = np.array([stamp for stream in streams for stamp in stream.stamps_ns], np.int64)
-    log_times_ns = np.array([stamp for stream in streams for stamp in stream.log_times_ns], np.int64)
+    sources = tuple((stream.channel, place) for stream in streams for place in stream.places)
     if damaged:
         why = next(stream.why_damaged for stream in streams if stream.why_damaged)
-        if not len(stamps_ns):
+        if not sources:
             raise RecordingError(f"{why} (none of {damaged} {what} can be read)")
-        log.note(f"{what} left out", f"{damaged} of {damaged + len(stamps_ns)}; the first: {why}")
-    sources = tuple((stream.channel, place) for stream in streams for place in stream.places)
-    stamps_ns, order = as_logged(stamps_ns, log_times_ns, what, log)
+        log.note(f"{what} left out", f"{damaged} of {damaged + len(sources)}; the first: {why}")
+    sent, logged = chain(*(s.stamps_ns for s in streams)), chain(*(s.log_times_ns for s in streams))
+    stamps_ns, order = as_logged(list(sent), list(logged), what, log)
     kept = usual_size([size for stream in streams for size in stream.sizes_px], what, log)
     if lenses is not None and not (of_usual := np.asarray(lenses.numbers == lenses.usual)).all():
         kept &= of_usual
@@ -407,8 +399,7 @@ def _images(streams: Sequence[_Stream], what: str, log: ReadLog, lenses: _Lenses
 def _samples(streams: Sequence[_Stream], what: str, log: ReadLog) -> tuple[Any, ...]:
     """The samples whose stamps increase as they arrived."""
     samples = [value for stream in streams for value in stream.values]
-    stamps_ns = np.array([sample.stamp_ns for _, sample in samples], np.int64)
-    stamps_ns, order = as_logged(stamps_ns, np.array([at for at, _ in samples], np.int64), what, log)
+    stamps_ns, order = as_logged([sample.stamp_ns for _, sample in samples], [at for at, _ in samples], what, log)
     stamped = [replace(samples[k][1], stamp_ns=int(stamps_ns[k])) for k in order.tolist()]
     return values_forward(stamped, [sample.stamp_ns for sample in stamped], what, log)
 
@@ -426,7 +417,7 @@ def _imu(streams: Sequence[_Stream], log: ReadLog) -> tuple[ImuSamples, str | No
     if not parts:
         return ImuSamples.empty(), None
     stamps_ns, gyro, accel = (np.concatenate([part[i] for part in parts]) for i in range(3))
-    stamps_ns, order = as_logged(stamps_ns.astype(np.int64), np.array(log_times_ns, np.int64), "imu", log)
+    stamps_ns, order = as_logged(stamps_ns, log_times_ns, "imu", log)
     return clean_imu(stamps_ns[order], gyro[order], accel[order], log), parts[0][3]
 
 
@@ -434,10 +425,8 @@ def _ground_truth(streams: Sequence[_Stream], log: ReadLog) -> Trajectory | None
     values = [value for stream in streams for value in stream.values]
     if not values:
         return None
-    stamps_ns = np.array([stamp_ns for _, (stamp_ns, _) in values], np.int64)
-    log_times_ns = np.array([at for at, _ in values], np.int64)
     rows = np.stack([row for _, (_, row) in values])
-    stamps_ns, order = as_logged(stamps_ns, log_times_ns, "ground truth", log)
+    stamps_ns, order = as_logged([ns for _, (ns, _) in values], [at for at, _ in values], "ground truth", log)
     return trajectory_of_rows(stamps_ns[order], rows[order], log)
 
 

@@ -9,12 +9,11 @@ from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.recordings.calibration_files import (
     calibration_files,
-    load_calibration,
     read_euroc_camera,
     read_euroc_imu,
     read_yaml,
 )
-from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
+from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts, logged_calibration
 from fleetmap.recordings.folders.layout import (
     existing_images,
     read_ground_truth,
@@ -54,13 +53,10 @@ def open_euroc(path: Path, options: OpenOptions) -> Recording:
             images = [folder / "data" / name.relative_to(folder) for name in names]
             cameras.append(existing_images(stamps_ns, images, folder.name, log))
     calibration, euroc_from_imu = _calibration(root, len(cameras), options, log)
-    parts = replace(
-        image_parts(path, "euroc", *rig_frames(root, log, cameras, calibration)),
-        name=root.resolve().name,
-        imu=read_imu(root / "mav0/imu0/data.csv", log),
-        ground_truth=_ground_truth(root, euroc_from_imu, log),
-    )
-    return finalize(parts, log)
+    frames = rig_frames(root, log, cameras, calibration)
+    imu = read_imu(root / "mav0/imu0/data.csv", log)
+    truth, name = _ground_truth(root, euroc_from_imu, log), root.resolve().name
+    return finalize(image_parts(path, "euroc", *frames, name=name, imu=imu, ground_truth=truth), log)
 
 
 def _calibration(root: Path, count: int, options: OpenOptions, log: ReadLog) -> tuple[RigCalibration, Array]:
@@ -81,8 +77,7 @@ def _calibration(root: Path, count: int, options: OpenOptions, log: ReadLog) -> 
         return RigCalibration(tuple(cameras), noise), euroc_from_imu
     for name in _CAMCHAINS:
         if (root / name).is_file():
-            log.files += calibration_files(root / name)
-            return load_calibration(root / name).calibration, euroc_from_imu
+            return logged_calibration(root / name, log).calibration, euroc_from_imu
     raise CalibrationError(
         f"{missing} is missing and there is no camchain.yaml; pass a calibration with --calibration FILE"
     )

@@ -3,7 +3,6 @@ each with its images in data and their timestamps.txt; calib_cam_to_cam.txt is t
 """
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -127,8 +126,8 @@ def open_kitti(path: Path, options: OpenOptions) -> Recording:
         log.files.append(path / "calib.txt")
     left, right = pair_images(left, right, log, tolerance_ns=0)
     truth = optional_truth(path / "poses.txt", log, lambda file: _ground_truth(file, stamps_of_number, log))
-    parts = image_parts(path, "kitti", calibration, SeriesFrames(FileReader(path, log.files), left, right))
-    return finalize(replace(parts, ground_truth=truth), log)
+    frames = SeriesFrames(FileReader(path, log.files), left, right)
+    return finalize(image_parts(path, "kitti", calibration, frames, ground_truth=truth), log)
 
 
 def _images(folder: Path, stamps_of_number: Stamps | None, log: ReadLog) -> ImageFiles:

@@ -51,7 +51,7 @@ def open_seven_scenes(path: Path, options: OpenOptions) -> Recording:
     calibration = RigCalibration((colour_camera,), None, calibration.base_from_body)
     truth = _ground_truth(colour, se3_inverse(depth_camera.body_from_cam), log)
     frames = SeriesFrames(FileReader(path, log.files), colour, depth=depth, register=register)
-    return finalize(replace(image_parts(path, "7scenes", calibration, frames), ground_truth=truth), log)
+    return finalize(image_parts(path, "7scenes", calibration, frames, ground_truth=truth), log)
 
 
 class DepthRegistration:

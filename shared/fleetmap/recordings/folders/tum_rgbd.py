@@ -4,7 +4,6 @@ Without a calibration file, folders whose name says freiburg1, 2 or 3 get the co
 layout itself holds none. Source: Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems", and its page of file formats.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -66,7 +65,7 @@ def open_tum_rgbd(path: Path, options: OpenOptions) -> Recording:
     calibration = RigCalibration(calibration.cameras[:1], None, calibration.base_from_body)
     truth = optional_truth(path / "groundtruth.txt", log, read_truth)
     frames = SeriesFrames(FileReader(path, log.files), colour, depth=depth, register=_metres)
-    return finalize(replace(image_parts(path, "tum-rgbd", calibration, frames), ground_truth=truth), log)
+    return finalize(image_parts(path, "tum-rgbd", calibration, frames, ground_truth=truth), log)
 
 
 def _metres(depth: NDArray[np.float32], _: str) -> NDArray[np.float32]:

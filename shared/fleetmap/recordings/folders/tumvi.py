@@ -1,14 +1,12 @@
 """TUM-VI folders with cam0/images, cam1/images, times.txt, a Kalibr camchain.yaml, imu.txt and gt_imu.csv."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
-from fleetmap.recordings.calibration_files import calibration_files, load_calibration
 from fleetmap.recordings.files import natural_key
-from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
+from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts, logged_calibration
 from fleetmap.recordings.folders.layout import (
     ImageFiles,
     existing_images,
@@ -34,19 +32,12 @@ def open_tumvi(path: Path, options: OpenOptions) -> Recording:
         raise RecordingError(f"{path / 'cam0/images'} is missing, cam1 is there; copy the recording again")
     present = [name for name in ("cam0", "cam1") if (path / name / "images").is_dir()]
     cameras = [_images(path / name, name, log) for name in present]
-    given = calibration_of_options(options, log)
-    if given is None:
-        camchain = path / "camchain.yaml"
-        if not camchain.is_file():
-            raise CalibrationError(f"{camchain} is missing; pass a calibration with --calibration FILE")
-        log.files += calibration_files(camchain)
-        given = load_calibration(camchain)
-    parts = replace(
-        image_parts(path, "tumvi", *rig_frames(path, log, cameras, given.calibration)),
-        imu=read_imu(path / "imu.txt", log),
-        ground_truth=read_ground_truth(path / "gt_imu.csv", log),
-    )
-    return finalize(parts, log)
+    given, camchain = calibration_of_options(options, log), path / "camchain.yaml"
+    if given is None and not camchain.is_file():
+        raise CalibrationError(f"{camchain} is missing; pass a calibration with --calibration FILE")
+    frames = rig_frames(path, log, cameras, (given or logged_calibration(camchain, log)).calibration)
+    imu, truth = read_imu(path / "imu.txt", log), read_ground_truth(path / "gt_imu.csv", log)
+    return finalize(image_parts(path, "tumvi", *frames, imu=imu, ground_truth=truth), log)
 
 
 def _images(folder: Path, name: str, log: ReadLog) -> ImageFiles:

@@ -11,7 +11,7 @@ import zlib
 from bisect import bisect_right
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
+from functools import cached_property, lru_cache, partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -104,30 +104,18 @@ class McapFile(Container):
         self._file = path.open("rb")
         self._channels: dict[int, Channel] = {}
         self._schemas: dict[int, tuple[str, bytes]] = {}
-        self._chunk_starts: list[int] | None = None
-        self._chunks: dict[int, bytes] = {}
+        self._unpacked_chunk = lru_cache(_KEPT_CHUNKS)(self._unpack_chunk)
         self._too_large = 0
         self._bad_chunks: list[tuple[int, int]] = []  # byte and size
 
     def messages(self) -> Iterator[Message]:
         """See Container: in the order of the file."""
-        self._file.seek(0)
-        if self._file.read(len(MAGIC)) != MAGIC:
+        if self._bytes(0, len(MAGIC)) != MAGIC:
             fault = what_file_instead(self.path) or "not an MCAP file: it begins differently; copy the recording again"
             raise RecordingError(f"{self.path} is {fault}")
-        at: int | None = len(MAGIC)
-        while at is not None:
-            is_end, next_at = yield from self._record(at)
-            if is_end:
-                self._file.seek(max(0, self.size - len(MAGIC)))
-                if self._file.read() != MAGIC:
-                    self._note("the file ends inside its index", "no message is missing")
-                break
-            if next_at is None:
-                starts = self._read_index()
-                behind = bisect_right(starts, at)
-                next_at = starts[behind] if behind < len(starts) else None
-            at = next_at
+        at = len(MAGIC)
+        while at:
+            at = yield from self._record(at)
         if self._too_large:
             limit = f"the limit of a record is {MAX_MESSAGE_BYTES >> 20} MiB"
             self.issues.append(DataIssue("records that are too large", f"{self._too_large} left out; {limit}"))
@@ -138,11 +126,7 @@ class McapFile(Container):
 
     def read(self, place: Place) -> bytes:
         at, length, chunk_at = place
-        if chunk_at >= 0:
-            data = self._unpacked_chunk(chunk_at)[at : at + length]
-        else:
-            self._file.seek(at)
-            data = self._file.read(length)
+        data = self._unpacked_chunk(chunk_at)[at : at + length] if chunk_at >= 0 else self._bytes(at, length)
         if len(data) < length:
             raise RecordingError(f"{self.path} became shorter while it was read; is it still being written?")
         return bytes(unpack_message(memoryview(data)))
@@ -150,36 +134,39 @@ class McapFile(Container):
     def close(self) -> None:
         self._file.close()
 
-    def _record(self, at: int) -> Generator[Message, None, tuple[bool, int | None]]:
-        """Yield the messages of the record at `at`; return True at the data's end, and the start of the next record, None if unknown."""
+    def _bytes(self, at: int, length: int) -> bytes:
         self._file.seek(at)
-        head = self._file.read(_RECORD_HEAD.size)
-        if len(head) < _RECORD_HEAD.size:
+        return self._file.read(length)
+
+    def _record(self, at: int) -> Generator[Message, None, int]:
+        """Yield the messages of the record at `at`; return the start of the next one, 0 at the end."""
+        head, start = self._bytes(at, _RECORD_HEAD.size), at + _RECORD_HEAD.size
+        rest = self.size - start
+        opcode, length = _RECORD_HEAD.unpack(head.ljust(_RECORD_HEAD.size, b"\0"))
+        if rest < 0:
             why = "it ends inside a record's head" if head else "the recorder was stopped hard"
             self._note("the file has no end mark", why)
-            return False, None
-        opcode, length = _RECORD_HEAD.unpack(head)
-        start, rest = at + len(head), self.size - at - len(head)
-        if not 1 <= opcode < 0x80 or length > _LARGEST_RECORD_BYTES:
+        elif not 1 <= opcode < 0x80 or length > _LARGEST_RECORD_BYTES:
             self._note("not an MCAP record", f"{rest} bytes from byte {at} on are not readable in sequence")
-            return False, None
-        if length > rest:
-            self._note(
-                "the file ends inside a record",
-                f"{length - rest} of {length} bytes of the record at byte {at} are missing",
-            )
+        elif length > rest:
+            missing = f"{length - rest} of {length} bytes of the record at byte {at} are missing"
+            self._note("the file ends inside a record", missing)
             if opcode == Opcode.CHUNK:
-                yield from self._chunk(start, self._file.read(min(rest, _MAX_RECORD_BYTES)), is_cut=True)
-            return False, None
-        if opcode in (Opcode.DATA_END, Opcode.FOOTER):
-            return True, None
-        if length > _MAX_RECORD_BYTES:
-            self._too_large += 1
-        elif opcode == Opcode.CHUNK:
-            yield from self._chunk(start, self._file.read(length))
-        elif opcode == Opcode.MESSAGE or opcode in _PARSED:
-            yield from self._content(opcode, memoryview(self._file.read(length)), start, -1)
-        return False, start + length
+                yield from self._chunk(start, self._bytes(start, min(rest, _MAX_RECORD_BYTES)), is_cut=True)
+        elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
+            if self._bytes(max(0, self.size - len(MAGIC)), len(MAGIC)) != MAGIC:
+                self._note("the file ends inside its index", "no message is missing")
+            return 0
+        else:
+            if length > _MAX_RECORD_BYTES:
+                self._too_large += 1
+            elif opcode == Opcode.CHUNK:
+                yield from self._chunk(start, self._bytes(start, length))
+            elif opcode == Opcode.MESSAGE or opcode in _PARSED:
+                yield from self._content(opcode, memoryview(self._bytes(start, length)), start, -1)
+            return start + int(length)
+        starts = self._chunk_starts
+        return next(iter(starts[bisect_right(starts, at) :]), 0)
 
     def _chunk(self, at: int, content: bytes, *, is_cut: bool = False) -> Iterator[Message]:
         try:
@@ -198,10 +185,8 @@ class McapFile(Container):
         except ValueError:
             self._bad_chunks.append((at, len(content)))
             return
-        if chunk.compression:
-            base, chunk_at = 0, at
-        else:
-            base, chunk_at = at + 40, -1  # the records are stored uncompressed after the chunk's header
+        # Records that are not compressed are in the file, behind the chunk's header
+        base, chunk_at = (0, at) if chunk.compression else (at + 40, -1)
         position = 0
         while position + _RECORD_HEAD.size <= len(unpacked):
             opcode, length = _RECORD_HEAD.unpack_from(unpacked, position)
@@ -214,25 +199,23 @@ class McapFile(Container):
             position += length
 
     def _content(self, opcode: int, content: memoryview, at: int, chunk_at: int) -> Iterator[Message]:
-        """Return the message in a record's content at byte `at`; other records are kept."""
+        """Yield the message in a record's content at byte `at`; other records are kept."""
         try:
             if opcode != Opcode.MESSAGE:
                 self._keep_record(_parsed(opcode, content), content)
                 return
-            if len(content) < _MESSAGE_HEAD.size:
+            if len(content) < (head := _MESSAGE_HEAD.size):
                 raise ValueError("it ends too early")
             channel_id, _, log_time, _ = _MESSAGE_HEAD.unpack_from(content)
             if channel_id not in self._channels:
-                self._read_index()  # its own record may be in a damaged chunk
-            channel = self._channels.get(channel_id)
-            if channel is None:
+                _ = self._chunk_starts  # its own record may be in a damaged chunk, and is again in the index
+            if channel_id not in self._channels:
                 raise ValueError(f"message of an unknown channel {channel_id}")
-            data = unpack_message(content[_MESSAGE_HEAD.size :], self.unpack)
+            data = unpack_message(content[head:], self.unpack)
         except ValueError as error:
             self._note("a damaged record", f"kind {opcode} at byte {at}: {error}")
             return
-        head = _MESSAGE_HEAD.size
-        yield channel, log_time, (at + head, len(content) - head, chunk_at), data
+        yield self._channels[channel_id], log_time, (at + head, len(content) - head, chunk_at), data
 
     def _keep_record(self, record: Any, content: memoryview) -> None:
         self.keep(len(content))
@@ -253,44 +236,35 @@ class McapFile(Container):
                 if "stamps" in record.metadata:
                     self.issues.append(UNCERTAIN_STAMPS)
 
-    def _unpacked_chunk(self, at: int) -> bytes:
-        if at not in self._chunks:
-            self._file.seek(at - 8)
-            length = int.from_bytes(self._file.read(8), "little")
-            chunk = _parsed(Opcode.CHUNK, self._file.read(min(length, _MAX_RECORD_BYTES)))
-            while len(self._chunks) >= _KEPT_CHUNKS:
-                del self._chunks[next(iter(self._chunks))]
-            self._chunks[at] = unpack(chunk.compression, chunk.data)
-        return self._chunks[at]
+    def _unpack_chunk(self, at: int) -> bytes:
+        length = int.from_bytes(self._bytes(at - 8, 8), "little")
+        chunk = _parsed(Opcode.CHUNK, self._bytes(at, min(length, _MAX_RECORD_BYTES)))
+        return unpack(chunk.compression, chunk.data)
 
-    def _read_index(self) -> list[int]:
+    @cached_property
+    def _chunk_starts(self) -> list[int]:
         """Starts of the chunks by the index at the file's end, empty without one; schemas and channels there are kept."""
-        if self._chunk_starts is None:
-            self._chunk_starts = sorted(self._indexed_chunks())
-        return self._chunk_starts
-
-    def _indexed_chunks(self) -> Iterator[int]:
+        starts: list[int] = []
         tail_bytes = _RECORD_HEAD.size + 20 + len(MAGIC)  # footer and end mark
-        self._file.seek(max(0, self.size - tail_bytes))
-        tail = self._file.read(tail_bytes)
-        if len(tail) < tail_bytes or tail[0] != Opcode.FOOTER or not tail.endswith(MAGIC):
-            return
-        at = summary_at = _parsed(Opcode.FOOTER, tail[_RECORD_HEAD.size :]).summary_start
+        tail = self._bytes(max(0, self.size - tail_bytes), tail_bytes)
+        is_whole = len(tail) == tail_bytes and tail[0] == Opcode.FOOTER and tail.endswith(MAGIC)
+        at = summary_at = _parsed(Opcode.FOOTER, tail[_RECORD_HEAD.size :]).summary_start if is_whole else 0
         while 0 < at <= self.size - _RECORD_HEAD.size:
-            self._file.seek(at)
-            opcode, length = _RECORD_HEAD.unpack(self._file.read(_RECORD_HEAD.size))
+            opcode, length = _RECORD_HEAD.unpack(self._bytes(at, _RECORD_HEAD.size))
+            at += _RECORD_HEAD.size
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.CHUNK_INDEX) and length <= _MAX_RECORD_BYTES:
-                content = memoryview(self._file.read(length))
+                content = memoryview(self._bytes(at, length))
                 try:
                     record = _parsed(opcode, content)
                 except ValueError:
-                    return
+                    break
                 if opcode != Opcode.CHUNK_INDEX:
                     self._keep_record(record, content)
                 elif record.chunk_start_offset < summary_at:
                     self.keep(0)
-                    yield record.chunk_start_offset
-            at += _RECORD_HEAD.size + length
+                    starts.append(record.chunk_start_offset)
+            at += length
+        return sorted(starts)
 
     def _note(self, what: str, detail: str) -> None:
         if len(self.issues) < _MOST_ISSUES:
