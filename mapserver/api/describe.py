@@ -21,12 +21,9 @@ class ExactJson(JSONResponse):
 
 def _exact(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: str(v) if _is_stamp(key, v) else _exact(v) for key, v in value.items()}
+        # The type is that of an integer, and not of a bool
+        return {k: str(v) if type(v) is int and str(k).endswith("_ns") else _exact(v) for k, v in value.items()}
     return [_exact(item) for item in value] if isinstance(value, list) else value
-
-
-def _is_stamp(key: object, value: object) -> bool:
-    return isinstance(key, str) and key.endswith("_ns") and isinstance(value, int) and not isinstance(value, bool)
 
 
 def install(app: FastAPI) -> None:

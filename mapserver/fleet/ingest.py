@@ -3,7 +3,7 @@
 import math
 import threading
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Annotated, Any
 
 import msgspec
@@ -26,10 +26,6 @@ _TRACE_STEP_M = 0.5
 _MAX_CAUSES = 64
 _MAX_KEPT_TRACES = 200_000
 _DAY_NS = 86_400_000_000_000
-_PERIODS = (
-    *("trace_days", "tally_days", "failure_days", "picture_days", "replay_days", "survey_picture_days"),
-    *("recording_days", "picture_bytes"),
-)
 
 
 class IngestSettings(Section, frozen=True):
@@ -51,7 +47,9 @@ class IngestSettings(Section, frozen=True):
     replay_bytes: PositiveInt = 2_000_000_000  # above, the oldest recordings are deleted
 
     def retention(self) -> FleetRetention:
-        return FleetRetention(**{name: getattr(self, name) for name in _PERIODS})
+        return FleetRetention(
+            **{f.name: getattr(self, f.name) for f in fields(FleetRetention) if hasattr(self, f.name)}
+        )
 
 
 @dataclass(slots=True)
@@ -208,12 +206,8 @@ class Ingest:
         is_changed = health.status != stream.status or has_moved
         due = quiet_ns >= self._settings.trace_every_s * 1e9 or (is_changed and quiet_ns >= _LEAST_BETWEEN_TRACES_NS)
         if due:
-            stream.trace_ns, stream.status, stream.trace_map_m, stream.rows_left = (
-                now_ns,
-                health.status,
-                here,
-                rows_left - 1,
-            )
+            stream.trace_ns, stream.status = now_ns, health.status
+            stream.trace_map_m, stream.rows_left = here, rows_left - 1
         return due
 
     def _grid(self, site: str, version: int | None) -> _Grid | None:

@@ -181,7 +181,9 @@ class _Night:
                 raise refused
             return f"site {self._request.site}: nothing new"
         versions = ", ".join(str(version) for version in self._report.published)
-        return f"site {self._request.site}: version {versions} published, {self._counts()}"
+        fates = [recording["fate"] for recording in self._report.recordings]
+        counts = ", ".join(f"{fates.count(where)} {where}" for where in (boxes.DONE, boxes.HELD, boxes.BAD))
+        return f"site {self._request.site}: version {versions} published, {counts}"
 
     def _identified(self, paths: tuple[Path, ...]) -> list[Recorded]:
         """Return the readable ones, each once."""
@@ -327,10 +329,6 @@ class _Night:
         """Record the recordings in work, so that the next nights know them if this one is killed."""
         self._report.looking_at = [path.name for path in paths]
         self._maps.tell_progress(self._report.job, self._report.looking_at, "looking_at")
-
-    def _counts(self) -> str:
-        fates = [recording["fate"] for recording in self._report.recordings]
-        return ", ".join(f"{fates.count(where)} {where}" for where in (boxes.DONE, boxes.HELD, boxes.BAD))
 
     def _say(self, words: str) -> None:
         self._console.print(printable(words), markup=False, highlight=False)

@@ -68,9 +68,8 @@ class FleetQueries:
         with self._database.write(durable=False) as change:
             ids = _ids(change, [*(key[:3] for key in batch.counters), *map(_robot_key, batch.traces)])
             _add_counters(change, ids, batch.counters)
-            rows = [{"key_id": ids[_robot_key(row)], **asdict(row)} for row in batch.traces]
-            for row in rows:
-                del row["site"], row["robot"]
+            traced = _TRACED.split(", ")
+            rows = [{"key_id": ids[_robot_key(row)]} | {n: getattr(row, n) for n in traced} for row in batch.traces]
             change.insert("traces", rows, "ON CONFLICT DO NOTHING")
             keep_last_reports(change, batch.last_reports)
 
@@ -327,7 +326,10 @@ def _known_ids(change: Transaction, keys: Sequence[Key]) -> dict[Key, int]:
 
 
 def _add_counters(change: Transaction, ids: Mapping[Key, int], counters: Mapping[CounterKey, Counters]) -> None:
-    rows = [{"key_id": ids[key[:3]], "hour": key[3], **asdict(counters[key])} for key in sorted(counters)]
+    rows = [
+        {"key_id": ids[key[:3]], "hour": key[3]} | {name: getattr(counters[key], name) for name in COUNTER_COLUMNS}
+        for key in sorted(counters)
+    ]
     change.insert("tallies", rows, f"ON CONFLICT (key_id, hour) DO UPDATE SET {_ADD}")
 
 

@@ -6,7 +6,6 @@ from datetime import UTC, datetime
 from fleetmap.errors import StateError
 from fleetmap.trust import site_role
 from mapserver.store import MapStore
-from mapserver.trust.authorities import Authorities
 from mapserver.trust.enrolment import RobotRegister
 from mapserver.trust.keys import KeyFolder
 from mapserver.trust.lists import TIMESTAMP, SignedLists
@@ -77,13 +76,9 @@ def trust_status(store: MapStore) -> TrustStatus:
             found.risks.append(f"{own.path(role)}: a thief of this machine can publish maps of {info.site}")
     if own.has("root"):
         found.risks.append(f"{own.path('root')}: a thief of this machine can do everything, irrevocably")
-    _look_at_certificates(RobotRegister(store).authorities, found)
-    return found
-
-
-def _look_at_certificates(authorities: Authorities, found: TrustStatus) -> None:
+    authorities = RobotRegister(store).authorities
     if not authorities.are_there:
-        return
+        return found
     for file, left in authorities.days_left().items():
         fault = ""
         if left < _CERTIFICATE_ENDS_SOON:
@@ -93,6 +88,7 @@ def _look_at_certificates(authorities: Authorities, found: TrustStatus) -> None:
         found.certificates.append(CertificateStatus(file, round(left, 2), fault))
     if (authorities.folder / "servers-ca.pem").is_file():
         found.risks.append(f"{authorities.folder}/servers-ca.pem: a thief of this machine can act as the server")
+    return found
 
 
 def _role(lists: SignedLists, role: str, now: datetime) -> RoleStatus:
