@@ -3,6 +3,7 @@
 | group | registered by the name of | as |
 |---|---|---|
 | `locclient.links` | its section in the configuration file | `LinkHook` |
+| `locclient.sources` | `[source] kind` | a function as those of `SOURCES` in `fleetmap/sources/source.py` |
 """
 
 from collections.abc import Callable, Mapping

@@ -1,4 +1,4 @@
-"""Sensor sources of a running robot. To add one: a file and a line in SOURCES."""
+"""Sensor sources of a running robot. To add one: a file and a line in SOURCES, or a plug-in."""
 
 import time
 from collections.abc import Callable
@@ -6,10 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-import cv2
-
 from fleetmap.bus import Bus
 from fleetmap.errors import RecordingError, UsageError
+from fleetmap.plugins import plugins
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording, read_calibration
 from fleetmap.recordings.ros2.graph import key_layout
 from fleetmap.sensors.calibration import RigCalibration
@@ -18,7 +17,6 @@ from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.replay_source import ReplaySource
 from fleetmap.sources.ros2 import Ros2Source
-from fleetmap.sources.uvc import UvcSource
 
 _ROOM_WAIT_S = 0.1
 _LONGEST_GAP_S = 10.0  # between frames: a longer one, such as days after a change of the clock, is skipped
@@ -80,22 +78,12 @@ def _recording(section: SourceSection, topics: Topics, _map_frame: str) -> Sourc
     return RecordingSource(opened, speed=section.speed)
 
 
-def _ros2(section: SourceSection, topics: Topics, map_frame: str) -> Source:
+def open_topics(section: SourceSection, topics: Topics, map_frame: str, *, images: bool = True) -> Ros2Source:
+    """Open ROS 2 topics as the source, or beside another one, which has the images."""
     calibration = _calibration(section)
     layout, bus = key_layout(section.keys, section.domain), Bus.connect(section.endpoint, is_ros=True)
-    return Ros2Source(bus, layout, topics, calibration, has_depth=section.sensors == "rgbd", map_frame=map_frame)
-
-
-def _uvc(section: SourceSection, topics: Topics, map_frame: str) -> Source:
-    if section.sensors != "stereo":
-        raise UsageError(
-            f'[source] sensors = "{section.sensors}": a uvc camera sends pairs; take topics, kind = "ros2"'
-        )
-    calibration = _calibration(section)
-    device: int | str = int(section.device) if section.device.isdecimal() else section.device
-    layout, bus = key_layout(section.keys, section.domain), Bus.connect(section.endpoint, is_ros=True)
-    topic_source = Ros2Source(bus, layout, topics, calibration, images=False, map_frame=map_frame)
-    return UvcSource(lambda: cv2.VideoCapture(device), calibration, section, topic_source)
+    has_depth = section.sensors == "rgbd"
+    return Ros2Source(bus, layout, topics, calibration, images=images, has_depth=has_depth, map_frame=map_frame)
 
 
 def _calibration(section: SourceSection) -> RigCalibration:
@@ -111,11 +99,7 @@ def _calibration(section: SourceSection) -> RigCalibration:
     return calibration
 
 
-SOURCES: dict[str, Callable[[SourceSection, Topics, str], Source]] = {
-    "recording": _recording,
-    "ros2": _ros2,
-    "uvc": _uvc,
-}
+SOURCES: dict[str, Callable[[SourceSection, Topics, str], Source]] = {"recording": _recording, "ros2": open_topics}
 
 
 def open_source(section: SourceSection, topics: Topics, map_frame: str = "map") -> Source:
@@ -123,6 +107,7 @@ def open_source(section: SourceSection, topics: Topics, map_frame: str = "map") 
 
     UsageError for an unknown kind or a missing option, RecordingError and CalibrationError for unusable files.
     """
-    if section.kind not in SOURCES:
-        raise UsageError(f"[source] kind = {section.kind!r}; known are {', '.join(SOURCES)}")
-    return SOURCES[section.kind](section, topics, map_frame)
+    openers = SOURCES if section.kind in SOURCES else SOURCES | plugins("locclient.sources")
+    if section.kind not in openers:
+        raise UsageError(f"[source] kind = {section.kind!r}; known are {', '.join(openers)}")
+    return openers[section.kind](section, topics, map_frame)

@@ -6,12 +6,14 @@ from collections.abc import Callable
 import cv2
 import numpy as np
 
-from fleetmap.errors import RecordingError
+from fleetmap.errors import RecordingError, UsageError
+from fleetmap.recordings import Topics
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame
 from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.ros2 import Ros2Source
+from fleetmap.sources.source import open_topics
 
 _REOPEN_S = 1.0
 _CLOCKS_AGREE_S = 1.0
@@ -84,6 +86,17 @@ class UvcSource:
         driver_s = capture.get(cv2.CAP_PROP_POS_MSEC) * 1e-3
         age_s = now_s - driver_s if abs(now_s - driver_s) < _CLOCKS_AGREE_S else 0.0
         return wall_ns - round((max(age_s, 0.0) + self._section.delay_s) * 1e9)
+
+
+def open_source(section: SourceSection, topics: Topics, map_frame: str) -> UvcSource:
+    """Open `[source] kind = "uvc"`; see `fleetmap.sources.source.open_source`."""
+    if section.sensors != "stereo":
+        raise UsageError(
+            f'[source] sensors = "{section.sensors}": a uvc camera sends pairs; take topics, kind = "ros2"'
+        )
+    device: int | str = int(section.device) if section.device.isdecimal() else section.device
+    others = open_topics(section, topics, map_frame, images=False)
+    return UvcSource(lambda: cv2.VideoCapture(device), others.calibration, section, others)
 
 
 def split_frame(picture: np.ndarray, stamp_ns: int) -> CameraFrame:

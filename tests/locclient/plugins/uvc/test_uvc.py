@@ -7,10 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
-from fleetmap.errors import RecordingError
+from fleetmap.errors import RecordingError, UsageError
+from fleetmap.recordings import Topics
 from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
-from fleetmap.sources.uvc import UvcSource, split_frame
+from fleetmap.sources.source import open_source
+from locclient.plugins.uvc import UvcSource, split_frame
 from support.recordings.recording_samples import calibration
 
 
@@ -84,3 +86,8 @@ def test_stamps_are_the_drivers_where_its_clock_is_known(driver_s: float | None,
 def test_what_is_no_pair_is_refused(picture: Callable[[], None]) -> None:
     with pytest.raises(RecordingError, match="side by side"):
         split_frame(picture, 0)  # type: ignore[arg-type]
+
+
+def test_a_uvc_camera_has_a_pair() -> None:
+    with pytest.raises(UsageError, match="uvc camera sends pairs"):
+        open_source(SourceSection(kind="uvc", sensors="mono"), Topics())
