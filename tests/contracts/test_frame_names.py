@@ -13,9 +13,6 @@ VAGUE = re.compile(r"^(.*_)?(poses?|transforms?|extrinsics?)$|^T$|^T_|_T$")
 VAGUE_FUNCTION = re.compile(r"^_?(poses?|transforms?|extrinsics?|T)$")
 ALLOWED = {
     "mapserver/fleet/fleet.py": {"last_pose"},  # the last PoseMessage as plain values, not a matrix
-    "shared/fleetmap/recordings/bags/decoders.py": {
-        "pose"
-    },  # the decoder of PoseStamped, beside those of image and imu
 }
 # Products are checked where both names say one of the project's own frames; others may be the same by another name.
 KNOWN = {"map", "survey", "odom", "body", "base", "cam"}
