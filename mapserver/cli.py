@@ -9,7 +9,6 @@ from fleetmap.cli_exit import require_extra, run_cli
 from fleetmap.cli_options import Commands, ConfigFile, Options, Version, make_app
 from mapserver.commands.align import align
 from mapserver.commands.areas import AREAS_GROUP
-from mapserver.commands.backup import attach, backup, backups, restore
 from mapserver.commands.build import build
 from mapserver.commands.building import BUILDING
 from mapserver.commands.calibrate import calibrate
@@ -24,7 +23,7 @@ from mapserver.commands.operators import OPERATORS
 from mapserver.commands.releases import diff, inspect, promote, publish, rollback, versions
 from mapserver.commands.robots import ROBOTS
 from mapserver.commands.serve import serve
-from mapserver.commands.store import audit, export, gc, import_, retention, verify
+from mapserver.commands.store import attach, audit, export, gc, import_, retention, verify
 from mapserver.commands.surfels import MAP
 from mapserver.commands.trust import TRUST
 from mapserver.hooks import command_hooks
@@ -47,9 +46,6 @@ COMMANDS: Commands = {
     "gc": gc,
     "attach": attach,
     "retention": retention,
-    "backup": backup,
-    "backups": backups,
-    "restore": restore,
     "export": export,
     "import": import_,
     "convert": convert,

@@ -1,7 +1,8 @@
-"""`mapserver verify`, `gc`, `export`, `import` and `audit`: the store as a whole, and versions as files."""
+"""`mapserver verify`, `gc`, `attach`, `export`, `import` and `audit`: the store as a whole, and versions as files."""
 
 import shlex
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options, settings_of
-from fleetmap.errors import BusyError, StoreError
+from fleetmap.console import plain_console
+from fleetmap.errors import BusyError, StoreError, UsageError
 from mapserver.commands.options import (
     ActorOptions,
     Json,
@@ -214,3 +216,35 @@ def _words(line: "AuditLine") -> str:
     parts += [line.actor and f"by {line.actor!r}{proved}", line.address and f"from {line.address!r}"]
     parts += [line.reason and f"because {line.reason!r}"]
     return ", ".join(part for part in parts if part)
+
+
+def attach(
+    store: NewStoreFolder,
+    content: Annotated[
+        str | None, typer.Option(metavar="URL", help="Object store for tiles, archives and pictures.")
+    ] = None,
+    database: Annotated[
+        str | None, typer.Option(metavar="URL", help="PostgreSQL database for everything else.")
+    ] = None,
+) -> None:
+    """Move a store out of its folder, or let a new folder share one that was moved; stop the server and the nights first."""
+    from mapserver.store import MapStore
+    from mapserver.store.places import Places
+
+    if content is None and database is None:
+        raise UsageError("name --content, --database or both")
+    with shown_progress("blobs") as progress:
+        copied = MapStore.attach(store, Places(content, database), progress)
+    typer.echo(
+        f"{store} uses {content or 'its content'} and {'the named' if database else 'its'} database; {copied} bytes of content were copied"
+    )
+
+
+@contextmanager
+def shown_progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Yield a function that shows how many are done of how many."""
+    from rich.progress import Progress
+
+    with Progress(console=plain_console(stderr=True), transient=True) as bars:
+        bar = bars.add_task(what, total=None)
+        yield lambda done, total: bars.update(bar, completed=done, total=total)

@@ -17,10 +17,10 @@ from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from mapserver import releases
-from mapserver.backup.backup import back_up
-from mapserver.backup.restore import restore
-from mapserver.backup.snapshots import BackupTarget
 from mapserver.fleet.fleet import Fleet
+from mapserver.plugins.backups.backup import back_up
+from mapserver.plugins.backups.restore import restore
+from mapserver.plugins.backups.snapshots import BackupTarget
 from mapserver.serving.bus_service import BusService
 from mapserver.store import Actor, FailureFilter, MapStore
 from mapserver.trust import init_here, update_lists

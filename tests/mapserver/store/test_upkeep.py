@@ -13,9 +13,9 @@ import pytest
 from fleetmap.errors import FleetmapError, MapFormatError, StateError, StoreError
 from fleetmap.mapformat import current_path
 from mapserver import releases
-from mapserver.backup.backup import back_up
-from mapserver.backup.restore import restore
-from mapserver.backup.snapshots import BackupTarget
+from mapserver.plugins.backups.backup import back_up
+from mapserver.plugins.backups.restore import restore
+from mapserver.plugins.backups.snapshots import BackupTarget
 from mapserver.store import Actor, MapStore, Retention, chain_faults, object_store
 from mapserver.store.blobs import Blobs
 from mapserver.store.places import Places, open_objects, read_places

@@ -13,7 +13,7 @@ import httpx
 
 from locclient.identity import RobotIdentity
 from locclient.maps.connection import outbox_path
-from mapserver.backup.snapshots import LEFT_OUT, NAMED
+from mapserver.plugins.backups.snapshots import LEFT_OUT, NAMED
 
 START_S = 120.0  # on a machine that may be busy
 

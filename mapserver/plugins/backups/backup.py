@@ -18,7 +18,7 @@ import pyrage
 
 from fleetmap.errors import StateError, UsageError, disk_errors
 from fleetmap.mapformat import sha256_hex
-from mapserver.backup.snapshots import LEFT_OUT, NAMED, PIECE_BYTES, BackupTarget, Snapshot
+from mapserver.plugins.backups.snapshots import LEFT_OUT, NAMED, PIECE_BYTES, BackupTarget, Snapshot
 from mapserver.store import MapStore
 from mapserver.store.database import format_of
 from mapserver.store.files import is_plain_file

@@ -1,17 +1,13 @@
-"""`mapserver backup`, `restore` and `backups`: copies of a store in a folder or an object store; `attach`: a store there."""
+"""`mapserver backup`, `restore` and `backups`: copies of a store in a folder or an object store."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from fleetmap.cli_options import expand_options
-from fleetmap.console import plain_console
-from fleetmap.errors import UsageError
-from mapserver.commands.options import ActorOptions, Json, NewStoreFolder, StoreFolder, open_store, print_json
-from mapserver.commands.store import EXIT_STATUS_FAULTS
+from mapserver.commands.options import ActorOptions, Json, StoreFolder, open_store, print_json
+from mapserver.commands.store import EXIT_STATUS_FAULTS, shown_progress
 
 Where = Annotated[str, typer.Argument(metavar="TARGET", help="Folder, or s3://BUCKET/PREFIX; for one store alone.")]
 
@@ -29,11 +25,11 @@ def backup(
     json: Json = False,
 ) -> None:
     """Back up a store, also while it is served; only what changed since the last time is copied."""
-    from mapserver.backup.backup import back_up, recipient_of
-    from mapserver.backup.snapshots import BackupTarget
+    from mapserver.plugins.backups.backup import back_up, recipient_of
+    from mapserver.plugins.backups.snapshots import BackupTarget
 
     key = recipient_of(recipient)
-    with open_store(store, read_only=True) as maps, _progress("blobs") as progress:
+    with open_store(store, read_only=True) as maps, shown_progress("blobs") as progress:
         done = back_up(maps, BackupTarget(target, create=True), recipient=key, keep=keep, progress=progress)
     if json:
         print_json(done)
@@ -65,12 +61,12 @@ def restore(
     json: Json = False,
 ) -> None:
     """Make a store of a backup. Robots then send again what the lost server had acknowledged in the last week."""
-    from mapserver.backup.restore import identities_of
-    from mapserver.backup.restore import restore as restored
-    from mapserver.backup.snapshots import BackupTarget
+    from mapserver.plugins.backups.restore import identities_of
+    from mapserver.plugins.backups.restore import restore as restored
+    from mapserver.plugins.backups.snapshots import BackupTarget
 
     identities = identities_of(identity)
-    with _progress("blobs") as progress:
+    with shown_progress("blobs") as progress:
         done = restored(
             BackupTarget(target), store, by.named(), name=snapshot, identities=identities, progress=progress
         )
@@ -101,8 +97,8 @@ def backups(
     json: Json = False,
 ) -> None:
     """List the snapshots of a backup."""
-    from mapserver.backup.restore import verify as verified
-    from mapserver.backup.snapshots import BackupTarget
+    from mapserver.plugins.backups.restore import verify as verified
+    from mapserver.plugins.backups.snapshots import BackupTarget
 
     where = BackupTarget(target)
     if not verify:
@@ -112,7 +108,7 @@ def backups(
         else:
             typer.echo("\n".join(names) or "no snapshots")
         return
-    with _progress("objects") as progress:
+    with shown_progress("objects") as progress:
         found = verified(where, progress)
     if json:
         print_json(found)
@@ -123,35 +119,3 @@ def backups(
         typer.echo(f"{len(found.faults)} faults" if found.faults else "clean")
     if found.faults:
         raise typer.Exit(EXIT_STATUS_FAULTS)
-
-
-def attach(
-    store: NewStoreFolder,
-    content: Annotated[
-        str | None, typer.Option(metavar="URL", help="Object store for tiles, archives and pictures.")
-    ] = None,
-    database: Annotated[
-        str | None, typer.Option(metavar="URL", help="PostgreSQL database for everything else.")
-    ] = None,
-) -> None:
-    """Move a store out of its folder, or let a new folder share one that was moved; stop the server and the nights first."""
-    from mapserver.store import MapStore
-    from mapserver.store.places import Places
-
-    if content is None and database is None:
-        raise UsageError("name --content, --database or both")
-    with _progress("blobs") as progress:
-        copied = MapStore.attach(store, Places(content, database), progress)
-    typer.echo(
-        f"{store} uses {content or 'its content'} and {'the named' if database else 'its'} database; {copied} bytes of content were copied"
-    )
-
-
-@contextmanager
-def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Yield a function that shows how many are done of how many."""
-    from rich.progress import Progress
-
-    with Progress(console=plain_console(stderr=True), transient=True) as bars:
-        bar = bars.add_task(what, total=None)
-        yield lambda done, total: bars.update(bar, completed=done, total=total)

@@ -14,9 +14,9 @@ import pyrage
 
 from fleetmap.errors import FleetmapError, MapFormatError, StoreError, UsageError, disk_errors
 from fleetmap.files import sync_path, write_atomically
-from mapserver.backup.backup import Progress
-from mapserver.backup.snapshots import PIECE_BYTES, BackupTarget, Snapshot
 from mapserver.operators.operators import Operators
+from mapserver.plugins.backups.backup import Progress
+from mapserver.plugins.backups.snapshots import PIECE_BYTES, BackupTarget, Snapshot
 from mapserver.store import Actor, MapStore
 from mapserver.store.blobs import Blobs, FolderObjects
 from mapserver.store.files import locked, make_folder

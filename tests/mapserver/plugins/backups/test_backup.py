@@ -17,9 +17,9 @@ from fleetmap.errors import FleetmapError, MapFormatError, StoreError, UsageErro
 from fleetmap.mapformat import blob_path, sha256_hex
 from fleetmap.messages import WantedVersion
 from fleetmap.trust import TrustedMap
-from mapserver.backup.backup import back_up, recipient_of
-from mapserver.backup.restore import identities_of, restore, verify
-from mapserver.backup.snapshots import BackupTarget
+from mapserver.plugins.backups.backup import back_up, recipient_of
+from mapserver.plugins.backups.restore import identities_of, restore, verify
+from mapserver.plugins.backups.snapshots import BackupTarget
 from mapserver.store import Actor, MapStore, Retention
 from mapserver.trust import KeyFolder, SignedLists, init_here
 from mapserver.trust.signing import rotate_online
