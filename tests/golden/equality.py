@@ -19,9 +19,11 @@ from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from benchmarks.common.recorded_runs import kept_folder, recorded, tool
+from fleetmap.encoding import to_json
 from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.mapformat.floors import Building, FloorEntry
 from fleetmap.recordings import open_recording
@@ -44,18 +46,23 @@ from support.recordings.realdata import DATA
 RIGS = {"stereo": "pair", "front-rear": "front-rear", "front-depth": "front-depth"}
 REAL = {"rgbd": ("7scenes_redkitchen_200", "rgbd"), "mono-inertial": ("euroc_mh01_start", "mono-inertial")}
 FLOORS = "floors"
+MEASURED = ("seconds", "realtime_factor", "peak_rss_mb", "pictures")
+"""Figures of a build that no other one repeats: times, memory, and the address of pictures, which says when they were first kept."""
 
 
 def built(recording: Path, store: Path, site: str, *options: str) -> dict[str, str]:
-    """The hashes of the tiles and the manifest of a recording's map, which is published."""
+    """The hashes of the tiles, and of the manifest without its time and MEASURED, of a recording's map, which is published."""
     to_store = ["--site", site, "--store", str(store)]
     subprocess.run([*tool("mapserver"), "build", str(recording), *to_store, "--threads", "2", *options], check=True)
     subprocess.run(
         [*tool("mapserver"), "publish", *to_store, "--force", "--reason", "compared", "--actor", "golden"], check=True
     )
     with MapStore.open(store) as maps:
-        tiles = {f"tile {n}": entry.sha256 for n, entry in enumerate(maps.manifest(site, 1).tiles)}
-        return {"manifest": maps.version(site, 1).manifest_sha256, **tiles}
+        manifest = maps.manifest(site, 1)
+    report = {name: value for name, value in manifest.report.items() if name not in MEASURED}
+    same = to_json(msgspec.structs.replace(manifest, created="", report=report), order="sorted")
+    tiles = {f"tile {n}": entry.sha256 for n, entry in enumerate(manifest.tiles)}
+    return {"manifest": hashlib.sha256(same).hexdigest(), **tiles}
 
 
 def hashed(estimates: Iterable[Estimate]) -> dict[str, str]:
