@@ -611,7 +611,9 @@ class InertialMode(WindowMode):
         """
         window, settings = self.window, self._rig.settings.filter
         body_from_next = self._body_from_next(self._seen_motion(tracked, guess))
-        sigmas = settings.free_rotation_sigma_rad, settings.free_translation_sigma_m
+        off_m = length(body_from_next[:3, 3] - self._body_from_next(guess)[:3, 3])
+        reach_m = float(np.hypot(_MAX_ACCEL_MPS2 * self._step_s**2, off_m))  # beside the last motion, of as long a step
+        sigmas = settings.free_rotation_sigma_rad, min(settings.free_translation_sigma_m, reach_m)
         duration_s = window.seconds_since(window.filter.clone_ids[-1])
         measured = self._measured_motion_cov(tracked, _BRIDGED_SIGMAS)
         window.filter.predict_random_walk(body_from_next, *sigmas, duration_s, measured)
