@@ -2,7 +2,8 @@
 
 `PYTHONPATH=tests python tests/benchmarks/robot/bench_gaps.py [--seed SEED] [--sites N] [--only CASE...] [--work FOLDER] [--out FILE.json]`.
 On N sites (5) a drive of the next day is replayed with 12 gaps of 0.25, 0.5 or 1 s in the IMU's samples, half of them at a time, with and
-without wheels; and with 0, 25, 50 or 75 % of its frames missing at random.
+without wheels, or with a gyro that repeats its sample for 0.5 s; with 0, 25, 50 or 75 % of its frames missing at random; and begun on the
+way, without wheels and a coarse position, for 40 frames each.
 """
 
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
@@ -28,14 +29,20 @@ _FIRST_S, _EVERY_S, _PLACES = 2.0, 1.5, 12
 CASES = {
     **{f"gaps of {gap_s:g} s{aid}": (gap_s, aid) for gap_s in _GAPS_S for aid in ("", ", no wheels")},
     **{f"{share:.0%} of frames dropped": (share, None) for share in _SHARES},
+    "frozen gyro for 0.5 s": (0.5, "frozen"),
+    "starts in motion, no wheels": (0.0, "starts"),
 }
+_STARTS, _START_FRAMES = range(60, 200, 7), 40
 
 
-def _with_gaps(recording: Recording, gap_s: float, half: int) -> Recording:
+def _with_gaps(recording: Recording, gap_s: float, half: int, *, is_frozen: bool) -> Recording:
     imu = recording.imu
     times_s = (imu.stamps_ns - recording.frame_stamps_ns[0]) * 1e-9 - _FIRST_S - half * _EVERY_S
     places, since_s = np.divmod(times_s, 2 * _EVERY_S)
     kept = (places < 0) | (2 * places >= _PLACES) | (since_s >= gap_s)
+    if is_frozen:
+        newest = np.maximum.accumulate(np.where(kept, np.arange(len(imu)), 0))
+        return replace(recording, imu=replace(imu, gyro_radps=imu.gyro_radps[newest]))
     return replace(recording, imu=ImuSamples(imu.stamps_ns[kept], imu.gyro_radps[kept], imu.accel_mps2[kept]))
 
 
@@ -47,8 +54,15 @@ def _drives(recording: Recording, case: str, seed: int) -> Iterator[ReplaySource
         kept = np.random.default_rng([seed, int(100 * amount)]).random(count) >= amount
         yield ReplaySource(recording, np.flatnonzero(kept), reverse=False)
         return
+    if aid == "starts":
+        for first in _STARTS:
+            yield ReplaySource(
+                replace(recording, wheel=[], priors=[]), np.arange(first, first + _START_FRAMES), reverse=False
+            )
+        return
     for half in range(2):
-        spoiled = _with_gaps(recording if not aid else replace(recording, wheel=[]), amount, half)
+        with_wheels = replace(recording, wheel=[]) if aid == ", no wheels" else recording
+        spoiled = _with_gaps(with_wheels, amount, half, is_frozen=aid == "frozen")
         yield ReplaySource(spoiled, np.arange(count), reverse=False)
 
 
