@@ -100,7 +100,7 @@ class MapView:
         """Rank places by the share of their landmarks, weighted by word rarity, found among descriptors (N, 32), best first.
 
         Not by symmetric similarity: a map within a budget holds a tenth of what a robot sees, and absence from it proves nothing. Each
-        place counts for itself: added up over its neighbours, fewer right ones are among the first (docs/studies/recognition.md).
+        place counts for itself: added up over its neighbours, fewer right ones are among the first.
         """
         if not len(descriptors):
             return np.zeros(0, np.int64)

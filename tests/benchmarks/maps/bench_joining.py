@@ -1,27 +1,22 @@
-"""Joining as a test: foreign sessions and true ones, rendered and without pictures, through the decision that builds take.
+"""Joining as a test: foreign sessions and true ones without pictures, through the decision that builds take.
 
-    PYTHONPATH=tests python tests/benchmarks/maps/bench_joining.py [--only PART...] [--sites 15] [--true-sites 34] [--rendered 7]
-        [--seed 500] [--work FOLDER] [--out FILE.json]
+    PYTHONPATH=tests python tests/benchmarks/maps/bench_joining.py [--only PART...] [--sites 15] [--true-sites 34]
+        [--seed 500] [--out FILE.json]
 
 A site is a building of its own seed. Foreign: every site's session in the map of every other site, without docks, with the docks of its
 own building (whose coordinates mean nothing in the other), with docks put anywhere. True: sessions of the same day, the next, three days
-on, of which half leads through what is not in the map, and against the survey's direction; rendered ones also by night. Lengths are 10
-to 80 m. Rates come with the 95 % bound of Clopper and Pearson. Without pictures there is no joint adjustment: errors are those of the
-pose graph of fixes. With pictures they are those beside the map's own frames: a map of 8 m is itself off by centimetres.
+on, of which half leads through what is not in the map, and against the survey's direction. Lengths are 10
+to 80 m. Rates come with the 95 % bound of Clopper and Pearson. There is no joint adjustment: errors are those of the
+pose graph of fixes.
 """
 
 import argparse
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
-import numpy as np
-from rich.console import Console
 from scipy.stats import beta
 
 from benchmarks.common.joining_sites import (
-    SETTINGS,
     Drive,
     Site,
     SiteMap,
@@ -33,40 +28,14 @@ from benchmarks.common.joining_sites import (
     site_map,
 )
 from benchmarks.common.recorded_runs import parsed, write_results
-from fleetmap.bow.shipped_vocabulary import default_vocabulary
-from fleetmap.geometry import Array, se3, se3_inverse
-from fleetmap.sensors.rectification import StereoCamera
-from fleetmap.sensors.samples import Trajectory
-from fleetsim.commands import record_order
-from fleetsim.recorder import Order
-from fleetsim.scenarios import SCENARIOS, Scenario, find_scenario
-from mapserver.drafting.survey_recordings import RecordingOptions, Surveyed, admit_recordings, survey_recording
+from fleetmap.geometry import Array
 from mapserver.survey.merge.membership import Membership, MembershipVerdict
-from mapserver.survey.merge.pipeline import extend
-from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
 
 _PLAIN = ("small-loop", "five-aisles", "busy")
-_LATER = (  # of the first rendered site, the second, and so on
-    (("next day", 1, "tote-1", "day"), ("night", 1, "survey", "night")),
-    (("three days on", 3, "survey", "day"), ("night", 1, "survey", "night")),
-    (("three days on", 3, "tote-1", "day"),),
-    (("next day", 1, "survey", "day"), ("night", 1, "survey", "night")),
-    (("same day", 0, "tote-1", "day"),),
-)
 _LENGTHS_M = (10.0, 20.0, 40.0, 80.0)
 _DOCKS = ("none", "own", "wrong")
 _MISPLACED_M = 0.05
-_FRAMES = 60
-PARTS = "pictures", "foreign", "true"
-
-
-class Shot(NamedTuple):
-    """A rendered session: its site, day, robot and light."""
-
-    site: Site
-    day: int = 0
-    robot: str = "survey"
-    light: str = "day"
+PARTS = "foreign", "true"
 
 
 def rate(count: int, total: int) -> dict[str, Any]:
@@ -138,87 +107,6 @@ def true(places: Sequence[Site]) -> Iterator[dict[str, Any]]:
             yield row | decided(known, moved, None if docks == "none" else moved.docks())
 
 
-def recorded(shot: Shot, work: Path) -> Path:
-    """The recording of a shot, rendered unless the work folder has it: each second picture of a run."""
-    site = shot.site
-    path = work / f"{site.scenario}-{site.seed}-d{shot.day}-{shot.robot}-{shot.light}-{_FRAMES}.mcap"
-    if not path.exists():
-        base = find_scenario(site.scenario)
-
-        def make() -> Scenario:
-            return replace(base, runs={name: replace(run, rate_hz=7.5) for name, run in base.runs.items()})
-
-        SCENARIOS[f"{site.scenario}-half"] = make
-        order = Order(f"{site.scenario}-half", site.seed, shot.day, shot.light, shot.robot, frames=_FRAMES)
-        record_order(order, path.with_suffix(".part"))
-        path.with_suffix(".part").rename(path)
-    return path
-
-
-def surveyed(path: Path, pinhole: StereoCamera | None) -> Surveyed:
-    """The survey of a recording, without a store."""
-    reading = RecordingOptions()
-    admitted = admit_recordings([path], reading, Console(quiet=True), needs_truth=False)
-    options = SurveyConfig(SETTINGS, default_vocabulary())
-    return survey_recording(path, admitted[path], reading, pinhole, options, SurveyTools())[0]
-
-
-def off_in_map_m(here: Surveyed, placed: Trajectory, truth: Trajectory) -> Array:
-    """(F,) how far a session's frames are from where the map's frame beside each says: the map's own error is not the joining's."""
-    known, own = here.survey.map.trajectory, here.truth
-    assert own is not None
-    stands = [(place, own.at(int(stamp))) for stamp, place in zip(known.stamps_ns, known.frame_from_body, strict=True)]
-    maps, truths = (np.stack(part) for part in zip(*((a, b) for a, b in stands if b is not None), strict=True))
-    off_m = []
-    for stamp, place in zip(placed.stamps_ns, placed.frame_from_body, strict=True):
-        true = truth.at(int(stamp))
-        if true is not None:
-            n = np.linalg.norm((truths - true)[:, :3, 3], axis=1).argmin()
-            apart = se3_inverse(maps[n]) @ place - se3_inverse(truths[n]) @ true
-            off_m.append(float(np.linalg.norm(apart[:3, 3])))
-    return np.array(off_m)
-
-
-def joined(here: Surveyed, other: Surveyed, docks: Array | None) -> dict[str, Any]:
-    """A rendered session in a rendered map, adjusted jointly and merged as a build does."""
-    result = extend(here.survey.map, other.survey, SETTINGS, map_from_survey=docks)
-    if isinstance(result, Membership):
-        seen = result.evidence
-        return {
-            "verdict": result.verdict.value,
-            "cells": seen.cells_expected,
-            "share": seen.seen_share,
-            "error_m": None,
-            "reason": result.reason,
-        }
-    assert other.truth is not None
-    off_m = off_in_map_m(here, result.map.trajectory, other.truth)
-    figures = {"cells": result.evidence.cells_expected, "share": result.evidence.seen_share}
-    return {"verdict": "joined", **figures, "error_m": round(float(np.median(off_m)), 4), "reason": ""}
-
-
-def rendered(places: Sequence[Site], work: Path) -> Iterator[dict[str, Any]]:
-    """Pictures: every site's session in every other site's map, and later ones of each site in its own."""
-    known: dict[Site, Surveyed] = {}
-    pinhole = None
-    for site in places:
-        known[site] = surveyed(recorded(Shot(site), work), pinhole)
-        pinhole = pinhole or known[site].survey.state.camera
-    pairs = [(here, other) for here in places for other in places if here != other]
-    for n, (here, other) in enumerate(pairs):
-        own = known[other].map_from_survey
-        docks = _DOCKS[n % 3] if own is not None else "none"
-        shift = se3(np.eye(3), np.array([5.0, -3.0, 0.0]))
-        given = None if docks == "none" or own is None else own if docks == "own" else shift @ own
-        row = {"kind": "foreign", "map": here, "session": other, "way_m": 8, "docks": docks}
-        yield row | joined(known[here], known[other], given)
-    for n, site in enumerate(site for site in places if site.scenario in _PLAIN):
-        for kind, day, robot, light in _LATER[n % len(_LATER)]:
-            moved = surveyed(recorded(Shot(site, day, robot, light), work), pinhole)
-            row = {"kind": kind, "map": site, "session": site, "way_m": 8, "docks": "none"}
-            yield row | joined(known[site], moved, None)
-
-
 def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """Rates by kind of session."""
     result: dict[str, Any] = {}
@@ -238,7 +126,6 @@ def measured(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """A row for each session."""
     plain = [Site(_PLAIN[n % 3], options.seed + 100 + n) for n in range(options.true_sites)]
     parts = {
-        "pictures": rendered(sites(options.rendered, options.seed), options.work),
         "foreign": foreign(sites(options.sites, options.seed + 50)),
         "true": true(plain),
     }
@@ -249,7 +136,7 @@ def measured(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
 
 def main() -> None:
     """Print the rates; write them as JSON where asked."""
-    options = parsed(__doc__, PARTS, sites=15, true_sites=34, rendered=7, seed=500)
+    options = parsed(__doc__, PARTS, sites=15, true_sites=34, seed=500)
     rows = list(measured(options))
     figures = {part: summary([row for row in rows if row["part"] == part]) for part in options.only or PARTS}
     write_results(options.out, {"rates": figures | {"all": summary(rows)}, "sessions": rows})

@@ -10,6 +10,7 @@ for whatever grows with revisits.
 
 import json
 import os
+import subprocess
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common.laps import repeated
-from benchmarks.common.recorded_runs import parsed, write_results
+from benchmarks.common.recorded_runs import parsed, recorded, tool, write_results
 from benchmarks.common.yardstick import at_reference, slowness
-from benchmarks.survey import bench_survey
 from fleetmap.recordings import open_recording
 from fleetmap.recordings.mcap.writer import copy_to_mcap
 
@@ -28,10 +28,8 @@ def build(recording: Path, folder: Path, frames: str) -> dict[str, Any]:
     """The report of a build in a process of its own, its figures beside it."""
     report = folder / f"{recording.stem}.json"
     slow, begin_s = [slowness()], _children_cpu_s()
-    bench_survey.run(
-        "mapserver.cli", "build", recording, "--site", recording.stem, "--store", folder / "store", "--report", report,
-        "--frames", frames,
-    )  # fmt: skip
+    to_store = ["--site", recording.stem, "--store", str(folder / "store"), "--report", str(report), "--frames", frames]
+    subprocess.run([*tool("mapserver"), "build", str(recording), *to_store], stdout=subprocess.DEVNULL, check=True)
     cpu_ms = 1e3 * (_children_cpu_s() - begin_s)
     slow.append(slowness())
     found: dict[str, Any] = json.loads(report.read_text("utf-8"))
@@ -70,7 +68,7 @@ def measure(source: Path, minutes: int) -> dict[str, Any]:
 def main() -> None:
     """Print the figures; write them as JSON where asked."""
     given = parsed(__doc__, minutes=10)
-    write_results(given.out, measure(bench_survey.recording_of("five-aisles", given.work), given.minutes))
+    write_results(given.out, measure(recorded(given.work, ("--seed", "1"), "five-aisles"), given.minutes))
 
 
 if __name__ == "__main__":
