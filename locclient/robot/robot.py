@@ -210,8 +210,8 @@ class Robot:
         self._onsets.handle(estimate, frame, odom_from_body, self.monitor.begun_ns)
         dock_error_m = self._docks.handle(bundle.priors, estimate)
         return Outcome(
-            estimate, published, cpu_s, stage_s, context, dock_error_m, speed_mps, is_covered, self._left_out(),
-            self._load.dropped_share,
+            estimate, published, cpu_s, stage_s, context, dock_error_m, speed_mps, is_covered,
+            {**self._left_out(), **bundle.left_out}, self._load.dropped_share,
         )  # fmt: skip
 
     def _left_out(self) -> dict[Flag, str]:

@@ -203,9 +203,12 @@ class SensorDrive:
 
     def _take(self) -> SensorBundle:
         try:
-            return self._intake.take(_POLL_S)
+            bundle = self._intake.take(_POLL_S)
         except RecordingError as error:
             raise self._ended_by(error) from error
+        if bundle.left_out:  # of which a survey is not made
+            raise self._ended_by(RecordingError("; ".join(bundle.left_out.values())))
+        return bundle
 
     def _ended_by(self, fault: Exception) -> RecordingError:
         reason = str(fault) if isinstance(fault, FleetmapError) else f"{type(fault).__name__}: {fault}"

@@ -12,6 +12,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from fleetmap.errors import RecordingError
+from fleetmap.messages import Flag
 from fleetmap.recordings import StoredFrame
 from fleetmap.recordings.ordering import UNITS, wrong_unit
 from fleetmap.sensors.samples import INTEGRATED_NS, PAUSE_NS, CameraFrame, ImuSamples, PositionPrior, WheelSample
@@ -24,6 +25,7 @@ _STAYS_NS = 500_000_000  # duration of older stamps after which the clock counts
 _NEVER_NS, _LATEST_NS = -(2**62), 2**62  # in 2116; later stamps are no times
 _STEP_NS = 100_000_000  # between values, until their own steps are known
 _STEPS = 9  # whose median is the usual one
+_IMU = "the IMU is left out"
 V = TypeVar("V")
 
 
@@ -82,7 +84,7 @@ class _Stream(Generic[V]):
         (stamp_ns, value), self._held = self._held, None
         if self.last_ns != _NEVER_NS:
             self._steps_ns.append(stamp_ns - self.last_ns)
-        self.last_ns, self._older_since_ns = stamp_ns, None
+        self.last_ns, self._older_since_ns, self.set_back = stamp_ns, None, ""
         return [value]
 
     def _note_older(self, stamp_ns: int) -> None:
@@ -95,7 +97,7 @@ class _Stream(Generic[V]):
         elif stamp_ns - since_ns >= _STAYS_NS:
             self.set_back = (
                 f"{self._what}: the stamps went back by {(self.last_ns - since_ns) * 1e-9:.1f} s, from {self.last_ns} to {since_ns}, and "
-                "go on from there: the sensors' clock was set; start again, which begins a new run with the new clock"
+                "go on from there: the clock was set"
             )
 
 
@@ -113,8 +115,8 @@ class Intake:
         self._changed = threading.Condition()
         self._imu: list[tuple[int, list[float]]] = []
         self._frame_stream = _Stream[CameraFrame | StoredFrame]("images")
-        self._imu_stream = _Stream[tuple[int, list[float]]]("imu")
-        self._wheel_stream = _Stream[WheelSample]("wheel odometry")
+        self._imu_stream = _Stream[tuple[int, list[float]]](_IMU)
+        self._wheel_stream = _Stream[WheelSample]("the wheels are left out")
         self._wheel: list[WheelSample] = []
         self._priors: list[PositionPrior] = []
         self._finished = self._forget = False
@@ -128,7 +130,7 @@ class Intake:
         with self._changed:
             _check_unit("images'", frame.stamp_ns, self._imu_stream.newest_ns)
             if _coarser_unit(self._imu_stream.newest_ns, frame.stamp_ns):
-                self._imu, self._imu_stream = [], _Stream("imu")
+                self._imu, self._imu_stream = [], _Stream(_IMU)
             self._queue(self._frame_stream.put(frame.stamp_ns, frame))
 
     def put_imu(self, samples: ImuSamples) -> None:
@@ -200,12 +202,14 @@ class Intake:
     def take(self, timeout_s: float) -> SensorBundle:
         """Take the oldest frame with the samples before it, once its inertial samples have arrived or their wait is over.
 
-        RecordingError once the stamps have permanently gone back: nothing would be accepted until they have caught up.
+        RecordingError once the images' stamps have permanently gone back: none would be accepted until they have caught up. The clock of
+        another sensor costs that sensor.
         """
+        images = self._frame_stream
         with self._changed:
-            self._changed.wait_for(lambda: self._frames or self._finished or self._set_back(), timeout_s)
-            if reason := self._set_back():
-                raise RecordingError(reason)
+            self._changed.wait_for(lambda: self._frames or self._finished or images.set_back, timeout_s)
+            if images.set_back:
+                raise RecordingError(f"{images.set_back}; start again, which begins a new run with the new clock")
             self._use_first()
             if not self._frames:
                 return SensorBundle()
@@ -221,7 +225,7 @@ class Intake:
             forget, self._forget = self._forget, False
             dropped, self._dropped = self._dropped, 0
             self._changed.notify_all()
-            return SensorBundle(frame, imu, wheel, priors, forget, dropped)
+            return SensorBundle(frame, imu, wheel, priors, forget, dropped, self._left_out())
 
     def _queue(self, certain: list[CameraFrame | StoredFrame]) -> None:
         """Queue frames. One that was held and the one that confirms it do not displace each other. The caller holds the lock."""
@@ -239,13 +243,17 @@ class Intake:
         if self._frame_stream.last_ns == _NEVER_NS:
             self._queue(self._frame_stream.release())
 
-    def _set_back(self) -> str:
-        """Reason why no more samples of a sensor would be accepted, empty in general."""
-        return self._frame_stream.set_back or self._imu_stream.set_back or self._wheel_stream.set_back
+    def _left_out(self) -> dict[Flag, str]:
+        set_back = {
+            Flag.IMU_REFUSED: self._imu_stream.set_back,
+            Flag.WHEELS_REFUSED: self._wheel_stream.set_back,
+        }
+        return {flag: f"{words}; stamp all sensors by one clock" for flag, words in set_back.items() if words}
 
     def _imu_is_there(self) -> bool:
-        """True if the IMU samples reach the oldest frame, which may have changed since the wait began."""
-        return self._finished or self._imu_stream.last_ns >= self._frames[0].stamp_ns + self._offset_ns
+        """True if the IMU samples reach the oldest frame, which may have changed since the wait began, or will not."""
+        is_awaited = not (self._finished or self._imu_stream.set_back)
+        return not is_awaited or self._imu_stream.last_ns >= self._frames[0].stamp_ns + self._offset_ns
 
 
 def _take_until(imu: list[tuple[int, list[float]]], until_ns: int) -> ImuSamples:

@@ -116,11 +116,6 @@ def test_a_clock_that_was_set_back_is_an_error_and_not_waited_for() -> None:
     queue.put_frame(frame(550))
     with pytest.raises(RecordingError, match=r"images: the stamps went back by 3600\.1 s.*clock was set; start again"):
         queue.take(0)
-    inertial = intake()
-    inertial.put_imu(imu(*range(hour_ms, hour_ms + 10)))
-    inertial.put_imu(imu(*range(600)))
-    with pytest.raises(RecordingError, match="imu: the stamps went back"):
-        inertial.take(0)
 
 
 AHEAD_MS = [130, 300, 900, 1600, 9900, 10_100, 18_000_000, (2**63 - 1) / MS, -300, -1600, -18_000_000, -(2**63) / MS]

@@ -23,7 +23,7 @@ from fleetmap.messages import (
     robot_key,
 )
 from fleetmap.occupancy_grid import OccupancyGrid
-from fleetmap.sensors.samples import CameraFrame
+from fleetmap.sensors.samples import CameraFrame, WheelSample
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.daemon import runtime
@@ -74,6 +74,8 @@ class ScriptedSource:
                 pass
             self.before.get(number, lambda: None)()
             intake.put_imu(bundle.imu)
+            for sample in bundle.wheel:
+                intake.put_wheel(sample)
             assert bundle.frame is not None
             intake.put_frame(bundle.frame)
 
@@ -327,6 +329,28 @@ def test_one_wrong_stamp_of_a_camera_and_an_imu_costs_a_frame(world: World, at: 
     assert {one.status for one in listener.estimates[35:67]} == {listener.estimates[-1].status} == {Status.TRACKING}
     off_m = listener.estimates[-1].map_from_body[:3, 3] - robot_world.truth(99)[:3, 3]
     assert np.linalg.norm(off_m) < 0.1
+
+
+@pytest.mark.parametrize("is_imu", [True, False])
+def test_a_clock_that_is_set_back_costs_its_sensor_and_people_see_it(world: World, is_imu: bool) -> None:
+    """Of wheels or an IMU. That of the cameras, and thus of all, ends the run."""
+    robot, listener, bundles = robot_world.new_robot(), Listener(), list(robot_world.bundles(110))
+    for number, bundle in enumerate(bundles):
+        back_ns = 10**10 if number >= 60 else 0
+        earlier_from_now = se3_inverse(robot_world.truth(number - 1)) @ robot_world.truth(number)
+        speed_mps = (robot.base_from_body @ earlier_from_now @ se3_inverse(robot.base_from_body))[:3, 3] / 0.1
+        wheel = WheelSample(bundle.frame.stamp_ns - (0 if is_imu else back_ns), speed_mps, 0.0, 0.02, 0.02)
+        imu = replace(bundle.imu, stamps_ns=bundle.imu.stamps_ns - back_ns) if is_imu else bundle.imu
+        bundles[number] = replace(bundle, imu=imu, wheel=[wheel])
+    source = ScriptedSource(bundles, ready=lambda: robot.running is not None)
+    Runtime(world.parts(source, robot, listener), ServiceManager("")).run()
+    assert [one.stamp_ns for one in listener.estimates] == [bundle.frame.stamp_ns for bundle in bundles]
+    for number, one in list(enumerate(listener.estimates))[35:]:
+        off_m = one.map_from_body[:3, 3] - robot_world.truth(number)[:3, 3]
+        assert one.status is Status.TRACKING
+        assert off_m @ np.linalg.solve(one.cov_rot_trans[3:, 3:], off_m) < 16.27, "0.999 of chi-square"
+    (status,) = world.fleet.robots("room")
+    assert status.last_health["flags"] == ("imu_refused" if is_imu else "wheels_refused",)
 
 
 def test_a_lying_account_on_the_bus_ends_nothing(world: World) -> None:
