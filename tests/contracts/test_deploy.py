@@ -66,7 +66,7 @@ def exec_form(value: str) -> list[str]:
 
 
 def command_lines() -> dict[str, list[str]]:
-    """Every command of ours that is deployed, by where it stands: images, compose, units, and the comments that say what to type."""
+    """Every command of ours, by where it stands: images, compose, units, the comments that say what to type, and documents."""
     lines = [(f"CMD {image}", shlex.join(exec_form(last(image, "CMD")))) for image in ("server", "robot")]
     lines.append(("HEALTHCHECK robot", shlex.join(exec_form(last("robot", "HEALTHCHECK")))))
     lines += [(f"compose {name}", shlex.join(service.get("command", []))) for name, service in SERVICES.items()]
@@ -83,6 +83,9 @@ def command_lines() -> dict[str, list[str]]:
                 lines.append((path.name, line.partition("=")[2].lstrip("-+!")))
             elif line.startswith("#  "):
                 lines.append((path.name, line.lstrip("# ").partition("      (")[0]))
+    for page in sorted(DEPLOY.parent.glob("docs/*.md")):
+        typed = re.findall(r"`((?:mapserver|locclient|fleetsim) [^`|]+)`", page.read_text("utf-8"))
+        lines += [(page.name, line) for line in typed]
     found = {}
     for number, (where, line) in enumerate(lines):
         words = shlex.split(line)
@@ -92,7 +95,7 @@ def command_lines() -> dict[str, list[str]]:
     return found
 
 
-def test_commands_know_the_options_that_deployment_gives_them() -> None:
+def test_commands_know_the_options_that_deployment_and_documents_give_them() -> None:
     deployed = command_lines()
     begins = {" ".join(line[:2]) for line in deployed.values()}
     assert {"locclient run", "locclient status", "locclient enrol", "locclient check"} <= begins

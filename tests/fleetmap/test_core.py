@@ -164,6 +164,19 @@ def test_no_number_leads_out_of_an_image(name: str, places: Array) -> None:
     HOSTILE[name](places)
 
 
+def test_products_are_rounded_before_they_are_added() -> None:
+    """No processor's fused additions, so that every machine computes the same bits."""
+    rng = np.random.default_rng(0)
+    points, cam_from_map = rng.normal(size=(2000, 3)).astype(np.float32), np.eye(4)
+    cam_from_map[:3, :3] = rng.normal(size=(3, 3))
+    numbers, points_cam, _ = core.discs_before(points, -points, cam_from_map, -9.0, 99.0, np.zeros(4), 9, 9)
+    x, y, z = points[numbers].astype(np.float64).T
+    assert len(numbers) > 1900
+    assert np.array_equal(
+        points_cam, np.stack([row[0] * x + row[1] * y + row[2] * z for row in cam_from_map[:3, :3]], axis=1)
+    )
+
+
 @pytest.mark.parametrize(("error", "told"), [("ModuleNotFoundError", "make core"), ("ImportError", "AVX2")])
 def test_a_core_that_is_missing_or_cannot_run_says_what_to_do(error: str, told: str) -> None:
     script = f"""

@@ -5,10 +5,10 @@ import pytest
 from numpy.typing import NDArray
 
 from fleetmap.errors import UsageError
-from fleetmap.sensors.samples import ImuSamples, WheelSample
+from fleetmap.sensors.samples import ImuSamples
 from fleetsim.motion.body_motion import RouteMotion, Shake
 from fleetsim.motion.routes import Limits, Route
-from fleetsim.sensors.faults import FAULTS, SLIP, Fault, FaultPlan, parse_fault
+from fleetsim.sensors.faults import FAULTS, Fault, FaultPlan, parse_fault
 from fleetsim.sensors.measurements import START_NS, measure_imu, measure_priors, measure_wheels
 from fleetsim.sensors.robots import ImuErrors, WheelErrors
 
@@ -85,14 +85,6 @@ def test_imu_gap_and_spike() -> None:
     assert np.diff(spoilt.stamps_ns).max() == 505_000_000
     assert (np.abs(spoilt.accel_mps2).max(axis=1) > 40).sum() == 1
     assert np.abs(samples.accel_mps2).max() < 40
-
-
-def test_wheel_slip_covers_its_time_only() -> None:
-    samples = tuple(WheelSample(START_NS + k * 10**8, np.array([1.0, 0, 0]), 0.0, 0.1, 0.1) for k in range(100))
-    speeds = [s.velocity_base_mps[0] for s in FaultPlan((Fault("wheel-slip", 2.0, 3.0),)).spoil_wheels(samples)]
-    assert speeds.count(SLIP) == 10
-    assert speeds[20] == SLIP
-    assert speeds[30] == 1.0
 
 
 @pytest.mark.parametrize("name", list(FAULTS))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fleetsim.scene.layout import Layout
-from fleetsim.scene.stock import Slot, last_restock_day, mix, slot_generator
+from fleetsim.scene.stock import Slot, last_restock_day, slot_generator
 from fleetsim.scene.world import World
 
 
@@ -72,20 +72,6 @@ def test_a_chunk_looks_the_same_whatever_was_visited_before() -> None:
     assert one is not other
     for name in ("quads", "values", "numbers", "light"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
-
-
-def test_far_chunks_are_plain() -> None:
-    world = World(Layout(aisles=12, bays=4), seed=1)
-    scene = world.scene_around(5.0, 3.0)
-    sizes = np.diff(scene.ranges, axis=1)[:, 0]
-    assert sizes[-1] < 0.2 * sizes[0]
-
-
-def test_mixing_is_even_and_repeats() -> None:
-    bits = np.array([mix(7, number) for number in range(4000)], np.uint64)
-    assert mix(7, 5) == mix(7, 5) != mix(5, 7)
-    ones = np.array([int((bits >> np.uint64(place) & np.uint64(1)).sum()) for place in range(64)])
-    assert (np.abs(ones - 2000) < 200).all()
 
 
 def test_a_cross_aisle_is_free_and_its_sides_are_guarded() -> None:

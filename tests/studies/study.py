@@ -1,8 +1,8 @@
 """What all studies share: results that are kept as they come, and the page that shows them.
 
 A study is a module of this folder with a `main`; `make study NAME=square` runs it. Its rows are kept in docs/studies/NAME.json after each
-case, so that one that was stopped goes on where it was; `make study NAME=square FRESH=1` begins anew, and CPU_S=600 begins no
-case after so many seconds of CPU: the page then shows what there is. JOBS=2 makes two cases at a time, each in a process of its own.
+case, so that one that was stopped goes on where it was; `make study NAME=square FRESH=1` begins anew. JOBS=2 makes two cases at a time,
+each in a process of its own.
 Its page is docs/studies/NAME.md: prose by hand, and between two marks the tables of the last run.
 """
 
@@ -12,8 +12,8 @@ import json
 import os
 import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from math import inf
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from itertools import starmap
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -44,33 +44,21 @@ def results(name: str, cases: Mapping[str, Callable[[], Row]], seeds: Sequence[i
     kept = json.loads(path.read_text()) if path.exists() and not os.environ.get("FRESH") else {}
     rows = {row["case"]: row for row in kept.get("rows", []) if row["case"] in cases}
     missing = {case: make for case, make in cases.items() if case not in rows}
-    made = _made(missing, int(os.environ.get("JOBS") or 1), float(os.environ.get("CPU_S") or inf))
+    made = _made(missing, int(os.environ.get("JOBS") or 1))
     for row in track(made, name, len(missing), console=Console(stderr=True), disable=len(cases) < 2):
         rows[row["case"]] = row
         _keep(path, [rows[c] for c in cases if c in rows], seeds)
     return [rows[case] for case in cases if case in rows]
 
 
-def _made(cases: Mapping[str, Callable[[], Row]], jobs: int, most_cpu_s: float) -> Iterator[Row]:
-    """The rows as they are ready, begun in the order of the cases, until so much CPU is spent. With several jobs each has a process."""
-    todo, spent_s = list(cases.items()), 0.0
+def _made(cases: Mapping[str, Callable[[], Row]], jobs: int) -> Iterator[Row]:
+    """The rows as they are ready, begun in the order of the cases; with several jobs each has a process."""
     if jobs == 1:
-        for case, make in todo:
-            if spent_s >= most_cpu_s:
-                return
-            row = _timed(case, make)
-            spent_s += row["cpu_s"]
-            yield row
+        yield from starmap(_timed, cases.items())
         return
     with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
-        running: set[Future[Row]] = set()
-        while running or (todo and spent_s < most_cpu_s):
-            while todo and len(running) < jobs and spent_s < most_cpu_s:
-                running.add(pool.submit(_timed, *todo.pop(0)))
-            ready, running = wait(running, return_when=FIRST_COMPLETED)
-            for done in ready:
-                spent_s += done.result()["cpu_s"]
-                yield done.result()
+        for done in as_completed([pool.submit(_timed, *case) for case in cases.items()]):
+            yield done.result()
 
 
 def _timed(case: str, make: Callable[[], Row]) -> Row:

@@ -51,14 +51,6 @@ def test_as_opencv_does(levels: int) -> None:
     assert right.mean() > 0.9
 
 
-@pytest.mark.parametrize(("window_px", "within_px"), [(5, 0.1), (9, 0.04), (15, 0.02)])
-def test_fractions_of_a_pixel(window_px: int, within_px: float) -> None:
-    pixels = grid(25.0, 9.0)
-    places, found = core.follow_pixels(painted(), painted((0.37, 0.61)), pixels, pixels, window_px // 2, 0, *UNCHECKED)
-    assert found.mean() > 0.95
-    assert np.median(np.linalg.norm(places - pixels - (0.37, 0.61), axis=1)[found]) < within_px
-
-
 def test_at_the_edge_only_what_is_in_the_picture_counts() -> None:
     pixels = np.array([[3.0, 60.0], [156.0, 60.0], [80.0, 2.5], [80.0, 117.0], [2.0, 2.0]])
     places, found = core.follow_pixels(painted(), painted((0.3, -0.4)), pixels, pixels, 7, 0, *UNCHECKED)

@@ -100,17 +100,6 @@ def test_patches_that_do_not_agree_are_refused(texture: Texture) -> None:
         assert np.isfinite(found[:, 0]).mean() < 0.12
 
 
-def test_border_pixels_are_refused(texture: Texture) -> None:
-    reference, _ = warped_pair(texture, np.eye(2))
-    pixels = np.array([[0.0, 0.0], [2.0, 100.0], [WIDTH - 1.0, 50.0], [100.0, HEIGHT - 2.0]])
-    level0, warp = np.zeros(4, np.int8), facing(np.repeat(np.eye(2)[None], 4, axis=0))
-    pyramid = half_pyramid(reference)
-    found = patch_align.refine_matches(
-        Patches(pyramid, pixels, level0), Patches(pyramid, pixels, level0), warp, SETTINGS
-    )
-    assert np.isnan(found).all()
-
-
 def test_warp_from_octaves_and_angles() -> None:
     """A feature found larger and turned clockwise: offsets there map back smaller and turned back."""
     warp = patch_align.warps_from_features(
