@@ -17,7 +17,6 @@ from mapserver.commands.doctor import doctor
 from mapserver.commands.evaluate import evaluate
 from mapserver.commands.fleet import FLEET
 from mapserver.commands.grid import GRID
-from mapserver.commands.live import live
 from mapserver.commands.nightly import nightly
 from mapserver.commands.operators import OPERATORS
 from mapserver.commands.releases import diff, inspect, promote, publish, rollback, versions
@@ -33,7 +32,6 @@ if TYPE_CHECKING:
 
 COMMANDS: Commands = {
     "build": build,
-    "live": live,
     "nightly": nightly,
     "publish": publish,
     "promote": promote,

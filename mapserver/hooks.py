@@ -3,6 +3,7 @@
 | group | registered by the name of | as |
 |---|---|---|
 | `mapserver.commands` | the command | a function as those of `COMMANDS` in `mapserver/cli.py`, in a module that is quick to import |
+| `mapserver.parts` | the plug-in | `PartHook` |
 | `mapserver.routes` | the plug-in | `RouteHook` |
 """
 
@@ -20,6 +21,15 @@ OfferedFile = Callable[[str, int], tuple["ExportHead", bytes]]
 
 RouteHook = Callable[[Any, OfferedFile], None]
 """Adds endpoints to the application, a FastAPI."""
+
+
+PartHook = Callable[[Any], None]
+"""Adds a part to a server that opens: pages, endpoints, messages of its bus; of a `Host` (`mapserver/dashboard/install.py`)."""
+
+
+def part_hooks() -> dict[str, PartHook]:
+    """Return the installed parts of a server."""
+    return plugins("mapserver.parts")
 
 
 def route_hooks() -> dict[str, RouteHook]:

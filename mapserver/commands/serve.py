@@ -274,7 +274,7 @@ def _run(
         nights,
     )
     app = create_app(maps, fleet, metrics, bus, lifespan, api)
-    install_dashboard(app, maps, fleet, api, bus_service.surveys)
+    install_dashboard(app, maps, fleet, api, bus_service.hear)
     # Outside the middleware that replaces the proxy's address by the client's.
     served = ProxiedPeople(ProxyHeadersMiddleware(app, sorted(proxies)), guard.proxy)  # type: ignore[arg-type]
     config = uvicorn.Config(

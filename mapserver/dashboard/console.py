@@ -15,6 +15,7 @@ from typing import TypeVar
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import HTMLResponse, StreamingResponse
 from fastapi.staticfiles import StaticFiles
+from jinja2 import Template
 from markupsafe import Markup
 
 from fleetmap.encoding import to_json
@@ -30,21 +31,10 @@ from mapserver.dashboard.map_layers import Layer, box_around, box_of, ground
 from mapserver.dashboard.rendering import TEMPLATES, address, age
 from mapserver.fleet_statistics.kpis import HOUR_NS
 from mapserver.operators.roles import Scope
-from mapserver.serving.live_surveys import LiveSurveys
 
 T = TypeVar("T")
 
 PATH = "/dashboard"
-PAGES = {
-    "": "Overview",
-    "robots": "Robots",
-    "trends": "Trends",
-    "map": "Map",
-    "failures": "Failures",
-    "surveys": "Surveys",
-    "live": "Live",
-    "administration": "Administration",
-}
 _UNDER = {"space": "map"}  # which of those leads to other pages
 _LOOK_COOKIE, _ZONE_COOKIE = "fleetmap_look", "fleetmap_zone"
 _WEEK_NS = 7 * 24 * HOUR_NS
@@ -54,13 +44,12 @@ _THEMES = {"dark": "body--dark", "light": ""}  # else as the system has it
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """Services of the pages: maps and surveys, fleet health, the robots now, settings of the API, surveys under way."""
+    """Services of the pages: maps and surveys, fleet health, the robots now, settings of the API."""
 
     maps: MapData
     health: HealthData
     robots: LiveRobots
     settings: ApiSettings
-    surveys: LiveSurveys
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,14 +102,15 @@ class PageContext:
 
 @dataclass(frozen=True, slots=True)
 class Console:
-    """Where pages are added."""
+    """Where pages are added. links: title and icon of each page that all pages link to, by its path, in their order."""
 
     app: FastAPI
     services: Services
+    links: dict[str, tuple[str, str]] = field(default_factory=dict)
 
-    def files(self) -> None:
-        """Adds what all pages load."""
-        self.app.mount("/static", StaticFiles(directory=Path(__file__).parent / "static"))
+    def files(self, path: str, folder: Path) -> None:
+        """Adds what pages load: the files of a folder."""
+        self.app.mount(f"/{path}", StaticFiles(directory=folder))
 
     def nothing_else(self) -> None:
         """Adds the page for addresses that no page has."""
@@ -136,18 +126,22 @@ class Console:
     def page(
         self,
         path: str,
-        template: str,
+        template: str | Template,
         fill: Callable[..., dict[str, object]],
         *,
+        link: tuple[str, str] | None = None,
         knows: Sequence[str] = (),
         under_way: Callable[[], list[str]] = list,
         of_site: bool = True,
     ) -> None:
         """Adds a page. fill: what its template needs beside `context`, of the services, it and the parts of `path` in braces; may block.
 
-        A FleetmapError becomes a notice within the frame. knows: query parameters beside the site. under_way: sites that the page
-        knows though the store has no version of them. of_site: False for a page that shows the same whatever site its address names.
+        A FleetmapError becomes a notice within the frame. link: title and icon by which all pages link to it. knows: query parameters
+        beside the site. under_way: sites that the page knows though the store has no version of them. of_site: False for a page that
+        shows the same whatever site its address names.
         """
+        if link is not None:
+            self.links[path] = link
 
         @self.app.get(f"/{path}", include_in_schema=False)
         async def shown(request: Request) -> Response:
@@ -196,7 +190,7 @@ class Console:
         self,
         request: Request,
         page: str,
-        template: str,
+        template: str | Template,
         fill: Callable[..., dict[str, object]],
         knows: Sequence[str],
         under_way: Callable[[], list[str]] = list,
@@ -208,7 +202,7 @@ class Console:
         try:
             growing, stored = await load(under_way), await load(self.services.maps.sites)
             sites = sorted({*stored, *growing})
-            if site is None and growing and (page == "live" or not stored):
+            if site is None and growing:
                 site = growing[0]
             elif not of_site:
                 site = site if site in sites else next(iter(sites), "")
@@ -224,15 +218,15 @@ class Console:
             template, found = "problem.html", {"words": str(error)}
             status = 503 if isinstance(error, StoreError) else 404
             site = site if site in sites else None  # links lead somewhere
-        listed = f"{root}/{page if page in PAGES else ''}"  # what is of one site is not looked for in another
+        listed = f"{root}/{page if page in self.links else ''}"  # what is of one site is not looked for in another
         look, who = request.cookies.get(_LOOK_COOKIE, ""), getattr(request.state, "operator", None)
         frame = {
             "root": root,
             "api": f"{root.removesuffix(PATH)}/v1",
-            "pages": PAGES,
+            "pages": self.links,
             "page": page,
             "sites": sites,
-            "elsewhere": listed if request.path_params or page not in PAGES else None,
+            "elsewhere": listed if request.path_params or page not in self.links else None,
             "site": site,
             "look": look if look in _THEMES else "",
             "theme": _THEMES.get(look, "print"),

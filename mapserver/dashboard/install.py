@@ -1,7 +1,10 @@
 """Installation of the dashboard in the API's server: pages under /dashboard, and their pictures."""
 
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Literal
 
 from fastapi import FastAPI, Request, Response
@@ -15,7 +18,6 @@ from mapserver.dashboard import (
     administration,
     failure,
     failures,
-    live_page,
     map_page,
     overview,
     people,
@@ -31,12 +33,29 @@ from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots
 from mapserver.fleet.alerts import active_alerts
 from mapserver.fleet.fleet import Fleet
-from mapserver.serving.live_surveys import LiveSurveys
+from mapserver.hooks import part_hooks
 from mapserver.store import MapStore
 
+Hear = Callable[[str, str, Callable[[str, bytes], None]], None]
+"""`BusService.hear`."""
 
-def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: ApiSettings, surveys: LiveSurveys) -> None:
-    """Adds the pages to `app`."""
+
+@dataclass(frozen=True, slots=True)
+class Host:
+    """A server for its parts, which add endpoints to `app`, pages to `console`, and messages of the bus; hear: None without a bus."""
+
+    store: MapStore
+    fleet: Fleet
+    settings: ApiSettings
+    app: FastAPI
+    console: Console
+    hear: Hear | None
+
+
+def install_dashboard(
+    app: FastAPI, store: MapStore, fleet: Fleet, settings: ApiSettings, hear: Hear | None = None
+) -> None:
+    """Adds the pages to `app`, and the parts that plug-ins have."""
     inbox = None if settings.nights is None else settings.nights.inbox
     alerts = partial(active_alerts, store, fleet, settings.alerts)
     services = Services(
@@ -44,13 +63,15 @@ def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: Api
         HealthData(store, settings.canary, settings.resurvey, time.time_ns, alerts),
         LiveRobots(fleet, time.monotonic),
         settings,
-        surveys,
     )
     pages = FastAPI(openapi_url=None)
     pages.add_middleware(GZipMiddleware, compresslevel=5)
     console = Console(pages, services)
-    console.files()
+    console.files("static", Path(__file__).parent / "static")
     _install_pages(console)
+    for install in part_hooks().values():
+        install(Host(store, fleet, settings, app, console, hear))
+    _install_administration(console)
     console.nothing_else()
     _install_files(pages, services)
     app.mount(PATH, pages)
@@ -62,23 +83,36 @@ def install_dashboard(app: FastAPI, store: MapStore, fleet: Fleet, settings: Api
         return RedirectResponse(f"{request.scope.get('root_path', '')}{PATH}/")
 
 
+def _link(title: str) -> tuple[str, str]:
+    return title, f"static/icons.svg#{title.lower()}"
+
+
 def _install_pages(console: Console) -> None:
     """What a page is asked with beside its site, and what it follows."""
-    span, growing = ("since", "until"), console.services.surveys.sites
-    console.page("", "overview.html", overview.page, knows=("find",))
+    span = ("since", "until")
+    console.page("", "overview.html", overview.page, link=_link("Overview"), knows=("find",))
     console.stream("now", overview.now)
-    console.page("trends", "trends.html", overview.trends, knows=span)
-    console.page("robots", "robots.html", robots.page, knows=("find", "state", "without"))
+    console.page("trends", "trends.html", overview.trends, link=_link("Trends"), knows=span)
+    console.page("robots", "robots.html", robots.page, link=_link("Robots"), knows=("find", "state", "without"))
     console.page("robots/{robot}", "robot.html", robot.page, knows=span)
     console.stream("robots/{robot}/now", robot.now)
-    console.page("map", "map.html", map_page.page, knows=("version", "before", "after", *span))
+    console.page("map", "map.html", map_page.page, link=_link("Map"), knows=("version", "before", "after", *span))
     console.page("space", "space.html", space_page.page, knows=("version", "x", "y"))
-    console.page("failures", "failures.html", failures.page, knows=(*failures.AXES, *span, "before", "sort"))
+    console.page(
+        "failures",
+        "failures.html",
+        failures.page,
+        link=_link("Failures"),
+        knows=(*failures.AXES, *span, "before", "sort"),
+    )
     console.page("failures/{failure}", "failure.html", failure.page, of_site=False)
-    console.page("surveys", "surveys.html", survey_jobs.page, knows=("job", *span))
-    console.page("live", "live.html", live_page.page, under_way=growing)
-    console.stream("live/now", live_page.heard, under_way=growing)
-    console.page("administration", "administration.html", administration.page, of_site=False)
+    console.page("surveys", "surveys.html", survey_jobs.page, link=_link("Surveys"), knows=("job", *span))
+
+
+def _install_administration(console: Console) -> None:
+    console.page(
+        "administration", "administration.html", administration.page, link=_link("Administration"), of_site=False
+    )
     console.page("administration/people", "people.html", people.page, of_site=False)
 
 

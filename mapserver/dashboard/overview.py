@@ -6,7 +6,7 @@ import time
 
 from fleetmap.messages import Flag
 from mapserver.dashboard import fleet_parts
-from mapserver.dashboard.console import PAGES, PageContext, Services, scene_of
+from mapserver.dashboard.console import PageContext, Services, scene_of
 from mapserver.dashboard.data import EVER
 from mapserver.dashboard.fleet_health import SiteHealth
 from mapserver.dashboard.fleet_parts import Bars, Figure
@@ -166,7 +166,7 @@ def _notices(services: Services, context: PageContext, health: SiteHealth) -> li
         tone, words, said = fleet_parts.trial_words(trial, context.moment)
         verdict, stop, _ = said.partition(". ")  # the page of trends has the rates
         told.append((tone, f"{words} {verdict}{stop}", "trends"))
-    found = [{"tone": tone, "words": words, "to": context.to(page), "more": PAGES[page]} for tone, words, page in told]
+    found = [{"tone": tone, "words": words, "to": context.to(page), "more": begun(page)} for tone, words, page in told]
     if health.areas:
         words = f"This week: {trend_sentence(list(health.areas))}."
         found.append({"tone": "quiet", "words": words, "to": f"{context.to('trends')}#worse", "more": "Area by area"})

@@ -9,7 +9,6 @@ import msgspec
 from fleetmap.bus import Bus, Handle
 from fleetmap.errors import FleetmapError, LinkError
 from fleetmap.failure_summary import ReplayPart
-from fleetmap.live_survey import LiveSurveyState, live_key
 from fleetmap.log_lines import LogLimit
 from fleetmap.mapformat import check_name
 from fleetmap.messages import (
@@ -27,7 +26,6 @@ from fleetmap.messages import (
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.serving.bus_access import BusGuard
-from mapserver.serving.live_surveys import LiveSurveys
 from mapserver.store import MapStore
 from mapserver.trust import SignedLists
 
@@ -75,7 +73,6 @@ class BusService:
         self._lists, self._restored_ns = SignedLists(store.folder), store.restored_ns()
         self._announced: dict[tuple[str, str], str | None] = {}
         self._recent = ByteCache(_CACHED_BYTES, store.blob)
-        self.surveys = LiveSurveys()
         self._handles: list[Handle] = [
             bus.queryable(robot_key("*", "*", "wanted"), self._counted("wanted", self._wanted)),
             bus.queryable(robot_key("*", "*", "failures"), self._counted("failure", self._failure)),
@@ -89,7 +86,6 @@ class BusService:
                 )
             ),
             *(bus.subscribe(robot_key("*", "*", what), self._hear) for what in ("ack", "health", "pose")),
-            bus.subscribe(live_key("*"), self._hear_survey),
         ]
         if guard is not None:
             self._handles.append(bus.queryable(robot_key("*", "*", "renew"), self._counted("renewal", self._renew)))
@@ -216,17 +212,18 @@ class BusService:
         else:
             self._count(what, "ok", 0)
 
-    def _hear_survey(self, key: str, payload: bytes) -> None:
-        try:
-            site, _, _ = split_key(key)
-            state = decode_message(payload, LiveSurveyState)
-            if state.site != check_name(site, "site"):
-                raise LinkError(f"a survey of {state.site[:64]!r} under the key of another site; check its sender")
-            self.surveys.take(state)
-        except FleetmapError as error:
-            self._refuse(key, "survey", error)
-        else:
-            self._count("survey", "ok", 0)
+    def hear(self, keys: str, what: str, take: Callable[[str, bytes], None]) -> None:
+        """Pass messages under these keys on, counted as `what`; one at which `take` raises a FleetmapError is logged as refused."""
+
+        def heard(key: str, payload: bytes) -> None:
+            try:
+                take(key, payload)
+            except FleetmapError as error:
+                self._refuse(key, what, error)
+            else:
+                self._count(what, "ok", 0)
+
+        self._handles.append(self._bus.subscribe(keys, heard))
 
     def _refuse(self, key: str, what: str, error: FleetmapError) -> None:
         """Log and count the refusal: published messages have no answer."""

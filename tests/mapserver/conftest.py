@@ -1,14 +1,18 @@
-"""Places of a store's content and metadata: its folder, an object store, PostgreSQL. Disks have room, whatever this machine's have."""
+"""Places of a store: its folder, an object store, PostgreSQL; a browser. Disks have room, whatever this machine's have."""
 
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from playwright.sync_api import Page, expect
 
 from mapserver.store.places import Places, write_places
+from support.pages.browser import Chromium, running_chromium
 from support.storage.postgres_server import PostgresServer, postgres_server
 from support.storage.s3_server import KEYS, s3_server
+
+expect.set_options(timeout=30_000)  # a busy machine answers late
 
 
 @pytest.fixture(autouse=True)
@@ -63,3 +67,16 @@ def metadata_folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     if request.param == "postgres":
         write_places(tmp_path, Places(database=request.getfixturevalue("postgres").database()))
     return tmp_path
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Chromium]:
+    # The second name is how a page from elsewhere would reach loopback.
+    with running_chromium("--host-resolver-rules=MAP elsewhere.example 127.0.0.1") as started:
+        yield started
+
+
+@pytest.fixture
+def page(browser: Chromium) -> Iterator[Page]:
+    with browser.context(viewport={"width": 1280, "height": 900}) as context:
+        yield context.new_page()

@@ -44,8 +44,7 @@ from mcap.writer import CompressionType, Writer
 
 from fleetmap.encoding import to_json
 from fleetmap.geometry import Array, quat_wxyz_from_rotation
-from fleetmap.live_survey import LiveSurveyState
-from fleetmap.messages import EstimateMessage, FailureKind, FailureReport, Status, report_dict
+from fleetmap.messages import FailureKind, FailureReport, Status, report_dict
 from fleetmap.recordings.images import jpeg_image
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Image
@@ -266,6 +265,20 @@ def status_log(stamp_ns: int, robot: str, status: str, cause: str) -> ChannelMes
     return _log("/log", stamp_ns, words, robot, _LEVELS.get(status, LogLevel.Error))
 
 
+def lines(stamp_ns: int, ends_m: Array, topic: str, frame: str) -> ChannelMessage:
+    """Lines between two places (L, 2, 2) on the floor of a frame."""
+    corners = [Point3(x=x, y=y) for x, y in ends_m.reshape(-1, 2).tolist()]
+    line = LinePrimitive(
+        type=LinePrimitiveLineType.LineList,
+        pose=_located(np.eye(4)),
+        thickness=2.0,
+        scale_invariant=True,
+        points=corners,
+        color=_colour(_WARN),
+    )
+    return ChannelMessage(topic, stamp_ns, _scene(stamp_ns, [_entity(stamp_ns, frame, topic, lines=[line])]))
+
+
 def failure(
     stamp_ns: int, report: FailureReport, pictures: Iterable[tuple[str, bytes]], where: str | None = None
 ) -> list[ChannelMessage]:
@@ -287,71 +300,10 @@ def failure(
     return found
 
 
-class SurveyChannels:
-    """Running surveys, seen from above, in a separate frame `survey`."""
-
-    def __init__(self, base_from_cam: Array | None = None) -> None:
-        """base_from_cam (4, 4): mounting of the camera, if known."""
-        self._base_from_cam = base_from_cam
-        self._status = ("", "")
-
-    def shown(self, state: LiveSurveyState) -> list[Shown]:
-        """Messages of the next state, with a log line if its status changed."""
-        stamp_ns, estimate = state.stamp_ns, state.estimate
-        found = [
-            Shown(
-                "/survey/landmarks",
-                stamp_ns,
-                lambda: points(stamp_ns, _from_above(state.landmarks()), "/survey/landmarks", SURVEY),
-            ),
-            Shown("/survey/path", stamp_ns, lambda: path(stamp_ns, _from_above(state.path()), "/survey/path", SURVEY)),
-            Shown("/survey/revisits", stamp_ns, lambda: _revisits(stamp_ns, state.loop_lines())),
-        ]
-        status = (state.phase, state.words) if estimate is None else (estimate.status, estimate.cause)
-        if status != self._status:
-            self._status = status
-            found.append(Shown("/log", stamp_ns, lambda: status_log(stamp_ns, state.recording, *status)))
-        if estimate is not None:
-            found += self._placed(estimate, state.recording)
-        return found
-
-    def _placed(self, estimate: EstimateMessage, name: str) -> list[Shown]:
-        odom_from_base, stamp_ns = estimate.odom_from_base.target_from_source, estimate.stamp_ns
-        joined, marks = [(ODOM, BASE, odom_from_base)], list[RobotMark]()
-        if self._base_from_cam is not None:
-            joined.append((BASE, CAMERA, self._base_from_cam))
-        if estimate.map_from_odom is not None:
-            map_from_odom = estimate.map_from_odom.target_from_source
-            joined.append((SURVEY, ODOM, map_from_odom))
-            marks.append(RobotMark(name, map_from_odom @ odom_from_base, estimate.status))
-        return [
-            Shown("/survey/robot", stamp_ns, lambda: robots(stamp_ns, marks, "/survey/robot", SURVEY)),
-            Shown("/tf", stamp_ns, lambda: links(stamp_ns, joined)),
-        ]
-
-
 def _log(topic: str, stamp_ns: int, words: str, name: str, level: LogLevel) -> ChannelMessage:
     return ChannelMessage(
         topic, stamp_ns, Log(timestamp=_stamp(stamp_ns), level=level, message=words, name=name).encode()
     )
-
-
-def _from_above(rows: Array) -> Array:
-    return np.column_stack([rows[:, :2], np.zeros(len(rows))])
-
-
-def _revisits(stamp_ns: int, ends_m: Array) -> ChannelMessage:
-    corners = [Point3(x=x, y=y) for x, y in ends_m.reshape(-1, 2).tolist()]
-    line = LinePrimitive(
-        type=LinePrimitiveLineType.LineList,
-        pose=_located(np.eye(4)),
-        thickness=2.0,
-        scale_invariant=True,
-        points=corners,
-        color=_colour(_WARN),
-    )
-    scene = _scene(stamp_ns, [_entity(stamp_ns, SURVEY, "revisits", lines=[line])])
-    return ChannelMessage("/survey/revisits", stamp_ns, scene)
 
 
 def _scene(stamp_ns: int, entities: list[SceneEntity]) -> bytes:

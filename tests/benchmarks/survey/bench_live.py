@@ -16,7 +16,8 @@ from benchmarks.common.recorded_runs import write_results
 from mapserver.config import survey_settings
 from mapserver.drafting.draft import BuildOptions
 from mapserver.drafting.survey_recordings import RecordingOptions
-from mapserver.live import LiveRequest, RecordedDrive, run_live
+from mapserver.plugins.live_surveys.drives import RecordedDrive
+from mapserver.plugins.live_surveys.live_survey import LiveRequest, run_live
 
 
 def bench(path: Path) -> dict[str, Any]:

@@ -3,50 +3,21 @@
 import cv2
 import numpy as np
 import pytest
-from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
-from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
-from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
-from foxglove_schemas_protobuf.Log_pb2 import Log
-from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
-from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
-from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
-from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from fleetmap.errors import UsageError
-from fleetmap.foxglove import ViewerAddress, channels, require_foxglove, viewer_address
-from fleetmap.foxglove.channels import CHANNELS, ChannelMessage, RobotMark, SurveyChannels
+from fleetmap.foxglove import channels, require_foxglove
+from fleetmap.foxglove.channels import RobotMark
 from fleetmap.geometry import rotation_from_quat_wxyz, se3, so3_exp
-from fleetmap.live_survey import LiveSurveyState
-from fleetmap.messages import EstimateMessage, FailureReport, Placement
+from fleetmap.messages import FailureReport, Placement
 from fleetmap.sensors.rectification import StereoCamera
+from support.fleet.foxglove_schemas import decoded, matrix, xyz
 
 STAMP_NS = 1_700_000_000_123_456_789
 TURNED = se3(so3_exp(np.array([0.1, -0.2, 0.7])), np.array([1.0, -2.0, 3.0]))
-KNOWN = {
-    message.DESCRIPTOR.full_name: message
-    for message in (
-        CameraCalibration, CompressedImage, FrameTransforms, ImageAnnotations, Log, PointCloud, PoseInFrame, PosesInFrame, SceneUpdate
-    )
-}  # fmt: skip
-
-
-def decoded(message: ChannelMessage):
-    """By the other library's classes."""
-    return KNOWN[CHANNELS[message.topic].name].FromString(message.data)
 
 
 def ns(stamp) -> int:
     return stamp.seconds * 10**9 + stamp.nanos
-
-
-def matrix(located) -> np.ndarray:
-    turn = located.orientation
-    return se3(rotation_from_quat_wxyz(np.array([turn.w, turn.x, turn.y, turn.z])), xyz(located.position))
-
-
-def xyz(vector) -> np.ndarray:
-    return np.array([vector.x, vector.y, vector.z])
 
 
 def test_landmarks_are_float32_and_thinned_where_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -132,45 +103,6 @@ def test_a_failure_nowhere_has_no_place() -> None:
 def test_impossible_times_are_the_nearest_possible_ones(stamp_ns: int) -> None:
     link = decoded(channels.links(stamp_ns, [("map", "odom", np.eye(4))])).transforms[0]
     assert 0 <= link.timestamp.seconds < 1 << 32
-
-
-def test_surveys_are_shown_in_their_own_frame_or_in_the_map() -> None:
-    estimate = EstimateMessage(
-        stamp_ns=6, status="TRACKING", map_version=None, odom_from_base=Placement.of(TURNED), map_from_odom=Placement.of(TURNED),
-        cov_rot_trans=None,
-    )  # fmt: skip
-    plain = {
-        "site": "hall", "recording": "monday", "stamp_ns": 7, "phase": "tracking", "seconds": 2.0, "frames": 40, "keyframes": 2,
-        "path_m": np.array([[0, 1], [2, 3]], "<f4").tobytes(), "quality": b"\xff\xff", "landmarks_m": np.array([[4, 5]], "<f4").tobytes(),
-        "loops_m": np.array([[0, 1, 2, 3]], "<f4").tobytes(),
-    }  # fmt: skip
-    told = SurveyChannels(np.eye(4))
-    first = {shown.topic: decoded(shown.make()) for shown in told.shown(LiveSurveyState(**plain, estimate=estimate))}
-    assert set(first) == {"/survey/landmarks", "/survey/path", "/survey/revisits", "/survey/robot", "/log", "/tf"}
-    np.testing.assert_array_equal(np.frombuffer(first["/survey/landmarks"].data, "<f4"), [4, 5, 0])
-    assert [(p.position.x, p.position.y) for p in first["/survey/path"].poses] == [(0, 1), (2, 3)]
-    line = first["/survey/revisits"].entities[0].lines[0]
-    assert (line.type, [(p.x, p.y) for p in line.points]) == (2, [(0, 1), (2, 3)])
-    np.testing.assert_allclose(matrix(first["/survey/robot"].entities[0].arrows[0].pose), TURNED @ TURNED, atol=1e-12)
-    links = {(link.parent_frame_id, link.child_frame_id) for link in first["/tf"].transforms}
-    assert links == {("survey", "odom"), ("odom", "base_link"), ("base_link", "camera")}
-    again = [shown.topic for shown in told.shown(LiveSurveyState(**plain, estimate=estimate))]
-    assert "/log" not in again, "its status is the same"
-    lost = told.shown(LiveSurveyState(**plain))
-    assert {shown.topic for shown in lost} == {"/survey/landmarks", "/survey/path", "/survey/revisits", "/log"}
-
-
-def test_addresses() -> None:
-    assert viewer_address("8765", insecure=False) == ViewerAddress("127.0.0.1", 8765)
-    assert viewer_address("localhost:0", insecure=False) == ViewerAddress("localhost", 0)
-    assert viewer_address("[::1]:9", insecure=False) == ViewerAddress("::1", 9)
-    assert viewer_address("0.0.0.0:1", insecure=True) == ViewerAddress("0.0.0.0", 1)
-    for text in ("", "x", "127.0.0.1", "70000", "-1", "1:", "127.0.0.1:x", "²"):
-        with pytest.raises(UsageError, match="write it like 8765"):
-            viewer_address(text, insecure=False)
-    for text in ("0.0.0.0:1", "maps.example:1", "[::]:1"):
-        with pytest.raises(UsageError, match="--insecure"):
-            viewer_address(text, insecure=False)
 
 
 def test_without_the_library_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

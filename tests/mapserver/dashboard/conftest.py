@@ -5,19 +5,9 @@ from collections.abc import Iterator
 
 import httpx
 import pytest
-from playwright.sync_api import Page, expect
 
 from support.fleet.dashboard_scene import ROBOTS, Served, fill_store, serving, talking
-from support.pages.browser import Chromium, running_chromium
-
-expect.set_options(timeout=30_000)  # a busy machine answers late
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Chromium]:
-    # The second name is how a page from elsewhere would reach loopback.
-    with running_chromium("--host-resolver-rules=MAP elsewhere.example 127.0.0.1") as started:
-        yield started
+from support.pages.browser import Chromium
 
 
 @pytest.fixture(scope="module")
@@ -41,9 +31,3 @@ def small_fleet(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> 
     fill_store(folder)
     with serving(folder) as server, talking(server.zenoh, 8):
         yield server
-
-
-@pytest.fixture
-def page(browser: Chromium) -> Iterator[Page]:
-    with browser.context(viewport={"width": 1280, "height": 900}) as context:
-        yield context.new_page()

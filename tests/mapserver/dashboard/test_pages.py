@@ -38,7 +38,6 @@ PAGES = {
     "failures/1": "Failure 1 of tug-7",
     "robots/tug-7": "tug-7",
     "surveys": "Surveys of hall",
-    "live": "Live survey of hall",
     "administration": "Administration",
     "administration/people": "Administration",
 }

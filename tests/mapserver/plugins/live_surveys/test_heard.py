@@ -8,9 +8,16 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import LinkError
-from fleetmap.live_survey import LiveSurveyState, live_key
 from fleetmap.messages import encode_message
-from mapserver.serving.live_surveys import SILENT_S, LiveSurveys
+from mapserver.api.version_routes import ApiSettings
+from mapserver.dashboard.install import install_dashboard
+from mapserver.plugins.live_surveys import message
+from mapserver.plugins.live_surveys.heard import SILENT_S, LiveSurveys
+from mapserver.plugins.live_surveys.message import LiveSurveyState, live_key
+from mapserver.serving.bus_service import BusService
+from support.fleet.hostile_messages import check_refusals, extremes, structs_of
+from support.fleet.memory_bus import MemoryBus
+from support.fleet.served_api import served_api
 from support.fleet.served_world import World, served_world
 
 
@@ -30,14 +37,37 @@ def world(tmp_path: Path) -> Iterator[World]:
         yield made
 
 
-def test_the_newest_state_of_a_site_is_kept(world: World) -> None:
+@pytest.fixture
+def surveys(world: World) -> LiveSurveys:
+    heard = LiveSurveys()
+    world.service.hear(live_key("*"), "survey", heard.hear)
+    return heard
+
+
+@pytest.mark.parametrize("kind", structs_of(message), ids=lambda kind: kind.__name__)
+def test_a_number_that_none_can_mean_is_refused_where_it_is_decoded(kind: type[msgspec.Struct]) -> None:
+    check_refusals(kind)
+
+
+def test_no_number_of_a_survey_takes_its_page(tmp_path: Path) -> None:
+    with served_api(tmp_path) as server, MemoryBus(server.bus._hub) as bus:
+        service = BusService(server.store, server.fleet, server.bus, lambda *_: None)
+        install_dashboard(server.client.app, server.store, server.fleet, ApiSettings(), service.hear)
+        assert server.client.get("/dashboard/parts/live/live.js").status_code == 200
+        for changed in extremes(LiveSurveyState):
+            bus.publish(live_key("lab"), changed)
+            assert server.client.get("/dashboard/live", params={"site": "lab"}).status_code == 200
+        service.close()
+
+
+def test_the_newest_state_of_a_site_is_kept(world: World, surveys: LiveSurveys) -> None:
     for frames in (10, 20):
         world.robot_bus.publish(live_key("hall"), encode_message(state(frames=frames)))
-    found = world.service.surveys.of("hall")
+    found = surveys.of("hall")
     assert found is not None
     assert found.state.frames == 20
     np.testing.assert_allclose(found.state.path(), [[0, 0, 1], [1, 0.5, 0]])
-    assert world.service.surveys.of("lab") is None
+    assert surveys.of("lab") is None
 
 
 @pytest.mark.parametrize(
@@ -52,10 +82,12 @@ def test_the_newest_state_of_a_site_is_kept(world: World) -> None:
         state(landmarks_m=bytes(1 << 17)),  # larger than a message may hold
     ],
 )
-def test_what_is_no_state_of_the_site_is_refused_and_counted(world: World, wrong: LiveSurveyState) -> None:
+def test_what_is_no_state_of_the_site_is_refused_and_counted(
+    world: World, surveys: LiveSurveys, wrong: LiveSurveyState
+) -> None:
     world.robot_bus.publish(live_key("hall"), encode_message(wrong))
     world.robot_bus.publish(live_key("hall"), b"nonsense")
-    assert world.service.surveys.sites() == []
+    assert surveys.sites() == []
     assert [(what, result) for what, result, _ in world.counts] == [("survey", "refused")] * 2
 
 

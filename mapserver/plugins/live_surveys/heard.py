@@ -5,7 +5,10 @@ import time
 from collections.abc import Callable
 from typing import NamedTuple
 
-from fleetmap.live_survey import LiveSurveyState
+from fleetmap.errors import LinkError
+from fleetmap.mapformat import check_name
+from fleetmap.messages import decode_message, split_key
+from mapserver.plugins.live_surveys.message import LiveSurveyState
 
 _MOST_SITES = 32
 SILENT_S = 5.0  # surveys report twice a second during the drive
@@ -31,6 +34,14 @@ class LiveSurveys:
         self._states: dict[str, tuple[LiveSurveyState, float, int]] = {}
         self._last_number = 0
         self._lock = threading.Lock()
+
+    def hear(self, key: str, payload: bytes) -> None:
+        """Store a survey's message; LinkError for one that is invalid, or of another site than its key."""
+        site, _, _ = split_key(key)
+        state = decode_message(payload, LiveSurveyState)
+        if state.site != check_name(site, "site"):
+            raise LinkError(f"a survey of {state.site[:64]!r} under the key of another site; check its sender")
+        self.take(state)
 
     def take(self, state: LiveSurveyState) -> None:
         """Store a state; LinkError for invalid arrays, which are not stored."""

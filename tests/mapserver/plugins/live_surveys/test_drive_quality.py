@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3, so3_exp
-from fleetmap.live_survey import COVERAGE_CELL_M
-from mapserver.live.mapping_process import covered_cells, missing_directions
+from mapserver.plugins.live_surveys.mapping_process import covered_cells, missing_directions
+from mapserver.plugins.live_surveys.message import COVERAGE_CELL_M
 
 
 def looking(positions_m: Array, yaw_rad: float) -> Array:

@@ -7,11 +7,12 @@ import pytest
 from rich.console import Console
 
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.live_survey import LiveSurveyState
 from fleetmap.sensors.samples import SensorSet
 from mapserver.config import survey_settings
 from mapserver.drafting.draft import BuildOptions
-from mapserver.live import LiveRequest, live_survey, run_live
+from mapserver.plugins.live_surveys import live_survey
+from mapserver.plugins.live_surveys.live_survey import LiveRequest, run_live
+from mapserver.plugins.live_surveys.message import LiveSurveyState
 from support.recordings.kidnapped_ride import APART_FRAMES, kidnapped
 from support.recordings.live_drives import MappingHere, played
 from support.recordings.recording_samples import write_euroc

@@ -1,16 +1,22 @@
 """The live page: a survey while it drives, its path, landmarks and revisits, and whether tracking and mapping keep up."""
 
 from base64 import b64encode
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 
 from fleetmap.geometry import Array
-from fleetmap.live_survey import COVERAGE_CELL_M, LiveSurveyState
 from mapserver.dashboard.console import PageContext, Services
+from mapserver.dashboard.install import Host
 from mapserver.dashboard.live import words_of
 from mapserver.dashboard.map_layers import Dots, Layer, Line, Mark, Square, trail
+from mapserver.dashboard.rendering import TEMPLATES
 from mapserver.dashboard.space.loops import VERDICTS
+from mapserver.plugins.live_surveys.heard import LiveSurveys
+from mapserver.plugins.live_surveys.message import COVERAGE_CELL_M, LiveSurveyState, live_key
 
+_FOLDER = Path(__file__).parent
 _MARGIN_M = 4.0
 _SHOWN_LANDMARKS = 4000
 _BEYOND_M = 12.0  # landmarks of far walls would shrink everything else
@@ -22,17 +28,28 @@ _PHASES = {
 }
 
 
-def heard(services: Services, context: PageContext) -> dict[str, object]:
+def install(host: Host) -> None:
+    """Add the page, and what it hears from surveys."""
+    surveys, console = LiveSurveys(), host.console
+    if host.hear is not None:
+        host.hear(live_key("*"), "survey", surveys.hear)
+    console.files("parts/live", _FOLDER / "static")
+    template = TEMPLATES.from_string((_FOLDER / "live.html").read_text("utf-8"))
+    link = "Live", "parts/live/icon.svg#live"
+    console.page("live", template, partial(page, surveys), link=link, under_way=surveys.sites)
+    console.stream("live/now", partial(heard, surveys), under_way=surveys.sites)
+
+
+def heard(surveys: LiveSurveys, _: Services, context: PageContext) -> dict[str, object]:
     """Changes when the page does."""
-    survey = services.surveys.of(context.site)
+    survey = surveys.of(context.site)
     if survey is None:
         return {"heard": None}
     return {"heard": survey.number, "silent": survey.is_silent}
 
 
-def page(services: Services, context: PageContext) -> dict[str, object]:
+def page(surveys: LiveSurveys, _: Services, context: PageContext) -> dict[str, object]:
     """What the template needs."""
-    surveys = services.surveys
     survey = surveys.of(context.site)
     if survey is None:
         return {"state": None}

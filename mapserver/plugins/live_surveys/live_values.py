@@ -8,11 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
-from fleetmap.live_survey import LivePart, LiveRevisit
 from fleetmap.messages import Cause, Status
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
+from mapserver.plugins.live_surveys.message import LivePart, LiveRevisit
 
 
 @dataclass(frozen=True, slots=True)

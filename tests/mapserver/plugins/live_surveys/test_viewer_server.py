@@ -11,12 +11,19 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import RecordingError, UsageError
-from fleetmap.foxglove import ViewerAddress, channels
+from fleetmap.foxglove import channels
 from fleetmap.foxglove.channels import ChannelMessage, Shown
-from fleetmap.foxglove.server import FoxgloveServer
+from fleetmap.geometry import se3, so3_exp
+from fleetmap.messages import EstimateMessage, Placement
+from mapserver.plugins.live_surveys.live_viewer import SurveyChannels
+from mapserver.plugins.live_surveys.message import LiveSurveyState
+from mapserver.plugins.live_surveys.viewer_address import ViewerAddress, viewer_address
+from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer
 from support.fleet.foxglove_client import FoxgloveClient
+from support.fleet.foxglove_schemas import decoded, matrix
 
 FREE = ViewerAddress("127.0.0.1", 0)
+TURNED = se3(so3_exp(np.array([0.1, -0.2, 0.7])), np.array([1.0, -2.0, 3.0]))
 POINTS = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
 HANGING = """
 import json, os, signal, sys
@@ -154,3 +161,42 @@ def test_a_port_in_use_is_told_at_once(server: FoxgloveServer) -> None:
         FoxgloveServer(ViewerAddress("127.0.0.1", port), "hall")
     with pytest.raises(UsageError, match="cannot listen there"):
         FoxgloveServer(ViewerAddress("no.such.name.invalid", 0), "hall")
+
+
+def test_surveys_are_shown_in_their_own_frame_or_in_the_map() -> None:
+    estimate = EstimateMessage(
+        stamp_ns=6, status="TRACKING", map_version=None, odom_from_base=Placement.of(TURNED), map_from_odom=Placement.of(TURNED),
+        cov_rot_trans=None,
+    )  # fmt: skip
+    plain = {
+        "site": "hall", "recording": "monday", "stamp_ns": 7, "phase": "tracking", "seconds": 2.0, "frames": 40, "keyframes": 2,
+        "path_m": np.array([[0, 1], [2, 3]], "<f4").tobytes(), "quality": b"\xff\xff", "landmarks_m": np.array([[4, 5]], "<f4").tobytes(),
+        "loops_m": np.array([[0, 1, 2, 3]], "<f4").tobytes(),
+    }  # fmt: skip
+    told = SurveyChannels(np.eye(4))
+    first = {shown.topic: decoded(shown.make()) for shown in told.shown(LiveSurveyState(**plain, estimate=estimate))}
+    assert set(first) == {"/survey/landmarks", "/survey/path", "/survey/revisits", "/survey/robot", "/log", "/tf"}
+    np.testing.assert_array_equal(np.frombuffer(first["/survey/landmarks"].data, "<f4"), [4, 5, 0])
+    assert [(p.position.x, p.position.y) for p in first["/survey/path"].poses] == [(0, 1), (2, 3)]
+    line = first["/survey/revisits"].entities[0].lines[0]
+    assert (line.type, [(p.x, p.y) for p in line.points]) == (2, [(0, 1), (2, 3)])
+    np.testing.assert_allclose(matrix(first["/survey/robot"].entities[0].arrows[0].pose), TURNED @ TURNED, atol=1e-12)
+    links = {(link.parent_frame_id, link.child_frame_id) for link in first["/tf"].transforms}
+    assert links == {("survey", "odom"), ("odom", "base_link"), ("base_link", "camera")}
+    again = [shown.topic for shown in told.shown(LiveSurveyState(**plain, estimate=estimate))]
+    assert "/log" not in again, "its status is the same"
+    lost = told.shown(LiveSurveyState(**plain))
+    assert {shown.topic for shown in lost} == {"/survey/landmarks", "/survey/path", "/survey/revisits", "/log"}
+
+
+def test_addresses() -> None:
+    assert viewer_address("8765", insecure=False) == ViewerAddress("127.0.0.1", 8765)
+    assert viewer_address("localhost:0", insecure=False) == ViewerAddress("localhost", 0)
+    assert viewer_address("[::1]:9", insecure=False) == ViewerAddress("::1", 9)
+    assert viewer_address("0.0.0.0:1", insecure=True) == ViewerAddress("0.0.0.0", 1)
+    for text in ("", "x", "127.0.0.1", "70000", "-1", "1:", "127.0.0.1:x", "²"):
+        with pytest.raises(UsageError, match="write it like 8765"):
+            viewer_address(text, insecure=False)
+    for text in ("0.0.0.0:1", "maps.example:1", "[::]:1"):
+        with pytest.raises(UsageError, match="--insecure"):
+            viewer_address(text, insecure=False)

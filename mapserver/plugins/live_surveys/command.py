@@ -15,13 +15,13 @@ from mapserver.commands.options import SurveyOptions, open_store
 
 if TYPE_CHECKING:
     from fleetmap.bus import Bus
-    from fleetmap.foxglove import ViewerAddress
-    from fleetmap.foxglove.server import FoxgloveServer
-    from fleetmap.live_survey import LiveSurveyState
     from mapserver import BuildOptions
     from mapserver.config import MapserverConfig
-    from mapserver.live import Drive
-    from mapserver.live.live_viewer import LiveViewer
+    from mapserver.plugins.live_surveys.drives import Drive
+    from mapserver.plugins.live_surveys.live_viewer import LiveViewer
+    from mapserver.plugins.live_surveys.message import LiveSurveyState
+    from mapserver.plugins.live_surveys.viewer_address import ViewerAddress
+    from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer
     from mapserver.survey.settings import SurveySettings
 
 
@@ -65,14 +65,15 @@ def live(
             f"--{of_recordings[0]} applies to a RECORDING only; for sensors set [source] and [topics] in {sensors}"
         )
     from fleetmap.console import plain_console
-    from fleetmap.foxglove import require_foxglove, viewer_address
+    from fleetmap.foxglove import require_foxglove
+    from mapserver.plugins.live_surveys.viewer_address import viewer_address
 
     at = None if options.foxglove is None else viewer_address(options.foxglove, insecure=options.insecure)
     if at is not None:
         require_foxglove("--foxglove")
-        from mapserver.live.live_viewer import LiveViewer
+        from mapserver.plugins.live_surveys.live_viewer import LiveViewer
     from fleetmap.recordings.sensor_subset import named_sensor_set
-    from mapserver.live import LiveRequest, run_live
+    from mapserver.plugins.live_surveys.live_survey import LiveRequest, run_live
 
     use = None if options.use is None else named_sensor_set(options.use)
     build, is_stopped = options.build_options(context, use=use), _stopping()
@@ -96,7 +97,7 @@ def live(
 def _played(recording: Path, build: "BuildOptions", speed: float) -> "Iterator[tuple[Drive, SurveySettings]]":
     """Return a recording, and the settings for its sensors."""
     from mapserver.config import survey_settings
-    from mapserver.live import RecordedDrive
+    from mapserver.plugins.live_surveys.drives import RecordedDrive
 
     with build.reading.open(recording) as (opened, indices):
         settings = survey_settings(build.config, opened.sensor_set)
@@ -111,7 +112,7 @@ def _driven(
     from fleetmap.sensors.samples import SensorSet
     from fleetmap.sources.source import open_source
     from mapserver.config import survey_settings
-    from mapserver.live import SensorDrive
+    from mapserver.plugins.live_surveys.drives import SensorDrive
 
     assert record is not None
     drive = SensorDrive(open_source(given.source, given.topics), record, given.topics)
@@ -157,7 +158,7 @@ def _bus(server: str | None, store: Path) -> "AbstractContextManager[Bus | None]
 def _foxglove(at: "ViewerAddress | None", site: str) -> "AbstractContextManager[FoxgloveServer | None]":
     if at is None:
         return nullcontext(None)
-    from fleetmap.foxglove.server import FoxgloveServer
+    from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer
 
     server = FoxgloveServer(at, site)
     typer.echo(f"foxglove: {server.url}")
@@ -165,8 +166,8 @@ def _foxglove(at: "ViewerAddress | None", site: str) -> "AbstractContextManager[
 
 
 def _teller(bus: "Bus | None", viewer: "LiveViewer | None") -> "Callable[[LiveSurveyState], None]":
-    from fleetmap.live_survey import live_key
     from fleetmap.messages import encode_message
+    from mapserver.plugins.live_surveys.message import live_key
 
     def tell(state: "LiveSurveyState") -> None:
         if bus is not None:

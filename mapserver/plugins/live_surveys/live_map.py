@@ -11,14 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse
-from fleetmap.live_survey import LivePart, LiveRevisit
 from fleetmap.messages import Cause, Status
 from fleetmap.sensors.rectification import RectifiedFrame
+from mapserver.plugins.live_surveys.live_values import (
+    LiveEstimate,
+    LiveLoops,
+    LiveParts,
+    LiveRig,
+    NewKeyframe,
+    joined_imu,
+)
+from mapserver.plugins.live_surveys.message import LivePart, LiveRevisit
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import apply_result, bundle_problem
 from mapserver.survey.bundle.problem import MotionPrior
 from mapserver.survey.keyframes.keyframes import make_keyframe
-from mapserver.survey.live.live_values import LiveEstimate, LiveLoops, LiveParts, LiveRig, NewKeyframe, joined_imu
 from mapserver.survey.loops.connected_components import MIN_SHARED, SigmaBetween, bridges
 from mapserver.survey.loops.keyframe_groups import KeyframeGroups
 from mapserver.survey.loops.loops import LoopCloser, LoopRecord, Loops, LoopVerdict, body_edge

@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 
 import mapserver
 from fleetmap.errors import FleetmapError, LinkError, RecordingError, UsageError
-from fleetmap.live_survey import LiveSurveyState
 from fleetmap.recordings import OpenOptions, Topics, open_recording
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from fleetmap.sources.intake import Intake
@@ -21,7 +20,10 @@ from mapserver.cli import app
 from mapserver.commands import live as live_command
 from mapserver.config import survey_settings
 from mapserver.drafting.draft import BuildOptions
-from mapserver.live import LiveRequest, RecordedDrive, SensorDrive, drives, live_survey, run_live
+from mapserver.plugins.live_surveys import drives, live_survey
+from mapserver.plugins.live_surveys.drives import RecordedDrive, SensorDrive
+from mapserver.plugins.live_surveys.live_survey import LiveRequest, run_live
+from mapserver.plugins.live_surveys.message import LiveSurveyState
 from mapserver.store import MapStore
 from support.recordings.live_drives import MappingHere, write_rgbd
 from support.recordings.recording_samples import calibration, kalibr_text, write_euroc

@@ -17,11 +17,18 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import Array
-from fleetmap.live_survey import COVERAGE_CELL_M, MAX_ARRAY_BYTES, NO_PART, LiveMissing, LivePart, LiveRevisit
 from fleetmap.sensors.rectification import RectifiedFrame
+from mapserver.plugins.live_surveys.live_map import LiveMap
+from mapserver.plugins.live_surveys.live_values import LiveEstimate, LiveRig, NewKeyframe
+from mapserver.plugins.live_surveys.message import (
+    COVERAGE_CELL_M,
+    MAX_ARRAY_BYTES,
+    NO_PART,
+    LiveMissing,
+    LivePart,
+    LiveRevisit,
+)
 from mapserver.quality.directions import tile_directions
-from mapserver.survey.live.live_map import LiveMap
-from mapserver.survey.live.live_values import LiveEstimate, LiveRig, NewKeyframe
 from mapserver.survey.survey_inputs import SurveyConfig
 
 _READY_WITHIN_S = 60.0  # time to import the survey on a busy machine

@@ -10,8 +10,8 @@ import pytest
 from playwright.sync_api import Page, expect
 
 from fleetmap.bus import Bus
-from fleetmap.live_survey import LiveMissing, LivePart, LiveRevisit, LiveSurveyState, live_key
 from fleetmap.messages import EstimateMessage, Placement, encode_message
+from mapserver.plugins.live_surveys.message import LiveMissing, LivePart, LiveRevisit, LiveSurveyState, live_key
 from mapserver.store import MapStore
 from support.fleet.dashboard_scene import Served, serving, wait_until, watch
 
@@ -33,6 +33,8 @@ def served(tmp_path: Path) -> Iterator[Served]:
 
 def test_a_survey_is_followed_to_its_end(page: Page, served: Served) -> None:
     with Bus.connect(served.zenoh) as bus:
+        page.goto(f"{served.http}/dashboard/live?site=yard")
+        expect(page.get_by_role("link", name="Live", exact=True)).to_have_count(1)
         deadline_s = time.monotonic() + 20
         while time.monotonic() < deadline_s:  # the subscription is known everywhere after a moment
             bus.publish(live_key("yard"), encode_message(STATE))

@@ -15,17 +15,17 @@ from rich.console import Console
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import se3_inverse, skew
-from fleetmap.live_survey import MAX_ARRAY_BYTES, LiveSurveyState
 from fleetmap.messages import EstimateMessage, Placement, covariance_entries
 from fleetmap.recordings.images import jpeg_image
 from fleetmap.sensors.samples import Image
 from mapserver.drafting.draft import BuildOptions
 from mapserver.drafting.survey_recordings import read_zones
 from mapserver.library import BuiltMap, build_map
-from mapserver.live.drives import Drive, DueFrame
-from mapserver.live.mapping_process import MOST_PLACES, NO_SKETCH, MappingProcess, thinning
-from mapserver.survey.live.live_values import LiveEstimate, LiveRig
-from mapserver.survey.live.tracking import LiveTracking, Tracked
+from mapserver.plugins.live_surveys.drives import Drive, DueFrame
+from mapserver.plugins.live_surveys.live_values import LiveEstimate, LiveRig
+from mapserver.plugins.live_surveys.mapping_process import MOST_PLACES, NO_SKETCH, MappingProcess, thinning
+from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, LiveSurveyState
+from mapserver.plugins.live_surveys.tracking import LiveTracking, Tracked
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig
 

@@ -14,9 +14,9 @@ from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, SensorSet
 from mapserver.config import survey_settings
-from mapserver.survey.live.live_map import LiveMap
-from mapserver.survey.live.live_values import LiveRig, NewKeyframe
-from mapserver.survey.live.tracking import LiveTracking
+from mapserver.plugins.live_surveys.live_map import LiveMap
+from mapserver.plugins.live_surveys.live_values import LiveRig, NewKeyframe
+from mapserver.plugins.live_surveys.tracking import LiveTracking
 from mapserver.survey.odometry_pass import SampleFeed
 from mapserver.survey.survey_inputs import SurveyConfig
 from support.worlds.inertial_motion import analytic_motion

@@ -11,9 +11,9 @@ from foxglove import Channel, Context
 from foxglove.websocket import ChannelView, Client, ServerListener
 
 from fleetmap.errors import FleetmapError, UsageError
-from fleetmap.foxglove import ViewerAddress
 from fleetmap.foxglove.channels import CHANNELS, Shown, encoding_of
 from fleetmap.log_lines import LogLimit
+from mapserver.plugins.live_surveys.viewer_address import ViewerAddress
 
 _WAITING = 32  # messages of a topic that are not encoded yet
 _BACKLOG = 256  # encoded messages waiting for one viewer; the library drops the oldest

@@ -11,7 +11,6 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from fleetmap.errors import FleetmapError, UsageError
-from fleetmap.live_survey import MAX_ARRAY_BYTES, LiveSurveyState
 from fleetmap.messages import MAX_MESSAGE_BYTES, encode_message
 from fleetmap.recordings import Topics, open_recording
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
@@ -21,8 +20,11 @@ from mapserver.cli import app
 from mapserver.config import survey_settings
 from mapserver.drafting.draft import BuildOptions
 from mapserver.library import build_map
-from mapserver.live import LiveRequest, LiveResult, SensorDrive, live_survey, run_live
-from mapserver.live.mapping_process import MappingProcess, thinned, thinning
+from mapserver.plugins.live_surveys import live_survey
+from mapserver.plugins.live_surveys.drives import SensorDrive
+from mapserver.plugins.live_surveys.live_survey import LiveRequest, LiveResult, run_live
+from mapserver.plugins.live_surveys.mapping_process import MappingProcess, thinned, thinning
+from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, LiveSurveyState
 from mapserver.store import MapStore
 from support.recordings.live_drives import MappingHere, played
 from support.recordings.recording_samples import make_sample, write_euroc

@@ -1,1 +1,0 @@
-"""Mapping during the drive: a local map at the newest keyframes, loops, and a pose graph."""
