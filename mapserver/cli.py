@@ -11,10 +11,8 @@ from mapserver.commands.align import align
 from mapserver.commands.areas import AREAS_GROUP
 from mapserver.commands.build import build
 from mapserver.commands.building import BUILDING
-from mapserver.commands.calibrate import calibrate
 from mapserver.commands.convert import convert
 from mapserver.commands.doctor import doctor
-from mapserver.commands.evaluate import evaluate
 from mapserver.commands.fleet import FLEET
 from mapserver.commands.grid import GRID
 from mapserver.commands.nightly import nightly
@@ -48,8 +46,6 @@ COMMANDS: Commands = {
     "import": import_,
     "convert": convert,
     "doctor": doctor,
-    "calibrate": calibrate,
-    "evaluate": evaluate,
     "align": align,
     "areas": AREAS_GROUP,
     "building": BUILDING,

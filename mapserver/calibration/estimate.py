@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleetmap.geometry import Array
-from fleetmap.recordings.calibration_files import format_calibration
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.calibration.estimator import Adjusted, adjust, prior_information
@@ -202,18 +201,3 @@ def in_words(parameter: ParameterEstimate) -> tuple[str, str]:
     """A correction and its sigma, in per cent, degrees, milliseconds, millimetres or pixels."""
     scale, unit, _ = SHOWN[parameter.unit]
     return f"{parameter.estimate * scale:+.3f} {unit}", f"{parameter.sigma * scale:.3f} {unit}"
-
-
-def corrected_file(estimate: CalibrationEstimate, rig: RigCalibration, names: list[str]) -> str:
-    """Return the text of a camchain: the corrected rig, with comments on measured and unchanged values."""
-    lines = [f"# Measured by `mapserver calibrate` from {', '.join(names)}."]
-    for p in estimate.parameters:
-        value, sigma = in_words(p)
-        what = f"corrected by {value}, sigma {sigma}" if p.is_judged else f"NOT JUDGED, old value kept: {p.reason}"
-        lines.append(f"# {p.name.value}: {what}")
-    if len(rig.views) > 1:
-        lines.append(
-            f"# Cameras from cam{rig.views[1][0]} on are as they were: check their mounting with `mapserver doctor`."
-        )
-    lines.append("# The wheels' scale and the IMU's noise are for information: this file keeps the noise that it had.")
-    return "\n".join(lines) + "\n" + format_calibration(estimate.corrected(rig))

@@ -163,7 +163,7 @@ def _finding(parameter: ParameterEstimate, estimate: CalibrationEstimate, focal_
     if not is_bad and abs(value) > tolerance.warn_above + sigma_all:  # large but uncertain: worth a warning
         return replace(not_judged(name.value, f"{words}: that may be chance", _LONGER), value=value)
     if is_bad:
-        words += "; calibrate again (with `mapserver calibrate`), or name the matching file with --calibration"
+        words += "; calibrate again, or name the matching file with --calibration"
     limits = f"warn {factor * tolerance.warn_above:g}, fail {factor * tolerance.fail_above:g} {unit} for sure"
     return Finding(name.value, verdict, value, limits, words, _LONGER if is_bad and is_coarse else "")
 

@@ -19,7 +19,8 @@ from fleetmap.sensors.samples import Trajectory
 from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
 from locclient.replay.run_result import ReplayResult
-from mapserver.evaluation.trajectory_error import absolute_trajectory_error, at_first_stamp, paired
+from mapserver.evaluation.trajectory_error import absolute_trajectory_error, paired
+from mapserver.plugins.trajectory_errors.errors import at_first_stamp
 from mapserver.survey.odometry_pass import FrameChain
 from studies.study import PAGES, Column, Row, between_marks, publish, results, rms, table
 from support.recordings.realdata import DATA

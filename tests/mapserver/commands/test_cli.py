@@ -56,10 +56,6 @@ def test_exit_statuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert status("mapserver", "versions", "--site", "lab", *to_store) == 0
     assert status("mapserver", "--help") == 0
     assert status("mapserver", "build", "--site", "lab") == 2
-    assert status("mapserver", "calibrate") == 2
-    assert status("mapserver", "calibrate", tmp_path / "none.mcap") == 3
-    assert status("mapserver", "calibrate", tmp_path / "none.mcap", "--out", tmp_path / "no" / "o.yaml") == 2
-    assert status("mapserver", "calibrate", tmp_path / "none.mcap", "--guess", "752:0.1") == 2
     assert status("mapserver", "no-such-command") == 2
     assert status("mapserver", "versions", "--site", "unknown", *to_store) == 2
     assert status("mapserver", "fleet", "replay", 10**20, *to_store) == 2

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from fleetmap.recordings import Recording, Topics
+    from fleetmap.sensors.calibration import RigCalibration
     from mapserver.calibration import CalibrationEstimate
     from mapserver.survey.survey_inputs import SurveyTools
 
@@ -53,7 +54,6 @@ def calibrate(
         return
     from fleetmap.console import plain_console
     from mapserver.calibration import estimate_calibration
-    from mapserver.calibration.estimate import corrected_file
     from mapserver.config import survey_settings
 
     with ExitStack() as opened:
@@ -105,8 +105,13 @@ def _write(out: Path, text: str, advice: str) -> None:
 
 def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Path | None, topics: "Topics") -> None:
     from fleetmap.recordings import OpenOptions, format_calibration, open_recording
-    from mapserver.calibration.from_guess import calibration_from_guess, first_rig, guessed_file, guessed_in_words
     from mapserver.config import survey_settings
+    from mapserver.plugins.rig_measurement.from_guess import (
+        calibration_from_guess,
+        first_rig,
+        guessed_file,
+        guessed_in_words,
+    )
 
     known = re.fullmatch(r"([1-9]\d{1,4})x([1-9]\d{1,4}):(\d*\.?\d+)", guess)
     baseline_m = float(known[3]) if known else 0.0
@@ -128,6 +133,24 @@ def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Pa
     if out is not None:
         advice = f"add the pose of the IMU, then calibrate again with --calibration {out}"
         _write(out, guessed_file(found, name), advice)
+
+
+def corrected_file(estimate: "CalibrationEstimate", rig: "RigCalibration", names: list[str]) -> str:
+    """Return the text of a camchain: the corrected rig, with comments on measured and unchanged values."""
+    from fleetmap.recordings import format_calibration
+    from mapserver.calibration.estimate import in_words
+
+    lines = [f"# Measured by `mapserver calibrate` from {', '.join(names)}."]
+    for p in estimate.parameters:
+        value, sigma = in_words(p)
+        what = f"corrected by {value}, sigma {sigma}" if p.is_judged else f"NOT JUDGED, old value kept: {p.reason}"
+        lines.append(f"# {p.name.value}: {what}")
+    if len(rig.views) > 1:
+        lines.append(
+            f"# Cameras from cam{rig.views[1][0]} on are as they were: check their mounting with `mapserver doctor`."
+        )
+    lines.append("# The wheels' scale and the IMU's noise are for information: this file keeps the noise that it had.")
+    return "\n".join(lines) + "\n" + format_calibration(estimate.corrected(rig))
 
 
 def _print(console: "Console", estimate: "CalibrationEstimate") -> None:

@@ -30,7 +30,7 @@ def evaluate(
     from fleetmap.console import plain_console
     from fleetmap.recordings.ordering import ReadLog
     from fleetmap.recordings.tum import read_covariances, read_truth, read_tum
-    from mapserver.evaluation.trajectory_error import summary
+    from mapserver.plugins.trajectory_errors.errors import summary
 
     log = ReadLog()
     trajectories = read_tum(estimate), read_truth(ground_truth, log)

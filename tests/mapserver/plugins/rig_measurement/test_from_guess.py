@@ -10,8 +10,8 @@ from fleetmap.geometry import Array, se3_inverse, so3_exp, so3_log
 from fleetmap.sensors.calibration import RigCalibration
 from fleetsim.recorder import Order
 from mapserver.calibration.estimator import adjust
-from mapserver.calibration.from_guess import RawMatches, first_rig, guessed_rig
 from mapserver.calibration.parameters import DISTORTION
+from mapserver.plugins.rig_measurement.from_guess import RawMatches, first_rig, guessed_rig
 from support.worlds.calibration_scene import Stretch, make_stretch, measured
 
 DISTORTED = np.array([-0.28, 0.07, 0.0, 0.0])

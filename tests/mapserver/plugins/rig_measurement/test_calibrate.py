@@ -13,6 +13,7 @@ from fleetmap.sensors.samples import CameraFrame
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate
 from mapserver.calibration.parameters import COLUMNS, RANGES
 from mapserver.cli import app
+from support.command_line import status
 from support.recordings.recording_samples import calibration, make_sample, write_euroc
 from support.recordings.rig_samples import write_kitti_raw
 from support.worlds.box_room import out_and_back, ride_sample
@@ -50,7 +51,15 @@ def test_the_other_cameras_of_a_rig_are_kept(tmp_path: Path, monkeypatch: pytest
     with open_recording(drive) as recording:
         before = recording.calibration.cameras
     after = read_calibration(tmp_path / "cams.yaml").cameras
+    assert "camera position z: NOT JUDGED" in (tmp_path / "cams.yaml").read_text()
     assert len(after) == 4
     np.testing.assert_allclose(after[3].body_from_cam, before[3].body_from_cam)
     apart = [np.linalg.norm((se3_inverse(c[0].body_from_cam) @ c[1].body_from_cam)[:3, 3]) for c in (before, after)]
     assert apart[1] == pytest.approx(1.01 * apart[0])
+
+
+def test_exit_statuses(tmp_path: Path) -> None:
+    assert status("mapserver", "calibrate") == 2
+    assert status("mapserver", "calibrate", tmp_path / "none.mcap") == 3
+    assert status("mapserver", "calibrate", tmp_path / "none.mcap", "--out", tmp_path / "no" / "o.yaml") == 2
+    assert status("mapserver", "calibrate", tmp_path / "none.mcap", "--guess", "752:0.1") == 2

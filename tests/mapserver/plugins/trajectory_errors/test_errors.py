@@ -24,15 +24,13 @@ from fleetmap.geometry import (
 from fleetmap.recordings.tum import StampedCovariances, format_stamp, parse_covariances, read_covariances, write_tum
 from fleetmap.sensors.samples import Trajectory
 from mapserver.cli import app
-from mapserver.evaluation.trajectory_error import (
-    absolute_trajectory_error,
+from mapserver.evaluation.trajectory_error import absolute_trajectory_error, paired, truth_from_estimate
+from mapserver.plugins.trajectory_errors.errors import (
     at_first_stamp,
     best_clock_shift,
     consistency,
     drift,
-    paired,
     relative_trajectory_error,
-    truth_from_estimate,
     unaligned_errors,
 )
 

@@ -1,0 +1,1 @@
+"""The errors of an estimated trajectory against the truth."""
