@@ -20,7 +20,6 @@ from mapserver.api.metrics import Metrics
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore
 from mapserver.trust import init_here
-from mapserver.trust.status import _ENDS_SOON, _SITE_ENDS_SOON
 from support.fleet.contracts_documents import REPOSITORY, click_command, text
 from support.storage.map_samples import publish_samples
 
@@ -201,63 +200,6 @@ def test_rules_and_board_ask_for_what_the_server_exports(tmp_path: Path) -> None
         assert set(re.findall(r"(\w+)[=!]", given)) <= labels.get(
             name, {"site", "version", "area", "cause", "robot"}
         ), name
-
-
-def test_rules_fire_when_they_should(tmp_path: Path) -> None:
-    """By Prometheus's own program: each rule beside its limit, and what it says."""
-    if (promtool := shutil.which("promtool")) is None:
-        pytest.skip("NO PROMTOOL: the rules for Prometheus are not tried; install Debian's prometheus to do it")
-    ends = {**_ENDS_SOON, "site-lab": _SITE_ENDS_SOON}
-    series = {f'fleetmap_trust_days_left{{role="{role}"}}': days - 0.01 for role, days in ends.items()}
-    series |= {f'fleetmap_trust_days_left{{role="{role}", job="other"}}': days + 0.01 for role, days in ends.items()}
-    series |= {
-        'fleetmap_site_robot_lost_seconds{site="hall", robot="tug-7"}': 420,
-        'fleetmap_site_night_failed{site="hall"}': 1,
-        'up{job="mapserver", instance="a"}': 0,
-        'up{job="mapserver", instance="b"}': 1,
-        'fleetmap_certificate_days_left{certificate="http"}': 13.9,
-        'fleetmap_certificate_days_left{certificate="server.pem"}': 14.1,
-        'fleetmap_store_disk_total_bytes{instance="a"}': 500e9,
-        'fleetmap_store_disk_free_bytes{instance="a"}': 49e9,
-        'fleetmap_store_disk_total_bytes{instance="b"}': 20e12,
-        'fleetmap_store_disk_free_bytes{instance="b"}': 51e9,
-    }
-    told = {
-        "RobotLost": ["tug-7 of hall has had no known position for 7m 0s"],
-        "NightFailed": ["the last night of hall failed; its job says why"],
-        "ServerDown": ["the map server does not answer: robots keep their maps, nobody sees their reports"],
-        "CertificateEnds": ["the certificate http of the map server ends in 13.9 days"],
-        "DiskFills": ["the disk of the map server is nearly full, or will be in four days; `mapserver gc` removes old versions"],
-        "ListEnds": [f"the signed list {role} ends in {days - 0.01:.1f} days, then robots take no new maps" for role, days in ends.items()],
-    }  # fmt: skip
-    labels = {
-        "RobotLost": [{"site": "hall", "robot": "tug-7"}],
-        "NightFailed": [{"site": "hall"}],
-        "ServerDown": [{"job": "mapserver", "instance": "a"}],
-        "CertificateEnds": [{"certificate": "http"}],
-        "DiskFills": [{"instance": "a"}],
-        "ListEnds": [{"role": role} for role in ends],
-    }
-    severity = {
-        rule["alert"]: rule["labels"] for rule in yaml.safe_load(RULES.read_text("utf-8"))["groups"][0]["rules"]
-    }
-    expected = [
-        {
-            "eval_time": "2h",
-            "alertname": f"Fleetmap{name}",
-            "exp_alerts": [
-                {"exp_labels": of | severity[f"Fleetmap{name}"], "exp_annotations": {"summary": words}}
-                for of, words in zip(labels[name], told[name], strict=True)
-            ],
-        }
-        for name in told
-    ]
-    values = [{"series": name, "values": f"{value}x150"} for name, value in series.items()]
-    tests = [{"interval": "1m", "input_series": values, "alert_rule_test": expected}]
-    path = tmp_path / "tests.yml"
-    path.write_text(yaml.safe_dump({"rule_files": [str(RULES)], "tests": tests}))
-    done = subprocess.run([promtool, "test", "rules", path], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
 
 
 def test_the_kernel_takes_the_rules_of_the_firewall() -> None:

@@ -45,12 +45,3 @@ def test_a_room_is_accepted_signed_and_equal_to_itself(site: RoomSite, tmp_path:
     assert report["areas"] == json.loads((outs[0] / "acceptance.json").read_text())["areas"]  # the same bytes
     (out / "acceptance.json").write_text("{}")
     assert invoke(mapserver_app, "trust", "verify", out, "--store", maps).exit_code != 0
-
-
-def test_an_earlier_report_that_is_none_and_a_folder_that_is_missing_are_named(site: RoomSite, tmp_path: Path) -> None:
-    (tmp_path / "x.json").write_text("{}")
-    given = ["accept", site.robot, "--site", "lab", "--store", site.store]
-    assert "is no acceptance report" in str(
-        invoke(mapserver_app, *given, "--out", tmp_path, "--before", tmp_path / "x.json").exception
-    )
-    assert "does not exist" in str(invoke(mapserver_app, *given, "--out", tmp_path / "none").exception)

@@ -8,20 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.errors import SurveyError, UsageError
-from fleetmap.geometry import Array, se3
+from fleetmap.geometry import Array
 from fleetmap.mapformat import Tile, decode_tile
-from fleetmap.recordings import open_recording
-from fleetmap.sensors.rectification import Rectifier
 from mapserver.cli import app
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
-from mapserver.survey.merge.membership import Membership, MembershipVerdict
-from mapserver.survey.merge.pipeline import extend
-from mapserver.survey.settings import SurveySettings
-from mapserver.survey.stages import survey
-from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs
 from support.recordings.recording_samples import Sample, make_sample, write_euroc
 from support.room_site import KNOWN_RIG, invoke, run
 from support.worlds.box_room import out_and_back, poster, ride_sample
@@ -197,26 +189,6 @@ def test_recordings_are_joined_and_a_foreign_one_is_left_out(nights: Nights, tmp
     assert report["duration_s"] == pytest.approx(4.9 + 4.3)
     with MapStore.open(tmp_path / "store") as maps:
         assert [r.name for r in maps.manifest("hall", 1).recordings] == ["night1", "night2"]
-
-
-def test_a_prior_alone_joins_nothing(nights: Nights, tmp_path: Path) -> None:
-    """Another building's docks may stand at any coordinates: a survey of another place is held with them as without."""
-    with MapStore.open(nights.store) as maps:
-        archive = maps.archive("lab", 1)
-    assert archive is not None
-    base, settings = decode_archive(archive), SurveySettings()
-    with open_recording(write_euroc(tmp_path / "foreign", make_sample(20))) as recording:
-        frames, rectifier = (
-            (recording.read_frame(n) for n in range(20)),
-            Rectifier(recording.calibration, pinhole=base.camera),
-        )
-        inputs = SurveyInputs(frames, 20, recording.imu, recording.calibration, rectifier)
-        foreign = survey(inputs, SurveyConfig(settings, default_vocabulary()))
-    for docks in (None, np.eye(4), se3(np.eye(3), np.array([30.0, 20.0, 0.0]))):
-        held = extend(base, foreign, settings, map_from_survey=docks)
-        assert isinstance(held, Membership)
-        assert held.verdict is not MembershipVerdict.JOINED
-        assert "drive" in held.reason
 
 
 def test_a_site_keeps_its_frame_and_takes_no_map_of_another_place(nights: Nights, tmp_path: Path) -> None:

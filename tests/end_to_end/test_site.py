@@ -21,24 +21,6 @@ from mapserver.cli import app as mapserver_app
 from mapserver.store import MapStore
 from support.room_site import FRAMES, KNOWN_RIG, RoomSite, invoke, process, run
 
-REPORT_KEYS = {
-    "frames": None,
-    "localised_share_of_all": None,
-    "localised_share": None,
-    "first_fix_s": None,
-    "not_localised_share": None,
-    "frame_ms": ("mean", "p50", "p99", "max"),
-    "frame_wall_ms": ("mean", "p50", "p99", "max"),
-    "stage_ms": ("decode", "image_quality", "map", "odometry", "rectify"),
-    "error_m": ("median", "p95", "p99", "max"),
-    "error_deg": ("median", "p99"),
-    "position_failures": None,
-    "silent_failures": None,
-    "status_share": ("INITIALISING", "TRACKING", "DEGRADED", "AMBIGUOUS", "LOST"),
-    "peak_rss_mb": None,
-    "map_version": None,
-    "failures_detected": None,
-}
 Replayed = tuple[dict[str, Any], Path]
 
 
@@ -59,19 +41,6 @@ def test_the_survey_is_good_to_millimetres_and_finds_its_way_back(site: RoomSite
     assert loops["accepted"] >= 3  # the way back shows every place again
     assert loops["candidates"] == loops["accepted"] + loops["gated_out"] + loops["rejected"]
     assert report["path_m"] == pytest.approx(5.0, abs=0.2)
-
-
-def test_the_replay_report_has_the_stable_keys_in_order(replayed: Replayed) -> None:
-    report, _ = replayed
-    assert [key for key in report if key in REPORT_KEYS] == list(REPORT_KEYS)
-    for key, names in REPORT_KEYS.items():
-        if names is not None:
-            assert tuple(report[key]) == names, key
-            assert all(isinstance(value, float) for value in report[key].values()), key
-    assert (report["frames"], report["map_version"]) == (FRAMES, 1)
-    assert report["failures_detected"] == 0
-    assert sum(report["status_share"].values()) == pytest.approx(1.0)
-    assert 50 < report["peak_rss_mb"] < 20_000
 
 
 def test_other_viewpoints_are_localised_to_a_centimetre_and_the_report_does_not_flatter_itself(

@@ -2,7 +2,6 @@
 
 from dataclasses import replace
 
-import cv2
 import numpy as np
 import pytest
 
@@ -11,7 +10,6 @@ from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp, transfo
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.rectification import RGBD_BASELINE_M, Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, Image
-from support.recordings.realdata import real_data
 from support.recordings.recording_samples import calibration as sample_calibration
 
 WIDTH, HEIGHT = 320, 240
@@ -176,38 +174,3 @@ def test_a_pinhole_far_from_the_rigs_is_refused() -> None:
     for factor in (0.5, 2.0):
         with pytest.raises(CalibrationError, match="focal length"):
             Rectifier(straight, pinhole=replace(own, focal_px=factor * own.focal_px))
-
-
-def test_the_double_spheres_of_a_real_pair_rectify_its_images() -> None:
-    """TUM-VI's pair as basalt calibrated it, at twice the size: points followed from left to right stay on their row."""
-    folder = real_data("tumvi_room1_fisheye_8")
-    cam1_from_cam0 = se3(
-        np.array([
-            [0.9999995881755, -0.0008429104329, -0.0003363788793],
-            [0.0008258897264, 0.9988593352731, -0.0477424993476],
-            [0.0003762378345, 0.0477422018742, 0.9988596200695],
-        ]),
-        np.array([-0.1009678603465, -0.0019668632282, -0.0015905749062]),
-    )  # fmt: skip
-    cameras = []
-    for (fx, fy, cx, cy, xi, alpha), place in (
-        ((158.286, 158.2743, 254.9612, 256.8894, -0.172131, 0.593118), np.eye(4)),
-        ((157.9183, 157.8901, 252.5655, 255.0249, -0.171148, 0.592554), se3_inverse(cam1_from_cam0)),
-    ):
-        intrinsics = np.array([2 * fx, 2 * fy, 2 * cx + 0.5, 2 * cy + 0.5])
-        shape = np.array([0.0, 0.0, 0.0, 0.0, xi, alpha])
-        cameras.append(CameraCalibration("double-sphere", 1024, 1024, intrinsics, shape, place))
-    rectifier, rises = Rectifier(RigCalibration(tuple(cameras))), []
-    for files in zip(*(sorted((folder / name).rglob("*.png"))[::4] for name in ("cam0", "cam1")), strict=True):
-        left, right = (
-            cv2.convertScaleAbs(cv2.imread(str(file), cv2.IMREAD_UNCHANGED), alpha=1 / 256) for file in files
-        )
-        frame = rectifier.rectify(CameraFrame(0, left, right))
-        corners = cv2.goodFeaturesToTrack(frame.left, 500, 0.01, 10)
-        there, is_there, _ = cv2.calcOpticalFlowPyrLK(
-            frame.left, frame.right, corners, None, winSize=(15, 15), maxLevel=5
-        )
-        back, _, _ = cv2.calcOpticalFlowPyrLK(frame.right, frame.left, there, None, winSize=(15, 15), maxLevel=5)
-        good = (is_there.ravel() == 1) & (np.linalg.norm((back - corners)[:, 0], axis=1) < 0.5)
-        rises.append((there - corners)[good, 0, 1])
-    assert np.median(np.abs(np.concatenate(rises))) < 0.5

@@ -297,18 +297,6 @@ def test_a_lost_tile_of_another_version_leaves_the_page_with_its_roll_back(tmp_p
     assert "Publish draft 3" in answer.text
 
 
-def test_another_site_is_chosen_on_pages_that_are_of_one(served: Served) -> None:
-    for path, leads_to in (
-        ("failures/1", ' action="/dashboard/failures"'),
-        ("robots/tug-7", ' action="/dashboard/robots"'),
-        ("space", ""),
-    ):
-        text = httpx.get(f"{served.http}/dashboard/{path}", timeout=60).text
-        assert f'<form method="get"{leads_to}><label>Site' in text, path
-    failed = httpx.get(f"{served.http}/dashboard/failures/1?site=nowhere", timeout=60)
-    assert (failed.status_code, "Failure 1 of tug-7" in failed.text) == (200, True), "its number alone names it"
-
-
 def test_surveys_begin_with_a_site_that_has_a_map(served: Served) -> None:
     with MapStore.open(served.folder) as store:
         store.update_job(store.begin_job("depot", "build"), "failed", "no images", {})
@@ -364,21 +352,6 @@ def test_times_are_those_of_the_browser_and_ranges_are_kept_to(served: Served) -
     within = shown(f"since={earlier}&until={later}", "Asia/Tokyo")
     assert "No failures match" not in within
     assert later in within, "the form says what was asked"
-
-
-def test_surveys_the_history_and_the_figures_keep_to_a_range(served: Served) -> None:
-    def shown(path: str, **query: str) -> str:
-        return httpx.get(f"{served.http}/dashboard/{path}", params=query, timeout=60).text
-
-    now = datetime.now(ZoneInfo("UTC"))
-    before = {"until": f"{now - timedelta(days=2):%Y-%m-%dT%H:%MZ}"}
-    within = {"since": f"{now - timedelta(hours=2):%Y-%m-%dT%H:%MZ}"}
-    assert "No job began in this time." in shown("surveys", **before)
-    assert "cameras are swapped" in shown("surveys", **within)
-    assert "Nothing happened in this time." in shown("map", **before)
-    assert "first survey" in shown("map", **within), "the reason in the history"
-    assert "Failures per robot-day, chosen hours" in shown("trends", **within)
-    assert "Failures per robot-day, last 24 h" in shown("trends")
 
 
 def test_the_look_that_was_chosen_stays(page: Page, served: Served) -> None:

@@ -134,23 +134,6 @@ def test_which_aisle_got_worse_this_week(operator: Operator) -> None:
     listed_in(page, "aisle 2")
 
 
-def test_which_aisle_got_worse_since_a_day(operator: Operator) -> None:
-    """Beside the 7 days before it: the last 7 days give the table that the page begins with."""
-    page = operator.page
-    opened(page, operator.served, "trends")
-    usual = page.get_by_role("table", name="What got worse this week").get_by_role("row")
-    week = usual.all_inner_texts()
-    expect(page.get_by_role("link", name="Since Monday", exact=True)).to_be_visible()
-    operator.click(page.get_by_role("link", name="Last 7 days", exact=True))
-    chosen = page.get_by_role("table", name="What got worse in the chosen time").get_by_role("row")
-    expect(chosen.nth(1)).to_contain_text(re.compile(r"^aisle 2\s*worse"))
-    assert len(chosen.all_inner_texts()) == len(week)
-    since = page.locator("input[name=since]").input_value()
-    operator.click(chosen.get_by_role("link", name="aisle 2"))
-    expect(page.locator("input[name=since]")).to_have_value(since)
-    listed_in(page, "aisle 2")
-
-
 def test_what_happened_last(operator: Operator) -> None:
     page = operator.page
     opened(page, operator.served, "failures")
@@ -160,14 +143,6 @@ def test_what_happened_last(operator: Operator) -> None:
     moments = [datetime.fromisoformat(when[:19]) for when in listed.evaluate_all("all => all.map(one => one.title)")]
     assert len(moments) > 5
     assert moments == sorted(moments, reverse=True)
-
-
-def test_the_worst_failure_by_the_keyboard(operator: Operator) -> None:
-    page = operator.page
-    opened(page, operator.served, "failures")
-    for key in ("Tab", "Enter", "Tab", "Enter"):
-        page.keyboard.press(key)
-    expect(page.locator("h1")).to_have_text(re.compile("^Failure "))
 
 
 def test_what_failed_in_aisle_2_today(operator: Operator) -> None:

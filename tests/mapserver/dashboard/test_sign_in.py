@@ -215,42 +215,6 @@ def test_a_script_in_a_failures_words_does_not_run(browser: Chromium, served: Se
         assert injected(context, served) is is_policy_off
 
 
-def test_a_renewed_certificate_is_taken_while_the_server_runs(tmp_path: Path) -> None:
-    import ssl
-
-    from mapserver.trust.http_certificate import HttpCertificate
-
-    certificate, key = (Path(path) for path in make_certificate(tmp_path, 1))
-    held, context = HttpCertificate(certificate, key), ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
-    assert held.names() == {"localhost", "maps.example", "127.0.0.1"}
-    context.load_cert_chain(certificate, key)
-
-    def shown() -> int:
-        """The number of the certificate that a new connection gets."""
-        inward, outward, client = ssl.MemoryBIO(), ssl.MemoryBIO(), ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-        client.check_hostname, client.verify_mode = False, ssl.CERT_NONE
-        ends = [client.wrap_bio(inward, outward), context.wrap_bio(outward, inward, server_side=True)]
-        for _ in range(6):
-            for end in ends:
-                try:
-                    end.do_handshake()
-                except ssl.SSLWantReadError:
-                    continue
-        return x509.load_der_x509_certificate(ends[0].getpeercert(binary_form=True)).serial_number
-
-    assert shown() == 1
-    time.sleep(0.01)
-    old_key = key.read_bytes()
-    make_certificate(tmp_path, 2)
-    new_key = key.read_bytes()
-    key.write_bytes(old_key)
-    held.renew(context)
-    assert shown() == 1, "half of a new pair is not taken"
-    key.write_bytes(new_key)
-    held.renew(context)
-    assert shown() == 2
-
-
 def test_the_server_takes_it_without_a_restart(served: Served) -> None:
     from ssl import get_server_certificate
 

@@ -15,10 +15,9 @@ from fleetmap.geometry import Array, se3
 from fleetmap.mapformat import Tile
 from fleetmap.messages import CameraNote, FailureAck, Placement, decode_message, encode_message, robot_key
 from mapserver.dashboard.space import points
-from mapserver.dashboard.space.points import space_bytes, surfel_bytes
+from mapserver.dashboard.space.points import space_bytes
 from mapserver.dashboard.space_page import robot_views
 from mapserver.store import MapStore
-from mapserver.surfels.surfel_map import EDGE_M
 from support.fleet.dashboard_scene import ROBOTS, SITE, Served, failure, opened, serving, talking, wait_until
 from support.pages.browser import box_of
 from support.pages.whole_page import assert_whole
@@ -66,24 +65,6 @@ def test_too_many_landmarks_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None
     assert 20 <= count <= 30
 
 
-def test_surfels_come_by_level_and_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
-    wall = seen_wall(with_board=True)
-    for most in (1_000_000, len(wall) // 2):
-        monkeypatch.setattr(points, "MAX_SURFELS", most)
-        step = math.ceil(len(wall) / most)
-        data = surfel_bytes(wall)
-        levels = int(np.frombuffer(data, "<u4", 1)[0])
-        counts, edges_m = np.frombuffer(data, "<u4", levels, 4), np.frombuffer(data, "<f4", levels, 4 + 4 * levels)
-        chosen = wall[np.arange(0, len(wall), step)]
-        assert counts.tolist() == np.bincount(chosen.levels, minlength=levels).tolist()
-        np.testing.assert_allclose(edges_m, EDGE_M * 2.0 ** np.arange(levels) * math.sqrt(step), rtol=1e-6)
-        at = np.frombuffer(data, "<f4", 3 * len(chosen), 4 + 8 * levels).reshape(-1, 3)
-        greys = np.frombuffer(data, np.uint8, offset=4 + 8 * levels + 12 * len(chosen))
-        order = np.argsort(chosen.levels, kind="stable")
-        np.testing.assert_array_equal(at, chosen.points_map[order])
-        np.testing.assert_array_equal(greys, chosen.greys[order])
-
-
 def test_surfaces_are_seen_and_measured(page: Page, tmp_path: Path) -> None:
     """A wall with known ends: what is clicked is as far apart as the surfels under the pointer."""
     wall = seen_wall(with_board=False)
@@ -128,10 +109,6 @@ def test_the_picture_of_a_survey_is_shown_at_a_place(page: Page, tmp_path: Path)
         page.get_by_role("button", name="Walk through it").click()
         expect(page.locator(".taken")).to_be_hidden()
         assert seen.faults == []
-
-
-def test_an_empty_version_is_empty() -> None:
-    assert space_bytes([]) == bytes(8)
 
 
 def test_the_map_is_seen_in_space_with_its_robots(page: Page, served: Served) -> None:

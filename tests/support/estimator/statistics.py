@@ -1,7 +1,7 @@
 """Statistics of what an estimator measures on the simulator's pictures.
 
-Measured by `python tests/benchmarks/simulator/measure_statistics.py` on `small-loop` (survey by day; tote by day and night, the next
-day's stock). Figures in the comments are that command's.
+Measured on `small-loop` (survey by day; tote by day and night, the next day's stock), whose true depth and motion tell where each
+corner, disparity and feature belongs. Figures in the comments are those of that day.
 """
 
 from typing import NamedTuple
