@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 from fleetmap.config import Section
+from fleetmap.hooks import plugins
 from fleetmap.mapformat.floors import Floor
 from fleetmap.messages import WantedVersion
-from fleetmap.plugins import plugins
 from fleetmap.sensors.samples import PositionPrior
 from locclient.identity import MapAddress
 from locclient.maps.tile_cache import TileCache

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from fleetmap.cli_options import Command
-from fleetmap.plugins import plugins
+from fleetmap.hooks import plugins
 
 if TYPE_CHECKING:
     from fleetmap.mapformat.version_file import ExportHead

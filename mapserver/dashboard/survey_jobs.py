@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
-from fleetmap.recordings import FILE_SUFFIXES
+from fleetmap.recordings import file_suffixes
 from mapserver.api.inbox_routes import NO_INBOX
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.data import JOBS_SHOWN
@@ -48,7 +48,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         "chosen": chosen,
         "inbox": services.maps.inbox_of(context.site),
         "no_inbox": NO_INBOX,
-        "suffixes": FILE_SUFFIXES,
+        "suffixes": file_suffixes(),
     }
     if chosen is None:
         return shown

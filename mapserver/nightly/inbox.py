@@ -29,7 +29,7 @@ from fleetmap.errors import FleetmapError, RecordingError, StateError, StoreErro
 from fleetmap.files import sync_path, write_atomically
 from fleetmap.log_lines import printable
 from fleetmap.mapformat.names import is_name
-from fleetmap.recordings import FILE_SUFFIXES, OpenOptions
+from fleetmap.recordings import OpenOptions, file_suffixes
 from mapserver.fleet.bounded_process import ProcessLimits, run_bounded
 from mapserver.nightly import reading
 from mapserver.store.files import check_no_link, make_folder
@@ -95,7 +95,7 @@ def arrivals(inbox: Path, settle_s: float, now_ns: int, *, is_brief: bool = Fals
         if path.name.startswith(".") or path.name in (DONE, HELD, BAD):
             continue
         try:
-            if stat.S_ISREG(path.lstat().st_mode) and path.suffix not in (*_UNFINISHED, *FILE_SUFFIXES, ".zip"):
+            if stat.S_ISREG(path.lstat().st_mode) and path.suffix not in (*_UNFINISHED, *file_suffixes(), ".zip"):
                 others.append(path.name)
             elif is_brief and path.is_dir() and not path.is_symlink():
                 complete.append(path)
@@ -227,7 +227,7 @@ def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> 
     name = f"{prefix}{path.name}"
     if not is_safe_name(f"99-{name}"):
         digest = hashlib.sha256(os.fsencode(path.name)).hexdigest()[:_HASH_SIGNS]
-        name = f"{prefix}unnamed-{digest}{path.suffix if path.suffix in FILE_SUFFIXES else ''}"
+        name = f"{prefix}unnamed-{digest}{path.suffix if path.suffix in file_suffixes() else ''}"
     check_no_link(path.parent, folder)
     with disk_errors(f"{path} cannot be moved to {folder}", "check the rights and space of the inbox"):
         make_folder(folder)
@@ -280,7 +280,7 @@ def contents(inbox: Path, settle_s: float, now_ns: int) -> InboxContents:
     if not inbox.is_dir():
         return InboxContents([], [], [], 0)
     here = arrivals(inbox, settle_s, now_ns, is_brief=True)
-    known = f"no recording; a recording is a folder, or a file that ends in {', '.join(FILE_SUFFIXES)}"
+    known = f"no recording; a recording is a folder, or a file that ends in {', '.join(file_suffixes())}"
     reasons = {path.name: "" for path in here.complete} | dict.fromkeys(here.others, known)
     reasons |= {path.name: reason for path, reason in (*here.waiting, *here.bad)}
     waiting = [_entry(inbox / name, reasons[name]) for name in sorted(reasons) if is_safe_name(name)]
@@ -338,9 +338,9 @@ def put_back(inbox: Path, where: str, name: str) -> None:
 def check_upload_name(inbox: Path, name: str) -> Path:
     """Return where an uploaded recording belongs. Raises UsageError for an invalid name, StateError for one that exists."""
     path = inbox / name
-    is_short = is_safe_name(name) and len(os.fsencode(name)) <= _UPLOAD_NAME_BYTES
-    if not is_short or path.suffix not in FILE_SUFFIXES:
-        known = f"{', '.join(FILE_SUFFIXES[:-1])} or {FILE_SUFFIXES[-1]}"
+    is_short, suffixes = is_safe_name(name) and len(os.fsencode(name)) <= _UPLOAD_NAME_BYTES, file_suffixes()
+    if not is_short or path.suffix not in suffixes:
+        known = f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
         words = f"{printable(name)[:80]!r} is an invalid name of a recording; use at most {_UPLOAD_NAME_BYTES} bytes that end in {known}"
         raise UsageError(f"{words} (`mapserver convert FOLDER OUT.mcap` makes one of a folder)")
     if os.path.lexists(path):

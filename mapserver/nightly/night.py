@@ -18,7 +18,7 @@ from rich.console import Console
 
 from fleetmap.errors import FleetmapError, GateRefusedError, RecordingError, StoreError, SurveyError
 from fleetmap.log_lines import printable
-from fleetmap.recordings import FILE_SUFFIXES
+from fleetmap.recordings import file_suffixes
 from mapserver import releases
 from mapserver.drafting.draft import BuildOptions, BuildRequest, build_draft
 from mapserver.drafting.job_lock import INTERRUPTED, end_interrupted, held, logged, only_one
@@ -161,7 +161,7 @@ class _Night:
         if left:
             self._wait(left[0].name, f"not yet{_like(left)}: a night takes {_MOST_A_NIGHT} recordings")
         if here.others:
-            known = ", ".join(FILE_SUFFIXES)
+            known = ", ".join(file_suffixes())
             words = f"no recording{_like(here.others)}; a recording is a folder, or a file that ends in {known}"
             self._wait(here.others[0], words)
         # The draft that a killed night saved, if still based on the current version

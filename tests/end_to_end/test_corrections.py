@@ -18,7 +18,7 @@ from mapserver.fleet.building import keep_areas
 from mapserver.library import build_map, open_map
 from mapserver.store import Actor, MapStore
 from mapserver.store.archive import decode_archive
-from support.recordings.recording_samples import START_NS, write_euroc
+from support.recordings.recording_samples import START_NS, write_mcap
 from support.room_site import run
 from support.worlds.box_room import out_and_back, poster, ride_sample
 
@@ -64,7 +64,7 @@ class Corrected:
         with poster(night, SCREEN_M):
             sample = ride_sample(ride(night) if night else out_and_back(5.0), 44 if night else 50, 0.1, seed=night)
         options = BuildOptions(frame_from_ground_truth=night == 0, actor=ADA)
-        built = build_map(write_euroc(self.folder / f"night{night}", sample), self.store, "lab", options)
+        built = build_map(write_mcap(self.folder / f"night{night}", sample), self.store, "lab", options)
         built.publish(trust_calibration=night == 0, actor=ADA)
         return built.version
 
@@ -133,9 +133,9 @@ def test_a_screen_that_is_never_used_misleads_nobody(tmp_path: Path) -> None:
     store, found = tmp_path / "store", {}
     with poster(0, wide_m):
         for number, sample in enumerate((ride_sample(out_and_back(5.0), 50, 0.1), ride_sample(ride(1), 44, 0.1))):
-            write_euroc(tmp_path / f"survey{number}", sample)
+            write_mcap(tmp_path / f"survey{number}", sample)
     with poster(0, wide_m, shift_m=0.3):
-        robot = write_euroc(tmp_path / "robot", ride_sample(ride(2), 44, 0.1, seed=2))
+        robot = write_mcap(tmp_path / "robot", ride_sample(ride(2), 44, 0.1, seed=2))
     for version in (1, 2):
         options = BuildOptions(frame_from_ground_truth=version == 1)
         built = build_map(tmp_path / f"survey{version - 1}", store, "lab", options)

@@ -13,7 +13,7 @@ import psutil
 from mapserver.cli import app
 from mapserver.store import MapStore
 from support.fleet.dashboard_scene import Served, serving
-from support.recordings.recording_samples import write_euroc
+from support.recordings.recording_samples import write_mcap
 from support.room_site import run
 from support.worlds.box_room import out_and_back, ride_sample
 
@@ -51,7 +51,7 @@ def built(served: Served, recording: str) -> int:
 def test_an_upload_becomes_a_version(tmp_path: Path) -> None:
     inbox, ride, other = tmp_path / "inbox", tmp_path / "ride.mcap", tmp_path / "other.mcap"
     for path, seconds in ((ride, 4.0), (other, 3.6)):
-        ride_folder = write_euroc(tmp_path / f"recorder {seconds}", ride_sample(out_and_back(seconds), 38, 0.1))
+        ride_folder = write_mcap(tmp_path / f"recorder {seconds}", ride_sample(out_and_back(seconds), 38, 0.1))
         run(app, "convert", ride_folder, path)
     inbox.mkdir()
     with MapStore.open(tmp_path / "store", create=True):

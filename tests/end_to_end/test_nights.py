@@ -9,7 +9,7 @@ import pytest
 
 from mapserver import cli
 from mapserver.store import MapStore
-from support.recordings.recording_samples import write_euroc
+from support.recordings.recording_samples import write_mcap
 from support.worlds.box_room import out_and_back, ride_sample
 
 
@@ -21,7 +21,7 @@ def test_two_nights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     inbox, report = tmp_path / "inbox", tmp_path / "night.json"
     rides = (out_and_back(4.0), out_and_back(3.6, reach_m=2.2, start_m=(-1.1, 0.5, 0.1)))
     for number, ride in enumerate(rides, 1):
-        write_euroc(inbox / f"ride{number}", ride_sample(ride, 38, 0.1, seed=number))
+        write_mcap(inbox / f"ride{number}", ride_sample(ride, 38, 0.1, seed=number))
         words = f"mapserver nightly --site lab --inbox {inbox} --store {tmp_path}/store --settle-s 0 --report {report}"
         monkeypatch.setattr(sys, "argv", shlex.split(words))
         with pytest.raises(SystemExit) as end:

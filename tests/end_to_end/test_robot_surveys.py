@@ -29,7 +29,7 @@ from mapserver.nightly.night import NightRequest, run_night
 from mapserver.nightly.robot_drives import RobotDrives
 from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, MapStore
-from support.recordings.recording_samples import START_NS, write_euroc
+from support.recordings.recording_samples import START_NS, write_mcap
 from support.worlds.box_room import out_and_back, poster, ride_sample
 
 ADA = Actor("ada", "new racks")
@@ -56,7 +56,7 @@ def drive(recording: Path, store: Path, area: SurveyArea, folder: Path) -> Surve
 
 def test_from_request_to_use_with_two_robots(tmp_path: Path) -> None:
     store, inbox, config = tmp_path / "store", tmp_path / "inbox", GateSettings()
-    write_euroc(tmp_path / "survey", ride_sample(out_and_back(9.0, reach_m=4.8, start_m=(-2.4, 0.6, 0.0)), 90, 0.1))
+    write_mcap(tmp_path / "survey", ride_sample(out_and_back(9.0, reach_m=4.8, start_m=(-2.4, 0.6, 0.0)), 90, 0.1))
     build_map(tmp_path / "survey", store, "lab", BuildOptions(frame_from_ground_truth=True)).publish(
         trust_calibration=True, actor=ADA
     )
@@ -64,7 +64,7 @@ def test_from_request_to_use_with_two_robots(tmp_path: Path) -> None:
     with poster(7, RACKS_M):
         rides = [out_and_back(8.0, reach_m=4.6, start_m=(-2.3, y, 0.1)) for y in (0.5, 0.58)]
         ways = [
-            write_euroc(tmp_path / f"way{n}", ride_sample(ride, 80, 0.1, seed=n + 1)) for n, ride in enumerate(rides)
+            write_mcap(tmp_path / f"way{n}", ride_sample(ride, 80, 0.1, seed=n + 1)) for n, ride in enumerate(rides)
         ]
 
     def night(site: str) -> None:

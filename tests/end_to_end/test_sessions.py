@@ -14,7 +14,7 @@ from fleetmap.mapformat import Tile, decode_tile
 from mapserver.cli import app
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
-from support.recordings.recording_samples import Sample, make_sample, write_euroc
+from support.recordings.recording_samples import Sample, make_sample, write_mcap
 from support.room_site import KNOWN_RIG, invoke, run
 from support.worlds.box_room import out_and_back, poster, ride_sample
 
@@ -33,12 +33,12 @@ class Nights:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.store = folder, folder / "store"
-        write_euroc(folder / "night1", ride_sample(out_and_back(5.0), 50, FRAME_S))
+        write_mcap(folder / "night1", ride_sample(out_and_back(5.0), 50, FRAME_S))
         self.samples = {2: second_ride(2)}
         with poster(7, POSTER_M):
             self.samples |= {3: second_ride(3), 4: second_ride(4)}
         for night, sample in self.samples.items():
-            write_euroc(folder / f"night{night}", sample)
+            write_mcap(folder / f"night{night}", sample)
         self.said = {1: self.build(1, "--frame-from-ground-truth")} | {
             night: self.build(night, None) for night in (2, 3)
         }
@@ -167,7 +167,7 @@ def test_the_same_night_again_gives_the_same_tiles(nights: Nights) -> None:
 
 def test_recordings_are_joined_and_a_foreign_one_is_left_out(nights: Nights, tmp_path: Path) -> None:
     """Two rides past one wall become one map; a ride through another world is named, with the reason."""
-    write_euroc(tmp_path / "foreign", make_sample(20))
+    write_mcap(tmp_path / "foreign", make_sample(20))
     rides = [nights.folder / "night1", tmp_path / "foreign", nights.folder / "night2"]
     files = ["--report", tmp_path / "r.json", "--trajectory-out", tmp_path / "t.tum", "--picture", tmp_path / "p.png"]
     said = run(
@@ -196,7 +196,7 @@ def test_a_site_keeps_its_frame_and_takes_no_map_of_another_place(nights: Nights
     error = invoke(app, "build", nights.folder / "night2", *to_store, "--frame-from-ground-truth").exception
     assert isinstance(error, UsageError)
     assert "frame is fixed" in str(error)
-    write_euroc(tmp_path / "foreign", make_sample(20))
+    write_mcap(tmp_path / "foreign", make_sample(20))
     error = invoke(app, "build", tmp_path / "foreign", *to_store).exception
     assert isinstance(error, SurveyError)
     assert "nothing could be joined" in str(error)

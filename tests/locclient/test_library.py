@@ -14,7 +14,7 @@ from fleetmap.recordings import open_recording
 from locclient import LocalizeOptions, LocalizerSettings, MapView, Relocalizer, fetch_map, finished, localize
 from locclient.maps.map_client import MapClient
 from mapserver.store import MapStore
-from support.recordings.recording_samples import write_euroc
+from support.recordings.recording_samples import write_mcap
 from support.worlds import robot_world
 
 FRAMES = 40
@@ -30,7 +30,7 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_euroc(tmp_path_factory.mktemp("drive"), robot_world.cycle())
+    return write_mcap(tmp_path_factory.mktemp("drive"), robot_world.cycle())
 
 
 def test_public_names_exist_and_the_import_is_light() -> None:

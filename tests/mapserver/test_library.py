@@ -10,13 +10,13 @@ import pytest
 import mapserver
 from fleetmap.errors import GateRefusedError, StateError, UsageError
 from mapserver import Actor, BuildOptions, build_map, open_map, open_store
-from support.recordings.recording_samples import write_euroc
+from support.recordings.recording_samples import write_mcap
 from support.worlds.box_room import out_and_back, ride_sample
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_euroc(tmp_path_factory.mktemp("drive") / "drive", ride_sample(out_and_back(6.0), 61, 0.1))
+    return write_mcap(tmp_path_factory.mktemp("drive") / "drive", ride_sample(out_and_back(6.0), 61, 0.1))
 
 
 def test_a_map_in_five_lines(recording: Path, tmp_path: Path) -> None:

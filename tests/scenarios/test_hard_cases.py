@@ -13,7 +13,7 @@ from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings.mcap.writer import copy_to_mcap
 from mapserver.cli import app
 from support.recordings.calibration_faults import pair_turn, swapped
-from support.recordings.recording_samples import write_euroc
+from support.recordings.recording_samples import write_mcap
 from support.recordings.spoiled_recording import (
     with_clock_shift,
     with_darkness,
@@ -31,7 +31,7 @@ GOOD_M = 0.02  # what the room is mapped to when nothing is wrong, with room to 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     folder = tmp_path_factory.mktemp("good")
-    return open_recording(write_euroc(folder / "survey", ride_sample(out_and_back(6.0), FRAMES, FRAME_S)))
+    return open_recording(write_mcap(folder / "survey", ride_sample(out_and_back(6.0), FRAMES, FRAME_S)))
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def another(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     """Another ride of the same robot in the same room."""
     ride = out_and_back(4.0, reach_m=1.8, start_m=(-0.8, -0.4, 0.2), yaw_rad=-1.2)
     folder = tmp_path_factory.mktemp("another")
-    return open_recording(write_euroc(folder / "survey", ride_sample(ride, 10, 0.6, seed=3)))
+    return open_recording(write_mcap(folder / "survey", ride_sample(ride, 10, 0.6, seed=3)))
 
 
 def built(recording: Recording, folder: Path) -> dict[str, Any]:

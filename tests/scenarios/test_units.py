@@ -14,7 +14,7 @@ from mapserver.store import FailureFilter, MapStore
 from support.fleet.contracts_documents import REPOSITORY
 from support.fleet.tls_site import START_S, TlsSite, forgotten_files
 from support.fleet.unit_filter import filtered
-from support.recordings.recording_samples import calibration, write_euroc
+from support.recordings.recording_samples import calibration, write_mcap
 from support.worlds import robot_world
 from support.worlds.box_room import out_and_back, ride_sample
 
@@ -70,7 +70,7 @@ def test_the_programs_do_their_work_under_the_filters_of_their_units(tmp_path: P
             assert httpx.get(f"{site.http}/readyz").status_code == 200
         assert [row.cause for row in store.fleet.failures(FailureFilter(site="room"))] == ["dark"]
     assert "snapshot" in site.run("mapserver", "backup", tmp_path / "target", "--store", site.store)
-    write_euroc(tmp_path / "inbox" / "ride", ride_sample(out_and_back(4.0), 38, 0.1, seed=1))
+    write_mcap(tmp_path / "inbox" / "ride", ride_sample(out_and_back(4.0), 38, 0.1, seed=1))
     words = f"nightly --site lab --inbox {tmp_path}/inbox --store {tmp_path}/lab --settle-s 0"
     site.run("mapserver", *shlex.split(words))
     assert forgotten_files(tmp_path / "lab") == []

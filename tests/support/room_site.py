@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 from fleetmap.geometry import Array
 from locclient.cli import app as locclient_app
 from mapserver.cli import app as mapserver_app
-from support.recordings.recording_samples import START_NS, write_euroc
+from support.recordings.recording_samples import START_NS, write_mcap
 from support.worlds.box_room import out_and_back, ride_sample
 
 FRAMES, FRAME_S = 50, 0.1
@@ -42,10 +42,10 @@ class RoomSite:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.store, self.robot = folder, folder / "store", folder / "robot"
-        write_euroc(folder / "survey", ride_sample(out_and_back(6.0), 60, FRAME_S))
+        write_mcap(folder / "survey", ride_sample(out_and_back(6.0), 60, FRAME_S))
         ride = out_and_back(5.0, reach_m=2.1, start_m=(-1.0, 0.3, 0.15), yaw_rad=1.45)
         self._ride = ride_sample(ride, FRAMES, FRAME_S, seed=1)
-        write_euroc(self.robot, self._ride)
+        write_mcap(self.robot, self._ride)
         to_store = ("--site", "lab", "--store", self.store)
         report = folder / "build.json"
         run(mapserver_app, "build", folder / "survey", *to_store, "--frame-from-ground-truth", "--report", report)

@@ -1,26 +1,26 @@
-"""Recordings of camera robots: folders of data sets, MCAP, rosbag2 in SQLite, ROS 1 bags, videos.
+"""Recordings of camera robots. MCAP is read here; plug-ins read other formats.
 
-To add a format: a module whose function reads the folder or file into `RecordingParts` and hands them to `finalize`,
-and a line in RECORDING_FORMATS (examples/new_recording_format.py is one).
+To add a format: a module whose function reads the folder or file into `RecordingParts` and hands them to `finalize`, and an entry point of
+`fleetmap.recordings`, or a line in RECORDING_FORMATS (examples/new_recording_format.py is one).
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from itertools import chain
 from pathlib import Path
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings import video
+from fleetmap.hooks import plugins
 from fleetmap.recordings.bags import ros1, sqlite
 from fleetmap.recordings.calibration_files import format_calibration, read_calibration
 from fleetmap.recordings.files import what_file_instead
-from fleetmap.recordings.folders import euroc, kitti, seven_scenes, tum_rgbd, tumvi
 from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.mcap import reader
 from fleetmap.recordings.recording import FrameSelection, FrameSource, OpenOptions, Recording, named_topics
 from fleetmap.sensors.source_settings import Topics
 
 __all__ = [
-    "FILE_SUFFIXES",
     "RECORDING_FORMATS",
     "FrameSelection",
     "FrameSource",
@@ -30,51 +30,57 @@ __all__ = [
     "StoredFrame",
     "StoredImage",
     "Topics",
+    "file_suffixes",
     "format_calibration",
     "named_topics",
     "open_recording",
     "read_calibration",
+    "recording_formats",
 ]
 
 
 @dataclass(frozen=True, slots=True)
 class RecordingFormat:
-    """Functions that recognise and open one format; `layout` describes it as text."""
+    """Functions that recognise and open one format; `layout` describes it as text. suffixes: of recordings that are one file.
+
+    rank: formats of a lower one are asked first. advice: for files that cannot be read, by their suffixes: what makes them readable, of
+    `{path}` and its `{stem}`.
+    """
 
     layout: str
     recognises: Callable[[Path], bool]
     open: Callable[[Path, OpenOptions], Recording]
+    suffixes: tuple[str, ...] = ()
+    rank: int = 0
+    advice: Mapping[tuple[str, ...], str] = field(default_factory=dict)
 
 
-RECORDING_FORMATS = {
-    "euroc": RecordingFormat("a folder with mav0/cam0/data.csv in it", euroc.recognises, euroc.open_euroc),
-    "tumvi": RecordingFormat("a folder with cam0/images and camchain.yaml", tumvi.recognises, tumvi.open_tumvi),
-    "kitti": RecordingFormat("a folder with image_l or image_0 and calib.txt", kitti.recognises, kitti.open_kitti),
-    "kitti-raw": RecordingFormat(
-        "a folder with image_00/data and calib_cam_to_cam.txt", kitti.recognises_raw, kitti.open_kitti_raw
-    ),
-    "7scenes": RecordingFormat(
-        "a folder with frame-NNNNNN.color.* and .depth.png", seven_scenes.recognises, seven_scenes.open_seven_scenes
-    ),
-    "tum-rgbd": RecordingFormat(
-        "a folder with rgb.txt, depth.txt and their images", tum_rgbd.recognises, tum_rgbd.open_tum_rgbd
-    ),
-    "mcap": RecordingFormat("an .mcap file, or a folder with the parts of one", reader.recognises, reader.open_mcap),
-    "rosbag2-sqlite": RecordingFormat("a rosbag2 .db3 file, or its folder", sqlite.recognises, sqlite.open_sqlite),
-    "rosbag1": RecordingFormat("a ROS 1 .bag file", ros1.recognises, ros1.open_bag),
-    "video": RecordingFormat("an .mp4 video of one camera", video.recognises, video.open_video),
-}
-# For unreadable files: the command that makes them readable
+# For unreadable files of any format: the command that makes them readable
 _ADVICE = {
     (".tar", ".tar.gz", ".tgz", ".tar.bz2", ".tar.xz", ".tar.zst"): "`tar xf {path}` unpacks it",
     (".7z", ".rar"): "`7z x {path}` unpacks it",
     (".mcap.zst", ".mcap.zstd", ".bag.zst"): "`zstd -d {path}` unpacks it",
-    (".avi", ".mkv", ".webm", ".ts", ".h264", ".264", ".265"): (
-        "`ffmpeg -i {path} -c copy {stem}.mp4` makes a video that can be read"
-    ),
-    (".bag.active",): "`rosbag reindex {path}` finishes it",
 }
-FILE_SUFFIXES = (".mcap", ".db3", ".bag", *video.SUFFIXES)  # of recordings that are one file
+_MCAP = "an .mcap file, or a folder with the parts of one"
+_SQLITE = "a rosbag2 .db3 file, or its folder"
+_UNFINISHED: Mapping[tuple[str, ...], str] = {(".bag.active",): "`rosbag reindex {path}` finishes it"}
+RECORDING_FORMATS = {
+    "mcap": RecordingFormat(_MCAP, reader.recognises, reader.open_mcap, (".mcap",)),
+    "rosbag2-sqlite": RecordingFormat(_SQLITE, sqlite.recognises, sqlite.open_sqlite, (".db3",), 1),
+    "rosbag1": RecordingFormat("a ROS 1 .bag file", ros1.recognises, ros1.open_bag, (".bag",), 2, _UNFINISHED),
+}
+_installed = cache(plugins)
+
+
+def recording_formats() -> dict[str, RecordingFormat]:
+    """Return RECORDING_FORMATS and those of plug-ins, in the order in which they are asked."""
+    known = RECORDING_FORMATS | _installed("fleetmap.recordings")
+    return dict(sorted(known.items(), key=lambda item: item[1].rank))
+
+
+def file_suffixes() -> tuple[str, ...]:
+    """Return the suffixes of recordings that are one file."""
+    return tuple(suffix for each in recording_formats().values() for suffix in each.suffixes)
 
 
 def open_recording(path: Path | str, options: OpenOptions | None = None) -> Recording:
@@ -93,14 +99,15 @@ def open_recording(path: Path | str, options: OpenOptions | None = None) -> Reco
         )
     if path.is_file() and (fault := what_file_instead(path)):
         raise RecordingError(f"{path} is {fault}")
-    found = next((each for each in RECORDING_FORMATS.values() if each.recognises(path)), None)
+    formats = recording_formats()
+    found = next((each for each in formats.values() if each.recognises(path)), None)
     if found is not None:
         return found.open(path, options)
     if path.is_dir() and not any(path.iterdir()):
         raise RecordingError(f"{path} is an empty folder; copy the recording again")
-    for suffixes, advice in _ADVICE.items():
+    for suffixes, advice in chain(_ADVICE.items(), *(each.advice.items() for each in formats.values())):
         if path.name.lower().endswith(suffixes):
             words = advice.format(path=path, stem=path.stem)
             raise RecordingError(f"{path} has an unknown format; {words}")
-    known = "; ".join(f"{name}: {recording_format.layout}" for name, recording_format in RECORDING_FORMATS.items())
+    known = "; ".join(f"{name}: {each.layout}" for name, each in formats.items())
     raise RecordingError(f"{path} has an unknown format. Known are {known}")

@@ -1,4 +1,4 @@
-"""Calibration files: EuRoC `sensor.yaml` and Kalibr camchain, and the format that the project writes.
+"""Calibration files: Kalibr camchain, and the format that the project writes.
 
 The form of `--calibration FILE` is Kalibr's camchain (cam0, cam1 with camera_model, intrinsics, distortion_model,
 distortion_coeffs, resolution, T_cam_imu or T_cn_cnm1, timeshift_cam_imu), with these keys beside the cameras:
@@ -152,7 +152,7 @@ def load_calibration(path: Path) -> CalibrationFile:
     found = parse_calibration(_read(path), str(path), path.parent)
     if "imu" in found.calibration.assumed:
         for candidate in sorted([*path.parent.glob("imu*.yaml"), *path.parent.glob("kalibr_imu_chain.yaml")]):
-            if noise := _imu_noise(read_yaml(candidate)):
+            if noise := imu_noise(read_yaml(candidate)):
                 rest = tuple(name for name in found.calibration.assumed if name != "imu")
                 return replace(found, calibration=replace(found.calibration, imu=noise, assumed=rest))
     return found
@@ -185,7 +185,7 @@ def parse_calibration(text: str, where: str, folder: Path | None = None) -> Cali
         if name != f"cam{number}":
             there = f"there is {', '.join(names)[:80]}"
             raise file.error(f"cam{number} is missing, {there}; number cameras from cam0")
-    noise = _imu_noise(file)
+    noise = imu_noise(file)
     sections = [file.section(name) for name in names]
     is_mounted = any(key in sections[0] for key in _MOUNTINGS)
     has_imu = bool(file.get("has_imu", noise is not None or is_mounted))
@@ -246,21 +246,6 @@ def format_calibration(calibration: RigCalibration) -> str:
     return out.getvalue()
 
 
-def read_euroc_camera(path: Path) -> CameraCalibration:
-    """Read the camera of a EuRoC `sensor.yaml`, mounted on the frame that the file calls body (`T_BS`)."""
-    file = read_yaml(path)
-    return check_camera(_camera(file, "distortion_coefficients", file.matrix("T_BS")), str(path))
-
-
-def read_euroc_imu(path: Path) -> tuple[Array, ImuNoise]:
-    """(4, 4) `T_BS` of a EuRoC IMU `sensor.yaml` (EuRoC's body from the IMU) and its noise.
-
-    Defaults for missing values.
-    """
-    file = read_yaml(path)
-    return file.matrix("T_BS"), _imu_noise(file) or ImuNoise()
-
-
 def read_yaml(path: Path) -> Section:
     """Read the mapping in a YAML file, with or without OpenCV's `%YAML:1.0` first line.
 
@@ -285,7 +270,7 @@ def _fault_of(matrix: Array) -> str:
 
 
 def _kalibr_camera(values: Section, previous: CameraCalibration | None) -> CameraCalibration:
-    camera = _camera(values, "distortion_coeffs", _body_from_cam(values, previous))
+    camera = camera_of(values, "distortion_coeffs", _body_from_cam(values, previous))
     shift_s = values.number("timeshift_cam_imu", previous.imu_minus_cam_s if previous else 0.0)
     return check_camera(replace(camera, imu_minus_cam_s=shift_s), values.where)
 
@@ -296,7 +281,7 @@ def _ros_camera(values: Section) -> CameraCalibration:
     translated = {"camera_model": "pinhole", "intrinsics": [fx, fy, cx, cy]}
     translated["resolution"] = [values["image_width"], values["image_height"]]
     lens = {key: value for key, value in values.items() if key.startswith("distortion") and value is not None}
-    return check_camera(_camera(Section(translated | lens, values.where), "distortion_coefficients"), values.where)
+    return check_camera(camera_of(Section(translated | lens, values.where), "distortion_coefficients"), values.where)
 
 
 def _body_from_cam(values: Section, previous: CameraCalibration | None) -> Array:
@@ -318,7 +303,8 @@ def _body_from_cam(values: Section, previous: CameraCalibration | None) -> Array
     return previous.body_from_cam @ se3_inverse(values.matrix("T_cn_cnm1"))
 
 
-def _camera(values: Section, distortion_key: str, body_from_cam: Array | None = None) -> CameraCalibration:
+def camera_of(values: Section, distortion_key: str, body_from_cam: Array | None = None) -> CameraCalibration:
+    """Return the camera in a section with Kalibr's names, its coefficients under `distortion_key`; not checked."""
     camera_model, name = str(values["camera_model"])[:80], str(values.get("distortion_model"))[:80]
     sphere_model = next((model for model, lens in LENSES.items() if lens.kalibr == camera_model.lower()), "")
     shape_names = tuple(LENSES[sphere_model].ranges) if sphere_model else ()
@@ -419,7 +405,8 @@ def _simplified(contour: NDArray[np.int32]) -> NDArray[np.int32]:
     return np.concatenate([kept, np.repeat(kept[-1:], max(0, 3 - len(kept)), axis=0)])
 
 
-def _imu_noise(file: Section) -> ImuNoise | None:
+def imu_noise(file: Section) -> ImuNoise | None:
+    """Return the noise in a section, or in its imu0; None without one."""
     inner = file.get("imu0", file.get("imu", file))
     if not isinstance(inner, dict) or not any(key in inner for key in _NOISE_KEYS.values()):
         return None

@@ -8,7 +8,7 @@ from typing import Protocol
 
 from fleetmap.bus import Bus
 from fleetmap.errors import RecordingError, UsageError
-from fleetmap.plugins import plugins
+from fleetmap.hooks import plugins
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording, read_calibration
 from fleetmap.recordings.ros2.graph import key_layout
 from fleetmap.sensors.calibration import RigCalibration

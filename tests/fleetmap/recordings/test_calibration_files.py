@@ -11,7 +11,7 @@ import yaml
 from fleetmap.errors import CalibrationError
 from fleetmap.geometry import se3, se3_exp
 from fleetmap.recordings import format_calibration, read_calibration
-from fleetmap.recordings.calibration_files import load_calibration, parse_calibration, read_euroc_camera
+from fleetmap.recordings.calibration_files import camera_of, load_calibration, parse_calibration, read_yaml
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from support.recordings.realdata import real_data
@@ -96,12 +96,6 @@ def test_the_real_chain_agrees_with_itself() -> None:
     assert both.cameras[0].model == "equidistant"
     assert both.imu is not None
     assert both.imu.gyro_noise_radps_rthz == pytest.approx(0.00016)
-
-
-def test_the_real_euroc_camera() -> None:
-    camera = read_euroc_camera(real_data("euroc_v101_keyframes") / "mav0/cam0/sensor.yaml")
-    assert camera.body_from_cam[0, 3] == -0.0216401454975
-    assert camera.intrinsics_px.tolist() == [458.654, 457.296, 367.215, 248.375]
 
 
 def sphere_text(**changed: object) -> str:
@@ -199,7 +193,10 @@ def test_lenses_of_every_layout(
     file = tmp_path / "camera.yaml"
     eye = {"rows": 4, "cols": 4, "data": np.eye(4).ravel().tolist()}
     file.write_text(yaml.safe_dump({"cam0": values} if layout == "kalibr" else {**values, "T_BS": eye}))
-    read = read_euroc_camera if layout == "euroc" else lambda path: read_calibration(path).cameras[0]
+
+    def read(path: Path) -> CameraCalibration:
+        return camera_of(read_yaml(path), key) if layout == "euroc" else read_calibration(path).cameras[0]
+
     if isinstance(kept, str):
         with pytest.raises(CalibrationError, match=kept):
             read(file)

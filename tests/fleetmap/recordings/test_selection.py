@@ -6,14 +6,14 @@ import pytest
 
 from fleetmap.errors import UsageError
 from fleetmap.recordings import FrameSelection, open_recording
-from support.recordings.recording_samples import make_sample, write_kitti
+from support.recordings.recording_samples import make_sample, write_mcap
 
 SAMPLE = make_sample(5)
 
 
 @pytest.mark.parametrize("text", [":", "::", "0:3", "1:", ":4", "::2", "1::2", "-3:", ":-1", "0:100:3"])
 def test_pythons_slices(text: str, tmp_path: Path) -> None:
-    recording = open_recording(write_kitti(tmp_path / "r", SAMPLE))
+    recording = open_recording(write_mcap(tmp_path / "r", SAMPLE))
     wanted = list(range(5))[slice(*(int(p) if p else None for p in text.split(":")))]
     assert FrameSelection.parse(text).apply(recording).tolist() == wanted
 
@@ -25,6 +25,6 @@ def test_nonsense_is_a_usage_error_that_names_it(text: str) -> None:
 
 
 def test_nothing_selected(tmp_path: Path) -> None:
-    recording = open_recording(write_kitti(tmp_path / "r", SAMPLE))
+    recording = open_recording(write_mcap(tmp_path / "r", SAMPLE))
     with pytest.raises(UsageError, match="selects none of the 5 frames"):
         FrameSelection.parse("7:").apply(recording)

@@ -15,18 +15,18 @@ from mapserver.cli import app
 from mapserver.config import survey_settings
 from mapserver.store import DraftContent, MapStore
 from mapserver.survey.settings import SurveySettings
-from support.recordings.recording_samples import make_sample, write_euroc
+from support.recordings.recording_samples import make_sample, write_mcap
 from support.storage.map_samples import draft_details, random_tile
 
 
 @pytest.fixture(scope="module")
-def euroc(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_euroc(tmp_path_factory.mktemp("recordings") / "turn", make_sample(8))
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_mcap(tmp_path_factory.mktemp("recordings") / "turn", make_sample(8))
 
 
-def test_each_reduction_has_what_its_name_says(euroc: Path) -> None:
-    with open_recording(euroc) as whole:
-        assert whole.sensor_set is sensor_set_of(euroc) is SensorSet.STEREO_INERTIAL
+def test_each_reduction_has_what_its_name_says(drive: Path) -> None:
+    with open_recording(drive) as whole:
+        assert whole.sensor_set is sensor_set_of(drive) is SensorSet.STEREO_INERTIAL
         assert reduced(whole, None) is whole
         for use in REDUCTIONS[whole.sensor_set]:
             less = reduced(whole, use)
@@ -40,8 +40,8 @@ def test_each_reduction_has_what_its_name_says(euroc: Path) -> None:
             assert less.content_hash() == whole.content_hash()
 
 
-def test_what_a_recording_lacks_cannot_be_used(euroc: Path) -> None:
-    with open_recording(euroc) as whole, pytest.raises(RecordingError, match=r"it cannot be used as rgbd; use it as"):
+def test_what_a_recording_lacks_cannot_be_used(drive: Path) -> None:
+    with open_recording(drive) as whole, pytest.raises(RecordingError, match=r"it cannot be used as rgbd; use it as"):
         reduced(whole, SensorSet.RGBD)
     with pytest.raises(UsageError, match=r"--use lidar: unknown sensor set; choose one of"):
         named_sensor_set("lidar")
@@ -58,9 +58,9 @@ def test_every_sensor_set_has_a_preset_and_the_file_goes_over_it(tmp_path: Path)
     assert survey_settings(None, SensorSet.MONO) != SurveySettings()
 
 
-def test_one_camera_that_only_turns_makes_no_map(euroc: Path, tmp_path: Path) -> None:
+def test_one_camera_that_only_turns_makes_no_map(drive: Path, tmp_path: Path) -> None:
     """The sample's camera turns on the spot: with two cameras that is a map, with one it is refused, never guessed."""
-    arguments = ["build", str(euroc), "--site", "lab", "--store", str(tmp_path / "store"), "--use", "mono"]
+    arguments = ["build", str(drive), "--site", "lab", "--store", str(tmp_path / "store"), "--use", "mono"]
     result = CliRunner().invoke(app, arguments)
     assert isinstance(result.exception, SurveyError), result.output
     assert "connected keyframe" in str(result.exception)

@@ -9,7 +9,7 @@ from fleetmap.errors import UsageError
 from fleetmap.recordings import FrameSelection, Recording, open_recording
 from fleetmap.sensors.samples import ImuSamples
 from fleetmap.sources.replay_source import ReplaySource
-from support.recordings.recording_samples import FRAME_NS, make_sample, write_euroc
+from support.recordings.recording_samples import FRAME_NS, make_sample, write_mcap
 
 LEAD_NS = 10_000_000
 SAMPLE = make_sample(8)
@@ -17,7 +17,7 @@ SAMPLE = make_sample(8)
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    return open_recording(write_euroc(tmp_path_factory.mktemp("recording"), SAMPLE))
+    return open_recording(write_mcap(tmp_path_factory.mktemp("recording"), SAMPLE))
 
 
 def source(recording: Recording, frames: str = ":", *, reverse: bool = False) -> ReplaySource:

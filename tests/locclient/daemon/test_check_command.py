@@ -16,7 +16,7 @@ from locclient.config import LocclientConfig
 from locclient.daemon.preflight import _clock, _pair
 from mapserver.store import MapStore
 from support.command_line import status
-from support.recordings.recording_samples import make_sample, write_euroc
+from support.recordings.recording_samples import make_sample, write_mcap
 from support.storage.map_samples import publish_samples
 
 Said = pytest.CaptureFixture[str]
@@ -25,7 +25,7 @@ Said = pytest.CaptureFixture[str]
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
     """A robot that lacks nothing."""
-    write_euroc(tmp_path / "walk", make_sample(12))
+    write_mcap(tmp_path / "walk", make_sample(12))
     with MapStore.open(tmp_path / "store", create=True) as maps:
         publish_samples(maps, 1)
     path = tmp_path / "robot.toml"

@@ -15,7 +15,7 @@ from locclient.maps.map_source import LocalMapSource
 from locclient.prior_option import parse_prior
 from mapserver.store import MapStore
 from support.command_line import status
-from support.recordings.recording_samples import calibration, make_sample, write_euroc
+from support.recordings.recording_samples import calibration, make_sample, write_euroc, write_mcap
 from support.storage.map_samples import publish_samples, save_sample_draft
 from support.worlds import robot_world
 
@@ -24,7 +24,7 @@ Said = pytest.CaptureFixture[str]
 
 @pytest.fixture(scope="module")
 def walk(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_euroc(tmp_path_factory.mktemp("recordings") / "walk", make_sample(3))
+    return write_mcap(tmp_path_factory.mktemp("recordings") / "walk", make_sample(3))
 
 
 @pytest.fixture(scope="module")

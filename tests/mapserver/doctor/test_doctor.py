@@ -34,14 +34,14 @@ from mapserver.doctor.sensors import (
     stamp_order,
 )
 from support.recordings.realdata import real_data
-from support.recordings.recording_samples import make_sample, write_euroc
+from support.recordings.recording_samples import make_sample, write_euroc, write_mcap
 
 SAMPLE = make_sample(26)
 
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    return open_recording(write_euroc(tmp_path_factory.mktemp("doctor") / "r", SAMPLE))
+    return open_recording(write_mcap(tmp_path_factory.mktemp("doctor") / "r", SAMPLE))
 
 
 class ChangedFrames:

@@ -18,14 +18,14 @@ from mapserver.doctor.findings import not_judged
 from mapserver.doctor.gyro_images import GyroFit
 from mapserver.doctor.run_checks import CheckResults
 from mapserver.drafting import admission
-from support.recordings.recording_samples import make_sample, write_euroc
+from support.recordings.recording_samples import make_sample, write_mcap
 
 P = CalibrationParameter
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    return open_recording(write_euroc(tmp_path_factory.mktemp("admission") / "r", make_sample(3)))
+    return open_recording(write_mcap(tmp_path_factory.mktemp("admission") / "r", make_sample(3)))
 
 
 def measured(parameter: P, value: float) -> MeasuredCalibration:

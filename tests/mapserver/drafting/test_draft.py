@@ -18,7 +18,7 @@ from fleetmap.mapformat import decode_tile
 from mapserver.cli import app
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
-from support.recordings.recording_samples import make_sample, write_euroc
+from support.recordings.recording_samples import make_sample, write_euroc, write_mcap
 
 FRAMES = 24
 SAMPLE = make_sample(FRAMES)
@@ -33,8 +33,8 @@ NOT_FOR_ROBOTS = {"map_bytes", "culled", "sessions", "directions", "starts", "vi
 
 
 @pytest.fixture(scope="module")
-def euroc(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_euroc(tmp_path_factory.mktemp("recordings") / "walk", SAMPLE)
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_mcap(tmp_path_factory.mktemp("recordings") / "walk", SAMPLE)
 
 
 def run(*arguments: object) -> Result:
@@ -61,11 +61,11 @@ def read_tum(path: Path) -> Array:
 
 
 @pytest.fixture(scope="module")
-def done(euroc: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def done(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with everything that one build in the truth's frame leaves."""
     out = tmp_path_factory.mktemp("out")
     files = ["--report", out / "r.json", "--trajectory-out", out / "t.tum", "--picture", out / "p.png"]
-    said = built(euroc, "--site", "lab", "--store", out / "store", "--frame-from-ground-truth", *files)
+    said = built(drive, "--site", "lab", "--store", out / "store", "--frame-from-ground-truth", *files)
     assert "draft 1" in said
     assert "mapserver publish --site lab" in said
     return out
@@ -155,8 +155,8 @@ def test_the_picture_shows_the_map_on_the_left_and_its_errors_on_the_right(done:
     assert count("14924b", right) + count("d1342f", right) == 0
 
 
-def test_building_again_gives_the_same_tiles(euroc: Path, done: Path, tmp_path: Path) -> None:
-    common = [euroc, "--site", "lab", "--frame-from-ground-truth", "--store"]
+def test_building_again_gives_the_same_tiles(drive: Path, done: Path, tmp_path: Path) -> None:
+    common = [drive, "--site", "lab", "--frame-from-ground-truth", "--store"]
     built(*common, tmp_path, "--threads", 2)
     assert "draft 2" in built(*common, tmp_path, "--threads", 1)  # without a process beside it
     with MapStore.open(tmp_path) as maps, MapStore.open(done / "store") as before:
@@ -178,16 +178,16 @@ def test_without_truth_nothing_is_claimed(tmp_path: Path) -> None:
     assert "no ground truth" in str(error)
 
 
-def test_wrong_orders_are_refused_before_the_work(euroc: Path, tmp_path: Path) -> None:
+def test_wrong_orders_are_refused_before_the_work(drive: Path, tmp_path: Path) -> None:
     to_store = ["--site", "lab", "--store", tmp_path / "store"]
     for arguments, kind, said in (
-        ([euroc, "--site", "La b", "--store", tmp_path / "store"], UsageError, "La b"),
-        ([euroc, *to_store, "--report", tmp_path / "no/r.json"], UsageError, "--report"),
-        ([euroc, *to_store, "--trajectory-out", tmp_path], UsageError, "--trajectory-out"),
-        ([euroc, *to_store, "--picture", tmp_path / "p.jpg"], UsageError, ".png"),
-        ([euroc, *to_store, "--frames", "1:2:x"], UsageError, "1:2:x"),
-        ([euroc, *to_store, "--frames", "900:"], UsageError, "900"),
-        ([euroc, *to_store, "--frames", ":2", "--frame-from-ground-truth"], RecordingError, "2 of 2"),
+        ([drive, "--site", "La b", "--store", tmp_path / "store"], UsageError, "La b"),
+        ([drive, *to_store, "--report", tmp_path / "no/r.json"], UsageError, "--report"),
+        ([drive, *to_store, "--trajectory-out", tmp_path], UsageError, "--trajectory-out"),
+        ([drive, *to_store, "--picture", tmp_path / "p.jpg"], UsageError, ".png"),
+        ([drive, *to_store, "--frames", "1:2:x"], UsageError, "1:2:x"),
+        ([drive, *to_store, "--frames", "900:"], UsageError, "900"),
+        ([drive, *to_store, "--frames", ":2", "--frame-from-ground-truth"], RecordingError, "2 of 2"),
         ([tmp_path / "nothing", *to_store], RecordingError, "nothing"),
     ):
         error = refused(*arguments)
@@ -196,6 +196,6 @@ def test_wrong_orders_are_refused_before_the_work(euroc: Path, tmp_path: Path) -
     assert not (tmp_path / "store").exists()
 
 
-def test_a_place_that_is_no_store_is_refused(euroc: Path, tmp_path: Path) -> None:
+def test_a_place_that_is_no_store_is_refused(drive: Path, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    assert isinstance(refused(euroc, "--site", "lab", "--store", tmp_path / "file"), StoreError)
+    assert isinstance(refused(drive, "--site", "lab", "--store", tmp_path / "file"), StoreError)

@@ -32,31 +32,31 @@ from mapserver.survey.bundle.stereo_yaw_check import StereoYaw
 from mapserver.survey.odometry_pass import parts_between_lifts
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyTools
-from support.recordings.recording_samples import make_sample, write_euroc
+from support.recordings.recording_samples import make_sample, write_mcap
 from support.worlds.pinhole_pair import CAMERA
 
 
 @pytest.fixture(scope="module")
-def euroc(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_euroc(tmp_path_factory.mktemp("recordings") / "turn", make_sample(8))
+def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_mcap(tmp_path_factory.mktemp("recordings") / "turn", make_sample(8))
 
 
 @pytest.mark.parametrize(("has_room", "decodings"), [(True, 8), (False, 12)])
 def test_frames_are_decoded_once(
-    euroc: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_room: bool, decodings: int
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_room: bool, decodings: int
 ) -> None:
     found: list[int] = []
     decode = series.decode_frame
     monkeypatch.setattr(series, "decode_frame", lambda stored: (found.append(stored.stamp_ns), decode(stored))[1])
     if not has_room:
         monkeypatch.setattr(mapped_images.os, "posix_fallocate", full)
-    with open_recording(euroc) as plain:
+    with open_recording(drive) as plain:
         expected = [plain.read_frame(n) for n in range(8)]
     with OpenRecordings(RecordingOptions(), tmp_path) as reading:
-        with reading.open(euroc) as (first, indices):
+        with reading.open(drive) as (first, indices):
             found.clear()
             assert [first.read_frame(n).stamp_ns for n in (2, 5, 2)] == [expected[n].stamp_ns for n in (2, 5, 2)]
-        with reading.open(euroc) as (second, _):
+        with reading.open(drive) as (second, _):
             assert second is first
             frames = [second.read_frame(int(n)) for n in (*indices, 0)]
     for own, theirs in zip(frames, expected, strict=False):
@@ -70,13 +70,13 @@ def full(*_: object) -> None:
     raise OSError(28, "No space left on device")
 
 
-def test_another_recording_closes_the_one_before(euroc: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    other = write_euroc(tmp_path / "other", make_sample(4))
+def test_another_recording_closes_the_one_before(drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    other = write_mcap(tmp_path / "other", make_sample(4))
     closed: list[int] = []
     close = Recording.close
     monkeypatch.setattr(Recording, "close", lambda self: (closed.append(len(self)), close(self)))
     with OpenRecordings(RecordingOptions(), tmp_path) as reading:
-        for path, count in ((euroc, 8), (other, 4), (euroc, 8)):
+        for path, count in ((drive, 8), (other, 4), (drive, 8)):
             with reading.open(path) as (recording, _):
                 assert len(recording) == count
         assert closed == [8, 4]
@@ -84,21 +84,21 @@ def test_another_recording_closes_the_one_before(euroc: Path, tmp_path: Path, mo
 
 
 def test_a_recording_that_cannot_be_used_is_closed(
-    euroc: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     closed: list[int] = []
     monkeypatch.setattr(Recording, "close", lambda self: closed.append(len(self)))
     with (
         pytest.raises(RecordingError, match="cannot be used as rgbd"),
         OpenRecordings(RecordingOptions(use=SensorSet.RGBD), tmp_path) as reading,
-        reading.open(euroc),
+        reading.open(drive),
     ):
         pass
     assert closed == [8]
 
 
 def test_a_survey_goes_on_from_what_was_followed_under_its_calibration(
-    euroc: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And from nothing else: a calibration that was tried on the way, or given before a correction, is not the survey's.
 
@@ -106,7 +106,7 @@ def test_a_survey_goes_on_from_what_was_followed_under_its_calibration(
     """
     monkeypatch.setattr(survey_recordings, "begin_survey", lambda _inputs, _settings, tools: [tools.images])
     monkeypatch.setattr(survey_recordings, "busiest_stretch", lambda chain, *_: chain)
-    with open_recording(euroc) as recording, mapped_images.MappedImageStore(tmp_path) as images:
+    with open_recording(drive) as recording, mapped_images.MappedImageStore(tmp_path) as images:
         begun = BegunSurvey(recording, np.arange(8), SurveySettings(), SurveyTools(images=images))
         given = recording.calibration
         tried, corrected = replace(given), replace(given)
@@ -135,7 +135,7 @@ def test_a_recording_ends_where_its_robot_is_lifted(
     assert [(part.start, part.stop) for part in parts_between_lifts(estimates)] == parts
 
 
-def test_nobody_holds_what_was_begun_once_its_loops_are_closed(euroc: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nobody_holds_what_was_begun_once_its_loops_are_closed(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its landmarks are as large as those that are made anew then."""
 
     @dataclass
@@ -148,7 +148,7 @@ def test_nobody_holds_what_was_begun_once_its_loops_are_closed(euroc: Path, monk
     def adjust(*_: object) -> None:
         raise SurveyError("held" if begun() else "let go of")
 
-    with open_recording(euroc) as recording:
+    with open_recording(drive) as recording:
         rig, camera = recording.calibration, Rectifier(recording.calibration).camera
     state: Any = State(camera)
     parts: Any = SimpleNamespace(keyframes=[], estimates=[]), state, set(), object()
@@ -160,7 +160,7 @@ def test_nobody_holds_what_was_begun_once_its_loops_are_closed(euroc: Path, monk
     monkeypatch.setattr(stages, "adjust_globally", adjust)
     config = SurveyConfig(SurveySettings(), default_vocabulary())
     with pytest.raises(SurveyError, match="let go of"):
-        survey_recording(euroc, admitted.pop(), RecordingOptions(), None, config, SurveyTools())
+        survey_recording(drive, admitted.pop(), RecordingOptions(), None, config, SurveyTools())
 
 
 def test_the_turn_within_each_pair_of_a_rig_is_told_and_judged() -> None:
@@ -191,7 +191,7 @@ def test_the_turn_within_each_pair_of_a_rig_is_told_and_judged() -> None:
         (1, 20.0, slice(None), True),
     ],
 )
-def test_a_short_drive_is_followed_as_a_whole(euroc: Path, frames: int, hz: float, chosen: slice, suits: bool) -> None:
-    with open_recording(euroc) as recording:
+def test_a_short_drive_is_followed_as_a_whole(drive: Path, frames: int, hz: float, chosen: slice, suits: bool) -> None:
+    with open_recording(drive) as recording:
         stamps_ns = (np.arange(frames) * 1e9 / hz).astype(np.int64)
         assert BegunSurvey.suits(replace(recording, frame_stamps_ns=stamps_ns), np.arange(frames)[chosen]) is suits

@@ -23,7 +23,7 @@ from mapserver.drafting.trajectory.given import Followed, fitted_scale, stamps_o
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.survey.given_poses import poses_as_odometry
 from mapserver.survey.state import OdometryPass
-from support.recordings.recording_samples import BODY_FROM_CAM0, START_NS, Sample, write_euroc
+from support.recordings.recording_samples import BODY_FROM_CAM0, START_NS, Sample, write_mcap
 from support.worlds.box_room import out_and_back, ride_sample
 
 FRAMES = 61
@@ -38,7 +38,7 @@ def sample() -> Sample:
 
 @pytest.fixture(scope="module")
 def recording(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_euroc(tmp_path_factory.mktemp("recordings") / "ride", sample)
+    return write_mcap(tmp_path_factory.mktemp("recordings") / "ride", sample)
 
 
 @pytest.fixture(autouse=True)
@@ -209,7 +209,7 @@ def test_missing_poses_are_bridged_by_our_odometry(
 
 def test_standing_still_shows_no_metres(tmp_path: Path) -> None:
     still = ride_sample(lambda _: se3(so3_exp(np.array([0, 0, np.pi / 2])), np.zeros(3)), 20, 0.1)
-    folder = write_euroc(tmp_path / "still", still)
+    folder = write_mcap(tmp_path / "still", still)
     file = written(tmp_path / "p.tum", np.array(still.world_from_body), in_seconds(still))
     with pytest.raises(UsageError, match="set its metres with --trajectory-scale METRES"):
         given(folder, OtherTrajectory(file, "body"), frames=20)

@@ -15,7 +15,7 @@ from mapserver import BuildOptions, build_map
 from mapserver.drafting.survey_recordings import RecordingOptions
 from mapserver.drafting.trajectory import OtherTrajectory
 from mapserver.drafting.trajectory.depths import DispImages, _DepthFrames
-from support.recordings.recording_samples import BODY_FROM_CAM0, HEIGHT, WIDTH, Sample, write_euroc
+from support.recordings.recording_samples import BODY_FROM_CAM0, HEIGHT, WIDTH, Sample, write_mcap
 from support.worlds.box_room import out_and_back, points_seen, ride_sample
 
 FRAMES, STEP, CELL_PX = 61, 2, 8
@@ -31,7 +31,7 @@ def sample() -> Sample:
 
 @pytest.fixture(scope="module")
 def recording(sample: Sample, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_euroc(tmp_path_factory.mktemp("recordings") / "ride", sample)
+    return write_mcap(tmp_path_factory.mktemp("recordings") / "ride", sample)
 
 
 @pytest.fixture

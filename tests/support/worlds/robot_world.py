@@ -24,7 +24,7 @@ from locclient.robot.robot import Robot
 from locclient.robot.version_trial import TrialSettings
 from mapserver import releases
 from mapserver.store import DraftContent, MapStore
-from support.recordings.recording_samples import FOCAL, HEIGHT, WIDTH, Sample, calibration, write_euroc
+from support.recordings.recording_samples import FOCAL, HEIGHT, WIDTH, Sample, calibration, write_mcap
 from support.storage.map_samples import draft_details
 from support.worlds.box_room import out_and_back, points_seen, ride_sample
 from support.worlds.vocabulary_training import train_vocabulary
@@ -95,7 +95,7 @@ def write(folder: Path, ride: Iterable[SensorBundle]) -> Path:
         np.concatenate([part.gyro_radps for part in imu]), np.concatenate([part.accel_mps2 for part in imu]),
         [truth(number) for number in range(len(bundles))],
     )  # fmt: skip
-    return write_euroc(folder, sample)
+    return write_mcap(folder, sample)
 
 
 def _noisy(picture: Image, rng: np.random.Generator) -> Image:

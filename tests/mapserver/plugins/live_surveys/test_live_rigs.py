@@ -26,7 +26,7 @@ from mapserver.plugins.live_surveys.live_survey import LiveRequest, run_live
 from mapserver.plugins.live_surveys.message import LiveSurveyState
 from mapserver.store import MapStore
 from support.recordings.live_drives import MappingHere, write_rgbd
-from support.recordings.recording_samples import calibration, kalibr_text, write_euroc
+from support.recordings.recording_samples import calibration, kalibr_text, write_mcap
 from support.worlds import robot_world
 
 METRIC = [SensorSet.STEREO_INERTIAL, SensorSet.STEREO, SensorSet.RGBD, SensorSet.MONO_INERTIAL]
@@ -39,7 +39,7 @@ class Site:
 
     def __init__(self, folder: Path) -> None:
         self.folder, self.store = folder, folder / "maps"
-        self.pairs = write_euroc(folder / "ride", robot_world.cycle())
+        self.pairs = write_mcap(folder / "ride", robot_world.cycle())
         self.depths = write_rgbd(folder / "depths.mcap", robot_world.cycle())
         with MapStore.open(self.store, create=True) as store:
             self.version = robot_world.save(store, site="lab")

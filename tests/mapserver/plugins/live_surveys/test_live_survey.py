@@ -27,7 +27,7 @@ from mapserver.plugins.live_surveys.mapping_process import MappingProcess, thinn
 from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, LiveSurveyState
 from mapserver.store import MapStore
 from support.recordings.live_drives import MappingHere, played
-from support.recordings.recording_samples import make_sample, write_euroc
+from support.recordings.recording_samples import make_sample, write_mcap
 
 FRAMES = 24
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
@@ -36,7 +36,7 @@ QUIET = Console(quiet=True)
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_euroc(tmp_path_factory.mktemp("recordings") / "walk", make_sample(FRAMES))
+    return write_mcap(tmp_path_factory.mktemp("recordings") / "walk", make_sample(FRAMES))
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from fleetmap.errors import UsageError
 from mapserver.cli import app
 from support.fleet.foxglove_client import FoxgloveClient
-from support.recordings.recording_samples import make_sample, write_euroc
+from support.recordings.recording_samples import make_sample, write_mcap
 
 pytestmark = pytest.mark.timeout(900)
 
@@ -44,7 +44,7 @@ def live(recording: Path, store: Path, *given: str) -> Iterator[FoxgloveClient]:
 
 
 def test_the_map_grows_before_the_viewers_eyes(tmp_path: Path) -> None:
-    recording = write_euroc(tmp_path / "walk", make_sample(24))
+    recording = write_mcap(tmp_path / "walk", make_sample(24))
     with live(recording, tmp_path / "maps") as viewer:
         viewer.subscribe(["/survey/path", "/survey/landmarks", "/camera", "/camera/matches", "/camera/calibration"])
         image = viewer.wait_for("/camera")[0][1]

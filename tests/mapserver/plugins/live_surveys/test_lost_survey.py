@@ -15,14 +15,14 @@ from mapserver.plugins.live_surveys.live_survey import LiveRequest, run_live
 from mapserver.plugins.live_surveys.message import LiveSurveyState
 from support.recordings.kidnapped_ride import APART_FRAMES, kidnapped
 from support.recordings.live_drives import MappingHere, played
-from support.recordings.recording_samples import write_euroc
+from support.recordings.recording_samples import write_mcap
 
 SETTINGS = survey_settings(None, SensorSet.STEREO)
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_euroc(tmp_path_factory.mktemp("recordings") / "kidnapped", kidnapped())
+    return write_mcap(tmp_path_factory.mktemp("recordings") / "kidnapped", kidnapped())
 
 
 class Drive:

@@ -5,9 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
-from fleetmap.recordings.files import natural_key
-from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts, logged_calibration
-from fleetmap.recordings.folders.layout import (
+from fleetmap.plugins.datasets.layout import (
     ImageFiles,
     existing_images,
     read_ground_truth,
@@ -15,8 +13,10 @@ from fleetmap.recordings.folders.layout import (
     read_table,
     rig_frames,
 )
+from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
+from fleetmap.recordings.files import natural_key
+from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts, logged_calibration
 from fleetmap.recordings.ordering import ReadLog, check_seconds
-from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.recordings.tum import parse_stamp_ns
 
 
@@ -68,3 +68,6 @@ def _stamp_ns(seconds: str, where: Path) -> int:
         check_seconds(float(seconds), str(where))
         return parse_stamp_ns(seconds)
     raise RecordingError(f"{where}: {seconds[:80]!r} is not a time in seconds; copy the recording again")
+
+
+FORMAT = RecordingFormat("a folder with cam0/images and camchain.yaml", recognises, open_tumvi, rank=-5)

@@ -10,10 +10,12 @@ import pytest
 
 from fleetmap.encoding import to_json
 from fleetmap.geometry import se3, se3_inverse, so3_exp, transform_points
+from fleetmap.plugins.datasets.euroc import read_camera
+from fleetmap.plugins.datasets.seven_scenes import DepthRegistration
 from fleetmap.recordings import OpenOptions, format_calibration, open_recording
-from fleetmap.recordings.folders.seven_scenes import DepthRegistration
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import SensorSet
+from support.recordings.realdata import real_data
 from support.recordings.recording_samples import (
     BASELINE_M,
     BODY_FROM_CAM0,
@@ -248,3 +250,9 @@ def test_depth_lands_where_the_colour_lens_sees_it(model: str, distortion: tuple
     (u, v), (rows, columns) = np.floor(colour.pixel_from_ray(point)[0]).astype(int), np.nonzero(registered)
     assert {*zip(rows.tolist(), columns.tolist(), strict=True)} == {(v, u), (v, u + 1), (v + 1, u), (v + 1, u + 1)}
     assert registered[rows, columns] == pytest.approx(point[0, 2])
+
+
+def test_the_real_euroc_camera() -> None:
+    camera = read_camera(real_data("euroc_v101_keyframes") / "mav0/cam0/sensor.yaml")
+    assert camera.body_from_cam[0, 3] == -0.0216401454975
+    assert camera.intrinsics_px.tolist() == [458.654, 457.296, 367.215, 248.375]

@@ -130,7 +130,7 @@ def test_pictures_beyond_the_limit_are_not_decoded(
     tmp_path: Path, rig: OpenOptions, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = movie(tmp_path / "a.mp4")
-    monkeypatch.setattr("fleetmap.recordings.video.MAX_PIXELS", WIDTH * HEIGHT - 1)
+    monkeypatch.setattr("fleetmap.plugins.videos.MAX_PIXELS", WIDTH * HEIGHT - 1)
     with pytest.raises(RecordingError, match=f"pictures of {WIDTH}x{HEIGHT} are larger than the limit"):
         open_recording(path, rig)
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import CalibrationError, RecordingError
-from fleetmap.recordings import RECORDING_FORMATS, OpenOptions, open_recording
+from fleetmap.recordings import OpenOptions, open_recording, recording_formats
 from support.recordings.recording_samples import (
     HEIGHT,
     WIDTH,
@@ -95,7 +95,7 @@ def test_paths_that_are_no_recording(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("hello")
     with pytest.raises(RecordingError) as caught:
         open_recording(tmp_path)
-    assert all(name in str(caught.value) for name in RECORDING_FORMATS)
+    assert all(name in str(caught.value) for name in recording_formats())
 
 
 @pytest.mark.parametrize(

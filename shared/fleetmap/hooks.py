@@ -1,4 +1,11 @@
-"""Plug-ins: what an installed distribution registers by entry points. The groups are hooks: see `hooks.py` of either side."""
+"""Plug-ins: what an installed distribution registers by entry points, in groups called hooks. This is the hook of either side:
+
+| group | registered by the name of | as |
+|---|---|---|
+| `fleetmap.recordings` | the format | `RecordingFormat` of `fleetmap/recordings/__init__.py`; takes the place of one of the same name |
+
+Those of a robot are in `locclient/hooks.py`, those of the map server in `mapserver/hooks.py`.
+"""
 
 from importlib.metadata import entry_points
 from typing import Any

@@ -9,9 +9,7 @@ import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse
-from fleetmap.recordings.files import natural_key
-from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
-from fleetmap.recordings.folders.layout import (
+from fleetmap.plugins.datasets.layout import (
     FileReader,
     ImageFiles,
     existing_images,
@@ -21,10 +19,12 @@ from fleetmap.recordings.folders.layout import (
     read_table,
     rig_frames,
 )
+from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
+from fleetmap.recordings.files import natural_key
+from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
 from fleetmap.recordings.image_series import SeriesFrames, pair_images
 from fleetmap.recordings.images import decode_grey
 from fleetmap.recordings.ordering import ReadLog, check_seconds
-from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration, check_camera
 from fleetmap.sensors.cameras import lens_of
 from fleetmap.sensors.samples import Stamps, Trajectory
@@ -200,3 +200,9 @@ def _ground_truth(file: Path, stamps_of_number: Stamps | None, log: ReadLog) -> 
     frame_from_body = np.tile(np.eye(4), (len(rows), 1, 1))
     frame_from_body[:, :3] = rows[:, :12].reshape(-1, 3, 4)
     return Trajectory(stamps_ns.astype(np.int64), frame_from_body)
+
+
+FORMAT = RecordingFormat("a folder with image_l or image_0 and calib.txt", recognises, open_kitti, rank=-4)
+RAW_FORMAT = RecordingFormat(
+    "a folder with image_00/data and calib_cam_to_cam.txt", recognises_raw, open_kitti_raw, rank=-3
+)

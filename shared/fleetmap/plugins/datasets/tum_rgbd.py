@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import se3_inverse
-from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
-from fleetmap.recordings.folders.layout import (
+from fleetmap.plugins.datasets.layout import (
     FileReader,
     ImageFiles,
     existing_images,
     optional_truth,
     read_image_list,
 )
+from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
+from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
 from fleetmap.recordings.image_series import SeriesFrames, pair_images
 from fleetmap.recordings.ordering import DEPTH_TOLERANCE_NS, ReadLog, pair_stamps
-from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.recordings.tum import read_truth as read_tum_truth
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.samples import Trajectory
@@ -88,3 +88,6 @@ def _published(path: Path) -> RigCalibration:
         f"{path}: the layout of TUM RGB-D holds no calibration, and the folder's name is none of the data set's "
         f"({', '.join(_CAMERAS)}); pass one with --calibration FILE"
     )
+
+
+FORMAT = RecordingFormat("a folder with rgb.txt, depth.txt and their images", recognises, open_tum_rgbd, rank=-1)

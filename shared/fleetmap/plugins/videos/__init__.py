@@ -17,16 +17,17 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
+from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.files import file_head, hash_file
 from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
 from fleetmap.recordings.image_series import ImageSeries, SeriesFrames
 from fleetmap.recordings.images import StoredImage, grey_image
 from fleetmap.recordings.limits import MAX_PIXELS, MAX_VIDEO_TABLE_BYTES
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS, ReadLog
-from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.samples import Image
 
-SUFFIXES = (".mp4", ".m4v", ".mov")
+_SUFFIXES = (".mp4", ".m4v", ".mov")
+_CONVERTED = (".avi", ".mkv", ".webm", ".ts", ".h264", ".264", ".265")
 _PLANES = ("yuv4", "yuvj4", "nv12", "nv21", "gray")  # pixel formats whose first plane is luma
 _BOX = struct.Struct(">I4s")
 _NO_TABLES = (b"mdat", b"free", b"skip", b"wide")
@@ -36,7 +37,7 @@ _UNEVEN = 1.5  # longest step over the median of a constant rate
 
 def recognises(path: Path) -> bool:
     """True for a file with the name or the first bytes of an MP4 video."""
-    return path.is_file() and (path.suffix.lower() in SUFFIXES or file_head(path, 12)[4:8] == b"ftyp")
+    return path.is_file() and (path.suffix.lower() in _SUFFIXES or file_head(path, 12)[4:8] == b"ftyp")
 
 
 def open_video(path: Path, options: OpenOptions) -> Recording:
@@ -217,3 +218,13 @@ def _luma(frame: Any) -> Image:
     plane = frame.planes[0]
     rows = np.frombuffer(plane, np.uint8).reshape(plane.height, plane.line_size)
     return np.ascontiguousarray(rows[:, : frame.width])
+
+
+FORMAT = RecordingFormat(
+    "an .mp4 video of one camera",
+    recognises,
+    open_video,
+    _SUFFIXES,
+    3,
+    {_CONVERTED: "`ffmpeg -i {path} -c copy {stem}.mp4` makes a video that can be read"},
+)

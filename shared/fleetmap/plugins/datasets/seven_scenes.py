@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse
+from fleetmap.plugins.datasets.layout import FileReader, ImageFiles, existing_images, read_image, read_table
+from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
-from fleetmap.recordings.folders.layout import FileReader, ImageFiles, existing_images, read_image, read_table
 from fleetmap.recordings.image_series import SeriesFrames, pair_images
 from fleetmap.recordings.images import decode_depth, decode_grey
 from fleetmap.recordings.ordering import ReadLog
-from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.cameras import CAMERA_MODELS
 from fleetmap.sensors.samples import Trajectory
@@ -154,3 +154,6 @@ def _rigid(file: Path) -> Array | None:
 def _pixels(camera: CameraCalibration) -> Array:
     u, v = np.meshgrid(np.arange(camera.width_px, dtype=np.float64), np.arange(camera.height_px, dtype=np.float64))
     return np.stack([u.ravel(), v.ravel()], axis=1)
+
+
+FORMAT = RecordingFormat("a folder with frame-NNNNNN.color.* and .depth.png", recognises, open_seven_scenes, rank=-2)

@@ -7,23 +7,23 @@ import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.recordings.calibration_files import (
-    calibration_files,
-    read_euroc_camera,
-    read_euroc_imu,
-    read_yaml,
-)
-from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts, logged_calibration
-from fleetmap.recordings.folders.layout import (
+from fleetmap.plugins.datasets.layout import (
     existing_images,
     read_ground_truth,
     read_image_list,
     read_imu,
     rig_frames,
 )
+from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
+from fleetmap.recordings.calibration_files import (
+    calibration_files,
+    camera_of,
+    imu_noise,
+    read_yaml,
+)
+from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts, logged_calibration
 from fleetmap.recordings.ordering import ReadLog
-from fleetmap.recordings.recording import OpenOptions, Recording
-from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
 from fleetmap.sensors.samples import Trajectory
 
 # The second kind is TUM-VI's, whose motion-capture poses are those of the IMU
@@ -62,7 +62,10 @@ def open_euroc(path: Path, options: OpenOptions) -> Recording:
 def _calibration(root: Path, count: int, options: OpenOptions, log: ReadLog) -> tuple[RigCalibration, Array]:
     """The calibration with the IMU as body, and EuRoC's body from the IMU (4, 4)."""
     imu_file = root / "mav0/imu0/sensor.yaml"
-    euroc_from_imu, noise = read_euroc_imu(imu_file) if imu_file.is_file() else (np.eye(4), None)
+    euroc_from_imu, noise = np.eye(4), None
+    if imu_file.is_file():
+        sensor = read_yaml(imu_file)
+        euroc_from_imu, noise = sensor.matrix("T_BS"), imu_noise(sensor) or ImuNoise()
     if given := calibration_of_options(options, log):
         return given.calibration, euroc_from_imu
     camera_files = [root / f"mav0/cam{i}/sensor.yaml" for i in range(count)]
@@ -70,7 +73,7 @@ def _calibration(root: Path, count: int, options: OpenOptions, log: ReadLog) -> 
     if missing is None:
         log.files += [part for file in camera_files for part in calibration_files(file)]
         log.files += [imu_file] if noise is not None else []
-        cameras = [read_euroc_camera(file) for file in camera_files]
+        cameras = [read_camera(file) for file in camera_files]
         if not np.array_equal(euroc_from_imu, np.eye(4)):
             imu_from_euroc = se3_inverse(euroc_from_imu)
             cameras = [replace(c, body_from_cam=imu_from_euroc @ c.body_from_cam) for c in cameras]
@@ -81,6 +84,12 @@ def _calibration(root: Path, count: int, options: OpenOptions, log: ReadLog) -> 
     raise CalibrationError(
         f"{missing} is missing and there is no camchain.yaml; pass a calibration with --calibration FILE"
     )
+
+
+def read_camera(path: Path) -> CameraCalibration:
+    """Read a sensor.yaml: the camera is mounted on the frame that the file calls body."""
+    file = read_yaml(path)
+    return check_camera(camera_of(file, "distortion_coefficients", file.matrix("T_BS")), str(path))
 
 
 def _ground_truth(root: Path, euroc_from_imu: Array, log: ReadLog) -> Trajectory | None:
@@ -95,3 +104,6 @@ def _ground_truth(root: Path, euroc_from_imu: Array, log: ReadLog) -> Trajectory
     if np.array_equal(imu_from_sensor, np.eye(4)):
         return trajectory
     return Trajectory(trajectory.stamps_ns, trajectory.frame_from_body @ se3_inverse(imu_from_sensor))
+
+
+FORMAT = RecordingFormat("a folder with mav0/cam0/data.csv in it", recognises, open_euroc, rank=-6)

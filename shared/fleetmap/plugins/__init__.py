@@ -1,0 +1,1 @@
+"""Plug-ins of either side, in a folder each. The rest of the package imports none: see `fleetmap/hooks.py`."""
