@@ -4,12 +4,13 @@
 |---|---|---|
 | `locclient.links` | its section in the configuration file | `LinkHook` |
 | `locclient.sources` | `[source] kind` | a function as those of `SOURCES` in `fleetmap/sources/source.py` |
+| `locclient.outputs` | `[output] format` | `OutputHook` |
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from fleetmap.config import Section
 from fleetmap.hooks import plugins
@@ -20,6 +21,14 @@ from locclient.identity import MapAddress
 from locclient.maps.tile_cache import TileCache
 from locclient.robot.robot import Outcome
 from locclient.robot.version_trial import VersionChange
+
+if TYPE_CHECKING:
+    from fleetmap.bus import Bus
+    from fleetmap.sensors.calibration import RigCalibration
+    from fleetmap.sensors.source_settings import Topics
+    from fleetmap.sources.intake import Intake
+    from locclient.output_section import OutputSection
+    from locclient.publisher import Publisher
 
 
 @dataclass(frozen=True)
@@ -71,6 +80,19 @@ class LinkHook:
     is_on: Callable[[Any], bool]
     check: Callable[[Any, MapAddress, bool], None]
     open: Callable[[Any, LinkedRobot], RobotLink]
+
+
+@dataclass(frozen=True)
+class OutputHook:
+    """A format of estimates for the robot's own programs. check: raises UsageError for settings of [output] that do not suit [topics].
+
+    connect: opens the bus at [output] endpoint. open: by that bus, or the map server's, the names of site and robot, and the rig;
+    the intake receives commands of the robot's own programs. Raises UsageError for an invalid topic.
+    """
+
+    open: "Callable[[OutputSection, Bus, str, str, RigCalibration, Intake], Publisher]"
+    check: "Callable[[OutputSection, Topics], None]"
+    connect: "Callable[[str], Bus]"
 
 
 def link_hooks() -> dict[str, LinkHook]:

@@ -5,7 +5,6 @@ from typing import Annotated
 import msgspec
 
 from fleetmap.config import Section
-from fleetmap.errors import UsageError
 from fleetmap.version_grid import FLOOR_M, TOP_M
 
 
@@ -33,13 +32,3 @@ class OutputSection(Section, frozen=True):
     sensor_frames: str = "fleetmap_"
     publish_odom: bool = True
     transform_tolerance_s: float = 0.0
-
-
-def check_for_ros2(section: OutputSection) -> None:
-    """Raise UsageError for frame names that tf2 rejects."""
-    frames = (section.map_frame, section.odom_frame, section.base_frame)
-    if len(set(frames)) < 3 or any(not name or name.startswith("/") for name in frames):
-        raise UsageError(
-            f"[output] map_frame, odom_frame and base_frame = {', '.join(map(repr, frames))}: tf2 needs three different names "
-            "that do not begin with a slash"
-        )

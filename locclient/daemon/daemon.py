@@ -19,8 +19,7 @@ from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import open_source
 from locclient.config import LocclientConfig, RunSection, links_of
-from locclient.daemon.publisher import Publisher
-from locclient.daemon.publishers import open_publisher
+from locclient.daemon.publishers import output_of
 from locclient.daemon.runtime import RuntimeParts
 from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.failure_file import PICTURES
@@ -35,8 +34,8 @@ from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
-from locclient.output_section import check_for_ros2
 from locclient.prior_option import parse_prior
+from locclient.publisher import Publisher
 from locclient.robot.failure_report import RobotProfile
 from locclient.robot.gc_freeze import gc_frozen
 from locclient.robot.robot import Robot
@@ -66,14 +65,7 @@ def check_run(config: LocclientConfig) -> MapAddress:
             check_reach(endpoint, insecure=run.insecure)
         except UsageError as error:
             raise UsageError(f"[{section}] endpoint = {error}") from error
-    output = config.output
-    if output.format == "ros2":
-        check_for_ros2(output)
-    if output.format == "ros2" and output.odom_topic.lstrip("/") == config.topics.wheel.lstrip("/"):
-        raise UsageError(
-            f"[output] odom_topic = {output.odom_topic!r} is also the topic of [topics] wheel: the robot would take its own "
-            'odometry for that of its wheels; set wheel = "" if it has none'
-        )
+    output_of(config.output).check(config.output, config.topics)
     if run.replays not in ("off", *PICTURES):
         raise UsageError(f"[run] replays = {run.replays!r}: choose off, {' or '.join(PICTURES)}")
     if run.frame_queue < 1:
@@ -140,13 +132,13 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         robot = Robot(calibration, rectifier, config.localizer, run.trial, time.thread_time, keeps_replay=keeps_replay)
         if prior is not None:
             robot.localizer.handle_prior(prior)
-        told_bus = None if is_alone else bus
+        told_bus, output = None if is_alone else bus, output_of(config.output)
         if config.output.endpoint is not None:
-            told_bus = Bus.connect(config.output.endpoint, is_ros=config.output.format == "ros2")
+            told_bus = output.connect(config.output.endpoint)
             stack.callback(told_bus.close)
         publisher = None
         if told_bus is not None:
-            publisher = open_publisher(config.output, told_bus, site, name, calibration, intake)
+            publisher = output.open(config.output, told_bus, site, name, calibration, intake)
             stack.callback(publisher.close)
             if server is not None:
                 server.client.takes_grids = publisher.grid_height_m is not None

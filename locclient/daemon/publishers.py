@@ -1,14 +1,16 @@
-"""Publishers of estimates to the robot's own programs. To add one: a class, and its format in `open_publisher`."""
+"""Publishers of estimates to the robot's own programs. To add one: a class, and a plug-in's `OutputHook` or a line in OUTPUTS."""
 
 from fleetmap.bus import Bus
 from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, se3_inverse
+from fleetmap.hooks import plugins
 from fleetmap.messages import EstimateMessage, Placement, covariance_entries, encode_message, robot_key
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sources.intake import Intake
-from locclient.daemon.publisher import Publisher
+from locclient.hooks import OutputHook
 from locclient.localization.estimate import Estimate
-from locclient.output_section import OutputSection, check_for_ros2
+from locclient.output_section import OutputSection
+from locclient.publisher import Publisher
 from locclient.robot.continuous_odom import PublishedPose
 
 _MAX_HYPOTHESES = 16
@@ -39,18 +41,18 @@ class MessagePackPublisher(Publisher):
         self._bus.publish(self._key, encode_message(message), may_drop=True)
 
 
-def open_publisher(
-    section: OutputSection, bus: Bus, site: str, robot: str, calibration: RigCalibration, intake: Intake
+def _message_pack(
+    _section: OutputSection, bus: Bus, site: str, robot: str, _calibration: RigCalibration, _intake: Intake
 ) -> Publisher:
-    """Open the publisher of the section. intake: receives commands of the robot's own programs.
+    return MessagePackPublisher(bus, robot_key(site, robot, "estimate"))
 
-    Raises UsageError for an unknown format or an invalid topic.
-    """
-    if section.format == "messagepack":
-        return MessagePackPublisher(bus, robot_key(site, robot, "estimate"))
-    if section.format == "ros2":
-        from locclient.daemon.ros2_localizer import Ros2Localizer
 
-        check_for_ros2(section)
-        return Ros2Localizer(bus, robot, section, calibration, intake)
-    raise UsageError(f"[output] format = {section.format!r}; known are messagepack and ros2")
+OUTPUTS = {"messagepack": OutputHook(_message_pack, lambda _section, _topics: None, Bus.connect)}
+
+
+def output_of(section: OutputSection) -> OutputHook:
+    """Return the format of the section. UsageError for an unknown one."""
+    known = OUTPUTS if section.format in OUTPUTS else OUTPUTS | plugins("locclient.outputs")
+    if section.format not in known:
+        raise UsageError(f"[output] format = {section.format!r}; known are {' and '.join(known)}")
+    return known[section.format]

@@ -21,7 +21,6 @@ from fleetmap.messages import RobotHealth, WantedVersion, encode_message
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import Source
 from fleetmap.threads import Jobs, ended_by_threads
-from locclient.daemon.publisher import Publisher
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.service_manager import ServiceManager
 from locclient.delivery.outbox import Outbox, QueuedReport
@@ -31,6 +30,7 @@ from locclient.maps.floor_maps import NO_GRID, FloorMaps
 from locclient.maps.loaded_map import Cell, LoadedMap, PositionBound, PositionBoundTracker
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
+from locclient.publisher import Publisher
 from locclient.robot.failure_report import RobotProfile, failure_report
 from locclient.robot.health_report import Figure, HealthFigures
 from locclient.robot.robot import FailureContext, Outcome, Robot

@@ -161,6 +161,7 @@ def test_an_enrolled_robot_drives_on_through_failures_a_new_version_and_restarts
 
 def test_nav2_starts_it_asks_it_and_stops_it(tmp_path: Path) -> None:
     """The daemon on a store's folder, behind rmw_zenoh's router: lifecycle manager, BasicNavigator, behaviour tree."""
+    pytest.importorskip("locclient.plugins.ros2_node")
     with MapStore.open(tmp_path / "store", create=True) as store:
         robot_world.save(store)
     with socket.socket() as probe:

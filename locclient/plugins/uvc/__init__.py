@@ -12,8 +12,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame
 from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
-from fleetmap.sources.ros2 import Ros2Source
-from fleetmap.sources.source import open_topics
+from locclient.plugins.ros2_node.source import Ros2Source, open_topics
 
 _REOPEN_S = 1.0
 _CLOCKS_AGREE_S = 1.0

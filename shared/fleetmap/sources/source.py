@@ -2,21 +2,17 @@
 
 import time
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Protocol
 
-from fleetmap.bus import Bus
 from fleetmap.errors import RecordingError, UsageError
 from fleetmap.hooks import plugins
-from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording, read_calibration
-from fleetmap.recordings.ros2.graph import key_layout
+from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import SensorSet
 from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.replay_source import ReplaySource
-from fleetmap.sources.ros2 import Ros2Source
 
 _ROOM_WAIT_S = 0.1
 _LONGEST_GAP_S = 10.0  # between frames: a longer one, such as days after a change of the clock, is skipped
@@ -78,32 +74,11 @@ def _recording(section: SourceSection, topics: Topics, _map_frame: str) -> Sourc
     return RecordingSource(opened, speed=section.speed)
 
 
-def open_topics(section: SourceSection, topics: Topics, map_frame: str, *, images: bool = True) -> Ros2Source:
-    """Open ROS 2 topics as the source, or beside another one, which has the images."""
-    calibration = _calibration(section)
-    layout, bus = key_layout(section.keys, section.domain), Bus.connect(section.endpoint, is_ros=True)
-    has_depth = section.sensors == "rgbd"
-    return Ros2Source(bus, layout, topics, calibration, images=images, has_depth=has_depth, map_frame=map_frame)
-
-
-def _calibration(section: SourceSection) -> RigCalibration:
-    if section.calibration is None:
-        raise UsageError("[source] calibration is missing: a live camera needs the path of its Kalibr camchain")
-    calibration = read_calibration(Path(section.calibration))
-    if section.sensors != "stereo":
-        return replace(calibration, cameras=calibration.cameras[:1])
-    if len(calibration.cameras) < 2:
-        count = len(calibration.cameras)
-        reason = f"{section.calibration} describes {count} camera; a stereo source needs a pair: or set [source] sensors to rgbd or mono"
-        raise UsageError(reason)
-    return calibration
-
-
-SOURCES: dict[str, Callable[[SourceSection, Topics, str], Source]] = {"recording": _recording, "ros2": open_topics}
+SOURCES: dict[str, Callable[[SourceSection, Topics, str], Source]] = {"recording": _recording}
 
 
 def open_source(section: SourceSection, topics: Topics, map_frame: str = "map") -> Source:
-    """Open the source configured in the section; map_frame: the only accepted frame of position priors on ROS 2 topics.
+    """Open the source configured in the section; map_frame: the only accepted frame of position priors.
 
     UsageError for an unknown kind or a missing option, RecordingError and CalibrationError for unusable files.
     """

@@ -15,10 +15,10 @@ from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, StoredFrame, open_recording
 from fleetmap.recordings.images import decode_frame
 from fleetmap.recordings.mcap.writer import copy_to_mcap
-from fleetmap.recordings.ros2.graph import RmwZenohKeys
 from fleetmap.sensors.source_settings import Topics
 from fleetmap.sources.intake import Intake
-from fleetmap.sources.ros2 import Ros2Source
+from locclient.plugins.ros2_node.graph import RmwZenohKeys
+from locclient.plugins.ros2_node.source import Ros2Source
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.bag_samples import write_rosbag1, write_rosbag2
 from support.recordings.mcap_samples import SAMPLE, Message, foreign_messages, write_foreign

@@ -12,12 +12,12 @@ from fleetmap.recordings.images import decode_depth, decode_frame, store_frame
 from fleetmap.recordings.mcap import writer
 from fleetmap.recordings.mcap.writer import McapRecordingWriter, copy_to_mcap
 from fleetmap.recordings.ros2 import messages
-from fleetmap.recordings.ros2.graph import RmwZenohKeys
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RGBD_BASELINE_M, Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from fleetmap.sources.intake import Intake
-from fleetmap.sources.ros2 import RigFrames, Ros2Source
+from locclient.plugins.ros2_node.graph import RmwZenohKeys
+from locclient.plugins.ros2_node.source import RigFrames, Ros2Source
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.rig_samples import simulated, write_rig
 

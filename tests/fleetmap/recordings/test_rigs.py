@@ -18,7 +18,7 @@ from fleetmap.recordings.ros2 import messages
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
-from fleetmap.sources.ros2 import RigFrames
+from locclient.plugins.ros2_node.source import RigFrames
 from support.recordings.mcap_samples import Message, write_foreign
 from support.recordings.recording_samples import START_NS, make_sample, write_euroc
 from support.recordings.rig_samples import images_of, simulated, write_kitti_raw, write_rig

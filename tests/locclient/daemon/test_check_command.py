@@ -67,8 +67,7 @@ def test_a_good_robot_passes(config: Path, capsys: Said) -> None:
     [
         ('site = "lab"', "", "fail  configuration", "[run] site is missing"),
         ('site = "lab"', 'site = "else"', "fail  store", "else"),
-        ('kind = "recording"', 'kind = "radar"', "fail  calibration", "'radar'; known are recording, ros2"),
-        ('kind = "recording"', 'kind = "ros2"', "fail  calibration", "camchain"),
+        ('kind = "recording"', 'kind = "radar"', "fail  calibration", "'radar'; known are recording"),
         ("/walk", "/nowhere", "fail  calibration", "does not exist"),
         ('store = "', 'server = "tcp/127.0.0.1:1"\n#', "fail  connection", "is the server running"),
         ('store = "', 'server = "tcp/127.0.0.1:1"\nstore = "', "fail  configuration", "either"),

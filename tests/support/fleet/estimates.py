@@ -2,11 +2,20 @@
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3
+from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Status
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.relocalizer import Fix
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sources.intake import Intake
+from locclient.daemon.publishers import output_of
 from locclient.localization.estimate import Estimate, Hypothesis
+from locclient.output_section import OutputSection
+from locclient.robot.continuous_odom import ContinuousOdom
+from support.fleet.memory_bus import MemoryBus, MemoryHub
+from support.recordings.recording_samples import calibration
+
+BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([0.2, 0.0, 0.5]))
 
 
 def estimate(
@@ -25,3 +34,21 @@ def estimate(
     own = Fix(np.eye(4), 1e-4 * np.eye(6), 40, 12) if fix else None
     others = tuple(Hypothesis(se3(np.eye(3), np.array([float(n), 0, 0])), 3) for n in range(hypotheses))
     return Estimate(stamp_ns, status, place, covariance, version, own, refused, innovation, others, odometry, {})
+
+
+def inputs(bus: MemoryBus) -> tuple[MemoryBus, str, str, RigCalibration, Intake]:
+    """What an output is opened with, after its section."""
+    intake = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
+    return (bus, "hall", "r1", calibration(), intake)
+
+
+def published(section: OutputSection, *estimates: object) -> dict[str, list[bytes]]:
+    """Payloads by key, of estimates one after another."""
+    hub, heard = MemoryHub(), {}  # type: ignore[var-annotated]
+    with MemoryBus(hub) as bus, MemoryBus(hub) as other:
+        other.subscribe("**", lambda key, payload: heard.setdefault(key, []).append(payload))
+        publisher, odom = output_of(section).open(section, *inputs(bus)), ContinuousOdom(BASE_FROM_BODY)
+        for one in estimates:
+            publisher.publish(one, odom.handle(one), BASE_FROM_BODY)  # type: ignore[arg-type]
+        publisher.close()
+    return heard

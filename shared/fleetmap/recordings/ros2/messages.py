@@ -254,11 +254,6 @@ def encode_frame_links(stamp_ns: int, links: Sequence[FrameLink]) -> bytes:
     return writer.message()
 
 
-def encode_text(text: str) -> bytes:
-    """std_msgs/String."""
-    return CdrWriter().text(text).message()
-
-
 def position_quat_xyzw(target_from_source: Array) -> Array:
     """x y z qx qy qz qw (7,), the numbers of a geometry_msgs/Pose."""
     quat_wxyz = quat_wxyz_from_rotation(target_from_source[:3, :3])

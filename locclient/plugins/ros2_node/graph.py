@@ -7,7 +7,7 @@ and services of DDS under their bare names.
 from dataclasses import dataclass
 
 from fleetmap.errors import UsageError
-from fleetmap.recordings.ros2.keys import dds_type, topic_chunks, type_hash
+from locclient.plugins.ros2_node.keys import dds_type, topic_chunks, type_hash
 
 PUBLISHER, SUBSCRIPTION, SERVICE = "MP", "MS", "SS"
 

@@ -12,12 +12,12 @@ import zenoh.ext
 from fleetmap.bus import Bus
 from fleetmap.recordings import Topics
 from fleetmap.recordings.images import grey_image, png_image
-from fleetmap.recordings.ros2.graph import BridgedDdsKeys
 from fleetmap.recordings.ros2.messages import encode_compressed_image, encode_image
 from fleetmap.sources.intake import Intake
-from fleetmap.sources.ros2 import Ros2Source
-from locclient.daemon.publishers import open_publisher
+from locclient.daemon.publishers import output_of
 from locclient.output_section import OutputSection
+from locclient.plugins.ros2_node.graph import BridgedDdsKeys
+from locclient.plugins.ros2_node.source import Ros2Source
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
 from support.fleet.nav2_client import eventually, message_name, typestore
@@ -43,7 +43,7 @@ def test_nav2_on_dds_reaches_the_localizer() -> None:
     with bridge() as dds, Bus.connect(f"tcp/127.0.0.1:{PORT}", is_ros=True) as bus:
         commands = intake()
         section = OutputSection(format="ros2", keys="ros2dds", autostart=False)
-        localizer = open_publisher(section, bus, "hall", "r1", calibration(), commands)
+        localizer = output_of(section).open(section, bus, "hall", "r1", calibration(), commands)
 
         def tokens() -> list[str]:
             replies = dds.liveliness().get("@/*/@ros2_lv/**", timeout=1.0)

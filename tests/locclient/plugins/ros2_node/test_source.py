@@ -11,8 +11,6 @@ from fleetmap.bus import Bus
 from fleetmap.errors import UsageError
 from fleetmap.recordings import StoredFrame, Topics
 from fleetmap.recordings.images import decode_frame, depth_image, grey_image, png_image
-from fleetmap.recordings.ros2.graph import RmwZenohKeys
-from fleetmap.recordings.ros2.keys import attachment
 from fleetmap.recordings.ros2.messages import (
     encode_compressed_image,
     encode_image,
@@ -23,8 +21,10 @@ from fleetmap.recordings.ros2.messages import (
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
-from fleetmap.sources.ros2 import Ros2Source, StereoPairs
 from fleetmap.sources.source import open_source
+from locclient.plugins.ros2_node.graph import RmwZenohKeys
+from locclient.plugins.ros2_node.keys import attachment
+from locclient.plugins.ros2_node.source import Ros2Source, StereoPairs
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.recording_samples import calibration
 

@@ -7,7 +7,7 @@ import numpy as np
 from fleetmap.geometry import se3, so3_exp
 from fleetmap.recordings.images import StoredFrame, decode_grey, grey_image
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sources.ros2 import RigFrames
+from locclient.plugins.ros2_node.source import RigFrames
 from support.recordings.recording_samples import calibration
 
 PERIOD_NS, LATE_NS = 50_000_000, 3_000_000

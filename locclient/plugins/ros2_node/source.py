@@ -4,21 +4,22 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
 from fleetmap.bus import Bus, Handle
-from fleetmap.errors import FleetmapError, RecordingError
-from fleetmap.recordings import StoredFrame, Topics
+from fleetmap.errors import FleetmapError, RecordingError, UsageError
+from fleetmap.recordings import StoredFrame, Topics, read_calibration
 from fleetmap.recordings.bags.topics import transports
 from fleetmap.recordings.images import StoredImage, grey_bits, grey_image, grey_peak
 from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS
 from fleetmap.recordings.ros2 import messages
-from fleetmap.recordings.ros2.graph import KeyLayout
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples
-from fleetmap.sensors.source_settings import CAMERA_ROLES, DEPTH_ROLES
+from fleetmap.sensors.source_settings import CAMERA_ROLES, DEPTH_ROLES, SourceSection
 from fleetmap.sources.intake import Intake
+from locclient.plugins.ros2_node.graph import KeyLayout, key_layout
 
 _IDLE_S = 1.0
 _WAITING_IMAGES = 8  # images of each side waiting for their partner
@@ -251,3 +252,24 @@ def _take_prior(map_frame: str, intake: Intake, _is_compressed: bool, payload: b
     if frame_id.lstrip("/") not in ("", map_frame):
         raise RecordingError(f"a position prior in the frame {frame_id!r} is not used; give it in {map_frame!r}")
     intake.put_prior(messages.decode_prior(payload))
+
+
+def open_topics(section: SourceSection, topics: Topics, map_frame: str, *, images: bool = True) -> Ros2Source:
+    """Open ROS 2 topics as the source, or beside another one, which has the images."""
+    calibration = _calibration(section)
+    layout, bus = key_layout(section.keys, section.domain), Bus.connect(section.endpoint, is_ros=True)
+    has_depth = section.sensors == "rgbd"
+    return Ros2Source(bus, layout, topics, calibration, images=images, has_depth=has_depth, map_frame=map_frame)
+
+
+def _calibration(section: SourceSection) -> RigCalibration:
+    if section.calibration is None:
+        raise UsageError("[source] calibration is missing: a live camera needs the path of its Kalibr camchain")
+    calibration = read_calibration(Path(section.calibration))
+    if section.sensors != "stereo":
+        return replace(calibration, cameras=calibration.cameras[:1])
+    if len(calibration.cameras) < 2:
+        count = len(calibration.cameras)
+        reason = f"{section.calibration} describes {count} camera; a stereo source needs a pair: or set [source] sensors to rgbd or mono"
+        raise UsageError(reason)
+    return calibration

@@ -12,7 +12,6 @@ from enum import IntEnum
 import numpy as np
 
 from fleetmap.bus import Bus
-from fleetmap.bus.ros2_node import Ros2Node
 from fleetmap.errors import FleetmapError
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse, so3_log
@@ -20,15 +19,21 @@ from fleetmap.messages import Status
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.odometry import OdometryStatus
 from fleetmap.recordings.ros2.cdr import CdrReader, CdrWriter
-from fleetmap.recordings.ros2.graph import LATCHED, Qos, key_layout
 from fleetmap.recordings.ros2.messages import (
     FrameLink,
     decode_frame_links,
     encode_frame_links,
     encode_prior,
-    encode_text,
 )
-from fleetmap.recordings.ros2.navigation_messages import (
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.samples import PositionPrior
+from fleetmap.sources.intake import Intake
+from locclient.localization.estimate import Estimate
+from locclient.localization.pose_covariance import transport_cov
+from locclient.output_section import OutputSection
+from locclient.plugins.ros2_node.driver_odometry import DriverOdometry
+from locclient.plugins.ros2_node.graph import LATCHED, Qos, key_layout
+from locclient.plugins.ros2_node.navigation_messages import (
     EMPTY,
     BondStatus,
     Diagnosis,
@@ -39,15 +44,10 @@ from fleetmap.recordings.ros2.navigation_messages import (
     encode_diagnostics,
     encode_grid,
     encode_motion,
+    encode_text,
 )
-from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.samples import PositionPrior
-from fleetmap.sources.intake import Intake
-from locclient.daemon.driver_odometry import DriverOdometry
-from locclient.daemon.publisher import Publisher
-from locclient.localization.estimate import Estimate
-from locclient.localization.pose_covariance import transport_cov
-from locclient.output_section import OutputSection
+from locclient.plugins.ros2_node.node import Ros2Node
+from locclient.publisher import Publisher
 from locclient.robot.continuous_odom import PublishedPose
 
 

@@ -22,14 +22,16 @@ from fleetmap.geometry import (
     so3_exp,
     so3_log,
 )
-from fleetmap.recordings.ros2.graph import RmwZenohKeys
+from fleetmap.sensors.source_settings import Topics
 from fleetmap.sources.intake import Intake
 from locclient.config import read_config
-from locclient.daemon.driver_odometry import Missing, PoseHistory
-from locclient.daemon.publisher import Publisher
-from locclient.daemon.publishers import open_publisher
+from locclient.daemon.publishers import output_of
 from locclient.localization.estimate import Estimate
-from locclient.output_section import OutputSection, check_for_ros2
+from locclient.output_section import OutputSection
+from locclient.plugins.ros2_node.driver_odometry import Missing, PoseHistory
+from locclient.plugins.ros2_node.graph import RmwZenohKeys
+from locclient.plugins.ros2_node.output import OUTPUT
+from locclient.publisher import Publisher
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.contracts_documents import REPOSITORY
 from support.fleet.estimates import estimate
@@ -149,7 +151,7 @@ class World:
         self.close()
         intake = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
         inputs = (MemoryBus(self.hub), "hall", "r1", calibration(), intake)
-        self.localizer = open_publisher(self.section, *inputs)
+        self.localizer = output_of(self.section).open(self.section, *inputs)
         self.odom, self.begun_ms = ContinuousOdom(BASE_FROM_BODY), at_ms
         if self.case.child != "base_link":
             self.put(
@@ -325,11 +327,15 @@ def test_other_programs_with_the_same_transforms_are_named() -> None:
 
 @pytest.mark.parametrize(
     ("settings", "words"),
-    [({"odom_frame": "map"}, "three different names"), ({"base_frame": "/base_link"}, "begin with a slash")],
+    [
+        ({"odom_frame": "map"}, "three different names"),
+        ({"base_frame": "/base_link"}, "begin with a slash"),
+        ({"odom_topic": "odom"}, "for that of its wheels"),
+    ],
 )
 def test_a_tree_that_cannot_be_right_is_refused_at_start(settings: dict[str, Any], words: str) -> None:
     with pytest.raises(UsageError, match=words):
-        check_for_ros2(OutputSection(format="ros2", **settings))
+        OUTPUT.check(OutputSection(format="ros2", **settings), Topics())
 
 
 def test_the_covariance_is_that_of_the_base() -> None:

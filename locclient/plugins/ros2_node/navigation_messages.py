@@ -79,6 +79,11 @@ def decode_initial_pose(data: bytes, map_frame: str) -> PositionPrior:
     return PositionPrior(0, prior.map_from_base, cov, is_revisable=True)
 
 
+def encode_text(text: str) -> bytes:
+    """std_msgs/String."""
+    return CdrWriter().text(text).message()
+
+
 def encode_motion(stamp_ns: int, frame_id: str, child_frame_id: str, motion: Motion) -> bytes:
     """nav_msgs/Odometry."""
     writer = CdrWriter().header(stamp_ns, frame_id).text(child_frame_id)

@@ -13,12 +13,12 @@ from fleetmap.errors import UsageError
 from fleetmap.geometry import se3
 from fleetmap.messages import Status
 from fleetmap.occupancy_grid import OccupancyGrid
-from fleetmap.recordings.ros2.graph import RmwZenohKeys
 from fleetmap.sources.intake import Intake
-from locclient.daemon.publishers import open_publisher
-from locclient.daemon.ros2_localizer import Ros2Localizer
 from locclient.localization.estimate import Estimate
 from locclient.output_section import OutputSection
+from locclient.plugins.ros2_node.graph import RmwZenohKeys
+from locclient.plugins.ros2_node.localizer import Ros2Localizer
+from locclient.plugins.ros2_node.output import OUTPUT
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
 from support.fleet.memory_bus import MemoryBus, MemoryHub
@@ -68,7 +68,7 @@ def robot(request: pytest.FixtureRequest) -> Iterator[Robot]:
     with rmw_router(free_port()) as endpoint, Bus.connect(endpoint, is_ros=True) as bus:
         intake = Intake(frames=2, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
         inputs = (bus, "hall", "r1", calibration(), intake)
-        localizer = open_publisher(OutputSection(**settings), *inputs)
+        localizer = OUTPUT.open(OutputSection(**settings), *inputs)
         assert isinstance(localizer, Ros2Localizer)
 
         def opened() -> LifecycleManager:
@@ -175,7 +175,7 @@ def test_the_bond_ends_with_the_manager_and_with_a_robot_that_is_stuck(
 ) -> None:
     manager = robot.open()
     assert manager.startup()
-    monkeypatch.setattr("locclient.daemon.ros2_localizer._STUCK_S", -1.0)
+    monkeypatch.setattr("locclient.plugins.ros2_node.localizer._STUCK_S", -1.0)
     assert eventually(
         lambda: (count := len(manager.beats)) > 0 and not eventually(lambda: len(manager.beats) > count, 0.5)
     )
@@ -318,7 +318,7 @@ def test_diagnostics_say_status_and_cause(
         other.subscribe(
             RmwZenohKeys(0).key("/diagnostics", "diagnostic_msgs/DiagnosticArray"), lambda _, data: heard.append(data)
         )
-        localizer = open_publisher(OutputSection(format="ros2"), *inputs)
+        localizer = OUTPUT.open(OutputSection(format="ros2"), *inputs)
         odom = ContinuousOdom(np.eye(4))
         for one in estimates:
             localizer.publish(one, odom.handle(one), np.eye(4))
@@ -353,9 +353,9 @@ def test_names_that_are_none_are_refused_at_once() -> None:
     with MemoryBus(MemoryHub()) as bus:
         inputs = (bus, "hall", "r1", calibration(), Intake(frames=1, imu_minus_cam_s=0, has_imu=False, imu_wait_s=0))
         with pytest.raises(UsageError, match="a b"):
-            open_publisher(OutputSection(format="ros2", pose_topic="a b"), *inputs)
+            OUTPUT.open(OutputSection(format="ros2", pose_topic="a b"), *inputs)
         with pytest.raises(UsageError, match="cyclone"):
-            open_publisher(OutputSection(format="ros2", keys="cyclone"), *inputs)
-        plain = open_publisher(OutputSection(format="ros2", map_topic=""), *inputs)
+            OUTPUT.open(OutputSection(format="ros2", keys="cyclone"), *inputs)
+        plain = OUTPUT.open(OutputSection(format="ros2", map_topic=""), *inputs)
         assert plain.grid_height_m is None, "another program publishes the map"
         plain.close()

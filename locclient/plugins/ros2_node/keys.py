@@ -11,7 +11,7 @@ from functools import cache
 from typing import Any
 
 from fleetmap.errors import UsageError
-from fleetmap.recordings.ros2.definitions import DEFINITIONS
+from locclient.plugins.ros2_node.definitions import DEFINITIONS
 
 # type_description_interfaces/FieldType: numbers of the types, and offsets for fixed and for unbounded arrays.
 _NUMBERS = "int8 uint8 int16 uint16 int32 uint32 int64 uint64 float32 float64"

@@ -11,10 +11,19 @@ from fleetmap.geometry import quat_wxyz_from_rotation, se3, so3_exp
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.recordings.images import grey_image, png_image
 from fleetmap.recordings.ros2 import messages
-from fleetmap.recordings.ros2.definitions import DEFINITIONS, service_definitions
-from fleetmap.recordings.ros2.graph import LATCHED, BridgedDdsKeys, Endpoint, NodeName, Qos, RmwZenohKeys
-from fleetmap.recordings.ros2.keys import type_hash
-from fleetmap.recordings.ros2.navigation_messages import (
+from fleetmap.sensors.samples import PositionPrior, WheelSample
+from locclient.plugins.ros2_node.definitions import DEFINITIONS, service_definitions
+from locclient.plugins.ros2_node.graph import LATCHED, BridgedDdsKeys, Endpoint, NodeName, Qos, RmwZenohKeys
+from locclient.plugins.ros2_node.keys import type_hash
+from locclient.plugins.ros2_node.localizer import (
+    TRANSITIONS,
+    LifecycleState,
+    encode_events,
+    encode_state,
+    encode_states,
+    encode_transitions,
+)
+from locclient.plugins.ros2_node.navigation_messages import (
     EMPTY,
     BondStatus,
     Diagnosis,
@@ -24,15 +33,7 @@ from fleetmap.recordings.ros2.navigation_messages import (
     encode_diagnostics,
     encode_grid,
     encode_motion,
-)
-from fleetmap.sensors.samples import PositionPrior, WheelSample
-from locclient.daemon.ros2_localizer import (
-    TRANSITIONS,
-    LifecycleState,
-    encode_events,
-    encode_state,
-    encode_states,
-    encode_transitions,
+    encode_text,
 )
 from support.fleet.nav2_client import message_name, typestore
 from support.recordings.realdata import real_data
@@ -96,7 +97,7 @@ def written() -> list[Written]:
         ),
         stamped("geometry_msgs/msg/PoseStamped", messages.encode_pose(STAMP_NS, "map", PLACE), "map", pose__position__x=1.5),
         Written("tf2_msgs/msg/TFMessage", messages.encode_frame_links(STAMP_NS, [link]), {"transforms.0.child_frame_id": "odom"}),
-        Written("std_msgs/msg/String", messages.encode_text("LOST"), {"data": "LOST"}),
+        Written("std_msgs/msg/String", encode_text("LOST"), {"data": "LOST"}),
         stamped(
             "nav_msgs/msg/OccupancyGrid", encode_grid(STAMP_NS, "map", GRID), "map", info__width=3, info__height=2,
             info__resolution=np.float32(0.05), info__origin__orientation__x=xyzw[0], data=np.array([0, 100, -1, 50, 0, 0]),
