@@ -11,13 +11,12 @@ import numpy as np
 from fleetmap.bus import Bus, Handle
 from fleetmap.errors import FleetmapError, RecordingError, UsageError
 from fleetmap.recordings import StoredFrame, Topics, read_calibration
-from fleetmap.recordings.bags.topics import transports
 from fleetmap.recordings.images import StoredImage, grey_bits, grey_image, grey_peak
 from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS
 from fleetmap.recordings.ros2 import messages
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples
-from fleetmap.sensors.source_settings import CAMERA_ROLES, DEPTH_ROLES, SourceSection
+from fleetmap.sensors.source_settings import CAMERA_ROLES, DEPTH_ROLES, SourceSection, transports
 from fleetmap.sources.intake import Intake
 from locclient.plugins.ros2_node.graph import KeyLayout, key_layout
 

@@ -1,4 +1,4 @@
-"""Recordings of camera robots. MCAP is read here; plug-ins read other formats.
+"""Recordings of camera robots. MCAP files that this project wrote are read here; plug-ins read other files.
 
 To add a format: a module whose function reads the folder or file into `RecordingParts` and hands them to `finalize`, and an entry point of
 `fleetmap.recordings`, or a line in RECORDING_FORMATS (examples/new_recording_format.py is one).
@@ -12,7 +12,6 @@ from pathlib import Path
 
 from fleetmap.errors import RecordingError
 from fleetmap.hooks import plugins
-from fleetmap.recordings.bags import ros1, sqlite
 from fleetmap.recordings.calibration_files import format_calibration, read_calibration
 from fleetmap.recordings.files import what_file_instead
 from fleetmap.recordings.images import StoredFrame, StoredImage
@@ -61,13 +60,8 @@ _ADVICE = {
     (".7z", ".rar"): "`7z x {path}` unpacks it",
     (".mcap.zst", ".mcap.zstd", ".bag.zst"): "`zstd -d {path}` unpacks it",
 }
-_MCAP = "an .mcap file, or a folder with the parts of one"
-_SQLITE = "a rosbag2 .db3 file, or its folder"
-_UNFINISHED: Mapping[tuple[str, ...], str] = {(".bag.active",): "`rosbag reindex {path}` finishes it"}
 RECORDING_FORMATS = {
-    "mcap": RecordingFormat(_MCAP, reader.recognises, reader.open_mcap, (".mcap",)),
-    "rosbag2-sqlite": RecordingFormat(_SQLITE, sqlite.recognises, sqlite.open_sqlite, (".db3",), 1),
-    "rosbag1": RecordingFormat("a ROS 1 .bag file", ros1.recognises, ros1.open_bag, (".bag",), 2, _UNFINISHED),
+    "mcap": RecordingFormat("an .mcap file of fleetmap's", reader.recognises, reader.open_mcap, (".mcap",)),
 }
 _installed = cache(plugins)
 

@@ -26,6 +26,9 @@ class SourceSection(Section, frozen=True):
 CAMERA_ROLES = ("left", "right", "cam2", "cam3", "cam4", "cam5", "cam6", "cam7")
 DEPTH_ROLES = ("depth", "cam2_depth", "cam3_depth", "cam4_depth", "cam5_depth", "cam6_depth", "cam7_depth")
 
+IMAGE_ROLES = (*CAMERA_ROLES, *DEPTH_ROLES)
+PACKED = ("/compressed", "/compressedDepth")
+
 
 class Topics(Section, frozen=True):
     """Topic names in MCAP files and ROS bags. An image topic also matches itself followed by `/compressed`. left and right are cameras
@@ -62,3 +65,10 @@ class Topics(Section, frozen=True):
     def depth_of(self, number: int) -> str:
         """The topic of the depth registered to the images of a camera beside the first view; empty beyond the eighth."""
         return str(getattr(self, f"cam{number}_depth", ""))
+
+
+def transports(topic: str, role: str) -> tuple[str, ...]:
+    """Topics on which ROS's image_transport may send the images of `topic`; only `topic` for other roles."""
+    if role not in IMAGE_ROLES or not topic:
+        return (topic,)
+    return (topic, *(topic + packed for packed in PACKED[: 2 if role in DEPTH_ROLES else 1]))

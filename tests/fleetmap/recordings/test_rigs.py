@@ -18,7 +18,6 @@ from fleetmap.recordings.ros2 import messages
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
-from locclient.plugins.ros2_node.source import RigFrames
 from support.recordings.mcap_samples import Message, write_foreign
 from support.recordings.recording_samples import START_NS, make_sample, write_euroc
 from support.recordings.rig_samples import images_of, simulated, write_kitti_raw, write_rig
@@ -260,7 +259,7 @@ def test_pairs_are_those_of_the_mounting_and_a_silent_camera_costs_its_own(
 
 def test_a_robot_and_its_recordings_pair_by_mounting(tmp_path: Path) -> None:
     calibration, frames = interleaved()
-    live, complete = RigFrames(calibration), []
+    live, complete = pytest.importorskip("locclient.plugins.ros2_node.source").RigFrames(calibration), []
     for frame in map(store_frame, frames):
         (rear,) = frame.others
         assert rear is not None

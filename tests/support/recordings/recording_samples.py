@@ -76,7 +76,7 @@ def make_sample(frames: int = 6, *, imu_before_ns: int = 500_000_000) -> Sample:
 
 def write_mcap(folder: Path, sample: Sample) -> Path:
     """A folder with an MCAP file of this project; the images are PNG."""
-    folder.mkdir(parents=True)
+    folder.mkdir(parents=True, exist_ok=True)
     imu = ImuSamples(sample.imu_stamps_ns, sample.gyro_radps, sample.accel_mps2)
     with McapRecordingWriter(folder / "drive.mcap", calibration(), name=folder.name) as writer:
         writer.write_imu(imu)

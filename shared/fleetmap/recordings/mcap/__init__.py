@@ -1,1 +1,1 @@
-"""Recordings as MCAP files: rosbag2 style (CDR) and Foxglove protobuf."""
+"""Recordings as MCAP files, of ROS 2 messages in CDR."""

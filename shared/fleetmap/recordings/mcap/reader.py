@@ -1,4 +1,4 @@
-"""Opens MCAP recordings: rosbag2 style (CDR) and Foxglove protobuf; whole, cut off or damaged, with or without their index.
+"""Opens MCAP recordings: whole, cut off or damaged, with or without their index.
 
 The mcap library parses the records. Its readers are not used, because they stop at the first damage, allocate as the file declares, and
 lose a chunk truncated by a power failure. Here damage is noted as a DataIssue, reading continues at the next chunk if the file
@@ -22,10 +22,10 @@ from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings.bags.container import Channel, Container, Message, Place
-from fleetmap.recordings.bags.streams import open_messages
 from fleetmap.recordings.files import file_head, natural_key, what_file_instead
 from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, unpack, unpack_message
+from fleetmap.recordings.mcap.container import Channel, Container, Message, Place
+from fleetmap.recordings.mcap.streams import open_written
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.samples import DataIssue
@@ -56,7 +56,12 @@ def recognises(path: Path) -> bool:
 
 
 def open_mcap(path: Path, options: OpenOptions) -> Recording:
-    """Open the recording in an MCAP file, or in a rosbag2 folder of its parts; its issues list damaged and missing data."""
+    """Open the recording that this project wrote to an MCAP file, or to a folder of parts; its issues list damaged and missing data."""
+    return open_written(path, partial(McapFiles, parts_at(path)), options)
+
+
+def parts_at(path: Path) -> tuple[Path, ...]:
+    """The MCAP files of the recording at `path`. RecordingError for a folder with several recordings."""
     files = sorted(path.glob("*.mcap"), key=lambda file: natural_key(file.name)) if path.is_dir() else [path]
     names = {re.sub(r"_\d+$", "", file.stem) for file in files}
     if len(names) > 1:
@@ -64,7 +69,7 @@ def open_mcap(path: Path, options: OpenOptions) -> Recording:
             f"{path} holds {len(files)} .mcap files of several recordings ({', '.join(sorted(names)[:5])}); choose one of them, or "
             "name the parts of one NAME_0.mcap, NAME_1.mcap"
         )
-    return open_messages(path, "mcap", partial(McapFiles, tuple(files)), options)
+    return tuple(files)
 
 
 class McapFiles(Container):

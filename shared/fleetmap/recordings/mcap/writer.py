@@ -14,7 +14,6 @@ from pathlib import Path
 from mcap.writer import CompressionType, Writer
 
 from fleetmap.errors import RecordingError, disk_errors
-from fleetmap.recordings.bags.container import CALIBRATION_ATTACHMENT
 from fleetmap.recordings.calibration_files import format_calibration
 from fleetmap.recordings.images import (
     INVERSE_DEPTH,
@@ -27,6 +26,7 @@ from fleetmap.recordings.images import (
     grey_image,
     store_frame,
 )
+from fleetmap.recordings.mcap.container import CALIBRATION_ATTACHMENT
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS
 from fleetmap.recordings.recording import Recording
 from fleetmap.recordings.ros2 import messages

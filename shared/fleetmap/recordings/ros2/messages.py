@@ -4,8 +4,10 @@ Decoding raises ValueError for invalid bytes; the reader counts them. Rotations 
 quaternions x y z w and covariances translation first, as in ROS; here they are wxyz and rotation first.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 
@@ -20,27 +22,6 @@ UNKNOWN_WHEEL_SIGMA_MPS, UNKNOWN_WHEEL_SIGMA_RADPS = 0.05, 0.05
 HALVES_SWAPPED = np.ix_([3, 4, 5, 0, 1, 2], [3, 4, 5, 0, 1, 2])  # of a covariance (6, 6): translation or rotation first
 _IMU_DOUBLES = 37
 _SLIGHTLY_OFF_UNIT, _MOST_OFF_UNIT = 1e-3, 0.1  # of a quaternion's length: rounded by hand; not a rotation
-
-
-@dataclass(frozen=True, slots=True)
-class CameraInfo:
-    """sensor_msgs/CameraInfo: sizes, lens and the projection of the rectified image.
-
-    matrix and projection are those of the full image, width_px x height_px. binning (2,): pixels that the driver combines; zeros
-    mean 1. roi (4,): x, y, width, height of the part that it sends, before binning; zeros mean all.
-    """
-
-    frame_id: str
-    width_px: int
-    height_px: int
-    lens: str
-    distortion: Array
-    matrix: Array
-    rect_from_cam: Array
-    projection: Array
-    binning: tuple[int, int] = (1, 1)
-    roi: tuple[int, int, int, int] = (0, 0, 0, 0)
-    stamp_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,20 +80,6 @@ def decode_compressed_image(data: bytes, where: str) -> StoredImage:
 def encode_compressed_image(stamp_ns: int, frame_id: str, image: StoredImage, form: str) -> bytes:
     """sensor_msgs/CompressedImage of an image file's bytes."""
     return CdrWriter().header(stamp_ns, frame_id).text(form).blob(image.data).message()
-
-
-def decode_camera_info(data: bytes) -> CameraInfo:
-    """sensor_msgs/CameraInfo."""
-    reader = CdrReader(data)
-    stamp_ns, frame_id = reader.stamp_ns(), reader.text()
-    height, width, lens = reader.unsigned(), reader.unsigned(), reader.text()
-    distortion = reader.doubles(reader.unsigned())
-    matrix, rect, projection = reader.doubles(9), reader.doubles(9), reader.doubles(12)
-    binning = reader.unsigned() or 1, reader.unsigned() or 1
-    x, y, roi_height, roi_width = (reader.unsigned() for _ in range(4))
-    matrices = matrix.reshape(3, 3), rect.reshape(3, 3), projection.reshape(3, 4)
-    roi = x, y, roi_width, roi_height
-    return CameraInfo(frame_id, width, height, lens, distortion, *matrices, binning, roi, stamp_ns)
 
 
 def encode_camera_info(stamp_ns: int, frame_id: str, camera: CameraCalibration) -> bytes:
@@ -258,3 +225,14 @@ def position_quat_xyzw(target_from_source: Array) -> Array:
     """x y z qx qy qz qw (7,), the numbers of a geometry_msgs/Pose."""
     quat_wxyz = quat_wxyz_from_rotation(target_from_source[:3, :3])
     return np.concatenate([target_from_source[:3, 3], quat_wxyz[1:], quat_wxyz[:1]])
+
+
+DECODERS: dict[str, Callable[[bytes], Any]] = {
+    "sensor_msgs/Image": partial(decode_image, where=""),
+    "sensor_msgs/CompressedImage": partial(decode_compressed_image, where=""),
+    "sensor_msgs/Imu": lambda data: decode_imu([data]),
+    "nav_msgs/Odometry": decode_odometry,
+    "geometry_msgs/PoseWithCovarianceStamped": decode_prior,
+    "geometry_msgs/PoseStamped": decode_pose,
+}
+"""From the bytes of a message to its value: StoredImage, as of `decode_imu`, WheelSample, PositionPrior, stamp and pose."""

@@ -6,25 +6,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from mcap.reader import make_reader
-from mcap.writer import CompressionType
 from mcap_ros2.decoder import DecoderFactory
 
-from fleetmap.errors import CalibrationError, RecordingError
+from fleetmap.errors import RecordingError
 from fleetmap.geometry import se3, se3_exp, so3_exp
-from fleetmap.recordings import OpenOptions, Recording, open_recording
-from fleetmap.recordings.images import StoredImage
+from fleetmap.recordings import open_recording
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
-from fleetmap.recordings.ros2 import messages as ros_messages
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.cameras import lens_of
-from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, PositionPrior, SensorSet, Trajectory, WheelSample
-from support.recordings.mcap_samples import IMU, SAMPLE, Message, foreign_messages, write_foreign
-from support.recordings.recording_samples import FOCAL, HEIGHT, WIDTH, calibration, kalibr_text
+from support.recordings.mcap_samples import IMU, SAMPLE
+from support.recordings.recording_samples import calibration
 
 WHEEL = WheelSample(int(SAMPLE.stamps_ns[1]), np.array([0.5, 0.01, 0.0]), 0.25, 0.02, 0.03)
 PRIOR = PositionPrior(
@@ -128,180 +122,6 @@ def test_the_ros_2_decoder_of_others_reads_every_message(tmp_path: Path) -> None
     assert {"/cam0/camera_info", "/odom", "/prior", "/ground_truth"} < set(seen)
 
 
-def assert_is_the_sample(recording: Recording) -> None:
-    np.testing.assert_array_equal(recording.frame_stamps_ns, SAMPLE.stamps_ns)
-    np.testing.assert_array_equal(recording.imu.gyro_radps, IMU.gyro_radps)
-    for index in (3, 0, 1):
-        frame = recording.read_frame(index)
-        np.testing.assert_array_equal(frame.left, SAMPLE.left[index])
-        np.testing.assert_array_equal(frame.right, SAMPLE.right[index])
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {"compression": CompressionType.ZSTD},
-        {"compression": CompressionType.LZ4},
-        {"use_chunking": False},
-        {"use_summary_offsets": False, "use_statistics": False, "repeat_channels": False, "repeat_schemas": False},
-        {"enable_crcs": False},
-    ],
-    ids=["zstd", "lz4", "unchunked", "no summary", "no checksums"],
-)
-def test_all_ways_to_store_it(tmp_path: Path, options: dict[str, Any]) -> None:
-    with open_recording(write_foreign(tmp_path / "a.mcap", foreign_messages(), **options)) as recording:
-        assert recording.issues == ()
-        assert_is_the_sample(recording)
-
-
-def test_calibration_by_camera_info_and_transforms(tmp_path: Path) -> None:
-    recording = open_recording(write_foreign(tmp_path / "a.mcap", foreign_messages()))
-    assert recording.calibration.imu is not None
-    for ours, wanted in zip(recording.calibration.cameras, calibration().cameras, strict=True):
-        np.testing.assert_allclose(ours.body_from_cam, wanted.body_from_cam, atol=1e-9)
-        np.testing.assert_array_equal(ours.intrinsics_px, wanted.intrinsics_px)
-    base_from_imu = se3_exp(np.array([0.1, 0.2, 0.3, 0.4, 0.5, 0.6]))
-    np.testing.assert_allclose(recording.calibration.base_from_body, base_from_imu, atol=1e-9)
-
-
-def test_no_transform_to_the_imu_nor_between_cameras(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"the pose of the right camera is unknown.*--calibration"):
-        open_recording(write_foreign(tmp_path / "a.mcap", foreign_messages(tf=False)))
-
-
-def test_topics_by_their_type_and_name(tmp_path: Path) -> None:
-    messages = foreign_messages(left="/camera/left/image_raw", right="/camera/right/image_raw", imu="/sensors/imu")
-    with open_recording(write_foreign(tmp_path / "a.mcap", messages)) as recording:
-        assert_is_the_sample(recording)
-
-
-def test_topics_noted_in_the_calibration_file(tmp_path: Path) -> None:
-    text = kalibr_text().replace("/cam0/image_raw", "/a/image").replace("/cam1/image_raw", "/b/image")
-    (tmp_path / "rig.yaml").write_text(text)
-    path = write_foreign(tmp_path / "a.mcap", foreign_messages(left="/a/image", right="/b/image", tf=False))
-    with open_recording(path, OpenOptions(calibration_file=tmp_path / "rig.yaml")) as recording:
-        assert_is_the_sample(recording)
-
-
-def camera_info(lens: str, distortion: list[float]) -> bytes:
-    """sensor_msgs/CameraInfo built by another CDR writer than ours."""
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_JAZZY)
-    types = store.types
-    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 7), "cam0_optical")
-    k = np.array([FOCAL, 0, WIDTH / 2, 0, FOCAL, HEIGHT / 2, 0, 0, 1.0])
-    p = np.array([FOCAL, 0, WIDTH / 2, 0, 0, FOCAL, HEIGHT / 2, 0, 0, 0, 1.0, 0])
-    roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-    message = types["sensor_msgs/msg/CameraInfo"](
-        header, HEIGHT, WIDTH, lens, np.array(distortion), k, np.eye(3).ravel(), p, 0, 0, roi
-    )
-    return bytes(store.serialize_cdr(message, "sensor_msgs/msg/CameraInfo"))
-
-
-def mono(tmp_path: Path, info: bytes) -> Recording:
-    messages = [m for m in foreign_messages() if m[0] == "/cam0/image_raw"]
-    return open_recording(
-        write_foreign(tmp_path / "a.mcap", [*messages, ("/cam0/camera_info", "sensor_msgs/CameraInfo", 1, info)])
-    )
-
-
-RATIONAL = [0.42, 0.03, 2e-4, -1e-4, 1e-3, 0.72, 0.14, 4e-3]
-
-
-@pytest.mark.parametrize(
-    ("lens", "distortion", "model", "kept"),
-    [
-        ("plumb_bob", [0.1, 0.2, 0.0, 0.0, 0.05], "radial-tangential", 5),
-        ("equidistant", [0.1, 0.2, 0.0, 0.01], "equidistant", 4),
-        ("double-sphere", [0.0, 0.0, 0.0, 0.0, -0.2, 0.6], "double-sphere", 6),
-        ("rational_polynomial", [*RATIONAL, *[0.0] * 6], "radial-tangential", 8),
-        ("inverse_brown_conrady", [0.0] * 5, "radial-tangential", 0),
-        ("", [], "radial-tangential", 0),
-    ],
-)
-def test_lenses(tmp_path: Path, lens: str, distortion: list[float], model: str, kept: int) -> None:
-    recording = mono(tmp_path, camera_info(lens, distortion))
-    camera = recording.calibration.cameras[0]
-    assert (recording.sensor_set, camera.model) == (SensorSet.MONO, model)
-    assert camera.distortion.tolist() == distortion[:kept]
-    Rectifier(recording.calibration).rectify(recording.read_frame(0))
-    if kept:  # as this project writes it
-        back = ros_messages.decode_camera_info(ros_messages.encode_camera_info(1, "cam0", camera))
-        assert lens_of(back.lens, back.distortion, "")[1].tolist() == distortion[:kept]
-
-
-@pytest.mark.parametrize(
-    ("lens", "distortion", "says"),
-    [
-        ("rational_polynomial", [*RATIONAL, *[0.0] * 5, 0.01], r"14 distortion coefficients.*tilted sensors"),
-        ("plumb_bob", [0.1], r"1 distortion coefficients \[0.1\] for plumb_bob"),
-        ("plumb_bob", [np.nan] * 5, "not finite"),
-        ("inverse_brown_conrady", [0.1] * 5, "'inverse_brown_conrady' is not supported"),
-        ("omnidirectional", [0.0] * 4, "'omnidirectional' is not supported"),
-    ],
-)
-def test_other_lenses_are_refused_by_name(tmp_path: Path, lens: str, distortion: list[float], says: str) -> None:
-    with pytest.raises(CalibrationError, match=says) as caught:
-        mono(tmp_path, camera_info(lens, distortion))
-    assert "calibrat" in str(caught.value)
-
-
-def test_images_of_every_encoding(tmp_path: Path) -> None:
-    grey = SAMPLE.left[0]
-    colour = cv2.merge([grey, grey // 2, 255 - grey])
-    wanted = cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY)
-    padded = np.zeros((HEIGHT, WIDTH + 12), np.uint8)
-    padded[:, :WIDTH] = grey
-    cases = [
-        (StoredImage("bgr8", colour.tobytes(), "", WIDTH, HEIGHT, 3 * WIDTH), wanted),
-        (StoredImage("rgb8", colour[..., ::-1].tobytes(), "", WIDTH, HEIGHT, 3 * WIDTH), wanted),
-        (StoredImage("mono16", (grey.astype("<u2") * 256).tobytes(), "", WIDTH, HEIGHT, 2 * WIDTH), grey),
-        (
-            StoredImage(
-                "mono16", (grey.astype(np.uint16) * 256).astype(">u2").tobytes(), "", WIDTH, HEIGHT, 2 * WIDTH, True
-            ),
-            grey,
-        ),
-        (StoredImage("mono8", padded.tobytes(), "", WIDTH, HEIGHT, WIDTH + 12), grey),
-    ]
-    messages: list[Message] = [("/cam0/camera_info", "sensor_msgs/CameraInfo", 1, camera_info("", []))]
-    for stamp, (image, _) in enumerate(cases, start=1):
-        messages.append(("/cam0/image_raw", "sensor_msgs/Image", stamp, ros_messages.encode_image(stamp, "c", image)))
-    recording = open_recording(write_foreign(tmp_path / "a.mcap", messages))
-    for index, (_, expected) in enumerate(cases):
-        np.testing.assert_array_equal(recording.read_frame(index).left, expected)
-
-
-@pytest.mark.parametrize("encoding", ["16UC1", "32FC1", "png"])
-def test_depth_beside_colour(tmp_path: Path, encoding: str) -> None:
-    depth_mm = np.full((HEIGHT, WIDTH), 2500, np.uint16)
-    depth_mm[:5], depth_mm[5:9] = 0, 65535
-    if encoding == "png":
-        name, data = "sensor_msgs/CompressedImage", cv2.imencode(".png", depth_mm)[1].tobytes()
-        message = ros_messages.encode_compressed_image(10, "c", StoredImage("file", data), "16UC1; png compressed")
-    else:
-        pixels = depth_mm if encoding == "16UC1" else np.where(depth_mm == 2500, np.float32(2.5), np.float32(np.nan))
-        rows = StoredImage(encoding, pixels.tobytes(), "", WIDTH, HEIGHT, pixels.strides[0])
-        name, message = "sensor_msgs/Image", ros_messages.encode_image(10, "c", rows)
-    left = StoredImage("mono8", SAMPLE.left[0].tobytes(), "", WIDTH, HEIGHT, WIDTH)
-    topic = "/depth/image_raw" + ("/compressed" if encoding == "png" else "")
-    recording = open_recording(
-        write_foreign(
-            tmp_path / "a.mcap",
-            [
-                ("/cam0/image_raw", "sensor_msgs/Image", 5, ros_messages.encode_image(5, "c", left)),
-                (topic, name, 10, message),
-                ("/cam0/camera_info", "sensor_msgs/CameraInfo", 1, camera_info("", [])),
-            ],
-        )
-    )
-    assert recording.sensor_set is SensorSet.RGBD
-    depth = recording.read_frame(0).depth_m
-    assert depth is not None
-    np.testing.assert_array_equal(depth, np.where(depth_mm == 2500, np.float32(2.5), np.float32(0)))
-
-
 def test_base_and_time_shift_travel(tmp_path: Path) -> None:
     rig = calibration()
     rig = RigCalibration(
@@ -310,15 +130,3 @@ def test_base_and_time_shift_travel(tmp_path: Path) -> None:
     recording = open_recording(write(tmp_path / "a.mcap", calibration=rig))
     np.testing.assert_array_equal(recording.calibration.base_from_body, rig.base_from_body)
     assert [c.imu_minus_cam_s for c in recording.calibration.cameras] == [0.0123, 0.0123]
-
-
-def test_a_rosbag2_folder(tmp_path: Path) -> None:
-    bag = tmp_path / "bag"
-    bag.mkdir()
-    (bag / "metadata.yaml").write_text("rosbag2_bagfile_information: {}\n")
-    write_foreign(bag / "bag_0.mcap", foreign_messages())
-    with open_recording(bag) as recording:
-        assert_is_the_sample(recording)
-    write_foreign(bag / "other_1.mcap", foreign_messages())
-    with pytest.raises(RecordingError, match=r"holds 2 \.mcap files of several recordings \(bag, other\)"):
-        open_recording(bag)

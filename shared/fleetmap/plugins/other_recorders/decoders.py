@@ -7,57 +7,74 @@ m/s^2, of one of IMU_TYPES. Wheel odometry and priors have no convention in prot
 
 import struct
 from collections.abc import Callable, Sequence
-from functools import cache, lru_cache, partial
+from dataclasses import dataclass
+from functools import cache, lru_cache
 from typing import Any
 
 import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array
-from fleetmap.recordings.bags.container import Channel
 from fleetmap.recordings.images import StoredImage
+from fleetmap.recordings.mcap.container import Channel, Container
 from fleetmap.recordings.ros2 import messages as ros
 from fleetmap.recordings.ros2.cdr import CdrReader
 from fleetmap.sensors.samples import Stamps
 
 ENCODINGS = ("cdr", "ros1", "protobuf")
 IMU_TYPES = ("sensor_msgs/Imu", "foxglove.Imu", "foxglove.IMU", "fleetmap.Imu")
-UNDECODABLE = (ValueError, AttributeError)  # the second: a field that a schema in the file lacks
 
 
-def decode(channel: Channel, data: bytes) -> Any:
-    """The value of a message, by its type: StoredImage, CameraInfo, WheelSample, PositionPrior, stamp and pose, or FrameLinks.
+@dataclass(frozen=True, slots=True)
+class CameraInfo:
+    """sensor_msgs/CameraInfo: sizes, lens and the projection of the rectified image.
 
-    As `decode_imu` of one message for an Imu. UNDECODABLE for invalid messages; RecordingError if a library is missing.
+    matrix and projection are those of the full image, width_px x height_px. binning (2,): pixels that the driver combines; zeros
+    mean 1. roi (4,): x, y, width, height of the part that it sends, before binning; zeros mean all.
     """
-    if channel.type_name in IMU_TYPES:
-        return decode_imu(channel, [data])
-    values, message_of = (_FOXGLOVE, _parsed) if channel.encoding == "protobuf" else (_ROS, _cdr)
-    if channel.type_name not in values:
-        raise ValueError(f"{channel.type_name} is not known in {channel.encoding}")
-    return values[channel.type_name](message_of(channel, data))
+
+    frame_id: str
+    width_px: int
+    height_px: int
+    lens: str
+    distortion: Array
+    matrix: Array
+    rect_from_cam: Array
+    projection: Array
+    binning: tuple[int, int] = (1, 1)
+    roi: tuple[int, int, int, int] = (0, 0, 0, 0)
+    stamp_ns: int = 0
 
 
-def decode_imu(channel: Channel, messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
-    """Stamps (N,), gyro (N, 3), accelerometer (N, 3), frame of the sensor. Errors as of `decode`, for any of the messages."""
-    if channel.encoding != "protobuf":
-        return ros.decode_imu([_cdr(channel, data) for data in messages])
-    found = [_parsed(channel, data) for data in messages]
-    gyro, accel = ([_xyz(getattr(m, name)) for m in found] for name in ("angular_velocity", "linear_acceleration"))
-    stamps_ns = np.array([_stamp_ns(message) for message in found], np.int64)
-    return stamps_ns, np.array(gyro), np.array(accel), str(getattr(found[0], "frame_id", ""))
+class AnyEncoding(Container):
+    """Base of containers whose messages may be in CDR, in ROS 1's format and in protobuf."""
 
+    def decode(self, channel: Channel, data: bytes) -> Any:
+        """See Container; CameraInfo, FrameLinks too."""
+        if channel.type_name in IMU_TYPES:
+            return self.decode_imu(channel, [data])
+        values, message_of = (_FOXGLOVE, _parsed) if channel.encoding == "protobuf" else (_ROS, _cdr)
+        if channel.type_name not in values:
+            raise ValueError(f"{channel.type_name} is not known in {channel.encoding}")
+        return values[channel.type_name](message_of(channel, data))
 
-def stamp_of(channel: Channel, data: bytes) -> int:
-    """Stamp of a message with a header, 0 where the sender set none; UNDECODABLE without one."""
-    if channel.encoding == "protobuf":
-        return _stamp_ns(_parsed(channel, data))
-    if channel.encoding == "cdr":
-        return CdrReader(data[:16]).stamp_ns()
-    if len(data) < 12:
-        raise ValueError(f"a message of {len(data)} bytes has no header")
-    seconds, nanoseconds = struct.unpack_from("<II", data, 4)  # behind its sequence number
-    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+    def decode_imu(self, channel: Channel, messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
+        if channel.encoding != "protobuf":
+            return ros.decode_imu([_cdr(channel, data) for data in messages])
+        found = [_parsed(channel, data) for data in messages]
+        gyro, accel = ([_xyz(getattr(m, name)) for m in found] for name in ("angular_velocity", "linear_acceleration"))
+        stamps_ns = np.array([_stamp_ns(message) for message in found], np.int64)
+        return stamps_ns, np.array(gyro), np.array(accel), str(getattr(found[0], "frame_id", ""))
+
+    def stamp_of(self, channel: Channel, data: bytes) -> int:
+        if channel.encoding == "protobuf":
+            return _stamp_ns(_parsed(channel, data))
+        if channel.encoding == "cdr":
+            return super().stamp_of(channel, data)
+        if len(data) < 12:
+            raise ValueError(f"a message of {len(data)} bytes has no header")
+        seconds, nanoseconds = struct.unpack_from("<II", data, 4)  # behind its sequence number
+        return int(seconds) * 1_000_000_000 + int(nanoseconds)
 
 
 def _cdr(channel: Channel, data: bytes) -> bytes:
@@ -126,14 +143,28 @@ def _stamp_ns(message: Any) -> int:
     return stamp
 
 
-def _camera_info(m: Any) -> ros.CameraInfo:
+def _camera_info(m: Any) -> CameraInfo:
     if len(m.K) != 9:
         raise ValueError(f"CameraCalibration with {len(m.K)} numbers in K")
     matrix = np.array(m.K).reshape(3, 3)
     rect = np.array(m.R).reshape(3, 3) if len(m.R) == 9 else np.eye(3)
     projection = np.array(m.P).reshape(3, 4) if len(m.P) == 12 else np.pad(matrix, ((0, 0), (0, 1)))
     lens = m.distortion_model, np.array(m.D)
-    return ros.CameraInfo(m.frame_id, m.width, m.height, *lens, matrix, rect, projection, stamp_ns=_stamp_ns(m))
+    return CameraInfo(m.frame_id, m.width, m.height, *lens, matrix, rect, projection, stamp_ns=_stamp_ns(m))
+
+
+def decode_camera_info(data: bytes) -> CameraInfo:
+    """sensor_msgs/CameraInfo."""
+    reader = CdrReader(data)
+    stamp_ns, frame_id = reader.stamp_ns(), reader.text()
+    height, width, lens = reader.unsigned(), reader.unsigned(), reader.text()
+    distortion = reader.doubles(reader.unsigned())
+    matrix, rect, projection = reader.doubles(9), reader.doubles(9), reader.doubles(12)
+    binning = reader.unsigned() or 1, reader.unsigned() or 1
+    x, y, roi_height, roi_width = (reader.unsigned() for _ in range(4))
+    matrices = matrix.reshape(3, 3), rect.reshape(3, 3), projection.reshape(3, 4)
+    roi = x, y, roi_width, roi_height
+    return CameraInfo(frame_id, width, height, lens, distortion, *matrices, binning, roi, stamp_ns)
 
 
 def _links(items: Sequence[Any]) -> list[ros.FrameLink]:
@@ -151,13 +182,8 @@ def _wxyz(quaternion: Any) -> tuple[float, float, float, float]:
     return quaternion.w, quaternion.x, quaternion.y, quaternion.z
 
 
-_ROS: dict[str, Callable[[Any], Any]] = {
-    "sensor_msgs/Image": partial(ros.decode_image, where=""),
-    "sensor_msgs/CompressedImage": partial(ros.decode_compressed_image, where=""),
-    "sensor_msgs/CameraInfo": ros.decode_camera_info,
-    "nav_msgs/Odometry": ros.decode_odometry,
-    "geometry_msgs/PoseWithCovarianceStamped": ros.decode_prior,
-    "geometry_msgs/PoseStamped": ros.decode_pose,
+_ROS: dict[str, Callable[[Any], Any]] = ros.DECODERS | {
+    "sensor_msgs/CameraInfo": decode_camera_info,
     "tf2_msgs/TFMessage": ros.decode_frame_links,
 }
 _FOXGLOVE: dict[str, Callable[[Any], Any]] = {

@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings.bags.container import Channel, Container, Message, Place
-from fleetmap.recordings.bags.decoders import ros1_digest
-from fleetmap.recordings.bags.streams import open_messages
-from fleetmap.recordings.bags.topics import KNOWN_TYPES, note_videos
+from fleetmap.plugins.other_recorders.decoders import AnyEncoding, ros1_digest
+from fleetmap.plugins.other_recorders.streams import open_messages
+from fleetmap.plugins.other_recorders.topics import KNOWN_TYPES, note_videos
+from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.files import file_head
 from fleetmap.recordings.limits import MAX_MESSAGE_BYTES
-from fleetmap.recordings.recording import OpenOptions, Recording
+from fleetmap.recordings.mcap.container import Channel, Message, Place
 
 _MAGIC = b"#ROSBAG V"
 _ADVICE = {"not indexed": "rosbag reindex", "encryption": "rosbag decrypt", "Compression": "rosbag decompress"}
@@ -36,7 +36,7 @@ def open_bag(path: Path, options: OpenOptions) -> Recording:
     return open_messages(path, "rosbag1", partial(BagFile, path), options)
 
 
-class BagFile(Container):
+class BagFile(AnyEncoding):
     """An open bag as a Container. A place: connection, log time in ns, index among its messages at that time."""
 
     def __init__(self, path: Path) -> None:
@@ -158,3 +158,8 @@ def _reason(error: BaseException, path: Path) -> str:
         if sign in words:
             return f"{words}; `{advice} {path}` makes one that can be read"
     return f"{words}; it is damaged: `rosbag reindex {path}` saves what is whole"
+
+
+FORMAT = RecordingFormat(
+    "a ROS 1 .bag file", recognises, open_bag, (".bag",), 2, {(".bag.active",): "`rosbag reindex {path}` finishes it"}
+)

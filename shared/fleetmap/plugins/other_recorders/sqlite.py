@@ -11,11 +11,12 @@ from functools import partial
 from pathlib import Path
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings.bags.container import Channel, Container, Message, Place
-from fleetmap.recordings.bags.streams import open_messages
+from fleetmap.plugins.other_recorders.decoders import AnyEncoding
+from fleetmap.plugins.other_recorders.streams import open_messages
+from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.files import file_head, natural_key, what_file_instead
 from fleetmap.recordings.limits import MAX_MESSAGE_BYTES, unpack_message
-from fleetmap.recordings.recording import OpenOptions, Recording
+from fleetmap.recordings.mcap.container import Channel, Message, Place
 
 _MAGIC = b"SQLite format 3\0"
 _PACKED = ".db3.zstd"
@@ -41,7 +42,7 @@ def open_sqlite(path: Path, options: OpenOptions) -> Recording:
     return open_messages(path, "rosbag2-sqlite", partial(SqliteFiles, tuple(files)), options)
 
 
-class SqliteFiles(Container):
+class SqliteFiles(AnyEncoding):
     """Open .db3 files of one recording, in the order of their names, as a Container. A place: number of the file, row, 0."""
 
     def __init__(self, files: Sequence[Path]) -> None:
@@ -138,3 +139,6 @@ def _opened(file: Path) -> sqlite3.Connection:
 
 def _recovery(file: Path) -> str:
     return f"save what is whole with `sqlite3 {file} .recover | sqlite3 saved.db3`"
+
+
+FORMAT = RecordingFormat("a rosbag2 .db3 file, or its folder", recognises, open_sqlite, (".db3",), 1)

@@ -202,7 +202,7 @@ def test_rosbag2s_own_bags_are_opened_and_say_what_they_hold(storage: str, name:
 def test_rosbag2s_own_bags_give_the_same_messages_as_by_rosbags(name: str) -> None:
     from rosbags.rosbag2 import Reader
 
-    from fleetmap.recordings.bags.sqlite import SqliteFiles
+    from fleetmap.plugins.other_recorders.sqlite import SqliteFiles
 
     bag = real_data("conformance/rosbag2") / "rosbag2_tests/resources/sqlite3" / name
     ours = SqliteFiles(sorted(bag.glob("*.db3")))

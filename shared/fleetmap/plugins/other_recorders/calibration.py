@@ -1,4 +1,4 @@
-"""Calibration from an MCAP file's CameraInfo messages and static transforms, if it has no calibration attachment."""
+"""Calibration from CameraInfo messages and static transforms, for files without a calibration attachment."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -8,7 +8,8 @@ import numpy as np
 
 from fleetmap.errors import CalibrationError
 from fleetmap.geometry import Array, se3, se3_inverse, so3_log
-from fleetmap.recordings.ros2.messages import CameraInfo, FrameLink
+from fleetmap.plugins.other_recorders.decoders import CameraInfo
+from fleetmap.recordings.ros2.messages import FrameLink
 from fleetmap.sensors.calibration import (
     LEAST_BASELINE_M,
     SAME_WAY_COSINE,

@@ -3,17 +3,16 @@
 from collections.abc import Iterable
 
 from fleetmap.errors import RecordingError
-from fleetmap.recordings.bags.container import Channel, Container
-from fleetmap.recordings.bags.decoders import IMU_TYPES
+from fleetmap.plugins.other_recorders.decoders import IMU_TYPES
+from fleetmap.recordings.mcap.container import Channel, Container
 from fleetmap.recordings.ordering import ReadLog
-from fleetmap.sensors.source_settings import CAMERA_ROLES, DEPTH_ROLES, Topics
+from fleetmap.sensors.source_settings import CAMERA_ROLES, IMAGE_ROLES, PACKED, Topics, transports
 
 INFO_TYPES = ("sensor_msgs/CameraInfo", "foxglove.CameraCalibration")
 IMAGE_TYPES = ("sensor_msgs/Image", "sensor_msgs/CompressedImage", "foxglove.RawImage", "foxglove.CompressedImage")
 TF_TYPES = ("tf2_msgs/TFMessage", "foxglove.FrameTransform", "foxglove.FrameTransforms")
-_IMAGE_ROLES = (*CAMERA_ROLES, *DEPTH_ROLES)
 _TYPES = {
-    **dict.fromkeys(_IMAGE_ROLES, IMAGE_TYPES),
+    **dict.fromkeys(IMAGE_ROLES, IMAGE_TYPES),
     "left_info": INFO_TYPES,
     "right_info": INFO_TYPES,
     "imu": IMU_TYPES,
@@ -30,16 +29,8 @@ _VIDEO_TYPES = (
 )
 KNOWN_TYPES = frozenset(name for names in _TYPES.values() for name in names)
 _ALONE = ("imu", "wheel", "prior", "ground_truth")
-_PACKED = ("/compressed", "/compressedDepth")
 _IMAGE_NAMES = ("image_raw", "image", "image_color", "image_mono", "image_rect", "image_rect_color", "image_rect_raw")
 _HINTS = {"depth": ("depth",), "left": ("left", "cam0", "infra1"), "right": ("right", "cam1", "infra2"), "other": ("",)}
-
-
-def transports(topic: str, role: str) -> tuple[str, ...]:
-    """Topics on which ROS's image_transport may send the images of `topic`; only `topic` for other roles."""
-    if role not in _IMAGE_ROLES or not topic:
-        return (topic,)
-    return (topic, *(topic + packed for packed in _PACKED[: 2 if role in DEPTH_ROLES else 1]))
 
 
 def note_videos(channels: Iterable[Channel], log: ReadLog | Container) -> None:
@@ -85,7 +76,7 @@ def choose_topics(channels: Iterable[Channel], wanted: Topics, where: str, log: 
         raise RecordingError(
             f"{where}: no topic is clearly the left image; name it with --topic left=/NAME. There is {there}{issues}"
         )
-    used = [chosen[role] for role in _IMAGE_ROLES if role in chosen]
+    used = [chosen[role] for role in IMAGE_ROLES if role in chosen]
     if unused := [topic for topic in images if topic not in used]:
         detail = f"{', '.join(unused)}; {', '.join(used)} {'are' if len(used) > 1 else 'is'} used"
         log.note("images not used", f"{detail}. Choose with --topic left=/NAME, right=/NAME or depth=/NAME")
@@ -123,11 +114,11 @@ def _of_one_camera(topics: list[str]) -> str | None:
     """The topic to read of one camera's topics: raw before compressed, original before rectified; None for several cameras or none."""
     if len({_camera(topic) for topic in topics}) != 1:
         return None
-    return min(topics, key=lambda topic: (topic.endswith(_PACKED), "rect" in topic, topic))
+    return min(topics, key=lambda topic: (topic.endswith(PACKED), "rect" in topic, topic))
 
 
 def _unpacked(topic: str) -> str:
-    for suffix in _PACKED:
+    for suffix in PACKED:
         topic = topic.removesuffix(suffix)
     return topic
 

@@ -14,8 +14,8 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Reader, Writer
 
 from fleetmap.errors import RecordingError
+from fleetmap.plugins.other_recorders import ros1
 from fleetmap.recordings import open_recording
-from fleetmap.recordings.bags import ros1
 from support.recordings.bag_samples import assert_same, write_rosbag1
 from support.recordings.mcap_samples import SAMPLE, foreign_messages, write_foreign
 from support.storage.memory_limit import memory_at_most

@@ -1,13 +1,18 @@
-"""Files of messages: the common interface of MCAP, rosbag2's SQLite and ROS 1 bags for `streams`."""
+"""Files of messages: the common interface of MCAP and of bags for `streams`."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from fleetmap.geometry import Array
 from fleetmap.recordings.limits import KeptBytes
-from fleetmap.sensors.samples import DataIssue
+from fleetmap.recordings.ros2 import messages as ros
+from fleetmap.recordings.ros2.cdr import CdrReader
+from fleetmap.sensors.samples import DataIssue, Stamps
 
 CALIBRATION_ATTACHMENT = "calibration.yaml"
+UNDECODABLE = (ValueError, AttributeError)  # the second: a field that a schema in the file lacks
 Place = tuple[int, ...]  # position of a message in its file, as numbered by its container
 
 
@@ -44,6 +49,18 @@ class Container(KeptBytes):
     def read(self, place: Place) -> bytes:
         """Read one message again; ValueError if it is damaged, RecordingError if the file has changed."""
         raise NotImplementedError
+
+    def decode(self, channel: Channel, data: bytes) -> Any:
+        """The value of a message by its type, as `DECODERS`; UNDECODABLE for invalid ones, RecordingError if a library is missing."""
+        return ros.DECODERS[channel.type_name](data)
+
+    def decode_imu(self, channel: Channel, messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
+        """Stamps (N,), gyro (N, 3), accelerometer (N, 3), frame of the sensor. Errors as of `decode`, for any of the messages."""
+        return ros.decode_imu(messages)
+
+    def stamp_of(self, channel: Channel, data: bytes) -> int:
+        """Stamp of a message with a header, 0 where the sender set none; UNDECODABLE without one."""
+        return CdrReader(data[:16]).stamp_ns()
 
     def close(self) -> None:
         """Close the files."""

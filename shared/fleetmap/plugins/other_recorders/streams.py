@@ -1,0 +1,282 @@
+"""A recording from the messages of any recorder: chooses topics, and computes the calibration from CameraInfo and transforms."""
+
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import CalibrationError, RecordingError
+from fleetmap.plugins.other_recorders.calibration import (
+    InfoCamera,
+    calibration_of_messages,
+    camera_poses,
+    frames_not_optical,
+    info_of_images,
+    last_links,
+    same_lens,
+    setting_of,
+)
+from fleetmap.plugins.other_recorders.decoders import ENCODINGS, CameraInfo
+from fleetmap.plugins.other_recorders.topics import (
+    IMAGE_TYPES,
+    INFO_TYPES,
+    KNOWN_TYPES,
+    TF_TYPES,
+    choose_topics,
+    info_topics,
+    note_videos,
+)
+from fleetmap.recordings.calibration_files import CalibrationFile
+from fleetmap.recordings.finalize import RecordingParts
+from fleetmap.recordings.mcap.container import UNDECODABLE, Channel, Container, Place
+from fleetmap.recordings.mcap.streams import (
+    ImageStream,
+    Roles,
+    Stream,
+    assemble,
+    attached_calibration,
+    collect,
+    open_container,
+)
+from fleetmap.recordings.ordering import ReadLog
+from fleetmap.recordings.recording import OpenOptions, Recording
+from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
+from fleetmap.sensors.source_settings import CAMERA_ROLES, Topics, transports
+
+_SAME_LENS = 0.02  # of the focal length
+_MOST_LENSES = 20  # of one camera in a recording
+_HEADER_BYTES = (
+    12  # CDR's head and a stamp, or ROS 1's sequence number and stamp: the difference between messages of equal content
+)
+_RECTIFIED = re.compile(r"(?<![a-z])(rect(?![a-z])|rectified)")  # image_rect, rect/image; not direct, image_unrect
+
+
+@dataclass(eq=False)
+class _InfoStream(Stream):
+    """CameraInfo messages that differ from the previous one; lenses repeat with every image.
+
+    Before the first valid lens only the latest is kept: uncalibrated drivers send zeros, others do so at their start.
+    """
+
+    lens: CameraInfo | None = None
+
+    def take(self, data: bytes, place: Place, logged_ns: int, log: ReadLog) -> None:
+        if self.lens is not None and data[_HEADER_BYTES:] == self.messages[-1][_HEADER_BYTES:]:
+            return
+        try:
+            info: CameraInfo = self.container.decode(self.channel, data)
+            lens = info if info.matrix[0, 0] > 0 else None
+        except UNDECODABLE:
+            lens = None
+        if self.lens is None:
+            self.messages, self.log_times_ns = [], []
+        elif lens is None or same_lens(lens, self.lens):
+            return
+        self.lens = lens
+        super().take(data, place, logged_ns, log)
+
+
+@dataclass(frozen=True)
+class _Lenses:
+    """The distinct lenses of the CameraInfo messages, and the lens number of each image (N,)."""
+
+    infos: list[CameraInfo]
+    numbers: NDArray[np.int64]
+
+    @property
+    def usual(self) -> int:
+        """Number of the lens of most images."""
+        return int(np.bincount(self.numbers, minlength=1).argmax())
+
+
+def open_messages(path: Path, file_format: str, opener: Callable[[], Container], options: OpenOptions) -> Recording:
+    """Open the recording at `path` through the container that `opener` opens; its issues list unreadable messages.
+
+    opener: must be picklable, because other processes may read part of the frames.
+    """
+    return open_container(path, file_format, opener, options, partial(_parts, opener, options))
+
+
+def _parts(
+    opener: Callable[[], Container],
+    options: OpenOptions,
+    container: Container,
+    given: CalibrationFile | None,
+    log: ReadLog,
+) -> RecordingParts:
+    streams, others = collect(container, partial(_stream_of, container, options.topics), log)
+    note_videos(others, log)
+    channels = [stream.channel for stream in streams if stream.messages or isinstance(stream, ImageStream)]
+    if not channels:
+        there = ", ".join(f"{c.topic} ({c.type_name} in {c.encoding or 'no encoding'})" for c in others[:8])
+        known = f"; known encodings are {', '.join(ENCODINGS)}" if others else ""
+        why = f"{log.told() or there or 'it is empty'}{known}"
+        raise RecordingError(f"{container.path} holds no message that can be read ({why})")
+    topics = _with_hints(options.topics, given, {channel.topic for channel in channels})
+    chosen = choose_topics(channels, topics, str(container.path), log)
+    by_id = {stream.channel.id: stream for stream in streams}
+    roles = {role: [by_id[channel.id] for channel in chosen[role]] for role in chosen}
+    calibration = given.calibration if given else attached_calibration(container)
+    lenses = _lenses_of(roles, log) if calibration is None else {}
+    usable = {role: _usable(f"{role} images", told, log) for role, told in lenses.items()}
+
+    def calibrate(imu_frame: str | None) -> tuple[RigCalibration, Sequence[str]]:
+        found = calibration
+        described: Sequence[str] = CAMERA_ROLES
+        if found is None:
+            found, described = _calibration(container, roles, lenses, imu_frame, log)
+        if "depth" in roles and "right" not in roles:
+            _note_unregistered(streams, roles, found.cameras[0], log)
+        return found, described
+
+    return assemble(container, opener, streams, roles, calibrate, log, usable)
+
+
+def _stream_of(container: Container, topics: Topics, channel: Channel) -> Stream | None:
+    """An empty stream for a channel that may be needed."""
+    is_known = channel.encoding in ENCODINGS and channel.type_name in KNOWN_TYPES
+    if not is_known or (channel.type_name in TF_TYPES and channel.topic != topics.tf_static):
+        return None
+    kind = (
+        _InfoStream if channel.type_name in INFO_TYPES else ImageStream if channel.type_name in IMAGE_TYPES else Stream
+    )
+    return kind(container, channel)
+
+
+def _with_hints(topics: Topics, given: CalibrationFile | None, present: set[str]) -> Topics:
+    """The wanted topics, completed by those noted in a Kalibr file if they exist and the caller chose no other."""
+    changes = {}
+    for role, key in (*((role, f"cam{number}") for number, role in enumerate(CAMERA_ROLES)), ("imu", "imu0")):
+        hint = given.topics.get(key, "") if given else ""
+        bases = [hint, hint.removesuffix("/compressed"), f"{hint}/image_raw"] if hint else []
+        named = next((base for base in bases if present.intersection(transports(base, role))), None)
+        if named and getattr(topics, role) == getattr(Topics(), role):
+            changes[role] = named
+    return msgspec.structs.replace(topics, **changes)
+
+
+def _lenses_of(roles: Roles, log: ReadLog) -> dict[str, _Lenses]:
+    """The lenses of the cameras that can be used, by their roles."""
+    lenses = {}
+    for side in CAMERA_ROLES[:2] if "depth" in roles else CAMERA_ROLES:
+        if side in roles:
+            told, topic = _lenses(roles[side], roles.get(f"{side}_info", ())), roles[side][0].channel.topic
+            if side in CAMERA_ROLES[:2] or (told.infos and len(told.numbers)):
+                lenses[side] = told
+            elif told.infos:
+                log.note("camera without an image", f"{side}: none of the images on {topic} can be read")
+            else:
+                log.note("camera without a lens", f"{side}: no CameraInfo beside {topic}; its images are not used")
+    return lenses
+
+
+def _usable(what: str, lenses: _Lenses, log: ReadLog) -> NDArray[np.bool_]:
+    """(N,) images taken with the usual lens; others are noted."""
+    of_usual = np.asarray(lenses.numbers == lenses.usual)
+    if not of_usual.all():
+        setting, other = (setting_of(lenses.infos[n]) for n in (lenses.usual, int(lenses.numbers[~of_usual][0])))
+        log.note(
+            f"{what}: the CameraInfo changes",
+            f"{int((~of_usual).sum())} of {len(of_usual)} left out, which have {other}; "
+            f"{setting} is used: keep zoom, focus, binning and roi as they are while you record",
+        )
+    return of_usual
+
+
+def _lenses(images: Sequence[ImageStream], streams: Sequence[Stream]) -> _Lenses:
+    """CalibrationError if the number of lenses keeps growing, as with autofocus."""
+    told: list[tuple[int, CameraInfo]] = [
+        (info.stamp_ns or log_time_ns, info)
+        for stream in streams
+        for log_time_ns, info in stream.values
+        if info.matrix[0, 0] > 0
+    ]
+    told.sort(key=lambda each: each[0])
+    infos: list[CameraInfo] = []
+    numbers: list[int] = []
+    for _, info in told:
+        number = next((n for n, lens in enumerate(infos) if same_lens(lens, info)), len(infos))
+        numbers.append(number)
+        if number == len(infos):
+            infos.append(info)
+        if len(infos) > _MOST_LENSES:
+            raise CalibrationError(
+                f"{streams[0].channel.topic} describes more than {_MOST_LENSES} lenses, from {setting_of(infos[0])} to "
+                f"{setting_of(info)}; a map needs one: switch off zoom and autofocus, or pass a calibration with --calibration FILE"
+            )
+    stamps_ns = [stamp_ns for stream in images for stamp_ns in stream.stamps_ns]
+    if not numbers:
+        return _Lenses(infos, np.zeros(len(stamps_ns), np.int64))
+    rows = np.searchsorted([stamp_ns for stamp_ns, _ in told], stamps_ns, side="right") - 1
+    return _Lenses(infos, np.array(numbers)[np.maximum(rows, 0)])
+
+
+def _note_unregistered(streams: Iterable[Stream], roles: Roles, camera: CameraCalibration, log: ReadLog) -> None:
+    """Note a depth topic whose CameraInfo differs from the left camera's: its pixels do not correspond."""
+    left, depth = (roles[role][0].channel.topic for role in ("left", "depth"))
+    fx, _, cx, cy = camera.intrinsics_px
+    beside = [stream for stream in streams if stream.channel.topic in info_topics(depth)]
+    infos = [info for stream in beside for _, info in stream.values]
+    if not infos or not infos[0].matrix.any():
+        return
+    own = np.array([infos[0].matrix[0, 0], infos[0].matrix[0, 2], infos[0].matrix[1, 2]])
+    if np.abs(own - [fx, cx, cy]).max() > _SAME_LENS * fx:
+        log.note(
+            "depth not registered",
+            f"{depth} has a lens of its own (fx cx cy {np.round(own, 1).tolist()}), not that of {left} ({fx:.1f}, {cx:.1f}, "
+            f"{cy:.1f}): record depth that is aligned to {left}, or name it with --topic depth=/NAME",
+        )
+
+
+def _calibration(
+    container: Container, roles: Roles, lenses: Mapping[str, _Lenses], imu_frame: str | None, log: ReadLog
+) -> tuple[RigCalibration, tuple[str, ...]]:
+    """The calibration by the messages in the container, and the roles of its cameras."""
+    cameras, sides = [], tuple(lenses)
+    for side, told in lenses.items():
+        image_topic = roles[side][0].channel.topic
+        if not told.infos:
+            has_messages = any(len(stream.messages) > stream.damaged for stream in roles.get(f"{side}_info", ()))
+            fault = (
+                f"every CameraInfo beside {image_topic} holds zeros, as drivers without a calibration send it; calibrate the camera, or"
+                if has_messages
+                else f"no CameraInfo beside {image_topic} describes its lens;"
+            )
+            raise CalibrationError(f"{container.path}: {fault} pass a calibration with --calibration FILE")
+        sizes_px = [size for stream in roles[side] for size in stream.sizes_px]
+        of_usual = [size for size, n in zip(sizes_px, told.numbers, strict=True) if n == told.usual]
+        size_px = Counter(of_usual).most_common(1)[0][0]
+        info = info_of_images(told.infos[told.usual], size_px, f"{container.path}: {image_topic}")
+        if info.binning != (1, 1) or info.roi[:2] != (0, 0):
+            setting = f"{setting_of(info)}, of images of just that size; the calibration is used as it is"
+            log.note("binning or roi not used", f"the CameraInfo beside {image_topic} says {setting}")
+        cameras.append(InfoCamera(info, bool(_RECTIFIED.search(image_topic.lower()))))
+    said = [value for stream in roles.get("tf_static", ()) for value in stream.values]
+    said.sort(key=lambda value: value[0])
+    links, changes = last_links([link for _, found in said for link in found])
+    for words in changes:
+        log.note("transform said twice", f"{words}; the last one is used, as tf2 does")
+    for issue in dict.fromkeys(link.issue for link in links if link.issue):
+        log.note("transform not sound", issue)
+    cam0_from_cams = camera_poses(cameras, links, str(container.path))
+    for camera, side, cam0_from_cam in zip(cameras, sides, cam0_from_cams, strict=True):
+        if cam0_from_cam is None:
+            what = f"no transform connects {camera.frame} to {cameras[0].frame}"
+            log.note("camera not mounted", f"{side}: {what}; its images are not used")
+    for words in frames_not_optical(cameras, links):
+        log.note("camera frame not optical", words)
+    mounted = tuple(
+        side for side, cam0_from_cam in zip(sides, cam0_from_cams, strict=True) if cam0_from_cam is not None
+    )
+    calibration = calibration_of_messages(cameras, cam0_from_cams, links, imu_frame, str(container.path))
+    if len(mounted) > 1:
+        marked = zip(calibration.cameras, mounted, strict=True)
+        placed = tuple(replace(camera, has_depth=f"{role}_depth" in roles) for camera, role in marked)
+        calibration = replace(calibration, cameras=placed)
+    return calibration, mounted

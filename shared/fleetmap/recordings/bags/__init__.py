@@ -1,1 +1,0 @@
-"""Recordings as messages on topics, independent of the file format."""

@@ -1,0 +1,345 @@
+"""A recording from the messages in a container: orders stamps, leaves images in the file."""
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from itertools import chain
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.errors import CalibrationError, RecordingError
+from fleetmap.geometry import Array
+from fleetmap.recordings.calibration_files import CalibrationFile, parse_calibration
+from fleetmap.recordings.files import hash_file
+from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize, image_parts
+from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, ViewSeries, pair_images, rig_images
+from fleetmap.recordings.images import StoredImage, check_image
+from fleetmap.recordings.mcap.container import CALIBRATION_ATTACHMENT, UNDECODABLE, Channel, Container, Place
+from fleetmap.recordings.ordering import (
+    DEPTH_TOLERANCE_NS,
+    ReadLog,
+    as_logged,
+    clean_imu,
+    trajectory_of_rows,
+    usual_size,
+    values_forward,
+)
+from fleetmap.recordings.recording import OpenOptions, Recording
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.samples import ImuSamples, Stamps, Trajectory
+from fleetmap.sensors.source_settings import CAMERA_ROLES, IMAGE_ROLES, Topics, transports
+
+_LAST_NS = 2**63 - 1  # MCAP's times have a bit more
+_TYPES = {
+    **dict.fromkeys(IMAGE_ROLES, ("sensor_msgs/Image", "sensor_msgs/CompressedImage")),
+    "imu": ("sensor_msgs/Imu",),
+    "wheel": ("nav_msgs/Odometry",),
+    "prior": ("geometry_msgs/PoseWithCovarianceStamped",),
+    "ground_truth": ("geometry_msgs/PoseStamped",),
+}
+Source = tuple[Channel, Place]
+
+
+@dataclass(eq=False)
+class Stream:
+    """The messages of one channel with their log times. damaged: number of messages left out."""
+
+    container: Container
+    channel: Channel
+    log_times_ns: list[int] = field(default_factory=list)
+    messages: list[bytes] = field(default_factory=list)
+    damaged: int = 0
+
+    def take(self, data: bytes, place: Place, logged_ns: int, log: ReadLog) -> None:
+        """Add a message."""
+        self.container.keep(len(data))
+        self.messages.append(data)
+        self.log_times_ns.append(logged_ns)
+
+    @cached_property
+    def values(self) -> list[tuple[int, Any]]:
+        """Log times and values of all messages that can be decoded; the others are counted."""
+        found = []
+        for log_time_ns, data in zip(self.log_times_ns, self.messages, strict=True):
+            try:
+                found.append((log_time_ns, self.container.decode(self.channel, data)))
+            except UNDECODABLE:
+                self.damaged += 1
+        return found
+
+
+@dataclass(eq=False)
+class ImageStream(Stream):
+    """Images by their place, stamp and size. why_damaged: the reason for the first one that was left out."""
+
+    stamps_ns: list[int] = field(default_factory=list)
+    places: list[Place] = field(default_factory=list)
+    sizes_px: list[tuple[int, int]] = field(default_factory=list)
+    why_damaged: str = ""
+
+    def take(self, data: bytes, place: Place, logged_ns: int, log: ReadLog) -> None:
+        """Add an image if it is whole, else keep the reason."""
+        stamp_ns, topic = None, f"{self.container.path}: {self.channel.topic}"
+        try:
+            stamp_ns = self.container.stamp_of(self.channel, data)
+            image: StoredImage = self.container.decode(self.channel, data)
+            size_px = check_image(replace(image, where=f"{topic} at {stamp_ns}"))
+        except (*UNDECODABLE, RecordingError) as error:
+            self.damaged += 1
+            why = str(error) if isinstance(error, RecordingError) else f"{topic}: {error}; the message is damaged"
+            self.why_damaged = self.why_damaged or why
+            log.damaged_ns += [stamp_ns] if stamp_ns else []
+            return
+        self.container.keep(0)
+        self.stamps_ns.append(stamp_ns)
+        self.sizes_px.append(size_px)
+        self.places.append(place)
+        self.log_times_ns.append(logged_ns)
+
+
+Roles = Mapping[str, Sequence[Any]]
+"""Streams by their role, ImageStreams for roles of images."""
+PartsOf = Callable[[Container, CalibrationFile | None, ReadLog], RecordingParts]
+"""Builds the parts of a recording, by the calibration that the caller chose or the container's."""
+
+
+def open_container(
+    path: Path, file_format: str, opener: Callable[[], Container], options: OpenOptions, parts_of: PartsOf
+) -> Recording:
+    """Open the recording at `path` through the container that `opener` opens; its issues list unreadable messages."""
+    log = ReadLog()
+    given = calibration_of_options(options, log)
+    container = opener()
+    try:
+        parts = parts_of(container, given, log)
+        return finalize(replace(parts, path=path, format=file_format, name=parts.name or path.stem), log)
+    except BaseException:
+        container.close()
+        raise
+
+
+def open_written(path: Path, opener: Callable[[], Container], options: OpenOptions) -> Recording:
+    """Open a file that this project wrote: topics by their names, the calibration as attached.
+
+    opener: must be picklable, because other processes may read part of the frames. CalibrationError without a calibration.
+    """
+
+    def parts_of(container: Container, given: CalibrationFile | None, log: ReadLog) -> RecordingParts:
+        streams, others = collect(container, lambda channel: _stream_of(container, channel), log)
+        roles = _named(streams, options.topics)
+        if "left" not in roles:
+            topics = ", ".join(f"{c.topic} ({c.type_name})" for c in (*(s.channel for s in streams), *others)) or "none"
+            wanted = f"name it with --topic left=/NAME. There is {topics}; {log.told() or 'nothing is damaged'}"
+            raise RecordingError(f"{container.path}: no images are on {options.topics.left}; {wanted}")
+
+        def calibrate(_: str | None) -> tuple[RigCalibration, Sequence[str]]:
+            found = given.calibration if given else attached_calibration(container)
+            if found is None:
+                how = "pass a calibration with --calibration FILE"
+                raise CalibrationError(f"{container.path} has no attachment {CALIBRATION_ATTACHMENT}; {how}")
+            return found, CAMERA_ROLES
+
+        return assemble(container, opener, streams, roles, calibrate, log)
+
+    return open_container(path, "mcap", opener, options, parts_of)
+
+
+def _stream_of(container: Container, channel: Channel) -> Stream | None:
+    """An empty stream for a channel, None for messages that no recording uses."""
+    if channel.encoding != "cdr" or channel.type_name not in {name for names in _TYPES.values() for name in names}:
+        return None
+    return (ImageStream if channel.type_name in _TYPES["left"] else Stream)(container, channel)
+
+
+def _named(streams: Sequence[Stream], topics: Topics) -> Roles:
+    roles = {}
+    for role, types in _TYPES.items():
+        there = {stream.channel.topic: stream for stream in streams if stream.channel.type_name in types}
+        if found := next((there[name] for name in transports(getattr(topics, role), role) if name in there), None):
+            roles[role] = [found]
+    return roles
+
+
+def attached_calibration(container: Container) -> RigCalibration | None:
+    """The calibration that this project attached to the file."""
+    attached = container.attachments.get(CALIBRATION_ATTACHMENT)
+    if attached is None:
+        return None
+    where = f"{container.path}: attachment {CALIBRATION_ATTACHMENT}"
+    return parse_calibration(attached.decode("utf-8", "replace"), where).calibration
+
+
+def collect(
+    container: Container, stream_of: Callable[[Channel], Stream | None], log: ReadLog
+) -> tuple[list[Stream], list[Channel]]:
+    """Read the messages of all channels for which there is a stream; also return the other channels."""
+    streams: dict[int, Stream] = {}
+    unused: dict[int, Channel] = {}
+    for channel, logged_ns, place, data in container.messages():
+        if channel.id in unused:
+            continue
+        stream = streams.get(channel.id) or stream_of(channel)
+        if stream is None:
+            unused[channel.id] = channel
+            continue
+        streams[channel.id] = stream
+        stream.take(bytes(data), place, min(logged_ns, _LAST_NS), log)
+    log.issues += container.issues
+    log.files[:0] = container.files
+    return list(streams.values()), list(unused.values())
+
+
+def assemble(
+    container: Container,
+    opener: Callable[[], Container],
+    streams: Sequence[Stream],
+    roles: Roles,
+    calibrate: Callable[[str | None], tuple[RigCalibration, Sequence[str]]],
+    log: ReadLog,
+    usable: Mapping[str, NDArray[np.bool_]] = MappingProxyType({}),
+) -> RecordingParts:
+    """Build the parts of a recording from the streams by their roles.
+
+    calibrate: by the frame of the IMU's messages, the calibration and the roles of its cameras. usable: (N,) by role, images to take.
+    """
+    imu, imu_frame = _imu(roles.get("imu", ()), log)
+    left = _images(roles["left"], "left images", log, usable.get("left"))
+    right = _images(roles["right"], "right images", log, usable.get("right")) if "right" in roles else None
+    depth = _images(roles["depth"], "depth images", log) if "depth" in roles else None
+    if right is not None:
+        depth = None
+    elif depth is not None:
+        left, depth = pair_images(left, depth, log, DEPTH_TOLERANCE_NS)
+    calibration, described = calibrate(imu_frame)
+    views = tuple[ViewSeries[Source], ...]()
+    if depth is None and len(calibration.cameras) > 1:
+        read = {"left": left, "right": right}
+        cameras, depths = {}, {}
+        for n, role in enumerate(described[: len(calibration.cameras)]):
+            if role in roles:
+                images = read.get(role) or _images(roles[role], f"{role} images", log, usable.get(role))
+                cameras[n] = f"{role} ({roles[role][0].channel.topic})", images
+                if calibration.cameras[n].has_depth and f"{role}_depth" in roles:
+                    depths[n] = _images(roles[f"{role}_depth"], f"depth images of cam{n}", log)
+        calibration, (left, right, _), views = rig_images(calibration, cameras, log, depths)
+    elif right is not None:
+        left, right = pair_images(left, right, log)
+    if depth is not None and (beside := [role for role in CAMERA_ROLES[2:] if role in roles]):
+        how = "let a stereo pair be left and right, and the depth camera cam2, with its depth on cam2_depth"
+        log.note("images not used", f"{', '.join(beside)}: beside a depth camera as first view no other is used; {how}")
+    sensors = {
+        "imu": imu,
+        "wheel": _samples(roles.get("wheel", ()), "wheel odometry", log),
+        "priors": _samples(roles.get("prior", ()), "position priors", log),
+        "ground_truth": _ground_truth(roles.get("ground_truth", ()), log),
+    }
+    for stream in streams:
+        if stream.damaged and not isinstance(stream, ImageStream):
+            what = f"{stream.channel.topic}: damaged messages"
+            log.note(what, f"{stream.damaged} left out, {len(stream.messages)} were found")
+    frames = SeriesFrames(MessageReader(opener, container, log.files), left, right, depth, others=views)
+    return image_parts(container.path, "", calibration, frames, name=container.name, **sensors)
+
+
+def _images(
+    streams: Sequence[ImageStream], what: str, log: ReadLog, usable: NDArray[np.bool_] | None = None
+) -> ImageSeries[Source]:
+    damaged = sum(stream.damaged for stream in streams)
+    sources = tuple((stream.channel, place) for stream in streams for place in stream.places)
+    if damaged:
+        why = next(stream.why_damaged for stream in streams if stream.why_damaged)
+        if not sources:
+            raise RecordingError(f"{why} (none of {damaged} {what} can be read)")
+        log.note(f"{what} left out", f"{damaged} of {damaged + len(sources)}; the first: {why}")
+    sent, logged = chain(*(s.stamps_ns for s in streams)), chain(*(s.log_times_ns for s in streams))
+    stamps_ns, order = as_logged(list(sent), list(logged), what, log)
+    kept = usual_size([size for stream in streams for size in stream.sizes_px], what, log)
+    if usable is not None:
+        kept &= usable
+    return ImageSeries(stamps_ns, sources).take(order[kept[order]]).forward(what, log)
+
+
+def _samples(streams: Sequence[Stream], what: str, log: ReadLog) -> tuple[Any, ...]:
+    """The samples whose stamps increase as they arrived."""
+    samples = [value for stream in streams for value in stream.values]
+    stamps_ns, order = as_logged([sample.stamp_ns for _, sample in samples], [at for at, _ in samples], what, log)
+    stamped = [replace(samples[k][1], stamp_ns=int(stamps_ns[k])) for k in order.tolist()]
+    return values_forward(stamped, [sample.stamp_ns for sample in stamped], what, log)
+
+
+def _imu(streams: Sequence[Stream], log: ReadLog) -> tuple[ImuSamples, str | None]:
+    parts: list[tuple[Stamps, Array, Array, str]] = []
+    log_times_ns: list[int] = []
+    for stream in streams:
+        try:
+            parts.append(stream.container.decode_imu(stream.channel, stream.messages))
+            log_times_ns += stream.log_times_ns
+        except UNDECODABLE:  # one of them is damaged
+            parts += [part for _, part in stream.values]
+            log_times_ns += [at for at, _ in stream.values]
+    if not parts:
+        return ImuSamples.empty(), None
+    stamps_ns, gyro, accel = (np.concatenate([part[i] for part in parts]) for i in range(3))
+    stamps_ns, order = as_logged(stamps_ns, log_times_ns, "imu", log)
+    return clean_imu(stamps_ns[order], gyro[order], accel[order], log), parts[0][3]
+
+
+def _ground_truth(streams: Sequence[Stream], log: ReadLog) -> Trajectory | None:
+    values = [value for stream in streams for value in stream.values]
+    if not values:
+        return None
+    rows = np.stack([row for _, (_, row) in values])
+    stamps_ns, order = as_logged([ns for _, (ns, _) in values], [at for at, _ in values], "ground truth", log)
+    return trajectory_of_rows(stamps_ns[order], rows[order], log)
+
+
+class MessageReader:
+    """An ImageReader of the image messages of a container, which the first read opens if necessary.
+
+    read_files: files covered by the content's hash, the recording first.
+    """
+
+    def __init__(
+        self, opener: Callable[[], Container], container: Container | None, read_files: Sequence[Path]
+    ) -> None:
+        self._opener, self._container, self._read_files = opener, container, read_files
+        self._is_closed = False
+
+    def read(self, source: Source, stamp_ns: int) -> StoredImage:
+        channel, place = source
+        where = f"{self._read_files[0]}: {channel.topic} at {stamp_ns}"
+        if self._is_closed:
+            raise RecordingError(
+                f"{where} was asked for after the recording was closed; keep it open while frames are read"
+            )
+        try:
+            if self._container is None:
+                self._container = self._opener()
+            image: StoredImage = self._container.decode(channel, self._container.read(place))
+            return replace(image, where=where)
+        except UNDECODABLE as error:
+            raise RecordingError(
+                f"{where}: {error}; the message is damaged, leave the frame out with --frames"
+            ) from error
+        except OSError as error:
+            raise RecordingError(
+                f"{where} cannot be read any more ({error.strerror}); was the recording moved?"
+            ) from error
+
+    def apart(self) -> "MessageReader":
+        return MessageReader(self._opener, None, self._read_files)
+
+    def hash_into(self, digest: "hashlib._Hash", images: list[Source]) -> None:
+        """Hash the bytes of the recording's files, then those of the calibration file if one was given."""
+        for path in self._read_files:
+            hash_file(path, digest)
+
+    def close(self) -> None:
+        if self._container is not None:
+            self._container.close()
+        self._container, self._is_closed = None, True
