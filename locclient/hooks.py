@@ -5,6 +5,7 @@
 | `locclient.links` | its section in the configuration file | `LinkHook` |
 | `locclient.sources` | `[source] kind` | a function as those of `SOURCES` in `fleetmap/sources/source.py` |
 | `locclient.outputs` | `[output] format` | `OutputHook` |
+| `locclient.run_exports` | `locclient replay`'s option | a function of a path that opens a `RunExport` of `locclient/replay/replay.py` |
 """
 
 from collections.abc import Callable, Mapping

@@ -1,6 +1,6 @@
 """`locclient replay`: localization of a recording in a published map."""
 
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -13,7 +13,7 @@ from fleetmap.errors import UsageError
 if TYPE_CHECKING:
     from locclient.config import LocclientConfig
     from locclient.identity import MapAddress
-    from locclient.replay.run_export import RunExport
+    from locclient.replay.replay import RunExport
 
 Insecure = Annotated[
     bool, typer.Option("--insecure", help="Allow other machines without TLS, for maps and for ROS topics.")
@@ -178,7 +178,7 @@ def _run(
 
     from fleetmap.console import plain_console
     from fleetmap.encoding import to_json
-    from fleetmap.foxglove import require_foxglove
+    from fleetmap.hooks import plugin
     from fleetmap.recordings import FrameSelection, OpenOptions, named_topics, open_recording
     from fleetmap.recordings.sensor_subset import named_sensor_set, reduced
     from fleetmap.recordings.tum import write_tum
@@ -189,8 +189,9 @@ def _run(
     from locclient.replay.replay import replay as play
     from locclient.replay.starts import spread_starts, start_frames, starts
 
+    opening_export: AbstractContextManager[RunExport | None] = nullcontext()
     if files.mcap is not None:
-        require_foxglove("--mcap")
+        opening_export = plugin("locclient.run_exports", "mcap", "--mcap")(files.mcap)
     prior = parse_prior(playback.prior, "--prior")
     selection = FrameSelection.parse(playback.frames)
     use = None if playback.use is None else named_sensor_set(playback.use)
@@ -199,11 +200,7 @@ def _run(
     with ExitStack() as stack:
         recording = reduced(stack.enter_context(open_recording(path, opening)), use)
         source = ReplaySource.of(recording, selection, reverse=playback.reverse)
-        export: RunExport | None = None
-        if files.mcap is not None:
-            from locclient.replay.run_export import run_export
-
-            export = stack.enter_context(run_export(files.mcap))
+        export = stack.enter_context(opening_export)
         connection = stack.enter_context(connected(address, map_options.cache, map_options.cache_bytes))
         with Progress(console=console, disable=not console.is_terminal) as bar:
             for issue in recording.issues:

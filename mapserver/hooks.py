@@ -3,6 +3,7 @@
 | group | registered by the name of | as |
 |---|---|---|
 | `mapserver.commands` | the command | a function as those of `COMMANDS` in `mapserver/cli.py`, in a module that is quick to import |
+| `mapserver.failure_exports` | `--format` of `mapserver fleet export` | a function as `write_json_lines` in `mapserver/fleet/exports.py` |
 | `mapserver.parts` | the plug-in | `PartHook` |
 | `mapserver.routes` | the plug-in | `RouteHook` |
 """

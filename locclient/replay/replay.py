@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import cv2
 
@@ -18,7 +18,7 @@ from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, 
 from fleetmap.recordings.sensor_subset import reduced
 from fleetmap.sensors.lens_fit import lens_of_frames
 from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sensors.samples import PositionPrior, SensorSet
+from fleetmap.sensors.samples import CameraFrame, PositionPrior, SensorSet
 from fleetmap.sources.replay_source import ReplaySource
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.identity import GivenAddress, MapAddress
@@ -34,11 +34,18 @@ from locclient.robot.gc_freeze import gc_frozen
 from locclient.robot.robot import Outcome, Robot
 from locclient.robot.version_trial import TrialSettings
 
-if TYPE_CHECKING:  # needs the extra `foxglove`
-    from locclient.replay.run_export import RunExport
-
 _ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws|unixsock-stream)/")
 TRUTH_FLAG = "frame_from_ground_truth"  # key of the configuration: the map lies in the frame of the recordings' truth
+
+
+class RunExport(Protocol):
+    """Writes a replay's outcomes, frame by frame."""
+
+    def begin(self, first_ns: int, loaded: LoadedMap, profile: RobotProfile, rectifier: Rectifier) -> None:
+        """Write the map and the robot. Called once, before the first frame, with its stamp."""
+
+    def handle(self, frame: CameraFrame, outcome: Outcome) -> None:
+        """Write the results of a frame, with its images as recorded."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +55,7 @@ class ReplayOptions:
     settings: LocalizerSettings = field(default_factory=LocalizerSettings)
     realtime: bool = False
     progress: Callable[[int], None] = lambda _: None
-    export: "RunExport | None" = None
+    export: RunExport | None = None
 
 
 def load_map(source: MapSource) -> tuple[LoadedMap, FetchedTiles, str]:

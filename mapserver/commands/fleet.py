@@ -55,7 +55,8 @@ def export(
     ] = None,
 ) -> None:
     """Write failures as JSON lines, or as MCAP with log, positions and pictures for Foxglove."""
-    from mapserver.fleet.exports import write_json_lines, write_mcap
+    from fleetmap.hooks import plugin
+    from mapserver.fleet.exports import write_json_lines
     from mapserver.store import FailureFilter
 
     chosen = format_ or next((known for known in ExportFormat if out.suffix == f".{known}"), None)
@@ -65,7 +66,8 @@ def export(
     with open_store(store, read_only=True) as maps:
         if site is not None:
             maps.current(site)  # raises for an unknown site
-        write = write_mcap if chosen is ExportFormat.MCAP else write_json_lines
+        is_plain = chosen is ExportFormat.JSONL
+        write = write_json_lines if is_plain else plugin("mapserver.failure_exports", chosen, f"--format {chosen}")
         count = write(maps, FailureFilter(site=site, since_ns=since_ns), out)
     typer.echo(f"{count} failures")
 

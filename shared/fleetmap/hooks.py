@@ -10,6 +10,16 @@ Those of a robot are in `locclient/hooks.py`, those of the map server in `mapser
 from importlib.metadata import entry_points
 from typing import Any
 
+from fleetmap.errors import UsageError
+
+
+def plugin(group: str, name: str, what: str) -> Any:
+    """Return what is registered in a group by that name. UsageError without it; what: the feature that needs it."""
+    found = plugins(group)
+    if name not in found:
+        raise UsageError(f"{what} needs a plug-in that is not installed: an entry point {name} of {group}")
+    return found[name]
+
 
 def plugins(group: str) -> dict[str, Any]:
     """Return what is registered in a group, by name, in order. Whose folder was deleted is not installed."""

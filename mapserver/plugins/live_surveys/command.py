@@ -65,7 +65,7 @@ def live(
             f"--{of_recordings[0]} applies to a RECORDING only; for sensors set [source] and [topics] in {sensors}"
         )
     from fleetmap.console import plain_console
-    from fleetmap.foxglove import require_foxglove
+    from fleetmap.plugins.viewer_channels import require_foxglove
     from mapserver.plugins.live_surveys.viewer_address import viewer_address
 
     at = None if options.foxglove is None else viewer_address(options.foxglove, insecure=options.insecure)

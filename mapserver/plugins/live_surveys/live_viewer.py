@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from fleetmap.foxglove import channels
-from fleetmap.foxglove.channels import BASE, CAMERA, ODOM, SURVEY, RobotMark, Shown
 from fleetmap.geometry import Array
 from fleetmap.messages import EstimateMessage
+from fleetmap.plugins.viewer_channels import channels
+from fleetmap.plugins.viewer_channels.channels import BASE, CAMERA, ODOM, SURVEY, RobotMark, Shown
 from mapserver.plugins.live_surveys.drives import Drive
 from mapserver.plugins.live_surveys.message import LiveSurveyState
 from mapserver.plugins.live_surveys.tracking import Tracked

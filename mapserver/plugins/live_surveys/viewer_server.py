@@ -11,8 +11,8 @@ from foxglove import Channel, Context
 from foxglove.websocket import ChannelView, Client, ServerListener
 
 from fleetmap.errors import FleetmapError, UsageError
-from fleetmap.foxglove.channels import CHANNELS, Shown, encoding_of
 from fleetmap.log_lines import LogLimit
+from fleetmap.plugins.viewer_channels.channels import CHANNELS, Shown, encoding_of
 from mapserver.plugins.live_surveys.viewer_address import ViewerAddress
 
 _WAITING = 32  # messages of a topic that are not encoded yet

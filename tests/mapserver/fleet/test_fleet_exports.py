@@ -166,8 +166,10 @@ def test_json_lines_hold_every_failure_in_order(folder: tuple[Path, Known], tmp_
 
 
 def test_mcap_holds_the_channels_of_viewers(folder: tuple[Path, Known], tmp_path: Path) -> None:
-    from fleetmap.foxglove.channels import CHANNELS
-    from mapserver.fleet.exports import failures_oldest_first, write_mcap
+    pytest.importorskip("mapserver.plugins.viewer_files")
+    from fleetmap.plugins.viewer_channels.channels import CHANNELS
+    from mapserver.fleet.exports import failures_oldest_first
+    from mapserver.plugins.viewer_files.failures import write_mcap
 
     path = tmp_path / "out.mcap"
     with MapStore.open(folder[0]) as store:

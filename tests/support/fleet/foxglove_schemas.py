@@ -11,8 +11,8 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.PosesInFrame_pb2 import PosesInFrame
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
-from fleetmap.foxglove.channels import CHANNELS, ChannelMessage
 from fleetmap.geometry import rotation_from_quat_wxyz, se3
+from fleetmap.plugins.viewer_channels.channels import CHANNELS, ChannelMessage
 
 KNOWN = {
     message.DESCRIPTOR.full_name: message

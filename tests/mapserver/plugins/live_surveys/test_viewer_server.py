@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import RecordingError, UsageError
-from fleetmap.foxglove import channels
-from fleetmap.foxglove.channels import ChannelMessage, Shown
 from fleetmap.geometry import se3, so3_exp
 from fleetmap.messages import EstimateMessage, Placement
+from fleetmap.plugins.viewer_channels import channels
+from fleetmap.plugins.viewer_channels.channels import ChannelMessage, Shown
 from mapserver.plugins.live_surveys.live_viewer import SurveyChannels
 from mapserver.plugins.live_surveys.message import LiveSurveyState
 from mapserver.plugins.live_surveys.viewer_address import ViewerAddress, viewer_address

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import UsageError
-from fleetmap.foxglove import channels, require_foxglove
-from fleetmap.foxglove.channels import RobotMark
 from fleetmap.geometry import rotation_from_quat_wxyz, se3, so3_exp
 from fleetmap.messages import FailureReport, Placement
+from fleetmap.plugins.viewer_channels import channels, require_foxglove
+from fleetmap.plugins.viewer_channels.channels import RobotMark
 from fleetmap.sensors.rectification import StereoCamera
 from support.fleet.foxglove_schemas import decoded, matrix, xyz
 

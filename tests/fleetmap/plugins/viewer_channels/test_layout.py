@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator
 from typing import Any
 
-from fleetmap.foxglove.channels import CHANNELS
+from fleetmap.plugins.viewer_channels.channels import CHANNELS
 from support.fleet.contracts_documents import REPOSITORY
 
 LAYOUT = json.loads((REPOSITORY / "deploy" / "foxglove-layout.json").read_text("utf-8"))

@@ -11,8 +11,8 @@ from mcap_protobuf.decoder import DecoderFactory
 from typer.testing import CliRunner
 
 from fleetmap.errors import UsageError
-from fleetmap.foxglove.channels import CHANNELS
 from fleetmap.geometry import Array, rotation_from_quat_wxyz, se3
+from fleetmap.plugins.viewer_channels.channels import CHANNELS
 from locclient.cli import app
 from mapserver.store import MapStore
 from support.worlds import robot_world

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from fleetmap.files import appearing_file
-from fleetmap.foxglove import channels
-from fleetmap.foxglove.channels import BASE, CAMERA, MAP, ODOM, ChannelWriter, RobotMark
 from fleetmap.geometry import Array, se3_inverse
+from fleetmap.plugins.viewer_channels import channels
+from fleetmap.plugins.viewer_channels.channels import BASE, CAMERA, MAP, ODOM, ChannelWriter, RobotMark
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
