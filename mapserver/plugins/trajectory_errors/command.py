@@ -29,7 +29,8 @@ def evaluate(
 
     from fleetmap.console import plain_console
     from fleetmap.recordings.ordering import ReadLog
-    from fleetmap.recordings.tum import read_covariances, read_truth, read_tum
+    from fleetmap.recordings.tum import read_truth, read_tum
+    from mapserver.plugins.trajectory_errors.covariances import read_covariances
     from mapserver.plugins.trajectory_errors.errors import summary
 
     log = ReadLog()

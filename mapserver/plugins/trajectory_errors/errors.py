@@ -4,9 +4,9 @@ import numpy as np
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, align_points, rotation_angle_rad, se3_inverse, so3_log, transform_points
-from fleetmap.recordings.tum import StampedCovariances
 from fleetmap.sensors.samples import Stamps, Trajectory
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error, paired, rms
+from mapserver.plugins.trajectory_errors.covariances import StampedCovariances
 
 _MAX_SHIFT_S = 0.05
 _KITTI_LENGTHS_M = (100.0, 200.0, 300.0, 400.0, 500.0, 600.0, 700.0, 800.0)

@@ -4,7 +4,6 @@ Stamps are written with nine decimals and read as decimals, never through a floa
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 from decimal import Decimal, InvalidOperation
 from pathlib import Path
 from typing import NamedTuple
@@ -15,11 +14,10 @@ from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
 from fleetmap.recordings.files import read_text
 from fleetmap.recordings.ordering import ReadLog, forward_only
-from fleetmap.sensors.samples import Stamps, Trajectory
+from fleetmap.sensors.samples import Trajectory
 
 _NS = 1_000_000_000
 _MOST_S = 9_223_372_036  # limit of 64 bits of nanoseconds
-_ROWS, _COLUMNS = np.triu_indices(6)
 
 
 def format_tum(trajectory: Trajectory) -> str:
@@ -149,35 +147,3 @@ def parse_stamp_ns(field: str) -> int:
         unit = next((name for name, most in (("ms", 10**13), ("us", 10**16)) if abs(seconds) < most), "ns")
         raise ValueError(f"stamp {field!r} is not within {_MOST_S} seconds, it looks like {unit}")
     return int(seconds * _NS)
-
-
-@dataclass(frozen=True, slots=True)
-class StampedCovariances:
-    """stamps_ns (N,) rising, covs_rot_trans (N, 6, 6)."""
-
-    stamps_ns: Stamps
-    covs_rot_trans: Array
-
-
-def parse_covariances(text: str, what: str = "covariances") -> StampedCovariances:
-    """Parse the covariances of a trajectory: lines of a stamp and the 21 numbers of the upper triangle, rotation first.
-
-    Raises RecordingError, naming `what` and the line, for anything but 22 finite numbers of a positive definite matrix, or
-    stamps that do not rise.
-    """
-    stamps, covariances = [], []
-    for line in stamped_lines(text, what):
-        if len(line.values) != len(_ROWS) or not np.isfinite(line.values).all():
-            raise RecordingError(f"{line.where}: {len(line.values)} numbers after the stamp, 21 finite ones are needed")
-        covariance = np.zeros((6, 6))
-        covariance[_ROWS, _COLUMNS] = covariance[_COLUMNS, _ROWS] = line.values
-        if np.linalg.eigvalsh(covariance)[0] <= 0:
-            raise RecordingError(f"{line.where}: the covariance is not positive definite; is its order rotation first?")
-        stamps.append(line.stamp_ns)
-        covariances.append(covariance)
-    return StampedCovariances(np.array(stamps, np.int64), np.array(covariances).reshape(-1, 6, 6))
-
-
-def read_covariances(path: Path) -> StampedCovariances:
-    """Read the covariances in the file at `path`; RecordingError as `parse_covariances`, and if it cannot be read."""
-    return parse_covariances(read_text(path, "covariances as CSV are expected"), str(path))

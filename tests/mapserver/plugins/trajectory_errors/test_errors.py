@@ -21,10 +21,11 @@ from fleetmap.geometry import (
     se3_inverse,
     so3_exp,
 )
-from fleetmap.recordings.tum import StampedCovariances, format_stamp, parse_covariances, read_covariances, write_tum
+from fleetmap.recordings.tum import format_stamp, write_tum
 from fleetmap.sensors.samples import Trajectory
 from mapserver.cli import app
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error, paired, truth_from_estimate
+from mapserver.plugins.trajectory_errors.covariances import StampedCovariances, parse_covariances, read_covariances
 from mapserver.plugins.trajectory_errors.errors import (
     at_first_stamp,
     best_clock_shift,
