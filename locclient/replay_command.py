@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from locclient.config import LocclientConfig
     from locclient.identity import MapAddress
     from locclient.replay.replay import RunExport
+    from locclient.replay.run_result import ReplayResult
 
 Insecure = Annotated[
     bool, typer.Option("--insecure", help="Allow other machines without TLS, for maps and for ROS topics.")
@@ -90,6 +91,18 @@ class ResultFiles:
     trajectory: Annotated[Path | None, typer.Option(help="Write the localized frames to this TUM file.")] = None
     picture: Annotated[Path | None, typer.Option(help="Draw the run from above into this PNG file.")] = None
     mcap: Annotated[Path | None, typer.Option(help="Write the run to this MCAP file, which Foxglove opens.")] = None
+
+    def write(self, result: "ReplayResult", report: dict[str, object]) -> None:
+        """Write all but the MCAP file, which is written frame by frame."""
+        from fleetmap.encoding import to_json
+        from fleetmap.recordings.tum import write_tum
+
+        if self.report is not None:
+            self.report.write_bytes(to_json(report, indent=2) + b"\n")
+        if self.trajectory is not None:
+            write_tum(self.trajectory, result.trajectory)
+        if self.picture is not None:
+            result.save_picture(self.picture)
 
     def check(self) -> None:
         """Raise UsageError for files that cannot be written."""
@@ -177,11 +190,9 @@ def _run(
     from rich.table import Table
 
     from fleetmap.console import plain_console
-    from fleetmap.encoding import to_json
     from fleetmap.hooks import plugin
     from fleetmap.recordings import FrameSelection, OpenOptions, named_topics, open_recording
     from fleetmap.recordings.sensor_subset import named_sensor_set, reduced
-    from fleetmap.recordings.tum import write_tum
     from fleetmap.sources.replay_source import ReplaySource
     from locclient.maps.connection import connected
     from locclient.prior_option import parse_prior
@@ -215,13 +226,7 @@ def _run(
                 start_frames(found)
                 for found in starts(source, numbers, load_map(connection.source)[0], settings.localizer)
             ]
-    if files.report is not None:
-        given = report | ({"starts": anew} if playback.starts else {})
-        files.report.write_bytes(to_json(given, indent=2) + b"\n")
-    if files.trajectory is not None:
-        write_tum(files.trajectory, result.trajectory)
-    if files.picture is not None:
-        result.save_picture(files.picture)
+    files.write(result, report | ({"starts": anew} if playback.starts else {}))
     table = Table("measure", "value")
     for name, value in report.items():
         table.add_row(name, _shown(value))

@@ -8,6 +8,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 
@@ -15,6 +16,7 @@ from fleetmap.bus import Bus
 from fleetmap.errors import LinkError, UsageError
 from fleetmap.free_memory import give_back_free_memory
 from fleetmap.messages import WantedVersion
+from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import open_source
@@ -42,6 +44,15 @@ from locclient.robot.robot import Robot
 
 _PATIENCE_S = 120.0  # without an answer during a download; the next attempt resumes it
 _log = logging.getLogger(__name__)
+
+
+class _OpenMap(NamedTuple):
+    """The map, its version to begin with, its caches, and the exchange with the server."""
+
+    maps: MapSource
+    first: WantedVersion | None
+    caches: tuple[TileCache, ...]
+    server: ServerSync | None
 
 
 def check_run(config: LocclientConfig) -> MapAddress:
@@ -87,8 +98,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
     Raises FleetmapError for unusable settings.
     """
     cv2.setNumThreads(1)  # leave the other cores to the robot's other programs
-    run = config.run
-    address = check_run(config)
+    run, address = config.run, check_run(config)
     site, name = address.site, address.robot
     is_alone = address.server is None and address.store is None
     with ExitStack() as stack:
@@ -107,51 +117,23 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             imu_wait_s=run.imu_wait_s,
         )
         outbox_file = configured_outbox(run, site, name)
-        outbox = Outbox(outbox_file, max_bytes=run.outbox_bytes, is_needed=False)
-        if outbox.fault:
-            _log.error("failures are not kept: %s", outbox.fault)
-        if outbox.set_aside is not None:
-            _log.warning("the spool was damaged; it was moved to %s, and a new one was started", outbox.set_aside)
+        outbox = _opened_outbox(outbox_file, run.outbox_bytes)
         give_back_free_memory()
         stack.enter_context(gc_frozen())
-        caches: tuple[TileCache, ...] = ()
-        server: ServerSync | None = None
-        maps: MapSource
-        first: WantedVersion | None
-        if bus is None:
-            maps, first = _local_map(run, site)
-        else:
-            # Two caches of the same folder, because one is not thread-safe; the second only reads.
-            caches = tuple(TileCache(cache_folder(run.cache), max_bytes=run.cache_bytes) for _ in range(2))
-            client = MapClient(bus, caches[0], site, name, patience_s=_PATIENCE_S)
-            client.require(None if is_alone else trusted_map(bus, address, cache_folder(run.cache)))
-            maps, first = CachedMap(caches[1], site), client.active()
-            server = ServerSync(client, outbox, retry_s=run.trial.retry_s, upkeep=_upkeep(address, bus))
-            server.is_alone = is_alone
+        maps, first, caches, server = _local_map(run, site) if bus is None else _server_map(run, address, bus, outbox)
         keeps_replay = server is not None and not is_alone and run.replays != "off"
         robot = Robot(calibration, rectifier, config.localizer, run.trial, time.thread_time, keeps_replay=keeps_replay)
         if prior is not None:
             robot.localizer.handle_prior(prior)
-        told_bus, output = None if is_alone else bus, output_of(config.output)
-        if config.output.endpoint is not None:
-            told_bus = output.connect(config.output.endpoint)
-            stack.callback(told_bus.close)
-        publisher = None
-        if told_bus is not None:
-            publisher = output.open(config.output, told_bus, site, name, calibration, intake)
-            stack.callback(publisher.close)
-            if server is not None:
-                server.client.takes_grids = publisher.grid_height_m is not None
-        floors = _floor_maps(config, address, bus, caches, server, maps, publisher)
+        publisher = _opened_publisher(stack, config, address, None if is_alone else bus, calibration, intake)
         if server is not None:
             server.links = _links(config, site, server, caches[0], intake)
+            server.client.takes_grids = publisher is not None and publisher.grid_height_m is not None
+        floors = _floor_maps(config, address, bus, caches, server, maps, publisher)
         mounting = (robot.base_from_body, rectifier.body_from_cam, rectifier.camera)
         clock = (calibration.imu, rectifier.imu_minus_cam_s)
         profile = RobotProfile(site, name, *mounting, config.localizer, *clock, run.replays, rectifier.mounted[1:])
-        replays: ReplayQueue | None = None
-        if server is not None and keeps_replay:
-            server.replays = Outbox(replay_outbox(outbox_file), max_bytes=run.replays_bytes, is_needed=False)
-            replays = ReplayQueue(server.replays, profile, run.replays)
+        replays = _keep_recordings(server, outbox_file, profile, run) if server and keeps_replay else None
         if server is not None and run.surveys:
             server.drives = SurveyDrives(outbox_file.with_name(f"{outbox_file.stem}.drives"), calibration)
         yield RuntimeParts(
@@ -170,6 +152,53 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             floors=floors,
             drives=None if server is None else server.drives,
         )
+
+
+def _opened_outbox(file: Path, max_bytes: int) -> Outbox:
+    outbox = Outbox(file, max_bytes=max_bytes, is_needed=False)
+    if outbox.fault:
+        _log.error("failures are not kept: %s", outbox.fault)
+    if outbox.set_aside is not None:
+        _log.warning("the spool was damaged; it was moved to %s, and a new one was started", outbox.set_aside)
+    return outbox
+
+
+def _keep_recordings(server: ServerSync, outbox_file: Path, profile: RobotProfile, run: RunSection) -> ReplayQueue:
+    """Keep recordings of failures until the server has them."""
+    server.replays = Outbox(replay_outbox(outbox_file), max_bytes=run.replays_bytes, is_needed=False)
+    return ReplayQueue(server.replays, profile, run.replays)
+
+
+def _opened_publisher(
+    stack: ExitStack,
+    config: LocclientConfig,
+    address: MapAddress,
+    bus: Bus | None,
+    calibration: RigCalibration,
+    intake: Intake,
+) -> Publisher | None:
+    """Return the publisher at [output] endpoint, else on the map server's bus, which the stack closes; None without either."""
+    output = output_of(config.output)
+    if config.output.endpoint is not None:
+        bus = output.connect(config.output.endpoint)
+        stack.callback(bus.close)
+    if bus is None:
+        return None
+    publisher = output.open(config.output, bus, address.site, address.robot, calibration, intake)
+    stack.callback(publisher.close)
+    return publisher
+
+
+def _server_map(run: RunSection, address: MapAddress, bus: Bus, outbox: Outbox) -> _OpenMap:
+    """Return the map that the disk holds, and the exchange with its server, if there is one."""
+    is_alone = address.server is None
+    # Two caches of the same folder, because one is not thread-safe; the second only reads.
+    caches = tuple(TileCache(cache_folder(run.cache), max_bytes=run.cache_bytes) for _ in range(2))
+    client = MapClient(bus, caches[0], address.site, address.robot, patience_s=_PATIENCE_S)
+    client.require(None if is_alone else trusted_map(bus, address, cache_folder(run.cache)))
+    server = ServerSync(client, outbox, retry_s=run.trial.retry_s, upkeep=_upkeep(address, bus))
+    server.is_alone = is_alone
+    return _OpenMap(CachedMap(caches[1], address.site), client.active(), caches, server)
 
 
 def _floor_maps(
@@ -232,7 +261,7 @@ def configured_outbox(run: RunSection, site: str, robot: str) -> Path:
     return outbox_path(site, robot) if run.outbox is None else Path(run.outbox)
 
 
-def _local_map(run: RunSection, site: str) -> tuple[LocalMapSource, WantedVersion]:
+def _local_map(run: RunSection, site: str) -> _OpenMap:
     source = LocalMapSource(Path(run.store or ""), site)
     wanted = source.wanted()
     if wanted.version is None:
@@ -240,4 +269,4 @@ def _local_map(run: RunSection, site: str) -> tuple[LocalMapSource, WantedVersio
             f"site {site} has no published version in {run.store}; "
             f"publish one with `mapserver publish --site {site} --store {shlex.quote(run.store or '')}`"
         )
-    return source, wanted
+    return _OpenMap(source, wanted, (), None)

@@ -121,29 +121,38 @@ def replay(
             options.progress(number)
             continue
         wall_s = time.monotonic() - wall_s
-        truth = source.truth_map_from_body(number)
-        result.frames.append(frame_record(outcome, truth if truth_in_map else None, wall_s, decode_s))
-        result.estimates.append(outcome.estimate)
-        result.truths.append(truth)
-        result.search.handle(outcome.estimate, outcome.speed_mps, may_be_mapped=outcome.may_be_mapped)
-        result.failures += outcome.failure is not None
-        result.notes.extend(words for words in outcome.left_out.values() if words not in result.notes)
+        _add(result, outcome, source.truth_map_from_body(number), wall_s, decode_s)
         if options.export is not None:
             options.export.handle(raw, outcome)
         options.progress(number)
-    if 2 * len(unread) > number + 1:
-        raise RecordingError(f"{len(unread)} of {number + 1} frames cannot be read; the first: {unread[0]}")
+    _note_the_whole(result, source, unread)
+    return result
+
+
+def _add(result: ReplayResult, outcome: Outcome, truth: Array | None, wall_s: float, decode_s: float) -> None:
+    """Add a frame to the result; truth: map_from_body or that in the frame of the truth, as of the result."""
+    result.frames.append(frame_record(outcome, truth if result.truth_in_map else None, wall_s, decode_s))
+    result.estimates.append(outcome.estimate)
+    result.truths.append(truth)
+    result.search.handle(outcome.estimate, outcome.speed_mps, may_be_mapped=outcome.may_be_mapped)
+    result.failures += outcome.failure is not None
+    result.notes.extend(words for words in outcome.left_out.values() if words not in result.notes)
+
+
+def _note_the_whole(result: ReplayResult, source: ReplaySource, unread: list[str]) -> None:
+    """Note what the frames say together. RecordingError if most cannot be read."""
+    if 2 * len(unread) > len(source):
+        raise RecordingError(f"{len(unread)} of {len(source)} frames cannot be read; the first: {unread[0]}")
     if unread:
-        result.notes.append(f"{len(unread)} of {number + 1} frames are left out; the first: {unread[0]}")
+        result.notes.append(f"{len(unread)} of {len(source)} frames are left out; the first: {unread[0]}")
     if words := result.search.words:
         result.notes.append(words)
         recording = source.recording
         fit = lens_of_frames(recording.calibration, recording.frame_stamps_ns, recording.read_frame)
         if fit is not None and fit.is_doubtful:  # with a wrong lens model nothing in the map matches
             result.notes.append(fit.words(recording.calibration.cameras[0]))
-    if not truth_in_map and any(truth is not None for truth in result.truths):
+    if not result.truth_in_map and any(truth is not None for truth in result.truths):
         result.notes.append(result.alignment_note())
-    return result
 
 
 def frame_record(outcome: Outcome, truth_map_from_body: Array | None, wall_s: float, decode_s: float) -> FrameRecord:
