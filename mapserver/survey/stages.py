@@ -40,6 +40,7 @@ from mapserver.survey.loops.connected_components import (
     find_components,
     find_groups,
     only_kept,
+    without_doubted,
 )
 from mapserver.survey.loops.loops import LoopCloser, Loops
 from mapserver.survey.loops.sim3_loops import gate_covariances, solve_scaled
@@ -124,7 +125,7 @@ def finish_survey(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConf
     state, loops = close_loops(chain, inputs, config, tools)
     # Neighbours need not be matched again, except for one camera: the depths used for matching have changed.
     matched, tracks = (chain.matched, Tracks.of(state.landmarks)) if depths is None else (set(), None)
-    odometry = chain.odometry
+    odometry = without_doubted(chain.odometry, loops.doubted)
     # Landmarks so far are those of neighbours; all are built again, and nothing may hold the old ones meanwhile.
     del chain
     state = replace(
@@ -221,12 +222,13 @@ def close_loops(
         begun.matched,
         tools.executor,
         groups,
+        find_groups(state, lambda *_: np.inf, 0.0) if odometry.scale_known else None,
         measures_scale=not odometry.scale_known,
     )
     for i in range(len(posed.keyframes)):
         closer.close(i)
         tools.at("loops", i + 1, len(posed.keyframes))
-    loops = closer.loops
+    loops = replace(closer.loops, doubted=closer.doubted())
     if odometry.scale_known:
         return _solved(state, closer.begin, chain, loops)
     if not loops.edges:

@@ -3,7 +3,7 @@
 Only one component can be in a map: the pose of any other relative to it is unknown.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -20,6 +20,7 @@ from mapserver.survey.state import OdometryPass, SurveyState
 
 MIN_SHARED = 15  # landmarks; a loop needs as many matches
 _MIN_KEYFRAMES = 2
+_UNKNOWN_M = 1e3
 _SURE_SIGMAS = 3.0
 _LARGEST = "the largest part"
 _APART = "its position relative to the largest part is uncertain; drive it again"
@@ -128,6 +129,13 @@ class SigmaBetween:
     def __call__(self, a: int, b: int) -> float:
         """Return the growth of the variance between them, as a standard deviation."""
         return float(np.sqrt(max(self._variances[b] - self._variances[a], 0.0)))
+
+
+def without_doubted(odometry: OdometryPass, doubted: Sequence[int]) -> OdometryPass:
+    """Return odometry that knows nothing of the motion from doubted keyframes to the next ones."""
+    after = np.array(odometry.keyframe_frames)[np.array(doubted, int)]
+    steps = np.searchsorted(after, np.arange(len(odometry.covariances)), side="left")
+    return replace(odometry, covariances=odometry.covariances + _UNKNOWN_M**2 * steps[:, None, None] * np.eye(6))
 
 
 def only_kept(

@@ -66,10 +66,14 @@ class LoopRecord:
 
 @dataclass(frozen=True)
 class Loops:
-    """All candidates, and the edges (i_from_j of bodies) of the accepted ones that tell more than is known without them."""
+    """All candidates, and the edges (i_from_j of bodies) of the accepted ones that tell more than is known without them.
+
+    doubted: keyframes whose motion to the next one no picture shows, and matches that agree with each other contradict.
+    """
 
     records: list[LoopRecord] = field(default_factory=list)
     edges: list[PoseEdge] = field(default_factory=list)
+    doubted: tuple[int, ...] = ()
 
     def counts(self) -> dict[str, int]:
         """Return candidates, gated_out, rejected, accepted; ambiguous ones count as rejected."""
@@ -88,7 +92,7 @@ class Loops:
         for n, r in enumerate(records):
             if (r.i, r.j) in outliers and r.verdict is LoopVerdict.ACCEPTED:
                 records[n] = replace(r, verdict=LoopVerdict.REJECTED, reason=CONTRADICTED)
-        return Loops(records, [e for e in self.edges if (e.i, e.j) not in outliers])
+        return replace(self, records=records, edges=[e for e in self.edges if (e.i, e.j) not in outliers])
 
 
 class LoopCloser:
@@ -107,18 +111,21 @@ class LoopCloser:
         matched: Iterable[tuple[int, int]],
         executor: Executor = SERIAL,
         groups: KeyframeGroups | None = None,
+        pieces: KeyframeGroups | None = None,
         *,
         measures_scale: bool = False,
     ) -> None:
         """matched: pairs of keyframes matched as neighbours, which are not loops. groups: joined here by certain revisits; None
-        if all keyframes belong together. Pairs, groups, marginals, records and edges have the numbers of keyframes; each has a view
-        or several, in turn in `posed`.
+        if all keyframes belong together. pieces: keyframes that pictures link; None if the motion between them is not to be doubted.
+        Pairs, groups, marginals, records and edges have the numbers of keyframes; each has a view or several, in turn in `posed`.
         """
         self.loops, self.learned = Loops(), list[PoseEdge]()
         self.groups, self.scales = groups, dict[tuple[int, int], tuple[float, float]]()
         self._config, self._settings, self._executor = config, config.settings.loops, executor
         self._measures_scale = measures_scale
         self._waiting, self._repetition = WaitingRevisits(), Repetition()
+        self._pieces, self._against = pieces or KeyframeGroups(), WaitingRevisits()
+        self._breaks = list[tuple[int, int]]()  # keyframes, of the first and the last of which one must be
         self._neighbours: dict[int, list[int]] = {}
         self._vectors: list[BowVector] = []
         self._index = PlaceIndex(config.vocabulary.word_count)
@@ -170,7 +177,7 @@ class LoopCloser:
         With repeated aisles the most similar candidates may all be in other aisles, so the gate goes down the
         list and records the refused ones.
         """
-        far, zoned = list[int](), list[int]()
+        far, zoned, beyond = list[int](), list[int](), list[int]()
         i, bodies = i // self._views, found.ids // self._views
         for start in range(0, len(found.ids), _CHUNK):
             js = bodies[start : start + _CHUNK]
@@ -181,9 +188,11 @@ class LoopCloser:
             known = (apart_m < _ALIAS_REACH * reach_m) & self._marginals.known(i, js, _WELL_KNOWN)
             for n, is_reachable in enumerate(reachable.tolist(), start):
                 here, there = self._map_from_body[[i, bodies[n]], :3, 3]
-                if not is_reachable:
+                if not is_reachable and len(beyond) < self._settings.top and self._are_unlinked(i, int(bodies[n])):
+                    beyond.append(n)
+                elif not is_reachable:
                     far.append(n)
-                elif known[n - start]:
+                elif known[n - start] and not self._are_unlinked(i, int(bodies[n])):
                     continue
                 elif not self._config.zones.compatible(here, there):
                     zoned.append(n)
@@ -194,7 +203,7 @@ class LoopCloser:
                 first, *others = (int(bodies[n]) for n in refused)
                 fate = float(found.scores[refused[0]]), LoopVerdict.GATED_OUT, reason
                 self.loops.records.append(LoopRecord(i, first, *fate, also=tuple(others)))
-        del found.chosen[self._settings.top :]
+        found.chosen[self._settings.top :] = beyond
         return found
 
     def _verify(self, i: int, found: "_Candidates") -> list[tuple[PoseEdge, LoopRecord]]:
@@ -234,6 +243,7 @@ class LoopCloser:
         innovation = self._marginals.innovation_squared(edge)
         if innovation > settings.max_innovation:
             self._learn_repetition(edge, count, innovation)
+            self._weigh_against(match, edge)
             reason = f"matches, but from an impossible position (innovation {innovation:.0f})"
             return LoopVerdict.GATED_OUT, reason
         supported = self._neighbours_agree(match)
@@ -270,6 +280,30 @@ class LoopCloser:
                     self.groups.join(each.edge.i, each.edge.j)
                 for each in sure:
                     self._accept(each.edge)
+
+    def _are_unlinked(self, i: int, j: int) -> bool:
+        """Return True for keyframes of two pieces: their relative pose is that of odometry which no picture confirms."""
+        return bool(len(self._pieces)) and self._pieces.of(i) != self._pieces.of(j)
+
+    def _weigh_against(self, match: PairMatch, edge: PoseEdge) -> None:
+        """Count a match from an impossible position against the motion between two pieces, if neighbours confirm it.
+
+        Those that agree with each other are a break of that motion, or of another place that looks the same: nobody can tell.
+        """
+        if not self._are_unlinked(edge.i, edge.j) or not self._neighbours_agree(match):
+            return
+        agreeing = self._against.add(Revisit(edge, 0), self._pieces, self._marginals)
+        if agreeing:
+            self._breaks.append((max(r.edge.j for r in agreeing), min(r.edge.i for r in agreeing)))
+
+    def doubted(self) -> tuple[int, ...]:
+        """Return `Loops.doubted`. A revisit on either side of a break, where the motion expects it, removes the doubt."""
+        confirmed = [(r.j, r.i) for r in self.loops.records if r.verdict is LoopVerdict.ACCEPTED]
+        return tuple(
+            k
+            for k in sorted({k for first, last in self._breaks for k in range(first, last)})
+            if self._are_unlinked(k, k + 1) and not any(j <= k < i for j, i in confirmed)
+        )
 
     def _accept(self, edge: PoseEdge) -> None:
         if self._marginals.gain(edge, np.diag(_WELL_KNOWN**2)) < _WORTH_LEARNING:

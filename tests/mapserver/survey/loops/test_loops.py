@@ -16,6 +16,7 @@ from fleetmap.geometry import Array, se3_exp, se3_inverse, se3_log, transform_po
 from fleetmap.pnp.pnp import Correspondences, refine_pnp
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from mapserver.survey.keyframes.keyframes import make_keyframe
+from mapserver.survey.loops.keyframe_groups import KeyframeGroups
 from mapserver.survey.loops.loops import LoopCloser, LoopRecord, Loops, LoopVerdict, by_disparity
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
@@ -82,6 +83,7 @@ def looked(
     until: int,
     only_words: Sequence[int] = (),
     settings: SurveySettings = SETTINGS,
+    pieces: KeyframeGroups | None = None,
 ) -> Loops:
     """Loops of the first keyframes of a drive that sees rendered keyframes in an order, at places (K, 4, 4) that odometry believes.
 
@@ -102,10 +104,11 @@ def looked(
         SurveyConfig(settings, vocabulary, Zones()),
         GraphMarginals(path, chain),
         {(k, k + 1) for k in range(len(chain))},
+        pieces=pieces,
     )
     for k in range(until):
         closer.close(k)
-    return closer.loops
+    return replace(closer.loops, doubted=closer.doubted())
 
 
 def replace_loops(settings: SurveySettings, **changes: float) -> SurveySettings:
@@ -270,6 +273,25 @@ def test_a_step_of_the_site_is_learnt_where_it_is_seen_and_counts_everywhere(twi
     assert record.verdict is verdict
     if verdict is LoopVerdict.AMBIGUOUS:
         assert "1.90 m apart look the same" in record.reason
+
+
+@pytest.mark.parametrize(
+    ("dark", "aside_m", "returns", "doubted"),
+    [(9, 0.9, 0, (9,)), (9, 8.0, 0, (9,)), (None, 0.9, 0, ()), (9, 0.9, 4, ())],
+    ids=["moved in the dark", "out of sight", "by pictures", "confirmed by a return"],
+)
+def test_motion_that_no_picture_shows_is_doubted_where_matches_agree_against_it(
+    dark: int | None, aside_m: float, returns: int, doubted: tuple[int, ...]
+) -> None:
+    """Six places are met again aside of where they can be: the way there is wrong, or they look the same. Pictures and a return tell."""
+    _, places, _, _ = seen()
+    path = np.array([*places, *places[4:], *places[:returns]])
+    path[10:16, 1, 3] += aside_m
+    pieces = KeyframeGroups([(k, k + 1) for k in range(len(path) - 1) if k != dark], len(path))
+    order = [*range(10), *range(4, 10), *range(returns)]
+    loops = looked(order, path, [0.005] * (len(path) - 1), len(path), pieces=pieces)
+    assert loops.doubted == doubted
+    assert all(e.i >= 16 for e in loops.edges)
 
 
 def test_candidates_refused_together_are_all_counted() -> None:
