@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from fleetmap.config import Section
 from fleetmap.hooks import plugins
-from fleetmap.mapformat.floors import Floor
+from fleetmap.mapformat.building import Floor
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient.identity import MapAddress
@@ -55,8 +55,8 @@ class LinkedRobot:
 class RobotLink:
     """An open link, as the functions that the daemon calls: `start` and `stop` with its own threads.
 
-    work: what may block, repeatedly on the network's thread. after_frame: the results of a frame, the versions in use, the building's
-    floors, and the versions of the others' maps by their sites; on the localizing thread. silence: once a second while frames are missing.
+    work: what may block, repeatedly on the network's thread. after_frame: the results of a frame, the versions in use, the building, and
+    the versions of its other sites' maps; on the localizing thread. silence: once a second while frames are missing.
     changed_version: on the network's thread, after the change on the disk. chooses: who selects the version in place of the map server.
     """
 

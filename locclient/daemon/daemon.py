@@ -30,8 +30,8 @@ from locclient.delivery.report_delivery import ReplayQueue
 from locclient.delivery.survey_drives import SurveyDrives
 from locclient.hooks import LinkedRobot, RobotLink
 from locclient.identity import GivenAddress, MapAddress, check_reach
+from locclient.maps.building_maps import BuildingMaps
 from locclient.maps.connection import cache_folder, open_bus, outbox_path, replay_outbox, trusted_map
-from locclient.maps.floor_maps import FloorMaps
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource
 from locclient.maps.tile_cache import TileCache
@@ -129,7 +129,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         if server is not None:
             server.links = _links(config, site, server, caches[0], intake)
             server.client.takes_grids = publisher is not None and publisher.grid_height_m is not None
-        floors = _floor_maps(config, address, bus, caches, server, maps, publisher)
+        building = _building_maps(config, address, bus, caches, server, maps, publisher)
         mounting = (robot.base_from_body, rectifier.body_from_cam, rectifier.camera)
         clock = (calibration.imu, rectifier.imu_minus_cam_s)
         profile = RobotProfile(site, name, *mounting, config.localizer, *clock, run.replays, rectifier.mounted[1:])
@@ -149,7 +149,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             first=first,
             failures_folder=None if run.failures is None else Path(run.failures),
             caches=caches,
-            floors=floors,
+            building=building,
             drives=None if server is None else server.drives,
         )
 
@@ -201,7 +201,7 @@ def _server_map(run: RunSection, address: MapAddress, bus: Bus, outbox: Outbox) 
     return _OpenMap(CachedMap(caches[1], address.site), client.active(), caches, server)
 
 
-def _floor_maps(
+def _building_maps(
     config: LocclientConfig,
     address: MapAddress,
     bus: Bus | None,
@@ -209,8 +209,8 @@ def _floor_maps(
     server: ServerSync | None,
     maps: MapSource,
     publisher: Publisher | None,
-) -> FloorMaps:
-    """Return the maps of the other floors of the robot's building, as far as its disk has them."""
+) -> BuildingMaps:
+    """Return the maps of the other sites of the robot's building, as far as its disk has them."""
     folder, grid_height_m = Path(config.run.store or ""), None if publisher is None else publisher.grid_height_m
 
     def over_the_bus(site: str) -> MapSource:
@@ -221,12 +221,12 @@ def _floor_maps(
         return client
 
     if server is None:
-        floors = FloorMaps(maps, lambda site: LocalMapSource(folder, site))
+        building = BuildingMaps(maps, lambda site: LocalMapSource(folder, site))
     else:
-        floors = server.floors = FloorMaps(server.client, over_the_bus)
-    floors.grid_height_m = grid_height_m
-    floors.refresh(asks=server is None)
-    return floors
+        building = server.building = BuildingMaps(server.client, over_the_bus)
+    building.grid_height_m = grid_height_m
+    building.refresh(asks=server is None)
+    return building
 
 
 def _upkeep(address: MapAddress, bus: Bus) -> Callable[[], None]:

@@ -26,7 +26,7 @@ from locclient.daemon.service_manager import ServiceManager
 from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.delivery.report_delivery import ReplayQueue, write_failure
 from locclient.delivery.survey_drives import SurveyDrives
-from locclient.maps.floor_maps import NO_GRID, FloorMaps
+from locclient.maps.building_maps import NO_GRID, BuildingMaps
 from locclient.maps.loaded_map import Cell, LoadedMap, PositionBound, PositionBoundTracker
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
@@ -61,7 +61,7 @@ class RuntimeParts:
     failures_folder: Path | None = None
     drives: SurveyDrives | None = None
     caches: tuple[TileCache, ...] = ()
-    floors: FloorMaps | None = None
+    building: BuildingMaps | None = None
 
 
 class Runtime:
@@ -78,7 +78,7 @@ class Runtime:
         self._bound = PositionBound()
         self._held: list[WantedVersion] = []
         self._loaded: deque[LoadedMap] = deque()
-        self._floor = ""  # where the robot is
+        self._site = ""  # whose map the robot is in
         self._failures: deque[tuple[FailureContext, int]] = deque(maxlen=_MAX_PENDING)
         # Owned by the localizing thread.
         self._figures = HealthFigures()
@@ -90,7 +90,7 @@ class Runtime:
         # Owned by the disk thread.
         self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
         self._fetched_again: set[str] = set()
-        self._shown_grid: tuple[str, WantedVersion] | None = None  # with its floor
+        self._shown_grid: tuple[str, WantedVersion] | None = None  # with its site
         self._refused_tiles: dict[str, dict[Cell, str]] = {}
 
     def stop(self) -> None:
@@ -162,8 +162,8 @@ class Runtime:
             give_back_free_memory()  # of the previous version and of loading this one; takes 0.5 ms
         while server is not None and server.frames:
             robot.align(server.frames.popleft())
-        while self._parts.floors is not None and self._parts.floors.changes:
-            robot.use_floors(*self._parts.floors.changes.popleft())
+        while self._parts.building is not None and self._parts.building.changes:
+            robot.use_building(*self._parts.building.changes.popleft())
             give_back_free_memory()
         while server is not None and server.priors:
             intake.put_prior(server.priors.popleft())
@@ -188,12 +188,12 @@ class Runtime:
 
     def _after_frame(self, outcome: Outcome) -> None:
         estimate = outcome.estimate
-        self._floor = estimate.floor
+        self._site = estimate.floor
         if self._publisher is not None:
             _send(partial(self._publisher.publish, estimate, outcome.published, self._robot.base_from_body))
         for link in self._links:
             held = frozenset(loaded.version for loaded in self._robot.held)
-            link.after_frame(outcome, held, self._robot.floors, self._robot.visited_versions)
+            link.after_frame(outcome, held, self._robot.building, self._robot.visited_versions)
         was_lost = self._figures.search.is_long
         before = {} if self._figures.last is None else self._figures.last.left_out
         for flag in outcome.left_out.keys() - before.keys():
@@ -295,32 +295,27 @@ class Runtime:
         self._refused_tiles = {sha256: cells for sha256, cells in self._refused_tiles.items() if sha256 in known}
 
     def _show_grid(self, version: WantedVersion) -> None:
-        """Publish the grid of the floor's map: of the confirmed version, or of another floor. If an older client did not fetch it with
-        the version, fetch it now, once."""
-        publisher, floor = self._publisher, self._floor
+        """Publish the grid of the map in which the robot is: of the confirmed version, or of another site's. If an older client did not
+        fetch it with the version, fetch it now, once."""
+        publisher, site, building = self._publisher, self._site, self._parts.building
         height_m = None if publisher is None else publisher.grid_height_m
-        if floor and self._parts.floors is not None:
-            version = self._parts.floors.held.get(floor, version)
-        if publisher is None or height_m is None or (floor, version) == self._shown_grid:
+        if site and building is not None:
+            version = building.held.get(site, version)
+        if publisher is None or height_m is None or (site, version) == self._shown_grid:
             return
-        is_other_floor = self._shown_grid is not None and self._shown_grid[0] != floor
-        self._shown_grid, grid, why = (floor, version), None, ""
+        was_elsewhere = self._shown_grid is not None and self._shown_grid[0] != site
+        self._shown_grid, grid, why = (site, version), None, ""
         try:
-            if floor and self._parts.floors is not None:
-                grid = self._parts.floors.grid(floor)
+            if site and building is not None:
+                grid = building.grid(site)
             else:
                 grid = self._parts.tile_loader.grid(version, height_m)
         except FleetmapError as error:
-            why = str(error)
-            key = f"grid {version.manifest_sha256}"
-            if is_other_floor:  # a planner must not use the floor where the robot was
+            why, key = str(error), f"grid {version.manifest_sha256}"
+            if was_elsewhere:  # a planner must not use the grid of where the robot was
                 _send(partial(publisher.show_grid, version.version or 0, NO_GRID, ""))
-            if (
-                not floor
-                and isinstance(error, LinkError)
-                and self._server is not None
-                and key not in self._fetched_again
-            ):
+            may_fetch = not site and isinstance(error, LinkError) and key not in self._fetched_again
+            if may_fetch and self._server is not None:
                 self._fetched_again.add(key)
                 self._server.refetch.append(version)
                 return

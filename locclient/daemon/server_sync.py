@@ -15,7 +15,7 @@ from locclient.delivery.outbox import Outbox
 from locclient.delivery.report_delivery import deliver, deliver_replay_part
 from locclient.delivery.survey_drives import SurveyDrives
 from locclient.hooks import RobotLink
-from locclient.maps.floor_maps import FloorMaps
+from locclient.maps.building_maps import BuildingMaps
 from locclient.maps.map_client import MapClient
 from locclient.prior_option import told_prior
 from locclient.robot.version_trial import Change, VersionChange
@@ -48,7 +48,7 @@ class ServerSync:
         """retry_s: delay before a postponed version is offered again. upkeep: called once an hour; its errors are logged."""
         self.replays: Outbox | None = None  # recordings of failures, which may be large
         self.drives: SurveyDrives | None = None  # through areas that operators want to be surveyed
-        self.floors: FloorMaps | None = None  # of the robot's building
+        self.building: BuildingMaps | None = None
         self._replayed_bytes: dict[str, int] = {}
         self.recordings_at_s = 0.0
         # The upkeep first: after a renewal whose response was lost, the server admits no other request.
@@ -139,8 +139,8 @@ class ServerSync:
         if self.drives is not None:
             self.drives.requests = self.client.surveys
         self._learn_frame()
-        if self.floors is not None:
-            self.floors.refresh()
+        if self.building is not None:
+            self.building.refresh()
         sha256 = wanted.manifest_sha256
         if sha256 is None:
             words = (

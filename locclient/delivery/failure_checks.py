@@ -170,7 +170,7 @@ class _Walk:
             self._camera = value
         elif isinstance(value, QueryInput):
             if not 0 <= value.view < len(self._cameras):
-                raise _refused(f"{where}.view", f"{value.view} of a rig of {len(self._cameras)} views")
+                raise _refused(f"{where}.view", f"{value.view} of a rig of {len(self._cameras)} cameras")
             self._camera = self._cameras[value.view]
         for name in names:
             member, at = getattr(value, name), f"{where}.{name}".lstrip(".")

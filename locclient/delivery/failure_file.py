@@ -56,7 +56,7 @@ class LocalizerRecord(msgspec.Struct, frozen=True, kw_only=True):
     start: Start
     used: UsedMap | None
     frames: Annotated[list[tuple[Commands, Percept]], msgspec.Meta(min_length=1, max_length=2000)]
-    others: Annotated[tuple[MountedCamera, ...], msgspec.Meta(max_length=15)] = ()  # of the rig's other views
+    others: Annotated[tuple[MountedCamera, ...], msgspec.Meta(max_length=15)] = ()  # the rig's other cameras
 
 
 def failure_file(cut: FailureCut, report: FailureReport, profile: RobotProfile, pictures: str) -> bytes:
@@ -187,8 +187,8 @@ def _reduced_rig(frames: Sequence[RingFrame], profile: RobotProfile) -> RigCalib
     """Return the rectified rig at the pictures' size."""
     has_right = any(frame.picture is not None and frame.picture.right is not None for frame in frames)
     pairs = [has_right, *(each.camera.baseline_m > 0 for each in profile.others)]
-    views = (_reduced_view(profile, view, is_pair=is_pair) for view, is_pair in enumerate(pairs))
-    cameras = tuple(camera for view in views for camera in view)
+    reduced = (_reduced_view(profile, view, is_pair=is_pair) for view, is_pair in enumerate(pairs))
+    cameras = tuple(camera for view in reduced for camera in view)
     return RigCalibration(cameras, profile.imu, profile.base_from_body)
 
 

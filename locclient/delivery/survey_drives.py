@@ -15,7 +15,7 @@ import numpy as np
 from fleetmap.errors import FleetmapError, LinkError, disk_errors
 from fleetmap.failure_summary import MAX_DRIVE_BYTES, ReplayPart
 from fleetmap.geometry import Array, inside_rings
-from fleetmap.mapformat.floors import edge_distance_m
+from fleetmap.mapformat.building import edge_distance_m
 from fleetmap.messages import PART_BYTES, Status, SurveyArea
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_grey, jpeg_image, store_frame
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
@@ -155,8 +155,8 @@ class SurveyDrives:
             self._writer.write_wheel(taken.wheel)
             if taken.frame is not None and not self._is_full:
                 frame = _stored(taken.frame)
-                views = [frame, *(other for other in frame.others if other is not None)]
-                self._bytes += sum(len(each.data) for v in views for each in (v.left, v.right, v.depth) if each)
+                parts = [frame, *(other for other in frame.others if other is not None)]
+                self._bytes += sum(len(each.data) for v in parts for each in (v.left, v.right, v.depth) if each)
                 self._writer.write_frame(frame)
                 self._is_full = self._bytes > 0.9 * MAX_DRIVE_BYTES  # the rest: samples, and the frames until it ends
 

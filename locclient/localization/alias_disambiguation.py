@@ -28,15 +28,15 @@ from fleetmap.features.matching import packed
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
 from fleetmap.relocalization.map_view import CovisibleLandmarks
 
-_MAX_VIEWS, _ALL_VIEWS = 64, (1 << 64) - 1  # in the history: about 20 m of travel
+_MAX_LOOKS, _ALL_LOOKS = 64, (1 << 64) - 1  # in the history: about 20 m of travel
 _MAX_LANDMARKS = 3000  # of a hypothesis: about 30 m of travel
-_STEP_M, _STEP_RAD = 0.2, 0.15  # between counted views: two views from one viewpoint fail for the same reasons
+_STEP_M, _STEP_RAD = 0.2, 0.15  # between counted looks: two looks from one viewpoint fail for the same reasons
 _REACH_M, _ALIKE_BITS = 0.15, 75  # between landmarks of one object in two aisles; others differ by over 90 bits
 # Sizes of a plate, a poster, a pallet: in one of the lattices, a single cell contains most of a sign and little else.
 _LATTICES = np.array([(cell_m, shift) for cell_m in (0.35, 0.6, 0.9) for shift in (0.0, 0.5)])
 _BLOCK_M, _MAX_BLOCKS = 1.8, 256
 _MAX_BLOCK_LOG_ODDS = 3.0  # so that no single movable object decides
-# Beta parameters of the share of views in which a landmark is observed. If present: about two in five, and one in eight landmarks
+# Beta parameters of the share of looks in which a landmark is observed. If present: about two in five, and one in eight landmarks
 # is never observed. If absent: by chance.
 _PRESENT, _NEVER_SHARE, _ABSENT = (2.0, 2.8), 0.12, (0.5, 10.0)
 Flags = NDArray[np.bool_]
@@ -68,12 +68,12 @@ def is_other_viewpoint(since: Array) -> bool:
 
 @dataclass(slots=True)
 class ViewpointGate:
-    """Admits a view only from another viewpoint than the last admitted one."""
+    """Admits a look only from another viewpoint than the last admitted one."""
 
     odom_from_body: Array | None = None
 
     def is_new(self, odom_from_body: Array) -> bool:
-        """Return True if this view is admitted, and store it as the last one."""
+        """Return True if this look is admitted, and store it as the last one."""
         last = self.odom_from_body
         if last is not None and not is_other_viewpoint(se3_inverse(last) @ odom_from_body):
             return False
@@ -87,10 +87,10 @@ class ViewpointGate:
 
 @dataclass(slots=True)
 class ObservationHistory:
-    """Last views of one hypothesis in which each landmark was expected, and in which it was found; ids (L,) ascending.
+    """Last looks of one hypothesis in which each landmark was expected, and in which it was found; ids (L,) ascending.
 
-    Views are bits, the newest is the lowest. views: those with a fix at the hypothesis; expected, found (L,): per landmark.
-    points_odom (L, 3): means over the views. They coincide with those of another hypothesis that observed the same objects.
+    Looks are bits, the newest is the lowest. looks: those with a fix at the hypothesis; expected, found (L,): per landmark.
+    points_odom (L, 3): means over the looks. They coincide with those of another hypothesis that observed the same objects.
     """
 
     ids: NDArray[np.uint32] = field(default_factory=lambda: np.zeros(0, np.uint32))
@@ -98,16 +98,16 @@ class ObservationHistory:
     descriptors: NDArray[np.uint8] = field(default_factory=lambda: np.zeros((0, 32), np.uint8))
     expected: NDArray[np.uint64] = field(default_factory=lambda: np.zeros(0, np.uint64))
     found: NDArray[np.uint64] = field(default_factory=lambda: np.zeros(0, np.uint64))
-    views: int = 0
+    looks: int = 0
 
-    def begin_view(self) -> None:
-        """Begin a view without a fix at this hypothesis so far; drop landmarks that only the oldest view had."""
-        self.views = self.views << 1 & _ALL_VIEWS
+    def begin_look(self) -> None:
+        """Begin a look without a fix at this hypothesis so far; drop landmarks that only the oldest look had."""
+        self.looks = self.looks << 1 & _ALL_LOOKS
         self.expected, self.found = self.expected << np.uint64(1), self.found << np.uint64(1)
         self._keep(np.flatnonzero(self.expected))
 
     def add(self, odom_from_map: Array, observed: CovisibleLandmarks) -> None:
-        self.views |= 1
+        self.looks |= 1
         ids, inverse = np.unique(np.concatenate([self.ids, observed.ids]), return_inverse=True)
         old, new = inverse[: len(self.ids)], inverse[len(self.ids) :]
         points, descriptors = np.zeros((len(ids), 3)), np.zeros((len(ids), 32), np.uint8)
@@ -124,9 +124,9 @@ class ObservationHistory:
         newest = expected & (~expected + np.uint64(1))  # the lowest bit
         self._keep(np.sort(np.argsort(newest, kind="stable")[:_MAX_LANDMARKS]))
 
-    def counts(self, views: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
-        """Return the number of these views (bits) in which each landmark was expected (L,) and found (L,)."""
-        mask = np.uint64(views)
+    def counts(self, looks: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Return the number of these looks (bits) in which each landmark was expected (L,) and found (L,)."""
+        mask = np.uint64(looks)
         return np.bitwise_count(self.expected & mask), np.bitwise_count(self.found & mask)
 
     def redefine_odom(self, new_odom_from_old_odom: Array) -> None:
@@ -147,10 +147,10 @@ def mark_shared(one: ObservationHistory, other: ObservationHistory, one_shared: 
 def log_odds(one: ObservationHistory, other: ObservationHistory, one_shared: Flags, other_shared: Flags) -> float:
     """Return the log Bayes factor of the first hypothesis against the second, given the observations; 0 without evidence.
 
-    Only views with a fix at both count: a fix at a single hypothesis may be wrong. one_shared, other_shared: landmarks that look
+    Only looks with a fix at both count: a fix at a single hypothesis may be wrong. one_shared, other_shared: landmarks that look
     the same at the same position of any hypothesis, and so do not support theirs. Source: Kass and Raftery 1995 (Bayes factors).
     """
-    common = one.views & other.views
+    common = one.looks & other.looks
     if not common or not len(one.ids) or not len(other.ids):
         return 0.0
     one_alike, other_alike = np.zeros(len(one.ids), bool), np.zeros(len(other.ids), bool)
@@ -160,18 +160,18 @@ def log_odds(one: ObservationHistory, other: ObservationHistory, one_shared: Fla
     )
 
 
-def _support(views: int, one: tuple[ObservationHistory, Flags], other: tuple[ObservationHistory, Flags]) -> float:
-    """Return the log odds of the blocks that support the first hypothesis in these views; each with its excluded landmarks."""
+def _support(looks: int, one: tuple[ObservationHistory, Flags], other: tuple[ObservationHistory, Flags]) -> float:
+    """Return the log odds of the blocks that support the first hypothesis in these looks; each with its excluded landmarks."""
     sides = []
     for history, excluded in (one, other):
-        expected, found = history.counts(views)
+        expected, found = history.counts(looks)
         sides.append((history.points_odom, _LOG_LIKELIHOODS[expected, found], excluded | (expected == 0)))
     strongest = core.block_log_odds(sides[0], sides[1], _LATTICES, _MODEL, _BLOCK_M, _MAX_BLOCKS)
     return float(np.clip(strongest, 0.0, _MAX_BLOCK_LOG_ODDS).sum())
 
 
 def log_beta_binomial(expected: int, found: int, a: float, b: float) -> float:
-    """Return the log probability of one sequence of `expected` views, `found` of them positive, of a landmark with rate Beta(a, b)."""
+    """Return the log probability of one sequence of `expected` looks, `found` of them positive, of a landmark with rate Beta(a, b)."""
     # log B(a + found, b + expected - found) - log B(a, b)
     seen, missed = a + found, b + expected - found
     return lgamma(seen) + lgamma(missed) - lgamma(a + b + expected) + lgamma(a + b) - lgamma(a) - lgamma(b)
@@ -179,8 +179,8 @@ def log_beta_binomial(expected: int, found: int, a: float, b: float) -> float:
 
 def _log_likelihoods() -> Array:
     """Return (expected, found, 2): log likelihoods of these counts if the landmark is present, and if it is absent."""
-    table = np.zeros((_MAX_VIEWS + 1, _MAX_VIEWS + 1, 2))
-    for expected in range(_MAX_VIEWS + 1):
+    table = np.zeros((_MAX_LOOKS + 1, _MAX_LOOKS + 1, 2))
+    for expected in range(_MAX_LOOKS + 1):
         for found in range(expected + 1):
             absent = log_beta_binomial(expected, found, *_ABSENT)
             present = log_beta_binomial(expected, found, *_PRESENT)

@@ -14,7 +14,9 @@ from fleetmap.relocalization.relocalizer import Fix
 from locclient.localization.calibration.parameters import NOT_JUDGED, CalibrationState
 from locclient.localization.hypothesis_set import HypothesisSet
 from locclient.localization.image_quality import GOOD_IMAGE, ImageQuality
+from locclient.localization.place import Place
 from locclient.localization.pose_hypothesis import PoseHypothesis
+from locclient.localization.priors.prior import Prior
 from locclient.localization.settings import TrackSettings
 
 
@@ -64,6 +66,11 @@ class Estimate:
     floor: str = ""
 
     @property
+    def is_at_home(self) -> bool:
+        """True if it is in the map of the robot's own site."""
+        return not self.floor
+
+    @property
     def views_in_words(self) -> str:
         """Return the state of each view, and which one is compared with the map; empty for a rig of one view."""
         if len(self.views) == 1:
@@ -92,15 +99,13 @@ def assemble(
     *,
     confirmed: PoseHypothesis | None,
     candidates: HypothesisSet,
-    prior: PoseHypothesis | None,
+    prior: Prior | None,
     has_failed: bool,
     was_tracking: bool,
-    rides: Sequence[PoseHypothesis] = (),
 ) -> Estimate:
     """Return `estimate`, whose cause is that of its images, completed by status, pose and cause.
 
-    prior: pose by the prior and the motion since. has_failed: the last map query found no fix. rides: the places where the robot may be
-    after a ride in a lift, on each floor.
+    has_failed: the last map query found no fix.
     """
     if confirmed is not None:
         return _of_confirmed(estimate, confirmed, candidates.hypotheses, has_failed, settings)
@@ -108,17 +113,20 @@ def assemble(
     is_open = bool(competitors) or (bool(ranking) and candidates.may_be_lookalike(ranking[0]))
     status = Status.AMBIGUOUS if is_open else Status.LOST if was_tracking else Status.INITIALISING
     estimate = replace(estimate, status=status, hypotheses=_published(ranking))
-    if rides and not is_open:
-        return replace(estimate, status=Status.AMBIGUOUS, hypotheses=_published(rides))
-    if ranking and (is_open or prior is None or not was_tracking):
-        return estimate if is_open else _with_pose(estimate, ranking[0], settings)
-    if prior is None or estimate.map_version is None:
+    rides = [] if prior is None or prior.names_floor or is_open else prior.places()
+    if rides:
+        places = tuple(Hypothesis(place.map_from_body, 1, place.floor) for place in rides)
+        return replace(estimate, status=Status.AMBIGUOUS, hypotheses=places)
+    known = None if prior is None else prior.hypothesis
+    if ranking and (is_open or known is None or not was_tracking):
+        return estimate if is_open else _with_pose(estimate, ranking[0].now, settings)
+    if known is None or estimate.map_version is None:
         return estimate
     # Nothing in the map matches: use the prior and the odometry since, within its accuracy.
-    if radius_95_m(prior.now_cov) <= settings.lost_radius_m:
+    if radius_95_m(known.now.cov_rot_trans) <= settings.lost_radius_m:
         status = Status.DEGRADED
     estimate = replace(estimate, status=status, cause=_cause(estimate, has_failed=True))
-    return _with_pose(estimate, prior, settings)
+    return _with_pose(estimate, known.now, settings)
 
 
 def _cause(estimate: Estimate, *, has_failed: bool) -> Cause:
@@ -134,8 +142,8 @@ def _of_confirmed(
     has_failed: bool,
     settings: TrackSettings,
 ) -> Estimate:
-    is_known = not np.isnan(confirmed.now_map_from_body).any()
-    radius_m = radius_95_m(confirmed.now_cov) if is_known else float("inf")
+    is_known = not np.isnan(confirmed.now.map_from_body).any()
+    radius_m = radius_95_m(confirmed.now.cov_rot_trans) if is_known else float("inf")
     age_s = (estimate.odometry.stamp_ns - confirmed.stamp_ns) * 1e-9
     is_broken = confirmed.has_broken or confirmed.lost_imu
     cause = _cause(estimate, has_failed=has_failed) or (Cause.ODOMETRY if is_broken else Cause.NONE)
@@ -157,22 +165,19 @@ def _of_confirmed(
     if status is not Status.TRACKING and is_told:  # the robot may be at either
         places = _published([confirmed, *elsewhere])
         return replace(estimate, status=Status.AMBIGUOUS, hypotheses=places)
-    return _with_pose(estimate, confirmed, settings)
+    return _with_pose(estimate, confirmed.now, settings)
 
 
-def _with_pose(estimate: Estimate, hypothesis: PoseHypothesis, settings: TrackSettings) -> Estimate:
+def _with_pose(estimate: Estimate, place: Place, settings: TrackSettings) -> Estimate:
     """Add the pose, and the map's own uncertainty, which is common to all fixes and does not average out.
 
     The estimate has no pose if pose or covariance contain NaN.
     """
-    if np.isnan(hypothesis.now_map_from_body).any() or np.isnan(hypothesis.now_cov).any():
+    if np.isnan(place.map_from_body).any() or np.isnan(place.cov_rot_trans).any():
         return estimate
     of_map = np.diag([settings.map_sigma_rad**2] * 3 + [settings.map_sigma_m**2] * 3)
-    covariance = hypothesis.now_cov + of_map
-    return replace(
-        estimate, map_from_body=hypothesis.now_map_from_body, cov_rot_trans=covariance, floor=hypothesis.floor
-    )
+    return replace(estimate, **place._replace(cov_rot_trans=place.cov_rot_trans + of_map)._asdict())
 
 
 def _published(hypotheses: Sequence[PoseHypothesis]) -> tuple[Hypothesis, ...]:
-    return tuple(Hypothesis(h.now_map_from_body, h.support, h.floor) for h in hypotheses)
+    return tuple(Hypothesis(h.now.map_from_body, h.support, h.now.floor) for h in hypotheses)

@@ -61,7 +61,7 @@ class HypothesisSet:
             hypothesis.misses += 1
             hypothesis.decay(self._settings.evidence_kept_share)
             if is_new_viewpoint:
-                hypothesis.history.begin_view()
+                hypothesis.history.begin_look()
         for fix, fresh in observations:
             self._vote(fix, fresh, odom_from_body if is_new_viewpoint else None)
         self.hypotheses = [h for h in self.hypotheses if h.misses < self._settings.max_misses]
@@ -82,7 +82,7 @@ class HypothesisSet:
     def _count(self, hypothesis: PoseHypothesis, fix: Fix, fresh: PoseHypothesis, odom_from_body: Array | None) -> None:
         hypothesis.add_fix(fix.inliers, fix.landmark_recall)
         if self._settings.is_whole_site_mapped and fix.covisible is not None and odom_from_body is not None:
-            hypothesis.history.add(odom_from_body @ se3_inverse(fresh.now_map_from_body), fix.covisible)
+            hypothesis.history.add(odom_from_body @ se3_inverse(fresh.now.map_from_body), fix.covisible)
 
     def update(self, observations: Observations, odom_from_body: Array) -> TimeSliced[None]:
         """Run `observe` and the disambiguation, in time slices."""
@@ -173,13 +173,13 @@ class HypothesisSet:
         has_enough = hypothesis.support >= settings.confirming_fixes
         return has_enough and hypothesis.travelled_m >= settings.confirming_distance_m
 
-    def is_confirmed(self, hypothesis: PoseHypothesis, fixes: Sequence[Fix], *, floors: int = 1) -> bool:
+    def is_confirmed(self, hypothesis: PoseHypothesis, fixes: Sequence[Fix], *, is_one_map: bool = True) -> bool:
         """Return True after enough fixes over enough distance, or for the only hypothesis after an unambiguous fix: a strong one, or one
         of enough agreeing fixes if the map's look-alikes were measured well enough, so that no distance is needed to exclude them.
 
-        floors: number of those that were searched; of several, one fix says too little: it may be missing on the robot's own."""
+        is_one_map: one alone was searched; of several, one fix says too little: it may be missing in the right one."""
         settings = self._settings
-        if floors == 1 and len(self.hypotheses) == len(fixes) == 1:
+        if is_one_map and len(self.hypotheses) == len(fixes) == 1:
             fix = fixes[0]
             # It agrees too well for any other place of this map.
             is_unambiguous = fix.inlier_share >= settings.strong_share and fix.alias_ratio < settings.strong_alias_share
@@ -194,9 +194,10 @@ class HypothesisSet:
         (Mahalanobis test)."""
         if self.abandoned is None:
             return None
-        error = boxminus(hypothesis.now_map_from_body, self.abandoned.now_map_from_body)
-        if self.abandoned.floor != hypothesis.floor:
+        then, now = self.abandoned.now, hypothesis.now
+        error = boxminus(now.map_from_body, then.map_from_body)
+        if then.floor != now.floor:
             return max(_STOREY_M, float(np.linalg.norm(error[3:])))
-        covariance = hypothesis.now_cov + self.abandoned.now_cov
+        covariance = now.cov_rot_trans + then.cov_rot_trans
         is_beyond = error @ np.linalg.solve(covariance, error) > self._settings.innovation_limit
         return float(np.linalg.norm(error[3:])) if is_beyond else None

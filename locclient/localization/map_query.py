@@ -1,7 +1,7 @@
 """Map queries: their start, and their work spread over frames. Pure."""
 
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,9 +16,9 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import ViewpointGate
 from locclient.localization.estimate import QueryResult
+from locclient.localization.held_maps import HeldMaps
 from locclient.localization.image_quality import UNUSABLE
 from locclient.localization.percept import Percept, QueryInput
-from locclient.localization.pose_covariance import transport_cov
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.pose_tracker import PoseTracker
 from locclient.localization.settings import LocalizerSettings
@@ -27,7 +27,7 @@ _SPREAD_SHARE = 0.45  # of the query interval: if frames are farther apart, a qu
 _HYPOTHESES_AT_ONCE = 3  # in one time slice of a search
 # Per frame, where a late estimate does no harm: from an unchanged viewpoint, in the first searches without a prior, and after lost tracks.
 _MORE_SLICES = 3
-_TORN_SLICES = 2  # among places that the next views may tell apart; three find the right one a fifteenth sooner
+_TORN_SLICES = 2  # among places that the next looks may tell apart; three find the right one a fifteenth sooner
 _COUNTERPART_M = 3.0  # around the place of a fix on another floor, whose map may lie so far off in the building
 _FIRST_SEARCHES = 10  # then the robot probably drives where nothing is mapped, and keeps to the time of a frame
 
@@ -59,73 +59,52 @@ class MapQuery:
     failed: number of failed queries in a row.
     """
 
-    def __init__(self, tracker: PoseTracker, settings: LocalizerSettings) -> None:
-        self._tracker, self._settings, self._track = tracker, settings, settings.track
-        self._relocalizers: dict[str, tuple[Relocalizer, ...]] = {}  # of each floor, for each view
-        self._plan_from_map: Mapping[str, Array] = {}  # of each floor of a building, along the floor
+    def __init__(self, tracker: PoseTracker, maps: HeldMaps, settings: LocalizerSettings, cameras: int = 1) -> None:
+        """cameras: number of those of the rig."""
+        self._tracker, self._maps, self._settings, self._track = tracker, maps, settings, settings.track
         self.view = 0  # whose frame is queried
         self.failed = 0
         self.finished: FinishedQuery | None = None  # finished with the last frame
-        self.is_riding = False  # in a lift, whose cabin looks the same on every floor
         self._job: TimeSliced[QueryResult] | None = None
         self._begun: tuple[Percept, RectifiedFrame | None] | None = None  # the frame of that job, or of the last one
         self._begun_ns: int | None = None
         self._slices, self._is_urgent = 1, False  # of that job: slices per frame; started by lost tracks
         self._last_ns: int | None = None  # of the last frame
-        self._gates = [ViewpointGate()]  # of each view
-        # Of each view, by floor: searched without success from the viewpoint of the gate.
-        self._failed_places: list[defaultdict[str, list[Array]]] = [defaultdict(list)]
+        self._gates = [ViewpointGate() for _ in range(cameras)]
+        # Of each camera, by floor: searched without success from the viewpoint of the gate.
+        self._failed_places: list[defaultdict[str, list[Array]]] = [defaultdict(list) for _ in range(cameras)]
+        tracker.on_restart.append(self.forget)
 
     @property
     def is_under_way(self) -> bool:
         return self._job is not None
 
-    def use(self, *relocalizers: Relocalizer, floor: str = "") -> None:
-        """Use another map of a floor, by a relocalizer for each of the rig's views; cancel a running query."""
-        if len(relocalizers) != len(self._gates):
-            self._gates = [ViewpointGate() for _ in relocalizers]
-        self._relocalizers[floor] = relocalizers
-        self._note_missing()
+    def begin_anew(self) -> None:
+        """Cancel a running query: the maps have changed."""
         self._cancel()
-        self._failed_places = [defaultdict(list) for _ in relocalizers]
-
-    def use_floors(self, plan_from_map: Mapping[str, Array]) -> None:
-        """Search these floors only, besides the robot's own; cancel a running query.
-
-        plan_from_map (4, 4): of each floor, with the same building coordinates for places one above the other, and z of its map.
-        """
-        self._plan_from_map = plan_from_map
-        self._relocalizers = {
-            floor: r for floor, r in self._relocalizers.items() if not floor or floor in plan_from_map
-        }
-        self._note_missing()
-        self._cancel()
-
-    def _note_missing(self) -> None:
-        self._tracker.building = self._plan_from_map.keys()
-        self._tracker.missing_floors = self._plan_from_map.keys() - self._relocalizers.keys()
+        self._failed_places = [defaultdict(list) for _ in self._gates]
 
     def forget(self) -> None:
         """Forget the pose; cancel a running query."""
-        self._cancel()
+        self.begin_anew()
         self.failed = 0
-        self._failed_places = [defaultdict(list) for _ in self._gates]
 
     def _cancel(self) -> None:
         self._job = None
         self._tracker.end_query()
 
-    def step(self, percept: Percept, frame: RectifiedFrame | None) -> QueryResult:
+    def step(self, percept: Percept, frame: RectifiedFrame | None, *, is_riding: bool = False) -> QueryResult:
         """Return the result of a query finished with this frame, with the stamp of the query's frame; otherwise an empty result.
 
         Queries are spread over frames, except the first one, those after a gap, and those of recordings with hardly more frames
-        than queries. frame: None in a replay, where queries begin at the recorded frames.
+        than queries. frame: None in a replay, where queries begin at the recorded frames. is_riding: in a lift, whose cabin looks the same
+        everywhere.
         """
         self.finished = None
         if percept.odometry.new_odom_from_old_odom is not None:
             for gate in self._gates:
                 gate.redefine_odom(percept.odometry.new_odom_from_old_odom)
-        if self.is_riding:
+        if is_riding:
             self.forget()
             result = QueryResult(refused="the robot rides in a lift")
         else:
@@ -139,7 +118,7 @@ class MapQuery:
         is_urgent = percept.has_broken and not self.failed
         if (is_urgent and not self._is_urgent) or odometry.after_gap:
             self._cancel()  # a frame before the break, or before the gap, says little of the robot's present pose
-        if self._job is None and self._relocalizers:
+        if self._job is None and self._maps.by_floor:
             is_due = is_urgent or self._is_due(odometry)
             begins = percept.query is not None if frame is None else is_due
             if begins:
@@ -211,7 +190,7 @@ class MapQuery:
             if frame is not None and percept.query is not None and percept.query.features is not None:
                 is_confirmed = self._tracker.confirmed is not None
                 floor = self._tracker.floor if result.fix is None else result.fix.floor
-                relocalizer = self._on(floor) or next(iter(self._relocalizers.values()))[self.view]
+                relocalizer = self._on(floor) or self._any_relocalizer()
                 looked = percept.odometry, percept.query.features, result.fix, relocalizer, is_confirmed
                 self.finished = FinishedQuery(frame, *looked)
             return result
@@ -219,19 +198,20 @@ class MapQuery:
 
     def _on(self, floor: str) -> Relocalizer | None:
         """Return the relocalizer of the queried view on a floor; None if the robot does not hold its map."""
-        held = self._relocalizers.get(floor)
-        return None if held is None else held[self.view]
+        return self._maps.relocalizer(floor, self.view)
+
+    def _any_relocalizer(self) -> Relocalizer:
+        return next(iter(self._maps.by_floor.values())).relocalizers[self.view]
 
     def _run(self, query: QueryInput, frame: RectifiedFrame | None, *, is_sparse: bool) -> TimeSliced[QueryResult]:
         tracker = self._tracker
-        features = yield from _extract(query, frame, next(iter(self._relocalizers.values()))[self.view])
+        features = yield from _extract(query, frame, self._any_relocalizer())
         confirmed = tracker.confirmed
         if confirmed is None:
             tracker.forget_frames()
             fixes, outside = yield from self._search(features)
-            prior = tracker.prior
-            floors = sum(prior is None or floor in prior.floors for floor in self._relocalizers)
-            return (yield from tracker.update_candidates(fixes, outside=outside, floors=floors))
+            is_one_map = len(self._floors_of_prior()) <= 1
+            return (yield from tracker.update_candidates(fixes, outside=outside, is_one_map=is_one_map))
         near = self._near(features, confirmed)
         if near is None and (earlier := tracker.earlier_frames()):
             yield
@@ -243,7 +223,7 @@ class MapQuery:
         fixes = [] if near is None else [near]
         if near is None and (is_sparse or self.failed + 1 >= self._track.search_after_failed):
             yield
-            fixes = yield from self._anywhere(confirmed.floor, features, None, self._rotation(confirmed))
+            fixes = yield from self._anywhere(confirmed.now.floor, features, None, self._rotation(confirmed))
             fixes = [fix for fix in fixes if fix.inliers >= self._settings.fix.min_inliers]
         return tracker.update(fixes, confirmed, is_near=near is not None)
 
@@ -254,17 +234,21 @@ class MapQuery:
         earlier: Sequence[EarlierFrame] = (),
     ) -> Fix | None:
         """Return the fix near a hypothesis at the frame of the query, by that frame and earlier ones."""
-        relocalizer = self._on(hypothesis.floor)
+        floor = hypothesis.now.floor
+        relocalizer = self._on(floor)
         if relocalizer is None:
             return None
-        map_from_body = hypothesis.query_map_from_body
-        map_from_cam = map_from_body @ self._tracker.body_from_cam
-        cov_cam = transport_cov(hypothesis.query_cov, map_from_cam[:3, 3] - map_from_body[:3, 3])
-        fix = relocalizer.near(features, map_from_cam, cov_cam, earlier)
-        return None if fix is None else _at_floor([fix], hypothesis.floor)[0]
+        map_from_cam, covariance, _ = hypothesis.then.of_point(self._tracker.body_from_cam)
+        fix = relocalizer.near(features, map_from_cam, covariance, earlier)
+        return None if fix is None else _at_floor([fix], floor)[0]
 
     def _rotation(self, hypothesis: PoseHypothesis) -> Array:
-        return (hypothesis.query_map_from_body @ self._tracker.body_from_cam)[:3, :3]
+        return (hypothesis.then.map_from_body @ self._tracker.body_from_cam)[:3, :3]
+
+    def _floors_of_prior(self) -> list[str]:
+        """Return the floors to search."""
+        prior = self._tracker.prior
+        return [floor for floor in self._maps.by_floor if prior is None or floor in prior.floors]
 
     def _search(self, features: FrameFeatures) -> TimeSliced[tuple[list[Fix], bool]]:
         """Return fixes in all maps, or within the prior; near the candidates first. True if some lie outside the prior."""
@@ -277,12 +261,11 @@ class MapQuery:
             if number % _HYPOTHESES_AT_ONCE == 0:
                 yield
         only = candidates[0] if len(candidates) == 1 else None
-        prior, fixes = tracker.prior, list[Fix]()
-        floors = [floor for floor in self._relocalizers if prior is None or floor in prior.floors]
+        prior, fixes, floors = tracker.prior, list[Fix](), self._floors_of_prior()
         for floor in floors:
-            places = self._relocalizers[floor][self.view].view.map_from_cam[:, :3, 3]
+            places = self._maps.by_floor[floor].relocalizers[self.view].view.map_from_cam[:, :3, 3]
             near = None if prior is None else prior.is_near(places, floor)
-            rotation = self._rotation(only) if only is not None and only.floor == floor else None
+            rotation = self._rotation(only) if only is not None and only.now.floor == floor else None
             here, failed = [fix for fix in found if fix.floor == floor], self._failed_places[self.view][floor]
             fixes += yield from self._anywhere(floor, features, near, rotation, here, failed)
         fixes += yield from self._counterparts(features, fixes, floors)
@@ -296,7 +279,7 @@ class MapQuery:
             return fixes if prior.is_revisable else within, len(within) < len(fixes)
         yield
         fixes = []
-        for floor in self._relocalizers:
+        for floor in self._maps.by_floor:
             fixes += yield from self._anywhere(floor, features)
         fixes = [fix for fix in sorted(fixes, key=lambda fix: -fix.inliers) if tracker.is_reliable(fix)]
         return fixes if tracker.drops_prior(fixes) else [], bool(fixes)
@@ -323,7 +306,7 @@ class MapQuery:
         """Return fixes at the places above and below the best fix of each floor that have none yet: floors may look alike, and a search
         that fails on the robot's own must not leave another one without competitors."""
         added: list[Fix] = []
-        known = self._plan_from_map
+        known = self._maps.plan_from_map
         for floor in floors if len(floors) > 1 else ():
             best = next((fix for fix in fixes if fix.floor == floor), None)
             relocalizer = self._on(floor)

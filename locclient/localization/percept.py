@@ -7,8 +7,8 @@ from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.frame_features import FrameFeatures
 from locclient.localization.calibration.parameters import NOT_JUDGED, CalibrationState
 from locclient.localization.image_quality import ImageQuality
-from locclient.localization.lift_ride import Ride
 from locclient.localization.pose_hypothesis import Motion
+from locclient.localization.priors.ride_gauge import Ride
 
 
 @dataclass(slots=True)
@@ -27,7 +27,7 @@ class QueryInput:
 class Percept:
     """Percept of one frame.
 
-    motions: of the odometry, from start frames of hypotheses. is_reversed: images of a pair or of two views are exchanged, or mirrored.
+    motions: of the odometry, from start frames of hypotheses. is_reversed: images of a pair or of two cameras are exchanged, or mirrored.
     calibration: its state by the map before this frame. query: of a map query that begins with this frame. image: of the view that the
     odometry follows; views: faults of the images of each view. ride: motion in a lift, None for a robot without a building.
     """

@@ -9,7 +9,8 @@ import numpy as np
 from fleetmap.geometry import Array, length
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from locclient.localization.alias_disambiguation import ObservationHistory
-from locclient.localization.pose_covariance import bounded_turn, boxminus, compose_cov, compose_end_cov
+from locclient.localization.place import ORIGIN, Place
+from locclient.localization.pose_covariance import bounded_turn, boxminus
 from locclient.localization.settings import TrackSettings
 
 # Sigmas of one step: radians, metres, share of the distance.
@@ -28,26 +29,21 @@ class Motion(NamedTuple):
 
 @dataclass
 class PoseHypothesis:
-    """Pose of the body in `map` at one frame of the odometry, and its support.
+    """Place of the body at one frame of the odometry, and its support.
 
-    map_from_body and cov_rot_trans: at that frame. now_map_from_body, now_cov: propagated to the present. query_map_from_body,
-    query_cov: at the frame of the present map query, which may be some frames old. stamp_ns: of the last fix. support: number of
-    agreeing fixes. inlier_sum, recall_sum, queries: sums of inliers, of landmark recall, and of map queries, older ones
-    decayed. query_inliers, query_recall: of this query's fix, 0 without. recall_total, looks: landmark recall of all queries, 0
-    for those without a fix, and their number. misses: queries since the last fix. told_log_odds: log odds that an operator who chose
-    this place is right, 0 without one. has_broken: tracks were lost since the last fix, lost_imu: so was the IMU, for longer than
-    images alone are believed, missed: so were frames. is_by_vision: it moved without an IMU since its frame. floor: whose `map` it
-    is, empty for the robot's own.
+    start: at that frame. now: propagated to the present. then: at the frame of the present map query, which may be some frames old.
+    stamp_ns: of the last fix. support: number of agreeing fixes. inlier_sum, recall_sum, queries: sums of inliers, of landmark recall, and
+    of map queries, older ones decayed. query_inliers, query_recall: of this query's fix, 0 without. recall_total, looks: landmark recall of
+    all queries, 0 for those without a fix, and their number. misses: queries since the last fix. told_log_odds: log odds that an operator
+    who chose this place is right, 0 without one. has_broken: tracks were lost since the last fix, lost_imu: so was the IMU, for longer than
+    images alone are believed, missed: so were frames. is_by_vision: it moved without an IMU since its frame.
     """
 
     frame_index: int
     stamp_ns: int
-    map_from_body: Array
-    cov_rot_trans: Array
-    now_map_from_body: Array
-    now_cov: Array
-    query_map_from_body: Array = field(default_factory=lambda: np.eye(4))
-    query_cov: Array = field(default_factory=lambda: np.zeros((6, 6)))
+    start: Place
+    now: Place
+    then: Place = ORIGIN
     support: int = 1
     inlier_sum: float = 0.0
     recall_sum: float = 0.0
@@ -63,24 +59,17 @@ class PoseHypothesis:
     lost_imu: bool = False
     missed: bool = False
     is_by_vision: bool = False
-    floor: str = ""
     history: ObservationHistory = field(default_factory=ObservationHistory)
 
     @classmethod
-    def at(
-        cls, odometry: OdometryEstimate, map_from_body: Array, cov_rot_trans: Array, floor: str = ""
-    ) -> "PoseHypothesis":
-        at_frame = map_from_body, cov_rot_trans
-        return cls(odometry.frame_index, odometry.stamp_ns, *at_frame, *at_frame, floor=floor)
+    def at(cls, odometry: OdometryEstimate, place: Place = ORIGIN) -> "PoseHypothesis":
+        return cls(odometry.frame_index, odometry.stamp_ns, place, place)
 
     @classmethod
-    def at_query(
-        cls, query: "PoseHypothesis", map_from_body: Array, cov_rot_trans: Array, floor: str
-    ) -> "PoseHypothesis":
-        """Propagate a pose at the frame of a map query to the present. query: the identity at that frame, propagated to the present."""
-        then = compose_end_cov(map_from_body, cov_rot_trans, query.map_from_body, query.cov_rot_trans)
-        now = compose_end_cov(map_from_body, cov_rot_trans, query.now_map_from_body, query.now_cov)
-        fresh = cls(query.frame_index, query.stamp_ns, *then, *now, has_broken=query.has_broken, floor=floor)
+    def at_query(cls, query: "PoseHypothesis", place: Place) -> "PoseHypothesis":
+        """Propagate a place at the frame of a map query to the present. query: the origin at that frame, propagated to the present."""
+        ways = place.at_end_of(query.start), place.at_end_of(query.now)
+        fresh = cls(query.frame_index, query.stamp_ns, *ways, has_broken=query.has_broken)
         fresh.lost_imu, fresh.missed, fresh.is_by_vision = query.lost_imu, query.missed, query.is_by_vision
         return fresh
 
@@ -102,11 +91,11 @@ class PoseHypothesis:
         return self.recall_total / max(self.looks, 1)
 
     def is_same_pose(self, fresh: "PoseHypothesis", settings: TrackSettings) -> bool:
-        error, covariance = boxminus(fresh.now_map_from_body, self.now_map_from_body), self.now_cov
+        error, covariance = boxminus(fresh.now.map_from_body, self.now.map_from_body), self.now.cov_rot_trans
         far_m = settings.hypothesis_distance_m + 3 * np.sqrt(np.trace(covariance[3:, 3:]))
         far_rad = np.radians(settings.hypothesis_angle_deg) + 3 * np.sqrt(np.trace(covariance[:3, :3]))
         is_near = bool(np.linalg.norm(error[3:]) < far_m and np.linalg.norm(error[:3]) < far_rad)
-        return is_near and fresh.floor == self.floor
+        return is_near and fresh.now.floor == self.now.floor
 
     def speaks_against_others(self, settings: TrackSettings) -> bool:
         """Return True if its fixes may contradict a confirmed pose: strong ones, or ones that moved with the robot, farther than the
@@ -131,13 +120,12 @@ class PoseHypothesis:
 
     def mark_query(self) -> None:
         """Store the present pose for the map query that begins now."""
-        self.query_map_from_body, self.query_cov = self.now_map_from_body, self.now_cov
+        self.then = self.now
 
     def take_pose(self, other: "PoseHypothesis") -> None:
         """Adopt the pose of another hypothesis, and keep the own support."""
         self.frame_index, self.stamp_ns = other.frame_index, other.stamp_ns
-        self.map_from_body, self.cov_rot_trans = other.map_from_body, other.cov_rot_trans
-        self.now_map_from_body, self.now_cov = other.now_map_from_body, other.now_cov
+        self.start, self.now = other.start, other.now
         self.is_by_vision = other.is_by_vision
 
     def propagate(
@@ -158,17 +146,14 @@ class PoseHypothesis:
                 and odometry.status is not OdometryStatus.DEGRADED
                 and odometry.scale_known
             )
-            cov_step = _step_cov(_MEASURED_DRIFT if is_sure else _RESTARTED, step_m)
-            self.now_map_from_body, self.now_cov = compose_cov(self.now_map_from_body, self.now_cov, step, cov_step)
+            self.now = self.now.moved(step, _step_cov(_MEASURED_DRIFT if is_sure else _RESTARTED, step_m))
         else:
             distance_m = length(motion.body_from_now[:3, 3])
             drift = _VISION_ONLY if self.is_by_vision else (0.0, settings.drift_floor_m, settings.drift_share)
-            cov_motion = motion.cov_rot_trans + _step_cov(drift, distance_m)
-            now = compose_cov(self.map_from_body, self.cov_rot_trans, motion.body_from_now, cov_motion)
-            self.now_map_from_body, self.now_cov = now
+            self.now = self.start.moved(motion.body_from_now, motion.cov_rot_trans + _step_cov(drift, distance_m))
         if motion is None or motion.is_last:
             self.frame_index, self.is_by_vision = odometry.frame_index, False
-            self.map_from_body, self.cov_rot_trans = self.now_map_from_body, bounded_turn(self.now_cov)
+            self.start = self.now._replace(cov_rot_trans=bounded_turn(self.now.cov_rot_trans))
 
 
 def _step_cov(sigmas: tuple[float, float, float], distance_m: float) -> Array:

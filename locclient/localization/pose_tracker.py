@@ -1,8 +1,8 @@
 """Pose tracking in the map: a prior, competing candidates or one confirmed pose, propagated by the odometry. Pure."""
 
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,17 +11,19 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.inertial import GRAVITY_MPS2
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.frame_features import FrameFeatures
-from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes
+from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, is_reliable
 from fleetmap.sensors.rectification import MountedCamera
 from fleetmap.sensors.samples import PositionPrior
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import is_other_viewpoint
 from locclient.localization.estimate import QueryResult
+from locclient.localization.held_maps import HeldMaps
 from locclient.localization.hypothesis_set import HypothesisSet, Observations
-from locclient.localization.initial_pose_prior import InitialPosePrior, agrees
-from locclient.localization.pose_covariance import innovation_of, kalman_update, transport_cov
+from locclient.localization.place import Place
+from locclient.localization.pose_covariance import innovation_of, kalman_update
 from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
+from locclient.localization.priors.prior import Prior
 from locclient.localization.settings import LocalizerSettings
 
 _OWN_FIX_M = 0.3  # between a fix and the hypothesis that it supports
@@ -59,7 +61,7 @@ class Start:
 
 
 class _Unmatched(NamedTuple):
-    """The frame of a query without a fix, as the identity; features of one of its views, body_from_cam (4, 4)."""
+    """The frame of a query without a fix, as the identity; features of one of its cameras, body_from_cam (4, 4)."""
 
     frame: PoseHypothesis
     features: FrameFeatures
@@ -84,60 +86,73 @@ class PoseTracker:
     CONFIRMED   --its radius includes the next similar place-->  SEARCHING, with the pose as a prior
     """
 
-    def __init__(self, settings: LocalizerSettings, mounted: Sequence[MountedCamera], base_from_body: Array) -> None:
-        """mounted: the cameras of the rig's views."""
+    def __init__(
+        self, settings: LocalizerSettings, mounted: Sequence[MountedCamera], base_from_body: Array, maps: HeldMaps
+    ) -> None:
+        """mounted: the cameras of the rig."""
         self._settings, self._track = settings, settings.track
-        self._mounted, self._base_from_body = mounted, base_from_body
+        self._mounted, self.base_from_body, self.maps = mounted, base_from_body, maps
+        self.on_restart: list[
+            Callable[[], None]
+        ] = []  # called when what was seen before says nothing of the robot's place any more
         self._view, self.body_from_cam = 0, mounted[0].body_from_cam  # of the last query
-        self.prior: InitialPosePrior | None = None
+        self.prior: Prior | None = None
         self.candidates = HypothesisSet(settings.track)
         self._repeated = HypothesisSet(settings.track)  # by all fixes of searches, also those of few matches
         self.confirmed: PoseHypothesis | None = None
         self.was_tracking = False
         self.is_carried = False  # it was lifted since it knew its pose
-        self.lookalikes: LookAlikes | None = None
-        self.alias_step_m = ALIAS_STEP_M
         self.odom_from_body: Array | None = None  # of the last frame
+        self._step_m = 0.0  # to the last frame
         self._last_ns, self._period_ns = 0, 1 << 62  # of frames: the last stamp, and the shortest step
         self._imu_ns: int | None = None  # stamp of the last frame with an IMU, None once its loss is a doubt
         self._query_frame: PoseHypothesis | None = None  # of the running map query, as the identity
         self._query_index: int | None = None  # of the last map query's frame
         self.floor = ""  # of the last confirmed pose
-        self.building: Set[str] = frozenset()  # its floors
-        self.missing_floors: Set[str] = frozenset()  # whose maps the robot does not hold
-        # Frames of queries since the last fix, each as the identity.
-        self._unmatched: list[_Unmatched] = []
+        self._unmatched: list[_Unmatched] = []  # frames of queries since the last fix
 
     # --- priors and starts --------------------------------------------------------------------------------------------
 
-    def handle_prior(self, prior: PositionPrior) -> None:
-        """Use a prior at this moment; it replaces any earlier one.
+    def prior_given(
+        self, prior: PositionPrior, odometry: OdometryEstimate, floors: Mapping[str, Array | None] | None
+    ) -> Prior:
+        """Return a prior given between the last two frames, on its own floor or one of several, as of `Prior.floors`."""
+        rig = self.base_from_body, self._track
+        return Prior.given(prior, odometry, *rig, travelled_m=self._step_m, floors=floors)
 
-        Without a floor, an operator's is of the floor that the robot was on; a dock's, while that is not known, and any after a ride is of
-        any.
-        """
-        floors: Mapping[str, Array | None] | None = None
-        is_open = not prior.is_revisable or (self.prior is not None and not self.prior.names_floor)
-        if prior.floor is None and self.confirmed is None and is_open and len(self.building) > 1:
-            floors = dict.fromkeys(sorted(self.building))
-        prior = replace(prior, floor=self.floor if prior.floor is None else prior.floor)
-        self.prior = InitialPosePrior(prior, self._base_from_body, self._track, floors)
+    def prior_at(self, known: PoseHypothesis, **how: Any) -> Prior:
+        """Return a pose as a prior. how: arguments of `Prior`."""
+        return Prior.at(known, self.base_from_body, self._track, **how)
 
-    def is_contradicted_by(self, prior: PositionPrior) -> bool:
-        """Return True if a confirmed pose lies outside the bound of a prior."""
-        return self.confirmed is not None and not agrees(prior, self.confirmed, self._base_from_body)
+    def take(self, prior: Prior) -> None:
+        """Use a prior from now on; it replaces any earlier one. One of a ride replaces the confirmed pose, too."""
+        self.prior = prior
+        if prior.is_ride:
+            self.confirmed = None
+            self.forget_frames()
+            self.candidates.reset()
+            self._restart()
 
-    def forget(self, *, keeps_new_prior: bool = False, is_carried: bool = False) -> None:
-        """Drop the pose and search the whole map. keeps_new_prior: keep a prior received since the last frame. is_carried: the robot
-        knows that it is lifted, and is LOST if it had a pose."""
-        if not (keeps_new_prior and self.prior is not None and self.prior.is_new):
-            self.prior = None
-        self.confirmed = self._query_frame = None
+    def move_prior(self, floors: Mapping[str, Array | None]) -> None:
+        """Move the prior in force to other floors, as of `Prior.floors`."""
+        assert self.prior is not None
+        self.prior.floors = floors
+        self.candidates.reset()
+        self._restart()
+
+    def forget(self, *, is_carried: bool = False) -> None:
+        """Drop the pose and search the whole map. is_carried: the robot knows that it is lifted, and is LOST if it had a pose."""
+        self.confirmed = self.prior = self._query_frame = None
         self.forget_frames()
         self.candidates.reset()
         self._repeated.reset()
         self.was_tracking &= is_carried
         self.is_carried = self.was_tracking
+        self._restart()
+
+    def _restart(self) -> None:
+        for act in self.on_restart:
+            act()
 
     def start(self, failed_queries: int) -> Start:
         """Return the state with which another tracker of the same odometry can start."""
@@ -151,14 +166,12 @@ class PoseTracker:
             frame_index=known.frame_index,
             stamp_ns=known.stamp_ns,
             support=known.support,
-            map_from_body=known.map_from_body,
-            cov_rot_trans=known.cov_rot_trans,
+            **known.start._asdict(),
             is_confirmed=self.confirmed is not None,
             is_revisable=prior is not None and prior.is_revisable,
             is_told=prior is None or prior.is_told,
             travelled_m=0.0 if prior is None else prior.travelled_m,
             has_broken=known.has_broken,
-            floor=known.floor,
         )
 
     def begin(self, start: Start) -> None:
@@ -167,17 +180,14 @@ class PoseTracker:
         self.was_tracking, self.is_carried = start.was_tracking, start.is_carried
         if start.map_from_body is None or start.cov_rot_trans is None:
             return
-        at_frame = start.map_from_body, start.cov_rot_trans
-        known = PoseHypothesis(start.frame_index, start.stamp_ns, *at_frame, *at_frame, support=start.support)
-        known.has_broken, known.floor, self.floor = start.has_broken, start.floor, start.floor
+        place = Place(start.map_from_body, start.cov_rot_trans, start.floor)
+        known = PoseHypothesis(start.frame_index, start.stamp_ns, place, place, support=start.support)
+        known.has_broken, self.floor = start.has_broken, start.floor
         if start.is_confirmed:
             self.confirmed = known
         else:
-            self.prior = self._prior_at(known, is_revisable=start.is_revisable, is_told=start.is_told)
-            self.prior.travelled_m = start.travelled_m
-
-    def _prior_at(self, known: PoseHypothesis, *, is_revisable: bool, is_told: bool) -> InitialPosePrior:
-        return InitialPosePrior.at(known, self._base_from_body, self._track, is_revisable=is_revisable, is_told=is_told)
+            how = {"is_revisable": start.is_revisable, "is_told": start.is_told, "travelled_m": start.travelled_m}
+            self.prior = self.prior_at(known, **how)
 
     # --- propagation --------------------------------------------------------------------------------------------------
 
@@ -214,8 +224,9 @@ class PoseTracker:
         if change is not None:
             self.candidates.redefine_odom(change)
         self.odom_from_body = odometry.odom_from_body
+        self._step_m = float(np.linalg.norm(step[:3, 3]))
         if self.prior is not None:
-            self.prior.propagate(odometry, step)
+            self.prior.travelled_m += self._step_m
 
     def _tracked(self) -> list[PoseHypothesis]:
         found = [
@@ -242,38 +253,19 @@ class PoseTracker:
         self._doubt_confirmed(odometry)
         for hypothesis in self._tracked():
             hypothesis.mark_query()
-        self._query_frame = PoseHypothesis.at(odometry, np.eye(4), np.zeros((6, 6)))
+        self._query_frame = PoseHypothesis.at(odometry)
         self._query_index = odometry.frame_index
 
     def _doubt_confirmed(self, odometry: OdometryEstimate) -> None:
         """Turn a pose whose radius exceeds half of the site's smallest repetition into a prior: a fix of the next bay or aisle would be
         within the gate of its covariance, and must be confirmed like any other."""
         confirmed = self.confirmed
-        if confirmed is None or not radius_95_m(confirmed.now_cov) > 0.5 * self.alias_step_m:
+        if confirmed is None or not radius_95_m(confirmed.now.cov_rot_trans) > 0.5 * self.maps.alias_step_m:
             return
         self.candidates.reset()
-        self.candidates.abandoned, self.confirmed = confirmed, None
-        self.prior = None
-        if np.isfinite(confirmed.now_cov).all() and np.isfinite(confirmed.now_map_from_body).all():
-            at_present = PoseHypothesis.at(odometry, confirmed.now_map_from_body, confirmed.now_cov, confirmed.floor)
-            self.prior = self._prior_at(at_present, is_revisable=True, is_told=False)
-
-    def ride(self, odometry: OdometryEstimate, floors: Mapping[str, Array | None], sigma_m: float) -> None:
-        """Turn the confirmed pose into a prior on all floors of a lift; sigma_m: of one floor's map above another one's.
-
-        floors: confirmed_from_map (4, 4), None for the floor of the pose.
-        """
-        known = self.confirmed
-        assert known is not None
-        self.candidates.reset()
-        self.forget_frames()
-        self.confirmed = self.prior = None
-        if np.isfinite(known.now_cov).all() and np.isfinite(known.now_map_from_body).all():
-            covariance = known.now_cov + np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 0.0]) * sigma_m**2
-            at_present = PoseHypothesis.at(odometry, known.now_map_from_body, covariance, known.floor)
-            how = (at_present, self._base_from_body, self._track)
-            self.prior = InitialPosePrior.at(*how, is_revisable=True, is_told=False, floors=floors)
-            self.prior.is_ride = True
+        self.candidates.abandoned, self.confirmed, self.prior = confirmed, None, None
+        if confirmed.now.is_finite:
+            self.prior = self.prior_at(PoseHypothesis.at(odometry, confirmed.now), is_revisable=True)
 
     def end_query(self) -> None:
         self._query_frame = None
@@ -297,19 +289,19 @@ class PoseTracker:
         for each in self._unmatched:
             own = self._mounted[each.view].camera
             if self._is_aside(each) and replace(own, baseline_m=lens.baseline_m) == lens:
-                earlier_from_query = each.frame.query_map_from_body
+                earlier_from_query, covariance, _ = each.frame.then
                 cam_from_query = se3_inverse(each.body_from_cam) @ earlier_from_query @ self.body_from_cam
                 features = each.features if own == lens else each.features.without_depth()
-                found.append(EarlierFrame(features, cam_from_query, each.frame.query_cov))
+                found.append(EarlierFrame(features, cam_from_query, covariance))
         return found
 
     def _is_aside(self, earlier: _Unmatched) -> bool:
-        return earlier.view != self._view or is_other_viewpoint(earlier.frame.query_map_from_body)
+        return earlier.view != self._view or is_other_viewpoint(earlier.frame.then.map_from_body)
 
     def observations(self, fixes: Sequence[Fix]) -> Observations:
         """Return the fixes of the running query with their poses at present."""
         assert self._query_frame is not None
-        found = [(fix, PoseHypothesis.at_query(self._query_frame, *self._at_body(fix), fix.floor)) for fix in fixes]
+        found = [(fix, PoseHypothesis.at_query(self._query_frame, self._place_by(fix))) for fix in fixes]
         return found if self.prior is None else self.prior.weighed(found)
 
     def is_reliable(self, fix: Fix) -> bool:
@@ -330,28 +322,26 @@ class PoseTracker:
     def _speaks(self, fix: Fix, at: PoseHypothesis) -> bool:
         """Return True for a reliable fix, or one within the gate of a prior that names one place, such as a dock's: as near a confirmed
         pose, other places are excluded there, and few matches decide only about the last decimetres."""
-        known = None if self.prior is None else self.prior.known_pose(0.5 * self.alias_step_m)
+        known = None if self.prior is None else self.prior.known_pose(0.5 * self.maps.alias_step_m)
         if self.is_reliable(fix):
             return True
-        if known is None or fix.inliers < self._settings.fix.min_inliers or fix.floor != known.floor:
+        if known is None or fix.inliers < self._settings.fix.min_inliers or at.now.floor != known.now.floor:
             return False
-        _, innovation = innovation_of(at.now_map_from_body, at.now_cov, known.now_map_from_body, known.now_cov)
+        _, innovation = innovation_of(*at.now[:2], *known.now[:2])
         return innovation <= self._track.innovation_limit
 
-    def _at_body(self, fix: Fix) -> tuple[Array, Array]:
-        """Return a fix as map_from_body with its covariance (map axes, about the body)."""
-        map_from_body = fix.map_from_cam @ se3_inverse(self.body_from_cam)
-        return map_from_body, transport_cov(fix.cov_rot_trans, map_from_body[:3, 3] - fix.map_from_cam[:3, 3])
+    def _place_by(self, fix: Fix) -> Place:
+        return Place(fix.map_from_cam, fix.cov_rot_trans, fix.floor).of_point(se3_inverse(self.body_from_cam))
 
     def within_prior(self, fixes: Sequence[Fix]) -> list[Fix]:
         """Return the fixes within the prior."""
         assert self.prior is not None
-        return [fix for fix, hypothesis in self.observations(fixes) if self.prior.is_compatible(hypothesis)]
+        return [fix for fix, hypothesis in self.observations(fixes) if self.prior.is_compatible(hypothesis.now)]
 
     def drops_prior(self, fixes: Sequence[Fix]) -> bool:
         """Return True if fixes, none within the prior, contradict it by now; then drop it: their places must be confirmed."""
         assert self.prior is not None
-        if not self.prior.is_contradicted(self.observations(fixes), self.lookalikes):
+        if not self.prior.is_contradicted(self.observations(fixes), self.maps.lookalikes):
             return False
         self.prior = None
         self.candidates.reset()
@@ -366,8 +356,8 @@ class PoseTracker:
         assert self._query_frame is not None
         if not fixes:
             return NO_AGREEMENT
-        map_from_body, covariance = confirmed.query_map_from_body, confirmed.query_cov
-        innovations = [(fix, *innovation_of(*self._at_body(fix), map_from_body, covariance)) for fix in fixes]
+        map_from_body, covariance, _ = confirmed.then
+        innovations = [(fix, *innovation_of(*self._place_by(fix)[:2], map_from_body, covariance)) for fix in fixes]
         # A fix near the prediction is tested by the gate alone; one found by search must also be reliable.
         limit = self._track.innovation_limit
         gated = [entry for entry in innovations if entry[2] <= limit and (is_near or self.is_reliable(entry[0]))]
@@ -379,9 +369,8 @@ class PoseTracker:
                 return QueryResult(None, f"{len(gated)} places match the image", innovation)
             reason = f"the fix is {off_m:.2f} m off, more than its covariance admits"
             return QueryResult(None, reason, innovation, off_m if is_near else None)
-        _, cov_fix = self._at_body(fix)
-        updated = kalman_update(map_from_body, covariance, error, cov_fix)
-        self.confirmed = PoseHypothesis.at_query(self._query_frame, *updated, confirmed.floor)
+        updated = kalman_update(map_from_body, covariance, error, self._place_by(fix).cov_rot_trans)
+        self.confirmed = PoseHypothesis.at_query(self._query_frame, Place(*updated, confirmed.now.floor))
         self.confirmed.support = confirmed.support + 1
         self.candidates.reset()
         return QueryResult(fix, "", innovation, off_m)
@@ -396,17 +385,18 @@ class PoseTracker:
             self.confirmed = None
             self.prior = None  # it led to that pose
 
-    def update_candidates(self, fixes: list[Fix], *, outside: bool, floors: int = 1) -> TimeSliced[QueryResult]:
+    def update_candidates(self, fixes: list[Fix], *, outside: bool, is_one_map: bool = True) -> TimeSliced[QueryResult]:
         """Update the candidates, and confirm one without competitors and with enough support or a tight prior.
 
-        outside: True if fixes outside the prior were left out. floors: number of those that were searched.
+        outside: True if fixes outside the prior were left out. is_one_map: one alone was searched.
         """
         assert self.odom_from_body is not None
         candidates = self.candidates
         is_near = self.prior is not None and self.prior.is_tight(self._track.near_prior_sigma_m)
         # True if the robot cannot be at an unmapped place that looks like a mapped one.
-        is_excluded = self.lookalikes is not None and (is_near or self._track.is_whole_site_mapped)
-        candidates.lookalikes = LookAlikes(0.0, 0.0) if is_excluded else self.lookalikes
+        lookalikes = self.maps.lookalikes
+        is_excluded = lookalikes is not None and (is_near or self._track.is_whole_site_mapped)
+        candidates.lookalikes = LookAlikes(0.0, 0.0) if is_excluded else lookalikes
         observations = self.observations(fixes)
         for fix, at in observations:
             at.support = int(self._speaks(fix, at))
@@ -419,22 +409,23 @@ class PoseTracker:
             return QueryResult(None, f"{len(competitors) + 1} places match the image: {told}")
         moved_m = None
         has_prior = self.prior is not None and best.support > 0 and self.prior.confirms(best)
-        if not has_prior and self.missing_floors:
-            return QueryResult(None, f"floor {min(self.missing_floors)}, whose map is not here yet, may look the same")
+        if not has_prior and (missing := self.maps.missing):
+            return QueryResult(None, f"floor {min(missing)}, whose map is not here yet, may look the same")
         if not has_prior and candidates.may_be_lookalike(best):
-            assert self.lookalikes is not None
-            told = f"{best.evidence} here, {self.lookalikes.recall:.0%} there"
+            assert lookalikes is not None
+            told = f"{best.evidence} here, {lookalikes.recall:.0%} there"
             return QueryResult(None, f"a place that is not in the map may look the same: {told}")
-        if has_prior or (not candidates.has_low_recall(best) and candidates.is_confirmed(best, fixes, floors=floors)):
+        if has_prior or (
+            not candidates.has_low_recall(best) and candidates.is_confirmed(best, fixes, is_one_map=is_one_map)
+        ):
             moved_m = candidates.moved_m(best)
             candidates.reset()
             self._repeated.reset()
-            self.confirmed, self.prior, self.floor = best, None, best.floor
+            self.confirmed, self.prior, self.floor = best, None, best.now.floor
             self.was_tracking, self.is_carried = True, False
-        best_m = best.now_map_from_body[:3, 3]
         for fix, hypothesis in self.observations(fixes):
-            off_m = np.linalg.norm(hypothesis.now_map_from_body[:3, 3] - best_m)
-            if off_m < _OWN_FIX_M and hypothesis.floor == best.floor:
-                waits = self.confirmed is None and floors > 1
+            off_m = np.linalg.norm(hypothesis.now.position_m - best.now.position_m)
+            if off_m < _OWN_FIX_M and hypothesis.now.floor == best.now.floor:
+                waits = self.confirmed is None and not is_one_map
                 return QueryResult(fix, ONE_OF_FLOORS if waits else "", moved_m=moved_m)
         return QueryResult(None, "the fix does not agree with those before", moved_m=moved_m)

@@ -47,7 +47,7 @@ class PositionBoundTracker:
         self._known: tuple[int, Array] | None = None  # stamp and position of the last estimate with a pose
 
     def handle(self, estimate: Estimate) -> PositionBound:
-        if estimate.floor:  # another site's map, which says nothing of this one's tiles
+        if not estimate.is_at_home:  # another site's map, which says nothing of this one's tiles
             self._known = None
             return PositionBound()
         if estimate.map_from_body is not None and estimate.status in {Status.TRACKING, Status.DEGRADED}:
@@ -106,10 +106,10 @@ class LoadedMap:
     def version(self) -> int:
         return self.manifest.version
 
-    def show(self, localizer: Localizer, floor: str = "") -> None:
-        """Let a localizer use it as the map of a floor; empty: of the robot's own site."""
+    def show(self, localizer: Localizer, site: str = "") -> None:
+        """Let a localizer use it as the map of a site of its building; empty: of the robot's own."""
         shown = (self.version, self.tiles.values(), self.vocabulary, self.manifest.camera.focal_px)
-        localizer.handle_version(*shown, self.lookalikes, self.alias_step_m, floor=floor)
+        localizer.handle_version(*shown, self.lookalikes, self.alias_step_m, site=site)
 
     @property
     def alias_step_m(self) -> float:

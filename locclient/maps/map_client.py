@@ -244,7 +244,7 @@ class MapClient(MapSource):
         except (LinkError, MapFormatError, StoreError) as error:
             if active is None:
                 raise
-            _log.info("floor %s: version %s stays active: %s", self._site, active.version, error)
+            _log.info("site %s: version %s stays active: %s", self._site, active.version, error)
             return active
         return wanted
 

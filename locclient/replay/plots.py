@@ -200,9 +200,9 @@ class _Axes:
 def ticks(low: float, high: float) -> list[float]:
     """Return about eight round values between two limits, in steps of 1, 2 or 5 times a power of ten."""
     about = 8
-    power = 10.0 ** np.floor(np.log10((high - low) / about))
+    power = 10.0 ** (np.log10((high - low) / about) // 1)
     step = float(next(power * k for k in (1, 2, 5, 10) if power * k * about >= high - low))
-    return [round(k * step, 9) for k in range(int(np.ceil(low / step - 1e-9)), int(np.floor(high / step + 1e-9)) + 1)]
+    return [round(k * step, 9) for k in range(int(np.ceil(low / step - 1e-9)), int((high / step + 1e-9) // 1) + 1)]
 
 
 def _text(picture: Picture, words: str, at: tuple[int, int], colour: Colour, scale: float = 0.5) -> None:

@@ -13,7 +13,7 @@ class PublishedPose:
     """One estimate in the published frames; map_from_odom is None while there is no single pose.
 
     building_from_map: of the robot's map, None if the map does not define it. cov_rot_trans (6, 6): of map_from_base, map axes, about
-    the base, None if the estimate has none. level: name of the floor's level, of a building; else empty.
+    the base, None if the estimate has none. level: name of its level, of a building; else empty.
     """
 
     odom_from_base: Array

@@ -1,6 +1,5 @@
 """Failure report: context in numbers and small images. Pure; the caller provides id and wall clock."""
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -108,7 +107,7 @@ _MATCHES_WIDTH_PX = 800
 @dataclass(frozen=True)
 class RobotProfile:
     """Common data of all reports of a robot: site, name, mounting, rectified camera, settings, noise and clock of the IMU, the privacy of
-    its pictures: full, blurred or off (none), and the rectified cameras of its other views."""
+    its pictures: full, blurred or off (none), and the rectified other cameras."""
 
     site: str
     robot: str
@@ -129,8 +128,8 @@ class RobotProfile:
 def failure_report(context: FailureContext, profile: RobotProfile, *, report_id: str, wall_ns: int) -> FailureReport:
     """Return the message. wall_ns: the robot's wall clock when the failure began."""
     failure, onset, image = context.failure, context.onset, context.failure.image
-    belief, map_from_base, is_own = onset.belief, None, not failure.estimate.floor
-    # The server has no place for a pose on another site's floor.
+    belief, map_from_base, is_own = onset.belief, None, failure.estimate.is_at_home
+    # The server has no place for a pose in another site's map.
     if onset.map_from_body is not None and is_own and not (belief and belief.floor):
         map_from_base = onset.map_from_body @ se3_inverse(profile.base_from_body)
     matches = _matches(context, profile)
@@ -183,7 +182,8 @@ def _tile(context: FailureContext, map_from_base: Array | None) -> tuple[int, in
     if map_from_base is None or context.running is None:
         return None
     size_m = context.running.manifest.tile_size_m
-    return math.floor(float(map_from_base[0, 3]) / size_m), math.floor(float(map_from_base[1, 3]) / size_m)
+    x, y = (map_from_base[:2, 3] // size_m).tolist()
+    return int(x), int(y)
 
 
 def _matches(context: FailureContext, profile: RobotProfile) -> Matches | None:

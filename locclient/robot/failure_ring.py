@@ -111,8 +111,8 @@ class FailureRing:
         self._query: QueryInput | None = None  # of the last map query
         self._pictured_ns = -(2**62)
 
-    def use(self, loaded: LoadedMap, floor: str = "") -> None:
-        used = UsedMap(loaded.version, loaded.wanted.manifest_sha256 or "", tuple(loaded.tiles), floor)
+    def use(self, loaded: LoadedMap, site: str = "") -> None:
+        used = UsedMap(loaded.version, loaded.wanted.manifest_sha256 or "", tuple(loaded.tiles), site)
         self._used = self._commands.used = used
 
     def handle_samples(self, bundle: SensorBundle) -> None:

@@ -209,7 +209,7 @@ class HealthFigures:
             robot=robot,
             stamp_ns=0 if last is None else last.stamp_ns,
             wall_ns=wall_ns,
-            version=None if last is None or last.floor else last.map_version,
+            version=last.map_version if last is not None and last.is_at_home else None,
             status=Status.INITIALISING if last is None else last.status,
             flags=tuple(flags),
             metrics={**figures, **more},

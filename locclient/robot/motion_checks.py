@@ -226,11 +226,11 @@ class WheelAgreement:
 class ExchangedViews:
     """Compares the images with all other sensors at once: what one rotation of the images explains for each is a fault of the images.
 
-    Rotations are those of other views against the first one, whose topics may be exchanged, and that of the wheels against the images.
+    Rotations are those of other cameras against the first one, whose topics may be exchanged, and that of the wheels against the images.
     """
 
     def __init__(self, calibration: RigCalibration, mounted: Sequence[MountedCamera]) -> None:
-        """mounted: the cameras of the rig's views."""
+        """mounted: the cameras of the rig."""
         self._base_from_body = calibration.base_from_body[:3, :3]
         first, *names = (" and ".join(f"cam{number}" for number in numbers) for numbers in calibration.views)
         axes = [self._base_from_body @ each.body_from_cam[:3, :3] for each in mounted]

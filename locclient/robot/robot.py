@@ -5,8 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from fleetmap.failure_definition import may_be_mapped, radius_95_m
 from fleetmap.geometry import Array
-from fleetmap.mapformat.building import BuildingFrame
-from fleetmap.mapformat.floors import Floor
+from fleetmap.mapformat.building import BuildingFrame, Floor
 from fleetmap.mapformat.manifest import building_frame
 from fleetmap.messages import Cause, Flag, PoseMessage, Status
 from fleetmap.recordings.images import StoredFrame, decode_frame
@@ -74,9 +73,9 @@ class Outcome:
     dropped_share: float = 0.0
 
     def pose_message(self) -> PoseMessage | None:
-        """Return the pose for the server; None while there is no single one with a covariance, or it is on another site's floor."""
+        """Return the pose for the server; None while there is no single one with a covariance, or it is in another site's map."""
         estimate, map_from_base, cov = self.estimate, self.published.map_from_base, self.published.cov_rot_trans
-        if map_from_base is None or cov is None or estimate.floor:
+        if map_from_base is None or cov is None or not estimate.is_at_home:
             return None
         return PoseMessage.of(estimate.stamp_ns, map_from_base, cov, estimate.status, estimate.map_version)
 
@@ -114,9 +113,9 @@ class Robot:
         self._wheels_fault, self._wheels_unused = calibration.wheels_fault, dict[Flag, str]()
         self._aligned: BuildingFrame | None = None
         self._of_version: BuildingFrame | None = None
-        self.floors: Mapping[str, Floor] = {}  # of the building, by `Localizer.handle_floors`
-        self._visited: dict[str, LoadedMap] = {}  # maps of the other floors
-        self._floor = ""  # of the last estimate
+        self.building: Mapping[str, Floor] = {}  # by `Localizer.handle_building`
+        self._visited: dict[str, LoadedMap] = {}  # maps of its other sites
+        self._site = ""  # whose map the last estimate is in
 
     @property
     def held(self) -> list[LoadedMap]:
@@ -125,12 +124,12 @@ class Robot:
 
     @property
     def running(self) -> LoadedMap | None:
-        """Return the map of the floor where the robot is."""
-        return self._visited.get(self._floor) if self._floor else self._versions.running
+        """Return the map of the site where the robot is."""
+        return self._visited.get(self._site) if self._site else self._versions.running
 
     @property
     def visited_versions(self) -> dict[str, int]:
-        """Return the versions of the other floors' maps, by their sites."""
+        """Return the versions of the maps of the building's other sites."""
         return {site: loaded.version for site, loaded in self._visited.items()}
 
     def take_changes(self) -> list[VersionChange]:
@@ -142,15 +141,15 @@ class Robot:
         """Use other tiles of a held version, or a new version: the first one is adopted at once, any other is put on trial."""
         self._versions.use(loaded)
 
-    def use_floors(self, floors: Mapping[str, Floor], maps: Sequence[LoadedMap]) -> None:
-        """Use the floors of the robot's building, as `Localizer.handle_floors`, and new versions of the others.
+    def use_building(self, building: Mapping[str, Floor], maps: Sequence[LoadedMap]) -> None:
+        """Use the robot's building, as `Localizer.handle_building`, and new versions of its other sites.
 
         Those are used without a trial: they are current on their own site, where its robots have tried them.
         """
-        if floors is not self.floors:  # they change less often than maps
-            self.floors = floors
-            self._visited = {site: held for site, held in self._visited.items() if site in floors}
-            self.localizer.handle_floors(floors)
+        if building is not self.building:  # it changes less often than maps
+            self.building = building
+            self._visited = {site: held for site, held in self._visited.items() if site in building}
+            self.localizer.handle_building(building)
         for loaded in maps:
             self._visited[loaded.wanted.site] = loaded
             loaded.show(self.localizer, loaded.wanted.site)
@@ -180,7 +179,7 @@ class Robot:
         decoded_s = self._clock_s()
         frame = self._rectifier.rectify(raw)
         rectified_s = self._clock_s()
-        if self.localizer.awaits(frame):
+        if self.localizer.perception.awaits(frame):
             return None
         estimate = self.localizer.handle_stereo(frame)
         cpu_s = self._clock_s() - begun_s
@@ -191,20 +190,21 @@ class Robot:
         stage_s = {"decode": decoded_s - begun_s, "rectify": rectified_s - decoded_s, **estimate.stage_s}
         self._last = (frame, estimate)
         self._enter(estimate.floor)
-        if estimate.floor:
-            self._versions.pause()
-        else:
+        if estimate.is_at_home:
             self._versions.handle(estimate)
-        level = self.floors[self._floor].entry.level if self.floors else ""
+        else:
+            self._versions.pause()
+        level = self.building[self._site].entry.level if self.building else ""
         published = replace(self._odom.handle(estimate), building_from_map=self._building_from_map(), level=level)
         speed_mps = self._speed.handle(wheel, estimate.odometry, published.odom_from_base)
         self._wheels.handle(wheel if self._wheels_fault else bundle.wheel, estimate.odometry)
-        self._images_refused = self._views.refused(self._wheels, self.localizer.odometry.accelerometer)
+        odometry, percept = self.localizer.perception.odometry, self.localizer.perception.percept
+        self._images_refused = self._views.refused(self._wheels, odometry.accelerometer)
         self.localizer.handle_contradiction("".join(self._images_refused.values()))
         is_covered = self._may_be_mapped(estimate)
         failure = self.monitor.handle(estimate, speed_mps, may_be_mapped=is_covered)
-        if self.ring is not None and self.localizer.percept is not None:
-            self.ring.handle(self.localizer.percept, frame, estimate, self.localizer.start(), self.monitor.begun_ns)
+        if self.ring is not None and percept is not None:
+            self.ring.handle(percept, frame, estimate, self.localizer.start(), self.monitor.begun_ns)
         odom_from_body = published.odom_from_base @ self.base_from_body
         context = None if failure is None else self._context(failure, odom_from_body)
         self._onsets.handle(estimate, frame, odom_from_body, self.monitor.begun_ns)
@@ -215,7 +215,7 @@ class Robot:
         )  # fmt: skip
 
     def _left_out(self) -> dict[Flag, str]:
-        odometry = self.localizer.odometry
+        odometry = self.localizer.perception.odometry
         if self._images_refused:
             return {**self._images_refused, **self._wheels_unused, **self._load.overload}
         wheels = self._wheels.refused or self._wheels_unused
@@ -254,21 +254,21 @@ class Robot:
         return FailureContext(failure, onset, unmatched, evidence, self.running, cut)
 
     def _show(self, loaded: LoadedMap) -> None:
-        if self.ring is not None and not self._floor:
+        if self.ring is not None and not self._site:
             self.ring.use(loaded)
         self._of_version = building_frame(loaded.manifest)
         loaded.show(self.localizer)
 
-    def _enter(self, floor: str) -> None:
-        """Note the floor where the robot is; recordings of failures need its map."""
-        if floor == self._floor:
+    def _enter(self, site: str) -> None:
+        """Note in whose map the robot is; recordings of failures need it."""
+        if site == self._site:
             return
-        self._floor = floor
+        self._site = site
         if self.ring is not None and self.running is not None:
-            self.ring.use(self.running, floor)
+            self.ring.use(self.running, site)
 
     def _building_from_map(self) -> Array | None:
-        if self.floors:
-            return self.floors[self._floor].building_from_map
+        if self.building:
+            return self.building[self._site].building_from_map
         frame = self._aligned or self._of_version
         return None if frame is None else frame.building_from_map

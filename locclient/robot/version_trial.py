@@ -175,7 +175,7 @@ class VersionTrials:
         self._candidate = self._trial = self._failed_reason = None
 
     def pause(self) -> None:
-        """Interrupt a trial while the robot is on another site's floor; it begins again on its own."""
+        """Interrupt a trial while the robot is in another site's map; it begins again on its own."""
         self._last = self._trial = None
 
     def _begin_trial(self) -> None:

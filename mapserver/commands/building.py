@@ -9,7 +9,7 @@ from fleetmap.errors import UsageError
 from mapserver.commands.options import ActorOptions, Json, StoreFolder, open_store, print_json
 
 if TYPE_CHECKING:
-    from fleetmap.mapformat.floors import Building, FloorEntry
+    from fleetmap.mapformat.building import Building, FloorEntry
     from mapserver.store import MapStore
 
 _Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the building.")]
@@ -25,7 +25,7 @@ def set_(
     by: ActorOptions,
 ) -> None:
     """Make aligned sites the floors of a building; robots of each of them then know all of its floors."""
-    from fleetmap.mapformat.floors import Building
+    from fleetmap.mapformat.building import Building
     from mapserver.fleet.floors import floors_of, keep_building, single_lifts
 
     building = Building(name=name, floors=tuple(map(_entry, floor)))
@@ -65,7 +65,7 @@ def list_(*, store: StoreFolder, json: Json = False) -> None:
 
 def _entry(text: str) -> "FloorEntry":
     from fleetmap.mapformat import check_name
-    from fleetmap.mapformat.floors import FloorEntry
+    from fleetmap.mapformat.building import FloorEntry
 
     site, _, rest = text.partition("=")
     level, _, height = rest.rpartition("@")

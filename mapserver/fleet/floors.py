@@ -5,8 +5,7 @@ from collections.abc import Sequence
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, UsageError
-from fleetmap.mapformat.building import AREAS, FLOORS
-from fleetmap.mapformat.floors import Building, Floor, FloorEntry, read_building, read_lifts
+from fleetmap.mapformat.building import AREAS, FLOORS, Building, Floor, FloorEntry, read_building, read_lifts
 from mapserver.store import Actor, MapStore
 
 

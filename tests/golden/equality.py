@@ -24,8 +24,7 @@ import numpy as np
 
 from benchmarks.common.recorded_runs import kept_folder, recorded, tool
 from fleetmap.encoding import to_json
-from fleetmap.mapformat.building import BuildingFrame
-from fleetmap.mapformat.floors import Building, FloorEntry
+from fleetmap.mapformat.building import Building, BuildingFrame, FloorEntry
 from fleetmap.recordings import open_recording
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.replay_source import ReplaySource
@@ -33,7 +32,7 @@ from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient import LocalizeOptions, localize
 from locclient.localization.estimate import Estimate
 from locclient.localization.settings import LocalizerSettings
-from locclient.maps.floor_maps import FloorMaps
+from locclient.maps.building_maps import BuildingMaps
 from locclient.maps.map_source import LocalMapSource
 from locclient.replay.replay import load_map
 from locclient.robot.robot import Robot
@@ -96,7 +95,7 @@ def in_a_building(drive: Path, store: Path) -> Iterable[Estimate]:
         floors = tuple(FloorEntry(site=site, level=site, height_m=4.0 * n) for n, site in enumerate(("low", "high")))
         keep_building(maps, Building(name="tower", floors=floors), NOBODY)
     own = LocalMapSource(store, "low")
-    held = FloorMaps(own, lambda other: LocalMapSource(store, other))
+    held = BuildingMaps(own, lambda other: LocalMapSource(store, other))
     held.refresh()
     change = held.changes.popleft()
     with open_recording(drive) as recording:
@@ -104,7 +103,7 @@ def in_a_building(drive: Path, store: Path) -> Iterable[Estimate]:
             recording.calibration, Rectifier(recording.calibration), LocalizerSettings(), TrialSettings(), lambda: 0.0
         )
         robot.use(load_map(own)[0])
-        robot.use_floors(change.floors, change.maps)
+        robot.use_building(change.building, change.maps)
         source = ReplaySource(recording, np.arange(len(recording.frame_stamps_ns)), reverse=False)
         for number, imu in enumerate(source.imu_before_each()):
             outcome = robot.handle(

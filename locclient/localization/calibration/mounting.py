@@ -1,4 +1,4 @@
-"""Information of one fix on the mounting of the cameras, by gravity, driving direction and floor. Pure."""
+"""Information of one fix on the mounting of the cameras, by gravity, driving direction and the ground. Pure."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -13,10 +13,10 @@ from fleetmap.sensors.samples import WheelSample
 
 _ACCEL_BIAS_RAD = 0.003  # short-term error of gravity in the IMU's axes
 _FLOOR_RADIUS_M, _FLOOR_SIGMA_M = 4.0, 0.02
-_SLAB_M = 0.06  # landmarks of a floor lie within this height
-# minimum number of landmarks of a floor, and ratio to the mean of the slabs above
+_SLAB_M = 0.06  # landmarks of the ground lie within this height
+# minimum number of landmarks of the ground, and ratio to the mean of the slabs above
 _MIN_IN_SLAB, _MIN_DENSITY = 12, 3.0
-_BELOW_SHARE = 0.05  # of the landmarks may lie below the floor: reflections, and errors of depth
+_BELOW_SHARE = 0.05  # of the landmarks may lie below the ground: reflections, and errors of depth
 _MIN_STEP_M, _MAX_TURN_RAD = 0.4, 0.15  # of a step that determines the driving direction
 _KEPT_SAMPLES = 2000  # of wheel odometry: 20 s at 100 Hz, a hundred times the duration of a fix
 
@@ -30,7 +30,7 @@ class BasePose(NamedTuple):
 
 
 class WheelTravel:
-    """Path of the base by the wheels alone. is_heard: True if wheel samples were received, so that the robot stands on a floor."""
+    """Path of the base by the wheels alone. is_heard: True if wheel samples were received, so that the robot stands on the ground."""
 
     def __init__(self) -> None:
         self._stamps_ns: deque[int] = deque(maxlen=_KEPT_SAMPLES)
@@ -96,9 +96,9 @@ def _turned(vector: Array, by_rad: float) -> Array:
 
 
 def height(base: BasePose, points_map: Array) -> tuple[float, float] | None:
-    """Return the height of the base above the map's floor around it, and its sigma; None if the landmarks show no floor.
+    """Return the height of the base above the map's ground around it, and its sigma; None if the landmarks show none.
 
-    A floor is the lowest height with many more landmarks than above it and hardly any below.
+    The ground is the lowest height with many more landmarks than above it and hardly any below.
     """
     place_m = base.map_from_base[:3, 3]
     near = np.abs(points_map[:, :2] - place_m[:2]).max(axis=1) < _FLOOR_RADIUS_M

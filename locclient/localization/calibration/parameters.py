@@ -10,21 +10,21 @@ from locclient.localization.pose_covariance import transport_cov
 DRIFT_SIGMAS = 5.0
 """Drift limit in sigmas of a parameter: p = 6e-7 for one test. Ten parameters and three windows, corrected by Bonferroni's inequality,
 give at most 1.8e-5 for each independent window, about 30 m of driving: 3.3 % for a robot-day of 57 km if errors are normally
-distributed, and less because the drift must also be large. The first view after a start is judged alone, by the six parameters of
+distributed, and less because the drift must also be large. The first look after a start is judged alone, by the six parameters of
 the images: 3.4e-6 for each start, 8e-5 per day with one start per hour."""
 
 
 class Parameter(NamedTuple):
     """One parameter: truth minus calibration; relative for a scale, else in radians or metres.
 
-    figure: its name in health reports, with its unit; per_unit: units of the figure in one of the value. floor: sigma of the error
-    shared with the map, which no number of views averages away. limit: size that counts as drift in any view; below it, a camera
+    figure: its name in health reports, with its unit; per_unit: units of the figure in one of the value. least_sigma: of the error
+    shared with the map, which no number of looks averages away. limit: size that counts as drift in any look; below it, a camera
     parameter is judged by the position error that it causes at the robot's place (`BIAS_LIMIT_M`). text: for display.
     """
 
     figure: str
     per_unit: float
-    floor: float
+    least_sigma: float
     limit: float
     text: str
 
@@ -40,9 +40,9 @@ PARAMETERS = (
     Parameter("camera_roll_deg", _DEG, 0.0026, 0.01, "roll of the cameras against the IMU"),
     Parameter("camera_pitch_deg", _DEG, 0.0026, 0.01, "pitch of the cameras against the IMU"),
     Parameter("camera_yaw_deg", _DEG, 0.0026, 0.01, "turn of the cameras against the driving direction"),
-    Parameter("camera_height_m", 1.0, 0.01, 0.03, "height of the cameras above the floor"),
+    Parameter("camera_height_m", 1.0, 0.01, 0.03, "height of the cameras above the ground"),
 )
-"""Images determine the first six, gravity the next two, wheels the ninth, floors the last.
+"""Images determine the first six, gravity the next two, wheels the ninth, the ground the last.
 
 Floors: usual difference of scales and rotations between good pairs and the survey's, by calibration and by the effect of lighting on
 stereo matching. Limits: focal length, 1.5 cm at 3 m; the pair, an error of a few centimetres at 3 m in some places (0.05 degrees of

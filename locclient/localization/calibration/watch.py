@@ -1,4 +1,4 @@
-"""Calibration watch: independent views collected while the robot drives, and a test of each parameter. Pure."""
+"""Calibration watch: independent looks collected while the robot drives, and a test of each parameter. Pure."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -32,16 +32,16 @@ from locclient.localization.calibration.parameters import (
 from locclient.localization.map_query import FinishedQuery
 from locclient.localization.pose_covariance import transport_cov
 
-_STEP_M, _FIRST_STEP_M, _STEP_RAD = 1.0, 0.5, 0.35  # between two views, and between the first ones
-_MIN_NEW_SHARE = 0.1  # weight of a view without landmarks new to the window
-# Number of views: of the window, and for a test. One is enough for a confirmed pose: a fix at a wrong place may show any parameter.
-_WINDOW, _MIN_VIEWS, _MIN_CONFIRMED_VIEWS = 40, 2, 1
-# Number of latest views that show a sudden change, and of earlier ones to compare with.
+_STEP_M, _FIRST_STEP_M, _STEP_RAD = 1.0, 0.5, 0.35  # between two looks, and between the first ones
+_MIN_NEW_SHARE = 0.1  # weight of a look without landmarks new to the window
+# Number of looks: of the window, and for a test. One is enough for a confirmed pose: a fix at a wrong place may show any parameter.
+_WINDOW, _MIN_LOOKS, _MIN_CONFIRMED_LOOKS = 40, 2, 1
+# Number of latest looks that show a sudden change, and of earlier ones to compare with.
 _RECENT, _MIN_BEFORE = (4, 10), 6
-_FEW = 10  # views; until then they are taken more often
+_FEW = 10  # looks; until then they are taken more often
 # A standstill: maximum speed and duration. Odometry initialized in motion may mistake it for a standstill, with a wrong gravity.
 _STOOD_M, _STOOD_S = 0.03, 0.35
-# Share of a parameter's floor: error common to neighbouring views, which the scatter of a few views does not show.
+# Share of a parameter's least sigma: error common to neighbouring looks, which the scatter of a few looks does not show.
 _LOCAL_FLOORS = 2.0
 _MAP_TILT_SIGMA_RAD = 0.05  # of a map surveyed without IMU, which is levelled by its cameras
 _GRAVITY_MPS2, _UNHELD_S = 9.81, 0.9  # age of a fix beyond which no pose is TRACKING
@@ -59,7 +59,7 @@ class Mounting:
 
 
 @dataclass(frozen=True)
-class _View:
+class _Look:
     """Information and score of PARAMETERS and the map's tilt; pose_per_parameter as in CameraView; landmark ids."""
 
     information: Array
@@ -71,9 +71,9 @@ class _View:
 class CalibrationWatch:
     """Compares observations with the map in which the robot is localized. Estimates do not change until a parameter has drifted.
 
-    Each view is linearized about the calibration with its own pose, so that information adds up; its weight is the share of its
-    landmarks that no other view of the window showed, because a landmark's error is the same in all views. A parameter's sigma is the
-    largest of three: by the information, by the scatter of the views, and its floor. One view has no scatter.
+    Each look is linearized about the calibration with its own pose, so that information adds up; its weight is the share of its
+    landmarks that no other look of the window showed, because a landmark's error is the same in all looks. A parameter's sigma is the
+    largest of three: by the information, by the scatter of the looks, and its least sigma. One look has no scatter.
 
     Sources: Triggs et al. 2000 (self-calibration in bundle adjustment), Huber 1967 (covariance from the scatter of scores).
     """
@@ -81,20 +81,20 @@ class CalibrationWatch:
     def __init__(self, rig: Mounting, stereo_settings: StereoSettings, imu_minus_cam_s: float = 0.0) -> None:
         """imu_minus_cam_s: time offset of the calibration."""
         self._rig, self._stereo, self._imu_minus_cam_s = rig, stereo_settings, imu_minus_cam_s
-        self._views: deque[_View] = deque(maxlen=_WINDOW)
+        self._looks: deque[_Look] = deque(maxlen=_WINDOW)
         self._wheels = WheelTravel()
         self._last_map_from_cam: Array | None = None
         self._last_base: BasePose | None = None
         self._stood_from: tuple[int, Array] | None = None  # the oldest query from nearly the same place
         self._has_stood = False
         self.state = NOT_JUDGED
-        self.has_confirmed = False  # a view of a confirmed pose was added
+        self.has_confirmed = False  # a look of a confirmed pose was added
 
     def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
         self._wheels.handle(samples)
 
     def handle(self, query: FinishedQuery) -> None:
-        """Add a map query if it is a new view."""
+        """Add a map query if it is a new look."""
         fix, frame = query.fix, query.frame
         assert fix is not None
         matched = fix.matched
@@ -119,8 +119,8 @@ class CalibrationWatch:
             information[:IMAGE, :IMAGE], score[:IMAGE] = share * seen.information, share * seen.score
         self._add_mounting(query, information, score)
         shift = np.zeros((6, IMAGE)) if seen is None else seen.pose_per_parameter
-        self._views.append(_View(information, score, shift, ids))
-        state = self._judged(_MIN_CONFIRMED_VIEWS if query.is_confirmed else _MIN_VIEWS)
+        self._looks.append(_Look(information, score, shift, ids))
+        state = self._judged(_MIN_CONFIRMED_LOOKS if query.is_confirmed else _MIN_LOOKS)
         self.state = state._replace(drifts=(*state.drifts, *self._time_offset(query.odometry)))
 
     def handle_unmatched(self, query: FinishedQuery) -> None:
@@ -132,14 +132,14 @@ class CalibrationWatch:
         pixels = np.column_stack([matched.pixels[:, :2], matched.pixels[:, 0] - found[:, 0]])
         self.handle(replace(query, fix=replace(query.fix, matched=replace(matched, pixels=pixels))))
 
-    # --- views --------------------------------------------------------------------------------------------------------
+    # --- looks --------------------------------------------------------------------------------------------------------
 
     def _is_new(self, map_from_cam: Array) -> bool:
         last = self._last_map_from_cam
         if last is None:
             return True
         moved_m = float(np.linalg.norm(map_from_cam[:3, 3] - last[:3, 3]))
-        step_m = _STEP_M if len(self._views) >= _FEW else _FIRST_STEP_M
+        step_m = _STEP_M if len(self._looks) >= _FEW else _FIRST_STEP_M
         return moved_m > step_m or rotation_angle_rad(last[:3, :3].T @ map_from_cam[:3, :3]) > _STEP_RAD
 
     def _look_for_a_stand(self, stamp_ns: int, place_m: Array) -> None:
@@ -148,8 +148,8 @@ class CalibrationWatch:
         self._has_stood |= (stamp_ns - self._stood_from[0]) * 1e-9 >= _STOOD_S
 
     def _new_share(self, ids: frozenset[int]) -> float:
-        """Return the share of landmarks that no view of the window has shown."""
-        known = frozenset[int]().union(*(ids & view.ids for view in self._views))
+        """Return the share of landmarks that no look of the window has shown."""
+        known = frozenset[int]().union(*(ids & look.ids for look in self._looks))
         return max(1.0 - len(known) / len(ids), _MIN_NEW_SHARE) if ids else 1.0
 
     def _add_mounting(self, query: FinishedQuery, information: Array, score: Array) -> None:
@@ -179,7 +179,7 @@ class CalibrationWatch:
         self._last_base = base
 
     def _time_offset(self, odometry: OdometryEstimate) -> list[Drift]:
-        sigma = float(np.hypot(odometry.imu_minus_cam_sigma_s, TIME_OFFSET.floor))
+        sigma = float(np.hypot(odometry.imu_minus_cam_sigma_s, TIME_OFFSET.least_sigma))
         if not np.isfinite(sigma):
             return []
         value = odometry.imu_minus_cam_s - self._imu_minus_cam_s
@@ -188,23 +188,23 @@ class CalibrationWatch:
 
     # --- judgement ----------------------------------------------------------------------------------------------------
 
-    def _judged(self, min_views: int) -> CalibrationState:
-        """Judge the window. Views before a sudden change at its end are dropped, so that knocks and repairs show at once."""
-        views = list(self._views)
-        if len(views) < min_views:
+    def _judged(self, min_looks: int) -> CalibrationState:
+        """Judge the window. Looks before a sudden change at its end are dropped, so that knocks and repairs show at once."""
+        looks = list(self._looks)
+        if len(looks) < min_looks:
             return NOT_JUDGED
         for recent in _RECENT:
-            if len(views) >= recent + _MIN_BEFORE:
-                before, sigma_before = _estimate(views[:-recent])
-                now, sigma_now = _estimate(views[-recent:])
+            if len(looks) >= recent + _MIN_BEFORE:
+                before, sigma_before = _estimate(looks[:-recent])
+                now, sigma_now = _estimate(looks[-recent:])
                 is_known = np.isfinite(sigma_before) & np.isfinite(sigma_now)
                 change = np.abs(now - before)[is_known] / np.hypot(sigma_before, sigma_now)[is_known]
                 if change.size and change.max() > DRIFT_SIGMAS:
-                    views = views[-recent:]
-                    self._views = deque(views, maxlen=_WINDOW)
+                    looks = looks[-recent:]
+                    self._looks = deque(looks, maxlen=_WINDOW)
                     break
-        value, sigma = _estimate(views)
-        return _state(views, value, sigma)
+        value, sigma = _estimate(looks)
+        return _state(looks, value, sigma)
 
 
 def _with_depth(matched: Correspondences, right_px: Array) -> Correspondences:
@@ -214,24 +214,26 @@ def _with_depth(matched: Correspondences, right_px: Array) -> Correspondences:
     return replace(matched, pixels=np.column_stack([matched.pixels[:, :2], columns]))
 
 
-def _estimate(views: Sequence[_View]) -> tuple[Array, Array]:
-    """Return values and sigmas (COUNT,) of PARAMETERS by views, infinite if unobserved; one view determines those of the images alone."""
+def _estimate(looks: Sequence[_Look]) -> tuple[Array, Array]:
+    """Return values and sigmas (COUNT,) of PARAMETERS by looks, infinite if unobserved; one look determines those of the images alone."""
     prior = np.array([_PRIOR_SIGMA] * COUNT + [_MAP_TILT_SIGMA_RAD] * 2) ** -2.0
-    information = np.array([view.information for view in views])
-    score = np.array([view.score for view in views])
+    information = np.array([look.information for look in looks])
+    score = np.array([look.score for look in looks])
     covariance = np.linalg.inv(information.sum(axis=0) + np.diag(prior))
     value = covariance @ score.sum(axis=0)
     off = (score - information @ value) @ covariance
-    scatter = np.sqrt((off**2).sum(axis=0) * len(views) / max(len(views) - 1, 1))
+    scatter = np.sqrt((off**2).sum(axis=0) * len(looks) / max(len(looks) - 1, 1))
     sigma = np.maximum(np.sqrt(np.diag(covariance)), scatter)[:COUNT]
-    common = np.array([parameter.floor for parameter in PARAMETERS]) * np.sqrt(1.0 + _LOCAL_FLOORS**2 / len(views))
+    common = np.array([parameter.least_sigma for parameter in PARAMETERS]) * np.sqrt(
+        1.0 + _LOCAL_FLOORS**2 / len(looks)
+    )
     is_shown = sigma < _JUDGED_SIGMA_SHARE * _PRIOR_SIGMA
-    is_shown[IMAGE:] &= len(views) >= _MIN_VIEWS
+    is_shown[IMAGE:] &= len(looks) >= _MIN_LOOKS
     return value[:COUNT], np.where(is_shown, np.hypot(sigma, common), np.inf)
 
 
-def _state(views: Sequence[_View], value: Array, sigma: Array) -> CalibrationState:
-    shifts = np.array([view.pose_per_parameter for view in views])  # (V, 6, IMAGE)
+def _state(looks: Sequence[_Look], value: Array, sigma: Array) -> CalibrationState:
+    shifts = np.array([look.pose_per_parameter for look in looks])  # (V, 6, IMAGE)
     each = shifts * value[:IMAGE]
     bias_m = np.sqrt((each[:, 3:] ** 2).sum(axis=1).mean(axis=0))
     drifts = []
@@ -245,7 +247,7 @@ def _state(views: Sequence[_View], value: Array, sigma: Array) -> CalibrationSta
     wrong = [drift for drift in drifts if drift.is_drifted]
     cov_bias = max((_cov_bias(shifts[at], value, sigma) for at in (slice(None), slice(-1, None))), key=_squared_m)
     if not wrong:
-        cov_bias += np.diag([0.0] * 3 + [_in_bends_m(_tilt_in_doubt(views, value, sigma)) ** 2] * 3)
+        cov_bias += np.diag([0.0] * 3 + [_in_bends_m(_tilt_in_doubt(looks, value, sigma)) ** 2] * 3)
         is_excluded = _squared_m(cov_bias) <= BIAS_LIMIT_M**2
         return CalibrationState(tuple(drifts), None if is_excluded else cov_bias)
     wrong.sort(key=lambda drift: (-drift.bias_m, -abs(drift.value) / drift.sigma))
@@ -253,13 +255,13 @@ def _state(views: Sequence[_View], value: Array, sigma: Array) -> CalibrationSta
     return CalibrationState(tuple(drifts), cov_bias + _cov_elsewhere(value, sigma), text)
 
 
-def _tilt_in_doubt(views: Sequence[_View], value: Array, sigma: Array) -> float:
+def _tilt_in_doubt(looks: Sequence[_Look], value: Array, sigma: Array) -> float:
     """Return the camera rotation about the body's x or y, rad, by gravity if the map is level; 0 if turns of the robot exclude it."""
-    information = sum((view.information[TILT, TILT] for view in views), 1e-9 * np.eye(2))
+    information = sum((look.information[TILT, TILT] for look in looks), 1e-9 * np.eye(2))
     covariance = np.linalg.inv(information)
-    in_level_map = np.abs(covariance @ sum(view.score[TILT] for view in views))
-    floor, limit = np.array([(PARAMETERS[k].floor, PARAMETERS[k].limit) for k in range(TILT.start, TILT.stop)]).T
-    common = floor * np.sqrt(1.0 + _LOCAL_FLOORS**2 / len(views))
+    in_level_map = np.abs(covariance @ sum(look.score[TILT] for look in looks))
+    least, limit = np.array([(PARAMETERS[k].least_sigma, PARAMETERS[k].limit) for k in range(TILT.start, TILT.stop)]).T
+    common = least * np.sqrt(1.0 + _LOCAL_FLOORS**2 / len(looks))
     is_odd = in_level_map > np.maximum(limit, DRIFT_SIGMAS * np.hypot(np.sqrt(np.diag(covariance)), common))
     is_open = np.abs(value[TILT]) + 2.0 * sigma[TILT] > limit
     return float(np.max(in_level_map, where=is_odd & is_open, initial=0.0))

@@ -322,7 +322,7 @@ class Ros2Localizer(Publisher):
         return fault
 
     def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:
-        """Publish the grid. Without one the last grid stays on the topic: all versions of a floor share the map's frame."""
+        """Publish the grid. Without one the last grid stays on the topic: all versions of a site share the map's frame."""
         self._map_words = why if grid is None else f"grid of version {version}"
         if grid is None:
             _log.warning("planners get no new map: %s", why)

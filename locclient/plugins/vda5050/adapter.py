@@ -13,7 +13,7 @@ from fleetmap.encoding import to_plain
 from fleetmap.errors import FleetmapError, LinkError
 from fleetmap.failure_definition import is_driving
 from fleetmap.geometry import se3, se3_inverse, so3_exp
-from fleetmap.mapformat.floors import Floor
+from fleetmap.mapformat.building import Floor
 from fleetmap.messages import Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient.hooks import LinkedRobot
@@ -27,7 +27,7 @@ from locclient.robot.version_trial import Change, VersionChange
 
 _MOST_JOBS = 16
 _ENABLE_S = 120.0  # for the trial of a version, and that of the previous one after a failure
-_TILT_SIGMA_RAD, _HEIGHT_SIGMA_M = 0.05, 0.2  # of a flat floor, as x, y and theta define neither
+_TILT_SIGMA_RAD, _HEIGHT_SIGMA_M = 0.05, 0.2  # of flat ground, as x, y and theta define neither
 _SIGMAS = 3.7  # maximum distance from the fleet manager's pose for agreement
 _ERRORS: dict[type[Exception], tuple[str, str]] = {
     DuplicateMapError: ("DUPLICATE_MAP", "WARNING"),
@@ -78,8 +78,8 @@ class FleetAdapter:
         self._last_said: object = None
         self._versions: list[tuple[int, bool]] = []
         self._in_use: frozenset[int] = frozenset()
-        self._floors: Mapping[str, Floor] = {}  # of the robot's building
-        self._floor_versions: Mapping[str, int] = {}  # of the others' maps, whose ids are their sites
+        self._building: Mapping[str, Floor] = {}  # of the robot's building
+        self._visited_versions: Mapping[str, int] = {}  # of the others' maps, whose ids are their sites
         # None while the map does not define its pose in the fleet manager's frame.
         self._fleet_from_map = np.eye(4) if section.frame == "map" else None
 
@@ -107,7 +107,7 @@ class FleetAdapter:
                 return
             self._book.end("order")
             named = {node.node_position.map_id for node in message.nodes if node.node_position is not None}
-            known = self._floor_versions.keys() | ({self.map_id} if self._versions else set())
+            known = self._visited_versions.keys() | ({self.map_id} if self._versions else set())
             for map_id in sorted(named - known)[:20]:
                 words = f"the order {message.order_id[:200]!r} names a map that is not on the robot: {map_id[:200]!r}"
                 references = {"orderId": message.order_id, "mapId": map_id}
@@ -242,13 +242,13 @@ class FleetAdapter:
 
     def _initialize(self, action: Action, given: dict[str, Any]) -> None:
         now, section = self._localization, self._section
-        floor = given["mapId"] if given["mapId"] in self._floor_versions.keys() - {self.map_id} else ""
+        site = given["mapId"] if given["mapId"] in self._visited_versions.keys() - {self.map_id} else ""
         fleet_from_map = self._fleet_from_map
-        if section.frame == "building" and self._floors:
-            fleet_from_map = self._floors[floor].frame.building_from_map
+        if section.frame == "building" and self._building:
+            fleet_from_map = self._building[site].frame.building_from_map
         words = ""
         is_own = given["mapId"] == self.map_id and any(is_enabled for _, is_enabled in self._versions)
-        if not (floor or is_own):
+        if not (site or is_own):
             words = f"map {given['mapId'][:80]!r} is not enabled here"
         elif abs(given["theta"]) > np.pi + 1e-6:
             words = f"theta = {given['theta']} is beyond -pi to pi"
@@ -260,7 +260,7 @@ class FleetAdapter:
             return self._book.fail(action, "INITIALIZE_POSITION_FAILED", words)
         if self._placing is not None:
             self._book.set(self._placing[0], "FAILED", "replaced by another initializePosition")
-        place = Position(float(given["x"]), float(given["y"]), float(given["theta"]), floor=floor)
+        place = Position(float(given["x"]), float(given["y"]), float(given["theta"]), site=site)
         self._placing = (action, place, self._clock_s() + section.initialize_s)
         self._book.set(action, "RUNNING")
         if now.status == Status.TRACKING:  # a pose confirmed by fixes is not dropped for an operator's
@@ -268,23 +268,23 @@ class FleetAdapter:
         sigmas = [_TILT_SIGMA_RAD] * 2 + [section.initial_sigma_rad] + [section.initial_sigma_m] * 2 + [_HEIGHT_SIGMA_M]
         fleet_from_base = se3(so3_exp(np.array([0.0, 0.0, place.theta_rad])), np.array([place.x_m, place.y_m, 0.0]))
         map_from_base = se3_inverse(fleet_from_map) @ fleet_from_base
-        self._robot.put_prior(PositionPrior(now.stamp_ns + 1, map_from_base, np.diag(np.square(sigmas)), floor=floor))
+        self._robot.put_prior(PositionPrior(now.stamp_ns + 1, map_from_base, np.diag(np.square(sigmas)), False, site))
         return None
 
     def after_frame(
         self,
         outcome: Outcome,
         in_use: frozenset[int],
-        floors: Mapping[str, Floor] | None = None,
-        floor_versions: Mapping[str, int] | None = None,
+        building: Mapping[str, Floor] | None = None,
+        visited_versions: Mapping[str, int] | None = None,
     ) -> None:
         """Handle the results of a frame, and the versions that the localizer holds; on the localizing thread.
 
-        floors: of the robot's building, by `Localizer.handle_floors`; floor_versions: of the others' maps, by their sites.
+        building: as of `Localizer.handle_building`; visited_versions: of its other sites' maps.
         """
         with self._lock:
-            self._in_use, self._floors = in_use, floors or {}
-            self._floor_versions = floor_versions or {}
+            self._in_use, self._building = in_use, building or {}
+            self._visited_versions = visited_versions or {}
             if self._section.frame == "building":
                 self._fleet_from_map = outcome.published.building_from_map
             how = (outcome, self._robot.lost_radius_m, self._fleet_from_map)
@@ -344,7 +344,7 @@ class FleetAdapter:
             found: dict[str, Any] = {**_EMPTY, "driving": now.is_driving, **self._robots_own()}
             if self._last_node is not None and found["lastNodeId"] == self._last_node[1]:
                 found["lastNodeId"] = self._last_node[0]
-            others = [(site, number, True) for site, number in self._floor_versions.items() if site != self.map_id]
+            others = [(site, number, True) for site, number in self._visited_versions.items() if site != self.map_id]
             found["maps"] = [
                 {"mapId": map_id, "mapVersion": str(number), "mapStatus": "ENABLED" if on else "DISABLED"}
                 for map_id, number, on in [*((self.map_id, *own) for own in self._versions), *others]

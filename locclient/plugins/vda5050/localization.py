@@ -32,19 +32,19 @@ _STATUS_WORDS = {
 
 @dataclass(frozen=True)
 class Position:
-    """A pose of the base in the fleet manager's frame. radius_m: of 95 %, infinite if the robot is not localized. floor: site of another
-    floor of the robot's building, empty for its own.
+    """A pose of the base in the fleet manager's frame. radius_m: of 95 %, infinite if the robot is not localized. site: another one
+    of the robot's building, whose map it is in; empty for its own.
     """
 
     x_m: float
     y_m: float
     theta_rad: float
     radius_m: float = float("inf")
-    floor: str = ""
+    site: str = ""
 
     def away_from(self, other: "Position") -> tuple[float, float]:
-        """Return the distance in metres, infinite on another floor, and the angle in radians from 0 to pi."""
-        if self.floor != other.floor:
+        """Return the distance in metres, infinite in another map, and the angle in radians from 0 to pi."""
+        if self.site != other.site:
             return float("inf"), pi
         turn = abs(self.theta_rad - other.theta_rad) % (2 * pi)
         return hypot(self.x_m - other.x_m, self.y_m - other.y_m), min(turn, 2 * pi - turn)
@@ -96,18 +96,18 @@ class Localization:
     def mobile_robot_position(self, map_id: str, lost_radius_m: float) -> dict[str, object] | None:
         """Return the object of the state; None before the first pose. The score is 1 for an exact pose, 0 at lost_radius_m.
 
-        map_id: of the robot's own site; other floors are called by their sites.
+        map_id: of the robot's own site; other maps are called by their sites.
         """
         place, is_localized = self.position, self.is_localized and not self.is_silent
         if (
-            place is None or place.floor == map_id
-        ):  # a configured id that is another floor's site: fleet managers would take it for the own
+            place is None or place.site == map_id
+        ):  # a configured id that is another site: fleet managers would take it for the own
             return None
         found: dict[str, object] = {
             "x": place.x_m,
             "y": place.y_m,
             "theta": place.theta_rad,
-            "mapId": place.floor or map_id,
+            "mapId": place.site or map_id,
         }
         found |= {"localized": is_localized, "localizationScore": 0.0}
         if is_localized:

@@ -1,13 +1,18 @@
-"""The building's frame, used by operators and fleet managers, and the pose of `map` in it."""
+"""Buildings: the frame used by operators and fleet managers, the pose of `map` in it, and floors, of which each is a site with its own
+map, versions and areas. Lifts are areas of the floors.
+"""
 
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 from math import pi
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import numpy as np
 
-from fleetmap.errors import MapFormatError
-from fleetmap.geometry import Array, se3, so3_exp
+from fleetmap.errors import FleetmapError, MapFormatError
+from fleetmap.geometry import Array, Rings, inside_any, se3, se3_inverse, so3_exp, transform_points
+from fleetmap.mapformat.names import check_name
 
 BUILDING_KEY = "building"
 """Key in `configuration` of a manifest, where older readers ignore it: elsewhere format 1 refuses unknown keys."""
@@ -48,3 +53,128 @@ def aligned_frame(data: bytes) -> BuildingFrame:
         return msgspec.json.decode(data, type=_Alignment).frame
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise MapFormatError(f"the site's alignment cannot be read ({error}); run `mapserver align` again") from error
+
+
+MAX_FLOORS_BYTES = 64_000
+_MAX_FLOORS = 100
+
+_Text = Annotated[str, msgspec.Meta(min_length=1, max_length=64)]
+
+
+class FloorEntry(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """One floor: its site, its level's name for fleet managers, and the height of its map's z = 0 in the building."""
+
+    site: _Text
+    level: _Text
+    height_m: Coordinate
+
+
+class Building(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+    """The floors of a building, from below; the same bytes are a file (kind FLOORS) of each of its sites."""
+
+    name: _Text
+    floors: Annotated[tuple[FloorEntry, ...], msgspec.Meta(min_length=2, max_length=_MAX_FLOORS)]
+
+
+@dataclass(frozen=True)
+class Floor:
+    """A floor with the pose of its map in the building, and the polygons of its lifts in its `map`, by the lift's name."""
+
+    entry: FloorEntry
+    frame: BuildingFrame
+    lifts: Mapping[str, tuple[Rings, ...]] = field(default_factory=dict)
+
+    @property
+    def building_from_map(self) -> Array:
+        """(4, 4), with the floor's height."""
+        building_from_map = self.frame.building_from_map.copy()
+        building_from_map[2, 3] += self.entry.height_m
+        return building_from_map
+
+    def lifts_at(self, position_m: Array, reach_m: float) -> frozenset[str]:
+        """Return the lifts whose outlines hold a position (2,) or are at most reach_m from it: several of a bank of lifts."""
+        return frozenset(
+            name
+            for name, polygons in self.lifts.items()
+            if inside_any(position_m[None], polygons)[0]
+            or min(edge_distance_m(position_m, rings) for rings in polygons) <= reach_m
+        )
+
+
+def check_building(building: Building) -> Building:
+    """Return the building with its floors from below; MapFormatError for repeated sites, levels or heights."""
+    for floor in building.floors:
+        check_name(floor.site, "site")
+    for what in ("site", "level", "height_m"):
+        values = [getattr(floor, what) for floor in building.floors]
+        if twice := [value for value in values if values.count(value) > 1]:
+            words = f"two floors have the same {what.removesuffix('_m')}, {twice[0]}"
+            raise MapFormatError(f"building {building.name!r}: {words}")
+    return msgspec.structs.replace(building, floors=tuple(sorted(building.floors, key=lambda floor: floor.height_m)))
+
+
+def read_building(data: bytes) -> Building:
+    """Read a site's file of kind FLOORS; MapFormatError for anything else."""
+    try:
+        return check_building(msgspec.json.decode(data, type=Building))
+    except FleetmapError as error:
+        raise MapFormatError(str(error)) from error
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise MapFormatError(f"a building of these floors cannot be read ({error}); set the building again") from error
+
+
+class _Shape(msgspec.Struct):
+    type: Literal["Polygon", "MultiPolygon"]
+    coordinates: msgspec.Raw
+
+
+class _Properties(msgspec.Struct):
+    lift: str | None = None
+
+
+class _Feature(msgspec.Struct):
+    geometry: _Shape
+    properties: _Properties
+
+
+class _Areas(msgspec.Struct):
+    features: list[_Feature]
+    frame: Literal["map", "building"] | None = None
+
+
+def read_lifts(areas: bytes | None, frame: BuildingFrame) -> dict[str, tuple[Rings, ...]]:
+    """Return the lifts in a site's file of areas, as `Floor.lifts`; areas of one lift are joined. MapFormatError for an invalid file.
+
+    frame: the site's alignment, for areas that were drawn in the building.
+    """
+    lifts: dict[str, tuple[Rings, ...]] = {}
+    try:
+        read = _Areas([]) if areas is None else msgspec.json.decode(areas, type=_Areas)
+        for feature in read.features:
+            if feature.properties.lift is None:
+                continue
+            if feature.geometry.type == "Polygon":
+                polygons = [msgspec.json.decode(feature.geometry.coordinates, type=list[list[list[float]]])]
+            else:
+                polygons = msgspec.json.decode(feature.geometry.coordinates, type=list[list[list[list[float]]]])
+            for polygon in polygons:
+                rings = [np.array([corner[:2] for corner in ring[:-1]], float) for ring in polygon]
+                if not rings or not all(r.ndim == 2 and r.shape[1] == 2 and len(r) >= 3 for r in rings):
+                    raise ValueError(f"lift {feature.properties.lift[:64]!r} has no outline")
+                if read.frame == "building":
+                    map_from_building = se3_inverse(frame.building_from_map)
+                    rings = [transform_points(map_from_building, np.c_[r, np.zeros(len(r))])[:, :2] for r in rings]
+                lifts[feature.properties.lift] = (*lifts.get(feature.properties.lift, ()), tuple(rings))
+    except (msgspec.MsgspecError, ValueError, IndexError) as error:
+        raise MapFormatError(f"the site's areas cannot be read ({error}); import them again") from error
+    return lifts
+
+
+def edge_distance_m(position_m: Array, rings: Iterable[Array]) -> float:
+    """Return the distance of a position (2,) from the nearest edge of the rings, as of `inside_rings`."""
+    nearest_m = np.inf
+    for ring in rings:
+        edges, to = np.roll(ring, -1, axis=0) - ring, position_m - ring
+        along = np.clip((to * edges).sum(axis=1) / np.maximum((edges**2).sum(axis=1), 1e-12), 0.0, 1.0)
+        nearest_m = min(nearest_m, float(np.linalg.norm(to - along[:, None] * edges, axis=1).min()))
+    return nearest_m

@@ -25,6 +25,7 @@ from fleetmap.sensors.rectification import MountedCamera, OtherView, RectifiedFr
 from fleetmap.sensors.samples import CameraFrame, PositionPrior, wheel_between
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.estimate import Estimate
+from locclient.localization.held_maps import HeldMap
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
 from support.estimator.simulated_run import EstimatorSession, Found
@@ -285,13 +286,12 @@ def run_localizer(
     localizer = Localizer(*rig, settings, others=mounted)
 
     def new_tracker(first_frame: int, first_id: int) -> Tracker:
-        followed = views[localizer.odometry._rig.followed]
+        followed = views[localizer.perception.odometry._rig.followed]
         return EstimatorTracker(followed, followed.camera, settings.odometry.tracker, first_frame)
 
-    localizer.odometry._new_tracker = new_tracker  # type: ignore[method-assign]
-    localizer.odometry._tracker = new_tracker(0, 0)
-    localizer._query.use(*(SessionRelocalizer(view, each, settings) for each in views))
-    localizer._map_version, localizer._tracker.lookalikes = 1, lookalikes
+    localizer.perception.odometry._new_tracker = new_tracker  # type: ignore[method-assign]
+    localizer.perception.odometry._tracker = new_tracker(0, 0)
+    localizer.maps.use("", HeldMap(1, tuple(SessionRelocalizer(view, each, settings) for each in views), lookalikes))
     if prior is not None:
         localizer.handle_prior(prior)
     estimates, last_ns = [], 0

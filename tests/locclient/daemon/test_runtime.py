@@ -33,7 +33,7 @@ from locclient.daemon.service_manager import ServiceManager
 from locclient.delivery.outbox import Outbox
 from locclient.delivery.report_delivery import ReplayQueue
 from locclient.localization.estimate import Estimate
-from locclient.maps.floor_maps import FloorMaps
+from locclient.maps.building_maps import BuildingMaps
 from locclient.maps.loaded_map import PositionBound, TileSelectionSettings
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import CachedMap, LocalMapSource
@@ -452,12 +452,12 @@ def test_planners_get_the_grid_of_the_floor(tmp_path: Path, has_grid: bool) -> N
     """At the change; of a floor without one an empty grid, and never that of the floor where the robot was."""
     with house(tmp_path / "store", robot_world.tiles(), robot_world.tiles(), has_grid=has_grid) as store:
         source = LocalMapSource(store.folder, "low")
-        floors = FloorMaps(source, lambda site: LocalMapSource(store.folder, site))
+        floors = BuildingMaps(source, lambda site: LocalMapSource(store.folder, site))
         floors.grid_height_m = 0.5
         floors.refresh()
         low, listener = robot_world.wanted(store, "low"), Listener(grid_height_m=0.5)
         parts = SimpleNamespace(
-            server=None, publisher=listener, floors=floors, tile_loader=TileLoader(source, TileSelectionSettings())
+            server=None, publisher=listener, building=floors, tile_loader=TileLoader(source, TileSelectionSettings())
         )
         made = Runtime.__new__(Runtime)
         made._parts, made._server, made._publisher, made._shown_grid = parts, None, listener, None  # type: ignore[assignment]

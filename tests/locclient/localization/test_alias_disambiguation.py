@@ -63,7 +63,7 @@ class Aisles:
                     stands &= ~((points > BOX[0]) & (points < BOX[1])).all(axis=1)
                 found = self.rng.random(len(ahead)) < np.where(stands[ahead], shares[ahead], 0.04)
                 seen = CovisibleLandmarks(ahead.astype(np.uint32), points[ahead], looks_like[ahead], found)
-                history.begin_view()
+                history.begin_look()
                 history.add(odom_from_true, seen)
         return histories
 
@@ -181,7 +181,7 @@ def plainly(one: ObservationHistory, other: ObservationHistory) -> float:
         ):
             for n in set(range(len(history.ids))) - alike:
                 cell = tuple(np.floor(history.points_odom[n] / cell_m + shift).astype(int).tolist())
-                looks = one.views & other.views
+                looks = one.looks & other.looks
                 counts = (int(history.expected[n]) & looks).bit_count(), (int(history.found[n]) & looks).bit_count()
                 if not counts[0]:
                     continue
@@ -228,8 +228,8 @@ def test_a_look_that_only_one_place_stands_for_does_not_count() -> None:
     one, other = Aisles(1, signs=0).drive(0)
     before = log_odds(one, other)
     for _ in range(8):
-        one.begin_view()
-        other.begin_view()
+        one.begin_look()
+        other.begin_look()
         one.add(
             np.eye(4), CovisibleLandmarks(one.ids, one.points_odom, one.descriptors, rng.random(len(one.ids)) < 0.02)
         )
@@ -239,7 +239,7 @@ def test_a_look_that_only_one_place_stands_for_does_not_count() -> None:
 def test_looks_are_counted_one_by_one() -> None:
     history = ObservationHistory()
     for number in range(6):
-        history.begin_view()
+        history.begin_look()
         if number % 2 == 0:
             ids = np.array([7, 3] if number < 4 else [9, 3], np.uint32)
             seen = CovisibleLandmarks(
@@ -247,8 +247,8 @@ def test_looks_are_counted_one_by_one() -> None:
             )
             history.add(np.eye(4), seen)
     assert history.ids.tolist() == [3, 7, 9]
-    assert history.views == 0b101010
-    expected, found = history.counts(history.views)
+    assert history.looks == 0b101010
+    expected, found = history.counts(history.looks)
     assert (expected.tolist(), found.tolist()) == ([3, 2, 1], [0, 2, 1])
     expected, found = history.counts(0b1010)
     assert (expected.tolist(), found.tolist()) == ([2, 1, 1], [0, 1, 1])
@@ -262,10 +262,10 @@ def test_a_history_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     for number in range(60):
         ids = np.arange(number // 10 * 10, number // 10 * 10 + 20, dtype=np.uint32)
         points = np.tile(ids[:, None], (1, 3)).astype(float)
-        history.begin_view()
+        history.begin_look()
         history.add(np.eye(4), CovisibleLandmarks(ids, points, np.zeros((20, 32), np.uint8), np.ones(20, bool)))
     assert history.ids.tolist() == list(range(40, 70))
     np.testing.assert_allclose(history.points_odom[:, 0], range(40, 70))
     for _ in range(64):
-        history.begin_view()
-    assert len(history.ids) == history.views == 0
+        history.begin_look()
+    assert len(history.ids) == history.looks == 0

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from locclient.localization.hypothesis_set import HypothesisSet
+from locclient.localization.place import Place
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
 
@@ -12,7 +13,7 @@ SETTINGS = TrackSettings()
 
 def hypothesis(inliers: list[int], recall: list[float]) -> PoseHypothesis:
     """A place with a fix of so many inliers in each query; 0: a query without one."""
-    made = PoseHypothesis(0, 0, np.eye(4), np.eye(6), np.eye(4), np.eye(6))
+    made = PoseHypothesis(0, 0, *2 * [Place(np.eye(4), np.eye(6))])
     for count, share in zip(inliers, recall, strict=True):
         made.decay(SETTINGS.evidence_kept_share)
         if count:

@@ -8,8 +8,8 @@ import pytest
 from fleetmap.messages import Cause, Status
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
-from locclient.localization.lift_ride import Ride, RideGauge
 from locclient.localization.pose_tracker import ONE_OF_FLOORS
+from locclient.localization.priors.ride_gauge import Ride, RideGauge
 from locclient.robot.failure_monitor import FailureMonitor
 from support.worlds.lift_world import FRAME_S, LiftWorld, RideResult, ride
 
@@ -199,7 +199,7 @@ def test_a_change_of_the_building_in_a_ride_ends_the_ride(monkeypatch: pytest.Mo
     world.board()
     for number, _ in enumerate(world.ride(2)):
         if number == 20:
-            world.localizer.handle_floors(dict(world.localizer._floors))
+            world.localizer.handle_building(dict(world.localizer._lift.building))
     list(world.stand(2.0))
     said = list(world.drive(-6.0))
     assert not world.wrong
@@ -219,7 +219,7 @@ def test_of_two_lifts_side_by_side_it_may_ride_either(monkeypatch: pytest.Monkey
     """The other one, which serves fewer floors, is within reach of the pose after the ride."""
     world = world_of(monkeypatch, 14, floors=3, likeness=0.97, has_imu=False)
     for number in range(3):
-        lifts = world.localizer._floors[world.keys[number]].lifts
+        lifts = world.localizer._lift.building[world.keys[number]].lifts
         ((ring,),) = lifts["A"]
         turn = world.map_from_plan[number][:2, :2]
         beside = {"0": ((ring + turn @ np.array([0.0, 2.1]),),)} if number < 2 else {}
@@ -243,12 +243,12 @@ def test_an_operator_without_a_floor_names_none_after_a_ride(monkeypatch: pytest
 def test_a_pose_on_a_floor_that_is_gone_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
     world = LiftWorld(monkeypatch, floors=2, likeness=0.0, seed=16)
     list(world.stand(0.2))
-    covariance, floors = np.diag([0.02**2] * 3 + [0.1**2] * 3), dict(world.localizer._floors)
+    covariance, floors = np.diag([0.02**2] * 3 + [0.1**2] * 3), dict(world.localizer._lift.building)
     world.localizer.handle_prior(PositionPrior(1, np.eye(4), covariance, floor="gone"))
     assert world.step(0.0, sees=False).floor == ""
     world.localizer.handle_prior(PositionPrior(2, np.eye(4), covariance, floor="floor-1"))
     assert world.step(0.0, sees=False).floor == "floor-1"
-    world.localizer.handle_floors({"": floors[""]})
+    world.localizer.handle_building({"": floors[""]})
     assert world.step(0.0, sees=False).floor == ""
 
 

@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 from itertools import pairwise
-from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +12,8 @@ from fleetmap.messages import Cause, FailureKind, Status
 from fleetmap.relocalization.relocalizer import Fix
 from locclient.localization.estimate import assemble
 from locclient.localization.hypothesis_set import HypothesisSet
+from locclient.localization.place import Place
+from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
 from locclient.robot.failure_monitor import FailureMonitor
 from support.fleet.estimates import estimate as estimate_at
@@ -467,23 +467,15 @@ def test_metres_of_an_innovation_are_told_of_what_lies_near_or_was_believed(trac
     assert elsewhere.innovation_m is None
 
 
-@pytest.mark.parametrize("broken", ["now_cov", "now_map_from_body"])
+@pytest.mark.parametrize("broken", ["cov_rot_trans", "map_from_body"])
 def test_a_pose_of_nan_is_none(broken: str) -> None:
     """Such as odometry leaves where a robot has lost most of its frames."""
-    values = {
-        "now_cov": 1e-4 * np.eye(6),
-        "now_map_from_body": np.eye(4),
-        "stamp_ns": 0,
-        "has_broken": False,
-        "lost_imu": False,
-        "missed": False,
-    }
-    values[broken] = values[broken] * np.nan
-    hypothesis: Any = SimpleNamespace(**values)
+    known = Place(np.eye(4), 1e-4 * np.eye(6))
+    place = known._replace(**{broken: np.nan * getattr(known, broken)})
     found = assemble(
         estimate_at(0.1, known=False),
         TrackSettings(),
-        confirmed=hypothesis,
+        confirmed=PoseHypothesis(0, 0, place, place),
         candidates=HypothesisSet(TrackSettings()),
         prior=None,
         has_failed=False,

@@ -167,7 +167,7 @@ def test_a_slower_or_dying_rear_pair_is_not_taken_for_the_front(front: str) -> N
             frame = replace(frame, others=(None,))
         localizer.handle_imu(imu_between(stamp_ns - FRAME_NS, stamp_ns + IMU_NS))
         rectified = rectifier.rectify(frame)
-        if localizer.awaits(rectified):
+        if localizer.perception.awaits(rectified):
             continue
         odometry = localizer.handle_stereo(rectified).odometry
         lost += odometry.status is OdometryStatus.DEGRADED

@@ -8,10 +8,9 @@ import pytest
 
 from fleetmap.encoding import to_json
 from fleetmap.mapformat import current_path
-from fleetmap.mapformat.building import FLOORS
-from fleetmap.mapformat.floors import Building, FloorEntry
+from fleetmap.mapformat.building import FLOORS, Building, FloorEntry
 from fleetmap.trust import TrustedMap, ask_over
-from locclient.maps.floor_maps import FloorMaps
+from locclient.maps.building_maps import BuildingMaps
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import LocalMapSource
 from locclient.maps.tile_cache import TileCache
@@ -35,7 +34,7 @@ class Network:
         self.bus = stack.enter_context(MemoryBus(self.hub))
         self.service = BusService(self.store, Fleet(self.store), self.bus, lambda *_: None)
 
-    def floors(self) -> FloorMaps:
+    def floors(self) -> BuildingMaps:
         bus, cache = self._stack.enter_context(MemoryBus(self.hub)), TileCache(self.cache)
         root = (self.store.folder / "trust" / "1.root.json").read_bytes()
 
@@ -47,7 +46,7 @@ class Network:
         own = client("low")
         if self.service is not None:
             own.bring(own.wanted())
-        return FloorMaps(own, client)
+        return BuildingMaps(own, client)
 
 
 @pytest.fixture
@@ -61,7 +60,7 @@ def test_floors_come_by_signed_lists(network: Network) -> None:
     floors.refresh()
     (change,) = floors.changes
     assert [(loaded.wanted.site, loaded.version) for loaded in change.maps] == [("high", 1)]
-    assert change.floors["high"].entry.level == "L1"
+    assert change.building["high"].entry.level == "L1"
 
 
 def test_a_version_that_is_not_signed_is_not_taken(network: Network) -> None:
@@ -88,7 +87,7 @@ def test_a_site_that_is_no_floor_of_this_building_is_none(network: Network, reco
     floor_maps = network.floors()
     floor_maps.refresh()
     (change,) = floor_maps.changes
-    assert (list(change.floors), change.maps) == (["", "high"], []), "where it may be, without a map"
+    assert (list(change.building), change.maps) == (["", "high"], []), "where it may be, without a map"
     network.store.keep_site_files("high", {FLOORS: network.store.site_file("low", FLOORS)}, "")
     update_lists(network.store)
     floor_maps.refresh()
@@ -108,10 +107,10 @@ def test_another_sites_map_is_not_taken_for_a_floors(network: Network) -> None:
     """A folder, whose files nobody signs: the upper floor's present version is the manifest of the lower one."""
     folder = network.store.folder
     (folder / current_path("high")).write_text((folder / current_path("low")).read_text())
-    floor_maps = FloorMaps(LocalMapSource(folder, "low"), lambda site: LocalMapSource(folder, site))
+    floor_maps = BuildingMaps(LocalMapSource(folder, "low"), lambda site: LocalMapSource(folder, site))
     floor_maps.refresh()
     (change,) = floor_maps.changes
-    assert (list(change.floors), change.maps) == (["", "high"], [])
+    assert (list(change.building), change.maps) == (["", "high"], [])
 
 
 def test_without_a_server_the_disk_has_them(network: Network) -> None:

@@ -21,7 +21,7 @@ from fleetmap.recordings.failure_recording import LOCALIZER, SUMMARY, attachment
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.samples import PositionPrior
 from locclient.delivery.failure_file import failure_file, read_failure_file
-from locclient.maps.floor_maps import FloorMaps
+from locclient.maps.building_maps import BuildingMaps
 from locclient.maps.map_source import LocalMapSource
 from locclient.replay.failure_replay import SAME_M, Comparison, compare_failure
 from locclient.replay.replay import load_map
@@ -126,10 +126,10 @@ def test_a_failure_on_another_floor_is_replayed_in_that_floors_map(carried: Carr
     """A robot of the lower floor that knows its place on the upper one when the recording begins."""
     robot = Robot(calibration(), robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
     with house(tmp_path, strange(robot_world.tiles()), robot_world.tiles(), x_m=3.0):
-        floors = FloorMaps(LocalMapSource(tmp_path, "low"), lambda site: LocalMapSource(tmp_path, site))
+        floors = BuildingMaps(LocalMapSource(tmp_path, "low"), lambda site: LocalMapSource(tmp_path, site))
         floors.refresh()
         robot.use(load_map(LocalMapSource(tmp_path, "low"))[0])
-        robot.use_floors(*floors.changes.popleft())
+        robot.use_building(*floors.changes.popleft())
     bundles = list(robot_world.bundles(120))
     for bundle in bundles:
         robot.handle(bundle)
@@ -209,7 +209,7 @@ def test_a_query_of_a_view_that_the_rig_does_not_have_is_refused(carried: Carrie
     state = _state_of(carried, 10_000)
     next(percept["query"] for _, percept in state["frames"] if percept["query"])["view"] = view
     spoiled = zstandard.ZstdCompressor().compress(msgspec.msgpack.encode(state))
-    with pytest.raises(RecordingError, match=f"{view} of a rig of 1 views"):
+    with pytest.raises(RecordingError, match=f"{view} of a rig of 1 cameras"):
         read_failure_file(_changed(carried, tmp_path / "spoiled.mcap", spoiled))
 
 

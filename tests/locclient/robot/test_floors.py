@@ -10,7 +10,7 @@ import pytest
 from fleetmap.geometry import se3_inverse
 from fleetmap.messages import Status
 from locclient.localization.estimate import Estimate
-from locclient.maps.floor_maps import FloorMaps
+from locclient.maps.building_maps import BuildingMaps
 from locclient.maps.map_source import LocalMapSource
 from locclient.robot.robot import Robot
 from mapserver.fleet.building import keep_areas
@@ -22,12 +22,12 @@ from support.worlds.building import SITES, house, strange
 
 def robot_of(store: MapStore, site: str = "low", *, missing: bool = False) -> Robot:
     source = LocalMapSource(store.folder, site)
-    floors, robot = FloorMaps(source, lambda other: LocalMapSource(store.folder, other)), robot_world.new_robot()
+    floors, robot = BuildingMaps(source, lambda other: LocalMapSource(store.folder, other)), robot_world.new_robot()
     floors.refresh()
     change = floors.changes.popleft()
     fetched = source.tiles(source.manifest(source.newest()))
     robot.use(replace(robot_world.loaded(store, site=site), tiles=fetched.tiles))
-    robot.use_floors(change.floors, [] if missing else change.maps)
+    robot.use_building(change.building, [] if missing else change.maps)
     return robot
 
 
@@ -76,7 +76,7 @@ def test_a_site_without_a_building_is_as_before(folder: Path) -> None:
     with MapStore.open(folder, create=True) as store:
         robot_world.save(store, site="low")
         source = LocalMapSource(folder, "low")
-        floors = FloorMaps(source, lambda other: LocalMapSource(folder, other))
+        floors = BuildingMaps(source, lambda other: LocalMapSource(folder, other))
         floors.refresh()
         assert not floors.changes
 
@@ -84,20 +84,20 @@ def test_a_site_without_a_building_is_as_before(folder: Path) -> None:
 def test_changes_of_floors_reach_the_robot_once(folder: Path) -> None:
     lift = geojson({"name": "a", "box": (1.0, 1.0, 3.0, 3.0), "lift": "A"})
     with house(folder, robot_world.tiles(), robot_world.tiles()) as store:
-        floors = FloorMaps(LocalMapSource(folder, "low"), lambda other: LocalMapSource(folder, other))
+        floors = BuildingMaps(LocalMapSource(folder, "low"), lambda other: LocalMapSource(folder, other))
         floors.refresh()
         floors.refresh()
         assert [len(change.maps) for change in floors.changes] == [1]
         keep_areas(store, "high", lift, "", NOBODY)
         floors.refresh()
-        assert list(floors.changes[-1].floors["high"].lifts) == ["A"]
+        assert list(floors.changes[-1].building["high"].lifts) == ["A"]
         robot_world.save(store, site="high", of=strange(robot_world.tiles()))
         floors.refresh()
         assert [loaded.version for loaded in floors.changes[-1].maps] == [2]
         assert len(floors.changes) == 3
         store.keep_site_files("low", {"floors": None}, "")
         floors.refresh()
-        assert floors.changes[-1].floors == {}
+        assert floors.changes[-1].building == {}
 
 
 def test_a_robot_that_visits_a_floor_reports_no_pose_on_its_own(folder: Path) -> None:

@@ -9,8 +9,16 @@ import pytest
 from fleetmap.access import Access, Holder
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, UsageError
-from fleetmap.mapformat.building import AREAS, FLOORS, BuildingFrame
-from fleetmap.mapformat.floors import Building, Floor, FloorEntry, read_building, read_lifts
+from fleetmap.mapformat.building import (
+    AREAS,
+    FLOORS,
+    Building,
+    BuildingFrame,
+    Floor,
+    FloorEntry,
+    read_building,
+    read_lifts,
+)
 from mapserver.cli import app
 from mapserver.fleet.building import forget_alignment, keep_areas
 from mapserver.fleet.floors import floors_of, keep_building

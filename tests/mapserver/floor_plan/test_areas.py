@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import UsageError
-from fleetmap.mapformat.building import BuildingFrame
-from fleetmap.mapformat.floors import Floor, FloorEntry, read_lifts
+from fleetmap.mapformat.building import BuildingFrame, Floor, FloorEntry, read_lifts
 from mapserver.drafting.area_corrections import AreaCorrections
 from mapserver.floor_plan.areas import Areas, MaskKind, read_areas
 from mapserver.grid.masks import mask_grid

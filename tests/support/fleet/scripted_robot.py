@@ -109,7 +109,7 @@ class Robot:
         settings = LocalizerSettings(track=TrackSettings(**track))
         self.localizer = Localizer(RigCalibration((lens,)), camera, BODY_FROM_CAM, 0.0, settings)
         self.odometry = ScriptedOdometry()
-        self.localizer.odometry = self.odometry
+        self.localizer.perception.odometry = self.odometry
         self.frames = 0
         self.inliers = 40
         self.landmark_recall = 1.0

@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from fleetmap.mapformat import Tile
-from fleetmap.mapformat.building import BuildingFrame
-from fleetmap.mapformat.floors import Building, FloorEntry
+from fleetmap.mapformat.building import Building, BuildingFrame, FloorEntry
 from mapserver.fleet.floors import keep_building
 from mapserver.floor_plan.alignment import Alignment, encode_alignment
 from mapserver.store import NOBODY, MapStore

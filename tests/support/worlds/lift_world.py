@@ -9,8 +9,7 @@ import pytest
 
 from fleetmap.bow import Vocabulary
 from fleetmap.geometry import Array, Rings, se3, se3_inverse, so3_exp
-from fleetmap.mapformat.building import BuildingFrame
-from fleetmap.mapformat.floors import Floor, FloorEntry
+from fleetmap.mapformat.building import BuildingFrame, Floor, FloorEntry
 from fleetmap.messages import Status
 from fleetmap.relocalization.map_view import CovisibleLandmarks
 from fleetmap.relocalization.relocalizer import Fix
@@ -123,7 +122,7 @@ class LiftWorld:
             LocalizerSettings(track=TrackSettings(**self.track)),
         )
         self.localizer = Localizer(RigCalibration((lens,), imu), camera, BODY_FROM_CAM, 0.0, settings)
-        self.odometry = self.localizer.odometry = Odometry()  # type: ignore[assignment]
+        self.odometry = self.localizer.perception.odometry = Odometry()  # type: ignore[assignment]
         # Each map has its own origin and heading in the building.
         frames = [BuildingFrame(x_m=5.0 * n, y_m=-2.0 * n, yaw_rad=0.4 * n) for n in range(self.floors)]
         self.map_from_plan = [se3_inverse(frame.building_from_map) for frame in frames]
@@ -133,9 +132,9 @@ class LiftWorld:
             held[key] = Floor(
                 FloorEntry(site=key or "own", level=f"L{n}", height_m=STOREY_M * n), frame, {"A": ((ring,),)}
             )
-        self.localizer.handle_floors(held)
+        self.localizer.handle_building(held)
         for key in self.keys:
-            self.localizer.handle_version(1, [key], Vocabulary.__new__(Vocabulary), 400.0, floor=key)  # type: ignore[list-item]
+            self.localizer.handle_version(1, [key], Vocabulary.__new__(Vocabulary), 400.0, site=key)  # type: ignore[list-item]
         self.plan_from_body = se3(np.eye(3), np.array([0.0, 0.0, 0.3]))
         pallets = [(x, y, 0.5) for x in (0.0, 2.0, 4.0, 6.0) for y in (-2.0, 2.0)]
         stock = np.concatenate([np.random.default_rng(5).uniform(0.0, 0.5, (12, 3)) + at for at in pallets])
@@ -145,9 +144,9 @@ class LiftWorld:
 
     def redraw(self, number: int, lifts: dict[str, tuple[Rings, ...]]) -> None:
         """Draw other lifts on a floor."""
-        floors = dict(self.localizer._floors)
+        floors = dict(self.localizer._lift.building)
         floors[self.keys[number]] = replace(floors[self.keys[number]], lifts=lifts)
-        self.localizer.handle_floors(floors)
+        self.localizer.handle_building(floors)
 
     @property
     def map_from_body(self) -> Array:

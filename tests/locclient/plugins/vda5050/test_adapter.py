@@ -14,8 +14,7 @@ import pytest
 
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3, so3_exp
-from fleetmap.mapformat.building import BuildingFrame
-from fleetmap.mapformat.floors import Floor, FloorEntry
+from fleetmap.mapformat.building import BuildingFrame, Floor, FloorEntry
 from fleetmap.messages import Cause, Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient import hooks

@@ -1,6 +1,7 @@
-"""Initial pose prior, from a dock or an operator, in force until the map has confirmed a pose. Pure."""
+"""A prior of the robot's place: from a dock, an operator, a ride or an earlier pose, in force until the map has confirmed a pose. Pure."""
 
 from collections.abc import Mapping
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,9 @@ from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.hypothesis_set import HypothesisSet, Observations
-from locclient.localization.pose_covariance import compose_inverse_cov, transport_cov
+from locclient.localization.percept import Percept
+from locclient.localization.place import ORIGIN, Place
+from locclient.localization.pose_covariance import compose_inverse_cov
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
 
@@ -24,21 +27,28 @@ _WIDER = 23.026 / _CHI2_999
 _PLACE_REACH_M = 3.0  # maximum distance between the robot and a place with the same view
 
 
-def agrees(prior: PositionPrior, confirmed: PoseHypothesis, base_from_body: Array) -> bool:
-    """Return True if a confirmed pose lies within the bound of a prior's position and heading."""
+def agrees(prior: PositionPrior, confirmed: Place, base_from_body: Array) -> bool:
+    """Return True if a confirmed place lies within the bound of a prior's position and heading."""
     if prior.floor not in (None, confirmed.floor):
         return False
-    map_from_base = confirmed.now_map_from_body @ se3_inverse(base_from_body)
+    map_from_base = confirmed.map_from_body @ se3_inverse(base_from_body)
     off_m = map_from_base[:2, 3] - prior.map_from_base[:2, 3]
-    cov_m2 = _WIDER * prior.cov_rot_trans[3:5, 3:5] + confirmed.now_cov[3:5, 3:5] + _SIGMA_M**2 * np.eye(2)
+    covariance = _WIDER * prior.cov_rot_trans + confirmed.cov_rot_trans
+    cov_m2 = covariance[3:5, 3:5] + _SIGMA_M**2 * np.eye(2)
     turn_rad = so3_log(prior.map_from_base[:3, :3].T @ map_from_base[:3, :3])[2]
-    variance = _WIDER * prior.cov_rot_trans[2, 2] + confirmed.now_cov[2, 2]
     return bool(
-        off_m @ np.linalg.solve(cov_m2, off_m) < _CHI2_999 and abs(turn_rad) < _BOUND_SIGMAS * np.sqrt(variance)
+        off_m @ np.linalg.solve(cov_m2, off_m) < _CHI2_999 and abs(turn_rad) < _BOUND_SIGMAS * np.sqrt(covariance[2, 2])
     )
 
 
-class InitialPosePrior:
+class PriorSource(Protocol):
+    """Something that tells a robot where it is; asked with every frame, after those before it in `Localizer`."""
+
+    def prior(self, percept: Percept) -> "Prior | None":
+        """Return what it tells at this frame that it has not told before."""
+
+
+class Prior:
     """A prior, and the robot's motion since its moment.
 
     hypothesis: the pose by both, published while the map gives none; None for priors with an unknown heading. contradictions: places
@@ -49,99 +59,88 @@ class InitialPosePrior:
 
     def __init__(
         self,
-        prior: PositionPrior,
-        base_from_body: Array,
-        settings: TrackSettings,
-        floors: Mapping[str, Array | None] | None = None,
-    ) -> None:
-        """floors: default: that of the prior alone."""
-        self._prior, self._base_from_body, self._settings = prior, base_from_body, settings
-        self.floors: Mapping[str, Array | None] = floors or {prior.floor or "": None}
-        self.travelled_m = 0.0
-        self._since: PoseHypothesis | None = None  # the first frame after it, as the identity
-        self.hypothesis: PoseHypothesis | None = None
-        self.contradictions = HypothesisSet(settings)
-        self.is_revisable, self.is_told, self.is_ride = prior.is_revisable, True, False
-
-    @classmethod
-    def at(
-        cls,
-        known: PoseHypothesis,
+        base: Place,
+        since: PoseHypothesis,
+        known: PoseHypothesis | None,
         base_from_body: Array,
         settings: TrackSettings,
         *,
         is_revisable: bool,
-        is_told: bool,
+        is_told: bool = False,
+        is_ride: bool = False,
+        travelled_m: float = 0.0,
         floors: Mapping[str, Array | None] | None = None,
-    ) -> "InitialPosePrior":
-        """Return a pose at a frame of the odometry as a prior."""
-        map_from_base = known.map_from_body @ se3_inverse(base_from_body)
-        covariance = transport_cov(known.cov_rot_trans, map_from_base[:3, 3] - known.map_from_body[:3, 3])
-        prior = PositionPrior(known.stamp_ns, map_from_base, covariance, is_revisable, known.floor)
-        made = cls(prior, base_from_body, settings, floors)
-        identity = np.eye(4), np.zeros((6, 6))
-        made.is_told = is_told
-        made.hypothesis, made._since = known, PoseHypothesis(known.frame_index, known.stamp_ns, *identity, *identity)
-        return made
+    ) -> None:
+        """base: place of the base. since: its frame, as the origin. known: of the body there. floors: default: that of the place alone."""
+        self._base, self._since, self.hypothesis = base, since, known
+        self._base_from_body, self._settings = base_from_body, settings
+        self.is_revisable, self.is_told, self.is_ride = is_revisable, is_told, is_ride
+        self.travelled_m = travelled_m
+        self.floors: Mapping[str, Array | None] = floors or {base.floor: None}
+        self.contradictions = HypothesisSet(settings)
 
-    @property
-    def is_new(self) -> bool:
-        return self._since is None
+    @classmethod
+    def given(
+        cls,
+        prior: PositionPrior,
+        odometry: OdometryEstimate,
+        base_from_body: Array,
+        settings: TrackSettings,
+        **how: Any,
+    ) -> "Prior":
+        """Return a prior from outside at a frame. how: arguments of the constructor."""
+        base, known = Place(prior.map_from_base, prior.cov_rot_trans, prior.floor or ""), None
+        if np.isfinite(prior.cov_rot_trans).all():
+            known = PoseHypothesis.at(odometry, base.of_point(base_from_body))
+        rig = base_from_body, settings
+        return cls(base, PoseHypothesis.at(odometry), known, *rig, is_revisable=prior.is_revisable, is_told=True, **how)
 
-    def propagate(self, odometry: OdometryEstimate, step: Array) -> None:
-        """Propagate to the present frame, by `step` (4, 4) from the last one. The caller propagates `tracked` with other hypotheses."""
-        self.travelled_m += float(np.linalg.norm(step[:3, 3]))
-        if self._since is not None:
-            return
-        self._since = PoseHypothesis.at(odometry, np.eye(4), np.zeros((6, 6)))
-        if np.isfinite(self._prior.cov_rot_trans).all():
-            map_from_body = self._prior.map_from_base @ self._base_from_body
-            lever_m = map_from_body[:3, 3] - self._prior.map_from_base[:3, 3]
-            covariance = transport_cov(self._prior.cov_rot_trans, lever_m)
-            self.hypothesis = PoseHypothesis.at(odometry, map_from_body, covariance, self._prior.floor or "")
+    @classmethod
+    def at(cls, known: PoseHypothesis, base_from_body: Array, settings: TrackSettings, **how: Any) -> "Prior":
+        """Return a pose at a frame of the odometry as a prior. how: arguments of the constructor."""
+        base, since = (
+            known.start.of_point(se3_inverse(base_from_body)),
+            PoseHypothesis(known.frame_index, known.stamp_ns, ORIGIN, ORIGIN),
+        )
+        return cls(base, since, known, base_from_body, settings, **how)
 
     @property
     def names_floor(self) -> bool:
         """True if the prior says on which floor the robot is, without pictures."""
         return not self.is_ride and len(self.floors) == 1
 
-    def on_each_floor(self) -> list[PoseHypothesis]:
-        """Return the pose by the prior on each of its floors; empty without a heading."""
-        known, found = self.hypothesis, list[PoseHypothesis]()
-        for floor, prior_from_map in self.floors.items() if known is not None else ():
-            assert known is not None
-            map_from_body = known.now_map_from_body
-            if prior_from_map is not None:
-                map_from_body = se3_inverse(prior_from_map) @ map_from_body
-            at_frame = map_from_body, known.now_cov
-            found.append(PoseHypothesis(known.frame_index, known.stamp_ns, *at_frame, *at_frame, floor=floor))
+    def places(self) -> list[Place]:
+        """Return the present place by the prior on each of its floors; empty without a heading."""
+        if self.hypothesis is None:
+            return []
+        (map_from_body, covariance, _), found = self.hypothesis.now, list[Place]()
+        for floor, prior_from_map in self.floors.items():
+            there = map_from_body if prior_from_map is None else se3_inverse(prior_from_map) @ map_from_body
+            found.append(Place(there, covariance, floor))
         return found
 
     def tracked(self) -> list[PoseHypothesis]:
         return [*filter(None, (self.hypothesis, self._since)), *self.contradictions.hypotheses]
 
-    def is_compatible(self, hypothesis: PoseHypothesis) -> bool:
-        """Return True if a present pose, traced back by the robot's motion, lies within the bound of the prior's position, on one of its
+    def is_compatible(self, place: Place) -> bool:
+        """Return True if a present place, traced back by the robot's motion, lies within the bound of the prior's position, on one of its
         floors."""
-        if hypothesis.floor not in self.floors:
+        if place.floor not in self.floors:
             return False
-        if self._since is None:
-            return True
-        since, now = ((h.now_map_from_body, h.now_cov) for h in (self._since, hypothesis))
-        map_from_then, covariance = compose_inverse_cov(*now, *since)
-        map_from_base = map_from_then @ se3_inverse(self._base_from_body)
-        prior_from_map, cov_m2 = self.floors[hypothesis.floor], covariance[3:5, 3:5]
+        since, prior_from_map = self._since.now, self.floors[place.floor]
+        map_from_then, covariance = compose_inverse_cov(*place[:2], *since[:2])
+        map_from_base, cov_m2 = map_from_then @ se3_inverse(self._base_from_body), covariance[3:5, 3:5]
         if prior_from_map is not None:
             map_from_base = prior_from_map @ map_from_base
             cov_m2 = prior_from_map[:2, :2] @ cov_m2 @ prior_from_map[:2, :2].T
-        off_m = map_from_base[:2, 3] - self._prior.map_from_base[:2, 3]
+        off_m = map_from_base[:2, 3] - self._base.position_m[:2]
         return bool(off_m @ np.linalg.solve(self._cov_m2(_WIDER) + cov_m2, off_m) < _CHI2_999)
 
     def is_contradicted(self, observations: Observations, lookalikes: LookAlikes | None) -> bool:
         """Return True if the fixes of a query, none within the prior, and earlier ones outweigh it.
 
         It weighs as much as the confirmation of a pose: more fixes than that must agree, over as much distance, on one place without
-        competitors or similar unmapped places. Repeated views of a standing robot add no evidence.
+        competitors or similar unmapped places. Repeated looks of a standing robot add no evidence.
         """
         found = self.contradictions
         found.lookalikes = lookalikes
@@ -158,14 +157,14 @@ class InitialPosePrior:
         prior_from_map = self.floors[floor]
         if prior_from_map is not None:
             positions_map = transform_points(prior_from_map, positions_map)
-        off_m = np.linalg.norm(positions_map[:, :2] - self._prior.map_from_base[:2, 3], axis=1)
+        off_m = np.linalg.norm(positions_map[:, :2] - self._base.position_m[:2], axis=1)
         return np.asarray(off_m < _BOUND_SIGMAS * self._sigma_m(_WIDER) + self.travelled_m + _PLACE_REACH_M)
 
     def weighed(self, observations: Observations) -> Observations:
         """Return the fixes of a query, each weighted by an operator's prior: 0 for places outside it. Exact sources exclude other places
         instead."""
         for _, hypothesis in observations if self.is_revisable and self.is_told else ():
-            if self.is_compatible(hypothesis):
+            if self.is_compatible(hypothesis.now):
                 share = self._settings.wrong_prior_share
                 hypothesis.told_log_odds = float(np.log1p(-share) - np.log(share))
         return observations
@@ -178,7 +177,7 @@ class InitialPosePrior:
     def known_pose(self, radius_m: float) -> PoseHypothesis | None:
         """Return the pose by an exact source and the motion since, while its 95 % radius is at most `radius_m`; else None."""
         known = self.hypothesis if self.is_told and not self.is_revisable and self.names_floor else None
-        return known if known is not None and radius_95_m(known.now_cov) <= radius_m else None
+        return known if known is not None and radius_95_m(known.now.cov_rot_trans) <= radius_m else None
 
     def is_tight(self, sigma_m: float) -> bool:
         """Return True if the present horizontal sigma is at most `sigma_m`."""
@@ -191,4 +190,4 @@ class InitialPosePrior:
         """Return the covariance (2, 2) of the horizontal position, the prior's own part times `scale`. It grows with the distance
         travelled, so that unmodelled drift, a push or an operator's error do not prevent localization forever."""
         added = _SIGMA_M**2 + (_DRIFT_SHARE * self.travelled_m) ** 2
-        return np.asarray(scale * self._prior.cov_rot_trans[3:5, 3:5] + added * np.eye(2))
+        return np.asarray(scale * self._base.cov_rot_trans[3:5, 3:5] + added * np.eye(2))

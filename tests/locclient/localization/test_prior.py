@@ -5,8 +5,9 @@ import numpy as np
 from fleetmap.geometry import se3, so3_exp
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.samples import PositionPrior
-from locclient.localization.initial_pose_prior import InitialPosePrior
-from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
+from locclient.localization.place import Place
+from locclient.localization.pose_hypothesis import Motion
+from locclient.localization.priors.prior import Prior
 from locclient.localization.settings import TrackSettings
 
 BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, 1.5])), np.array([0.4, 0.0, 0.2]))
@@ -21,9 +22,8 @@ class Ride:
         self.map_from_body = se3(so3_exp(np.array([0.0, 0.0, 0.7])), np.array([20.0, 8.0, 0.3]))
         map_from_base = self.map_from_body @ np.linalg.inv(BASE_FROM_BODY)
         covariance = np.diag([np.inf] * 3 + [sigma_m**2, sigma_m**2, np.inf])
-        self.prior = InitialPosePrior(PositionPrior(0, map_from_base, covariance), BASE_FROM_BODY, SETTINGS)
-        self.frame = 0
-        self.prior.propagate(self._estimate(), np.eye(4))
+        self.frame, given = 0, PositionPrior(0, map_from_base, covariance)
+        self.prior = Prior.given(given, self._estimate(), BASE_FROM_BODY, SETTINGS)
 
     def _estimate(self) -> OdometryEstimate:
         return OdometryEstimate(
@@ -39,12 +39,12 @@ class Ride:
                 age = self.frame - hypothesis.frame_index
                 motion = Motion(np.linalg.matrix_power(STEP, age), 1e-8 * np.eye(6), is_last=age > 5)
                 hypothesis.propagate({hypothesis.frame_index: motion}, self._estimate(), STEP, SETTINGS)
-            self.prior.propagate(self._estimate(), STEP)
+            self.prior.travelled_m += float(np.linalg.norm(STEP[:3, 3]))
 
-    def place(self, turned_rad: float = 0.0) -> PoseHypothesis:
+    def place(self, turned_rad: float = 0.0) -> Place:
         placed = self.map_from_body.copy()
         placed[:3, :3] = so3_exp(np.array([0.0, 0.0, turned_rad])) @ placed[:3, :3]
-        return PoseHypothesis.at(self._estimate(), placed, np.diag([0.002**2] * 3 + [0.01**2] * 3))
+        return Place(placed, np.diag([0.002**2] * 3 + [0.01**2] * 3))
 
 
 def test_a_place_that_is_right_but_turned_round_does_not_lead_back() -> None:

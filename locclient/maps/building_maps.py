@@ -9,8 +9,18 @@ import numpy as np
 
 from fleetmap.bow import decode_vocabulary
 from fleetmap.errors import FleetmapError, MapFormatError, StateError, UnreachableError
-from fleetmap.mapformat.building import ALIGNMENT, AREAS, FLOORS, BuildingFrame, aligned_frame
-from fleetmap.mapformat.floors import MAX_FLOORS_BYTES, Floor, FloorEntry, read_building, read_lifts
+from fleetmap.mapformat.building import (
+    ALIGNMENT,
+    AREAS,
+    FLOORS,
+    MAX_FLOORS_BYTES,
+    BuildingFrame,
+    Floor,
+    FloorEntry,
+    aligned_frame,
+    read_building,
+    read_lifts,
+)
 from fleetmap.messages import WantedVersion
 from fleetmap.occupancy_grid import UNKNOWN, OccupancyGrid
 from fleetmap.version_grid import grid_of, occupancy
@@ -23,14 +33,14 @@ _UNKNOWN = BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0)  # of a floor whose file
 _log = logging.getLogger(__name__)
 
 
-class FloorChange(NamedTuple):
-    """Floors as of `Localizer.handle_floors`, all of them, and new versions of the others."""
+class BuildingChange(NamedTuple):
+    """The building as of `Localizer.handle_building`, all of it, and new versions of the other floors."""
 
-    floors: dict[str, Floor]
+    building: dict[str, Floor]
     maps: list[LoadedMap]
 
 
-class FloorMaps:
+class BuildingMaps:
     """`refresh` reads the record of the robot's own site, and the other sites by their own signed lists; changes wait in `changes`.
 
     A floor whose files cannot be read stays as it was. One whose map is missing stays a floor, on which the robot may be.
@@ -46,7 +56,7 @@ class FloorMaps:
         self._grids: dict[str, OccupancyGrid | str] = {}  # or why there is none
         self._made_of = b""  # the record and the files of the floors
         self._faults: dict[str, str] = {}
-        self.changes: deque[FloorChange] = deque()
+        self.changes: deque[BuildingChange] = deque()
 
     def refresh(self, *, asks: bool = True) -> None:
         """Read everything anew; asks: False reads the disk alone. UnreachableError without an answer of a server; all else is logged."""
@@ -84,7 +94,7 @@ class FloorMaps:
             self._sources = {site: source for site, source in self._sources.items() if site in floors}
             held = {site: wanted for site, wanted in self.held.items() if site in floors}
             self.held = held | {loaded.wanted.site: loaded.wanted for loaded in maps}
-            self.changes.append(FloorChange(floors, maps))
+            self.changes.append(BuildingChange(floors, maps))
         return None
 
     def grid(self, site: str) -> OccupancyGrid:

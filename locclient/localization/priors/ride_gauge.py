@@ -1,4 +1,4 @@
-"""Rides in lifts: the vertical motion of a robot whose wheels rest, from its accelerometer. Pure.
+"""The vertical motion of a robot whose wheels rest, from its accelerometer. Pure.
 
 At rest the length of the specific force is gravity plus the cabin's acceleration plus a bias, whatever the robot's tilt. A Kalman filter
 follows height, vertical speed and that constant. Lifts stand when a ride begins and ends: then the speed is zero, which corrects
@@ -6,14 +6,12 @@ the height as well, by its covariance with the speed. Source: zero-velocity upda
 """
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3_inverse
 from fleetmap.inertial import GRAVITY_MPS2
-from fleetmap.mapformat.floors import Floor
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples, WheelSample
 
@@ -30,12 +28,6 @@ _LONGEST_S = (
 )
 _BIAS_SIGMA_MPS2 = 0.3  # before the first rest
 _SCALE_SIGMA = 0.02  # of an accelerometer, calibrated or not
-_HEIGHT_SIGMA_M = 0.15  # of the recorded heights of floors
-_BOUND_SIGMAS = 4.42  # 0.99999 of a normal distribution
-LIFT_SIGMAS = 3.7  # of a position that may lie in a lift: 0.999 of two dimensions
-SHORTEST_RIDE_S = 3.0  # for one storey
-CARRIED_M = 1.0  # outside of lifts: floors are farther apart, and no ramp rises while wheels rest
-PLAN_SIGMA_M = 0.3  # of one floor's map above another one's
 
 
 class Ride(NamedTuple):
@@ -48,39 +40,6 @@ class Ride(NamedTuple):
     sigma_m: float
     rest_s: float
     is_cut: bool = False
-
-
-class LiftVisit(NamedTuple):
-    """A stay in one of `lifts` since it was entered on a floor, or since its place was confirmed there.
-
-    is_ride: it has ridden, or may have, and its floor is open, also outside of the lift (is_inside: False). is_doubted: something lifted
-    the robot.
-    """
-
-    lifts: frozenset[str]
-    floor: str
-    since_ns: int
-    is_ride: bool = False
-    is_doubted: bool = False
-    is_inside: bool = True
-
-
-def floors_after(floors: Mapping[str, Floor], visit: LiftVisit, ride: Ride) -> dict[str, Array | None]:
-    """Return the floors of the lift where the robot may be, with from_map (4, 4), from each one's map along the floor to that where it
-    entered; None for the same. All of the lift's while it moves and if the rise is unknown; all of the building if it leads to none of
-    those: a lift may be in the map of some floors only."""
-    served = {key: floor for key, floor in floors.items() if not visit.lifts.isdisjoint(floor.lifts)}
-    entered = floors[visit.floor]
-    if not ride.is_moving and not (visit.is_doubted and not visit.is_ride) and np.isfinite(ride.sigma_m):
-        bound_m = _BOUND_SIGMAS * float(np.hypot(ride.sigma_m, _HEIGHT_SIGMA_M))
-        rises_m = {key: floor.entry.height_m - entered.entry.height_m for key, floor in served.items()}
-        reached = {key: floor for key, floor in served.items() if abs(rises_m[key] - ride.rise_m) <= bound_m}
-        served = reached or dict(floors)
-    map_from_building = se3_inverse(entered.frame.building_from_map)
-    return {
-        key: None if key == visit.floor else map_from_building @ floor.frame.building_from_map
-        for key, floor in served.items()
-    }
 
 
 class RideGauge:
