@@ -21,7 +21,7 @@ from locclient.config import LocclientConfig
 from locclient.daemon.daemon import check_run, configured_outbox
 from locclient.delivery.outbox import Outbox
 from locclient.identity import MapAddress
-from locclient.localization.calibration.pair_order import REVERSED_TEXT, PairOrder, pair_order
+from locclient.localization.calibration.pair_order import FAULTS, PairOrder, pair_order
 from locclient.maps.connection import cache_folder, open_bus, trusted_map
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import LocalMapSource
@@ -141,8 +141,8 @@ def _pair(raw: CameraFrame | StoredFrame | None, rectifier: Rectifier) -> Iterat
     if frame.right is None:
         return
     order = pair_order(frame, OrbSettings())
-    if order is PairOrder.REVERSED:
-        yield Finding(FAIL, "left and right", REVERSED_TEXT)
+    if order in FAULTS:
+        yield Finding(FAIL, "left and right", FAULTS[order])
     elif order is PairOrder.RIGHT:
         yield Finding(OK, "left and right", "the left image is the left one")
     else:

@@ -11,7 +11,7 @@ from fleetmap.relocalization.relocalizer import is_reliable
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.time_sliced import TimeSliced
-from locclient.localization.calibration.pair_order import REVERSED_TEXT, PairOrder, pair_order
+from locclient.localization.calibration.pair_order import FAULTS, PairOrder, pair_order
 from locclient.localization.calibration.parameters import CalibrationState
 from locclient.localization.calibration.watch import CalibrationWatch, Mounting
 from locclient.localization.estimate import Estimate
@@ -39,12 +39,12 @@ class CalibrationMonitor:
     def is_reversed(self, frame: RectifiedFrame, *, is_localized: bool) -> bool:
         """Return True if images are known to be exchanged or mirrored; test the order of this frame's pair if due."""
         age_s = (frame.stamp_ns - self._order_ns) * 1e-9
-        undecided = {PairOrder.UNKNOWN: _UNDECIDED_S, PairOrder.REVERSED: _REVERSED_S}
+        undecided = {PairOrder.UNKNOWN: _UNDECIDED_S, **dict.fromkeys(FAULTS, _REVERSED_S)}
         if age_s >= undecided.get(self._order, np.inf if is_localized else _NOT_LOCALIZED_S):
             order = pair_order(frame, OrbSettings(count=_ORDER_CORNERS))
             self._order_ns = frame.stamp_ns
             self._order = self._order if order is PairOrder.UNKNOWN else order
-        return self._order is PairOrder.REVERSED
+        return self._order in FAULTS
 
     def add(self, query: FinishedQuery) -> None:
         """Add a finished map query; from time to time, search for an unmatched frame without its depth."""
@@ -69,7 +69,7 @@ class CalibrationMonitor:
 
     @property
     def state(self) -> CalibrationState:
-        text = self.contradiction or (REVERSED_TEXT if self._order is PairOrder.REVERSED else "")
+        text = self.contradiction or FAULTS.get(self._order, "")
         return CalibrationState(text=text) if text else self.watch.state
 
     def _view(self, query: FinishedQuery) -> TimeSliced[None]:

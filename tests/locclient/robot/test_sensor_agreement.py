@@ -134,3 +134,23 @@ def test_one_sensor_that_all_others_contradict_costs_itself(
             assert known is not None
             assert np.linalg.norm(known[:3, 3] - robot_world.truth(number)[:3, 3]) < 0.1
     assert np.mean([o.estimate.status is Status.TRACKING for o in outcomes[20:]]) > 0.9
+
+
+@pytest.mark.parametrize("is_left", [True, False])
+def test_an_image_that_is_exchanged_with_one_of_another_view_is_named(store: MapStore, is_left: bool) -> None:
+    """The rear pair sees the room upside down."""
+    front = calibration()
+    rear_cameras = [replace(c, body_from_cam=se3(TURNED, np.zeros(3)) @ c.body_from_cam) for c in front.cameras]
+    both = replace(front, cameras=(*front.cameras, *rear_cameras))
+    robot = Robot(both, Rectifier(both), robot_world.SETTINGS, robot_world.TRIAL)
+    robot.use(robot_world.loaded(store))
+    outcomes = []
+    for bundle in robot_world.bundles(30):
+        seen = bundle.frame
+        left, right = (np.ascontiguousarray(image[::-1]) for image in (seen.left, seen.right))
+        rear = replace(seen, left=seen.left, right=right) if is_left else replace(seen, left=left, right=seen.right)
+        seen = replace(seen, left=left, others=(rear,)) if is_left else replace(seen, right=right, others=(rear,))
+        outcomes.append(robot.handle(replace(bundle, frame=seen)))
+    assert Status.TRACKING not in {outcome.estimate.status for outcome in outcomes}
+    assert "is exchanged with one of another view" in outcomes[-1].estimate.calibration.text
+    assert outcomes[-1].estimate.cause is Cause.CALIBRATION
