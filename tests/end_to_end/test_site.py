@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import signal
 import subprocess
 import sys
 import time
@@ -19,6 +18,7 @@ from fleetmap.mapformat import blob_path
 from locclient.cli import app as locclient_app
 from mapserver.cli import app as mapserver_app
 from mapserver.store import MapStore
+from support.fleet.dashboard_scene import serving
 from support.room_site import FRAMES, KNOWN_RIG, RoomSite, invoke, process, run
 
 Replayed = tuple[dict[str, Any], Path]
@@ -124,34 +124,24 @@ def test_over_the_network_the_same_comes_out_and_the_server_sees_the_robot(
 ) -> None:
     """Two processes, real zenoh and real HTTP on loopback."""
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    listens = ["--http", "127.0.0.1:0", "--zenoh", "tcp/127.0.0.1:0"]
-    serve = process("mapserver.cli", "serve", "--store", site.store, *listens)
-    with subprocess.Popen(serve, env=environment, stdout=subprocess.PIPE, text=True) as server:
-        try:
-            assert server.stdout is not None
-            addresses = dict(server.stdout.readline().strip().split(": ", 1) for _ in range(2))
-            assert server.stdout.readline() == "ready\n"
-            options = ["--server", addresses["zenoh"], "--site", "lab", "--cache", tmp_path / "cache"]
-            run(locclient_app, "replay", site.robot, *options, "--trajectory", tmp_path / "r.tum")
-            (tmp_path / "run.toml").write_text(
-                f'server = "{addresses["zenoh"]}"\nsite = "lab"\n[run]\nrobot = "r7"\ncache = "{tmp_path}/cache"\n'
-                f'outbox = "{tmp_path}/spool.sqlite3"\n[source]\nkind = "recording"\nrecording = "{site.robot}"\nspeed = 1.0\n'
-            )
-            daemon = process("locclient.cli", "run", "--config", tmp_path / "run.toml")
-            done = subprocess.run(daemon, env=environment, capture_output=True, text=True, check=False, timeout=120)
-            assert done.returncode == 0, done.stderr
-            deadline_s, told = time.monotonic() + 10, False
-            while not told:
-                assert time.monotonic() < deadline_s, "the report on the whole ride did not come"
-                robots = httpx.get(f"{addresses['http']}/v1/robots").json()["robots"]
-                (robot,) = (each for each in robots if each["robot"] == "r7")
-                metrics = (robot["last_health"] or {}).get("metrics", {})
-                told = metrics.get("frames") == FRAMES
-                time.sleep(0.02)
-        finally:
-            server.send_signal(signal.SIGINT)
-            status = server.wait(timeout=30)
-    assert status == 0
+    with serving(site.store) as served:
+        options = ["--server", served.zenoh, "--site", "lab", "--cache", tmp_path / "cache"]
+        run(locclient_app, "replay", site.robot, *options, "--trajectory", tmp_path / "r.tum")
+        (tmp_path / "run.toml").write_text(
+            f'server = "{served.zenoh}"\nsite = "lab"\n[run]\nrobot = "r7"\ncache = "{tmp_path}/cache"\n'
+            f'outbox = "{tmp_path}/spool.sqlite3"\n[source]\nkind = "recording"\nrecording = "{site.robot}"\nspeed = 1.0\n'
+        )
+        daemon = process("locclient.cli", "run", "--config", tmp_path / "run.toml")
+        done = subprocess.run(daemon, env=environment, capture_output=True, text=True, check=False, timeout=120)
+        assert done.returncode == 0, done.stderr
+        deadline_s, told = time.monotonic() + 10, False
+        while not told:
+            assert time.monotonic() < deadline_s, "the report on the whole ride did not come"
+            robots = httpx.get(f"{served.http}/v1/robots").json()["robots"]
+            (robot,) = (each for each in robots if each["robot"] == "r7")
+            metrics = (robot["last_health"] or {}).get("metrics", {})
+            told = metrics.get("frames") == FRAMES
+            time.sleep(0.02)
     assert (tmp_path / "r.tum").read_bytes() == (replayed[1] / "r.tum").read_bytes(), "in one process and in two"
     assert robot["version"] == 1
     assert robot["last_health"]["status"] == "TRACKING"

@@ -4,13 +4,10 @@ Each drill shows first what the thief achieves, or tries, and then the way back.
 """
 
 import getpass
-import os
 import re
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -30,6 +27,7 @@ from mapserver.store import MapStore
 from mapserver.trust import KeyFolder, SignedLists
 from mapserver.trust.repository import ListRepository, site_targets
 from mapserver.trust.signing import init_offline
+from support.fleet.dashboard_scene import serving
 from support.storage.map_samples import publish_samples, save_sample_draft
 
 SITE, YEAR_NS = "lab", 365 * 86_400_000_000_000
@@ -43,7 +41,6 @@ class Drill:
         self.folder, self.store, self.lists = folder, folder / "store", SignedLists(folder / "store")
         self.stick = folder / "stick"
         self.words: dict[str, str] = {}
-        self.robots: list[Bus] = []
         monkeypatch.setattr(getpass, "getpass", lambda prompt: self.words[prompt.split()[-1].rstrip(":")])
 
     def run(self, *words: object, fails: str = "") -> str:
@@ -63,9 +60,7 @@ class Drill:
         return ["--key", self.stick / "root-1.pem"]
 
     def robot(self, name: str) -> "Robot":
-        bus = Bus.connect(self.endpoint)
-        self.robots.append(bus)
-        return Robot(self, bus, name)
+        return Robot(self, self.robots.enter_context(Bus.connect(self.endpoint)), name)
 
     def repository(self) -> ListRepository:
         return ListRepository(self.store, datetime.now(UTC))
@@ -82,9 +77,9 @@ class Drill:
         shutil.copytree(self.lists.folder, before)
         act(self.repository())
 
-        def restore() -> None:
-            shutil.rmtree(self.lists.folder)
-            shutil.copytree(before, self.lists.folder)
+        def restore() -> None:  # the server is at work in the folder: nothing is deleted under it
+            self.lists.folder.rename(self.folder / f"stolen-{before.stat().st_ino}")
+            before.rename(self.lists.folder)
 
         return restore
 
@@ -113,22 +108,10 @@ class Robot:
 
 
 @contextmanager
-def serving(drill: Drill) -> Iterator[None]:
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-    words = ["-m", "mapserver.cli", "serve", "--store", str(drill.store), "--http", "127.0.0.1:0"]
-    command = [sys.executable, *words, "--zenoh", "tcp/127.0.0.1:0"]
-    process = subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
-    try:
-        process.stdout.readline()
-        drill.endpoint = process.stdout.readline().split()[1]
-        assert process.stdout.readline() == "ready\n"
+def served(drill: Drill) -> Iterator[None]:
+    with serving(drill.store) as server, ExitStack() as drill.robots:
+        drill.endpoint = server.zenoh
         yield
-    finally:
-        for bus in drill.robots:
-            bus.close()
-        process.terminate()
-        process.wait(timeout=30)
-        process.stdout.close()
 
 
 @pytest.fixture
@@ -139,7 +122,7 @@ def drill(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Drill]:
         publish_samples(store, 2)
     made.run("init", "--stick", made.stick)
     made.run("admit", SITE, *made.key)
-    with serving(made):
+    with served(made):
         yield made
 
 
@@ -220,7 +203,7 @@ def test_the_root_expires(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
         path, words = init_offline(store, drill.stick)
         drill.words = {str(path): words}
     drill.run("admit", SITE, *drill.key)
-    with serving(drill):
+    with served(drill):
         robot = drill.robot("r1")
         robot.client.require(None)
         assert robot.ready() == (2, "")  # what it has, from a time when all was valid

@@ -18,8 +18,8 @@ from playwright.sync_api import Page, sync_playwright
 
 from benchmarks.common.recorded_runs import parsed, write_results
 from benchmarks.common.yardstick import slowness
-from benchmarks.fleet.server_process import cpu_s, resident_mb, serving
-from support.fleet.dashboard_scene import SITE, fill_store, talking
+from benchmarks.fleet.server_process import cpu_s, resident_mb
+from support.fleet.dashboard_scene import SITE, fill_store, serving, talking
 from support.pages.browser import Chromium
 
 _PAGES = ("", "trends", "map", "failures", "surveys")
@@ -100,9 +100,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         fill_store(Path(folder))
         slow = slowness()
-        with serving(Path(folder)) as (process, http, zenoh):
-            ready_s = cpu_s(process.pid)
-            figures = measure(http, zenoh, process.pid, asked.robots)
+        with serving(Path(folder)) as served:
+            ready_s = cpu_s(served.process)
+            figures = measure(served.http, served.zenoh, served.process, asked.robots)
     figures["ready_cpu_s"] = ready_s
     if slow is not None:
         figures["ready_cpu_s_at_reference"] = ready_s / slow

@@ -20,7 +20,7 @@ import numpy as np
 from prometheus_client.parser import text_string_to_metric_families
 
 from benchmarks.common.recorded_runs import parsed, write_results
-from benchmarks.fleet.server_process import SITE, measured, serving
+from benchmarks.fleet.server_process import SITE, measured
 from fleetmap.bus import Bus
 from fleetmap.errors import FleetmapError
 from fleetmap.messages import (
@@ -35,6 +35,7 @@ from fleetmap.messages import (
 from mapserver import releases
 from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters
 from mapserver.store import DraftContent, FailureFilter, FleetBatch, MapStore
+from support.fleet.dashboard_scene import serving
 from support.fleet.made_fleet import NS, Known, MadeRobot
 from support.storage.map_samples import draft_details, random_tile
 
@@ -119,18 +120,18 @@ def measure_load(folder: Path, robots: int, seconds: int) -> dict[str, Any]:
     """Drives, counts, compares; raises AssertionError where a count differs."""
     context = multiprocessing.get_context("spawn")
     said, begin, end = context.Queue(), context.Event(), context.Event()
-    with serving(folder) as (process, http, endpoint):
+    with serving(folder) as served:
         shares = [range(n, robots, _PROCESSES) for n in range(_PROCESSES)]
-        fleets = [context.Process(target=_robots, args=(endpoint, s, seconds, said, begin, end)) for s in shares]
+        fleets = [context.Process(target=_robots, args=(served.zenoh, s, seconds, said, begin, end)) for s in shares]
         for fleet in fleets:
             fleet.start()
         assert [said.get() for _ in fleets] == ["ready"] * len(fleets)
-        with measured(process.pid, http, _PAGES, 1.0) as load:
+        with measured(served.process, served.http, _PAGES, 1.0) as load:
             begin.set()
             answers = [said.get() for _ in fleets]
         time.sleep(6.0)  # the last flush and the last look for robots
-        text = httpx.get(f"{http}/metrics", timeout=30).text
-        present = httpx.get(f"{http}/v1/robots?limit=1000", timeout=30).json()["robots"]
+        text = httpx.get(f"{served.http}/metrics", timeout=30).text
+        present = httpx.get(f"{served.http}/v1/robots?limit=1000", timeout=30).json()["robots"]
         end.set()
         for fleet in fleets:
             fleet.join()

@@ -20,13 +20,14 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common.recorded_runs import parsed, write_results
-from benchmarks.fleet.server_process import SITE, measured, serving
+from benchmarks.fleet.server_process import SITE, measured
 from fleetmap.bus import Bus
 from fleetmap.mapformat import Manifest, Tile, decode_manifest, decode_tile, verified
 from fleetmap.messages import WantedVersion, decode_message, robot_key
 from locclient.maps.map_client import ChunkReader
 from mapserver import releases
 from mapserver.store import DraftContent, MapStore
+from support.fleet.dashboard_scene import serving
 from support.storage.map_samples import draft_details, random_tile
 
 _TILE_LANDMARKS = 5000
@@ -139,10 +140,10 @@ def bench(folder: Path, clients: int, site_mb: float) -> dict[str, dict[str, flo
     publish(folder, site_tiles(site_mb))
     context, rows = multiprocessing.get_context("spawn"), dict[str, dict[str, float]]()
     said = context.Queue()
-    with serving(folder) as (server, http, endpoint):
+    with serving(folder) as served:
         orders = [context.Queue() for _ in range(_PROCESSES)]
         fleets = [
-            context.Process(target=_robots, args=(endpoint, range(n, clients, _PROCESSES), queue, said))
+            context.Process(target=_robots, args=(served.zenoh, range(n, clients, _PROCESSES), queue, said))
             for n, queue in enumerate(orders)
         ]
         for fleet in fleets:
@@ -150,9 +151,9 @@ def bench(folder: Path, clients: int, site_mb: float) -> dict[str, dict[str, flo
         assert [said.get() for _ in fleets] == ["ready"] * len(fleets)
         for name in ("whole", "delta", "nothing moved", "whole again"):
             if name in ("delta", "nothing moved"):
-                with announced(endpoint):
+                with announced(served.zenoh):
                     publish(folder, next_night(folder, is_changed=name == "delta"))
-            with measured(server.pid, http, _LISTS, 0.05) as load:
+            with measured(served.process, served.http, _LISTS, 0.05) as load:
                 for queue in orders:
                     queue.put("anew" if name == "whole again" else "go")
                 seconds, sizes = zip(*(row for _ in fleets for row in said.get()), strict=True)

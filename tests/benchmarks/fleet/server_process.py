@@ -1,8 +1,6 @@
-"""A running server for benchmarks, and what it costs."""
+"""What a running server costs."""
 
 import os
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -13,25 +11,6 @@ from pathlib import Path
 import httpx
 
 SITE = "bench"
-_REPOSITORY = Path(__file__).resolve().parents[3]
-_SOURCES = os.pathsep.join(str(_REPOSITORY / folder) for folder in ("shared", "", "tests"))
-
-
-@contextmanager
-def serving(folder: Path, endpoint: str = "tcp/127.0.0.1:0") -> Iterator[tuple[subprocess.Popen[str], str, str]]:
-    """A running server and its HTTP and zenoh addresses."""
-    command = [sys.executable, "-m", "mapserver.cli", "serve", "--store", str(folder)]
-    command += ["--http", "127.0.0.1:0", "--zenoh", endpoint]
-    process = subprocess.Popen(command, env=os.environ | {"PYTHONPATH": _SOURCES}, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    try:
-        addresses = dict(process.stdout.readline().strip().split(": ", 1) for _ in range(2))
-        assert process.stdout.readline() == "ready\n"
-        yield process, addresses["http"], addresses["zenoh"]
-    finally:
-        process.terminate()
-        process.wait(timeout=30)
-        process.stdout.close()
 
 
 def resident_mb(pid: int) -> float:

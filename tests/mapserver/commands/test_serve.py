@@ -1,6 +1,7 @@
 """The commands, and `serve` as a process with real HTTP and real zenoh on loopback."""
 
 import os
+import signal
 import subprocess
 import sys
 from contextlib import ExitStack
@@ -13,7 +14,6 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from benchmarks.fleet.server_process import serving
 from fleetmap.bus import Bus
 from fleetmap.cli_options import Program
 from fleetmap.errors import StoreError, UnreachableError, UsageError
@@ -23,7 +23,7 @@ from mapserver import cli, releases
 from mapserver.commands.serve import HttpOptions, serve
 from mapserver.config import MapserverConfig
 from mapserver.store import DraftContent, MapStore
-from support.fleet.dashboard_scene import serving as scene_serving
+from support.fleet.dashboard_scene import serving
 from support.storage.map_samples import draft_details, random_tile
 
 _ENDS = """
@@ -63,18 +63,18 @@ def test_a_server_that_is_killed_in_the_middle_of_a_fetch_is_waited_for(tmp_path
         store.save("lab", DraftContent(tiles=tiles, vocabulary=b"words", details=draft_details()))
         releases.publish(store, "lab")
     with ExitStack() as servers:
-        process, _, zenoh = servers.enter_context(serving(tmp_path / "store"))
-        bus = servers.enter_context(Bus.connect(zenoh))
+        served = servers.enter_context(serving(tmp_path / "store"))
+        bus = servers.enter_context(Bus.connect(served.zenoh))
         through, asked, failed = bus.get, [], []
 
         def get(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
             asked.append(key)
             if len(asked) == 6:
-                process.kill()
-                process.wait()
+                os.kill(served.process, signal.SIGKILL)
+                os.waitpid(served.process, 0)
             if len(failed) == 2 and len(asked) < 100:
                 asked.extend(["back"] * 100)
-                servers.enter_context(serving(tmp_path / "store", zenoh))
+                servers.enter_context(serving(tmp_path / "store", "--zenoh", served.zenoh))
             try:
                 return through(key, payload, timeout_s=timeout_s)
             except UnreachableError:
@@ -128,7 +128,7 @@ def test_beyond_the_machine_http_is_refused_until_it_is_protected(tmp_path: Path
     ):
         refused = CliRunner().invoke(cli.app, ["serve", *arguments, *more])
         assert isinstance(refused.exception, UsageError) and words in str(refused.exception)
-    with scene_serving(tmp_path, "--insecure", http="0.0.0.0:0") as served:
+    with serving(tmp_path, "--insecure", http="0.0.0.0:0") as served:
         address = served.http.replace("0.0.0.0", "127.0.0.1")
         assert httpx.get(f"{address}/v1/sites").status_code == 200
         page = httpx.get(f"{address}/dashboard/", headers={"Accept": "text/html"})
