@@ -133,12 +133,14 @@ def draw_dashboard() -> None:
     sys.path.insert(0, str(REPOSITORY / "tests"))
     from support.fleet.dashboard_scene import serving, talking, wait_until
     from support.pages.browser import running_chromium
+    from support.storage.dense_samples import rack_surfels, surfel_extras
     from support.storage.operator_scene import fill_shift
 
     folder = WORK / "dashboard"
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
-    fill_shift(folder)
+    extras, said = surfel_extras(rack_surfels())
+    fill_shift(folder, extras, surfels=said)
     with (
         serving(folder) as served,
         talking(served.zenoh, 8),

@@ -14,14 +14,12 @@ from mapserver.commands.building import BUILDING
 from mapserver.commands.convert import convert
 from mapserver.commands.doctor import doctor
 from mapserver.commands.fleet import FLEET
-from mapserver.commands.grid import GRID
 from mapserver.commands.nightly import nightly
 from mapserver.commands.operators import OPERATORS
 from mapserver.commands.releases import diff, inspect, promote, publish, rollback, versions
 from mapserver.commands.robots import ROBOTS
 from mapserver.commands.serve import serve
 from mapserver.commands.store import attach, audit, export, gc, import_, retention, verify
-from mapserver.commands.surfels import MAP
 from mapserver.commands.trust import TRUST
 from mapserver.hooks import command_hooks
 
@@ -51,8 +49,6 @@ COMMANDS: Commands = {
     "building": BUILDING,
     "fleet": FLEET,
     "robots": ROBOTS,
-    "grid": GRID,
-    "map": MAP,
     "operators": OPERATORS,
     "audit": audit,
     "trust": TRUST,

@@ -6,6 +6,7 @@
 | `mapserver.failure_exports` | `--format` of `mapserver fleet export` | a function as `write_json_lines` in `mapserver/fleet/exports.py` |
 | `mapserver.parts` | the plug-in | `PartHook` |
 | `mapserver.routes` | the plug-in | `RouteHook` |
+| `mapserver.stages` | the plug-in | `StageHook` |
 """
 
 from collections.abc import Callable
@@ -20,8 +21,11 @@ if TYPE_CHECKING:
 OfferedFile = Callable[[str, int], tuple["ExportHead", bytes]]
 """Head and SHA-256 of the file of a published version, by site and number; FleetmapError as `GET .../file`."""
 
-RouteHook = Callable[[Any, OfferedFile], None]
-"""Adds endpoints to the application, a FastAPI."""
+RouteHook = Callable[[Any, Any, OfferedFile], None]
+"""Adds endpoints to the application, a FastAPI, over an open `MapStore`."""
+
+StageHook = Callable[[Any], dict[str, Any]]
+"""Makes more of a draft's surveys than tiles: of a `ChosenDraft` each `Extra` by the key of its report (`mapserver/drafting/extras.py`)."""
 
 
 PartHook = Callable[[Any], None]
@@ -36,6 +40,11 @@ def part_hooks() -> dict[str, PartHook]:
 def route_hooks() -> dict[str, RouteHook]:
     """Return the installed parts of the HTTP API."""
     return plugins("mapserver.routes")
+
+
+def stage_hooks() -> dict[str, StageHook]:
+    """Return the installed stages after a build's surveys."""
+    return plugins("mapserver.stages")
 
 
 def command_hooks() -> dict[str, Command]:

@@ -7,13 +7,12 @@ from fastapi import Path, Query
 from fastapi.dependencies.utils import get_flat_params
 from fastapi.params import Header
 from fastapi.routing import APIRoute
-from pydantic import BaseModel, Field
+from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 
 from fleetmap.errors import UsageError
 from fleetmap.mapformat.names import NAME_PATTERN, SHA256_PATTERN
-from fleetmap.version_grid import FLOOR_M, TOP_M
 from mapserver.api.moments import read_range
 from mapserver.operators.roles import OPERATOR_PATTERN
 from mapserver.store import FailureFilter
@@ -27,9 +26,6 @@ TokenNumber = Annotated[str, Path(pattern="^[0-9a-f]{12}$", examples=["3fa9c1d25
 RequestId = Annotated[str, Path(pattern="^[0-9a-f]{8}$", examples=["3fa9c1d2"])]
 SiteFilter = Annotated[str | None, Query(pattern=NAME_PATTERN, description="of this site alone", examples=["hall"])]
 Version = Annotated[int, Path(ge=1, le=1 << 31, examples=[3])]
-RobotHeight = Annotated[
-    float, Query(gt=FLOOR_M, le=TOP_M, description="metres; higher objects are not obstacles", examples=[1.1])
-]
 Sha256 = Annotated[str, Path(pattern=SHA256_PATTERN, examples=["5e" * 32])]
 Number = Annotated[int, Path(ge=1, le=1 << 62, examples=[12])]
 RecordingName = Annotated[str, Path(max_length=220, examples=["monday.mcap"])]
@@ -50,29 +46,6 @@ Limit = Annotated[int, Query(ge=1, le=1000, description="items of a page", examp
 _NEXT = "`next` of the previous page"
 NumberCursor = Annotated[int | None, Query(ge=0, le=(1 << 62), description=_NEXT, examples=[None])]
 NameCursor = Annotated[str | None, Query(max_length=160, description=_NEXT, examples=[None])]
-
-
-class ViewPose(BaseModel):
-    """Camera position and viewing direction in `map`."""
-
-    x_m: float = Field(ge=-1e5, le=1e5, description="of the camera", examples=[1.5])
-    y_m: float = Field(ge=-1e5, le=1e5, description="of the camera", examples=[2.0])
-    z_m: float = Field(0.0, ge=-1e3, le=1e3, description="of the camera", examples=[0.5])
-    yaw_deg: float = Field(ge=-360, le=360, description="counter-clockwise from x", examples=[90.0])
-    pitch_deg: float = Field(0.0, ge=-90, le=90, description="downwards", examples=[0.0])
-    width_px: int = Field(320, ge=16, le=640, description="of the picture", examples=[320])
-
-
-class NearPlace(BaseModel):
-    """A place in `map`, and the viewing direction there."""
-
-    x_m: float = Field(ge=-1e5, le=1e5, description="of the place", examples=[1.5])
-    y_m: float = Field(ge=-1e5, le=1e5, description="of the place", examples=[2.0])
-    z_m: float = Field(0.0, ge=-1e3, le=1e3, description="of the place", examples=[0.5])
-    yaw_deg: float | None = Field(
-        None, ge=-360, le=360, description="pictures that look elsewhere come last", examples=[90.0]
-    )
-    limit: int = Field(1, ge=1, le=100, description="number of pictures", examples=[1])
 
 
 _TIME = "ISO 8601; without an offset the server's local time; a date alone is the whole day"

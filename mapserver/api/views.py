@@ -188,31 +188,6 @@ class CanaryView:
 
 
 @dataclass(frozen=True, slots=True)
-class PictureView:
-    """A picture of a survey: where its camera was and looked, in `map`, how far that is from the asked place, when and by which survey.
-
-    taken_ns: of the recording's clock, which may count from another moment than 1970.
-    """
-
-    sha256: str
-    x_m: float
-    y_m: float
-    z_m: float
-    yaw_deg: float
-    pitch_deg: float
-    distance_m: float
-    taken_ns: int
-    recording: str
-
-
-@dataclass(frozen=True, slots=True)
-class PictureList:
-    """Pictures of the surveys of a version, those nearest to a place first."""
-
-    pictures: list[PictureView]
-
-
-@dataclass(frozen=True, slots=True)
 class TokenView:
     """A valid token: its number, its scopes and its end. The token itself is not stored."""
 

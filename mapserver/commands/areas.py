@@ -96,7 +96,7 @@ def export(
     """Write the areas with a mask for nav2's costmap filters, in the frame of the map."""
     from fleetmap.occupancy_grid import write_grid
     from mapserver.floor_plan.areas import MaskKind
-    from mapserver.grid.masks import mask_grid
+    from mapserver.floor_plan.masks import mask_grid
 
     asked = {MaskKind.KEEP_OUT: keep_out, MaskKind.SPEED: speed}
     if not any(asked.values()):

@@ -35,7 +35,6 @@ from mapserver.operators.roles import Scope
 T = TypeVar("T")
 
 PATH = "/dashboard"
-_UNDER = {"space": "map"}  # which of those leads to other pages
 _LOOK_COOKIE, _ZONE_COOKIE = "fleetmap_look", "fleetmap_zone"
 _WEEK_NS = 7 * 24 * HOUR_NS
 _EVERY_S = 1.0
@@ -44,12 +43,17 @@ _THEMES = {"dark": "body--dark", "light": ""}  # else as the system has it
 
 @dataclass(frozen=True, slots=True)
 class Services:
-    """Services of the pages: maps and surveys, fleet health, the robots now, settings of the API."""
+    """Services of the pages: maps and surveys, fleet health, the robots now, settings of the API; panels: see `shown`."""
 
     maps: MapData
     health: HealthData
     robots: LiveRobots
     settings: ApiSettings
+    panels: dict[str, list[Callable[..., str]]] = field(default_factory=dict)
+
+    def shown(self, place: str, *of: object) -> list[Markup]:
+        """What parts add to a place of a page: the HTML of each, of these services, the page's context and what it is about."""
+        return [Markup(panel(self, *of)) for panel in self.panels.get(place, ())]
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +99,11 @@ class PageContext:
         """The address of a page of the same site."""
         return address(f"{self.root}/{path}", site=self.site, **query)
 
+    @property
+    def api(self) -> str:
+        """Prefix of the API's addresses."""
+        return f"{self.root.removesuffix(PATH)}/v1"
+
     def plan_picture(self, version: int) -> str:
         """The address of the picture of a version's plan."""
         return f"{self.root}/plans/{self.site}/{version}.png"
@@ -130,13 +139,15 @@ class Console:
         fill: Callable[..., dict[str, object]],
         *,
         link: tuple[str, str] | None = None,
+        under: str | None = None,
         knows: Sequence[str] = (),
         under_way: Callable[[], list[str]] = list,
         of_site: bool = True,
     ) -> None:
         """Adds a page. fill: what its template needs beside `context`, of the services, it and the parts of `path` in braces; may block.
 
-        A FleetmapError becomes a notice within the frame. link: title and icon by which all pages link to it. knows: query parameters
+        A FleetmapError becomes a notice within the frame. link: title and icon by which all pages link to it; under: the
+        page that leads to it. knows: query parameters
         beside the site. under_way: sites that the page knows though the store has no version of them. of_site: False for a page that
         shows the same whatever site its address names.
         """
@@ -146,9 +157,9 @@ class Console:
         @self.app.get(f"/{path}", include_in_schema=False)
         async def shown(request: Request) -> Response:
             """A page."""
-            page = path.partition("/")[0]
-            page = _UNDER.get(page, page)
-            return await self._shown(request, page, template, fill, knows, under_way, of_site=of_site)
+            return await self._shown(
+                request, under or path.partition("/")[0], template, fill, knows, under_way, of_site=of_site
+            )
 
     def stream(
         self,
@@ -222,7 +233,7 @@ class Console:
         look, who = request.cookies.get(_LOOK_COOKIE, ""), getattr(request.state, "operator", None)
         frame = {
             "root": root,
-            "api": f"{root.removesuffix(PATH)}/v1",
+            "api": PageContext(root, "").api,
             "pages": self.links,
             "page": page,
             "sites": sites,

@@ -10,22 +10,17 @@ from typing import Generic, TypeVar
 from fleetmap.errors import FleetmapError, UsageError
 from fleetmap.mapformat import decode_tile
 from fleetmap.mapformat.building import ALIGNMENT
-from fleetmap.messages import FailureReport
 from fleetmap.version_grid import known_grid, occupancy
 from mapserver import releases
 from mapserver.dashboard.map_layers import Box, Layer, Picture, box_of
 from mapserver.dashboard.plan import Plan, make_plan
-from mapserver.dashboard.space.loops import Loop, loops_of_version
-from mapserver.dashboard.space.points import space_bytes, surfel_bytes
 from mapserver.dashboard.underlays import floor_picture, grid_picture
 from mapserver.floor_plan.alignment import PLAN
 from mapserver.nightly.inbox import InboxContents, contents, sites_of
 from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
-from mapserver.serving.expected_views import failure_camera
 from mapserver.serving.night_runs import SETTLE_S
 from mapserver.store import MapStore, VerdictRow, VersionInfo
-from mapserver.surfels.surfel_map import index_address, surfels_of
 
 _log = logging.getLogger(__name__)
 T = TypeVar("T")
@@ -36,15 +31,6 @@ JOBS_SHOWN = 100
 Span = tuple[int | None, int | None]
 """From when and until before when, nanoseconds since 1970; None: without an end."""
 EVER: Span = (None, None)
-
-
-def _fault(read: Callable[[], object]) -> str | None:
-    """The message of what cannot be read, None where it can."""
-    try:
-        read()
-    except FleetmapError as error:
-        return str(error)
-    return None
 
 
 class _Kept(Generic[T]):
@@ -124,19 +110,6 @@ class MapData:
             ),
         )
 
-    def space(self, site: str, version: int) -> bytes:
-        """A version's landmarks and places for the view in space; made at each call, since browsers keep it."""
-        manifest = self.store.manifest(site, version)
-        return space_bytes([decode_tile(self.store.blob(entry.sha256)) for entry in manifest.tiles])
-
-    def surfels(self, site: str, version: int) -> bytes:
-        """A version's surfels for the view in space, as `space`; StateError without any."""
-        return surfel_bytes(surfels_of(self.store.manifest(site, version), self.store.blob))
-
-    def loops(self, site: str, version: int) -> list[Loop]:
-        """Loops of the build that made a version, as far as a job that is kept tells them."""
-        return loops_of_version((job.report for job in self.store.jobs(site, limit=JOBS_SHOWN)), version)
-
     def underlays(self, site: str, version: int, root: str) -> list[Layer]:
         """The floor plan and the occupancy grid under a version's map, where there are any; root: prefix of their addresses."""
         found = []
@@ -172,18 +145,6 @@ class MapData:
     def _grid(self, site: str, version: int) -> tuple[bytes, Box] | None:
         tiles = known_grid(self.store.manifest(site, version), self.store.blob)
         return grid_picture(occupancy(tiles, _GRID_HEIGHT_M)) if tiles else None
-
-    def lacks_view(self, report: FailureReport) -> str | None:
-        """Why it cannot be drawn what a robot should have seen when its failure began; None where it can."""
-        return _fault(lambda: index_address(self.store.manifest(report.site, failure_camera(report)[0])))
-
-    def lacks_surfels(self, site: str, version: int) -> str | None:
-        """Why a version has no map that renders; None where it has one."""
-        return _fault(lambda: index_address(self.store.manifest(site, version)))
-
-    def lacks_pictures(self, site: str, version: int) -> str | None:
-        """Why a version keeps no pictures of its surveys; None where it does."""
-        return _fault(lambda: self.store.survey_pictures(site, version))
 
     def difference(self, site: str, before: int, after: int) -> Difference:
         """The difference between two versions."""

@@ -40,7 +40,7 @@ def page(services: Services, context: PageContext, failure: str) -> dict[str, ob
         "advice": ADVICE.get(row.cause),
         "seen": min(seen, key=lambda picture: abs(picture.stamp_ns - began_ns), default=None),
         "clock": clock,
-        "lacks_view": services.maps.lacks_view(report),
+        "views": services.shown("failure", context, row, report),
         "seconds": {"instants": story.instants(moments, recorded, clock), "pictures": pictures},
         "steps": story.steps(moments, began_ns),
         "scene": _scene(services, context, row, report, story.path(moments, clock)),
@@ -48,6 +48,7 @@ def page(services: Services, context: PageContext, failure: str) -> dict[str, ob
         "nearby_words": words,
         "nearby_pictures": services.maps.store.fleet.first_pictures(other.number for other in near[:_LISTED]),
         "facts": _facts(context, row, report),
+        "links": [] if row.x_map_m is None else services.shown("place", context, row.version, row.x_map_m, row.y_map_m),
         "words_of": words_of,
         "matches": [picture.place for picture in detail.pictures if picture.kind == "matches"],
     }

@@ -24,7 +24,6 @@ from mapserver.dashboard import (
     robot,
     robots,
     sign_in_page,
-    space_page,
     survey_jobs,
 )
 from mapserver.dashboard.console import PATH, Console, Services
@@ -36,6 +35,7 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.hooks import part_hooks
 from mapserver.store import MapStore
 
+LASTING = "private, max-age=31536000, immutable"  # versions do not change
 Hear = Callable[[str, str, Callable[[str, bytes], None]], None]
 """`BusService.hear`."""
 
@@ -97,7 +97,6 @@ def _install_pages(console: Console) -> None:
     console.page("robots/{robot}", "robot.html", robot.page, knows=span)
     console.stream("robots/{robot}/now", robot.now)
     console.page("map", "map.html", map_page.page, link=_link("Map"), knows=("version", "before", "after", *span))
-    console.page("space", "space.html", space_page.page, knows=("version", "x", "y"))
     console.page(
         "failures",
         "failures.html",
@@ -117,8 +116,6 @@ def _install_administration(console: Console) -> None:
 
 
 def _install_files(pages: FastAPI, services: Services) -> None:
-    lasting = "private, max-age=31536000, immutable"  # versions do not change
-
     @pages.exception_handler(FleetmapError)
     def missing(_: Request, error: FleetmapError) -> Response:
         return Response(str(error), 404, media_type="text/plain")
@@ -126,17 +123,7 @@ def _install_files(pages: FastAPI, services: Services) -> None:
     @pages.get("/plans/{site}/{version}.png")
     def plan(site: str, version: int) -> Response:
         """The picture of a version's plan."""
-        return _file(services.maps.plan(site, version).png, "image/png", lasting)
-
-    @pages.get("/spaces/{site}/{version}.bin")
-    def space(site: str, version: int) -> Response:
-        """Landmarks and places of a version."""
-        return _file(services.maps.space(site, version), "application/octet-stream", lasting)
-
-    @pages.get("/surfels/{site}/{version}.bin")
-    def surfels(site: str, version: int) -> Response:
-        """Surfels of a version."""
-        return _file(services.maps.surfels(site, version), "application/octet-stream", lasting)
+        return file_response(services.maps.plan(site, version).png, "image/png")
 
     @pages.get("/underlays/{site}/{version}/{kind}.png")
     def underlay(site: str, version: int, kind: Literal["floor", "grid"]) -> Response:
@@ -144,8 +131,9 @@ def _install_files(pages: FastAPI, services: Services) -> None:
         found = services.maps.underlay(site, version, kind)
         if found is None:
             raise StateError(f"version {version} of {site} has no {kind}")
-        return _file(found[0], "image/png", "private, no-cache")
+        return file_response(found[0], "image/png", "private, no-cache")
 
 
-def _file(data: bytes, media_type: str, cache_control: str) -> Response:
+def file_response(data: bytes, media_type: str, cache_control: str = LASTING) -> Response:
+    """Answer with a file; LASTING for one that never changes."""
     return Response(data, media_type=media_type, headers={"Cache-Control": cache_control, **PICTURE_HEADERS})

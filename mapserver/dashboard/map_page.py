@@ -107,6 +107,8 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         "version_facts": _facts(maps, info, plan),
         "one_way": one_way(plan, maps.store.areas(site)),
         "changes": changes,
+        "moved": services.shown("changes", context, changes["before"], changes["after"]),
+        "links": services.shown("version", context, shown),
         "alignment": _aligned(maps.store.alignment(site)),
         "corrected": _CORRECTED,
         "waiting": [area.name for area in forgets],
@@ -327,14 +329,12 @@ def _changes(maps: MapData, context: PageContext, rows: SiteReleases, before: in
         earlier = max((version for version in rows.versions if version < after), default=after)
         before = current.version if current and current.version != after else rows.rollback_target or earlier
     tiles, swipe = maps.changed_tiles(site, before, after), None
-    lacks = filter(None, (maps.lacks_surfels(site, version) for version in (before, after)))
-    lack = next(lacks, "")
     try:
         facts = _changed(maps.difference(site, before, after))
         swipe = None if before == after else _swipe(maps, context, before, after)
     except FleetmapError as error:
         facts = [("Not known", str(error))]
-    return {"before": before, "after": after, "tiles": tiles, "lack": lack, "facts": facts, "swipe": swipe}
+    return {"before": before, "after": after, "tiles": tiles, "facts": facts, "swipe": swipe}
 
 
 def _swipe(maps: MapData, context: PageContext, before: int, after: int) -> dict[str, object]:

@@ -11,8 +11,8 @@ from fleetmap.recordings import file_suffixes
 from mapserver.api.inbox_routes import NO_INBOX
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.data import JOBS_SHOWN
+from mapserver.dashboard.loops import VERDICTS, Loop, builds_of, dicts, loops_of
 from mapserver.dashboard.map_layers import Item, Layer, Line, Mark
-from mapserver.dashboard.space.loops import VERDICTS, Loop, builds_of, dicts, loops_of
 from mapserver.store import JobInfo
 
 _TELLING_S = 4.0  # of a stage, before what is left of it can be said

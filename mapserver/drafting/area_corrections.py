@@ -1,11 +1,11 @@
-"""Corrections that operators drew as areas, applied to a build: at the landmarks, the tiles, the grid and the surfels.
+"""Corrections that operators drew as areas, applied to a build: at the landmarks, the tiles, and what plug-ins make.
 
 A point belongs to an area by its position in `map`, at any height. `forget` waits for a recording made after it that covers what is
-there: its landmarks, cells, surfels and pictures of the version before then go, once; recordings older than it add no landmarks there.
+there: its landmarks of the version before then go, once; recordings older than it add no landmarks there.
 `never use` removes them from every build, `freeze` keeps those of the version before.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,14 +14,10 @@ import numpy as np
 from fleetmap.encoding import to_json
 from fleetmap.geometry import AnyArray, Array, Rings, inside_any
 from fleetmap.mapformat import Manifest
-from fleetmap.mapformat.grid_tile import CELL_M, TILE_CELLS, TILE_SIZE_M
-from fleetmap.version_grid import Tiles as Grid
 from mapserver.drafting.draft_evidence import Before
 from mapserver.drafting.survey_recordings import Surveyed, map_trajectories
 from mapserver.floor_plan.areas import Area, Areas, CorrectionKind, read_areas
 from mapserver.floor_plan.survey_requests import COVERED_SHARE, near_drives
-from mapserver.surfels.surfel_map import Surfels, SurfelTile, SurfelTiles, encode_tile
-from mapserver.surfels.survey_pictures import SurveyPicture
 from mapserver.survey.merge.area_corrections import Mask, SurveyLimits, is_before
 from mapserver.survey.merge.merge import kept
 from mapserver.survey.merge.multi_session import MapMerger, MergedMap, Session
@@ -30,9 +26,6 @@ from mapserver.survey.survey_map import SurveyMap
 
 CORRECTIONS_KEY = "corrections"
 """Key in `configuration` of a manifest with the corrections that a version has, as GeoJSON; older readers ignore it."""
-
-_Place = tuple[int, int]
-_CENTRES_M = (np.stack(np.meshgrid(*[np.arange(TILE_CELLS)] * 2), axis=-1).reshape(-1, 2) + 0.5) * CELL_M  # row by row
 
 
 def corrections_of(manifest: Manifest) -> Areas:
@@ -86,7 +79,7 @@ class AreaCorrections:
         """
         survey = before.survey
         removed = survey.landmark_ids[self._is_gone(survey.points_map)]
-        is_due = self._is_due(survey.points_map)
+        is_due = self.is_due(survey.points_map)
         return replace(
             before,
             survey=kept(survey, ~is_due) if is_due.any() else survey,
@@ -97,40 +90,14 @@ class AreaCorrections:
         """Return (N,) which points (N, 2) or (N, 3) are kept as in the version before."""
         return self._is_in(CorrectionKind.FREEZE, points_map)
 
+    @property
+    def freezes(self) -> bool:
+        """True if an area is kept as in the version before."""
+        return bool(_of(self.areas, CorrectionKind.FREEZE))
+
     def configuration(self, site: str) -> dict[str, Any]:
         """Return the entry of the manifest."""
         return {CORRECTIONS_KEY: Areas.of(self.areas).geojson(site)} if self.areas else {}
-
-    def grid_before(self, before: Grid) -> Grid:
-        """Return the grid on which a build goes on."""
-        return {place: np.where(_cells(place, self._is_due), np.uint8(0), cells) for place, cells in before.items()}
-
-    def grid(self, grown: Grid, before: Grid) -> Grid:
-        """Return a grown grid with cells unknown where nothing is used, and as before where it is frozen."""
-        found, none = {}, np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8)
-        for place, cells in grown.items():
-            kept = np.where(_cells(place, self.frozen), before.get(place, none), cells)
-            found[place] = np.where(_cells(place, self._is_unused), np.uint8(0), kept)
-        return found
-
-    def surfels_before(self, before: SurfelTiles) -> SurfelTiles:
-        """Return the surfels on which a build goes on."""
-        return _without(before, self._is_due)
-
-    def surfels(self, grown: SurfelTiles, before: SurfelTiles) -> SurfelTiles:
-        """Return grown surfels without those where nothing is used, and with those of before where it is frozen."""
-        left = _without(grown, lambda points: self.frozen(points) | self._is_unused(points))
-        tiles = dict(left.tiles)
-        for place in before.tiles if _of(self.areas, CorrectionKind.FREEZE) else ():
-            old = before.surfels(place)
-            kept = old[self.frozen(old.points_map) & ~self._is_unused(old.points_map)]
-            if len(kept):
-                tiles[place] = encode_tile(place, Surfels.joined([left.surfels(place), kept]))
-        return replace(left, tiles=tiles)
-
-    def pictures_before(self, before: Iterable[SurveyPicture]) -> list[SurveyPicture]:
-        """Return the pictures of the version before that were not taken where it is due to be forgotten."""
-        return [one for one in before if not self._is_due(np.array([one.place_map_m]))[0]]
 
     def _start(self, base: SurveyMap) -> SurveyMap:
         gone = self._is_gone(base.points_map)
@@ -143,13 +110,15 @@ class AreaCorrections:
         since = [(p, area.correction.since_ns or 0) for area in forget if area.correction for p in area.polygons]
         return SurveyLimits(_polygons(frozen), _polygons(unused), tuple(since))
 
-    def _is_due(self, points_map: AnyArray) -> Mask:
+    def is_due(self, points_map: AnyArray) -> Mask:
+        """Return (N,) which points are forgotten now."""
         return inside_any(points_map, _polygons(self.due))
 
     def _is_gone(self, points_map: AnyArray) -> Mask:
-        return self._is_due(points_map) | self._is_unused(points_map)
+        return self.is_due(points_map) | self.is_unused(points_map)
 
-    def _is_unused(self, points_map: AnyArray) -> Mask:
+    def is_unused(self, points_map: AnyArray) -> Mask:
+        """Return (N,) which points are never used."""
         return self._is_in(CorrectionKind.NEVER_USE, points_map)
 
     def _is_in(self, kind: CorrectionKind, points_map: AnyArray) -> Mask:
@@ -170,20 +139,3 @@ def _is_covered(area: Area, base: SurveyMap, found: MergedMap) -> bool:
     passed = near_drives(base.map_from_body[:, :2, 3], driven_since(found, since_ns))
     seen = np.bincount(base.obs_landmark[passed[base.obs_keyframe]], minlength=len(inside)) > 0
     return not inside.any() or float(seen[inside].mean()) >= COVERED_SHARE
-
-
-def _cells(place: _Place, chosen: Callable[[AnyArray], Mask]) -> Mask:
-    """Return (N, N, 1) which cells of a grid tile are chosen by their centres."""
-    return chosen(np.array(place) * TILE_SIZE_M + _CENTRES_M).reshape(TILE_CELLS, TILE_CELLS, 1)
-
-
-def _without(surfels: SurfelTiles, gone: Callable[[AnyArray], Mask]) -> SurfelTiles:
-    tiles: dict[_Place, SurfelTile] = dict(surfels.tiles)
-    for place in surfels.tiles:
-        old = surfels.surfels(place)
-        removed = gone(old.points_map)
-        if removed.all():
-            del tiles[place]
-        elif removed.any():
-            tiles[place] = encode_tile(place, old[~removed])
-    return replace(surfels, tiles=tiles)

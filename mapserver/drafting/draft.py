@@ -3,7 +3,7 @@
 import resource
 import time
 from collections.abc import Callable, Sequence
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -15,16 +15,16 @@ from rich.console import Console
 from fleetmap.bow.shipped_vocabulary import default_vocabulary, default_vocabulary_bytes
 from fleetmap.console import plain_console
 from fleetmap.encoding import to_json, to_plain
-from fleetmap.errors import RecordingError, StateError, StoreError, UsageError
+from fleetmap.errors import RecordingError, StoreError, UsageError
 from fleetmap.mapformat import CameraEntry, Tile
 from fleetmap.recordings import OpenOptions, Topics
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import SensorSet
-from fleetmap.version_grid import encode_grid, grid_report
 from mapserver.drafting.accuracy import Accuracy, accuracy, estimated_trajectory
 from mapserver.drafting.area_corrections import AreaCorrections, driven_since, waiting
 from mapserver.drafting.draft_evidence import Before, DraftMap, JudgedSession, examine_draft, replayed_probes
+from mapserver.drafting.extras import ChosenDraft, MappedSession, made_extras
 from mapserver.drafting.job_lock import Job, JobProgress, recorded_job
 from mapserver.drafting.mapped_images import MappedImageStore
 from mapserver.drafting.progress import ProgressView, StageTimes
@@ -55,14 +55,10 @@ from mapserver.drafting.view_check import TileChooser, asked_views
 from mapserver.drafting.worker import open_executor, single_threaded_libraries
 from mapserver.evaluation.trajectory_error import truth_from_estimate
 from mapserver.floor_plan.areas import Areas
-from mapserver.grid.survey_grid import GridGrower, GridSession, Grower, grow
 from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged
 from mapserver.quality.probes import alias_step_m
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
-from mapserver.surfels.surfel_map import SurfelTiles, known_surfels, surfel_report
-from mapserver.surfels.survey_pictures import PICTURES_KEY, SurveyPicture, kept_pictures
-from mapserver.surfels.survey_surfels import SurfelGrower
 from mapserver.survey.executor import Executor
 from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.loops.loops import Loops
@@ -299,32 +295,13 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     frozen = corrections.frozen(survey_map.points_map)
     chooser = TileChooser(survey_map, run.settings.budget, wanted, default_vocabulary(), frozen)
     tiles, views = chooser.choose(asked_views(judged))
-    run.times.begin("grid and surfels")
+    run.times.begin("extras")
     sessions = [
-        GridSession(s.entry.name, s.survey, session.trajectory.frame_from_body)
+        MappedSession(s.entry.name, s.survey, session.trajectory.frame_from_body)
         for s, session in zip(built.taken, judged, strict=True)
     ]
-    grid_before = {} if parent is None else parent.grid
-    grid_grower = GridGrower(corrections.grid_before(grid_before))
-    growers: dict[str, Grower] = {"grid": grid_grower} if run.settings.occupancy_grid else {}
-    if run.settings.surfel_map:
-        known = SurfelTiles() if parent is None else known_surfels(parent.manifest, maps.blob)
-        growers["surfels"] = surfel_grower = SurfelGrower(corrections.surfels_before(known))
-    without = grow(growers, sessions, run.settings.stereo)
-    grid, surfels = encode_grid(corrections.grid(grid_grower.tiles, grid_before)), list[bytes]()
-    grid_said = grid_report(grid, without.get("grid", {})) if grid or without.get("grid") else None
-    surfels_said = None
-    if run.settings.surfel_map:
-        grown = corrections.surfels(surfel_grower.surfels, known)
-        surfels = grown.blobs()
-        surfels_said = surfel_report(surfels, len(grown), without["surfels"])
-    pictures, pictures_said = list[bytes](), None
-    if run.settings.survey_pictures:
-        before: tuple[SurveyPicture, ...] = ()
-        if parent is not None and PICTURES_KEY in parent.manifest.report:
-            with suppress(StateError):  # all of them were removed after their period
-                before = maps.survey_pictures(site, parent.manifest.version)
-        pictures, pictures_said = kept_pictures(sessions, corrections.pictures_before(before), maps.blob, maps.now_ns())
+    before = None if parent is None else parent.manifest
+    extras = made_extras(ChosenDraft(sessions, run.settings, corrections, before, maps))
     run.times.begin("examining")
     evidence = msgspec.structs.replace(_evidence(run, built, judged, tiles, parent), views=views)
     run.times.begin("storing")
@@ -342,13 +319,11 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     step_m = alias_step_m(evidence.repetition, known_m)
     report = msgspec.structs.replace(
         report,
-        grid=grid_said,
-        surfels=surfels_said,
-        pictures=pictures_said,
         surveyed_requests=asked,
         removed_landmarks={} if parent is None else parent.removed(),
         alias_step_m=step_m,
     )
+    said = to_plain(report) | {key: to_plain(extra.report) for key, extra in extras.items()}
     starts = None if evidence.starts is None else msgspec.structs.replace(evidence.starts, lookalikes=[])
     details = DraftDetails(
         created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
@@ -358,23 +333,24 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         configuration=_configuration(run, parent) | corrections.configuration(site),
         libraries=library_versions(),
         # A robot downloads the manifest: its part about the build is short.
-        report={key: value for key, value in to_plain(report).items() if key not in _NOT_FOR_ROBOTS}
+        report={key: value for key, value in said.items() if key not in _NOT_FOR_ROBOTS}
         | {EVIDENCE_KEY: to_plain(msgspec.structs.replace(evidence, directions=None, starts=starts, views=None))},
     )
     job = run.request.options.job
     content = DraftContent(
-        tiles=tiles, vocabulary=default_vocabulary_bytes(), details=details, archive=archive, grid=grid, surfels=surfels,
-        pictures=pictures, evidence=evidence, job=job,
+        tiles=tiles, vocabulary=default_vocabulary_bytes(), details=details, archive=archive,
+        extras=[(extra.kind, data) for extra in extras.values() for data in extra.blobs], evidence=evidence, job=job,
     )  # fmt: skip
     version = maps.save(site, content, actor=run.request.options.actor).version
     report = msgspec.structs.replace(report, map_bytes=maps.version(site, version).map_bytes)
+    said |= {"map_bytes": report.map_bytes}
     run.times.begin("writing")
     words = sentence(site, version, None if parent is None else parent.manifest.version, report, maps.folder)
     taken, outcomes = {s.entry.sha256 for s in built.taken}, zip(built.surveyed, built.joined.outcomes, strict=True)
     draft = Draft(
         version,
         maps.areas(site).name_tiles(words, TILE_SIZE_M),
-        to_plain(report),
+        said,
         {s.entry.sha256: o.reason for s, o in outcomes if s.entry.sha256 not in taken},
     )
     _write_files(run, built, draft)

@@ -1,7 +1,7 @@
 """Evidence about a draft: frames of recordings, relocalized in the tiles in their final form."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,8 +21,6 @@ from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetmap.sensors.samples import SensorSet, Trajectory
-from fleetmap.version_grid import Tiles as Grid
-from fleetmap.version_grid import known_grid
 from mapserver.quality.directions import tile_directions
 from mapserver.quality.evidence import Probes, displaced, examine, trajectory_breaks
 from mapserver.quality.figures import Evidence, RigEvidence, TrajectoryBreaks
@@ -128,7 +126,7 @@ def _read(
 
 @dataclass(frozen=True, slots=True)
 class Before:
-    """The parent version of a draft: its manifest, survey, tiles and grid, and the calibrations judged up to it.
+    """The parent version of a draft: its manifest, survey and tiles, and the calibrations judged up to it.
 
     removed_ids: landmarks that corrections of the site's areas take from the draft, None for none.
     """
@@ -137,7 +135,6 @@ class Before:
     survey: SurveyMap
     tiles: list[Tile]
     calibrations: list[RigEvidence]
-    grid: Grid = field(default_factory=dict)
     removed_ids: NDArray[np.uint32] | None = None
 
     @classmethod
@@ -147,7 +144,7 @@ class Before:
         known = () if evidence is None else evidence.calibrations or ()
         judged = [RigEvidence(rig.rig, rig.judged) for rig in known if rig.judged]
         tiles = [decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles]
-        return cls(manifest, survey, tiles, judged, known_grid(manifest, maps.blob))
+        return cls(manifest, survey, tiles, judged)
 
     def wanted_ids(self, survey_map: SurveyMap) -> NDArray[np.uint32]:
         """Return landmarks with priority in the budget: those on the robots, and those new in the map.

@@ -13,14 +13,11 @@ import numpy as np
 from fleetmap.encoding import to_plain
 from fleetmap.errors import disk_errors
 from fleetmap.geometry import Array
-from fleetmap.version_grid import GridReport
 from mapserver.drafting.accuracy import Accuracy
 from mapserver.drafting.survey_recordings import Surveyed
 from mapserver.quality.directions import one_way_words
 from mapserver.quality.figures import Evidence, Starts, SurveyedViews, TileDirections
 from mapserver.quality.probes import lookalike_words
-from mapserver.surfels.surfel_map import SurfelReport
-from mapserver.surfels.survey_pictures import PicturesReport
 from mapserver.survey.loops.loops import LoopRecord, LoopVerdict
 from mapserver.survey.merge.multi_session import MergedMap
 
@@ -58,9 +55,6 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
     views: SurveyedViews | None = None
     lookalike_recall: float | None = None
     alias_step_m: float | None = None
-    grid: GridReport | None = None
-    surfels: SurfelReport | None = None
-    pictures: PicturesReport | None = None
     surveyed_requests: dict[str, float] = {}
     removed_landmarks: dict[str, int] = {}
 

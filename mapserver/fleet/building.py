@@ -15,9 +15,9 @@ from fleetmap.mapformat.building import ALIGNMENT, AREAS, FLOORS
 from mapserver.fleet.survey_requests import ask_for_survey
 from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment, map_corners_m
 from mapserver.floor_plan.areas import MAX_REASON, Area, Areas, Correction, CorrectionKind, read_areas
+from mapserver.floor_plan.masks import check_masks_on_map
 from mapserver.floor_plan.pins import Fit, Pin, fit_pins
 from mapserver.floor_plan.plan_file import PlanFile, upwards
-from mapserver.grid.masks import check_masks_on_map
 from mapserver.store import Actor, MapStore
 from mapserver.store.map_store import AREAS_BEFORE
 

@@ -211,8 +211,9 @@ class MapStore(StoreQueries):
                 tiles.append(TileEntry(**where, sha256=self._blobs.put(data), bytes=len(data)))
             vocabulary = BlobEntry(sha256=self._blobs.put(content.vocabulary), bytes=len(content.vocabulary))
             archive_sha256 = None if content.archive is None else self._blobs.put(content.archive)
-            every = {"grid": content.grid, "surfel": [*content.surfels, *content.pictures]}
-            extras = {kind: [self._blobs.put(data) for data in blobs] for kind, blobs in every.items()}
+            extras = {
+                kind: [self._blobs.put(data) for one, data in content.extras if one == kind] for kind in EXTRA_TABLES
+            }
             with self._database.write() as change:
                 change.insert("sites", [{"site": site}], "ON CONFLICT DO NOTHING")
                 last = change.execute("SELECT last_version FROM sites WHERE site = ?", (site,)).fetchone()[0]

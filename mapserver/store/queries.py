@@ -4,7 +4,7 @@ import json
 from collections.abc import Callable, Sequence, Set
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 
@@ -34,10 +34,8 @@ from mapserver.store.rows import (
     VersionInfo,
 )
 from mapserver.store.shared_files import SharedFiles
+from mapserver.store.survey_pictures import SurveyPicture, pictures_of
 from mapserver.store.usage import DiskMeter, DiskSpace, StoreUsage, UsageMeter
-
-if TYPE_CHECKING:
-    from mapserver.surfels.survey_pictures import SurveyPicture
 
 EXTRA_TABLES = {"grid": "grid_blobs", "surfel": "surfel_blobs"}
 """By kind: table of the bytes of a version not needed by its robots; pictures of surveys are among the surfels."""
@@ -172,10 +170,8 @@ class StoreQueries:
         )
         return next((kind for kind in (*_OF_VERSIONS, "grid", *FOR_ROBOTS) if kind in kinds), None)
 
-    def survey_pictures(self, site: str, version: int) -> "tuple[SurveyPicture, ...]":
+    def survey_pictures(self, site: str, version: int) -> tuple[SurveyPicture, ...]:
         """Return the surveys' pictures of a version that are still kept; errors as of `manifest` and `pictures_of`."""
-        from mapserver.surfels.survey_pictures import pictures_of  # loads OpenCV, which few commands need
-
         query = "SELECT sha256 FROM surfel_blobs WHERE site = ? AND version = ?"
         kept = set(self._database.column(query, (site, version)))
         found = tuple(p for p in pictures_of(self.manifest(site, version), self._blobs.get) if p.sha256 in kept)

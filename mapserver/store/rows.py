@@ -143,19 +143,15 @@ class DraftDetails(msgspec.Struct, frozen=True, kw_only=True):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DraftContent:
-    """A new draft. archive: the whole survey; grid, surfels, pictures: as of `encode_grid`, `SurfelTiles.blobs`, `kept_pictures`;
-    evidence: for the gate.
-
-    job: number of the job that built it.
+    """A new draft. archive: the whole survey; extras: bytes that localization does not need, by kind in `EXTRA_TABLES`; evidence: for the
+    gate. job: number of the job that built it.
     """
 
     tiles: Sequence[Tile]
     vocabulary: bytes
     details: DraftDetails
     archive: bytes | None = None
-    grid: Sequence[bytes] = ()
-    surfels: Sequence[bytes] = ()
-    pictures: Sequence[bytes] = ()
+    extras: Sequence[tuple[str, bytes]] = ()
     evidence: Evidence | None = None
     job: int | None = None
 

@@ -21,8 +21,8 @@ from mapserver.fleet.fleet import Fleet  # noqa: E402
 from mapserver.quality.figures import Compared, Evidence, ProbeFigures, TrajectoryBreaks  # noqa: E402
 from mapserver.store import DraftContent, MapStore  # noqa: E402
 from mapserver.store.archive import ARCHIVE_FORMAT, encode_archive  # noqa: E402
-from mapserver.surfels.surfel_map import surfel_report  # noqa: E402
-from support.storage.map_samples import draft_details, encode_surfels, random_survey, random_tile, wall  # noqa: E402
+from support.storage.dense_samples import surfel_extras, wall  # noqa: E402
+from support.storage.map_samples import draft_details, random_survey, random_tile  # noqa: E402
 
 _LOOKS = ProbeFigures(40, 0.975, 0.0, 0.001, 0.004, 290.0, 1.77)
 EVIDENCE = Evidence(held_out=Compared(_LOOKS, _LOOKS, 1.0), motion=TrajectoryBreaks(100, 0, 0.01))
@@ -35,13 +35,13 @@ def write_store(folder: Path) -> None:
             rng = np.random.default_rng(seed)
             tiles = [random_tile(rng, landmarks=8, places=1, cell=(x, 0)) for x in range(2)]
             grid = encode_grid({(0, 0): np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8)})
-            surfels = wall()[:20]
-            blobs = encode_surfels(surfels)
-            said = {"grid": grid_report(grid, {}), "surfels": surfel_report(blobs, len(surfels), {})}
-            details = draft_details(path_m=12.5, **{name: msgspec.to_builtins(value) for name, value in said.items()})
+            extras, said = surfel_extras(wall()[:20])
+            extras += [("grid", data) for data in grid]
+            reported = msgspec.to_builtins(grid_report(grid, {}))
+            details = draft_details(path_m=12.5, grid=reported, surfels=said)
             store.save(
-                "lab", DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive %d" % seed, grid=grid,
-                surfels=blobs, evidence=EVIDENCE if seed == 3 else None),
+                "lab", DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive %d" % seed, extras=extras,
+                evidence=EVIDENCE if seed == 3 else None),
             )  # fmt: skip
             if seed < 3:
                 releases.publish(store, "lab")

@@ -1,13 +1,17 @@
 """Places of a store: its folder, an object store, PostgreSQL; a browser. Disks have room, whatever this machine's have."""
 
 import os
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import httpx
 import pytest
 from playwright.sync_api import Page, expect
 
 from mapserver.store.places import Places, write_places
+from support.command_line import status as status_of
+from support.fleet.dashboard_scene import ROBOTS, Served, fill_store, serving, talking
 from support.pages.browser import Chromium, running_chromium
 from support.storage.postgres_server import PostgresServer, postgres_server
 from support.storage.s3_server import KEYS, s3_server
@@ -76,7 +80,34 @@ def browser() -> Iterator[Chromium]:
         yield started
 
 
+@pytest.fixture(scope="module")
+def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    folder = tmp_path_factory.mktemp("store")
+    fill_store(folder)
+    with serving(folder) as server:
+        with talking(server.zenoh, ROBOTS):
+            deadline_s = time.monotonic() + 30
+            while len(httpx.get(f"{server.http}/v1/robots?limit=1000").json()["robots"]) < ROBOTS:
+                assert time.monotonic() < deadline_s
+                time.sleep(0.2)
+        yield server
+    assert [line for line in server.log if "ERROR" in line or "Traceback" in line] == []
+
+
 @pytest.fixture
 def page(browser: Chromium) -> Iterator[Page]:
     with browser.context(viewport={"width": 1280, "height": 900}) as context:
         yield context.new_page()
+
+
+@pytest.fixture
+def run(capsys: pytest.CaptureFixture[str]):
+    """The command line in this process."""
+
+    def run(*arguments: object, status: int = 0) -> str:
+        found = status_of("mapserver", *arguments)
+        told = capsys.readouterr()
+        assert found == status, told.err
+        return told.out + told.err
+
+    return run

@@ -10,9 +10,9 @@ from fleetmap.geometry import Array
 from mapserver.dashboard.console import PageContext, Services
 from mapserver.dashboard.install import Host
 from mapserver.dashboard.live import words_of
+from mapserver.dashboard.loops import VERDICTS
 from mapserver.dashboard.map_layers import Dots, Layer, Line, Mark, Square, trail
 from mapserver.dashboard.rendering import TEMPLATES
-from mapserver.dashboard.space.loops import VERDICTS
 from mapserver.plugins.live_surveys.heard import LiveSurveys
 from mapserver.plugins.live_surveys.message import COVERAGE_CELL_M, LiveSurveyState, live_key
 

@@ -4,9 +4,10 @@ from fastapi import FastAPI, Request
 
 from mapserver.api.parameters import Site, Version
 from mapserver.hooks import OfferedFile
+from mapserver.store import MapStore
 
 
-def install(app: FastAPI, offered: OfferedFile) -> None:
+def install(app: FastAPI, _: MapStore, offered: OfferedFile) -> None:
     """Add the endpoint."""
 
     @app.get("/v1/sites/{site}/versions/{version}/vda5050")

@@ -22,8 +22,8 @@ from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
 from fleetmap.version_grid import FLOOR_M, SLICE_M, Tiles, occupancy
 from fleetsim.recorder import Order, Session, prepare
-from mapserver.grid.dense_stereo import dense_disparity, floor_distance_m, nearest_around
-from mapserver.grid.site_grid import REACH_PX, SessionViews, updated
+from mapserver.plugins.dense_maps.dense_stereo import dense_disparity, floor_distance_m, nearest_around
+from mapserver.plugins.dense_maps.site_grid import REACH_PX, SessionViews, updated
 
 RADIUS_M, HEIGHT_M = 0.3, 1.1
 _EVERY, _NEXT_DAY = 6, 8  # frames that are looked at; day of the second session's stock

@@ -1,164 +1,17 @@
 """The OpenAPI document holds: whatever is asked as it allows (or not), the answers are as it says and never 500."""
 
-import os
-import time
 from pathlib import Path
-from unittest.mock import Mock
 
-import msgspec
-import numpy as np
 import pytest
-import schemathesis
-from hypothesis import HealthCheck, given, settings
-from schemathesis.checks import not_a_server_error
-from schemathesis.specs.openapi.checks import (
-    content_type_conformance,
-    response_schema_conformance,
-    status_code_conformance,
-)
 
-from fleetmap.messages import CameraNote, Placement, RobotHealth, Thumbnail
-from mapserver import releases
-from mapserver.api.app import create_app
-from mapserver.api.guard import GuardSettings
-from mapserver.api.metrics import Metrics
-from mapserver.api.version_routes import ApiSettings
-from mapserver.drafting.job_lock import log_path
-from mapserver.fleet.building import align, replace_areas
-from mapserver.fleet.fleet import Fleet
-from mapserver.fleet.survey_requests import ask_for_survey
-from mapserver.floor_plan.pins import parse_pin
-from mapserver.operators.operators import Operators
-from mapserver.operators.roles import Scope
-from mapserver.serving.night_runs import NightRuns
-from mapserver.store import Actor, FailureReplay, MapStore
-from mapserver.store.files import make_folder
-from mapserver.trust import init_here
-from mapserver.trust.enrolment import RobotRegister
-from support.fleet.memory_bus import MemoryBus, MemoryHub
-from support.fleet.quick_passwords import use_quick_passwords
-from support.fleet.reports import blindness
-from support.storage.map_samples import publish_samples, save_grid_draft, save_picture_draft, wall
-from support.storage.room_sessions import session_at
-
-EXAMPLES = int(os.environ.get("FLEETMAP_API_EXAMPLES", "8"))  # of each operation
-CHECKS = (not_a_server_error, status_code_conformance, content_type_conformance, response_schema_conformance)
-
-PINS = ["a=200,400:0,0", "b=200,0:20,0"]
-AREAS = (
-    b'{"type":"FeatureCollection","frame":"map","features":[{"type":"Feature","properties":{"name":"a"},'
-    b'"geometry":{"type":"Polygon","coordinates":[[[0,0],[1,0],[1,1],[0,0]]]}}]}'
-)
-POLYGON = [(1.0, 1.0), (3.0, 1.0), (3.0, 3.0)]
-FAILURE = blindness(
-    site="hall", tile=(0, 0), innovation=4.0, radius_95_m=0.2,
-    map_from_base=Placement(position_m=(0.5, 1.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0)),
-    thumbnails=(Thumbnail(stamp_ns=5, kind="frame", jpeg=b"\xff\xd8\xff\xd9"),),
-)  # fmt: skip
-LOOKED = msgspec.structs.replace(
-    FAILURE, id="f2", version=3, map_from_base=Placement.of(np.eye(4)),
-    camera=CameraNote(size_px=(320, 240), focal_px=300.0, centre_px=(159.5, 119.5), base_from_cam=Placement.of(np.eye(4))),
-)  # fmt: skip
-
-
-def ask_operation(operation: schemathesis.APIOperation, known: dict[str, str], headers: dict[str, str]) -> list[int]:
-    """The statuses of the answers to questions made up after the document, some of them about what is there."""
-    statuses: list[int] = []
-
-    @settings(max_examples=EXAMPLES, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
-    @given(case=operation.as_strategy())
-    def ask(case: schemathesis.Case) -> None:
-        number, path = len(statuses), case.path_parameters
-        if number % 2 and "site" in path:
-            path["site"] = "hall"
-            path |= {name: 1 + number % 3 for name in ("version", "before", "after") if name in path}
-        path |= {name: 1 for name in ("job", "number") if number % 2 and name in path}
-        path |= {name: value for name, value in known.items() if number % 2 and name in path}
-        path |= {"robot": "r1"} if number % 2 and "robot" in path else {}
-        path |= {"operator": "olga"} if number % 2 and "operator" in path else {}
-        path |= {"place": 0} if number % 2 and "place" in path else {}
-        path |= {"name": f"{number}.mcap"} if number % 2 and "name" in path else {}
-        path |= {"box": "held", "name": f"held-{number}.mcap"} if number % 2 and "box" in path else {}
-        if (
-            number % 2 and "/changes." in operation.label
-        ):  # the version that has surfels; few such questions are answered
-            path |= {"before": 3, "after": 3}
-        if number % 2 and operation.label.endswith("/pictures"):
-            path |= {"version": 4}
-        if number % 2 and operation.label.endswith("/estimate"):
-            case.query = {"pin": PINS}
-        if number % 4 == 3 and isinstance(case.query, dict):  # made-up moments are hardly ever ones
-            case.query = {name: value for name, value in case.query.items() if name not in ("since", "until")}
-        if number % 2 and isinstance(case.body, dict):
-            where = {name: 1.0 for name in ("x_map_m", "y_map_m") if name in case.body}
-            where |= {"corners_map_m": POLYGON} if "corners_map_m" in case.body else {}
-            if operation.label.endswith("/publish") and number % 4 == 1:  # the gate refuses the draft otherwise
-                where |= {"force": True, "reason": "a test"}
-            if operation.label.endswith("/rollback") and number % 4 == 1:  # made-up versions are hardly ever right
-                where |= {"to": None, "canary": None}
-            case.body = case.body | {"actor": "root"} | where
-        if number % 2 and operation.label.startswith(("PUT", "DELETE")):
-            case.query, case.headers = {"actor": "root"}, {}
-            if operation.label.startswith("PUT"):
-                kind = next((kind for kind in ("areas", "alignment") if operation.label.endswith(kind)), "recording")
-                case.body = {"areas": AREAS, "alignment": b""}.get(kind, b"recording")
-                case.query |= {"pin": PINS} if kind == "alignment" else {}
-        response = case.call(base_url="http://127.0.0.1", headers=headers)
-        case.validate_response(response, checks=list(CHECKS))
-        statuses.append(response.status_code)
-
-    ask()
-    return statuses
+from support.fleet.asked_api import answers
+from support.storage.map_samples import save_grid_draft
 
 
 def test_no_question_breaks_the_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    use_quick_passwords(monkeypatch)
-    now_ns = time.time_ns()
-    with MapStore.open(tmp_path, create=True) as store, MemoryBus(MemoryHub()) as bus:
-        publish_samples(store, 2, site="hall")
-        save_grid_draft(store, site="hall", surfels=wall())
-        save_picture_draft(store, [session_at([np.eye(4)], has_depth=True)], site="hall")
-        store.update_job(store.begin_job("hall", "nightly"), "done", "version 2 is published", {})
-        fleet = Fleet(store, clock_ns=lambda: now_ns)  # a robot that was heard stays so
-        for failure in (LOOKED, FAILURE):
-            assert not fleet.take_failure("hall", "r1", failure).refused
-        store.fleet.add_replay(1, FailureReplay(b"summary", b"recording", []), keep_bytes=100)
-        releases.start_canary(store, "hall", 1, 0.05)
-        releases.roll_back(store, "hall")
-        align(store, "hall", [parse_pin(pin) for pin in PINS], None, None, Actor("ada"))
-        replace_areas(store, "hall", AREAS, Actor("ada"), tag=None)
-        fleet.take_health("hall", "r1", RobotHealth(site="hall", robot="r1", stamp_ns=5, version=1, status="LOST"))
-        fleet.flush()
-        init_here(store)
-        robots = RobotRegister(store)
-        robots.authorities.init(["127.0.0.1"], None, None)
-        robots.enrol("hall", ["r1"], "tls/127.0.0.1:7447")
-        operators = Operators(store)
-        operators.add("olga", "viewer", None, Actor("ada"))
-        headers = {"Authorization": f"Bearer {operators.make_token('root', Scope, 1, Actor('ada'))}"}
-        operators.make_token("ci", ["read"], 1, Actor("ada"))
-        known = {
-            "asked": ask_for_survey(store, "hall", POLYGON, Actor("ada")).id,
-            "token": store.operators.tokens(now_ns)[0].sha256[:12],
-        }
-        receiver = Mock(**{"test.return_value": (True, "alerts.example accepted it")})
-        for number in range(1, 2 * EXAMPLES, 2):
-            make_folder(tmp_path / "inbox/hall/held")
-            (tmp_path / f"inbox/hall/held/held-{number}.mcap").touch()
-        log_path(tmp_path, 1).write_text("reading monday\n")
-        nights = NightRuns(store, tmp_path / "inbox")
-        monkeypatch.setattr(nights, "start", lambda site, log: store.job(1))
-        settings = ApiSettings(GuardSettings(names=frozenset({"testserver"})), webhook=receiver, nights=nights)
-        app = create_app(store, fleet, Metrics(store, fleet), bus, None, settings)
-        schema = schemathesis.openapi.from_asgi("/openapi.json", app, headers=headers)
-        asked = {
-            operation.ok().label: ask_operation(operation.ok(), known, headers)
-            for operation in schema.get_all_operations()
-        }
-        assert sum(len(statuses) for statuses in asked.values()) >= 100
-        for label, statuses in asked.items():
-            if label.endswith("/changes.geojson"):  # it shares a rate with changes.png, which was asked before
-                continue
-            is_known = "v1" in label and "{sha256}" not in label and not label.endswith("/build")
-            assert not is_known or {200, 201} & set(statuses), f"{label}: {statuses}"
-        assert store.verify().faults == []
+    monkeypatch.setattr("mapserver.api.file_routes.route_hooks", dict)  # a plug-in's tests ask its own
+    asked = answers(tmp_path, monkeypatch, lambda store: save_grid_draft(store, site="hall"))
+    assert sum(len(statuses) for statuses in asked.values()) >= 100
+    for label, statuses in asked.items():
+        is_known = "v1" in label and "{sha256}" not in label and not label.endswith("/build")
+        assert not is_known or {200, 201} & set(statuses), f"{label}: {statuses}"

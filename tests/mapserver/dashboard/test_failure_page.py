@@ -9,13 +9,11 @@ from zoneinfo import ZoneInfo
 
 import httpx
 import msgspec
-import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
 from fleetmap.failure_summary import Moment
-from fleetmap.geometry import se3
-from fleetmap.messages import CameraNote, FailureReport, Placement
+from fleetmap.messages import FailureReport
 from mapserver.dashboard import failure_story as story
 from mapserver.dashboard import failures
 from mapserver.dashboard.console import PageContext
@@ -26,7 +24,6 @@ from support.fleet.dashboard_scene import SITE, Served, failure, fill_store, mar
 from support.fleet.failed_robot import send_replay, small_file
 from support.pages.browser import Chromium
 from support.pages.whole_page import assert_whole
-from support.storage.map_samples import save_surfel_draft, wall
 
 BEGAN_NS = 50_000_000_000
 AT_NS = 1_790_000_000_000_000_000  # by the server's clock: 2026-09-21 14:13:20 UTC
@@ -139,7 +136,7 @@ def report(name: str, **changes: object) -> FailureReport:
 
 @pytest.fixture(scope="module")
 def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
-    """Failure 3: a robot that was carried, with a recording. 4: a recording by somebody who wants to do harm. 5: with a view."""
+    """Failure 3: a robot that was carried, with a recording. 4: a recording by somebody who wants to do harm."""
     folder = tmp_path_factory.mktemp("store")
     fill_store(folder)
     with MapStore.open(folder) as store:
@@ -157,14 +154,6 @@ def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Itera
             given = {"site": SITE, "robot": name, "id": f"of-{name}", "began_ns": BEGAN_NS, "stamps_ns": stamps_ns}
             file = small_file(folder / "failure.mcap", jpegs=jpegs, moments=moments, **given)
             send_replay(fleet, SITE, name, f"of-{name}", file)
-        save_surfel_draft(store, wall(), site="annex")  # which an address without a site means
-        version = save_surfel_draft(store, wall(), site=SITE)
-        optical = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
-        camera = CameraNote(
-            size_px=(320, 240), focal_px=300.0, centre_px=(160.0, 120.0), base_from_cam=Placement.of(optical)
-        )
-        known = report("tug-5", camera=camera, version=version, map_from_base=Placement.of(np.eye(4)))
-        assert not fleet.take_failure(SITE, "tug-5", known).refused
         fleet.flush()
     with serving(folder) as server:
         yield server
@@ -212,7 +201,6 @@ def test_a_failure_without_a_recording_shows_what_the_report_has(page: Page, ser
     expect(page.get_by_role("link", name="All failures")).to_have_attribute("href", re.compile(f"site={SITE}$"))
     expect(page.locator("#seen")).to_be_visible()
     expect(page.locator("main")).to_contain_text("no recording of the seconds around it")
-    expect(page.locator("main")).to_contain_text("No expected view: the report lacks the robot's camera")
     assert page.get_by_role("slider", name="Moment").count() == 0
     assert any(mark["shape"] == "cross" for mark in marks(page))
     assert seen.faults == []
@@ -224,14 +212,6 @@ def test_one_or_many(page: Page, served: Served) -> None:
         "3 others began within 5 m of it, 1 with this cause, of 3 other robots; tug-3 never failed elsewhere."
     )
     expect(page.get_by_role("list", name="Failures").get_by_role("listitem")).to_have_count(3)
-
-
-def test_the_expected_view_stands_beside_the_picture(page: Page, served: Served) -> None:
-    seen = opened(page, served, "failures/5")
-    expect(page.locator(".seen-expected img")).to_have_count(2)
-    wait_until(page, "document.querySelector('img[src*=expected]').naturalWidth === 320", within_s=90)
-    assert_whole(page)
-    assert seen.faults == []
 
 
 def test_a_recording_made_to_harm_is_shown_as_words(page: Page, served: Served) -> None:

@@ -1,4 +1,4 @@
-"""Corrections by areas, at the landmarks, the tiles' evidence, the grid, the surfels and the pictures."""
+"""Corrections by areas, at the landmarks and the tiles' evidence."""
 
 from dataclasses import replace
 from types import SimpleNamespace
@@ -7,14 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleetmap.geometry import Array, inside_any
-from fleetmap.mapformat import sha256_hex
+from fleetmap.geometry import inside_any
 from fleetmap.sensors.samples import Trajectory
 from mapserver.drafting.area_corrections import AreaCorrections, corrections_of, waiting
 from mapserver.floor_plan.areas import Area, Areas, Correction, CorrectionKind
 from mapserver.quality.gate import GateSettings, judge
-from mapserver.surfels.surfel_map import Surfels, SurfelTiles, encode_tile
-from mapserver.surfels.survey_pictures import SurveyPicture
 from mapserver.survey.merge import multi_session
 from mapserver.survey.merge.area_corrections import SurveyLimits, is_before
 from mapserver.survey.merge.merge import kept
@@ -116,45 +113,6 @@ def test_a_version_knows_its_corrections() -> None:
     assert waiting(areas, manifest(**configuration)) == []
     again = Areas.of([area(FORGET, (0, 0), (1, 1), NOW_NS + 1)])
     assert waiting(again, manifest(**configuration)) == list(again.areas)
-
-
-def test_cells_are_unknown_kept_or_grown() -> None:
-    grown, before = {(0, 0): np.full((320, 320, 4), 9, np.uint8)}, {(0, 0): np.full((320, 320, 4), 3, np.uint8)}
-    corrections = AreaCorrections([area(NEVER_USE, (0, 8), (4, 16)), area(FREEZE, (8, 0), (16, 4))])
-    cells = corrections.grid(grown, before)[0, 0]
-    assert (cells[160:, :80] == 0).all(), "rows are y"
-    assert (cells[:80, 160:] == 3).all()
-    assert (cells == 9).sum() == cells.size - 2 * 160 * 80 * 4
-    due = AreaCorrections((), [area(FORGET, (0, 8), (4, 16))]).grid_before(before)[0, 0]
-    assert ((due == 0).sum(), (due == 3).sum()) == (160 * 80 * 4, due.size - 160 * 80 * 4)
-
-
-def surfels(places: Array, grey: int) -> Surfels:
-    count = len(places)
-    points = np.column_stack([places, np.ones(count)]).astype(np.float32)
-    normals = np.tile(np.float32([1, 0, 0]), (count, 1))
-    return Surfels(points, normals, np.zeros(count, np.uint8), np.full(count, grey, np.uint8))
-
-
-def test_surfels_and_pictures() -> None:
-    places = np.stack(np.meshgrid(np.arange(16) + 0.5, np.arange(16) + 0.5), axis=-1).reshape(-1, 2)
-    old, new = (SurfelTiles({(0, 0): encode_tile((0, 0), surfels(places, grey))}) for grey in (3, 9))
-    corrections = AreaCorrections([area(NEVER_USE, (0, 8), (4, 16)), area(FREEZE, (8, 0), (16, 4))])
-    found = corrections.surfels(new, old).surfels((0, 0))
-    at = {
-        tuple(place): int(grey)
-        for place, grey in zip(np.floor(found.points_map[:, :2]).tolist(), found.greys, strict=True)
-    }
-    assert len(at) == len(found) == 256 - 32
-    assert {grey for (x, y), grey in at.items() if x >= 8 and y < 4} == {3}
-    assert {grey for (x, y), grey in at.items() if not (x >= 8 and y < 4)} == {9}
-    everywhere = AreaCorrections((), [area(FORGET, (-1, -1), (17, 17))])
-    assert everywhere.surfels_before(old).tiles == {}
-    picture = SurveyPicture(
-        place_map_m=(2.0, 9.0, 1.0), looks_map=(1.0, 0.0, 0.0), stamp_ns=1, kept_ns=1, recording="a", sha256=sha256_hex(b""), bytes=1
-    )  # fmt: skip
-    assert AreaCorrections((), [area(FORGET, (0, 8), (4, 16))]).pictures_before([picture]) == []
-    assert corrections.pictures_before([picture]) == [picture]
 
 
 def test_the_gate_does_not_count_what_corrections_removed() -> None:

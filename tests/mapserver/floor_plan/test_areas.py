@@ -11,7 +11,7 @@ from fleetmap.errors import UsageError
 from fleetmap.mapformat.building import BuildingFrame, Floor, FloorEntry, read_lifts
 from mapserver.drafting.area_corrections import AreaCorrections
 from mapserver.floor_plan.areas import Areas, MaskKind, read_areas
-from mapserver.grid.masks import mask_grid
+from mapserver.floor_plan.masks import mask_grid
 
 
 def box(x0: float, y0: float, x1: float, y1: float) -> list[list[float]]:

@@ -11,7 +11,6 @@ import pytest
 from typer.testing import CliRunner
 
 from fleetmap.errors import StateError
-from fleetmap.geometry import se3
 from mapserver import releases
 from mapserver.cli import app
 from mapserver.drafting.job_lock import only_one
@@ -19,17 +18,8 @@ from mapserver.nightly.inbox import BAD, DONE, HELD, put_away, remove_old
 from mapserver.store import FleetRetention, MapStore, Retention
 from support.storage.clock import Clock
 from support.storage.map_samples import save_picture_draft
-from support.storage.room_sessions import Seen, session_at
 
 DAY_S, HASH = 86_400, "ab" * 32
-
-
-def pictured(*x_m: float, since_ns: int = 0):
-    session = session_at([se3([[1, 0, 0], [0, 1, 0], [0, 0, 1]], [x, 0.0, 0.5]) for x in x_m], has_depth=True)
-    keyframes = session.survey.odometry.keyframes
-    for number, each in enumerate(keyframes):
-        keyframes[number] = Seen(replace(each.frame, stamp_ns=since_ns + each.frame.stamp_ns), each.frame_index)
-    return session
 
 
 @pytest.mark.parametrize("since_ns", [0, 1_400_000_000 * 10**9, 4_000_000_000 * 10**9])
@@ -37,11 +27,11 @@ def test_pictures_of_surveys_go_from_every_version_that_has_them(tmp_path: Path,
     """After their period since they came: their clock counts from a start, from 1970 and is of 2014, or is ahead."""
     clock = Clock()
     with MapStore.open(tmp_path, create=True, clock_ns=clock) as store:
-        first = save_picture_draft(store, [pictured(0.0, 3.0, since_ns=since_ns)])
+        first = save_picture_draft(store, 0.0, 3.0, since_ns=since_ns)
         releases.publish(store, "lab", first)
         clock.now_ns += 3 * DAY_S * 10**9
-        both = save_picture_draft(store, [pictured(-3.0, since_ns=since_ns)], store.survey_pictures("lab", first))
-        last = save_picture_draft(store, [], store.survey_pictures("lab", both))
+        both = save_picture_draft(store, -3.0, since_ns=since_ns, before=store.survey_pictures("lab", first))
+        last = save_picture_draft(store, before=store.survey_pictures("lab", both))
         for version in (both, last):
             releases.publish(store, "lab", version)
         assert [len(store.survey_pictures("lab", version)) for version in (first, both, last)] == [2, 3, 3]
@@ -119,7 +109,7 @@ def test_a_recording_that_somebody_else_removes_meanwhile_ends_nothing(
 
 def test_the_command_takes_its_periods_from_the_file(inbox: Path, tmp_path: Path) -> None:
     with MapStore.open(tmp_path / "store", create=True) as store:
-        save_picture_draft(store, [pictured(0.0, 3.0)])
+        save_picture_draft(store, 0.0, 3.0)
     config = tmp_path / "site.toml"
     config.write_text("[ingest]\nrecording_days = 1e-9\nsurvey_picture_days = 1e-9\n")
     command = ["retention", "--store", tmp_path / "store", "--inbox", inbox.parent]

@@ -17,7 +17,6 @@ from fleetmap.version_grid import known_grid
 from mapserver import releases
 from mapserver.store import Actor, MapStore
 from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive
-from mapserver.surfels.surfel_map import known_surfels
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 
@@ -89,7 +88,6 @@ def test_exports(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         info = store.import_version(GOLDEN / f"version-{EXPORT_FORMAT}.fmex", actor=Actor("ada"))
         assert list(known_grid(store.manifest("lab", 1), store.blob)) == [(0, 0)]
-        assert len(known_surfels(store.manifest("lab", 1), store.blob)) == 20
         assert (info.site, info.version, info.state, info.tiles) == ("lab", 1, "draft", 2)
         assert store.archive("lab", 1) == b"archive 1"
         assert releases.publish(store, "lab") == 1

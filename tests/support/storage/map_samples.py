@@ -1,32 +1,21 @@
 """Made-up tiles, surveys and drafts for tests of the map's way from the survey to the robot."""
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
 
 import msgspec
 import numpy as np
 
+from fleetmap.encoding import to_json
 from fleetmap.geometry import se3_exp
-from fleetmap.mapformat import CameraEntry, RecordingEntry, Tile
+from fleetmap.mapformat import CameraEntry, RecordingEntry, Tile, sha256_hex
 from fleetmap.mapformat.grid_tile import TILE_CELLS
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
 from fleetmap.version_grid import encode_grid, grid_report
 from mapserver import releases
-from mapserver.grid.survey_grid import GridSession
 from mapserver.store import DraftContent, DraftDetails, MapStore
-from mapserver.surfels.surfel_map import EDGE_M, TILE_SIZE_M, Surfels, SurfelTiles, encode_tile, surfel_report
-from mapserver.surfels.survey_pictures import SurveyPicture, kept_pictures
+from mapserver.store.survey_pictures import PICTURES_KEY, PictureIndex, PicturesReport, SurveyPicture
 from mapserver.survey.survey_map import SurveyMap
-
-
-def encode_surfels(surfels: Surfels) -> list[bytes]:
-    """All surfels of a version as blobs, cut into tiles."""
-    places = np.floor(surfels.points_map[:, :2] / TILE_SIZE_M).astype(np.int64)
-    every = np.unique(places, axis=0).tolist()
-    tiles = {(x, y): encode_tile((x, y), surfels[(places == (x, y)).all(axis=1)]) for x, y in every}
-    return SurfelTiles(tiles, surfels.falloff, surfels.exposures).blobs()
 
 
 def random_tile(
@@ -113,58 +102,42 @@ def save_sample_draft(store: MapStore, *, site: str = "lab", seed: int = 0, voca
     return store.save(site, content).version
 
 
-def _save_tile(store: MapStore, site: str, report: dict[str, object], **parts: Any) -> int:
-    """A draft of one tile, with these parts and what is reported of them."""
+def save_tile(store: MapStore, site: str, report: dict[str, object], extras: Sequence[tuple[str, bytes]]) -> int:
+    """A draft of one tile, with these bytes beside it and what is reported of them."""
     tiles, details = [random_tile(np.random.default_rng(0), cell=(0, 0))], draft_details(path_m=12.5, **report)
-    content = DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive", **parts)
+    content = DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=details, archive=b"archive", extras=extras)
     return store.save(site, content).version
 
 
-def save_grid_draft(store: MapStore, seed: int = 0, *, site: str = "lab", surfels: Surfels | None = None) -> int:
-    """A draft with a hall of 4 m x 2 m from (1, 3): free, with a box that reaches from 0.35 m to 0.6 m; with surfels, if they are given."""
+def save_grid_draft(
+    store: MapStore, seed: int = 0, *, site: str = "lab", extras: Sequence[tuple[str, bytes]] = (), **report: object
+) -> int:
+    """A draft with a hall of 4 m x 2 m from (1, 3): free, with a box that reaches from 0.35 m to 0.6 m; with more beside it, if given."""
     cells = np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8)
     cells[60:100, 20:100, 1] = 0xFF
     cells[70:80, 40 + seed : 50, 0] = 0b10
     cells[60:100, 20:100, 2:] = 17
     grid = encode_grid({(0, 0): cells})
-    blobs, said = [], {"grid": msgspec.to_builtins(grid_report(grid, {}))}
-    if surfels is not None:
-        blobs = encode_surfels(surfels)
-        said["surfels"] = msgspec.to_builtins(surfel_report(blobs, len(surfels), {}))
-    return _save_tile(store, site, said, grid=grid, surfels=blobs)
-
-
-def wall(distance_m: float = 2.0, *, grey: int = 120, edge_level: int = 1) -> Surfels:
-    """A wall across x at this distance, 4 m wide and 2 m high, that faces the origin; grey apart from a square of 0.4 m that is white."""
-    edge_m = EDGE_M * 2**edge_level
-    y, z = (axis.ravel() for axis in np.meshgrid(np.arange(-2.0, 2.0, edge_m), np.arange(-1.0, 1.0, edge_m)))
-    points = np.column_stack([np.full(len(y), distance_m), y + edge_m / 2, z + edge_m / 2]).astype(np.float32)
-    normals = np.tile(np.array([-1.0, 0.0, 0.0], np.float32), (len(y), 1))
-    greys = np.where((np.abs(points[:, 1]) < 0.2) & (np.abs(points[:, 2]) < 0.2), 250, grey).astype(np.uint8)
-    return Surfels(points, normals, np.full(len(y), edge_level, np.uint8), greys)
-
-
-def seen_wall(*, with_board: bool = False) -> Surfels:
-    """The wall as two views from the origin saw it, with a board of 0.6 m halfway before it."""
-    views = np.array([[0.0, y, 0.0, 1.0, 0.0, 0.0, 0.0] for y in (-0.1, 0.1)])
-    board = wall(1.0)
-    board = board[np.abs(board.points_map[:, 1:]).max(axis=1) < 0.3]
-    return replace(Surfels.joined([wall(), board] if with_board else [wall()]), exposures=views)
-
-
-def save_surfel_draft(store: MapStore, surfels: Surfels, *, site: str = "lab") -> int:
-    """A draft with these surfels."""
-    blobs = encode_surfels(surfels)
-    said = {"surfels": msgspec.to_builtins(surfel_report(blobs, len(surfels), {}))}
-    return _save_tile(store, site, said, surfels=blobs)
+    said = {"grid": msgspec.to_builtins(grid_report(grid, {})), **report}
+    return save_tile(store, site, said, [*(("grid", data) for data in grid), *extras])
 
 
 def save_picture_draft(
-    store: MapStore, sessions: Sequence[GridSession], before: Sequence[SurveyPicture] = (), *, site: str = "lab"
+    store: MapStore, *x_m: float, before: Sequence[SurveyPicture] = (), since_ns: int = 0, site: str = "lab"
 ) -> int:
-    """A draft with the pictures of these sessions, and those of a version before."""
-    blobs, said = kept_pictures(sessions, before, store.blob, store.now_ns())
-    return _save_tile(store, site, {"pictures": msgspec.to_builtins(said)}, pictures=blobs)
+    """A draft with pictures of a survey that were taken along x, each of other bytes, and those of a version before."""
+    jpegs = [b"picture from %f" % x for x in x_m]
+    taken = [
+        SurveyPicture(
+            place_map_m=(x, 0.0, 0.5), looks_map=(1.0, 0.0, 0.0), stamp_ns=since_ns + number, recording="ride",
+            sha256=sha256_hex(jpeg), bytes=len(jpeg), kept_ns=store.now_ns(),
+        )
+        for number, (x, jpeg) in enumerate(zip(x_m, jpegs, strict=True))
+    ]  # fmt: skip
+    index = to_json(PictureIndex(pictures=(*taken, *before)))
+    blobs = [index, *jpegs, *(store.blob(one.sha256) for one in before)]
+    said = PicturesReport(sha256=sha256_hex(index), bytes=sum(map(len, blobs)), pictures=len(taken) + len(before))
+    return save_tile(store, site, {PICTURES_KEY: msgspec.to_builtins(said)}, [("surfel", data) for data in blobs])
 
 
 def publish_samples(store: MapStore, count: int, *, first: int = 0, site: str = "lab") -> None:

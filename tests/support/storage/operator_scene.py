@@ -1,5 +1,6 @@
 """A hall as an operator finds it: two weeks of driving in four named aisles, one of which got worse, and what failed yesterday at 14:03."""
 
+from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -15,7 +16,6 @@ from mapserver.fleet_statistics.kpis import Counters, hour_of
 from mapserver.store import Actor, DraftContent, MapStore
 from mapserver.store.fleet_queries import FleetBatch
 from mapserver.store.rows import TraceRow
-from mapserver.surfels.surfel_map import Surfels, surfel_report
 from support.drawn_areas import geojson
 from support.fleet.dashboard_scene import (
     AISLE_M,
@@ -28,7 +28,7 @@ from support.fleet.dashboard_scene import (
     picture,
 )
 from support.fleet.failed_robot import send_replay, small_file
-from support.storage.map_samples import draft_details, encode_surfels
+from support.storage.map_samples import draft_details
 
 BEGAN_NS = 50_000_000_000
 WORSE = "aisle 2"
@@ -50,26 +50,10 @@ def aisles() -> bytes:
     return geojson(*aisles, {"name": "dock", "box": (0.0, 0.0, 7.9, WIDTH_M)})
 
 
-def rack_surfels(level: int = 3) -> Surfels:
-    """Both sides of the racks of `hall_tiles`, with uprights and boards darker than the goods."""
-    edge_m = 0.01 * 2**level
-    x, z = (axis.ravel() for axis in np.meshgrid(np.arange(3, LENGTH_M - 3, edge_m), np.arange(0.1, 3.0, edge_m)))
-    parts = []
-    for rack in np.arange(2.0, WIDTH_M, AISLE_M):
-        for side in (-1.0, 1.0):
-            points = np.column_stack([x, np.full(len(x), rack + 0.6 * side), z]).astype(np.float32)
-            frame = (x % 2.7 < 0.25) | (z % 1.0 < 0.2)
-            goods = 120 + 60 * ((np.floor(x / 0.9) * 7 + np.floor(z) * 3 + rack) % 5 / 5)
-            normals = np.tile(np.array([0.0, side, 0.0], np.float32), (len(x), 1))
-            greys = np.where(frame, 40, goods).astype(np.uint8)
-            parts.append(Surfels(points, normals, np.full(len(x), level, np.uint8), greys))
-    return Surfels.joined(parts)
-
-
-def fill_shift(folder: Path) -> None:
-    """Version 1 (used before), 2 (current, with surfels) and draft 3; areas, two weeks of counts, a day of traces, failures, jobs."""
+def fill_shift(folder: Path, extras: Sequence[tuple[str, bytes]] = (), **said: object) -> None:
+    """Version 1 (used before), 2 (current, with these bytes beside the tiles and what is reported of them) and draft 3;
+    areas, two weeks of counts, a day of traces, failures, jobs."""
     ada = Actor("ada", "the nightly map")
-    surfels = rack_surfels()
     with MapStore.open(folder, create=True) as store:
         for number in (1, 2, 3):
             report: dict[str, object] = {
@@ -77,12 +61,10 @@ def fill_shift(folder: Path) -> None:
                 "loops": {"candidates": 40, "accepted": 12},
                 "findings": {"monday": []},
             }  # fmt: skip
-            blobs = encode_surfels(surfels) if number == 2 else []
-            if blobs:
-                report["surfels"] = msgspec.to_builtins(surfel_report(blobs, len(surfels), {}))
+            report |= said if number == 2 else {}
             content = DraftContent(
                 tiles=hall_tiles(shifted_m=0.2 * (number - 1)), vocabulary=b"words" * 50,
-                details=draft_details(**report), surfels=blobs,
+                details=draft_details(**report), extras=extras if number == 2 else (),
             )  # fmt: skip
             store.save(SITE, content, actor=ada)
             if number < 3:

@@ -10,9 +10,10 @@ from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.version_grid import Tiles
-from mapserver.grid.survey_grid import GridGrower, GridSession, grow
-from mapserver.surfels.surfel_map import SurfelTiles
-from mapserver.surfels.survey_surfels import SurfelGrower
+from mapserver.drafting.extras import MappedSession
+from mapserver.plugins.dense_maps.surfel_map import SurfelTiles
+from mapserver.plugins.dense_maps.survey_grid import GridGrower, grow
+from mapserver.plugins.dense_maps.survey_surfels import SurfelGrower
 from mapserver.survey.state import MemoryImageStore
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT, WIDTH
 from support.worlds.box_room import ROOM_M, depth_of, stereo_pair
@@ -27,7 +28,7 @@ class Seen:
     images: MemoryImageStore = field(default_factory=MemoryImageStore)
 
 
-def session_at(places: list[Array], camera: StereoCamera = CAMERA, *, has_depth: bool = False) -> GridSession:
+def session_at(places: list[Array], camera: StereoCamera = CAMERA, *, has_depth: bool = False) -> MappedSession:
     """Results of a survey with keyframes at these map_from_body."""
     keyframes = []
     for number, map_from_body in enumerate(places):
@@ -41,7 +42,7 @@ def session_at(places: list[Array], camera: StereoCamera = CAMERA, *, has_depth:
         state=SimpleNamespace(camera=camera, body_from_cam=BODY_FROM_CAM0),
         stereo_yaw=SimpleNamespace(correction_px=0.0),
     )
-    return GridSession("ride", survey, np.array(places))  # type: ignore[arg-type]
+    return MappedSession("ride", survey, np.array(places))  # type: ignore[arg-type]
 
 
 def ride(height_m: list[float]) -> list[Array]:
@@ -53,14 +54,14 @@ def ride(height_m: list[float]) -> list[Array]:
     ]
 
 
-def grown_grid(before: Tiles, sessions: Sequence[GridSession]) -> tuple[Tiles, dict[str, str]]:
+def grown_grid(before: Tiles, sessions: Sequence[MappedSession]) -> tuple[Tiles, dict[str, str]]:
     """Tiles after these sessions, and why recordings add nothing."""
     grower = GridGrower(before)
     without = grow({"grid": grower}, sessions, StereoSettings())
     return grower.tiles, without["grid"]
 
 
-def grown_surfels(before: SurfelTiles, sessions: Sequence[GridSession]) -> tuple[SurfelTiles, dict[str, str]]:
+def grown_surfels(before: SurfelTiles, sessions: Sequence[MappedSession]) -> tuple[SurfelTiles, dict[str, str]]:
     """Surfels after these sessions, and why recordings add nothing."""
     grower = SurfelGrower(before)
     without = grow({"surfels": grower}, sessions, StereoSettings())

@@ -181,7 +181,7 @@ def save(store: MapStore, *, site: str = SITE, of: tuple[Tile, ...] | None = Non
             vocabulary=vocabulary(),
             details=details,
             archive=b"archive",
-            grid=grid,
+            extras=[("grid", data) for data in grid],
         ),
     ).version
     releases.publish(store, site)

@@ -1,1 +1,0 @@
-"""A version's map in three dimensions: its bytes for the browser, and the element that draws them."""

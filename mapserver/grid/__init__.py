@@ -1,1 +1,0 @@
-"""The occupancy grid and the height map of a site, from the pictures of its surveys. Pure."""

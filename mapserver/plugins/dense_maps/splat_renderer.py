@@ -1,0 +1,124 @@
+"""Splats rendered as in viewers, with the derivatives of a loss by their colours, sizes and opacities."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap import core
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.sensors.calibration import CameraCalibration
+from mapserver.plugins.dense_maps.splat_file import THICKNESS, Splats
+
+LEAST_ALPHA = core.SPLAT_LEAST_ALPHA
+BLUR_PX2 = 0.3  # variance of a pixel, as in the viewers
+NEAR_M, FAR_M = 0.1, 40.0
+LEAST_OPACITY, MOST_OPACITY = 0.01, 0.985
+_LEAST_GREY, _MOST_GREY = 0.0, 255.0
+_LEAST_SIGMA_M, _MOST_SIGMA_M = 1e-3, 1.0
+_BEYOND = 1.3  # in half widths of the picture: limit of the position used to linearise the projection
+GREY, SIZE, OPACITY = range(3)
+
+
+@dataclass(frozen=True, slots=True)
+class Drawn:
+    """A picture (H, W), 0 to 1 on black, the share of light that passes all splats (H, W), and the backward pass.
+
+    backward: from the derivatives (H, W) of a loss by the picture to the numbers (M,) of the drawn splats and the derivatives (M, 3)
+    of the loss by their parameters, in the order of `parameters_of`.
+    """
+
+    picture: Array
+    through: Array
+    backward: Callable[[Array], tuple[NDArray[np.int64], Array]]
+
+
+Renderer = Callable[[Splats, Array, CameraCalibration, Array], Drawn]
+"""From splats (only positions and normals are used), parameters (N, 3), a camera without distortion and map_from_cam (4, 4)."""
+
+
+def parameters_of(splats: Splats) -> Array:
+    """Return (N, 3) grey of 0 to 1, logarithm of the standard deviation in metres, logit of the opacity."""
+    opacities = np.clip(splats.opacities, LEAST_OPACITY, MOST_OPACITY)
+    sigmas_m = np.clip(splats.sigmas_m, _LEAST_SIGMA_M, _MOST_SIGMA_M)
+    return np.column_stack([splats.greys / 255.0, np.log(sigmas_m), np.log(opacities / (1 - opacities))])
+
+
+def with_parameters(splats: Splats, parameters: Array) -> Splats:
+    """Return the same splats with these parameters (N, 3)."""
+    opacities = 1.0 / (1.0 + np.exp(-parameters[:, OPACITY]))
+    return replace(splats, greys=255.0 * parameters[:, GREY], sigmas_m=np.exp(parameters[:, SIZE]), opacities=opacities)
+
+
+def bounds() -> tuple[Array, Array]:
+    """Return the smallest and the largest parameters (3,)."""
+    places = np.zeros((2, 3), np.float32)
+    sigmas_m, greys = np.array([_LEAST_SIGMA_M, _MOST_SIGMA_M]), np.array([_LEAST_GREY, _MOST_GREY])
+    ends = Splats(places, places, sigmas_m, greys, np.array([LEAST_OPACITY, MOST_OPACITY]))
+    low, high = parameters_of(ends)
+    return low, high
+
+
+@dataclass(frozen=True, slots=True)
+class _Flat:
+    """M splats in a picture, near to far: numbers, pixels (M, 2), and xx, xy, yy (M, 3) of their covariances for a sigma of 1 m."""
+
+    numbers: NDArray[np.int64]
+    pixels: Array
+    shapes: Array
+
+
+def draw(splats: Splats, parameters: Array, camera: CameraCalibration, map_from_cam: Array) -> Drawn:
+    """Render on the CPU. Both sides of a splat are visible. A splat smaller than a pixel is more transparent in proportion."""
+    flat = _projected(splats, camera, se3_inverse(map_from_cam))
+    chosen = parameters[flat.numbers]
+    own = flat.shapes * np.exp(2 * chosen[:, SIZE])[:, None]
+    blurred = own + BLUR_PX2 * np.array([1.0, 0.0, 1.0])
+    shrunk = np.sqrt(np.maximum(_determinant(own), 0.0) / _determinant(blurred))
+    opacities = 1.0 / (1.0 + np.exp(-chosen[:, OPACITY]))
+    peaks = shrunk * opacities
+    reaches_px = np.sqrt(2 * np.log(np.maximum(peaks / LEAST_ALPHA, 1.0)))[:, None] * np.sqrt(blurred[:, [0, 2]])
+    size_px = np.array([camera.width_px, camera.height_px])
+    is_seen = (peaks >= LEAST_ALPHA) & (
+        (flat.pixels + reaches_px >= 0) & (flat.pixels - reaches_px <= size_px - 1)
+    ).all(axis=1)
+    conics = blurred[is_seen][:, [2, 1, 0]] * (1.0, -1.0, 1.0) / _determinant(blurred[is_seen])[:, None]
+    reaches_px = np.ascontiguousarray(reaches_px[is_seen])
+    gaussians = flat.pixels[is_seen], np.ascontiguousarray(conics), reaches_px, peaks[is_seen], chosen[is_seen, GREY]
+    numbers, opacities = flat.numbers[is_seen], opacities[is_seen]
+    through, picture = core.blend(*gaussians, camera.width_px, camera.height_px)
+
+    def backward(slopes: Array) -> tuple[NDArray[np.int64], Array]:
+        return numbers, core.blend_backward(*gaussians, opacities, BLUR_PX2, np.ascontiguousarray(slopes), picture)
+
+    return Drawn(picture, through, backward)
+
+
+def _determinant(shapes: Array) -> Array:
+    return np.asarray(shapes[:, 0] * shapes[:, 2] - shapes[:, 1] ** 2)
+
+
+def _projected(splats: Splats, camera: CameraCalibration, cam_from_map: Array) -> _Flat:
+    """Project by EWA splatting: a Gaussian through the projection's derivative at its middle. Source: Zwicker et al. 2001."""
+    points = splats.points_map @ cam_from_map[:3, :3].T + cam_from_map[:3, 3]
+    fx, fy, cx, cy = camera.intrinsics_px
+    reach = _BEYOND * np.array([max(cx, camera.width_px - cx) / fx, max(cy, camera.height_px - cy) / fy])
+    depths = points[:, 2]
+    is_before = (depths > NEAR_M) & (depths < FAR_M) & (np.abs(points[:, :2]) < reach * depths[:, None]).all(axis=1)
+    numbers = np.flatnonzero(is_before)
+    numbers = numbers[np.argsort(depths[numbers], kind="stable")]
+    x, y, z = points[numbers].T
+    normals = splats.normals[numbers] @ cam_from_map[:3, :3].T
+    pixels = np.column_stack([fx * x / z + cx, fy * y / z + cy])
+    across, down = fx / z, fy / z  # the derivative's rows: across (1, 0, -x / z) and down (0, 1, -y / z)
+    along_u, along_v = across * (normals[:, 0] - normals[:, 2] * x / z), down * (normals[:, 1] - normals[:, 2] * y / z)
+    flattened = 1.0 - THICKNESS**2
+    shapes = np.column_stack(
+        [
+            across**2 * (1 + (x / z) ** 2) - flattened * along_u**2,
+            across * down * x * y / z**2 - flattened * along_u * along_v,
+            down**2 * (1 + (y / z) ** 2) - flattened * along_v**2,
+        ]
+    )
+    return _Flat(numbers, pixels, shapes)

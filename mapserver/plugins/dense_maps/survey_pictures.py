@@ -1,0 +1,88 @@
+"""The pictures of the surveys that a build keeps, and those nearest to a place."""
+
+from collections.abc import Callable, Iterable, Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetmap.encoding import to_json
+from fleetmap.geometry import Array
+from fleetmap.mapformat import sha256_hex
+from mapserver.drafting.extras import MappedSession
+from mapserver.store.survey_pictures import MOST, PictureIndex, PicturesReport, SurveyPicture
+
+_LARGEST_PX, _QUALITIES, _MOST_BYTES = 320, (75, 50, 25, 5), 20_000
+_EVERY_M = 2.0  # of path: at most 10 kB for each metre
+_SAME_M, _SAME_COSINE = 1.5, 0.7  # a later picture from there, looking that way, replaces one
+
+
+def nearest_pictures(
+    pictures: Sequence[SurveyPicture], place_map_m: Array, looks_map: Array | None = None
+) -> list[tuple[SurveyPicture, float]]:
+    """Return the pictures with their distances in metres, the nearest first, those that look more than 45 degrees elsewhere last."""
+    places, axes = (
+        np.array([getattr(one, name) for one in pictures]).reshape(-1, 3) for name in ("place_map_m", "looks_map")
+    )
+    off_m = np.linalg.norm(places - place_map_m, axis=1)
+    elsewhere = np.zeros(len(pictures), bool) if looks_map is None else axes @ looks_map < _SAME_COSINE
+    return [(pictures[i], float(off_m[i])) for i in np.lexsort([off_m, elsewhere]).tolist()]
+
+
+def kept_pictures(
+    sessions: Iterable[MappedSession], before: Sequence[SurveyPicture], blob: Callable[[str], bytes], now_ns: int
+) -> tuple[list[bytes], PicturesReport | None]:
+    """Return the index and each JPEG, and their report; no bytes and None without pictures.
+
+    before: pictures of the version before, which stay where no later survey looked the same way; blob: their bytes. now_ns: of the build.
+    """
+    data, found = dict[str, bytes](), list[SurveyPicture]()
+    for session in sessions:
+        survey, taken, last = session.survey, list[SurveyPicture](), None
+        for keyframe in survey.odometry.keyframes:
+            map_from_cam = session.map_from_body[keyframe.frame_index] @ survey.state.body_from_cam
+            if last is not None and np.linalg.norm(map_from_cam[:3, 3] - last) < _EVERY_M:
+                continue
+            place, looks = map_from_cam[:3, 3], map_from_cam[:3, 2]
+            if _is_among(place, looks, taken):
+                continue
+            last, jpeg = place, _jpeg(keyframe.frame.left)
+            sha256 = sha256_hex(jpeg)
+            data[sha256] = jpeg
+            taken.append(
+                SurveyPicture(
+                    place_map_m=tuple(place.round(3).tolist()), looks_map=tuple(looks.round(4).tolist()),
+                    stamp_ns=int(keyframe.frame.stamp_ns), recording=session.name, sha256=sha256, bytes=len(jpeg),
+                    kept_ns=now_ns,
+                )
+            )  # fmt: skip
+        found = taken + [one for one in found if not _is_among(one.place_map_m, one.looks_map, taken)]
+    others = [one for one in before if not _is_among(one.place_map_m, one.looks_map, found)]
+    found = (found + others)[:MOST]
+    if not found:
+        return [], None
+    addresses = sorted({one.sha256 for one in found})
+    index = to_json(PictureIndex(pictures=tuple(found)), order="deterministic")
+    blobs = [index, *(data.get(sha256) or blob(sha256) for sha256 in addresses)]
+    report = PicturesReport(sha256=sha256_hex(index), bytes=sum(map(len, blobs)), pictures=len(found))
+    return blobs, report
+
+
+def _is_among(place: Sequence[float] | Array, looks: Sequence[float] | Array, taken: Sequence[SurveyPicture]) -> bool:
+    """Return True if one of these was taken near the place and looks the same way."""
+    places, axes = (
+        np.array([getattr(one, name) for one in taken]).reshape(-1, 3) for name in ("place_map_m", "looks_map")
+    )
+    return bool(((np.linalg.norm(places - place, axis=1) < _SAME_M) & (axes @ looks > _SAME_COSINE)).any())
+
+
+def _jpeg(picture: NDArray[np.uint8]) -> bytes:
+    """Return a small JPEG, of lower quality where much is to be seen."""
+    scale = min(1.0, _LARGEST_PX / max(picture.shape))
+    small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    jpeg = b""
+    for quality in _QUALITIES:
+        jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+        if len(jpeg) <= _MOST_BYTES:
+            break
+    return jpeg

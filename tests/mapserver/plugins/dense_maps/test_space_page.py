@@ -1,0 +1,217 @@
+"""The map in space, in a real browser: everything that the version holds is drawn, robots move in it, colours mean what the scale says."""
+
+import math
+import re
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from playwright.sync_api import Page, expect
+
+from fleetmap.bus import Bus
+from fleetmap.geometry import Array, se3
+from fleetmap.mapformat import Tile
+from fleetmap.messages import CameraNote, FailureAck, Placement, decode_message, encode_message, robot_key
+from mapserver.plugins.dense_maps import space_points as points
+from mapserver.plugins.dense_maps.space_page import robot_views
+from mapserver.plugins.dense_maps.space_points import space_bytes
+from mapserver.store import MapStore
+from support.fleet.dashboard_scene import ROBOTS, SITE, Served, failure, opened, serving, talking, wait_until
+from support.pages.browser import box_of
+from support.pages.whole_page import assert_whole
+from support.storage.dense_samples import save_session_pictures, save_surfel_draft, seen_wall
+from support.storage.map_samples import random_tile, save_sample_draft
+from support.storage.room_sessions import session_at
+
+SEEN = "document.querySelector('.space-view').seen()"
+
+
+def tiles() -> list[Tile]:
+    rng = np.random.default_rng(3)
+    return [random_tile(rng, cell=(x, 0)) for x in range(2)]
+
+
+def inked(page: Page) -> tuple[int, Array]:
+    """How many pixels of the view are painted, and their mean colour."""
+    png = page.locator(".views canvas").screenshot()
+    picture = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR).astype(float)[3:-3, 3:-3]
+    painted = np.abs(picture - picture[0, 0]).max(axis=2) > 30
+    return int(painted.sum()), picture[painted].mean(axis=0)
+
+
+def test_bytes_hold_all_landmarks_and_places() -> None:
+    made = tiles()
+    data = space_bytes(made)
+    count, places = np.frombuffer(data, "<u4", 2)
+    assert (count, places) == (80, sum(len(tile.place_ids) for tile in made))
+    xyz = np.frombuffer(data, "<f4", 3 * count, 8).reshape(-1, 3)
+    np.testing.assert_allclose(xyz, np.concatenate([tile.points_map for tile in made]), atol=1e-4)
+    cameras = np.frombuffer(data, "<f4", 12 * places, 8 + 12 * count).reshape(-1, 3, 4)
+    order = np.argsort(np.concatenate([tile.place_ids for tile in made]), kind="stable")
+    in_order = np.concatenate([tile.map_from_cam for tile in made])[order, :3]
+    np.testing.assert_allclose(cameras, in_order, atol=1e-4, err_msg="as they were surveyed, one after the other")
+    exactness = np.frombuffer(data, np.uint8, count, 8 + 12 * count + 48 * places)
+    sigma_m = np.concatenate([tile.sigma_m for tile in made])
+    by_sigma = exactness[np.argsort(sigma_m)]
+    assert (np.diff(by_sigma.astype(int)) >= 0).all()
+    assert by_sigma[0] < by_sigma[-1]
+    assert len(data) == 8 + 12 * count + 48 * places + count
+
+
+def test_too_many_landmarks_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(points, "MAX_LANDMARKS", 30)
+    count, _ = np.frombuffer(space_bytes(tiles()), "<u4", 2)
+    assert 20 <= count <= 30
+
+
+def test_surfaces_are_seen_and_measured(page: Page, tmp_path: Path) -> None:
+    """A wall with known ends: what is clicked is as far apart as the surfels under the pointer."""
+    wall = seen_wall(with_board=False)
+    with MapStore.open(tmp_path, create=True) as store:
+        version = save_surfel_draft(store, wall)
+    with serving(tmp_path) as served:
+        seen = opened(page, served, "space", site="lab", version=version)
+        wait_until(page, f"document.querySelector('.space-view').seen && {SEEN}.surfels === {len(wall)}")
+        expect(page.get_by_role("checkbox", name="landmarks")).not_to_be_checked()
+        page.get_by_role("button", name="Measure a distance").click()
+        box = box_of(page.locator(".views canvas"))
+        page.mouse.click(box["x"] + 2, box["y"] + 2)
+        expect(page.locator(".where")).to_contain_text("Nothing is drawn there")
+        ends = [wall.points_map[wall.points_map[:, 1].argmin()], wall.points_map[wall.points_map[:, 1].argmax()]]
+        for end in ends:
+            x, y = page.evaluate(f"document.querySelector('.space-view').onPage({end.tolist()})")
+            page.mouse.click(box["x"] + x * box["width"], box["y"] + y * box["height"])
+        expect(page.locator(".where")).to_contain_text("m apart")
+        told = float(page.locator(".where").inner_text().split(" m apart")[0])
+        assert told == pytest.approx(float(np.linalg.norm(ends[1] - ends[0])), abs=0.3)
+    assert seen.faults == []
+
+
+def test_the_picture_of_a_survey_is_shown_at_a_place(page: Page, tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        places = [se3(np.eye(3), np.array([x, 0.0, 0.5])) for x in np.arange(0.0, 9.0, 0.5)]
+        version = save_session_pictures(store, [session_at(places, has_depth=True)])
+        old = save_sample_draft(store)
+    with serving(tmp_path) as served:
+        seen = opened(page, served, "space", site="lab", version=version)
+        wait_until(page, "document.querySelector('.space-view').seen")
+        expect(page.locator(".taken img")).to_be_hidden()
+        page.get_by_role("button", name="Walk through it").click()
+        expect(page.get_by_alt_text("What a survey's camera saw near here")).to_be_visible()
+        expect(page.locator(".taken figcaption")).to_have_text(re.compile(r"^Taken \d+\.\d m away by the survey ride$"))
+        wait_until(page, "document.querySelector('.taken img').naturalWidth === 320")
+        assert_whole(page)
+        assert seen.faults == []
+        seen = opened(page, served, "space", site="lab", version=old)
+        wait_until(page, "document.querySelector('.space-view').seen")
+        expect(page.get_by_text(f"Version {old} of site lab keeps no pictures of its surveys")).to_be_visible()
+        page.get_by_role("button", name="Walk through it").click()
+        expect(page.locator(".taken")).to_be_hidden()
+        assert seen.faults == []
+
+
+def test_the_map_is_seen_in_space_with_its_robots(page: Page, served: Served) -> None:
+    seen = opened(page, served, "space")
+    expect(page.locator("h1")).to_have_text("3D view of hall")
+    wait_until(page, f"document.querySelector('.space-view').seen && {SEEN}.robots.length === {ROBOTS}")
+    assert page.evaluate(SEEN)["landmarks"] > 50
+    page.get_by_role("checkbox", name="floor").uncheck()
+    page.get_by_role("checkbox", name="robots").uncheck()
+    page.wait_for_timeout(500)
+    amount, by_height = inked(page)
+    assert amount > 500, "something is drawn"
+    page.get_by_label("Landmarks by").select_option("exactness")
+    page.wait_for_timeout(500)
+    assert np.abs(inked(page)[1] - by_height).max() > 5, "other colours"
+    page.get_by_role("checkbox", name="landmarks").uncheck()
+    page.wait_for_timeout(500)
+    assert inked(page)[0] < amount
+    page.get_by_role("checkbox", name="landmarks").check()
+    with talking(served.zenoh, ROBOTS) as moved:
+        moved["tug-4"] = (40.0, 14.0)
+        at_new_place = f"{SEEN}.robots.some(r => r.name === 'tug-4' && r.x === 40 && r.y === 14 && r.tone === 'bad')"
+        wait_until(page, at_new_place)
+    page.get_by_role("button", name="From above").click()
+    page.wait_for_timeout(300)
+    across = {robot["name"]: robot["page"][0] for robot in page.evaluate(SEEN)["robots"]}
+    places = {robot["name"]: robot["x"] for robot in page.evaluate(SEEN)["robots"]}
+    order = sorted(across, key=across.__getitem__)
+    assert places[order[0]] < places[order[-1]], "x points to the right"
+    assert_whole(page)
+    assert seen.faults == []
+    assert seen.elsewhere([served.http, served.http.replace("http:", "ws:")]) == []
+
+
+def test_robots_and_places_are_opened_with_the_pointer(page: Page, served: Served) -> None:
+    seen = opened(page, served, "space")
+    wait_until(page, f"document.querySelector('.space-view').seen && {SEEN}.robots.length === {ROBOTS}")
+    expect(page.locator(".bar")).to_have_text(re.compile(r"^[125]0* m$"))
+    page.get_by_role("button", name="From above").click()
+    page.get_by_role("checkbox", name="robots").uncheck()
+    page.wait_for_timeout(300)
+    robots = page.evaluate(SEEN)["robots"]
+    robot = max(robots, key=lambda one: sorted(math.dist(one["page"], other["page"]) for other in robots)[1])
+    box = box_of(page.locator(".views canvas"))
+    there = box["x"] + robot["page"][0] * box["width"], box["y"] + robot["page"][1] * box["height"]
+    page.mouse.click(*there)
+    expect(page.locator(".where")).to_have_text(re.compile("^Place "))
+    assert page.evaluate(SEEN)["camera"][:2] == pytest.approx((robot["x"], robot["y"]), abs=1.0), (
+        "the place beside the robot"
+    )
+    page.get_by_role("button", name="Leave the walk").click()
+    page.get_by_role("button", name="From above").click()
+    page.get_by_role("checkbox", name="robots").check()
+    page.wait_for_timeout(300)
+    page.mouse.click(*there)
+    expect(page.locator("h1")).to_have_text(robot["name"])
+    assert seen.faults == []
+
+
+def told_camera(**changes: object) -> CameraNote:
+    """A camera that looks forward from 0.3 m before the robot's middle, with its axis above the middle of the picture."""
+    mounted = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.array([0.3, 0.0, 0.6]))
+    made = CameraNote(size_px=(640, 480), focal_px=320.0, centre_px=(320.0, 160.0), base_from_cam=Placement.of(mounted))
+    return msgspec.structs.replace(made, **changes)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"focal_px": 0.0},
+        {"focal_px": math.nan},
+        {"size_px": (1 << 20, 4)},
+        {"centre_px": (math.inf, 0.0)},
+        {"base_from_cam": Placement(position_m=(500.0, 0.0, 0.0), quat_wxyz=(1.0, 0.0, 0.0, 0.0))},
+        {"base_from_cam": Placement(position_m=(0.0, 0.0, 0.0), quat_wxyz=(math.nan, 0.0, 0.0, 0.0))},
+        {"base_from_cam": Placement(position_m=(0.0, 0.0, 0.0), quat_wxyz=(0.0, 0.0, 0.0, 0.0))},
+    ],
+)
+def test_what_is_no_camera_of_a_robot_is_left_out(changes: dict[str, object]) -> None:
+    assert robot_views({"tug-1": told_camera(**changes)}) == {}
+
+
+def test_a_robots_view_has_the_angles_and_the_mounting_of_its_own_camera() -> None:
+    view = robot_views({"tug-1": told_camera()})["tug-1"]
+    assert view == [-1.0, 1.0, -0.5, 1.0, *(0, 0, 1, 0.3, -1, 0, 0, 0, 0, -1, 0, 0.6)]
+
+
+def test_a_robot_that_told_its_camera_is_drawn_with_it(page: Page, served: Served) -> None:
+    report = msgspec.structs.replace(failure("tug-3", "f7"), camera=told_camera())
+    with Bus.connect(served.zenoh) as bus:
+        ack = decode_message(bus.get(robot_key(SITE, "tug-3", "failures"), encode_message(report)), FailureAck)
+    assert not ack.refused
+    seen = opened(page, served, "space")
+    expect(page.locator("main")).to_contain_text("1 with the view of their own camera")
+    wait_until(page, f"document.querySelector('.space-view').seen && {SEEN}.robots.length === {ROBOTS}")
+    views = {robot["name"]: np.reshape(robot["view"], (-1, 3)) for robot in page.evaluate(SEEN)["robots"]}
+    np.testing.assert_allclose(views["tug-3"].min(axis=0), [0.3, -1, -0.4], atol=1e-3)
+    np.testing.assert_allclose(views["tug-3"].max(axis=0), [1.3, 1, 1.1], atol=1e-3)
+    assert np.ptp(views["tug-2"], axis=0)[1] != pytest.approx(2, abs=0.01), "as wide as the survey's camera"
+    assert seen.faults == []
+
+
+def test_a_version_that_is_not_there_is_named(page: Page, served: Served) -> None:
+    opened(page, served, "space", version=99)
+    expect(page.locator(".notice.bad")).to_contain_text("99")

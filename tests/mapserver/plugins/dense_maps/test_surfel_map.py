@@ -1,0 +1,116 @@
+"""Surfels as bytes and back, through the store and its exports, and what is no surfel told by name."""
+
+import struct
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from fleetmap.errors import MapFormatError, NewerFormatError, StateError
+from mapserver import releases
+from mapserver.plugins.dense_maps.surfel_map import LEVELS, TILE_SIZE_M, Surfels, known_surfels, surfels_of
+from mapserver.store import MapStore, Retention
+from support.storage.dense_samples import encode_surfels, save_surfel_draft, wall
+from support.storage.map_samples import save_sample_draft
+
+
+def scattered(count: int = 4000) -> Surfels:
+    rng = np.random.default_rng(5)
+    normals = rng.normal(size=(count, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    points = rng.uniform([-40, -20, -3], [40, 20, 6], (count, 3))
+    levels, greys = rng.integers(0, LEVELS, count).astype(np.uint8), rng.integers(0, 256, count).astype(np.uint8)
+    return Surfels(points.astype(np.float32), normals.astype(np.float32), levels, greys, (-1.5, 0.5, 0.1))
+
+
+def test_bytes_are_the_same_in_any_order_and_give_the_surfels_back() -> None:
+    surfels = scattered()
+    blobs = encode_surfels(surfels)
+    assert blobs == encode_surfels(surfels[np.random.default_rng(1).permutation(len(surfels))])
+    assert len(blobs) == 1 + len(np.unique(np.floor(surfels.points_map[:, :2] / TILE_SIZE_M), axis=0))
+    with_store = {msgspec.json.decode(blobs[0])["tiles"][i]["sha256"]: data for i, data in enumerate(blobs[1:])}
+    assert len(with_store) == len(blobs) - 1
+    assert encode_surfels(Surfels.joined([])) == []
+
+
+def test_a_version_keeps_them_and_gives_those_that_are_near(tmp_path: Path) -> None:
+    surfels = scattered()
+    with MapStore.open(tmp_path, create=True) as store:
+        manifest = store.manifest("lab", save_surfel_draft(store, surfels))
+        found = surfels_of(manifest, store.blob)
+        near = surfels_of(manifest, store.blob, (1.0, 1.0, 2.0))
+    assert (len(found), found.falloff) == (len(surfels), surfels.falloff)
+    order, wanted = (np.lexsort(s.points_map[:, ::-1].round(2).T) for s in (found, surfels))
+    gap = np.linalg.norm(
+        found.points_map[order][:, None, :2] - surfels.points_map[wanted][None, :50, :2], axis=2
+    ).argmin(axis=0)
+    picked, meant = found[order[gap]], surfels[wanted[:50]]
+    np.testing.assert_allclose(picked.points_map, meant.points_map, atol=6e-4)
+    assert (picked.normals * meant.normals).sum(axis=1).min() > np.cos(np.radians(1.0))
+    np.testing.assert_array_equal(picked.levels, meant.levels)
+    np.testing.assert_array_equal(picked.greys, meant.greys)
+    assert 0 < len(near) < len(found)
+    assert (np.abs(near.points_map[:, :2] - 1.0) <= TILE_SIZE_M + 2.0).all()
+
+
+def test_surfels_far_above_or_below_their_tile_are_left_out(tmp_path: Path) -> None:
+    surfels = scattered()
+    stray = surfels[np.array([0, 1])]
+    stray.points_map[:, 2] += [70.0, -70.0]
+    with MapStore.open(tmp_path, create=True) as store:
+        manifest = store.manifest("lab", save_surfel_draft(store, Surfels.joined([surfels, stray])))
+        found = surfels_of(manifest, store.blob)
+    assert len(found) == len(surfels)
+    assert found.points_map[:, 2].min() == pytest.approx(surfels.points_map[:, 2].min(), abs=1e-3)
+    assert found.points_map[:, 2].max() == pytest.approx(surfels.points_map[:, 2].max(), abs=1e-3)
+
+
+def test_they_travel_with_the_archive_and_go_with_their_version(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "a", create=True) as store, MapStore.open(tmp_path / "b", create=True) as other:
+        for level in range(4):
+            save_surfel_draft(store, wall(edge_level=1 + level % 2, grey=100 + level))
+        releases.publish(store, "lab", 1)
+        store.export_version("lab", 1, tmp_path / "v.fmex")
+        store.export_version("lab", 1, tmp_path / "robots.fmex", archive=False)
+        assert (tmp_path / "v.fmex").read_bytes()[4:6] == b"\x03\x00"
+        assert (tmp_path / "robots.fmex").read_bytes()[4:6] == b"\x01\x00"
+        other.import_version(tmp_path / "v.fmex")
+        assert len(known_surfels(other.manifest("lab", 1), other.blob)) == len(wall())
+        index = store.manifest("lab", 1).report["surfels"]["sha256"]
+        assert store.served_kind(index) is None  # robots never get them
+        before = store.verify()
+        removed = store.collect_garbage(Retention(keep_drafts=1, keep_days=0.0)).removed
+        after = store.verify()
+        assert (removed, after.faults) == ([("lab", 2), ("lab", 3)], [])
+        assert before.blobs - after.blobs >= 2 * 3
+
+
+def test_what_is_not_there_or_damaged_is_told(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        bare = store.manifest("lab", save_sample_draft(store))
+        with pytest.raises(StateError, match="surfel_map = true"):
+            surfels_of(bare, store.blob)
+        manifest = store.manifest("lab", save_surfel_draft(store, wall()))
+        blobs = encode_surfels(wall())
+    said = msgspec.structs.replace(manifest, report={"surfels": {"without": {"ride": "one camera measures no depth"}}})
+    with pytest.raises(StateError, match="ride: one camera"):
+        surfels_of(said, {}.__getitem__)
+    with pytest.raises(MapFormatError, match="surfels"):
+        surfels_of(msgspec.structs.replace(manifest, report={"surfels": {"sha256": "x"}}), {}.__getitem__)
+    index = manifest.report["surfels"]["sha256"]
+    with pytest.raises(MapFormatError, match="index of surfels"):
+        surfels_of(manifest, lambda _: b"{}[")
+    newer = blobs[0].replace(b'"format_version":1', b'"format_version":2')
+    with pytest.raises(NewerFormatError, match="format 2"):
+        surfels_of(manifest, lambda _: newer)
+    with pytest.raises(NewerFormatError, match="format 2"):
+        surfels_of(
+            manifest, lambda sha: blobs[0] if sha == index else blobs[1][:4] + struct.pack("<H", 2) + blobs[1][6:]
+        )
+    first = msgspec.json.decode(blobs[0])["tiles"][0]["sha256"]
+    swapped = {index: blobs[0], first: blobs[2]}
+    with pytest.raises(MapFormatError, match="is at the place of"):
+        surfels_of(manifest, lambda sha: swapped.get(sha, blobs[1]))
+    with pytest.raises(MapFormatError, match="surfel tile"):
+        surfels_of(manifest, lambda sha: blobs[0] if sha == index else blobs[1][:40])
