@@ -545,7 +545,7 @@ class InertialMode(WindowMode):
         )
         is_lifted = self._lift.is_lifted(window.stamp_ns, rolled, *moved)
         is_by_imu = self._rig.camera.baseline_m == 0 and window.stamp_ns - self._measured_ns > _BY_IMU_NS
-        return Step(self, used, is_lost=tracked.lost or is_by_imu, is_lifted=is_lifted)
+        return Step(self, used, is_lost=tracked.lost or is_by_imu or monitor.is_in_doubt, is_lifted=is_lifted)
 
     def _lacking_mps(self, seen: Array) -> Array:
         """Speed (3,) in the axes of `odom` that the state lacks for the motion since the last frame, cam_from_previous (4, 4)."""

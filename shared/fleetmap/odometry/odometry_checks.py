@@ -8,6 +8,7 @@ from fleetmap.geometry import Array, rotation_angle_rad
 
 _DISAGREEMENT_RAD = 0.02  # between the rotation of one step by images and by gyro
 _MAX_DISAGREEMENTS = 8  # surplus of disagreeing over agreeing frames, at which the IMU is abandoned
+_DOUBTED = 2  # the same at which nobody knows which of the two is right: one frame may have matched wrongly
 MAX_OFFSET_SIGMAS = 3.0  # a larger time offset is implausible
 _DIVERGED_MPS, _MAX_DIVERGED_FRAMES = 5.0, 3  # from the speed by images, for so many consecutive frames
 
@@ -31,6 +32,11 @@ class DivergenceMonitor:
         is_off = rotation_angle_rad(predicted[:3, :3].T @ seen[:3, :3]) > _DISAGREEMENT_RAD
         self._disagreements = max(self._disagreements + (1 if is_off else -1), 0)
         return self._disagreements >= _MAX_DISAGREEMENTS
+
+    @property
+    def is_in_doubt(self) -> bool:
+        """True while images and gyro contradict each other, and either may be wrong."""
+        return self._disagreements >= _DOUBTED
 
     def is_wrong_start(self, offset_s: float, off_mps: float) -> bool:
         """True if the filter must be initialized again, this frame included; off_mps: difference between its speed and that of the images.

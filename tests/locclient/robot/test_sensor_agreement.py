@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleetmap.geometry import se3, se3_inverse, so3_exp
+from fleetmap.geometry import rotation_angle_rad, se3, se3_inverse, so3_exp
 from fleetmap.messages import Cause, Flag, Status
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample
@@ -154,3 +154,20 @@ def test_an_image_that_is_exchanged_with_one_of_another_view_is_named(store: Map
     assert Status.TRACKING not in {outcome.estimate.status for outcome in outcomes}
     assert "is exchanged with one of another view" in outcomes[-1].estimate.calibration.text
     assert outcomes[-1].estimate.cause is Cause.CALIBRATION
+
+
+def test_while_a_gyro_contradicts_the_images_nobody_knows_which_of_them_is_right(store: MapStore) -> None:
+    """Its sign is reversed in the middle of a turn: one frame may be the images' fault, two are DEGRADED at once."""
+    robot, outcomes = Robot(calibration(), robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL), []
+    robot.use(robot_world.loaded(store))
+    for number, bundle in enumerate(robot_world.bundles(60)):
+        sign = 1.0 if number < 35 else -1.0
+        outcomes.append(robot.handle(replace(bundle, imu=replace(bundle.imu, gyro_radps=sign * bundle.imu.gyro_radps))))
+    off_rad = [
+        rotation_angle_rad(o.estimate.map_from_body[:3, :3].T @ robot_world.truth(n)[:3, :3])
+        for n, o in enumerate(outcomes)
+        if o.estimate.status is Status.TRACKING
+    ]
+    assert max(off_rad) < 0.07
+    assert {o.estimate.status for o in outcomes[25:35]} == {Status.TRACKING}
+    assert any(Flag.IMU_REFUSED in o.left_out for o in outcomes)
