@@ -11,7 +11,7 @@
 #   make core                  build what changed of the compiled core, shared/core, beside the sources; the other verbs do it first
 #   make bench                 all figures of tests/acceptance.toml; many hours (NAMES="joining fleet" for some)
 #   make acceptance            those that no change may make worse; an hour
-#   make study NAME=square     an experiment of docs/studies once more (FRESH=1: from its beginning)
+#   make study NAME=warehouse  an experiment of docs/studies once more (FRESH=1: from its beginning)
 #   make clean                 remove everything that the other verbs made
 
 PYTHON ?= python3
@@ -104,7 +104,7 @@ acceptance: core
 	PYTHONPATH=tests $(BIN)/python tests/acceptance.py $(NAMES)
 
 study: core
-	@test -f "tests/studies/$(NAME).py" || { echo "NAME=one of docs/studies, such as make study NAME=square"; exit 2; }
+	@test -f "tests/studies/$(NAME).py" || { echo "NAME=one of docs/studies, such as make study NAME=warehouse"; exit 2; }
 	PYTHONPATH=tests $(BIN)/python -m studies.$(NAME)
 
 clean:
