@@ -4,6 +4,8 @@
 |---|---|---|
 | `mapserver.commands` | the command | a function as those of `COMMANDS` in `mapserver/cli.py`, in a module that is quick to import |
 | `mapserver.failure_exports` | `--format` of `mapserver fleet export` | a function as `write_json_lines` in `mapserver/fleet/exports.py` |
+| `mapserver.databases` | the scheme of a URL, or `other` | `DatabaseHook` |
+| `mapserver.objects` | the scheme of a URL, or `other` | `ObjectsHook` |
 | `mapserver.parts` | the plug-in | `PartHook` |
 | `mapserver.routes` | the plug-in | `RouteHook` |
 | `mapserver.stages` | the plug-in | `StageHook` |
@@ -13,7 +15,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from fleetmap.cli_options import Command
-from fleetmap.hooks import plugins
+from fleetmap.hooks import plugin, plugins
 
 if TYPE_CHECKING:
     from fleetmap.mapformat.version_file import ExportHead
@@ -28,8 +30,20 @@ StageHook = Callable[[Any], dict[str, Any]]
 """Makes more of a draft's surveys than tiles: of a `ChosenDraft` each `Extra` by the key of its report (`mapserver/drafting/extras.py`)."""
 
 
+ObjectsHook = Callable[[str], Any]
+"""Opens the `Objects` (`mapserver/store/blobs.py`) under a URL."""
+
+DatabaseHook = Callable[..., Any]
+"""Opens the `Database` (`mapserver/store/database.py`) under a URL: of it, the clock in nanoseconds, and `create`: make its tables."""
+
 PartHook = Callable[[Any], None]
 """Adds a part to a server that opens: pages, endpoints, messages of its bus; of a `Host` (`mapserver/dashboard/install.py`)."""
+
+
+def open_url(group: str, url: str, what: str) -> Any:
+    """Return what opens URLs of this scheme, by a hook of stores; UsageError if nothing does."""
+    scheme = url.partition("://")[0]
+    return plugin(group, scheme if scheme in plugins(group) else "other", f"{what} under {scheme}://")
 
 
 def part_hooks() -> dict[str, PartHook]:

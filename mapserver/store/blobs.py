@@ -1,4 +1,4 @@
-"""Bytes in a folder or, by `object_store`, under a URL; and content-addressed bytes in either."""
+"""Bytes in a folder or, by a plug-in, under a URL; and content-addressed bytes in either."""
 
 import hashlib
 import os

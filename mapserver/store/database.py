@@ -1,4 +1,4 @@
-"""The database of an open store: reading, write transactions, the log. Its SQL is the same in SQLite, here, and in `postgres`."""
+"""The database of an open store: reading, write transactions, the log. Its SQL is the same in SQLite, here, and in those of plug-ins."""
 
 import json
 import os

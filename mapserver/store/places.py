@@ -8,6 +8,7 @@ import msgspec
 from fleetmap.encoding import to_json
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.files import write_atomically
+from mapserver.hooks import open_url
 from mapserver.store.blobs import FolderObjects, Objects
 from mapserver.store.database import Database, SqliteDatabase
 
@@ -16,7 +17,7 @@ _FILE = "places.json"
 
 
 class Places(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """content: URL of the object store with tiles, archives and pictures; database: of the PostgreSQL database; None: in the folder."""
+    """content: URL of the object store with tiles, archives and pictures; database: of the database; None: in the folder."""
 
     content: str | None = None
     database: str | None = None
@@ -43,19 +44,16 @@ def open_objects(where: str | Path) -> Objects:
     """Return the objects in a folder or under a URL. Raises StoreError for a URL that cannot be opened."""
     if isinstance(where, Path) or "://" not in where:
         return FolderObjects(Path(where).absolute())
-    from mapserver.store.object_store import BucketObjects  # late: a store in a folder does not need obstore
-
-    return BucketObjects(where)
+    opened: Objects = open_url("mapserver.objects", where, "an object store")(where)
+    return opened
 
 
 def open_database(
     root: Path, places: Places, clock_ns: Callable[[], int], *, create: bool, read_only: bool
 ) -> Database:
-    """Return the database of a store, in its folder or in PostgreSQL; errors as of these."""
+    """Return the database of a store, in its folder or under a URL; errors as of these."""
     if places.database is None:
         return SqliteDatabase(root / DATABASE, clock_ns, read_only=read_only)
-    try:
-        from mapserver.store.postgres import PostgresDatabase
-    except ImportError as error:
-        raise UsageError(f"a database in PostgreSQL needs {error.name}; install fleetmap[server,postgres]") from error
-    return PostgresDatabase(places.database, clock_ns, create=create)
+    opens = open_url("mapserver.databases", places.database, "a store's database")
+    opened: Database = opens(places.database, clock_ns, create=create)
+    return opened

@@ -9,6 +9,7 @@ import httpx
 import pytest
 from playwright.sync_api import Page, expect
 
+import mapserver
 from mapserver.store.places import Places, write_places
 from support.command_line import status as status_of
 from support.fleet.dashboard_scene import ROBOTS, Served, fill_store, serving, talking
@@ -16,6 +17,7 @@ from support.pages.browser import Chromium, running_chromium
 from support.storage.postgres_server import PostgresServer, postgres_server
 from support.storage.s3_server import KEYS, s3_server
 
+HAS_REMOTE = (Path(mapserver.__path__[0]) / "plugins" / "remote_stores").is_dir()
 expect.set_options(timeout=30_000)  # a busy machine answers late
 
 
@@ -53,7 +55,7 @@ def postgres() -> Iterator[PostgresServer]:
         yield server
 
 
-@pytest.fixture(params=["folder", "s3", "postgres"])
+@pytest.fixture(params=["folder", *(("s3", "postgres") if HAS_REMOTE else ())])
 def store_folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """The folder of a new store, whose content is there or in S3, and its metadata there or in PostgreSQL."""
     folder = tmp_path / "store"
@@ -65,7 +67,7 @@ def store_folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.fixture(params=["sqlite", "postgres"])
+@pytest.fixture(params=["sqlite", *(("postgres",) if HAS_REMOTE else ())])
 def metadata_folder(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     """The folder of a new store, whose metadata is there or in PostgreSQL."""
     if request.param == "postgres":

@@ -12,9 +12,9 @@ from fleetmap.geometry import Array
 from fleetmap.relocalization.map_view import MapView
 from mapserver.drafting.draft_evidence import PROBES
 from mapserver.drafting.worker import single_threaded_libraries
-from mapserver.fleet_statistics.day_rate import Stratum, day_rate
 from mapserver.fleet_statistics.kpis import ROBOT_DAY_S, Counters, format_rate, rate
 from mapserver.floor_plan.areas import Areas
+from mapserver.plugins.acceptance.day_rate import Stratum, day_rate
 from mapserver.plugins.acceptance.document import drawn
 from mapserver.plugins.acceptance.drives import Drive, DriveRequest, MapUnderTest, checked, examined, replayed
 from mapserver.plugins.acceptance.figures import UNKNOWN_PLACE, AreaFigures, Count, Incidents, Report, Similar

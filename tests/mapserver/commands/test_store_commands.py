@@ -10,7 +10,6 @@ import pytest
 from fleetmap.mapformat import blob_path
 from mapserver.store import MapStore
 from support.storage.map_samples import publish_samples, save_sample_draft
-from support.storage.postgres_server import PostgresServer
 
 
 def test_a_life_of_versions(run, tmp_path: Path) -> None:
@@ -46,33 +45,6 @@ def test_a_life_of_versions(run, tmp_path: Path) -> None:
     assert json.loads(run("gc", *in_store, "--keep-drafts", 0, "--keep-days", 0, "--json"))["removed"] == [["lab", 3]]
     assert "no draft" in run("publish", *where, status=2)
     assert "clean" in run("verify", *in_store)
-
-
-def test_content_goes_where_attach_says(run, tmp_path: Path, s3: str) -> None:
-    with MapStore.open(tmp_path / "store", create=True) as store:
-        save_sample_draft(store)
-    assert s3 in run("attach", "--store", tmp_path / "store", "--content", s3)
-    (tmp_path / "store" / "blobs").rename(tmp_path / "not used any more")
-    assert "clean" in run("verify", "--store", tmp_path / "store")
-    (tmp_path / "store" / "places.json").write_text('{"contents": "s3://typing-error"}')
-    assert "places.json" in run("verify", "--store", tmp_path / "store", status=2)
-
-
-@pytest.mark.parametrize(
-    "url", ["s3://key:secret@a/b", "s3://secret@a/b", "s3://a/b?aws_secret_access_key=secret", "s3://a#secret"]
-)
-def test_a_secret_in_a_url_is_not_shown(run, tmp_path: Path, url: str) -> None:
-    MapStore.open(tmp_path / "store", create=True).close()
-    for command in (("attach", "--content", url), ("backup", url)):
-        told = run(*command, "--store", tmp_path / "store", status=2)
-        assert "AWS_SECRET_ACCESS_KEY" in told
-        assert "secret" not in told
-
-
-def test_the_password_of_a_database_is_not_shown(run, tmp_path: Path, postgres: PostgresServer) -> None:
-    url = postgres.database().replace("fleet@", "fleet:secret@")
-    MapStore.open(tmp_path / "store", create=True).close()
-    assert "secret" not in run("attach", "--store", tmp_path / "store", "--database", url)
 
 
 def test_verify_ends_with_a_status_of_its_own(run, tmp_path: Path) -> None:

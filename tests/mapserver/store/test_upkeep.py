@@ -4,7 +4,6 @@ import os
 import shutil
 import subprocess
 import sys
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -13,15 +12,10 @@ import pytest
 from fleetmap.errors import FleetmapError, MapFormatError, StateError, StoreError
 from fleetmap.mapformat import current_path
 from mapserver import releases
-from mapserver.plugins.backups.backup import back_up
-from mapserver.plugins.backups.restore import restore
-from mapserver.plugins.backups.snapshots import BackupTarget
-from mapserver.store import Actor, MapStore, Retention, chain_faults, object_store
-from mapserver.store.blobs import Blobs
-from mapserver.store.places import Places, open_objects, read_places
+from mapserver.store import Actor, MapStore, Retention, chain_faults
+from mapserver.store.places import read_places
 from support.storage.clock import Clock
 from support.storage.map_samples import publish_samples, save_sample_draft
-from support.storage.postgres_server import PostgresServer
 from support.storage.s3_server import Content
 
 ADA = Actor("ada", "a test")
@@ -206,68 +200,3 @@ def test_days_until_the_disk_is_full_are_known_after_a_day(
     assert (found.grows_bytes_per_day, found.days_left) == (0.0, None)
     clock.now_ns -= 3600 * 10**9
     assert store.disk_space().grows_bytes_per_day is None, "the clock was set back"
-
-
-def test_a_store_moves_out_of_its_folder_and_back(tmp_path: Path, s3: str, postgres: PostgresServer) -> None:
-    folder, database = tmp_path / "store", postgres.database()
-    with MapStore.open(folder, create=True) as store:
-        publish_samples(store, 2)
-        store.record_robot_report("lab", "r1", {"note": "caf\u00e9"}, 2)
-        tile, log = store.manifest("lab", 2).tiles[0].sha256, store.audit_lines()
-        data = store.blob(tile)
-    with pytest.raises(StoreError, match="credentials"):
-        MapStore.attach(folder, Places("s3://no-bucket-of-this-name"))
-    assert read_places(folder) == Places()
-    assert MapStore.attach(folder, Places(s3)) > 0
-    assert MapStore.attach(folder, Places(f"{s3}-2", database)) > 0
-    shutil.rmtree(folder / "blobs")
-    with pytest.raises(StoreError, match="holds no map store"):
-        MapStore.attach(tmp_path / "second", Places(s3, postgres.database()))
-    MapStore.attach(tmp_path / "second", Places(f"{s3}-2", database))
-    with MapStore.open(folder) as store, MapStore.open(tmp_path / "second") as second:
-        assert (store.audit_lines(), store.robots("lab")[0].last_report) == (log, {"note": "caf\u00e9"})
-        publish_samples(second, 1)
-        job = second.begin_job("lab", "build")
-        second.tell_progress(job, {"stage": "bundle"})
-        assert [info.state for info in store.versions("lab")] == ["published", "published", "current"]
-        assert store.verify().faults == chain_faults(store.audit_lines()) == []
-        back_up(store, target := BackupTarget(f"{s3}-backup", create=True))
-    restore(target, tmp_path / "restored", ADA)
-    with MapStore.open(tmp_path / "restored") as restored:
-        assert restored.verify().faults == []
-        assert chain_faults(restored.audit_lines()) == []
-        assert (restored.blob(tile), restored.jobs()[0].report) == (data, {"progress": {"stage": "bundle"}})
-        restored.update_job(job, "failed", "the server is gone", {})
-    with pytest.raises(StoreError, match="holds a store already"):
-        MapStore.attach(tmp_path / "restored", Places(None, database))
-
-
-def test_damaged_content_is_not_moved(store: MapStore, s3: str) -> None:
-    publish_samples(store, 1)
-    tile, folder, other = store.manifest("lab", 1).tiles[0].sha256, store.folder, f"{s3}-other"
-    Content(store).write(tile, store.blob(tile)[:-1] + b"?")
-    with pytest.raises(MapFormatError, match=tile):
-        MapStore.attach(folder, Places(other))
-    Content(store).remove(tile)
-    with pytest.raises(StoreError, match=f"{tile} is missing"):
-        MapStore.attach(folder, Places(other))
-    assert tile not in Blobs(open_objects(other)).sizes()
-    assert read_places(folder).content != other
-
-
-def test_an_object_store_that_does_not_answer_is_no_damage(
-    tmp_path: Path, s3: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with MapStore.open(tmp_path / "store", create=True) as store:
-        publish_samples(store, 1)
-    MapStore.attach(tmp_path / "store", Places(s3))
-    monkeypatch.setenv("AWS_ENDPOINT_URL", "http://127.0.0.1:9")
-    monkeypatch.setattr(object_store, "from_url", partial(object_store.from_url, retry_config={"max_retries": 0}))
-    with MapStore.open(tmp_path / "store") as store:
-        with pytest.raises(StoreError, match="credentials"):
-            store.verify()
-        with pytest.raises(StoreError, match="credentials"):
-            back_up(store, BackupTarget(str(tmp_path / "backups"), create=True))
-        with pytest.raises(StoreError, match="credentials"):
-            save_sample_draft(store)
-        assert store.current("lab").version == 1

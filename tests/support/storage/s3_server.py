@@ -7,12 +7,9 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-import obstore
-
 from fleetmap.mapformat import blob_path
 from mapserver.store import MapStore
-from mapserver.store.object_store import open_objects
-from mapserver.store.places import read_places
+from mapserver.store.places import open_objects, read_places
 
 KEYS = {"AWS_ACCESS_KEY_ID": "accesskey", "AWS_SECRET_ACCESS_KEY": "secretkey", "AWS_REGION": "us-east-1"}
 
@@ -45,15 +42,15 @@ class Content:
         if self._url is None:
             (self._root / blob_path(sha256)).write_bytes(data)
         else:
-            obstore.put(open_objects(self._url), blob_path(sha256), data)
+            open_objects(self._url).put(blob_path(sha256), [data])
 
     def remove(self, sha256: str) -> None:
         if self._url is None:
             (self._root / blob_path(sha256)).unlink()
         else:
-            obstore.delete(open_objects(self._url), blob_path(sha256))
+            open_objects(self._url).remove(blob_path(sha256))
 
     def count(self) -> int:
         if self._url is None:
             return sum(1 for _ in (self._root / "blobs").glob("??/*"))
-        return sum(len(batch) for batch in obstore.list(open_objects(self._url), "blobs"))
+        return sum(1 for _ in open_objects(self._url).listed("blobs"))

@@ -15,11 +15,12 @@ from fleetmap.access import Access, Holder
 from fleetmap.errors import BusyError, NewerFormatError, StoreError, UsageError
 from fleetmap.messages import RobotHealth
 from mapserver.fleet.fleet import Fleet
+from mapserver.plugins.remote_stores import postgres as postgres_module
+from mapserver.plugins.remote_stores.postgres import PostgresDatabase, Session
 from mapserver.serving.bus_access import BusGuard
-from mapserver.store import MapStore, chain_faults, postgres
+from mapserver.store import MapStore, chain_faults
 from mapserver.store.database import Database
 from mapserver.store.places import Places, read_places, write_places
-from mapserver.store.postgres import PostgresDatabase, Session
 from mapserver.store.schema import FORMAT
 from mapserver.trust import SignedLists, init_here
 from mapserver.trust.authorities import Authorities
@@ -258,7 +259,7 @@ def test_all_writers_get_their_turn(folders: tuple[Path, Path]) -> None:
 def test_who_waited_in_vain_for_its_turn_leaves_no_transaction(
     folders: tuple[Path, Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(postgres, "_OPTIONS", f"{postgres._OPTIONS} -c lock_timeout=100ms")
+    monkeypatch.setattr(postgres_module, "_OPTIONS", f"{postgres_module._OPTIONS} -c lock_timeout=100ms")
     with MapStore.open(folders[0]) as store, MapStore.open(folders[1]) as other:
         with store._database.write(), pytest.raises(StoreError, match="lock timeout"):
             other.audit("note", "in vain")
