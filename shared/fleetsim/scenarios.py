@@ -1,6 +1,9 @@
 """The scenarios, smallest first. To add one: a line in SCENARIOS."""
 
 from dataclasses import dataclass, replace
+from math import pi
+
+import msgspec
 
 from fleetmap.errors import UsageError
 from fleetsim.motion.routes import Route
@@ -150,6 +153,15 @@ def _identical() -> Scenario:
     return Scenario("six aisles that look the same until stock is moved: aliasing", layout, runs)
 
 
+def _marker_loop() -> Scenario:
+    """Distances between its two markers give the scale of a survey."""
+    loop = _small_loop()
+    (x_m, end_m), (y0, y1) = (0.02, loop.layout.length_m - 0.02), (loop.layout.aisle_y_m(aisle) for aisle in (0, 1))
+    markers = ((1, end_m, y0 - 1.0, 1.0, pi), (2, x_m, y1 + 1.0, 1.0, 0.0))
+    layout = msgspec.structs.replace(loop.layout, markers=markers)
+    return replace(loop, description="the small loop with a marker at each end", layout=layout)
+
+
 def _marked_ends() -> Scenario:
     alike = _identical()
     marked = Layout(aisles=6, bays=8, are_aisles_identical=True)
@@ -197,6 +209,7 @@ SCENARIOS = {
     "clip": _clip,
     "small-loop": _small_loop,
     "faults": _faulty,
+    "marker-loop": _marker_loop,
     "five-aisles": _five_aisles,
     "busy": _busy,
     "identical-aisles": _identical,

@@ -2,10 +2,13 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from fleetsim.scene.faces import MATERIAL_FLOOR, MATERIAL_LAMP, NO_BOTTOM, FaceBuilder, Surface
 from fleetsim.scene.layout import Layout, Rectangle
 from fleetsim.scene.stock import mix
 from fleetsim.textures.atlas import TEXEL_M
+from fleetsim.textures.painting import MARGIN_SHARE
 from fleetsim.textures.texture_set import Textures
 
 GROUP_DAY, GROUP_NIGHT, GROUP_SKY = 0, 1, 2  # lamp groups that are switched together
@@ -54,6 +57,7 @@ class HallMaker:
                 self._add_dock(builder, row)
         self._add_columns(builder, column, row)
         self._add_signs(builder, column, row)
+        self._add_markers(builder, column, row)
 
     def lamps(self, column: int, row: int) -> list[Lamp]:
         """The light sources in the chunk."""
@@ -197,6 +201,16 @@ class HallMaker:
                 for dx, dy, span, height, poster in plates:
                     plate = Surface(textures.posters[poster % len(textures.posters)], scramble=scramble)
                     builder.add_quad((x + dx, y + dy, height), (0, span, 0), (0, 0, -0.4), plate)
+
+    def _add_markers(self, builder: FaceBuilder, column: int, row: int) -> None:
+        """AprilTags with their white margin."""
+        half = self._layout.marker_m / 2 * (1 + 2 * MARGIN_SHARE)
+        for number, x, y, z, yaw_rad in self._layout.markers:
+            if self._layout.chunk_at(x, y) == (column, row):
+                right_x, right_y = -np.sin(yaw_rad) * half, np.cos(yaw_rad) * half
+                edge = (2 * right_x, 2 * right_y, 0.0)
+                surface = Surface(self._textures.markers[number])
+                builder.add_quad((x - right_x, y - right_y, z + half), edge, (0.0, 0.0, -2 * half), surface)
 
     def _add_signs(self, builder: FaceBuilder, column: int, row: int) -> None:
         """The aisle's number, hanging over both of its mouths."""

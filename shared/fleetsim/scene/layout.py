@@ -16,7 +16,8 @@ class Layout(Section, frozen=True):
 
     has_landmarks: posters, columns with signs, marked docks, all different. are_aisles_identical: stock, labels and
     floor repeat from aisle to aisle (until a slot is restocked), so that only geometry and context tell them apart.
-    restock_per_day: share of slots. moved_rows: rack rows that deviate from the plan: number, and metres along y.
+    restock_per_day: share of slots. moved_rows: rack rows that deviate from the plan: number, and metres along y. markers: AprilTags
+    (36h11) of marker_m: number, x, y, z of the middle, and yaw of the direction that they face.
     """
 
     aisles: int = 3
@@ -31,8 +32,10 @@ class Layout(Section, frozen=True):
     restock_per_day: float = 0.125
     empty_share: float = 0.1
     moved_rows: tuple[tuple[int, float], ...] = ()
+    markers: tuple[tuple[int, float, float, float, float], ...] = ()
 
     bay_m: ClassVar[float] = 2.7
+    marker_m: ClassVar[float] = 0.2
     rack_depth_m: ClassVar[float] = 1.1
     margin_m: ClassVar[float] = 1.0
     ceiling_m: ClassVar[float] = 7.5

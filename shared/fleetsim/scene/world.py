@@ -64,7 +64,9 @@ class World:
         self, layout: Layout, *, seed: int = 0, day: int = 0, workers: ThreadPoolExecutor | None = None
     ) -> None:
         self.layout, self.seed, self.day = layout, seed, day
-        self.textures = paint_textures(seed, layout.aisles, are_aisles_identical=layout.are_aisles_identical)
+        tags = tuple(sorted({marker[0] for marker in layout.markers}))
+        alike = layout.are_aisles_identical
+        self.textures = paint_textures(seed, layout.aisles, are_aisles_identical=alike, markers=tags)
         self._workers = workers
         self._hall = HallMaker(layout, self.textures, seed)
         self._racks = RackMaker(layout, self.textures, seed, day)

@@ -1,5 +1,6 @@
 """Painters of single textures: goods, signs, steel, concrete. Grey 0..255; 128 is neutral for overlays."""
 
+import cv2
 import numpy as np
 
 from fleetsim.textures.atlas import TEXEL_M
@@ -121,6 +122,17 @@ def rack_label(rng: np.random.Generator, text: str) -> Texture:
     write_barcode(image, rng, 56, 2, 70, 28)
     write_text(image, 3, 22, random_word(rng, 6), 1, 60)
     return image
+
+
+MARGIN_SHARE = 1 / 6  # of an AprilTag's side, white on each side of it
+
+
+def april_tag(number: int, side: int = 256) -> Texture:
+    """AprilTag of the family 36h11 with its white margin."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
+    margin = side // 8
+    tag = cv2.aruco.generateImageMarker(dictionary, number, side - 2 * margin)
+    return np.pad(np.minimum(tag, 225) + 15, margin, constant_values=240).astype(np.float32)
 
 
 def perforated_steel(rng: np.random.Generator) -> Texture:

@@ -39,8 +39,8 @@ def _paint_skus(rng: np.random.Generator, atlas: AtlasBuilder) -> tuple[Sku, ...
 class Textures:
     """Numbers of a site's textures in `atlas`, painted from its seed. `stretched` are those that fill a face of any size."""
 
-    def __init__(self, seed: int, aisles: int, *, are_aisles_identical: bool) -> None:
-        """Identical aisles all carry the same sign and rack labels."""
+    def __init__(self, seed: int, aisles: int, *, are_aisles_identical: bool, markers: tuple[int, ...] = ()) -> None:
+        """Identical aisles all carry the same sign and rack labels. markers: numbers of AprilTags."""
         rng, atlas = np.random.default_rng([seed, 1]), AtlasBuilder()
         add = atlas.add
         self.dirt = add(128 + 9 * noise(rng, 1024, range(2, 7), 0.85) + 5 * noise(rng, 1024, range(7, 9), 0.9))
@@ -67,13 +67,24 @@ class Textures:
         else:
             self.signs = tuple(add(painting.aisle_sign(rng, f"A{aisle + 1}")) for aisle in range(aisles))
             self.rack_labels = tuple(add(painting.rack_label(rng, f"{slot:04d}")) for slot in range(RACK_LABELS))
+        self.markers = {number: add(painting.april_tag(number)) for number in markers}
         self.stretched = frozenset(
-            (*self.posters, *self.signs, *self.labels, *self.rack_labels, self.vest, *self.cloth)
+            (
+                *self.markers.values(),
+                *self.posters,
+                *self.signs,
+                *self.labels,
+                *self.rack_labels,
+                self.vest,
+                *self.cloth,
+            )
         )
         self.atlas = atlas.finish()
 
 
 @lru_cache(maxsize=4)
-def paint_textures(seed: int, aisles: int, *, are_aisles_identical: bool = False) -> Textures:
+def paint_textures(
+    seed: int, aisles: int, *, are_aisles_identical: bool = False, markers: tuple[int, ...] = ()
+) -> Textures:
     """Every texture of a site with `aisles` aisles, painted once for all days and robots of the site; read-only."""
-    return Textures(seed, aisles, are_aisles_identical=are_aisles_identical)
+    return Textures(seed, aisles, are_aisles_identical=are_aisles_identical, markers=markers)
