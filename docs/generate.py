@@ -21,7 +21,7 @@ import typer  # noqa: E402
 
 from fleetmap.config import Section, Tiers, settings_in, tier_of  # noqa: E402
 from locclient.config import with_plugins  # noqa: E402
-from locclient.hooks import link_hooks  # noqa: E402
+from locclient.hooks import link_hooks, prior_hooks  # noqa: E402
 from mapserver.config import TIERS as MAPSERVER_TIERS  # noqa: E402
 from mapserver.config import MapserverConfig  # noqa: E402
 from mapserver.hooks import command_hooks  # noqa: E402
@@ -134,7 +134,7 @@ def settings_page(page: str, plugin: str | None = None) -> str:
         for program, (config, tiers) in PROGRAMS.items()
         for setting in settings_in(config)
         if (tier := tier_of(setting, tiers)) is not None
-        and (setting.section == plugin if plugin else setting.section not in link_hooks())
+        and (setting.section == plugin if plugin else setting.section not in link_hooks() | prior_hooks())
     }
     seen = set()
     parts, tier = re.split(r"^(?=###? )", page, flags=re.MULTILINE), ""

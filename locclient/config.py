@@ -7,13 +7,16 @@ import msgspec
 
 from fleetmap.cli_options import Commands, Options, command_defaults, file_type
 from fleetmap.config import Section, Tiers, read_given, refuse_internal
+from fleetmap.geometry import Array
 from fleetmap.recordings import Topics
+from fleetmap.sensors.rectification import MountedCamera
 from fleetmap.sensors.source_settings import SourceSection
-from locclient.hooks import LinkHook, link_hooks
+from locclient.hooks import LinkHook, link_hooks, prior_hooks
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import TileSelectionSettings
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
 from locclient.output_section import OutputSection
+from locclient.robot.robot import ImagePriors
 from locclient.robot.version_trial import TrialSettings
 
 TIERS = {
@@ -97,7 +100,7 @@ def read_config(path: Path | None, commands: Commands) -> tuple[LocclientConfig,
 
 def with_plugins() -> tuple[LocclientConfig, Tiers]:
     """Return the defaults of the whole file, with the sections of the installed plug-ins, and the tiers of its keys."""
-    sections = [(name, hook.section, hook.section()) for name, hook in link_hooks().items()]
+    sections = [(name, hook.section, hook.section()) for name, hook in (link_hooks() | prior_hooks()).items()]
     kind: type[LocclientConfig] = msgspec.defstruct(  # type: ignore[assignment]
         "Config", sections, bases=(LocclientConfig,), frozen=True, kw_only=True
     )
@@ -108,6 +111,13 @@ def links_of(config: LocclientConfig) -> list[tuple[LinkHook, Section]]:
     """Return the links that the file asks for, with their sections."""
     sections = ((hook, getattr(config, name, None)) for name, hook in link_hooks().items())
     return [(hook, section) for hook, section in sections if section is not None and hook.is_on(section)]
+
+
+def image_priors_of(config: LocclientConfig, mounted: MountedCamera, base_from_body: Array) -> list[ImagePriors]:
+    """Open the priors by images that the file asks for; UsageError for invalid settings."""
+    sections = ((hook, getattr(config, name, None)) for name, hook in prior_hooks().items())
+    opened = (hook.open(section, mounted, base_from_body) for hook, section in sections if section is not None)
+    return [prior for prior in opened if prior is not None]
 
 
 def with_common(given: dict[str, Any]) -> dict[str, Any]:

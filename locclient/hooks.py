@@ -3,6 +3,7 @@
 | group | registered by the name of | as |
 |---|---|---|
 | `locclient.links` | its section in the configuration file | `LinkHook` |
+| `locclient.priors` | its section in the configuration file | `PriorHook` |
 | `locclient.sources` | `[source] kind` | a function as those of `SOURCES` in `fleetmap/sources/source.py` |
 | `locclient.outputs` | `[output] format` | `OutputHook` |
 | `locclient.run_exports` | `locclient replay`'s option | a function of a path that opens a `RunExport` of `locclient/replay/replay.py` |
@@ -20,12 +21,14 @@ from fleetmap.messages import WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient.identity import MapAddress
 from locclient.maps.tile_cache import TileCache
-from locclient.robot.robot import Outcome
+from locclient.robot.robot import ImagePriors, Outcome
 from locclient.robot.version_trial import VersionChange
 
 if TYPE_CHECKING:
     from fleetmap.bus import Bus
+    from fleetmap.geometry import Array
     from fleetmap.sensors.calibration import RigCalibration
+    from fleetmap.sensors.rectification import MountedCamera
     from fleetmap.sensors.source_settings import Topics
     from fleetmap.sources.intake import Intake
     from locclient.output_section import OutputSection
@@ -94,6 +97,23 @@ class OutputHook:
     open: "Callable[[OutputSection, Bus, str, str, RigCalibration, Intake], Publisher]"
     check: "Callable[[OutputSection, Topics], None]"
     connect: "Callable[[str], Bus]"
+
+
+@dataclass(frozen=True)
+class PriorHook:
+    """What tells a robot its place by its images. section: all its keys may be set.
+
+    open: by the section, the rig's first camera, and base_from_body (4, 4); None if the section does not ask for it. UsageError for
+    invalid settings.
+    """
+
+    section: type[Section]
+    open: "Callable[[Any, MountedCamera, Array], ImagePriors | None]"
+
+
+def prior_hooks() -> dict[str, PriorHook]:
+    """Return the installed priors by their sections' names."""
+    return plugins("locclient.priors")
 
 
 def link_hooks() -> dict[str, LinkHook]:

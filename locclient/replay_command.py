@@ -2,6 +2,7 @@
 
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -194,6 +195,7 @@ def _run(
     from fleetmap.recordings import FrameSelection, OpenOptions, named_topics, open_recording
     from fleetmap.recordings.sensor_subset import named_sensor_set, reduced
     from fleetmap.sources.replay_source import ReplaySource
+    from locclient.config import image_priors_of
     from locclient.maps.connection import connected
     from locclient.prior_option import parse_prior
     from locclient.replay.replay import ReplayOptions, load_map
@@ -217,7 +219,8 @@ def _run(
             for issue in recording.issues:
                 console.print(f"note: {issue.what}: {issue.detail}".rstrip(": "))
             task = bar.add_task("replay", total=len(source))
-            options = ReplayOptions(settings.localizer, playback.realtime, lambda _: bar.advance(task), export)
+            how = settings.localizer, playback.realtime, lambda _: bar.advance(task), export
+            options = ReplayOptions(*how, partial(image_priors_of, settings))
             result = play(source, connection, options, prior)
         report, anew = result.report, []
         if playback.starts:

@@ -20,7 +20,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import open_source
-from locclient.config import LocclientConfig, RunSection, links_of
+from locclient.config import LocclientConfig, RunSection, image_priors_of, links_of
 from locclient.daemon.publishers import output_of
 from locclient.daemon.runtime import RuntimeParts
 from locclient.daemon.server_sync import ServerSync
@@ -122,7 +122,15 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         stack.enter_context(gc_frozen())
         maps, first, caches, server = _local_map(run, site) if bus is None else _server_map(run, address, bus, outbox)
         keeps_replay = server is not None and not is_alone and run.replays != "off"
-        robot = Robot(calibration, rectifier, config.localizer, run.trial, time.thread_time, keeps_replay=keeps_replay)
+        robot = Robot(
+            calibration,
+            rectifier,
+            config.localizer,
+            run.trial,
+            time.thread_time,
+            keeps_replay=keeps_replay,
+            image_priors=image_priors_of(config, rectifier.mounted[0], calibration.base_from_body),
+        )
         if prior is not None:
             robot.localizer.handle_prior(prior)
         publisher = _opened_publisher(stack, config, address, None if is_alone else bus, calibration, intake)

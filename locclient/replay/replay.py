@@ -2,7 +2,7 @@
 
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,7 +17,7 @@ from fleetmap.geometry import Array, rotation_angle_rad
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording
 from fleetmap.recordings.sensor_subset import reduced
 from fleetmap.sensors.lens_fit import lens_of_frames
-from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.rectification import MountedCamera, Rectifier
 from fleetmap.sensors.samples import CameraFrame, PositionPrior, SensorSet
 from fleetmap.sources.replay_source import ReplaySource
 from fleetmap.sources.sensor_bundle import SensorBundle
@@ -31,7 +31,7 @@ from locclient.replay.run_metrics import FrameRecord
 from locclient.replay.run_result import ReplayResult
 from locclient.robot.failure_report import RobotProfile
 from locclient.robot.gc_freeze import gc_frozen
-from locclient.robot.robot import Outcome, Robot
+from locclient.robot.robot import ImagePriors, Outcome, Robot
 from locclient.robot.version_trial import TrialSettings
 
 _ENDPOINT = re.compile(r"(tcp|tls|udp|quic|ws|unixsock-stream)/")
@@ -50,12 +50,14 @@ class RunExport(Protocol):
 
 @dataclass(frozen=True)
 class ReplayOptions:
-    """Settings of the localizer, playback at recorded speed, progress callback with the number of each frame, export file."""
+    """Settings of the localizer, playback at recorded speed, progress callback with the number of each frame, export file;
+    open_priors: as of `PriorHook.open`."""
 
     settings: LocalizerSettings = field(default_factory=LocalizerSettings)
     realtime: bool = False
     progress: Callable[[int], None] = lambda _: None
     export: RunExport | None = None
+    open_priors: Callable[[MountedCamera, Array], Sequence[ImagePriors]] = lambda *_: ()
 
 
 def load_map(source: MapSource) -> tuple[LoadedMap, FetchedTiles, str]:
@@ -87,7 +89,10 @@ def replay(
     cv2.setNumThreads(1)  # one thread, so that figures are those of one core
     loaded, tiles, note = load_map(connection.source)
     rectifier = Rectifier(source.calibration, has_depth=source.recording.sensor_set is SensorSet.RGBD)
-    robot = Robot(source.calibration, rectifier, options.settings, TrialSettings(), time.process_time)
+    found = options.open_priors(rectifier.mounted[0], source.calibration.base_from_body)
+    robot = Robot(
+        source.calibration, rectifier, options.settings, TrialSettings(), time.process_time, image_priors=found
+    )
     robot.use(loaded)
     give_back_free_memory()
     if prior is not None:

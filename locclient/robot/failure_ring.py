@@ -124,6 +124,10 @@ class FailureRing:
             self._commands.priors.clear()
         self._commands.priors.extend(bundle.priors)
 
+    def handle_prior(self, prior: PositionPrior) -> None:
+        """Add a prior by the images of the next frame."""
+        self._commands.priors.append(prior)
+
     def handle(
         self,
         percept: Percept,

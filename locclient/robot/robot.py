@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 from fleetmap.failure_definition import may_be_mapped, radius_95_m
 from fleetmap.geometry import Array
@@ -11,6 +12,7 @@ from fleetmap.messages import Cause, Flag, PoseMessage, Status
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
+from fleetmap.sensors.samples import PositionPrior
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
@@ -80,6 +82,16 @@ class Outcome:
         return PoseMessage.of(estimate.stamp_ns, map_from_base, cov, estimate.status, estimate.map_version)
 
 
+class ImagePriors(Protocol):
+    """Tells a robot its place by its images, as a plug-in."""
+
+    def priors(self, frame: RectifiedFrame) -> list[PositionPrior]:
+        """Return what a frame tells, before it is localized."""
+
+    def judge(self, estimate: Estimate) -> str:
+        """Compare what the frame told with its estimate; return a text that names what is left out from now on, empty for nothing."""
+
+
 class Robot:
     """Feeds sensor bundles and maps to the localizer and keeps two versions while one of them is on trial."""
 
@@ -92,9 +104,10 @@ class Robot:
         clock_s: Clock = lambda: 0.0,
         *,
         keeps_replay: bool = False,
+        image_priors: Sequence[ImagePriors] = (),
     ) -> None:
         """clock_s: measures CPU time; the default measures nothing. keeps_replay: record the seconds around a failure."""
-        self._rectifier, self._clock_s = rectifier, clock_s
+        self._rectifier, self._clock_s, self._image_priors = rectifier, clock_s, image_priors
         self.base_from_body = calibration.base_from_body
         mounting = (rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s)
         self.localizer = Localizer(calibration, *mounting, settings, clock_s, rectifier.mounted[1:])
@@ -181,7 +194,13 @@ class Robot:
         rectified_s = self._clock_s()
         if self.localizer.perception.awaits(frame):
             return None
+        for prior in [prior for source in self._image_priors for prior in source.priors(frame)]:
+            self.localizer.handle_prior(prior)
+            if self.ring is not None:
+                self.ring.handle_prior(prior)
         estimate = self.localizer.handle_stereo(frame)
+        moved = "; ".join(filter(None, (source.judge(estimate) for source in self._image_priors)))
+        refused = {Flag.PRIOR_REFUSED: moved} if moved else {}
         cpu_s = self._clock_s() - begun_s
         self._load.handle(estimate.stamp_ns, bundle.dropped)
         is_open = estimate.status is not Status.TRACKING and estimate.map_version is not None
@@ -211,7 +230,7 @@ class Robot:
         dock_error_m = self._docks.handle(bundle.priors, estimate)
         return Outcome(
             estimate, published, cpu_s, stage_s, context, dock_error_m, speed_mps, is_covered,
-            {**self._left_out(), **bundle.left_out}, self._load.dropped_share,
+            {**self._left_out(), **refused, **bundle.left_out}, self._load.dropped_share,
         )  # fmt: skip
 
     def _left_out(self) -> dict[Flag, str]:

@@ -94,6 +94,7 @@ class Flag(StrEnum):
     WHEELS_UNMOUNTED = "wheels_unmounted"
     IMAGES_REFUSED = "images_refused"
     OVERLOADED = "overloaded"
+    PRIOR_REFUSED = "prior_refused"
 
 
 class FailureKind(StrEnum):

@@ -1,4 +1,4 @@
-"""Prior source of what others tell a robot: docks, zones, markers, an operator, a fleet manager. Pure."""
+"""Prior source of what others tell a robot: docks, zones, an operator, a fleet manager. Pure."""
 
 from collections.abc import Mapping
 from dataclasses import replace

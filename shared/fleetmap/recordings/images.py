@@ -22,7 +22,7 @@ from fleetmap.sensors.samples import CameraFrame, Image
 _PNM = re.compile(rb"P[1-6](?:\s+|#[^\n]{0,1000}\n){1,20}(\d{1,10})(?:\s+|#[^\n]{0,1000}\n){1,20}(\d{1,10})[\s#]")
 # start of frame; not tables, extensions, arithmetic conditioning
 _JPEG_SIZES = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
-_JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}  # markers without a length
+_JPEG_ALONE = {0x01, *range(0xD0, 0xD9)}  # segments without a length
 _TIFF_KINDS = {1: "B", 3: "H", 4: "I"}  # byte, short, long
 _TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
 _THREADS = max(os.cpu_count() or 1, 2)  # a survey reads its parts in parallel

@@ -278,8 +278,10 @@ def run_localizer(
     session: EstimatorSession, view: MapView, prior: PositionPrior | None = None, frames: int | None = None, *,
     has_wheels: bool = False, settings: LocalizerSettings = SETTINGS, until: Callable[[Estimate], bool] = lambda _: False,
     lookalikes: LookAlikes | None = None, others: Sequence[EstimatorSession] = (),
+    priors: Callable[[int], Sequence[PositionPrior]] = lambda _: (),
 ) -> list[Estimate]:  # fmt: skip
-    """The localizer's estimates over a session in a map; the last one is that for which `until` holds. others: the rig's other views."""
+    """The localizer's estimates over a session in a map; the last one is that for which `until` holds. others: the rig's other views.
+    priors: those before each frame."""
     nominal, views = session.session.nominal, (session, *others)
     rig = nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s
     mounted = [MountedCamera(other.camera, other.body_from_cam) for other in others]
@@ -301,6 +303,8 @@ def run_localizer(
         if has_wheels:
             localizer.handle_wheel(wheel_between(session.session.wheel, last_ns, stamp_ns + 1))
         last_ns = stamp_ns + 1
+        for told in priors(frame):
+            localizer.handle_prior(told)
         estimates.append(localizer.handle_stereo(blank(session, frame, others)))
         if until(estimates[-1]):
             break
