@@ -20,6 +20,7 @@ import click  # noqa: E402
 import typer  # noqa: E402
 
 from fleetmap.config import Section, Tiers, settings_in, tier_of  # noqa: E402
+from fleetmap.hooks import plugins  # noqa: E402
 from locclient.config import with_plugins  # noqa: E402
 from locclient.hooks import link_hooks, prior_hooks  # noqa: E402
 from mapserver.config import TIERS as MAPSERVER_TIERS  # noqa: E402
@@ -44,11 +45,12 @@ def commands() -> dict[str, click.Command]:
     found: dict[str, click.Command] = {}
 
     def add(words: str, command: click.Command) -> None:
-        groups = getattr(command, "commands", None)
-        for name, each in (groups or {}).items():
-            add(f"{words} {name}", each)
-        if groups is None:
+        if not hasattr(command, "commands"):
             found[words] = command
+            return
+        context = click.Context(command)
+        for name in command.list_commands(context):  # those of plug-ins too
+            add(f"{words} {name}", command.get_command(context, name))
 
     for script, target in sorted(PROJECT["scripts"].items()):
         add(script, typer.main.get_command(importlib.import_module(target.partition(":")[0]).app))
@@ -121,7 +123,9 @@ def command_page(page: str, plugin: str | None = None) -> str:
         seen.add(heading[1])
         if rows := list(_command_rows(known[heading[1]])):
             parts[number] = with_table(part, "argument or option", rows)
-    own = {name for name in known if not (name.startswith("mapserver ") and name.split()[1] in command_hooks())}
+    hooks = {("mapserver", name) for name in command_hooks()}
+    hooks |= {("locclient", name) for name in plugins("locclient.commands")}
+    own = {name for name in known if tuple(name.split()[:2]) not in hooks}
     if plugin is None and (missing := sorted(own - seen)):
         raise ValueError(f"{COMMANDS.name} lacks {', '.join(missing)}; give each a heading and a sentence")
     return "".join(parts)

@@ -35,24 +35,6 @@ def enrol(
     typer.echo(f"{bundle} is used and no longer valid; remove it")
 
 
-def check(
-    context: typer.Context,
-    config: Annotated[Path, typer.Option(help="The TOML file of `locclient run`.")],
-    seconds: Annotated[float, typer.Option(min=0.0, help="Seconds to listen to the sensors; 0: not at all.")] = 3.0,
-    insecure: Insecure = False,
-) -> None:
-    """Check a robot before it drives; status 3 if something must be repaired first."""
-    settings = _with_insecure(context.obj.read_config(config)[0], insecure=insecure)
-    from locclient.daemon.preflight import FAIL, run_preflight
-
-    failed = False
-    for finding in run_preflight(settings, seconds):
-        typer.echo(f"{finding.level:<5} {finding.what}: {finding.text}")
-        failed |= finding.level == FAIL
-    if failed:
-        raise typer.Exit(3)
-
-
 def run(
     context: typer.Context,
     config: Annotated[Path, typer.Option(help="TOML file with the robot, its sensors, map and outputs.")],
@@ -66,8 +48,10 @@ def run(
     from fleetmap.log_lines import log_to_stderr
 
     log_to_stderr(logging.INFO if verbose else logging.WARNING, "%(levelname)s %(name)s: %(message)s")
-    settings = _with_insecure(context.obj.read_config(config)[0], insecure=insecure)
+    from locclient.config import with_insecure
     from locclient.daemon.daemon import check_run, daemon_parts
+
+    settings = with_insecure(context.obj.read_config(config)[0], insecure=insecure)
 
     check_run(settings)
     from locclient.daemon.runtime import Runtime
@@ -95,7 +79,6 @@ def status(
 
 COMMANDS: Commands = {
     "enrol": enrol,
-    "check": check,
     "replay": replay,
     "run": run,
     "status": status,
@@ -112,14 +95,7 @@ def _read_config(path: Path | None) -> "tuple[LocclientConfig, Options]":
     return read_config(path, {"replay": replay})  # [run] holds settings, not options
 
 
-def _with_insecure(config: "LocclientConfig", *, insecure: bool) -> "LocclientConfig":
-    """Return the configuration, with [run] insecure set if `insecure`."""
-    from msgspec.structs import replace
-
-    return replace(config, run=replace(config.run, insecure=True)) if insecure else config
-
-
-app = make_app(COMMANDS, locclient, _read_config)
+app = make_app(COMMANDS, locclient, _read_config, "locclient.commands")
 
 # Set before numpy is imported: matrix products are small, and a second BLAS thread costs more than it saves.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -129,3 +129,10 @@ def with_common(given: dict[str, Any]) -> dict[str, Any]:
         keys = {"site", "store", "server"} - left_out
         completed[name] = {key: given[key] for key in keys if key in given} | section
     return completed
+
+
+def with_insecure(config: LocclientConfig, *, insecure: bool) -> LocclientConfig:
+    """Return the configuration, with [run] insecure set if `insecure`."""
+    return (
+        msgspec.structs.replace(config, run=msgspec.structs.replace(config.run, insecure=True)) if insecure else config
+    )

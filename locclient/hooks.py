@@ -2,6 +2,7 @@
 
 | group | registered by the name of | as |
 |---|---|---|
+| `locclient.commands` | the command | a function as those of `COMMANDS` in `locclient/cli.py`, in a module that is quick to import |
 | `locclient.links` | its section in the configuration file | `LinkHook` |
 | `locclient.priors` | its section in the configuration file | `PriorHook` |
 | `locclient.sources` | `[source] kind` | a function as those of `SOURCES` in `fleetmap/sources/source.py` |

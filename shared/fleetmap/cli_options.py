@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
 
 import typer
+import typer.core
+import typer.main
 
 if TYPE_CHECKING:
     from fleetmap.config import Section
@@ -77,10 +79,29 @@ def _fields(kind: Any) -> list[inspect.Parameter]:
     ]
 
 
-def make_app(commands: Commands, callback: Command, read_config: ReadConfig) -> typer.Typer:
-    """Create a program of these commands; `callback` holds its own options, `read_config` serves --config."""
+def make_app(commands: Commands, callback: Command, read_config: ReadConfig, hook: str = "") -> typer.Typer:
+    """Create a program of these commands; `callback` holds its own options, `read_config` serves --config.
+
+    hook: the group of plug-ins' commands, which are imported when one is called or all are listed: that takes 2 MB.
+    """
+
+    class WithPlugins(typer.core.TyperGroup):
+        @functools.cached_property
+        def others(self) -> dict[str, Any]:
+            from fleetmap.hooks import plugins
+
+            found = plugins(hook) if hook else {}
+            return dict(typer.main.get_group(make_app(found, callback, read_config)).commands) if found else {}
+
+        def get_command(self, ctx: Any, cmd_name: str) -> Any:
+            return super().get_command(ctx, cmd_name) or self.others.get(cmd_name)
+
+        def list_commands(self, ctx: Any) -> list[str]:
+            return [*super().list_commands(ctx), *self.others]
+
     settings: dict[str, Any] = {"obj": Program(commands, read_config), "max_content_width": 140}
     app = typer.Typer(
+        cls=WithPlugins,
         no_args_is_help=True,
         add_completion=False,
         pretty_exceptions_enable=False,

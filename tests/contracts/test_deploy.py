@@ -103,14 +103,14 @@ def test_commands_know_the_options_that_deployment_and_documents_give_them() -> 
         program, *words = (word for word in line if word != "...")
         found = click_command(program)
         while True:
-            groups = getattr(found, "commands", {})
+            groups = found.list_commands(None) if hasattr(found, "list_commands") else []  # type: ignore[arg-type]
             end = next((number for number, word in enumerate(words) if word in groups), len(words))
             options = {name for option in found.params for name in option.opts}
             unknown = [word for word in words[:end] if word.startswith("-") and word.partition("=")[0] not in options]
             assert unknown == [], f"{where}: {found.name} does not know them"
             if end == len(words):
                 break
-            found, words = groups[words[end]], words[end + 1 :]
+            found, words = found.get_command(None, words[end]), words[end + 1 :]  # type: ignore[attr-defined]
         assert not getattr(found, "commands", None), f"{where}: {found.name} is no command"
 
 

@@ -61,5 +61,5 @@ def click_command(path: str) -> click.Command:
     module = project["scripts"][script].partition(":")[0]
     found = typer.main.get_command(importlib.import_module(module).app)
     for word in words:
-        found = found.commands[word]  # type: ignore[attr-defined]
+        found = found.get_command(None, word)  # type: ignore[attr-defined]
     return found

@@ -1,0 +1,28 @@
+"""The command `locclient check`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from locclient.replay_command import Insecure
+
+
+def check(
+    context: typer.Context,
+    config: Annotated[Path, typer.Option(help="The TOML file of `locclient run`.")],
+    seconds: Annotated[float, typer.Option(min=0.0, help="Seconds to listen to the sensors; 0: not at all.")] = 3.0,
+    insecure: Insecure = False,
+) -> None:
+    """Check a robot before it drives; status 3 if something must be repaired first."""
+    from locclient.config import with_insecure
+    from locclient.plugins.preflight.checks import FAIL, run_preflight
+
+    settings = with_insecure(context.obj.read_config(config)[0], insecure=insecure)
+
+    failed = False
+    for finding in run_preflight(settings, seconds):
+        typer.echo(f"{finding.level:<5} {finding.what}: {finding.text}")
+        failed |= finding.level == FAIL
+    if failed:
+        raise typer.Exit(3)
