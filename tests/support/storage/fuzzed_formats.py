@@ -24,22 +24,20 @@ MAX_CPU_SECONDS = 2.0
 MAX_GROWTH_BYTES = 256 << 20
 _NUMBERS = [0, 1, 2, 0x7F, 0x80, 0xFF, 0x7FFF, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, (1 << 63) - 1, (1 << 64) - 1]
 
-Edit = tuple[str, float, Any]
-"""A mutation: kind, position (as a share of the bytes), value."""
+Edit = tuple[float, int | None, bytes | int]
+"""Position (as a share), how many bytes go (None: as many as come), what comes: bytes, or those there so many times."""
 
-edits = st.lists(
-    st.one_of(
-        st.tuples(st.just("flip"), st.floats(0, 1), st.integers(1, 255)),
-        st.tuples(st.just("cut"), st.floats(0, 1), st.integers(1, 4096)),
-        st.tuples(st.just("insert"), st.floats(0, 1), st.binary(min_size=1, max_size=64)),
-        st.tuples(st.just("overwrite"), st.floats(0, 1), st.binary(min_size=1, max_size=16)),
-        st.tuples(
-            st.just("number"), st.floats(0, 1), st.tuples(st.sampled_from(_NUMBERS), st.sampled_from([1, 2, 4, 8]))
-        ),
-        st.tuples(st.just("repeat"), st.floats(0, 1), st.integers(1, 300)),
+_coming = st.one_of(
+    st.binary(max_size=64),
+    st.builds(
+        lambda n, size: (n % (1 << (8 * size))).to_bytes(size, "little"),
+        st.sampled_from(_NUMBERS),
+        st.sampled_from([1, 2, 4, 8]),
     ),
-    min_size=1,
-    max_size=6,
+    st.integers(1, 300),
+)
+edits = st.lists(
+    st.tuples(st.floats(0, 1), st.sampled_from([None, 0]) | st.integers(1, 4096), _coming), min_size=1, max_size=6
 )
 _json_values = st.recursive(
     st.one_of(
@@ -57,21 +55,10 @@ _json_values = st.recursive(
 
 def edited(data: bytes, changes: list[Edit]) -> bytes:
     """`data` with the edits, one after the other."""
-    for what, share, value in changes:
+    for share, going, coming in changes:
         at = int(share * max(0, len(data) - 1))
-        if what == "flip" and data:
-            data = data[:at] + bytes([data[at] ^ value]) + data[at + 1 :]
-        elif what == "cut":
-            data = data[:at] + data[at + value :]
-        elif what == "insert":
-            data = data[:at] + value + data[at:]
-        elif what == "overwrite":
-            data = data[:at] + value + data[at + len(value) :]
-        elif what == "number":
-            number, size = value
-            data = data[:at] + (number % (1 << (8 * size))).to_bytes(size, "little") + data[at + size :]
-        elif what == "repeat":
-            data = data[:at] + data[at : at + 16] * value + data[at:]
+        new = data[at : at + 16] * coming if isinstance(coming, int) else coming
+        data = data[:at] + new + data[at + (len(new) if going is None else going) :]
     return data
 
 

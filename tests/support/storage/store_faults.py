@@ -1,17 +1,12 @@
 """State of a store after a kill of its process, a disk failure or a power cut at any file-system call.
 
-`python tests/support/storage/store_faults.py [--every N] [--modes kill,tear,...]` prints what was tried and what was wrong, as JSON.
 Each try is a forked process on a copy of a small store, and afterwards: the store opens, `verify` is clean, the versions are in the
-states before
-or after the operation (after it, if it said so), the log is a continuation, the operation can be done again, and `gc` leaves no stray
-file.
+states before or after the operation (after it, if it said so), the log is a continuation, the operation can be done again, and `gc`
+leaves no stray file.
 """
 
-import argparse
-import json
 import random
 import shutil
-import sys
 import tempfile
 import time
 from collections import deque
@@ -19,17 +14,14 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-REPOSITORY = Path(__file__).resolve().parents[3]
-sys.path[:0] = [str(REPOSITORY / part) for part in ("shared", "", "tests")]
+import numpy as np
 
-import numpy as np  # noqa: E402
-
-from fleetmap.mapformat import current_path  # noqa: E402
-from mapserver import releases  # noqa: E402
-from mapserver.store import Actor, DraftContent, MapStore, Retention  # noqa: E402
-from support.storage.faulty_disk import Disk, in_child  # noqa: E402
-from support.storage.lost_writes import POLICIES, DiskImage  # noqa: E402
-from support.storage.map_samples import draft_details, random_tile  # noqa: E402
+from fleetmap.mapformat import current_path
+from mapserver import releases
+from mapserver.store import Actor, DraftContent, MapStore, Retention
+from support.storage.faulty_disk import Disk, in_child
+from support.storage.lost_writes import POLICIES, DiskImage
+from support.storage.map_samples import draft_details, random_tile
 
 ADA = Actor("ada", "a fault")
 MODES = ("kill", "tear", "ENOSPC", "EIO", "ENOSPC from then on", "EIO from then on", "power cut")
@@ -240,21 +232,3 @@ def run(
         "tries": tries,
         "wrong": wrong,
     }
-
-
-def main() -> int:
-    """The command; ends with 1 where something was wrong."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--every", type=int, default=1, help="only every N-th call")
-    parser.add_argument("--modes", default=",".join(MODES))
-    parser.add_argument("--scenarios", default=None)
-    parser.add_argument("--within-s", type=float, default=float("inf"), help="stop and print after so many seconds")
-    arguments = parser.parse_args()
-    names = None if arguments.scenarios is None else arguments.scenarios.split(",")
-    found = run(arguments.modes.split(","), arguments.every, names, arguments.within_s)
-    print(json.dumps(found, indent=1))
-    return int(bool(found["wrong"]))
-
-
-if __name__ == "__main__":
-    sys.exit(main())
