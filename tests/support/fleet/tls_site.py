@@ -10,18 +10,21 @@ from pathlib import Path
 from typing import Any
 
 import httpx
+import pytest
 
 from locclient.identity import RobotIdentity
 from locclient.maps.connection import outbox_path
-from mapserver.plugins.backups.snapshots import LEFT_OUT, NAMED
 
 START_S = 120.0  # on a machine that may be busy
 
 
 def forgotten_files(store: Path) -> list[str]:
     """Files of a store that are in no backup, and of which nothing says that they need not be."""
+    backed = pytest.importorskip("mapserver.plugins.backups.snapshots")
     names = [path.relative_to(store).as_posix() for path in store.rglob("*") if path.is_file()]
-    return [n for n in names if not (n.startswith("keys/") or NAMED.fullmatch(n) or LEFT_OUT.fullmatch(n))]
+    return [
+        n for n in names if not (n.startswith("keys/") or backed.NAMED.fullmatch(n) or backed.LEFT_OUT.fullmatch(n))
+    ]
 
 
 class TlsSite:
