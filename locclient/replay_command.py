@@ -132,7 +132,7 @@ def replay(
     """Fetch the site's map, localize every frame of a recording in it, and report the result; status 6: never localized.
 
     A failure's recording starts with the robot's pose, in the robot's version unless --version names another, and the result is compared
-    with the robot's. In a building it is played in the map of the floor where the robot was.
+    with the robot's. In a building it is played in the map where the robot was.
     """
     from fleetmap.recordings.failure_recording import is_failure_recording
 
@@ -162,8 +162,8 @@ def _replay_failure(
                 )
     files.check()
     summary, record = read_failure_file(path)
-    floor = record.used.floor if record.used else ""
-    address = replace(map_options, site=map_options.site or floor or summary.site).address(version)
+    used = record.used.site_of(summary.site) if record.used else summary.site
+    address = replace(map_options, site=map_options.site or used).address(version)
     with connected(address, map_options.cache, map_options.cache_bytes) as connection:
         sha256 = None if version is None else connection.source.ready().wanted.manifest_sha256
         found = compare_failure((summary, record), connection.source, sha256)

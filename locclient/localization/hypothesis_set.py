@@ -16,7 +16,7 @@ from locclient.localization.settings import TrackSettings
 
 _PAIRS_AT_ONCE = 4  # comparisons in a time slice of a query
 _MAX_WRONG_SHARE = 0.05  # of unmapped places that weak fixes of a standing robot may confirm by mistake
-_STOREY_M = 2.5  # at least, between two floors
+_STOREY_M = 2.5  # at least
 
 # The fixes of one query, each with its pose propagated to the present.
 Observations = Sequence[tuple[Fix, PoseHypothesis]]
@@ -190,13 +190,13 @@ class HypothesisSet:
         return self.is_supported(hypothesis)
 
     def moved_m(self, hypothesis: PoseHypothesis) -> float | None:
-        """Return the distance of a hypothesis from the abandoned pose, at least a storey on another floor; None if within their covariances
+        """Return the distance of a hypothesis from the abandoned pose, at least a storey in another map; None if within their covariances
         (Mahalanobis test)."""
         if self.abandoned is None:
             return None
         then, now = self.abandoned.now, hypothesis.now
         error = boxminus(now.map_from_body, then.map_from_body)
-        if then.floor != now.floor:
+        if not then.shares_map(now):
             return max(_STOREY_M, float(np.linalg.norm(error[3:])))
         covariance = now.cov_rot_trans + then.cov_rot_trans
         is_beyond = error @ np.linalg.solve(covariance, error) > self._settings.innovation_limit

@@ -115,10 +115,7 @@ class Localizer:
         self.perception.gauges = bool(building)
         self.maps.use_building(building)
         self._query.begin_anew()
-        known, prior, tracker = building.keys() | {""}, self._tracker.prior, self._tracker
-        if tracker.floor not in known or (prior is not None and (prior.is_ride or not prior.floors.keys() <= known)):
-            self.forget_pose()
-        tracker.floor = tracker.floor if tracker.floor in known else ""
+        self._tracker.keep_to(building.keys() | {""})
 
     def start(self) -> Start | None:
         """Return the state with which another localizer of the same odometry can start; None during a map query, whose fix is missing."""

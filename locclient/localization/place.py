@@ -22,6 +22,9 @@ class Place(NamedTuple):
     def is_finite(self) -> bool:
         return bool(np.isfinite(self.cov_rot_trans).all() and np.isfinite(self.map_from_body).all())
 
+    def shares_map(self, other: "Place") -> bool:
+        return self.floor == other.floor
+
     @property
     def position_m(self) -> Array:
         """Return (3,), in the map."""

@@ -95,7 +95,7 @@ class PoseHypothesis:
         far_m = settings.hypothesis_distance_m + 3 * np.sqrt(np.trace(covariance[3:, 3:]))
         far_rad = np.radians(settings.hypothesis_angle_deg) + 3 * np.sqrt(np.trace(covariance[:3, :3]))
         is_near = bool(np.linalg.norm(error[3:]) < far_m and np.linalg.norm(error[:3]) < far_rad)
-        return is_near and fresh.now.floor == self.now.floor
+        return is_near and fresh.now.shares_map(self.now)
 
     def speaks_against_others(self, settings: TrackSettings) -> bool:
         """Return True if its fixes may contradict a confirmed pose: strong ones, or ones that moved with the robot, farther than the

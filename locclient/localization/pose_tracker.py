@@ -1,6 +1,6 @@
 """Pose tracking in the map: a prior, competing candidates or one confirmed pose, propagated by the odometry. Pure."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -139,6 +139,13 @@ class PoseTracker:
         self.prior.floors = floors
         self.candidates.reset()
         self._restart()
+
+    def keep_to(self, floors: Set[str]) -> None:
+        """Forget a place on others than these floors, or on which one of them is open after a ride."""
+        prior, is_known = self.prior, self.floor in floors
+        if not is_known or (prior is not None and (prior.is_ride or not prior.floors.keys() <= floors)):
+            self.forget()
+        self.floor = self.floor if is_known else ""
 
     def forget(self, *, is_carried: bool = False) -> None:
         """Drop the pose and search the whole map. is_carried: the robot knows that it is lifted, and is LOST if it had a pose."""
@@ -325,7 +332,7 @@ class PoseTracker:
         known = None if self.prior is None else self.prior.known_pose(0.5 * self.maps.alias_step_m)
         if self.is_reliable(fix):
             return True
-        if known is None or fix.inliers < self._settings.fix.min_inliers or at.now.floor != known.now.floor:
+        if known is None or fix.inliers < self._settings.fix.min_inliers or not at.now.shares_map(known.now):
             return False
         _, innovation = innovation_of(*at.now[:2], *known.now[:2])
         return innovation <= self._track.innovation_limit
@@ -425,7 +432,7 @@ class PoseTracker:
             self.was_tracking, self.is_carried = True, False
         for fix, hypothesis in self.observations(fixes):
             off_m = np.linalg.norm(hypothesis.now.position_m - best.now.position_m)
-            if off_m < _OWN_FIX_M and hypothesis.now.floor == best.now.floor:
+            if off_m < _OWN_FIX_M and hypothesis.now.shares_map(best.now):
                 waits = self.confirmed is None and not is_one_map
                 return QueryResult(fix, ONE_OF_FLOORS if waits else "", moved_m=moved_m)
         return QueryResult(None, "the fix does not agree with those before", moved_m=moved_m)

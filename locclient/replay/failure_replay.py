@@ -37,12 +37,12 @@ def replay_failure(record: LocalizerRecord, load: Load) -> list[Moment]:
     rig = RigCalibration((), None, record.base_from_body)
     localizer = Localizer(rig, record.camera, record.body_from_cam, 0.0, record.settings, others=record.others)
     if record.used is not None:
-        load(record.used).show(localizer, record.used.floor)
+        load(record.used).show(localizer, record.used.site_of(""))
     localizer.begin(record.start)
     said = []
     for commands, percept in record.frames:
         if commands.used is not None:
-            load(commands.used).show(localizer, commands.used.floor)
+            load(commands.used).show(localizer, commands.used.site_of(""))
         if commands.forgets:
             localizer.forget_pose()
         for prior in commands.priors:
@@ -118,7 +118,7 @@ def compare_failure(
 ) -> Comparison:
     """Compare then and now, in the robot's map or in the version with that manifest; LinkError if a tile is not available.
 
-    source: of the site whose map the robot used, in a building that of its floor; the other floors are not searched. Of another version,
+    source: of the site whose map the robot used; a building's other ones are not searched. Of another version,
     tiles within the bounds of those in the robot's memory are used.
     """
     summary, record = failure
@@ -126,7 +126,7 @@ def compare_failure(
 
     def load(used: UsedMap) -> LoadedMap:
         if used not in maps:
-            maps[used] = _loaded(source, used.floor or summary.site, used, manifest_sha256)
+            maps[used] = _loaded(source, used.site_of(summary.site), used, manifest_sha256)
         return maps[used]
 
     now = replay_failure(record, load)

@@ -187,7 +187,7 @@ def _tile(context: FailureContext, map_from_base: Array | None) -> tuple[int, in
 
 
 def _matches(context: FailureContext, profile: RobotProfile) -> Matches | None:
-    """Return expected matches at the believed pose, in the image without a fix; None without a pose or its floor's map."""
+    """Return expected matches at the believed pose, in the image without a fix; None without a pose or its map."""
     onset, running = context.unmatched, context.running
     if onset.map_from_body is None or running is None:
         return None

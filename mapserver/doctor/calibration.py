@@ -34,7 +34,7 @@ _LONGER = "record a longer drive, with turns, starts and stops"
 class Tolerance:
     """Of one parameter: systematic sigma, error that costs 3 cm, error of another rig; True if a build may correct it."""
 
-    floor: float
+    least_sigma: float
     warn_above: float
     fail_above: float = np.inf
     correctable: bool = True
@@ -150,7 +150,7 @@ def _finding(parameter: ParameterEstimate, estimate: CalibrationEstimate, focal_
     name, tolerance = parameter.name, TOLERANCES[parameter.name]
     factor, unit, digits = SHOWN[parameter.unit]
     value, own_sigma = _net(parameter, estimate, focal_px)
-    sigma_all = float(np.hypot(own_sigma, tolerance.floor))
+    sigma_all = float(np.hypot(own_sigma, tolerance.least_sigma))
     sure = max(abs(value) - SURE_SIGMAS * sigma_all, 0.0)
     is_bad, is_coarse = parameter.is_judged and sure > tolerance.warn_above, own_sigma > tolerance.warn_above
     if not is_bad and (is_coarse or not parameter.is_judged):

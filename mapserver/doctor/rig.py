@@ -140,7 +140,7 @@ def judge_mounting(name: str, found: Mounting | None) -> Finding:
     if found is None:
         return not_judged(name, "too few frames of both could be followed", _DRIVE)
     variances, axes = np.linalg.eigh(found.cov)
-    variances += np.diag(axes.T @ found.cov_repeated @ axes) + 2 * tolerance.floor**2
+    variances += np.diag(axes.T @ found.cov_repeated @ axes) + 2 * tolerance.least_sigma**2
     sigmas, along = np.sqrt(variances), axes.T @ found.turn_rad
     is_known = (sigmas <= tolerance.warn_above) | (np.abs(along) > SURE_SIGMAS * sigmas)
     turn_rad = axes @ np.where(is_known, along, 0.0)

@@ -99,7 +99,7 @@ class Surveyed:
     def evidence(self) -> RigEvidence:
         """Evidence on its calibration: the pair is doubted if the survey's disparities contradict the angle accepted by the doctor."""
         limit, focal_px = TOLERANCES[CalibrationParameter.PAIR_YAW], self.survey.state.camera.focal_px
-        most_px = focal_px * (limit.warn_above + SURE_SIGMAS * limit.floor)
+        most_px = focal_px * (limit.warn_above + SURE_SIGMAS * limit.least_sigma)
         off = [f"{-yaw.shift_px:+.2f} px{of_view}" for of_view, yaw in self._yaws() if abs(yaw.correction_px) > most_px]
         if not off:
             return self.calibration

@@ -13,7 +13,7 @@ from mapserver.quality.figures import TileDirections
 HEADINGS = ("E", "NE", "N", "NW", "W", "SW", "S", "SE")  # E along x of `map`, N along y
 _NEAR_M = 2.0  # includes the other lane of an aisle, but not the next aisle
 _OTHER_WAY = -0.5  # cosine between the headings of two places, below which they look in opposite directions
-_UPRIGHT = 0.3  # horizontal part of an axis below which a camera looks at the ceiling or the floor
+_UPRIGHT = 0.3  # horizontal part of an axis below which a camera looks at the ceiling or the ground
 _LEAST_M = 3.0  # one-way places within a smaller extent are a turn, not an aisle
 _NAMED = 2
 

@@ -117,7 +117,7 @@ def _gyro_bias(given: Trajectory, inputs: SurveyInputs) -> Array:
 
 
 def _covariances(odom_from_body: Array) -> Array:
-    """Return (F, 6, 6) of a random walk along the path, with a floor for each step."""
+    """Return (F, 6, 6) of a random walk along the path, with a least sigma for each step."""
     steps_m = np.diff(odom_from_body[:, :3, 3], axis=0, prepend=odom_from_body[:1, :3, 3])
     of_a_metre, found = np.diag(np.repeat([_WALK_RAD**2, _WALK_M**2], 3)), [np.zeros((6, 6))]
     for step_m in steps_m:

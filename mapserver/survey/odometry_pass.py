@@ -241,7 +241,7 @@ def longest_run(odometry: OdometryPass, body_from_cam: Array) -> OdometryPass:
 
 
 def parts_between_lifts(estimates: Sequence[OdometryEstimate]) -> list[slice]:
-    """Return the runs of frames in which the robot was on its floor: nothing measures how hands or a fork carry it to the next.
+    """Return the runs of frames in which the robot was on the ground: nothing measures how hands or a fork carry it to the next.
 
     A lift is noticed by the motion within `WINDOW_NS`, whose frames belong to no part; nor does a run that is not longer.
     """

@@ -19,7 +19,7 @@ from mapserver.survey.merge.landmark_persistence import PRIOR_COUNT
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap, history_of
 
-# An object differs from its identical copy by about 30 bits, two objects by 128; copies have the same height on the same floor.
+# An object differs from its identical copy by about 30 bits, two objects by 128; copies have the same height above the ground.
 _ALIKE_BITS, _HEIGHT_M = 60, 0.15
 _OWN_M = 2.0  # within it the same object may have been mapped twice
 _REACH = 6  # neighbours compared among those that agree in two bytes

@@ -1,6 +1,6 @@
 """The grid of a version: encoding (an index, and one blob per tile; docs/map_format.md), and occupancy for a robot's height.
 
-A cell is a square column of the map: floor below FLOOR_M, then SLICES voxels of SLICE_M each.
+A cell is a square column of the map: ground below FLOOR_M, then SLICES voxels of SLICE_M each.
 """
 
 from collections.abc import Callable, Mapping
@@ -25,7 +25,7 @@ from fleetmap.mapformat.grid_tile import (
 from fleetmap.mapformat.manifest import Positive, Sha256, TileEntry
 from fleetmap.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
-FLOOR_M, SLICE_M, SLICES = 0.10, 0.25, 8  # the floor's unevenness, and the noise of its points
+FLOOR_M, SLICE_M, SLICES = 0.10, 0.25, 8  # the ground's unevenness, and the noise of its points
 TOP_M = FLOOR_M + SLICES * SLICE_M
 HEIGHT_STEP_M, LOWEST_M = 0.01, -0.16  # codes of heights: 0 unknown, then steps from LOWEST_M
 Counts = NDArray[np.uint8]
@@ -164,7 +164,7 @@ def decode_index(data: bytes, kind: type[T], what: str, **own: object) -> T:
 def occupancy(tiles: Mapping[tuple[int, int], Counts], robot_height_m: float) -> OccupancyGrid:
     """Occupancy in `map` for a robot of this height, cropped to known cells.
 
-    A cell is occupied if anything is between the floor and the robot's top, free if all of that was seen empty, else unknown.
+    A cell is occupied if anything is between the ground and the robot's top, free if all of that was seen empty, else unknown.
     Raises UsageError for a height outside the grid, and for a grid with more cells than a planner's map may have.
     """
     levels = np.ceil((robot_height_m - FLOOR_M) / SLICE_M - 1e-9)

@@ -1,4 +1,4 @@
-"""Disparities of whole pictures, and the floor height below the camera. Source of the matcher: Hirschmueller 2008, in OpenCV's version."""
+"""Disparities of whole pictures, and the ground height below the camera. Source of the matcher: Hirschmueller 2008, in OpenCV's version."""
 
 from collections.abc import Iterable
 
@@ -85,7 +85,7 @@ def nearest_around(disparity_px: NDArray[np.float32], reach_px: int) -> NDArray[
 
 
 def floor_distance_m(views: Iterable[tuple[NDArray[np.float32], Array]], camera: StereoCamera) -> float | None:
-    """Return the distance of the floor below the camera, from disparities (H, W) and map_from_cam (4, 4) of some views.
+    """Return the distance of the ground below the camera, from disparities (H, W) and map_from_cam (4, 4) of some views.
 
     Per view the most frequent height of near points below the camera; the median, if most views agree. None if
     they do not: the camera is carried by hand, or the map is not level.

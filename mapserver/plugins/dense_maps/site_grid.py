@@ -41,7 +41,7 @@ class SessionViews:
         map_from_cam: Array,
         floor_m: float,
     ) -> None:
-        """Add one view. disparity: as of `dense_disparity`, with that of `nearest_around` between; floor_m: distance of the floor below."""
+        """Add one view. disparity: as of `dense_disparity`, with that of `nearest_around` between; floor_m: distance of the ground."""
         size = 2 * _RANGE_CELLS + 1
         at_cells = map_from_cam[:2, 3] / CELL_M
         corner = np.floor(at_cells).astype(np.int64) - _RANGE_CELLS
@@ -127,7 +127,7 @@ def _height(old: Counts, new: Counts) -> Counts:
 
 
 def height_map(tiles: Mapping[tuple[int, int], Counts]) -> tuple[Array, OccupancyGrid]:
-    """Return (2, H, W) metres over the floor of the lowest and the highest surface, NaN if unseen, and their grid."""
+    """Return (2, H, W) metres over the ground of the lowest and the highest surface, NaN if unseen, and their grid."""
     layers = []
     for layer in (2, 3):
         codes = whole_grid({place: cells[..., layer].view(np.int8) for place, cells in tiles.items()}, 0, is_cut=False)

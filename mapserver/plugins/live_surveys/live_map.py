@@ -213,8 +213,8 @@ class LiveMap:
 
         def allowed_m(i: int, j: int) -> float:
             gained = self._walked_m2[first + j] - self._walked_m2[first + i]
-            floor = 0.05 + 0.03 * float(np.linalg.norm(chain_from_body[j, :3, 3] - chain_from_body[i, :3, 3]))
-            return 3.0 * float(np.sqrt(gained + floor**2))
+            least = 0.05 + 0.03 * float(np.linalg.norm(chain_from_body[j, :3, 3] - chain_from_body[i, :3, 3]))
+            return 3.0 * float(np.sqrt(gained + least**2))
 
         sigma = _ROTATION_SIGMA_RAD if self._news[-1].inertial else None
         found = finder.match(

@@ -76,8 +76,8 @@ class LiveTracking:
         before, step_cov, imu = self._before, None, joined_imu(self._imu)
         if before is not None:
             step = se3_inverse(before.frame_from_body) @ frame_from_body
-            known, floor = (before.covariance, covariance), floor_of(inertial=estimate.inertial)
-            step_cov = step_covariance(known, before.frame_from_body[:3, :3], step, floor)
+            known, least = (before.covariance, covariance), floor_of(inertial=estimate.inertial)
+            step_cov = step_covariance(known, before.frame_from_body[:3, :3], step, least)
             if self._torn_m2 > before.torn_m2:
                 step_cov = step_cov + _TORN_M2 * np.eye(6)
         rotation = estimate.odom_from_body[:3, :3]

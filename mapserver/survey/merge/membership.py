@@ -36,7 +36,7 @@ from mapserver.survey.settings import SessionSettings
 
 _REMAINING_SHARE = 0.5  # of the expected cells: a map of which the greater part has changed needs a new survey
 # Seen share of another building's map: in pictures of twelve pairs of halls of one layout, with fixes at each place, 0.25 to 0.39 of
-# the cells (floor marks, beams, columns, lamps)
+# the cells (ground marks, beams, columns, lamps)
 _SHARED_SHARE = 0.4
 _MIN_BLOCKS = 8  # of 1.5 m: two walls of 3 m x 3 m
 _MOST_PLACES, _MOST_LOOKS = 4, 240  # compared alignments, keyframes used

@@ -35,7 +35,7 @@ _INERTIAL_FLOOR = Floor(0.0005, 0.01, 0.002, 0.01)
 
 
 def floor_of(*, inertial: bool) -> Floor:
-    """Return the floor for steps of a chain of keyframes that are adjusted with their neighbours."""
+    """Return the least covariance for steps of a chain of keyframes that are adjusted with their neighbours."""
     return _INERTIAL_FLOOR if inertial else FLOOR
 
 
@@ -68,11 +68,11 @@ def blackout_factors(odometry: OdometryPass, state: SurveyState) -> list[Relativ
 
 def chain_edges(odometry: OdometryPass, state: SurveyState) -> list[PoseEdge]:
     """Return edges between neighbours with their adjusted motion and the covariance of the odometry."""
-    floor = floor_of(inertial=odometry.inertial)
+    least = floor_of(inertial=odometry.inertial)
     edges = []
     for k, a, b in _neighbours(odometry):
         i_from_j = se3_inverse(state.map_from_body[k]) @ state.map_from_body[k + 1]
-        edges.append(PoseEdge(k, k + 1, i_from_j, edge_covariance(odometry, a, b, floor), is_loop=False))
+        edges.append(PoseEdge(k, k + 1, i_from_j, edge_covariance(odometry, a, b, least), is_loop=False))
     return edges
 
 
@@ -93,14 +93,14 @@ def carried(covariance: Array, lever_m: Array) -> Array:
     return np.asarray(about @ covariance @ about.T)
 
 
-def edge_covariance(odometry: OdometryPass, a: int, b: int, floor: Floor = FLOOR) -> Array:
-    """Return (6, 6) of i_from_j between frames a and b, axes of a: the growth of the odometry's uncertainty, with a floor."""
+def edge_covariance(odometry: OdometryPass, a: int, b: int, least: Floor = FLOOR) -> Array:
+    """Return (6, 6) of i_from_j between frames a and b, axes of a: the growth of the odometry's uncertainty, with a least one."""
     first, last = odometry.odom_from_body[[a, b]]
     known = odometry.covariances[a], odometry.covariances[b]
-    return step_covariance(known, first[:3, :3], se3_inverse(first) @ last, floor)
+    return step_covariance(known, first[:3, :3], se3_inverse(first) @ last, least)
 
 
-def step_covariance(known: tuple[Array, Array], odom_from_first: Array, first_from_last: Array, floor: Floor) -> Array:
+def step_covariance(known: tuple[Array, Array], odom_from_first: Array, first_from_last: Array, least: Floor) -> Array:
     """Return (6, 6) of a step in axes of its first body, from covariances (6, 6) of both poses in odom axes; first's rotation (3, 3).
 
     An initial error of direction also moves the last pose, and is contained in its covariance at every step. About the position of
@@ -110,4 +110,4 @@ def step_covariance(known: tuple[Array, Array], odom_from_first: Array, first_fr
     values, vectors = np.linalg.eigh(0.5 * (gained + gained.T))
     gained = (vectors * np.maximum(values, 0.0)) @ vectors.T  # one camera's first frames may have moved since
     carry = np.kron(np.eye(2), odom_from_first.T)
-    return np.asarray(carry @ gained @ carry.T + floor.covariance(first_from_last))
+    return np.asarray(carry @ gained @ carry.T + least.covariance(first_from_last))

@@ -24,7 +24,7 @@ _HEADING_KNOWN_RAD = 0.2
 # A robot that was not away for so long, and not further, is still at the same device: tags are read from up to 3 m.
 _AWAY_NS, _AWAY_M = 10_000_000_000, 3.0
 _UNKNOWN_VARIANCE = np.array([1.0] * 3 + [1e4] * 3)  # rad^2, m^2
-# Errors of a prior by the floor's unevenness and a robot's tilt: roll, pitch, yaw in rad; x, y, z in m.
+# Errors of a prior by the ground's unevenness and a robot's tilt: roll, pitch, yaw in rad; x, y, z in m.
 _UNEVEN = np.diag(np.square([0.05, 0.05, 0.0, 0.01, 0.01, 0.25]))
 # Of the frame `map` about the first keyframe: gravity knows roll and pitch, priors yaw and position.
 _LEVEL = np.diag(np.square([1e-3, 1e-3, 0.5, 10.0, 10.0, 10.0]))

@@ -138,15 +138,15 @@ def _agrees(measured: Array, predicted: Array, allowed_m: float) -> bool:
 
 
 def drift_allowance_m(covariances: NDArray[np.float64], positions_m: Array) -> Callable[[int, int], float]:
-    """Return the allowed difference of measured and predicted motion before loop closure: three sigmas of odometry, and a floor.
+    """Return the allowed difference of measured and predicted motion before loop closure: three sigmas of odometry, and a least one.
 
     covariances (K, 6, 6) of the keyframes' odometry; the growth between two of them is their relative uncertainty.
     """
 
     def allowed_m(i: int, j: int) -> float:
         gained = max(float(np.trace(covariances[j][3:, 3:] - covariances[i][3:, 3:])), 0.0)
-        floor = 0.05 + 0.03 * float(np.linalg.norm(positions_m[j] - positions_m[i]))
-        return 3.0 * float(np.sqrt(gained + floor**2))
+        least = 0.05 + 0.03 * float(np.linalg.norm(positions_m[j] - positions_m[i]))
+        return 3.0 * float(np.sqrt(gained + least**2))
 
     return allowed_m
 

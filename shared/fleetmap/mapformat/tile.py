@@ -1,4 +1,4 @@
-"""A tile, decoded: the part of a version that covers one square of the floor."""
+"""A tile, decoded: the part of a version that covers one square of the ground."""
 
 from dataclasses import dataclass
 

@@ -30,7 +30,7 @@ class OdometryEstimate:
     successive estimates: improved knowledge of gravity rotates `odom` about its origin, far from the body.
     imu_minus_cam_s is the estimated time offset, 0 without an IMU, and imu_minus_cam_sigma_s its standard deviation.
     scale_known is False for one camera of unknown scale: lengths are then in an arbitrary unit. revised:
-    earlier frames with new poses, (frame index, odom_from_body (4, 4)). is_lifted: a floor robot leaves its floor. is_bridged: samples of
+    earlier frames with new poses, (frame index, odom_from_body (4, 4)). is_lifted: a ground robot leaves the ground. is_bridged: samples of
     the IMU are missing since the frame before, the images alone show the motion.
     """
 

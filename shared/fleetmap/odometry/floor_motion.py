@@ -1,6 +1,6 @@
-"""Detection of a floor robot without wheel odometry that leaves its floor, from the motion of IMU and images.
+"""Detection of a ground robot without wheel odometry that leaves the ground, from the motion of IMU and images.
 
-What stands on a floor moves along one plane of its own body, also on ramps: it has no speed along the normal of that plane. The robot's
+What stands on the ground moves along one plane of its own body, also on ramps: it has no speed along the normal of that plane. The robot's
 drive shows whether that holds for it, and which plane it is. Source: Dissanayake et al. 2001 (motion constraints of land vehicles).
 """
 
@@ -18,7 +18,7 @@ _PLANE_RAD = np.radians(
     1.0
 )  # root mean square between motion and plane: of cars 0.3 degrees, of drones and hands at least 3
 _UP_WEIGHT = 0.003  # of the mean up direction as the normal: motion to 1 degree against slopes to 4, in 20 windows
-# Motion off the plane that a floor causes: thresholds, and the foot and the top of slopes of 17 degrees.
+# Motion off the plane that the ground causes: thresholds, and the foot and the top of slopes of 17 degrees.
 _OFF_M, _OFF_SHARE = 0.05, 0.3
 _SIGMAS = 4.0
 # By braking and loads; a slope of 17 degrees under a wheelbase of 0.3 m tilts less within this way.
@@ -53,7 +53,7 @@ class FloorMotion:
         self._way_m, self._earlier_up = 0.0, np.zeros(3)  # since it stood so
 
     def is_lifted(self, stamp_ns: int, up_body: Array, earlier_from_body: Array | None, sigma_mps: float) -> bool:
-        """True if the robot leaves the floor with this frame.
+        """True if the robot leaves the ground with this frame.
 
         up_body (3,): unit, in the body's axes. earlier_from_body (4, 4): since the frame before. sigma_mps: of the speed upwards.
         """

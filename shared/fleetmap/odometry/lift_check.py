@@ -1,4 +1,4 @@
-"""Detection of a robot that is lifted off its floor, by hands, fork or hoist, from the motion of IMU and images, and of its wheels."""
+"""Detection of a robot that is lifted off the ground, by hands, fork or hoist, from the motion of IMU and images, and of its wheels."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -11,10 +11,10 @@ from fleetmap.odometry.floor_motion import FloorMotion
 from fleetmap.sensors.samples import WheelSample
 
 WINDOW_NS = 400_000_000
-# Climb that a floor allows: thresholds, and slopes of 17 degrees over the rolled distance.
+# Climb that the ground allows: thresholds, and slopes of 17 degrees over the rolled distance.
 _CLIMB_M, _CLIMB_SHARE = 0.05, 0.3
 _SIGMAS = 4.0
-_TILT = np.cos(np.radians(12.0))  # against the floor on which it rolled: ramps and braking cause less
+_TILT = np.cos(np.radians(12.0))  # against the ground on which it rolled: ramps and braking cause less
 _FLOOR_KEPT = 0.95  # share of the old up direction, with each frame in which the wheels roll
 _ROLLING_MPS = 0.05
 # Distance without rotation of the wheels; a robot that skids with locked wheels slows down.
@@ -24,7 +24,7 @@ _CARRIED_M, _SKID_SHARE = 0.15, 0.8
 class _Step(NamedTuple):
     stamp_ns: int
     climb_m: float
-    way_m: Array  # (2,) of the base along the floor, in its own axes
+    way_m: Array  # (2,) of the base along the ground, in its own axes
     rolled_m: float
     is_rolling: bool  # straight on or in a turn on the spot
 
@@ -44,7 +44,7 @@ class LiftCheck:
         self, stamp_ns: int, wheel: Sequence[WheelSample], odom_from_body: Array, earlier_from_body: Array | None,
         climb_sigma_mps: float,
     ) -> bool:  # fmt: skip
-        """True if the robot leaves the floor with this frame; stamps on the IMU's clock.
+        """True if the robot leaves the ground with this frame; stamps on the IMU's clock.
 
         wheel: the samples since the frame before. odom_from_body (4, 4): z is up. earlier_from_body (4, 4): since the frame before.
         climb_sigma_mps: of the speed upwards.

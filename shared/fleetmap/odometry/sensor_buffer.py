@@ -79,7 +79,7 @@ class SensorBuffer:
 
     @property
     def on_wheels(self) -> bool:
-        """True if recent wheel odometry exists: the robot stands on a floor."""
+        """True if recent wheel odometry exists: the robot stands on the ground."""
         return bool(self._wheel)
 
     def wheel_between(self, start_ns: int, end_ns: int) -> list[WheelSample]:

@@ -1,6 +1,6 @@
 """Motion of a robot's body: a quintic spline in x, y, z, yaw, pitch, roll, so that rates and accelerations are exact.
 
-Euler angles are safe here: a floor robot never pitches anywhere near 90 degrees.
+Euler angles are safe here: a ground robot never pitches anywhere near 90 degrees.
 """
 
 from collections.abc import Callable, Sequence
@@ -100,7 +100,7 @@ class Shake:
 
 
 class RouteMotion:
-    """A route as driven by a body at `height_m` above the floor."""
+    """A route as driven by a body at `height_m` above the ground."""
 
     def __init__(self, route: Route, limits: Limits, height_m: float, shake: Shake, rng: np.random.Generator) -> None:
         path = time_path(route, limits)
@@ -180,13 +180,13 @@ class CarriedMotion:
         return self._pick(times_s, lambda motion, local_s: motion.velocity_body(local_s))
 
     def _local(self, times_s: Array) -> tuple[NDArray[np.int64], Array]:
-        """(N,) the piece in force, and the time since the robot stood on its floor, which is negative before."""
+        """(N,) the piece in force, and the time since the robot stood on the ground, which is negative before."""
         piece = np.minimum(np.searchsorted(self._ends_s, times_s, side="right"), len(self._motions) - 1)
         starts_s = np.concatenate([[0.0], self._ends_s[:-1] + LIFT_S])
         return piece, times_s - starts_s[piece]
 
     def _height(self, times_s: Array, derivative: int) -> Array:
-        """(N,) above the floor, or a derivative; the fifth-order curve that begins and ends at rest."""
+        """(N,) above the ground, or a derivative; the fifth-order curve that begins and ends at rest."""
         piece, local_s = self._local(times_s)
         ends_s = np.array([motion.duration_s for motion in self._motions])[piece]
         before, after = -local_s / LIFT_S, (local_s - ends_s) / LIFT_S
@@ -209,7 +209,7 @@ class CarriedMotion:
 
 
 def _control_points(path: TimedPath, height_m: float, shake: Shake, rng: np.random.Generator) -> Array:
-    """(K, 6) each KNOT_S from 6 knots before the start: the path, floor ripple with speed, squat, lean."""
+    """(K, 6) each KNOT_S from 6 knots before the start: the path, ground ripple with speed, squat, lean."""
     moments = np.arange(-6, int(np.ceil(path.times_s[-1] / KNOT_S)) + 7) * KNOT_S
     control = np.zeros((len(moments), 6))
     for column, source in ((0, path.points_map[:, 0]), (1, path.points_map[:, 1]), (3, path.yaw_rad)):

@@ -1,4 +1,4 @@
-"""Routes over the floor: way points rounded, timed within a robot's limits, checked against solid things."""
+"""Routes over the ground: way points rounded, timed within a robot's limits, checked against solid things."""
 
 import math
 from dataclasses import dataclass

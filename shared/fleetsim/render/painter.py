@@ -26,7 +26,7 @@ _NOISE_TABLE = 1 << 18
 class Look:
     """Quality of the pictures.
 
-    samples: per pixel side, for sharp pictures' edges. reflectance: of the floor seen from above.
+    samples: per pixel side, for sharp pictures' edges. reflectance: of the ground seen from above.
     """
 
     samples: int = 2

@@ -1,4 +1,4 @@
-"""The hall of one chunk: floor with markings, walls, roof, lamps, columns, docks, signs."""
+"""The hall of one chunk: ground with markings, walls, roof, lamps, columns, docks, signs."""
 
 from dataclasses import dataclass
 
@@ -82,7 +82,7 @@ class HallMaker:
         builder.add_quad((x_min, y_max, z_m), (x_max - x_min, 0, 0), (0, y_min - y_max, 0), surface)
 
     def _add_markings(self, builder: FaceBuilder, column: int, row: int) -> None:
-        """Lane lines along the racks, a stop line across each aisle mouth; 2 mm above the floor."""
+        """Lane lines along the racks, a stop line across each aisle mouth; 2 mm above the ground."""
         layout, (x_min, _, x_max, _) = self._layout, self.rectangle(column, row)
         y, half = layout.aisle_y_m(row), layout.aisle_width_m / 2 - 0.15
         x_first, x_last = layout.bay_x_m(0) - 0.5, layout.bay_x_m(layout.bays) + 0.5

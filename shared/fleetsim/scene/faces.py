@@ -34,7 +34,7 @@ _FACTORS = np.array([_CORNERS[name] for name in FACE_NAMES], np.float64)  # (6 f
 class Faces:
     """F faces ready for the core.
 
-    quads (F, 9): O, U, V in map, metres. values (F, 6): texels along U and V, tint, offset of the dirt (for floors: of
+    quads (F, 9): O, U, V in map, metres. values (F, 6): texels along U and V, tint, offset of the dirt (for ground: of
     the concrete) in texels x2, emission. numbers (F, 6): material, texture, lamp group, first light sample, light
     samples along U and V. owners (F, 2): box and side (index in FACE_NAMES), -1 without a box. boxes (B, 8): centre,
     half sizes, cos and sin of yaw.
@@ -61,7 +61,7 @@ class Surface(NamedTuple):
     """The look of a face or box. texture: of all sides of a box, or by the side's name.
 
     scramble chooses the face's window of the dirt texture; offset_texels replaces the offset that follows from it
-    (floor tiles meet through it).
+    (ground tiles meet through it).
     """
 
     texture: int | dict[str, int]

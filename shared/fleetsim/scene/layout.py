@@ -15,7 +15,7 @@ class Layout(Section, frozen=True):
     every row, which form cross aisles.
 
     has_landmarks: posters, columns with signs, marked docks, all different. are_aisles_identical: stock, labels and
-    floor repeat from aisle to aisle (until a slot is restocked), so that only geometry and context tell them apart.
+    ground repeat from aisle to aisle (until a slot is restocked), so that only geometry and context tell them apart.
     restock_per_day: share of slots. moved_rows: rack rows that deviate from the plan: number, and metres along y. markers: AprilTags
     (36h11) of marker_m: number, x, y, z of the middle, and yaw of the direction that they face.
     """

@@ -11,7 +11,7 @@ from fleetsim.scene.building import Lamp
 LIGHT_STATES = {"day": (1.0, 1.0, 1.0), "evening": (1.0, 1.0, 0.08), "night": (0.0, 0.8, 0.01)}
 LAMP_REACH_M = 14.0
 GREY_PER_MS = 70.0  # grey levels per unit radiance and millisecond of exposure at gain 1
-_AMBIENT_SHARE = 0.9  # of the unshadowed mean light on the floor
+_AMBIENT_SHARE = 0.9  # of the unshadowed mean light on the ground
 _MEAN_REFLECTANCE = 0.32
 
 
@@ -40,11 +40,11 @@ class LampField:
             self._ambient[lamp.group] += _AMBIENT_SHARE * lamp.power * _floor_integral(lamp.z_m) / floor_area_m2
 
     def ambient(self, groups: Array) -> float:
-        """Light that reaches every surface, one bounce crudely: a share of the mean light on the floor."""
+        """Light that reaches every surface, one bounce crudely: a share of the mean light on the ground."""
         return float(groups @ self._ambient)
 
     def floor_light(self, groups: Array, x_m: float, y_m: float) -> float:
-        """Unshadowed light on the floor at a place, ambient light included."""
+        """Unshadowed light on the ground at a place, ambient light included."""
         offsets = self._places - (x_m, y_m, 0.0)
         squared = np.einsum("ij,ij->i", offsets, offsets)
         near = squared < LAMP_REACH_M**2
@@ -59,7 +59,7 @@ def _received(squared_m2: Array, height_m: Array) -> Array:
 
 
 def _floor_integral(height_m: float) -> float:
-    """Integral of the lamp term over the floor under a lamp of power 1."""
+    """Integral of the lamp term over the ground under a lamp of power 1."""
     radius = (np.arange(400) + 0.5) * LAMP_REACH_M / 400
     squared = radius**2 + height_m**2
     inside = squared < LAMP_REACH_M**2

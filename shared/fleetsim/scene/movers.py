@@ -10,7 +10,7 @@ from fleetsim.scene.faces import FaceBuilder, Faces, Surface, Vector
 from fleetsim.textures.texture_set import Textures
 
 Part = tuple[Vector, Vector, str]  # centre and half sizes in the mover's axes, material
-# Share of the floor's light on the sides xXyYzZ.
+# Share of the ground's light on the sides xXyYzZ.
 SIDE_LIGHT = np.array([0.55, 0.7, 0.5, 0.65, 0.3, 1.0])
 
 
@@ -99,7 +99,7 @@ class Apparition:
     place_at: Callable[[float], tuple[float, float, float] | None]
 
     def place(self, t_s: float) -> tuple[float, float, float]:
-        """x, y, yaw in map at t; far below the floor while absent."""
+        """x, y, yaw in map at t; far below the ground while absent."""
         return self.place_at(t_s) or (-1e4, -1e4, 0.0)
 
 
@@ -123,7 +123,7 @@ def add_movers(builder: FaceBuilder, movers: tuple[AnyMover, ...], textures: Tex
 
 
 def mover_light(faces: Faces, movers: tuple[AnyMover, ...], floor_light: list[float], t_s: float) -> Array:
-    """Light samples of the movers' faces: the floor's light at each one's place, by side."""
+    """Light samples of the movers' faces: the ground's light at each one's place, by side."""
     boxes_of = [len(MOVER_KINDS[mover.kind].parts(t_s)) for mover in movers]
     of_box = np.repeat(np.array(floor_light), boxes_of)
     per_face = 0.8 * of_box[faces.owners[:, 0]] * SIDE_LIGHT[faces.owners[:, 1]]

@@ -88,15 +88,15 @@ class RackMaker:
                 y += sku.width_m + rng.uniform(0.05, 0.4)
 
     def add_parked_pallet(self, builder: FaceBuilder, number: int, x_m: float, y_m: float) -> None:
-        """A pallet with a stack of cartons on the floor by an end wall; changes as often as a slot."""
+        """A pallet with a stack of cartons on the ground by an end wall; changes as often as a slot."""
         layout, textures = self._layout, self._textures
         rng = slot_generator(layout, self._seed, self._day, Slot(layout.rows + number, 0, 0))
         pallet = Surface(textures.wood, scramble=int(rng.integers(0, 1 << 24)))
         builder.add_box((x_m, y_m, 0.07), (0.4, 0.6, 0.07), pallet)
         sku = textures.skus[int(rng.integers(0, len(textures.skus)))]
         sides = {"x": sku.front, "X": sku.front, "y": sku.side, "Y": sku.side, "z": sku.top, "Z": sku.top}
-        for floor in range(int(rng.integers(1, 5))):
-            z = 0.14 + (floor + 0.5) * sku.height_m + 0.002 * floor
+        for layer in range(int(rng.integers(1, 5))):
+            z = 0.14 + (layer + 0.5) * sku.height_m + 0.002 * layer
             for side in (-1, 1):
                 centre = (x_m + rng.uniform(-0.03, 0.03), y_m + side * (sku.width_m / 2 + 0.01), z)
                 half = (0.36, sku.width_m / 2, sku.height_m / 2)
@@ -159,8 +159,8 @@ class RackMaker:
             sku = textures.skus[int(rng.integers(0, len(textures.skus)))]
             if x + sku.width_m > end:
                 return
-            for floor in range(int(rng.integers(1, 4))):
-                bottom = base + floor * (sku.height_m + 0.002)
+            for layer in range(int(rng.integers(1, 4))):
+                bottom = base + layer * (sku.height_m + 0.002)
                 if bottom + sku.height_m > ceiling:
                     break
                 self._add_carton(builder, rng, sku, slot.row, (x, y, bottom))

@@ -58,7 +58,7 @@ def test_an_error_that_costs_3_cm_warns_and_that_of_another_rig_fails(parameter:
     """Three sigmas come off first: what is not sure is no fault."""
     limit = TOLERANCES[parameter]
     slack = (
-        3.0 * float(np.hypot(0.1 * limit.warn_above, limit.floor))
+        3.0 * float(np.hypot(0.1 * limit.warn_above, limit.least_sigma))
         + 3.0 * (RANGES[parameter].unit == "rad") * 0.4 / FOCAL_PX
     )
     name = parameter.name.lower()
@@ -75,7 +75,7 @@ def test_noise_is_told_in_multiples_of_the_data_sheet() -> None:
 
 def test_a_dear_error_that_may_be_chance_is_neither_ok_nor_a_fault() -> None:
     """One percent of baseline, 10 cm of 10 m, two and a half sigmas from nothing."""
-    sigma = np.hypot(0.1 * 0.003, TOLERANCES[P.BASELINE].floor)
+    sigma = np.hypot(0.1 * 0.003, TOLERANCES[P.BASELINE].least_sigma)
     (finding,) = [f for f in findings_of(estimate(baseline=-0.003 - 2.5 * sigma), FOCAL_PX) if f.name == "baseline"]
     assert finding.verdict is Verdict.NOT_JUDGED
     assert "that may be chance" in finding.sentence

@@ -117,8 +117,8 @@ def initial_state(vision: Trajectory, alignment: Alignment) -> InitialState:
     to_error[3:6] += skew(state.velocity_mps) @ to_error[0:3]
     to_error[6:9] = skew(state.position_m) @ to_error[0:3]
     covariance = 4.0 * to_error @ solved @ to_error.T
-    floor = np.diag([1e-6] * 3 + [1e-4] * 3 + [1e-6] * 3 + [4e-6] * 3 + [1e-4] * 3)
-    return InitialState(state, covariance + floor, int(vision.stamps_ns[-1]))
+    least = np.diag([1e-6] * 3 + [1e-4] * 3 + [1e-6] * 3 + [4e-6] * 3 + [1e-4] * 3)
+    return InitialState(state, covariance + least, int(vision.stamps_ns[-1]))
 
 
 def _gyro_bias_step(motion: VisualMotion, imu: ImuSamples, noise: ImuNoise, gyro_bias: Array) -> Array:

@@ -93,7 +93,9 @@ class WheelMode(Mode):
         sigma_m = (
             rolled.sigma_m + settings.wheel_speed_scale_sigma * rolled.way_m + settings.wheel_slip_mps * rolled.moving_s
         )
-        tilt_rad = settings.initial_tilt_sigma_rad if rolled.moving_s else 0.0  # by the floor, which wheels do not show
+        tilt_rad = (
+            settings.initial_tilt_sigma_rad if rolled.moving_s else 0.0
+        )  # by the ground, which wheels do not show
         turns = [sigma_rad + tilt_rad, sigma_rad + tilt_rad, sigma_rad]
         return np.diag(np.square([*turns, *[sigma_m + turns[0] * rolled.way_m] * 3]))
 

@@ -266,7 +266,7 @@ def status_log(stamp_ns: int, robot: str, status: str, cause: str) -> ChannelMes
 
 
 def lines(stamp_ns: int, ends_m: Array, topic: str, frame: str) -> ChannelMessage:
-    """Lines between two places (L, 2, 2) on the floor of a frame."""
+    """Lines between two places (L, 2, 2) on the ground of a frame."""
     corners = [Point3(x=x, y=y) for x, y in ends_m.reshape(-1, 2).tolist()]
     line = LinePrimitive(
         type=LinePrimitiveLineType.LineList,
