@@ -274,9 +274,12 @@ class MapQuery:
         if prior is None:
             return fixes, False
         within = tracker.within_prior(fixes)
+        if prior.is_measured and within and within[0].inliers < self._track.competitor_share * fixes[0].inliers:
+            within = []  # what looks a little like this place is elsewhere
         if within or not prior.is_revisable:
             # An operator may have chosen an alias of the place.
-            return fixes if prior.is_revisable else within, len(within) < len(fixes)
+            is_open = prior.is_revisable and not prior.is_measured
+            return fixes if is_open else within, len(within) < len(fixes)
         yield
         fixes = []
         for floor in self._maps.by_floor:

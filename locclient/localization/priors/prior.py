@@ -54,7 +54,7 @@ class Prior:
     hypothesis: the pose by both, published while the map gives none; None for priors with an unknown heading. contradictions: places
     of fixes outside a revisable prior. is_told: True for a prior from outside, such as a dock, a zone or an operator; else it is the
     robot's own estimate by odometry. floors: those on which the robot may be, with prior_from_map (4, 4), from each one's map to that of
-    the prior; None for the same map. is_ride: the robot may have ridden a lift to any of them.
+    the prior; None for the same map. is_ride: the robot may have ridden a lift to any of them. is_measured: as of `PositionPrior`.
     """
 
     def __init__(
@@ -67,6 +67,7 @@ class Prior:
         *,
         is_revisable: bool,
         is_told: bool = False,
+        is_measured: bool = False,
         is_ride: bool = False,
         travelled_m: float = 0.0,
         floors: Mapping[str, Array | None] | None = None,
@@ -75,6 +76,7 @@ class Prior:
         self._base, self._since, self.hypothesis = base, since, known
         self._base_from_body, self._settings = base_from_body, settings
         self.is_revisable, self.is_told, self.is_ride = is_revisable, is_told, is_ride
+        self.is_measured = is_measured
         self.travelled_m = travelled_m
         self.floors: Mapping[str, Array | None] = floors or {base.floor: None}
         self.contradictions = HypothesisSet(settings)
@@ -92,8 +94,8 @@ class Prior:
         base, known = Place(prior.map_from_base, prior.cov_rot_trans, prior.floor or ""), None
         if np.isfinite(prior.cov_rot_trans).all():
             known = PoseHypothesis.at(odometry, base.of_point(base_from_body))
-        rig = base_from_body, settings
-        return cls(base, PoseHypothesis.at(odometry), known, *rig, is_revisable=prior.is_revisable, is_told=True, **how)
+        how = {"is_revisable": prior.is_revisable, "is_measured": prior.is_measured, "is_told": True} | how
+        return cls(base, PoseHypothesis.at(odometry), known, base_from_body, settings, **how)
 
     @classmethod
     def at(cls, known: PoseHypothesis, base_from_body: Array, settings: TrackSettings, **how: Any) -> "Prior":

@@ -58,7 +58,9 @@ class MarkerPriors:
         best = min(new, key=lambda number: float(np.trace(self._seen[number].cov_rot_trans[3:, 3:])))
         self._told.add(best)
         map_from_base, covariance, site = self._seen[best]
-        return [PositionPrior(frame.stamp_ns, map_from_base, covariance, is_revisable=True, floor=site)]
+        return [
+            PositionPrior(frame.stamp_ns, map_from_base, covariance, is_revisable=True, floor=site, is_measured=True)
+        ]
 
     def judge(self, estimate: Estimate) -> str:
         """Compare the frame's markers with its estimate; return a text that names those that stand elsewhere than listed."""

@@ -92,7 +92,8 @@ class PositionPrior:
 
     map_from_base (4, 4); cov_rot_trans (6, 6) of a perturbation in map axes; infinite where unknown. is_revisable: from an operator, who
     may err: it replaces the robot's estimate, and fixes may contradict it. floor: whose `map` it is in, of a building; empty for the
-    robot's own site, None for the floor where it is.
+    robot's own site, None for the floor where it is. is_measured: of a revisable one, that a sensor told it, which errs otherwise than by
+    taking one of several alike places for another.
     """
 
     stamp_ns: int
@@ -100,6 +101,7 @@ class PositionPrior:
     cov_rot_trans: Array
     is_revisable: bool = False
     floor: str | None = None
+    is_measured: bool = False
 
 
 # Default sigmas of an operator's pose: roll pitch yaw (rad), x y z (m). Yaw, x and y are those of RViz.

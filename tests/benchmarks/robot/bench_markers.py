@@ -1,7 +1,7 @@
 """Starts before a marker in one of six identical aisles, and before one that was moved by two metres: at the estimator's level.
 
 `PYTHONPATH=tests python tests/benchmarks/robot/bench_markers.py [--starts N] [--seed N] [--only NAME...] [--out FILE.json]`.
-N starts (100) of each kind, spread over the drive. A marker of 0.2 m stands 1.5 to 3.5 m before the robot and is turned from it by up to 35
+N starts (100) of each kind, spread over the drive. A marker of 0.2 m stands 0.8 to 2.2 m before the robot and is turned from it by up to 35
 degrees, in pictures that OpenCV paints and the plug-in searches, as long as it is seen. "moved": its list places it two metres off, in a
 direction of its own, in the identical aisles and in the same ones with signs at their ends; the robot drives on for ten seconds.
 """
@@ -70,7 +70,7 @@ def start_at(site: Site, number: int, moved_m: float, duration_s: float, rng: np
     """The start at a frame of the drive."""
     session = LateSession(site.robot, number)
     map_from_cam = session.map_from_body[0] @ session.body_from_cam
-    ahead_m, bearing_rad = rng.uniform(1.5, 3.5), rng.uniform(-0.35, 0.35)
+    ahead_m, bearing_rad = rng.uniform(0.8, 2.2), rng.uniform(-0.35, 0.35)
     offset = ahead_m * np.array([np.tan(bearing_rad), rng.uniform(-0.15, 0.15), 1.0])
     seen_rad = np.arctan2(*-map_from_cam[1::-1, 2])
     there = facing(map_from_cam[:3, 3] + map_from_cam[:3, :3] @ offset, seen_rad + rng.uniform(-0.6, 0.6))
