@@ -5,8 +5,6 @@ from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.hooks import plugins
 from fleetmap.messages import EstimateMessage, Placement, covariance_entries, encode_message, robot_key
-from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sources.intake import Intake
 from locclient.hooks import OutputHook
 from locclient.localization.estimate import Estimate
 from locclient.output_section import OutputSection
@@ -19,8 +17,9 @@ _MAX_HYPOTHESES = 16
 class MessagePackPublisher(Publisher):
     """Sends EstimateMessage under the robot's key."""
 
-    def __init__(self, bus: Bus, key: str) -> None:
-        self._bus, self._key = bus, key
+    def __init__(self, _section: OutputSection, bus: Bus, site: str, robot: str, *_: object) -> None:
+        """See `OutputHook`."""
+        self._bus, self._key = bus, robot_key(site, robot, "estimate")
 
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
         body_from_base = se3_inverse(base_from_body)
@@ -41,13 +40,7 @@ class MessagePackPublisher(Publisher):
         self._bus.publish(self._key, encode_message(message), may_drop=True)
 
 
-def _message_pack(
-    _section: OutputSection, bus: Bus, site: str, robot: str, _calibration: RigCalibration, _intake: Intake
-) -> Publisher:
-    return MessagePackPublisher(bus, robot_key(site, robot, "estimate"))
-
-
-OUTPUTS = {"messagepack": OutputHook(_message_pack, lambda _section, _topics: None, Bus.connect)}
+OUTPUTS = {"messagepack": OutputHook(MessagePackPublisher, lambda _section, _topics: None, Bus.connect)}
 
 
 def output_of(section: OutputSection) -> OutputHook:

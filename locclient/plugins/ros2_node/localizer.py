@@ -164,9 +164,9 @@ class Ros2Localizer(Publisher):
     """
 
     def __init__(
-        self, bus: Bus, robot: str, section: OutputSection, calibration: RigCalibration, intake: Intake
+        self, section: OutputSection, bus: Bus, _site: str, robot: str, calibration: RigCalibration, intake: Intake
     ) -> None:
-        """Raises UsageError for invalid names."""
+        """See `OutputHook`. Raises UsageError for invalid names."""
         self._section, self._robot, self._calibration, self._intake = section, robot, calibration, intake
         self.grid_height_m = section.robot_height_m if section.map_topic else None
         self._grid: OccupancyGrid | None = None

@@ -4,9 +4,7 @@ from functools import partial
 
 from fleetmap.bus import Bus
 from fleetmap.errors import UsageError
-from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.source_settings import Topics
-from fleetmap.sources.intake import Intake
 from locclient.hooks import OutputHook
 from locclient.output_section import OutputSection
 from locclient.plugins.ros2_node.localizer import Ros2Localizer
@@ -27,10 +25,4 @@ def _check(section: OutputSection, topics: Topics) -> None:
         )
 
 
-def _open(
-    section: OutputSection, bus: Bus, _site: str, robot: str, calibration: RigCalibration, intake: Intake
-) -> Ros2Localizer:
-    return Ros2Localizer(bus, robot, section, calibration, intake)
-
-
-OUTPUT = OutputHook(_open, _check, partial(Bus.connect, is_ros=True))
+OUTPUT = OutputHook(Ros2Localizer, _check, partial(Bus.connect, is_ros=True))
