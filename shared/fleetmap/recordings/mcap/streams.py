@@ -131,18 +131,16 @@ def open_written(path: Path, opener: Callable[[], Container], options: OpenOptio
 
     def parts_of(container: Container, given: CalibrationFile | None, log: ReadLog) -> RecordingParts:
         streams, others = collect(container, lambda channel: _stream_of(container, channel), log)
-        roles = _named(streams, options.topics)
-        if "left" not in roles:
-            topics = ", ".join(f"{c.topic} ({c.type_name})" for c in (*(s.channel for s in streams), *others)) or "none"
-            wanted = f"name it with --topic left=/NAME. There is {topics}; {log.told() or 'nothing is damaged'}"
-            raise RecordingError(f"{container.path}: no images are on {options.topics.left}; {wanted}")
+        there = ", ".join(f"{c.topic} ({c.type_name})" for c in (*(s.channel for s in streams), *others)) or "none"
+        found = "; ".join(filter(None, (f"there is {there}", log.told())))
+        roles = _named(streams, options.topics, f"{container.path} has no", found)
 
         def calibrate(_: str | None) -> tuple[RigCalibration, Sequence[str]]:
-            found = given.calibration if given else attached_calibration(container)
-            if found is None:
+            calibration = given.calibration if given else attached_calibration(container)
+            if calibration is None:
                 how = "pass a calibration with --calibration FILE"
                 raise CalibrationError(f"{container.path} has no attachment {CALIBRATION_ATTACHMENT}; {how}")
-            return found, CAMERA_ROLES
+            return calibration, CAMERA_ROLES
 
         return assemble(container, opener, streams, roles, calibrate, log)
 
@@ -156,12 +154,16 @@ def _stream_of(container: Container, channel: Channel) -> Stream | None:
     return (ImageStream if channel.type_name in _TYPES["left"] else Stream)(container, channel)
 
 
-def _named(streams: Sequence[Stream], topics: Topics) -> Roles:
+def _named(streams: Sequence[Stream], topics: Topics, has_no: str, found: str) -> Roles:
+    """Streams by the names of their topics. RecordingError without the left image, and without a topic that the caller named."""
     roles = {}
     for role, types in _TYPES.items():
+        name = getattr(topics, role)
         there = {stream.channel.topic: stream for stream in streams if stream.channel.type_name in types}
-        if found := next((there[name] for name in transports(getattr(topics, role), role) if name in there), None):
-            roles[role] = [found]
+        if stream := next((there[sent] for sent in transports(name, role) if sent in there), None):
+            roles[role] = [stream]
+        elif role == "left" or (name and name != getattr(Topics(), role)):
+            raise RecordingError(f"{has_no} topic {name} of type {' or '.join(types)} for --topic {role}; {found}")
     return roles
 
 

@@ -13,7 +13,8 @@ from mcap_ros2.decoder import DecoderFactory
 
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import se3, se3_exp, so3_exp
-from fleetmap.recordings import open_recording
+from fleetmap.recordings import OpenOptions, Topics, open_recording
+from fleetmap.recordings.mcap import reader
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, PositionPrior, SensorSet, Trajectory, WheelSample
@@ -130,3 +131,24 @@ def test_base_and_time_shift_travel(tmp_path: Path) -> None:
     recording = open_recording(write(tmp_path / "a.mcap", calibration=rig))
     np.testing.assert_array_equal(recording.calibration.base_from_body, rig.base_from_body)
     assert [c.imu_minus_cam_s for c in recording.calibration.cameras] == [0.0123, 0.0123]
+
+
+@pytest.mark.parametrize(
+    ("topics", "says"),
+    [
+        (
+            Topics(left="/front"),
+            "no topic /front of type sensor_msgs/Image or .* for --topic left; there is .*/cam0/image_raw",
+        ),
+        (Topics(wheel="/wheels"), "no topic /wheels of type nav_msgs/Odometry for --topic wheel"),
+        (Topics(wheel="", imu=""), ""),
+    ],
+)
+def test_topics_that_were_named_must_be_there(tmp_path: Path, topics: Topics, says: str) -> None:
+    path = write(tmp_path / "a.mcap")
+    if says:
+        with pytest.raises(RecordingError, match=says):
+            reader.open_mcap(path, OpenOptions(topics=topics))
+        return
+    with reader.open_mcap(path, OpenOptions(topics=topics)) as recording:
+        assert (recording.wheel, len(recording.imu), recording.sensor_set) == ((), 0, SensorSet.STEREO)
