@@ -16,14 +16,11 @@ import fleetmap
 from fleetmap.bus import Bus
 from fleetmap.encoding import to_json
 from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT
-from mapserver.api import describe, problems, views
+from mapserver.api import building_routes, describe, fleet_routes, inbox_routes, problems, views
 from mapserver.api import parameters as p
-from mapserver.api.building_routes import install_building_routes
 from mapserver.api.bytes_response import bytes_response
 from mapserver.api.file_routes import install_file_routes
-from mapserver.api.fleet_routes import install_fleet_routes
 from mapserver.api.guard import Guard
-from mapserver.api.inbox_routes import install_inbox_routes
 from mapserver.api.metrics import CONTENT_TYPE, Metrics
 from mapserver.api.people_routes import install_people_routes
 from mapserver.api.request_limits import RequestLimits
@@ -64,15 +61,16 @@ def create_app(
     app.add_middleware(Guard, settings=replace(settings.guard, operators=operators))
     app.add_middleware(RequestLimits)
     app.add_middleware(_Measured, metrics=metrics)
+    app.state.store, app.state.resurvey, app.state.placing = store, settings.resurvey, RobotPlacing(store, fleet, bus)
+    app.state.nights, app.state.uploads = settings.nights, set()
+    for routes in (inbox_routes, fleet_routes, building_routes):
+        app.include_router(routes.router)
     _install_service_routes(app, store, fleet, metrics, bus)
     _install_list_routes(app, store, fleet)
     _install_map_routes(app, store)
     install_file_routes(app, store)
-    install_inbox_routes(app, store, settings.nights)
     install_version_routes(app, store, settings)
-    install_fleet_routes(app, store, settings.resurvey, RobotPlacing(store, fleet, bus))
     install_server_routes(app, store, fleet, settings)
-    install_building_routes(app, store)
     install_people_routes(app, store, operators, bus)
     describe.install(app)
     return app

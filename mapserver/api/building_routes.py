@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any
 
-from fastapi import Depends, FastAPI, Header, Query, Request, Response
+from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from starlette.exceptions import HTTPException
 
 from fleetmap.encoding import to_plain
@@ -54,87 +54,101 @@ PlanName = Annotated[
 Scale = Annotated[
     float | None, Query(ge=1e-6, le=1e3, description="of the plan; without it estimated from the pins", examples=[None])
 ]
-
-
-def install_building_routes(app: FastAPI, store: MapStore) -> None:
-    """Add the endpoints."""
-
-    @app.get("/v1/sites/{site}/areas")
-    def areas(response: Response, site: p.Site) -> dict[str, Any]:
-        """Named areas of a site as GeoJSON, with metres in `map` instead of degrees."""
-        store.current(site)  # raises for an unknown site
-        _tag(response, site)  # read first: a change in between makes the tag too old, not the areas
-        return store.areas(site).geojson(site)
-
-    @app.put("/v1/sites/{site}/areas", openapi_extra=_file("application/geo+json"))
-    def replace(response: Response, site: p.Site, by: By, data: File, if_match: IfMatch = None) -> dict[str, Any]:
-        """Replace the areas of a site by those of a file, as `mapserver areas import`. Areas drawn in the building stay in its frame."""
-        store.current(site)
-        with _refused_with(422):
-            kept = replace_areas(store, site, data, by, tag=_given(if_match))
-        _tag(response, site)
-        return kept.geojson(site)
-
-    @app.delete("/v1/sites/{site}/areas")
-    def remove(site: p.Site, by: By, if_match: IfMatch = None) -> views.ServiceState:
-        """Remove the areas of a site; their past counts stay."""
-        keep_areas(store, site, None, "no areas", by, tag=_given(if_match))
-        return views.ServiceState("ok")
-
-    @app.post("/v1/sites/{site}/areas/undo")
-    def undo(request: Request, site: p.Site, act: views.Act) -> dict[str, Any]:
-        """Bring back the areas and corrections of a site as before their last change; once more, and they are as now."""
-        return undo_areas(store, site, actor_of(request, act.actor, act.reason)).geojson(site)
-
-    @app.get("/v1/sites/{site}/alignment")
-    def alignment(site: p.Site) -> dict[str, Any]:
-        """The pose of the map in the drawing of its building, with what is left at each pin."""
-        store.current(site)
-        found = store.alignment(site)
-        if found is None:
-            raise HTTPException(404, f"site {site} is not aligned; PUT pins and the picture of a floor plan here")
-        return dict(to_plain(found))
-
-    @app.put("/v1/sites/{site}/alignment", openapi_extra=_file("application/octet-stream"))
-    def set_alignment(
-        site: p.Site, by: By, data: PlanFile, pin: Pins, plan: PlanName = None, metres_per_pixel: Scale = None
-    ) -> dict[str, Any]:
-        """Align the map with the picture of a floor plan (PNG, JPEG, TIFF, BMP or PGM), or with pins alone, as `mapserver align`."""
-        store.current(site)
-        if bool(data) != (plan is not None):
-            raise HTTPException(422, "send a picture as the body with its name as `plan`, or neither of them")
-        with _refused_with(422):
-            drawing = None if plan is None else decode_plan(plan, data)
-            found, _ = align(store, site, [parse_pin(text) for text in pin], drawing, metres_per_pixel, by)
-        return dict(to_plain(found))
-
-    @app.get("/v1/sites/{site}/alignment/estimate")
-    def estimate(site: p.Site, pin: Pins, metres_per_pixel: Scale = None) -> dict[str, Any]:
-        """The pose of the map that these pins would give, with what is left at each; nothing is kept."""
-        store.current(site)
-        with _refused_with(422):
-            found, fit = estimate_alignment(store, site, [parse_pin(text) for text in pin], None, metres_per_pixel)
-        return dict(to_plain(found)) | {"far_sigma_m": fit.far_sigma_m, "is_checked": fit.is_checked}
-
-    @app.delete("/v1/sites/{site}/alignment")
-    def forget(site: p.Site, by: By) -> views.ServiceState:
-        """Remove the alignment of a site and its floor plan; 409 while areas are drawn in the building."""
-        store.current(site)
-        with _refused_with(409):
-            forget_alignment(store, site, by)
-        return views.ServiceState("ok")
-
-    def _tag(response: Response, site: str) -> None:
-        response.headers.update({"ETag": f'"{store.areas_tag(site)}"', "Cache-Control": "no-cache"})
-
-
-def _given(if_match: str | None) -> str | None:
-    return None if if_match in (None, "*") else if_match.removeprefix("W/").strip('"')
+router = APIRouter()
 
 
 def _file(media_type: str) -> dict[str, Any]:
     """The OpenAPI description of a body that is a file."""
     return {"requestBody": {"content": {media_type: {"schema": {"type": "string", "format": "binary"}}}}}
+
+
+@router.get("/v1/sites/{site}/areas")
+def areas(response: Response, store: p.Store, site: p.Site) -> dict[str, Any]:
+    """Named areas of a site as GeoJSON, with metres in `map` instead of degrees."""
+    store.current(site)  # raises for an unknown site
+    _tag(response, store, site)  # read first: a change in between makes the tag too old, not the areas
+    return store.areas(site).geojson(site)
+
+
+@router.put("/v1/sites/{site}/areas", openapi_extra=_file("application/geo+json"))
+def replace(
+    response: Response, store: p.Store, site: p.Site, by: By, data: File, if_match: IfMatch = None
+) -> dict[str, Any]:
+    """Replace the areas of a site by those of a file, as `mapserver areas import`. Areas drawn in the building stay in its frame."""
+    store.current(site)
+    with _refused_with(422):
+        kept = replace_areas(store, site, data, by, tag=_given(if_match))
+    _tag(response, store, site)
+    return kept.geojson(site)
+
+
+@router.delete("/v1/sites/{site}/areas")
+def remove(store: p.Store, site: p.Site, by: By, if_match: IfMatch = None) -> views.ServiceState:
+    """Remove the areas of a site; their past counts stay."""
+    keep_areas(store, site, None, "no areas", by, tag=_given(if_match))
+    return views.ServiceState("ok")
+
+
+@router.post("/v1/sites/{site}/areas/undo")
+def undo(request: Request, store: p.Store, site: p.Site, act: views.Act) -> dict[str, Any]:
+    """Bring back the areas and corrections of a site as before their last change; once more, and they are as now."""
+    return undo_areas(store, site, actor_of(request, act.actor, act.reason)).geojson(site)
+
+
+@router.get("/v1/sites/{site}/alignment")
+def alignment(store: p.Store, site: p.Site) -> dict[str, Any]:
+    """The pose of the map in the drawing of its building, with what is left at each pin."""
+    store.current(site)
+    found = store.alignment(site)
+    if found is None:
+        raise HTTPException(404, f"site {site} is not aligned; PUT pins and the picture of a floor plan here")
+    return dict(to_plain(found))
+
+
+@router.put("/v1/sites/{site}/alignment", openapi_extra=_file("application/octet-stream"))
+def set_alignment(
+    store: p.Store,
+    site: p.Site,
+    by: By,
+    data: PlanFile,
+    pin: Pins,
+    plan: PlanName = None,
+    metres_per_pixel: Scale = None,
+) -> dict[str, Any]:
+    """Align the map with the picture of a floor plan (PNG, JPEG, TIFF, BMP or PGM), or with pins alone, as `mapserver align`."""
+    store.current(site)
+    if bool(data) != (plan is not None):
+        raise HTTPException(422, "send a picture as the body with its name as `plan`, or neither of them")
+    with _refused_with(422):
+        drawing = None if plan is None else decode_plan(plan, data)
+        found, _ = align(store, site, [parse_pin(text) for text in pin], drawing, metres_per_pixel, by)
+    return dict(to_plain(found))
+
+
+@router.get("/v1/sites/{site}/alignment/estimate")
+def estimate(store: p.Store, site: p.Site, pin: Pins, metres_per_pixel: Scale = None) -> dict[str, Any]:
+    """The pose of the map that these pins would give, with what is left at each; nothing is kept."""
+    store.current(site)
+    with _refused_with(422):
+        found, fit = estimate_alignment(store, site, [parse_pin(text) for text in pin], None, metres_per_pixel)
+    return dict(to_plain(found)) | {"far_sigma_m": fit.far_sigma_m, "is_checked": fit.is_checked}
+
+
+@router.delete("/v1/sites/{site}/alignment")
+def forget(store: p.Store, site: p.Site, by: By) -> views.ServiceState:
+    """Remove the alignment of a site and its floor plan; 409 while areas are drawn in the building."""
+    store.current(site)
+    with _refused_with(409):
+        forget_alignment(store, site, by)
+    return views.ServiceState("ok")
+
+
+def _tag(response: Response, store: MapStore, site: str) -> None:
+    response.headers.update({"ETag": f'"{store.areas_tag(site)}"', "Cache-Control": "no-cache"})
+
+
+def _given(if_match: str | None) -> str | None:
+    return None if if_match in (None, "*") else if_match.removeprefix("W/").strip('"')
 
 
 @contextmanager

@@ -4,14 +4,15 @@ import asyncio
 import logging
 import time
 from pathlib import Path as File
+from typing import cast
 
-from fastapi import FastAPI, Request, Response
+from fastapi import APIRouter, Request, Response
 from starlette.exceptions import HTTPException
 
 from fleetmap.errors import StateError, UsageError
 from mapserver.api import views
 from mapserver.api.guard import By, actor_of
-from mapserver.api.parameters import Box, Number, RecordingName, Site
+from mapserver.api.parameters import Box, Number, RecordingName, Site, Store
 from mapserver.drafting.job_lock import log_path
 from mapserver.nightly.inbox import contents, put_back, sites_of
 from mapserver.nightly.upload import Upload
@@ -30,90 +31,96 @@ _FILE = {
 }
 _TEXT = {"content": {"text/plain": {"schema": {"type": "string"}}}}
 _log = logging.getLogger(__name__)
+router = APIRouter()
 
 
-def install_inbox_routes(app: FastAPI, store: MapStore, nights: NightRuns | None) -> None:
-    """Add the endpoints. nights: None if the server has no inbox."""
-    uploads: set[File] = set()
+def _runs(request: Request) -> NightRuns:
+    if request.app.state.nights is None:
+        raise StateError(NO_INBOX)
+    return cast(NightRuns, request.app.state.nights)
 
-    def runs() -> NightRuns:
-        if nights is None:
-            raise StateError(NO_INBOX)
-        return nights
 
-    def log(kind: str, words: str, site: str, actor: Actor) -> None:
-        store.audit(kind, words, actor=actor, site=site)
-        _log.info(
-            "site %s: %s: %s, by %s: %s", site, kind.replace("_", " "), words, actor.name, actor.reason or "no reason"
-        )
+def _uploads(request: Request) -> set[File]:
+    """The files that are being uploaded."""
+    return cast(set[File], request.app.state.uploads)
 
-    @app.get("/v1/sites/{site}/inbox")
-    def inbox(site: Site) -> views.Inbox:
-        """Recordings in the inbox of a site: those that wait, were held or are bad with the reason, and how many are in a version."""
-        folder = runs().inbox
-        if site not in {*sites_of(folder), *store.sites_with_jobs(), *(info.site for info in store.sites())}:
-            raise UsageError(f"no inbox of a site {site}; its first upload makes one")
-        here = contents(folder / site, SETTLE_S, time.time_ns())
-        return views.Inbox(site, here.waiting, here.held, here.bad, here.done)
 
-    @app.put("/v1/sites/{site}/inbox/{name}", status_code=201, openapi_extra=_FILE)
-    async def upload(request: Request, site: Site, name: RecordingName, who: By) -> views.Uploaded:
-        """Upload a recording as the request's body; it is there once all of it is. The first one of a site makes its inbox."""
-        folder = runs().inbox / site
-        if folder / name in uploads:
-            raise StateError(f"{name} is being uploaded already; wait for its end")
-        if len(uploads) >= _MOST_UPLOADS:
-            raise HTTPException(
-                429, f"{_MOST_UPLOADS} uploads go on; try again when one has ended", {"Retry-After": "30"}
-            )
-        uploads.add(folder / name)
+def _logged(store: MapStore, kind: str, words: str, site: str, actor: Actor) -> None:
+    store.audit(kind, words, actor=actor, site=site)
+    _log.info(
+        "site %s: %s: %s, by %s: %s", site, kind.replace("_", " "), words, actor.name, actor.reason or "no reason"
+    )
+
+
+@router.get("/v1/sites/{site}/inbox")
+def inbox(request: Request, store: Store, site: Site) -> views.Inbox:
+    """Recordings in the inbox of a site: those that wait, were held or are bad with the reason, and how many are in a version."""
+    folder = _runs(request).inbox
+    if site not in {*sites_of(folder), *store.sites_with_jobs(), *(info.site for info in store.sites())}:
+        raise UsageError(f"no inbox of a site {site}; its first upload makes one")
+    here = contents(folder / site, SETTLE_S, time.time_ns())
+    return views.Inbox(site, here.waiting, here.held, here.bad, here.done)
+
+
+@router.put("/v1/sites/{site}/inbox/{name}", status_code=201, openapi_extra=_FILE)
+async def upload(request: Request, store: Store, site: Site, name: RecordingName, who: By) -> views.Uploaded:
+    """Upload a recording as the request's body; it is there once all of it is. The first one of a site makes its inbox."""
+    folder, uploads = _runs(request).inbox / site, _uploads(request)
+    if folder / name in uploads:
+        raise StateError(f"{name} is being uploaded already; wait for its end")
+    if len(uploads) >= _MOST_UPLOADS:
+        raise HTTPException(429, f"{_MOST_UPLOADS} uploads go on; try again when one has ended", {"Retry-After": "30"})
+    uploads.add(folder / name)
+    try:
+        stated = request.headers.get("content-length")
+        part = await asyncio.to_thread(Upload, folder, name, None if stated is None else int(stated))
         try:
-            stated = request.headers.get("content-length")
-            part = await asyncio.to_thread(Upload, folder, name, None if stated is None else int(stated))
-            try:
-                data = bytearray()
-                async for chunk in request.stream():
-                    data += chunk
-                    if len(data) >= _WRITTEN_BYTES:
-                        await asyncio.to_thread(part.write, bytes(data))
-                        data.clear()
-                await asyncio.to_thread(part.write, bytes(data))
-                await asyncio.to_thread(part.end)
-            finally:
-                await asyncio.to_thread(part.discard)
-            await asyncio.to_thread(log, "recording_uploaded", f"{name}, {part.size_bytes} bytes", site, who)
-            return views.Uploaded(name, part.size_bytes)
-        except StateError:
-            raise
-        except UsageError as error:
-            raise HTTPException(422, str(error)) from error
+            data = bytearray()
+            async for chunk in request.stream():
+                data += chunk
+                if len(data) >= _WRITTEN_BYTES:
+                    await asyncio.to_thread(part.write, bytes(data))
+                    data.clear()
+            await asyncio.to_thread(part.write, bytes(data))
+            await asyncio.to_thread(part.end)
         finally:
-            uploads.discard(folder / name)
+            await asyncio.to_thread(part.discard)
+        await asyncio.to_thread(_logged, store, "recording_uploaded", f"{name}, {part.size_bytes} bytes", site, who)
+        return views.Uploaded(name, part.size_bytes)
+    except StateError:
+        raise
+    except UsageError as error:
+        raise HTTPException(422, str(error)) from error
+    finally:
+        uploads.discard(folder / name)
 
-    @app.post("/v1/sites/{site}/inbox/{box}/{name}/retry")
-    def retry(request: Request, site: Site, box: Box, name: RecordingName, act: views.Act) -> views.Inbox:
-        """Move a held or bad recording back into the inbox, for the next build."""
-        who = actor_of(request, act.actor, act.reason)
-        put_back(runs().inbox / site, box, name)
-        log("recording_tried_again", f"{name}, which was {box}", site, who)
-        return inbox(site)
 
-    @app.post("/v1/sites/{site}/build", status_code=202)
-    def build(request: Request, site: Site, act: views.Act) -> JobInfo:
-        """Build, judge and publish what waits in the inbox of a site, as `mapserver nightly` does; the answer is its job, which goes on."""
-        who = actor_of(request, act.actor, act.reason)
-        if site not in sites_of(runs().inbox):
-            raise StateError(f"nothing was ever uploaded for site {site}; upload a recording first")
-        return runs().start(site, lambda: log("build_started", "of what waits in the inbox", site, who))
+@router.post("/v1/sites/{site}/inbox/{box}/{name}/retry")
+def retry(request: Request, store: Store, site: Site, box: Box, name: RecordingName, act: views.Act) -> views.Inbox:
+    """Move a held or bad recording back into the inbox, for the next build."""
+    who = actor_of(request, act.actor, act.reason)
+    put_back(_runs(request).inbox / site, box, name)
+    _logged(store, "recording_tried_again", f"{name}, which was {box}", site, who)
+    return inbox(request, store, site)
 
-    @app.get("/v1/jobs/{job}/log", response_class=Response, responses={200: _TEXT})
-    def job_log(job: Number) -> Response:
-        """The last 64 KiB of a job's log, also while it runs."""
-        store.job(job)  # raises for an unknown one
-        try:
-            with log_path(store.folder, job).open("rb") as file:
-                file.seek(max(0, file.seek(0, 2) - _LOG_BYTES))
-                text = file.read(_LOG_BYTES).decode("utf-8", "replace")
-        except FileNotFoundError:
-            raise HTTPException(404, f"job {job} has no log: it ran in a terminal, or long ago") from None
-        return Response(text, media_type="text/plain", headers={"Cache-Control": "no-store"})
+
+@router.post("/v1/sites/{site}/build", status_code=202)
+def build(request: Request, store: Store, site: Site, act: views.Act) -> JobInfo:
+    """Build, judge and publish what waits in the inbox of a site, as `mapserver nightly` does; the answer is its job, which goes on."""
+    who = actor_of(request, act.actor, act.reason)
+    if site not in sites_of(_runs(request).inbox):
+        raise StateError(f"nothing was ever uploaded for site {site}; upload a recording first")
+    return _runs(request).start(site, lambda: _logged(store, "build_started", "of what waits in the inbox", site, who))
+
+
+@router.get("/v1/jobs/{job}/log", response_class=Response, responses={200: _TEXT})
+def job_log(store: Store, job: Number) -> Response:
+    """The last 64 KiB of a job's log, also while it runs."""
+    store.job(job)  # raises for an unknown one
+    try:
+        with log_path(store.folder, job).open("rb") as file:
+            file.seek(max(0, file.seek(0, 2) - _LOG_BYTES))
+            text = file.read(_LOG_BYTES).decode("utf-8", "replace")
+    except FileNotFoundError:
+        raise HTTPException(404, f"job {job} has no log: it ran in a terminal, or long ago") from None
+    return Response(text, media_type="text/plain", headers={"Cache-Control": "no-store"})

@@ -1,9 +1,9 @@
 """Parameters of paths and queries, and pages of long lists: `limit` items behind `cursor`, `next` the following page's cursor."""
 
 from collections.abc import Callable, Sequence
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal, TypeVar, cast
 
-from fastapi import Path, Query
+from fastapi import Depends, Path, Query, Request
 from fastapi.dependencies.utils import get_flat_params
 from fastapi.params import Header
 from fastapi.routing import APIRoute
@@ -15,7 +15,7 @@ from fleetmap.errors import UsageError
 from fleetmap.mapformat.names import NAME_PATTERN, SHA256_PATTERN
 from mapserver.api.moments import read_range
 from mapserver.operators.roles import OPERATOR_PATTERN
-from mapserver.store import FailureFilter
+from mapserver.store import FailureFilter, MapStore
 
 Item = TypeVar("Item")
 
@@ -77,6 +77,14 @@ async def known_parameters(request: HTTPConnection) -> None:
     if unknown:
         words = f"this address knows {', '.join(sorted(known))}" if known else "this address has none"
         raise HTTPException(422, f"unknown query parameter {unknown[0][:40]!r}; {words}")
+
+
+async def _store(request: Request) -> MapStore:
+    return cast(MapStore, request.app.state.store)
+
+
+Store = Annotated[MapStore, Depends(_store)]
+"""The open store of the application."""
 
 
 class FailureQuery(BaseModel):

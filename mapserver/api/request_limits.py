@@ -38,16 +38,10 @@ class RequestLimits:
             return await self._app(scope, receive, send)
         closing = _Closing(receive, send)
         receive, send = closing.receive, closing.send
-        if "://" in scope["path"][:8]:  # the absolute form of a URL, which h11 does not change
-            scope["path"] = "/" + "".join(scope["path"].split("/", 3)[3:])
-            scope["raw_path"] = b"/" + b"".join(scope["raw_path"].split(b"/", 3)[3:])
+        _set_path(scope)
         head_bytes = len(scope["raw_path"]) + len(scope["query_string"])
         head_bytes += sum(len(name) + len(value) + 4 for name, value in scope["headers"])
-        most_bytes, within_s = (SIGN_IN_BYTES, SIGN_IN_S) if scope["path"] == SIGN_IN else (MAX_BODY_BYTES, BODY_S)
-        file = _FILE.fullmatch(scope["path"]) if scope["method"] == "PUT" else None
-        if file is not None:
-            most_bytes = _FILE_BYTES[file[1]]
-        is_upload = file is not None and file[1] == "inbox"
+        most_bytes, within_s, is_upload = _limits(scope)
         too_large = 413, f"the body has more than {most_bytes} bytes"
         stated = dict(scope["headers"]).get(b"content-length", b"0")
         if head_bytes > MAX_HEAD_BYTES:
@@ -96,6 +90,23 @@ class RequestLimits:
         with suppress(ClientDisconnect):
             await self._app(scope, limited, answered)
         return None
+
+
+def _set_path(scope: Scope) -> None:
+    """Take the path out of the absolute form of a URL, which h11 does not change."""
+    if "://" in scope["path"][:8]:
+        scope["path"] = "/" + "".join(scope["path"].split("/", 3)[3:])
+        scope["raw_path"] = b"/" + b"".join(scope["raw_path"].split(b"/", 3)[3:])
+
+
+def _limits(scope: Scope) -> tuple[int, float, bool]:
+    """Return the most bytes of the body and the seconds for it; True for the upload of a recording, which has them again and again."""
+    if scope["path"] == SIGN_IN:
+        return SIGN_IN_BYTES, SIGN_IN_S, False
+    file = _FILE.fullmatch(scope["path"]) if scope["method"] == "PUT" else None
+    if file is None:
+        return MAX_BODY_BYTES, BODY_S, False
+    return _FILE_BYTES[file[1]], BODY_S, file[1] == "inbox"
 
 
 class _Closing:

@@ -7,7 +7,7 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
@@ -22,13 +22,18 @@ from fleetmap.log_lines import log_to_stderr
 from mapserver.commands.options import StoreFolder, open_store
 
 if TYPE_CHECKING:
+    import ssl
+
+    import uvicorn
     from fastapi import FastAPI
 
     from fleetmap.bus import Bus
+    from mapserver.api.app import Lifespan
     from mapserver.api.guard import GuardSettings
-    from mapserver.api.sign_in_proxy import SignInProxy
+    from mapserver.api.sign_in_proxy import ProxiedPeople, SignInProxy
     from mapserver.config import MapserverConfig
     from mapserver.fleet.fleet import Fleet
+    from mapserver.serving.background_tasks import BackgroundTask
     from mapserver.serving.bus_access import BusGuard
     from mapserver.serving.http_connections import BoundedListener
     from mapserver.serving.night_runs import NightRuns
@@ -197,6 +202,16 @@ def _end_process() -> None:
     os._exit(0)
 
 
+@dataclass
+class _Server:
+    """What runs until the end: the application, its periodic work in groups that do not wait for each other, and what is closed."""
+
+    fleet: "Fleet"
+    app: "FastAPI"
+    groups: "list[list[BackgroundTask]]"
+    closing: list[Callable[[], None]]
+
+
 def _run(
     maps: "MapStore",
     bus: "Bus",
@@ -213,29 +228,70 @@ def _run(
     from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
     from fleetmap.threads import ended_by_threads
-    from mapserver.api.app import create_app
-    from mapserver.api.metrics import Metrics
     from mapserver.api.sign_in_proxy import ProxiedPeople
-    from mapserver.api.version_routes import ApiSettings
-    from mapserver.dashboard.install import install_dashboard
-    from mapserver.fleet.fleet import Fleet
-    from mapserver.nightly.robot_drives import RobotDrives
-    from mapserver.serving.background_tasks import (
-        BackgroundTask,
-        admission_tasks,
-        alert_tasks,
-        run_background_tasks,
-        server_tasks,
-    )
-    from mapserver.serving.bus_service import BusService
-    from mapserver.serving.http_connections import BACKLOG, MAX_HEAD_BYTES
-    from mapserver.serving.webhook import Webhook
 
     # An operator's request passes between threads several times, and each time waits up to this long for robots' replies.
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     log_to_stderr(logging.INFO)
     if guard.warning:
         logging.getLogger(__name__).warning("%s", guard.warning)
+
+    @asynccontextmanager
+    async def lifespan(_: "FastAPI") -> AsyncIterator[None]:
+        import asyncio
+
+        from mapserver.serving.background_tasks import run_background_tasks
+
+        background = [asyncio.create_task(run_background_tasks(some)) for some in made.groups]
+        background.append(asyncio.create_task(listener.watch(server.server_state.connections)))
+        _say_addresses(listener, certificate, bus)
+        yield
+        for task in background:
+            task.cancel()
+        await asyncio.gather(*background, return_exceptions=True)
+        _bound_the_end(made.fleet)
+
+    made = _make(maps, bus, robots, settings, guard, certificate, nights, lifespan)
+    # Outside the middleware that replaces the proxy's address by the client's.
+    served = ProxiedPeople(ProxyHeadersMiddleware(made.app, sorted(proxies)), guard.proxy)  # type: ignore[arg-type]
+    config = _http_config(served, certificate)
+    if certificate is not None and config.ssl is not None:
+        made.groups[0] += _certificate_tasks(certificate, config.ssl)
+    # uvicorn stops on these signals and afterwards raises them again for the previous handlers:
+    # the default handlers would end the process with a status of being killed.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: None)
+    server = uvicorn.Server(config)
+    # The bus last: a query that another program answers first could be answered in this one's place.
+    bus.open()
+    try:
+        with ended_by_threads(lambda: setattr(server, "should_exit", True)):
+            server.run(sockets=[listener])
+    finally:
+        for close in made.closing:
+            close()
+
+
+def _make(
+    maps: "MapStore",
+    bus: "Bus",
+    robots: "BusGuard | None",
+    settings: "MapserverConfig",
+    guard: "GuardSettings",
+    certificate: "HttpCertificate | None",
+    nights: "NightRuns | None",
+    lifespan: "Lifespan",
+) -> _Server:
+    from mapserver.api.app import create_app
+    from mapserver.api.metrics import Metrics
+    from mapserver.api.version_routes import ApiSettings
+    from mapserver.dashboard.install import install_dashboard
+    from mapserver.fleet.fleet import Fleet
+    from mapserver.nightly.robot_drives import RobotDrives
+    from mapserver.serving.background_tasks import BackgroundTask, admission_tasks, alert_tasks, server_tasks
+    from mapserver.serving.bus_service import BusService
+    from mapserver.serving.webhook import Webhook
+
     fleet = Fleet(maps, settings=settings.ingest)
     metrics = Metrics(maps, fleet, settings.alerts, certificate)
     webhook = None if settings.alerts.webhook is None else Webhook(settings.alerts)
@@ -244,24 +300,6 @@ def _run(
     tasks = server_tasks(maps, fleet, bus_service, settings.canary)
     if drives is not None:
         tasks.append(BackgroundTask("building robots' drives", _BUILD_EVERY_S, drives.build))
-
-    @asynccontextmanager
-    async def lifespan(_: "FastAPI") -> AsyncIterator[None]:
-        import asyncio
-
-        groups = (tasks, admission_tasks(robots, fleet), alert_tasks(maps, fleet, settings.alerts, webhook))
-        background = [asyncio.create_task(run_background_tasks(some)) for some in groups]
-        background.append(asyncio.create_task(listener.watch(server.server_state.connections)))
-        host, port = listener.getsockname()[:2]
-        typer.echo(f"http: {'https' if certificate else 'http'}://{f'[{host}]' if ':' in host else host}:{port}")
-        typer.echo(f"zenoh: {bus.endpoint}")
-        typer.echo("ready")
-        yield
-        for task in background:
-            task.cancel()
-        await asyncio.gather(*background, return_exceptions=True)
-        _bound_the_end(fleet)
-
     api = ApiSettings(
         guard,
         settings.gate,
@@ -275,8 +313,25 @@ def _run(
     )
     app = create_app(maps, fleet, metrics, bus, lifespan, api)
     install_dashboard(app, maps, fleet, api, bus_service.hear)
-    # Outside the middleware that replaces the proxy's address by the client's.
-    served = ProxiedPeople(ProxyHeadersMiddleware(app, sorted(proxies)), guard.proxy)  # type: ignore[arg-type]
+    groups = [tasks, admission_tasks(robots, fleet), alert_tasks(maps, fleet, settings.alerts, webhook)]
+    closing = [each.close for each in (nights, webhook, bus_service) if each is not None]
+    return _Server(fleet, app, groups, [*closing, fleet.flush])
+
+
+def _say_addresses(listener: "BoundedListener", certificate: "HttpCertificate | None", bus: "Bus") -> None:
+    host, port = listener.getsockname()[:2]
+    typer.echo(f"http: {'https' if certificate else 'http'}://{f'[{host}]' if ':' in host else host}:{port}")
+    typer.echo(f"zenoh: {bus.endpoint}")
+    typer.echo("ready")
+
+
+def _http_config(served: "ProxiedPeople", certificate: "HttpCertificate | None") -> "uvicorn.Config":
+    import ssl
+
+    import uvicorn
+
+    from mapserver.serving.http_connections import BACKLOG, MAX_HEAD_BYTES
+
     config = uvicorn.Config(
         served,
         loop="asyncio",  # uvloop bypasses the listener
@@ -293,30 +348,18 @@ def _run(
         ssl_keyfile=None if certificate is None else certificate.key,
     )
     config.load()
-    if certificate is not None and config.ssl is not None:
-        import ssl
-
+    if config.ssl is not None:
         config.ssl.minimum_version = ssl.TLSVersion.TLSv1_2
-        renew = partial(certificate.renew, config.ssl)
-        tasks.append(BackgroundTask("checking the certificate of HTTP", _WARN_EVERY_S, certificate.warn))
-        tasks.append(BackgroundTask("renewing the certificate of HTTP", _RENEW_EVERY_S, renew))
-    # uvicorn stops on these signals and afterwards raises them again for the previous handlers:
-    # the default handlers would end the process with a status of being killed.
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: None)
-    server = uvicorn.Server(config)
-    # The bus last: a query that another program answers first could be answered in this one's place.
-    bus.open()
-    try:
-        with ended_by_threads(lambda: setattr(server, "should_exit", True)):
-            server.run(sockets=[listener])
-    finally:
-        if nights is not None:
-            nights.close()
-        if webhook is not None:
-            webhook.close()
-        bus_service.close()
-        fleet.flush()
+    return config
+
+
+def _certificate_tasks(certificate: "HttpCertificate", context: "ssl.SSLContext") -> "list[BackgroundTask]":
+    from mapserver.serving.background_tasks import BackgroundTask
+
+    return [
+        BackgroundTask("checking the certificate of HTTP", _WARN_EVERY_S, certificate.warn),
+        BackgroundTask("renewing the certificate of HTTP", _RENEW_EVERY_S, partial(certificate.renew, context)),
+    ]
 
 
 def _bound_the_end(fleet: "Fleet") -> None:

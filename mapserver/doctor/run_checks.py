@@ -12,7 +12,7 @@ from fleetmap.sensors.rectification import RectifiedFrame, Rectifier, StereoCame
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from mapserver.calibration.recordings import Follow
 from mapserver.doctor import accelerometer_images, images, sensors
-from mapserver.doctor.accelerometer_images import accelerometer_axes, fit_accelerometer
+from mapserver.doctor.accelerometer_images import AxesFit, accelerometer_axes, fit_accelerometer
 from mapserver.doctor.calibration import MeasuredCalibration, followed_frames, measure_calibration, unknown_calibration
 from mapserver.doctor.camera_motion import CameraTurns, body_motion
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
@@ -105,13 +105,7 @@ def run_checks(
         words = f"; or the images of all cameras are rotated by 180 degrees: {ROTATE_BACK}"
         gyro = [replace(f, sentence=f.sentence + words) if f.name == AXES else f for f in gyro]
 
-    axes, given = not_judged(accelerometer_images.NAME, *sensors.NO_IMU), None
-    if len(imu):
-        has_gravity = not any(f.name == sensors.GRAVITY and f.verdict is Verdict.FAIL for f in soon)
-        fits = fit_accelerometer(turns, imu, shift_s) if has_gravity else []
-        axes = accelerometer_axes(fits, recording.calibration.base_from_body if recording.wheel else None)
-        if axes.verdict is Verdict.OK:
-            given = next((fit for fit in fits if fit.is_given), None)
+    axes, given = _accelerometer(recording, turns, soon)
     wheels, metres = judge_metres(seen.wheels, given, seen.images, has_imu=len(imu) > 0)
 
     findings = [*sensors.stream_checks(recording), *soon, *gyro, axes, wheels, metres]
@@ -127,11 +121,7 @@ def run_checks(
     findings += [*calibration.findings, images.sharpness(seen.variances)]
     findings += [images.flicker_check(recording, frames.read), _readable(frames)]
     if len(imu):
-        count = min(turn_frames, len(recording))
-        bad = f"an image repeats the previous one {frames.repeats} times in {count} frames; record each image once, with its own stamp"
-        limits = Limits(0.02, 0.1, "of the frames")
-        good = "every frame has an image of its own"
-        findings.append(judge("repeated images", frames.repeats / count, limits, good, bad))
+        findings.append(_repeats(frames, min(turn_frames, len(recording))))
     known = (
         {}
         if seen.wheels is None or not seen.wheels.size
@@ -139,6 +129,23 @@ def run_checks(
     )
     known |= {} if given is None or given.metres <= 0 else {"the accelerometer": (given.metres, given.sigma)}
     return CheckResults(findings + sensors.other_issues(recording.issues), gyro_fit, calibration, known)
+
+
+def _accelerometer(recording: Recording, turns: CameraTurns, soon: Sequence[Finding]) -> tuple[Finding, AxesFit | None]:
+    """Return the finding of the accelerometer's axes; and the fit with the given ones, if they are right."""
+    if not len(recording.imu):
+        return not_judged(accelerometer_images.NAME, *sensors.NO_IMU), None
+    has_gravity = not any(f.name == sensors.GRAVITY and f.verdict is Verdict.FAIL for f in soon)
+    shift_s = recording.calibration.cameras[0].imu_minus_cam_s
+    fits = fit_accelerometer(turns, recording.imu, shift_s) if has_gravity else []
+    axes = accelerometer_axes(fits, recording.calibration.base_from_body if recording.wheel else None)
+    return axes, next((fit for fit in fits if fit.is_given), None) if axes.verdict is Verdict.OK else None
+
+
+def _repeats(frames: "_Frames", count: int) -> Finding:
+    bad = f"an image repeats the previous one {frames.repeats} times in {count} frames; record each image once, with its own stamp"
+    limits = Limits(0.02, 0.1, "of the frames")
+    return judge("repeated images", frames.repeats / count, limits, "every frame has an image of its own", bad)
 
 
 def run_cheap_checks(recording: Recording, sampled: int) -> list[Finding]:

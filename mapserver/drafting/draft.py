@@ -284,7 +284,7 @@ def _survey(
 
 def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Draft:
     """Cut the map into tiles, measure them, store the draft and write the requested files."""
-    site, survey_map, camera = run.request.site, built.joined.map, built.joined.map.camera
+    site, survey_map = run.request.site, built.joined.map
     wanted = None if parent is None else parent.wanted_ids(survey_map)
     judged = [
         JudgedSession(trajectory, s.probed, s.survey, s.entry.name)
@@ -305,7 +305,6 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     run.times.begin("examining")
     evidence = msgspec.structs.replace(_evidence(run, built, judged, tiles, parent), views=views)
     run.times.begin("storing")
-    archive = encode_archive(survey_map)
     report = make_report(
         built.surveyed,
         built.joined,
@@ -314,31 +313,19 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         seconds=time.perf_counter() - run.started_s,
         peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6,
     )
-    asked = covered_requests(maps, site, built.joined)
     known_m = None if parent is None else parent.manifest.report.get("alias_step_m")
     step_m = alias_step_m(evidence.repetition, known_m)
     report = msgspec.structs.replace(
         report,
-        surveyed_requests=asked,
+        surveyed_requests=covered_requests(maps, site, built.joined),
         removed_landmarks={} if parent is None else parent.removed(),
         alias_step_m=step_m,
     )
     said = to_plain(report) | {key: to_plain(extra.report) for key, extra in extras.items()}
-    starts = None if evidence.starts is None else msgspec.structs.replace(evidence.starts, lookalikes=[])
-    details = DraftDetails(
-        created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
-        tile_size_m=TILE_SIZE_M,
-        camera=CameraEntry(**{name: getattr(camera, name) for name in CameraEntry.__struct_fields__}),
-        recordings=tuple(s.entry for s in built.taken),
-        configuration=_configuration(run, parent) | corrections.configuration(site),
-        libraries=library_versions(),
-        # A robot downloads the manifest: its part about the build is short.
-        report={key: value for key, value in said.items() if key not in _NOT_FOR_ROBOTS}
-        | {EVIDENCE_KEY: to_plain(msgspec.structs.replace(evidence, directions=None, starts=starts, views=None))},
-    )
+    details = _details(run, built, parent, evidence, said)
     job = run.request.options.job
     content = DraftContent(
-        tiles=tiles, vocabulary=default_vocabulary_bytes(), details=details, archive=archive,
+        tiles=tiles, vocabulary=default_vocabulary_bytes(), details=details, archive=encode_archive(survey_map),
         extras=[(extra.kind, data) for extra in extras.values() for data in extra.blobs], evidence=evidence, job=job,
     )  # fmt: skip
     version = maps.save(site, content, actor=run.request.options.actor).version
@@ -355,6 +342,24 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
     )
     _write_files(run, built, draft)
     return draft
+
+
+def _details(
+    run: _Run, built: Built, parent: Before | None, evidence: Evidence, report: dict[str, Any]
+) -> DraftDetails:
+    starts = None if evidence.starts is None else msgspec.structs.replace(evidence.starts, lookalikes=[])
+    camera = built.joined.map.camera
+    return DraftDetails(
+        created=datetime.now(UTC).isoformat(timespec="seconds").replace("+00:00", "Z"),
+        tile_size_m=TILE_SIZE_M,
+        camera=CameraEntry(**{name: getattr(camera, name) for name in CameraEntry.__struct_fields__}),
+        recordings=tuple(s.entry for s in built.taken),
+        configuration=_configuration(run, parent) | built.corrections.configuration(run.request.site),
+        libraries=library_versions(),
+        # A robot downloads the manifest: its part about the build is short.
+        report={key: value for key, value in report.items() if key not in _NOT_FOR_ROBOTS}
+        | {EVIDENCE_KEY: to_plain(msgspec.structs.replace(evidence, directions=None, starts=starts, views=None))},
+    )
 
 
 def covered_requests(maps: MapStore, site: str, joined: MergedMap) -> dict[str, float]:
