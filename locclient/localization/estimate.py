@@ -147,9 +147,10 @@ def _of_confirmed(
     age_s = (estimate.odometry.stamp_ns - confirmed.stamp_ns) * 1e-9
     is_broken = confirmed.has_broken or confirmed.lost_imu
     cause = _cause(estimate, has_failed=has_failed) or (Cause.ODOMETRY if is_broken else Cause.NONE)
-    is_told = any(h.speaks_against_others(settings) for h in elsewhere)
+    told = [h for h in elsewhere if h.speaks_against_others(settings)]
+    is_moved = any(not confirmed.is_same_pose(h, settings) for h in told)
     # Its tracks or its IMU were lost, and the map has not confirmed its place since; or frames, and the map shows another one since.
-    is_doubted = is_broken or (confirmed.missed and is_told)
+    is_doubted = is_broken or (confirmed.missed and is_moved)
     if radius_m > settings.lost_radius_m:
         status = Status.LOST
     elif (
@@ -162,7 +163,7 @@ def _of_confirmed(
     else:
         status, cause = Status.TRACKING, Cause.NONE
     estimate = replace(estimate, status=status, cause=cause)
-    if status is not Status.TRACKING and is_told:  # the robot may be at either
+    if status is not Status.TRACKING and told:  # the robot may be at either
         places = _published([confirmed, *elsewhere])
         return replace(estimate, status=Status.AMBIGUOUS, hypotheses=places)
     return _with_pose(estimate, confirmed.now, settings)

@@ -31,3 +31,12 @@ def test_v101_as_a_whole_refuses_no_revisit_of_its_own(tmp_path: Path) -> None:
     assert found.frames >= 10
     assert found.p95_error_m is not None
     assert found.p95_error_m < 0.05
+
+
+def test_v101_by_every_second_frame_keeps_its_imu_and_stays_one_part(tmp_path: Path) -> None:
+    """Frames 2.7 s apart: where images cannot show a start in motion, the IMU's rest is the start."""
+    to_store = ["--site", "s", "--store", tmp_path / "store", "--report", tmp_path / "b.json", "--frames", "::2"]
+    run(mapserver_app, "build", real_data("euroc_v101_keyframes"), *to_store, "--frame-from-ground-truth")
+    report = json.loads((tmp_path / "b.json").read_text())
+    assert report["inertial"]
+    assert [part["kept"] for parts in report["parts"] for part in parts] == [True]

@@ -530,8 +530,10 @@ class InertialMode(WindowMode):
         is_unknown = window.filter.covariance[3, 3] > 0.5 * settings.initial_velocity_sigma_mps**2
         if is_unknown and not self.is_bridged and seen is not None:
             lacking_mps = self._lacking_mps(seen)
-            if wheel is None and len(window.filter.clone_ids) == 1 and length(lacking_mps) > _NEAR_REST_MPS:
-                return Step(self._begin_again(frame_index, tracked), np.zeros(0, np.int8), np.eye(4))  # it did not rest
+            # Images give a start in motion to who did not rest, if they are near enough to each other.
+            is_start = len(window.filter.clone_ids) == 1 and self._step_s <= self._rig.settings.start.moving_gap_s
+            if wheel is None and is_start and length(lacking_mps) > _NEAR_REST_MPS:
+                return Step(self._begin_again(frame_index, tracked), np.zeros(0, np.int8), np.eye(4))
             self._take_speed(lacking_mps, tracked)
         effort = (settings.chunk_frames_without_imu, 4) if self.is_bridged else (settings.chunk_frames, 1)
         used = window.update(frame_index, tracked, *effort)

@@ -314,7 +314,7 @@ def test_darkness_of_any_length_leaves_a_covariance() -> None:
         since = odometry.motion_since(estimate.frame_index - 1)
         assert since is None or np.linalg.eigvalsh(since[1])[0] > 0
     assert way_m < 2.0, "a second at its last speed"
-    assert np.sqrt(np.diag(hypothesis.cov_rot_trans)[:3]).max() < 1.001 * np.pi
+    assert np.sqrt(np.diag(hypothesis.start.cov_rot_trans)[:3]).max() < 1.001 * np.pi
     assert np.linalg.eigvalsh(hypothesis.now.cov_rot_trans)[0] > 0
     assert estimate.status is OdometryStatus.TRACKING
     assert estimate.inlier_share > 0.9

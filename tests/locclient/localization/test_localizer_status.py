@@ -188,6 +188,12 @@ def test_a_kidnapped_robot_leaves_tracking_and_finds_its_new_place(
     assert moved == pytest.approx([float(np.linalg.norm(off(-8.0)))], abs=0.1), "told once, when it was sure"
 
 
+def test_after_missed_frames_a_fix_beside_the_pose_is_no_other_place(tracking: Robot) -> None:
+    """A depth camera's fixes scatter beyond their covariance: within the distance of one hypothesis nobody carried the robot."""
+    tracking.frames, tracking.inliers = tracking.frames + 1, 80
+    assert {tracking.go(0.3, [off(0.3)]).status for _ in range(2)} == {Status.TRACKING}
+
+
 @pytest.mark.parametrize("inliers", [20, 80])
 def test_a_standing_robot_leaves_its_pose_for_strong_fixes_alone(tracking: Robot, inliers: int) -> None:
     """At a dock, with nothing mapped before it, an end of another aisle agrees a little with what it sees, again and again."""
