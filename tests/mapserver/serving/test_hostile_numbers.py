@@ -88,7 +88,6 @@ def test_a_report_that_cannot_be_read_hides_no_other_and_a_command_removes_it(se
     store, out = str(server.folder), server.folder.parent
     for command in (
         ["export", str(out / "a.jsonl")],
-        ["export", str(out / "a.mcap")],
         ["report", str(out / "a.html"), "--site", "lab"],
     ):
         assert CliRunner().invoke(app, ["fleet", *command, "--store", store]).exit_code == 0
