@@ -138,8 +138,8 @@ class Localizer:
     def localize(self, percept: Percept, frame: RectifiedFrame | None = None) -> Estimate:
         """Return the estimate by a percept, newer than all before. frame: its images; None if `percept` has all data of the frame."""
         tracker, odometry = self._tracker, percept.odometry
-        is_in_lift = odometry.is_lifted and self._lift.doubts()
-        if not is_in_lift and (odometry.is_lifted or self._is_away(percept)):
+        is_away_now = self._last_ns is not None and is_away(self._last_ns, odometry)
+        if not self._lift.doubts() if odometry.is_lifted else is_away_now:
             tracker.forget(is_carried=odometry.is_lifted)
         self._last_ns = odometry.stamp_ns
         tracker.propagate(odometry, percept.motions, has_broken=percept.has_broken)
@@ -154,9 +154,6 @@ class Localizer:
                 self._calibration.add(self._query.finished)
             percept.calibration = self._calibration.state
         return self._report(percept, result)
-
-    def _is_away(self, percept: Percept) -> bool:
-        return self._last_ns is not None and is_away(self._last_ns, percept.odometry)
 
     def _judge_cameras(self, percept: Percept, frame: RectifiedFrame) -> None:
         self._calibration.work()

@@ -138,12 +138,6 @@ class MapQuery:
             return True
         return (stamp_ns - self._last_ns) * 1e-9 > _SPREAD_SHARE * self._track.fix_interval_s
 
-    def _next_view(self, percept: Percept, frame: RectifiedFrame) -> int:
-        """Return the view to query: the last one as long as it gives fixes, else the next one with good images."""
-        count, first = len(self._gates), self.view + bool(self.failed)
-        order = [(first + k) % count for k in range(count)]
-        return next((k for k in order if percept.views[k] not in UNUSABLE), self.view)
-
     def _motion_until(self, odometry: OdometryEstimate, stamp_ns: int) -> Array | None:
         """Return the body's motion (4, 4) now_from_then from a moment to the present frame, at its speed; None if they are the same."""
         later_ns, before, last_ns = stamp_ns - odometry.stamp_ns, odometry.previous_from_body, self._last_ns
@@ -155,7 +149,11 @@ class MapQuery:
         odometry, tracker = percept.odometry, self._tracker
         if percept.query is None:
             assert frame is not None
-            percept.query = QueryInput(view=self._next_view(percept, frame))
+            # The last one as long as it gives fixes, else the next one with good images.
+            count, first = len(self._gates), self.view + bool(self.failed)
+            order = [(first + k) % count for k in range(count)]
+            chosen = next((k for k in order if percept.views[k] not in UNUSABLE), self.view)
+            percept.query = QueryInput(view=chosen)
         self.view = view = percept.query.view
         frame = None if frame is None else frame.view(view) or frame
         self._begun = percept, frame
@@ -273,7 +271,7 @@ class MapQuery:
         prior = tracker.prior
         if prior is None:
             return fixes, False
-        within = tracker.within_prior(fixes)
+        within = [fix for fix, at in tracker.observations(fixes) if prior.is_compatible(at.now)]
         if prior.is_measured and within and within[0].inliers < self._track.competitor_share * fixes[0].inliers:
             within = []  # what looks a little like this place is elsewhere
         if within or not prior.is_revisable:

@@ -118,10 +118,6 @@ class PoseHypothesis:
         self.recall_total += landmark_recall
         self.query_inliers, self.query_recall = inliers, landmark_recall
 
-    def mark_query(self) -> None:
-        """Store the present pose for the map query that begins now."""
-        self.then = self.now
-
     def take_pose(self, other: "PoseHypothesis") -> None:
         """Adopt the pose of another hypothesis, and keep the own support."""
         self.frame_index, self.stamp_ns = other.frame_index, other.stamp_ns

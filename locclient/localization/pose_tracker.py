@@ -14,7 +14,6 @@ from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, is_reliable
 from fleetmap.sensors.rectification import MountedCamera
-from fleetmap.sensors.samples import PositionPrior
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import is_other_viewpoint
 from locclient.localization.estimate import QueryResult
@@ -90,7 +89,7 @@ class PoseTracker:
         self, settings: LocalizerSettings, mounted: Sequence[MountedCamera], base_from_body: Array, maps: HeldMaps
     ) -> None:
         """mounted: the cameras of the rig."""
-        self._settings, self._track = settings, settings.track
+        self._settings, self.settings = settings, settings.track
         self._mounted, self.base_from_body, self.maps = mounted, base_from_body, maps
         self.on_restart: list[
             Callable[[], None]
@@ -103,7 +102,7 @@ class PoseTracker:
         self.was_tracking = False
         self.is_carried = False  # it was lifted since it knew its pose
         self.odom_from_body: Array | None = None  # of the last frame
-        self._step_m = 0.0  # to the last frame
+        self.step_m = 0.0  # to the last frame
         self._last_ns, self._period_ns = 0, 1 << 62  # of frames: the last stamp, and the shortest step
         self._imu_ns: int | None = None  # stamp of the last frame with an IMU, None once its loss is a doubt
         self._query_frame: PoseHypothesis | None = None  # of the running map query, as the identity
@@ -113,16 +112,9 @@ class PoseTracker:
 
     # --- priors and starts --------------------------------------------------------------------------------------------
 
-    def prior_given(
-        self, prior: PositionPrior, odometry: OdometryEstimate, floors: Mapping[str, Array | None] | None
-    ) -> Prior:
-        """Return a prior given between the last two frames, on its own floor or one of several, as of `Prior.floors`."""
-        rig = self.base_from_body, self._track
-        return Prior.given(prior, odometry, *rig, travelled_m=self._step_m, floors=floors)
-
     def prior_at(self, known: PoseHypothesis, **how: Any) -> Prior:
         """Return a pose as a prior. how: arguments of `Prior`."""
-        return Prior.at(known, self.base_from_body, self._track, **how)
+        return Prior.at(known, self.base_from_body, self.settings, **how)
 
     def take(self, prior: Prior) -> None:
         """Use a prior from now on; it replaces any earlier one. One of a ride replaces the confirmed pose, too."""
@@ -212,7 +204,7 @@ class PoseTracker:
             self._imu_ns = odometry.stamp_ns
         unheld_s = 0.0 if self._imu_ns is None else (odometry.stamp_ns - self._imu_ns) * 1e-9
         # What friction allows a robot to do that images misread: about its weight accelerates it at most.
-        lost_imu = 0.5 * GRAVITY_MPS2 * unheld_s**2 > self._track.degraded_radius_m
+        lost_imu = 0.5 * GRAVITY_MPS2 * unheld_s**2 > self.settings.degraded_radius_m
         self._imu_ns = None if lost_imu else self._imu_ns
         step_ns, self._last_ns = odometry.stamp_ns - self._last_ns, odometry.stamp_ns
         self._period_ns = min(self._period_ns, step_ns)
@@ -222,7 +214,7 @@ class PoseTracker:
         if odometry.previous_from_body is not None:
             step = odometry.previous_from_body
         for hypothesis in self._tracked():
-            hypothesis.propagate(motions, odometry, step, self._track)
+            hypothesis.propagate(motions, odometry, step, self.settings)
             hypothesis.has_broken |= has_broken
             hypothesis.lost_imu |= lost_imu
             hypothesis.missed |= step_ns > _MISSED_STEPS * self._period_ns
@@ -231,9 +223,9 @@ class PoseTracker:
         if change is not None:
             self.candidates.redefine_odom(change)
         self.odom_from_body = odometry.odom_from_body
-        self._step_m = float(np.linalg.norm(step[:3, 3]))
+        self.step_m = float(np.linalg.norm(step[:3, 3]))
         if self.prior is not None:
-            self.prior.travelled_m += self._step_m
+            self.prior.travelled_m += self.step_m
 
     def _tracked(self) -> list[PoseHypothesis]:
         found = [
@@ -259,7 +251,7 @@ class PoseTracker:
         self.body_from_cam = body_from_cam if now_from_then is None else now_from_then @ body_from_cam
         self._doubt_confirmed(odometry)
         for hypothesis in self._tracked():
-            hypothesis.mark_query()
+            hypothesis.then = hypothesis.now
         self._query_frame = PoseHypothesis.at(odometry)
         self._query_index = odometry.frame_index
 
@@ -312,18 +304,18 @@ class PoseTracker:
         return found if self.prior is None else self.prior.weighed(found)
 
     def is_reliable(self, fix: Fix) -> bool:
-        return is_reliable(fix, self._settings.fix, self._track.strong_inliers)
+        return is_reliable(fix, self._settings.fix, self.settings.strong_inliers)
 
     def believed(self, fixes: Sequence[Fix]) -> list[Fix]:
         """Return the fixes that speak for a place, and those of few matches at the only place that searches agree on: chance matches do not
         repeat there while the noise of the images changes. An unmapped place that looks the same does, so they confirm no pose."""
         self._repeated.observe(self.observations(fixes), None)
         order, competitors = self._repeated.ranking()
-        is_agreed = bool(order) and not competitors and order[0].support >= self._track.confirming_fixes
+        is_agreed = bool(order) and not competitors and order[0].support >= self.settings.confirming_fixes
         return [
             fix
             for fix, at in self.observations(fixes)
-            if self._speaks(fix, at) or (is_agreed and order[0].is_same_pose(at, self._track))
+            if self._speaks(fix, at) or (is_agreed and order[0].is_same_pose(at, self.settings))
         ]
 
     def _speaks(self, fix: Fix, at: PoseHypothesis) -> bool:
@@ -335,15 +327,10 @@ class PoseTracker:
         if known is None or fix.inliers < self._settings.fix.min_inliers or not at.now.shares_map(known.now):
             return False
         _, innovation = innovation_of(*at.now[:2], *known.now[:2])
-        return innovation <= self._track.innovation_limit
+        return innovation <= self.settings.innovation_limit
 
     def _place_by(self, fix: Fix) -> Place:
         return Place(fix.map_from_cam, fix.cov_rot_trans, fix.floor).of_point(se3_inverse(self.body_from_cam))
-
-    def within_prior(self, fixes: Sequence[Fix]) -> list[Fix]:
-        """Return the fixes within the prior."""
-        assert self.prior is not None
-        return [fix for fix, hypothesis in self.observations(fixes) if self.prior.is_compatible(hypothesis.now)]
 
     def drops_prior(self, fixes: Sequence[Fix]) -> bool:
         """Return True if fixes, none within the prior, contradict it by now; then drop it: their places must be confirmed."""
@@ -366,7 +353,7 @@ class PoseTracker:
         map_from_body, covariance, _ = confirmed.then
         innovations = [(fix, *innovation_of(*self._place_by(fix)[:2], map_from_body, covariance)) for fix in fixes]
         # A fix near the prediction is tested by the gate alone; one found by search must also be reliable.
-        limit = self._track.innovation_limit
+        limit = self.settings.innovation_limit
         gated = [entry for entry in innovations if entry[2] <= limit and (is_near or self.is_reliable(entry[0]))]
         fix, error, innovation = min(innovations, key=lambda entry: entry[2])
         off_m = float(np.linalg.norm(error[3:]))
@@ -386,8 +373,8 @@ class PoseTracker:
         """Abandon the confirmed pose when refused fixes agree with each other over several queries; confirm theirs anew."""
         assert self.odom_from_body is not None
         self.candidates.observe(self.observations(fixes), self.odom_from_body)
-        telling = [h.support for h in self.candidates.hypotheses if h.speaks_against_others(self._track)]
-        if max(telling, default=0) >= self._track.kidnap_fixes:
+        telling = [h.support for h in self.candidates.hypotheses if h.speaks_against_others(self.settings)]
+        if max(telling, default=0) >= self.settings.kidnap_fixes:
             self.candidates.abandoned = confirmed
             self.confirmed = None
             self.prior = None  # it led to that pose
@@ -399,10 +386,10 @@ class PoseTracker:
         """
         assert self.odom_from_body is not None
         candidates = self.candidates
-        is_near = self.prior is not None and self.prior.is_tight(self._track.near_prior_sigma_m)
+        is_near = self.prior is not None and self.prior.is_tight(self.settings.near_prior_sigma_m)
         # True if the robot cannot be at an unmapped place that looks like a mapped one.
         lookalikes = self.maps.lookalikes
-        is_excluded = lookalikes is not None and (is_near or self._track.is_whole_site_mapped)
+        is_excluded = lookalikes is not None and (is_near or self.settings.is_whole_site_mapped)
         candidates.lookalikes = LookAlikes(0.0, 0.0) if is_excluded else lookalikes
         observations = self.observations(fixes)
         for fix, at in observations:

@@ -208,7 +208,10 @@ class Robot:
             estimate = replace(estimate, cause=Cause.OVERLOADED)
         stage_s = {"decode": decoded_s - begun_s, "rectify": rectified_s - decoded_s, **estimate.stage_s}
         self._last = (frame, estimate)
-        self._enter(estimate.floor)
+        if estimate.floor != self._site:
+            self._site = estimate.floor
+            if self.ring is not None and self.running is not None:  # recordings of failures need the map
+                self.ring.use(self.running, self._site)
         if estimate.is_at_home:
             self._versions.handle(estimate)
         else:
@@ -277,14 +280,6 @@ class Robot:
             self.ring.use(loaded)
         self._of_version = building_frame(loaded.manifest)
         loaded.show(self.localizer)
-
-    def _enter(self, site: str) -> None:
-        """Note in whose map the robot is; recordings of failures need it."""
-        if site == self._site:
-            return
-        self._site = site
-        if self.ring is not None and self.running is not None:
-            self.ring.use(self.running, site)
 
     def _building_from_map(self) -> Array | None:
         if self.building:

@@ -39,4 +39,5 @@ class GivenPrior:
         if given.floor is None and confirmed is None and is_open and len(building) > 1:
             floors = dict.fromkeys(sorted(building))
         given = replace(given, floor=tracker.floor if given.floor is None else given.floor)
-        return tracker.prior_given(given, percept.odometry, floors)
+        how = {"travelled_m": tracker.step_m, "floors": floors}  # it was given between the last two frames
+        return Prior.given(given, percept.odometry, tracker.base_from_body, tracker.settings, **how)

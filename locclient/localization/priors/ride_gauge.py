@@ -79,7 +79,10 @@ class RideGauge:
         """Return the motion until a frame, dt_s after the one before; stamp_ns on the IMU's clock."""
         wheel, self._wheel = self._wheel, []
         self._wheel_ns = wheel[-1].stamp_ns if wheel else self._wheel_ns
-        is_rolling = any(_rolls(sample) for sample in wheel)
+        is_rolling = any(
+            np.linalg.norm(sample.velocity_base_mps) > _ROLLING_MPS or abs(sample.yaw_rate_radps) > _ROLLING_RADPS
+            for sample in wheel
+        )
         has_wheels = self._wheel_ns is not None and stamp_ns - self._wheel_ns <= _SILENT_NS
         self._rest_s = 0.0 if is_rolling else self._rest_s + dt_s
         imu, self._imu = self._imu, []
@@ -167,8 +170,3 @@ class RideGauge:
         self._cov = self._cov - np.outer(gain, self._cov[1])
         self._fastest_mps = self._still_s = 0.0
         self._speeds.clear()
-
-
-def _rolls(sample: WheelSample) -> bool:
-    speed_mps = float(np.linalg.norm(sample.velocity_base_mps))
-    return speed_mps > _ROLLING_MPS or abs(sample.yaw_rate_radps) > _ROLLING_RADPS

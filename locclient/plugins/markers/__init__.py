@@ -90,7 +90,7 @@ class MarkerPriors:
         def base(cam_from_marker: Array) -> Array:
             return np.asarray(map_from_marker @ se3_inverse(cam_from_marker) @ self._cam_from_base)
 
-        best = base(sides[0].cam_from_marker)
+        best = base(sides[0][0])
         listed = np.diag([_TURN_SIGMA_RAD**2] * 3 + [marker.sigma_m**2] * 3)
         covariance = Place(map_from_marker, listed).of_point(se3_inverse(map_from_marker) @ best).cov_rot_trans
         for moved in CORNER_SIGMA_PX * np.eye(8).reshape(8, 4, 2):

@@ -45,7 +45,8 @@ def markers(
     config: ConfigFile = None,
 ) -> None:
     """Measure where the markers of a site stand, by a version and the recording that it was built from."""
-    from fleetmap.plugins.markers import read_markers, write_markers
+    from fleetmap.encoding import to_json
+    from fleetmap.plugins.markers import read_markers
     from fleetmap.recordings import OpenOptions, format_calibration, open_recording
     from mapserver.plugins.markers.measurement import measure_markers, scale_by, scaled
     from mapserver.store.archive import decode_archive
@@ -67,7 +68,7 @@ def markers(
         x_m, y_m, z_m = marker.map_from_marker.position_m
         typer.echo(f"marker {marker.id}: {x_m:.3f} {y_m:.3f} {z_m:.3f} m, sigma {1e3 * marker.sigma_m:.0f} mm")
     if options.out is not None:
-        write_markers(options.out, found)
+        write_output(options.out, to_json(found, indent=2) + b"\n")
     if known is not None:
         scale = scale_by(found, known)
         typer.echo(f"scale: a metre of the map is {scale:.5f} m")

@@ -47,21 +47,21 @@ def measure_markers(recording: Recording, trajectory: Trajectory, size_m: float,
 
 def _placed(number: int, looks: list[_Seen], size_m: float, camera: StereoCamera) -> Marker | None:
     """Return a marker where the rays through its middle meet, which has the map's scale; None if they are too few or too parallel."""
-    sides = [poses_of(corners, size_m, camera)[0] for _, corners in looks]
-    near = [(*look, side) for look, side in zip(looks, sides, strict=True) if side.cam_from_marker[2, 3] < _FARTHEST_M]
+    near = [(*look, *poses_of(look[1], size_m, camera)[0]) for look in looks]
+    near = [look for look in near if look[2][2, 3] < _FARTHEST_M]
     if len(near) < _MIN_RAYS:
         return None
-    origins = np.array([there[:3, 3] for there, _, _ in near])
-    rays = np.array([there[:3, :3] @ _ray(corners, camera) for there, corners, _ in near])
+    origins = np.array([there[:3, 3] for there, *_ in near])
+    rays = np.array([there[:3, :3] @ _ray(corners, camera) for there, corners, *_ in near])
     if np.arccos(np.clip(rays @ rays.T, -1, 1)).max() < _MIN_ANGLE_RAD:
         return None
     across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
-    weights = np.array([side.cam_from_marker[2, 3] ** -2 for _, _, side in near])
+    weights = np.array([cam_from_marker[2, 3] ** -2 for _, _, cam_from_marker, _ in near])
     information = np.einsum("n,nij->ij", weights, across)
     middle_m = np.linalg.solve(information, np.einsum("n,nij,nj->i", weights, across, origins))
     sigma_rad = CORNER_SIGMA_PX / camera.focal_px
     sigma_m = sigma_rad * float(np.sqrt(np.linalg.eigvalsh(np.linalg.inv(information))[-1]))
-    turns = [side.weight * there[:3, :3] @ side.cam_from_marker[:3, :3] for there, _, side in near]
+    turns = [weight * (there @ cam_from_marker)[:3, :3] for there, _, cam_from_marker, weight in near]
     u, _, vt = np.linalg.svd(sum(turns, np.zeros((3, 3))))
     turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     placed = Placement.of(se3(turn, middle_m))

@@ -15,8 +15,9 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from benchmarks.common.recorded_runs import parsed, recorded, tool, write_results
+from fleetmap.encoding import to_json
 from fleetmap.messages import Placement
-from fleetmap.plugins.markers import Marker, MarkerList, write_markers
+from fleetmap.plugins.markers import Marker, MarkerList
 from fleetmap.recordings import format_calibration, open_recording
 from fleetsim.scenarios import find_scenario
 from mapserver.plugins.markers.measurement import scaled
@@ -62,7 +63,7 @@ def main() -> None:
         )
         with open_recording(drive) as recording:
             wrong.write_text(format_calibration(scaled(recording.calibration, TOO_LONG)), "utf-8")
-        write_markers(listed, known)
+        listed.write_bytes(to_json(known))
         before = built(drive, store, wrong, 1)
         which = ["--site", "hall", "--store", str(store), "--version", "1", "--size", str(layout.marker_m)]
         files = ["--calibration", str(wrong), "--known", str(listed), "--scaled", str(right)]

@@ -4,14 +4,13 @@ A marker's frame has its origin in the middle, x to the right and y up as it is 
 """
 
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import cv2
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.encoding import to_json
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Placement
@@ -59,12 +58,6 @@ def read_markers(path: Path) -> MarkerList:
     return listed
 
 
-def write_markers(path: Path, listed: MarkerList) -> None:
-    """Write a list as `read_markers` reads it; UsageError for a folder that is missing or full."""
-    with disk_errors(f"{path} cannot be written", "name another file", UsageError):
-        path.write_bytes(to_json(listed, indent=2) + b"\n")
-
-
 def detector_of(dictionary: str) -> cv2.aruco.ArucoDetector:
     """Return OpenCV's detector with corners refined below a pixel; UsageError for an unknown dictionary."""
     number = getattr(cv2.aruco, f"DICT_{dictionary}", None)
@@ -85,15 +78,9 @@ def corners_of(image: NDArray[np.uint8], detector: cv2.aruco.ArucoDetector) -> d
     return {number: quad.reshape(4, 2).astype(float) for number, quad in found if numbers.count(number) == 1}
 
 
-class MarkerPose(NamedTuple):
-    """cam_from_marker (4, 4), and how likely it is: a small or distant marker looks nearly the same from two sides."""
-
-    cam_from_marker: Array
-    weight: float
-
-
-def poses_of(corners: Array, size_m: float, camera: StereoCamera) -> list[MarkerPose]:
-    """Return the poses (one or two) of a marker by its corners (4, 2), the likelier first. Source: Collins and Bartoli 2014 (IPPE)."""
+def poses_of(corners: Array, size_m: float, camera: StereoCamera) -> list[tuple[Array, float]]:
+    """Return cam_from_marker (4, 4) by a marker's corners (4, 2), and how likely it is; the likelier first. A small or distant marker looks
+    nearly the same from two sides. Source: Collins and Bartoli 2014 (IPPE)."""
     half = size_m / 2
     square = np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
     _, turns, shifts, errors = cv2.solvePnPGeneric(
@@ -103,9 +90,8 @@ def poses_of(corners: Array, size_m: float, camera: StereoCamera) -> list[Marker
         np.asarray(errors).ravel() / CORNER_SIGMA_PX
     )  # `errors` is the root mean square of the 8 coordinates
     weights = np.exp(-0.5 * (cost - cost.min()))
-    weights /= weights.sum()
-    found = []
-    for turn, shift, weight in zip(turns, shifts, weights, strict=True):
-        cam_from_marker = se3(so3_exp(turn.ravel().astype(float)), shift.ravel().astype(float))
-        found.append(MarkerPose(cam_from_marker, float(weight)))
-    return sorted(found, key=lambda each: -each.weight)
+    found = [
+        (se3(so3_exp(turn.ravel().astype(float)), shift.ravel().astype(float)), float(weight))
+        for turn, shift, weight in zip(turns, shifts, weights / weights.sum(), strict=True)
+    ]
+    return sorted(found, key=lambda each: -each[1])

@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fleetmap.encoding import to_json
 from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, se3, se3_inverse
 from fleetmap.messages import Placement, Status
-from fleetmap.plugins.markers import Marker, MarkerList, read_markers, write_markers
+from fleetmap.plugins.markers import Marker, MarkerList, read_markers
 from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.pose_covariance import boxminus
@@ -114,6 +115,6 @@ def test_a_wrong_list_is_refused(tmp_path: Path, text: str, words: str) -> None:
 
 def test_a_list_comes_back_and_without_one_nothing_is_looked_for(tmp_path: Path) -> None:
     known, _ = listed()
-    write_markers(tmp_path / "markers.json", known)
+    (tmp_path / "markers.json").write_bytes(to_json(known))
     assert read_markers(tmp_path / "markers.json") == known
     assert PRIORS.open(MarkersSection(), MountedCamera(CAMERA, BODY_FROM_CAM), BASE_FROM_BODY) is None
