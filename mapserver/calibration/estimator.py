@@ -24,6 +24,7 @@ from mapserver.survey.bundle.problem import (
     MotionPrior,
     SelfCalibration,
 )
+from mapserver.survey.rig import Rig
 from mapserver.survey.settings import BundleSettings
 from mapserver.survey.state import PriorTerm
 
@@ -166,12 +167,12 @@ class Problem:
             known = MotionPrior(0, np.concatenate([data.start.motions[0, :3], np.zeros(6)]), _BIAS_SIGMAS)
             inertial = InertialTerms(velocities, gyro, accel, edges, [known])
         return BundleProblem(
-            camera=data.rectifier.camera,
-            body_from_cam=data.rectifier.body_from_cam,
+            rig=Rig.of_one(data.rectifier.camera, data.rectifier.body_from_cam),
             map_from_body=state.map_from_body,
             fixed=np.zeros(len(data.stamps_ns), np.bool_),
             points_map=state.points_map,
             obs_keyframe=data.obs_keyframe,
+            obs_camera=np.zeros_like(data.obs_keyframe),
             obs_landmark=data.obs_landmark,
             obs_pixels=data.obs_pixels[:, :3],
             obs_sigma_px=data.obs_sigma_px[:, :2],

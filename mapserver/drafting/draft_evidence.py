@@ -35,7 +35,7 @@ from mapserver.quality.probes import (
 )
 from mapserver.store import MapStore
 from mapserver.survey.executor import SERIAL, Executor
-from mapserver.survey.keyframes.rig_views import frame_of_view, other_views
+from mapserver.survey.rig import frame_of_camera, used_cameras
 from mapserver.survey.stages import Survey
 from mapserver.survey.survey_map import SurveyMap, history_of
 
@@ -116,8 +116,10 @@ def _read(
             frame = rectifier.rectify(recording.read_frame(int(selected[number])))
         except RecordingError:
             continue
-        for view in (0, *(view for view, camera in other_views(rectifier) if camera.baseline_m > 0)):
-            if (seen := frame_of_view(frame, view)) is not None:
+        for view, used in used_cameras(rectifier):
+            if view and not used.baseline_m > 0:
+                continue
+            if (seen := frame_of_camera(frame, view)) is not None:
                 camera, body_from_cam = rectifier.mounted[view]
                 features = probe_features(seen, camera, orb)
                 found.append(ProbedFrame(number, camera, body_from_cam, features, view=view))
@@ -260,7 +262,7 @@ def _breaks(sessions: Sequence[JudgedSession]) -> TrajectoryBreaks | None:
     """Return the breaks of all recordings together; a single camera's odometry has no scale to compare."""
     found = []
     for trajectory, _, survey, _ in sessions:
-        if survey.state.camera.baseline_m > 0:
+        if survey.state.rig.camera.baseline_m > 0:
             guess = survey.odometry
             odometry = (guess.odom_from_body, guess.covariances, guess.tracked.astype(bool))
             found.append(trajectory_breaks(trajectory.stamps_ns, trajectory.frame_from_body, *odometry))

@@ -98,7 +98,7 @@ class Surveyed:
 
     def evidence(self) -> RigEvidence:
         """Evidence on its calibration: the pair is doubted if the survey's disparities contradict the angle accepted by the doctor."""
-        limit, focal_px = TOLERANCES[CalibrationParameter.PAIR_YAW], self.survey.state.camera.focal_px
+        limit, focal_px = TOLERANCES[CalibrationParameter.PAIR_YAW], self.survey.state.rig.camera.focal_px
         most_px = focal_px * (limit.warn_above + SURE_SIGMAS * limit.least_sigma)
         off = [f"{-yaw.shift_px:+.2f} px{of_view}" for of_view, yaw in self._yaws() if abs(yaw.correction_px) > most_px]
         if not off:
@@ -371,7 +371,7 @@ def survey_recording(
             recording = replace(recording, wheel=())
         rectifier = Rectifier(rig, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
         inputs = survey_inputs_of(recording, indices, rectifier, None if given is None else given.trajectory)
-        if chain is None or chain.state.camera != rectifier.camera:
+        if chain is None or chain.state.rig.camera != rectifier.camera:
             chain = begin_survey(inputs, options.settings, tools)
         parts, held = parts_between_lifts(chain.odometry.estimates), [chain]
         del admission, chain  # otherwise it would be in memory twice
@@ -469,7 +469,7 @@ def survey_all(
     for path in paths:
         with _noting(path, unusable):
             done += survey_one(path, pinhole)
-            pinhole = pinhole or done[0].survey.state.camera
+            pinhole = pinhole or done[0].survey.state.rig.camera
     if not done:
         raise SurveyError(f"none of {len(paths)} recordings can be surveyed: {'; '.join((unusable or {}).values())}")
     return done

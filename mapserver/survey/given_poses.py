@@ -11,9 +11,9 @@ from fleetmap.odometry.tracking.tracker import MotionSince, Tracker
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.keyframes.keyframes import KeyframePolicy, make_keyframes
-from mapserver.survey.keyframes.rig_views import other_views
 from mapserver.survey.odometry_pass import summary_of
 from mapserver.survey.pose_graph.odometry_factors import carried
+from mapserver.survey.rig import used_cameras
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import FrameTracks, OdometryPass
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
@@ -34,15 +34,7 @@ def poses_as_odometry(
     is kept, any other is replaced by the body's axes at the first pose, as in fleetmap's odometry.
     """
     inertial = inputs.calibration.imu is not None and len(inputs.imu) > 0
-    offset_ns = int(inputs.rectifier.imu_minus_cam_s * 1e9)
-    gyro_bias = np.zeros(3)
-    odom_from_body = given.frame_from_body
-    if not inertial and len(given) and odom_from_body[0, 2, 2] < _UPRIGHT:
-        start_from_frame = se3_inverse(given.frame_from_body[0])
-        odom_from_body = start_from_frame @ given.frame_from_body
-    if inertial:
-        moved = Trajectory(given.stamps_ns + offset_ns, given.frame_from_body)
-        odom_from_body, gyro_bias = _levelled(moved, inputs), _gyro_bias(moved, inputs)
+    odom_from_body, gyro_bias = _upright(given, inputs, inertial)
     seconds = (given.stamps_ns - given.stamps_ns[0]) * 1e-9
     velocities = np.zeros((len(given), 3))
     if len(given) > 1:
@@ -81,12 +73,24 @@ def poses_as_odometry(
             if policy.wants(summary_of(frame, estimate, odom_from_body[number])):
                 yield number, frame
 
-    how = settings, tools.images, tools.executor, other_views(rectifier)
-    keyframes = list(make_keyframes(chosen(), rectifier.camera, *how))
+    keyframes = list(make_keyframes(chosen(), used_cameras(rectifier), settings, tools.images, tools.executor))
     tied = np.ones(len(given), bool)
     return OdometryPass(
         estimates, odom_from_body, covariances, tied, keyframes, inertial, tracks=FrameTracks.joined(seen)
     )
+
+
+def _upright(given: Trajectory, inputs: SurveyInputs, inertial: bool) -> tuple[Array, Array]:
+    """Return the poses (F, 4, 4) in an upright frame, and the gyro's bias (3,), zero without an IMU."""
+    frame_from_body = given.frame_from_body
+    if inertial:
+        offset_ns = int(inputs.rectifier.imu_minus_cam_s * 1e9)
+        moved = Trajectory(given.stamps_ns + offset_ns, frame_from_body)
+        return _levelled(moved, inputs), _gyro_bias(moved, inputs)
+    if not len(given) or frame_from_body[0, 2, 2] >= _UPRIGHT:
+        return frame_from_body, np.zeros(3)
+    start_from_frame = se3_inverse(frame_from_body[0])
+    return start_from_frame @ frame_from_body, np.zeros(3)
 
 
 def _motion_to(odom_from_cam: Array, number: int) -> MotionSince:

@@ -13,10 +13,10 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample, wheel_between
 from mapserver.survey.keyframes.keyframes import FrameSummary, KeyframePolicy, make_keyframes, sharpness
-from mapserver.survey.keyframes.rig_views import other_views
 from mapserver.survey.pose_graph.odometry_factors import carried, odometry_factors
+from mapserver.survey.rig import rig_of, used_cameras
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import FrameTracks, KeyframeMotion, Landmarks, OdometryPass, SurveyState, survey_camera
+from mapserver.survey.state import FrameTracks, KeyframeMotion, Landmarks, OdometryPass, SurveyState
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 LEAD_NS = 30_000_000  # lead of IMU and wheels over a frame, whose stamp may be too early
@@ -96,8 +96,7 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
             if tracked.is_keyframe:
                 yield tracked.number, tracked.frame
 
-    how = settings, tools.images, tools.executor, other_views(rectifier)
-    keyframes = list(make_keyframes(chosen(), rectifier.camera, *how))
+    keyframes = list(make_keyframes(chosen(), used_cameras(rectifier), settings, tools.images, tools.executor))
     estimates = run.chain.estimates
     inertial = bool(estimates) and inputs.calibration.imu is not None and estimates[-1].inertial
     done = OdometryPass(
@@ -115,7 +114,7 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
 
 
 def initial_state(odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:
-    """Return keyframes at their odometry poses, without landmarks."""
+    """Return keyframes of the first camera at their odometry poses, without landmarks."""
     rectifier, numbers = inputs.rectifier, odometry.keyframe_frames
     estimates = [odometry.estimates[n] for n in numbers]
     map_from_body = odometry.odom_from_body[numbers]
@@ -133,11 +132,9 @@ def initial_state(odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:
     return SurveyState(
         stamps_ns=np.array([k.stamp_ns for k in odometry.keyframes], np.int64),
         map_from_body=map_from_body.copy(),
-        body_from_cam=rectifier.body_from_cam,
-        camera=survey_camera(rectifier.camera),
+        rig=rig_of(rectifier).first,
         motion=motion,
         landmarks=Landmarks.empty(),
-        depth_views=frozenset([0] if rectifier.has_depth else []),
     )
 
 

@@ -151,7 +151,7 @@ def _in_parallel(
 
 
 def _stored(survey: SegmentSurvey, images: ImageStore) -> SegmentSurvey:
-    numbers = dict[int, int]()  # of pictures that views share: black ones
+    numbers = dict[int, int]()  # of pictures that images share: black ones
     keyframes = [_kept(keyframe, images, numbers) for keyframe in survey.odometry.keyframes]
     return replace(survey, odometry=replace(survey.odometry, keyframes=keyframes))
 

@@ -5,7 +5,8 @@
 | `follow` | frames, IMU, wheels, or given poses | `OdometryPass`: odometry of all frames, keyframes with their features |
 | `adjust_chain` | that | `AdjustedChain`: keyframes matched with their neighbours, landmarks, both adjusted |
 | `close_loops` | the chain, vocabulary, zones, position priors | `SurveyState` after the pose graph, in `map` by priors, and the `Loops` |
-| `adjust_globally` | keyframes after loops, matched pairs | all views matched again and adjusted; each pair's error of yaw |
+| `match_again` | keyframes after loops, matched pairs | the images of all cameras matched again, and adjusted |
+| `refine` | that | observations and keyframes again, at better poses; each camera's error of yaw |
 | `keep_largest` | the adjusted state, odometry, loops | their part in the connected component that becomes the map |
 | `place_frames`, `assemble` | the kept state | all frames, and the map; inconsistent observations are culled |
 
@@ -25,13 +26,12 @@ from fleetmap.bow import Vocabulary
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3_inverse
 from mapserver.survey.bundle.bundle_rounds import bundle_rounds, local_windows
-from mapserver.survey.bundle.stereo_yaw_check import NO_YAW, StereoYaw, estimate_stereo_yaw, without_stereo_yaw
+from mapserver.survey.bundle.stereo_yaw_check import StereoYaw, estimate_stereo_yaw, without_stereo_yaw
 from mapserver.survey.finish.culling import Culled
 from mapserver.survey.finish.frame_adjustment import place_frames
 from mapserver.survey.finish.map_assembly import assemble
 from mapserver.survey.finish.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
 from mapserver.survey.given_poses import poses_as_odometry
-from mapserver.survey.keyframes.rig_views import body_from_views, depth_views
 from mapserver.survey.loops.connected_components import (
     Component,
     Components,
@@ -55,13 +55,14 @@ from mapserver.survey.pose_graph.position_priors import (
     placed_by_priors,
     prior_edges,
 )
+from mapserver.survey.rig import rig_of
 from mapserver.survey.segments import in_segments
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import Landmarks, OdometryPass, PosedKeyframes, SurveyState
+from mapserver.survey.state import Landmarks, Mask, OdometryPass, RigImages, SurveyState, image_numbers
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.survey.tracks.matching import PairFinder, drift_allowance_m, fixed_allowance_m
-from mapserver.survey.tracks.mono_depths import MonoDepths, with_single_views
+from mapserver.survey.tracks.mono_depths import MonoDepths, with_single_cameras
 from mapserver.survey.tracks.tracks import Tracks, build_landmarks, refine_observations, tracks_of
 
 _MIN_KEYFRAMES = 2
@@ -75,7 +76,7 @@ class Survey:
 
     odometry: the initial trajectory. state: the adjusted variables, which still name the feature of each observation. landmarks_in_map:
     rows of the state's landmarks in the map. components: the connected components, of which one is the map. stereo_yaws: the extrinsic yaw
-    error of the pair of each view. seen (F,): frames located by points of the map; the others by odometry or the IMU.
+    error of each camera's pair. seen (F,): frames located by points of the map; the others by odometry or the IMU.
     """
 
     map: SurveyMap
@@ -91,7 +92,7 @@ class Survey:
 
     @property
     def stereo_yaw(self) -> StereoYaw:
-        """Return that of the first view."""
+        """Return that of the first camera."""
         return self.stereo_yaws[0]
 
 
@@ -120,21 +121,18 @@ def _whole(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -
 
 def finish_survey(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools) -> Survey:
     """Run the stages after `begin_survey`. The caller must drop its reference to the chain, or a long survey is in memory twice."""
-    settings, depths = config.settings, chain.depths
-    chain = replace(chain, odometry=with_single_views(chain.odometry, chain.state, inputs.rectifier, settings))
+    settings, rig = config.settings, rig_of(inputs.rectifier)
+    odometry = with_single_cameras(chain.odometry, chain.state.map_from_body, rig, settings)
+    chain = replace(chain, odometry=odometry)
     state, loops = close_loops(chain, inputs, config, tools)
     # Neighbours need not be matched again, except for one camera: the depths used for matching have changed.
-    matched, tracks = (chain.matched, Tracks.of(state.landmarks)) if depths is None else (set(), None)
-    odometry = without_doubted(chain.odometry, loops.doubted)
+    known = None
+    if chain.depths is None:
+        known = chain.matched, Tracks.of(state.landmarks, image_numbers(len(state.stamps_ns), len(rig)))
     # Landmarks so far are those of neighbours; all are built again, and nothing may hold the old ones meanwhile.
-    del chain
-    state = replace(
-        state,
-        landmarks=Landmarks.empty(),
-        body_from_view=body_from_views(inputs.rectifier),
-        depth_views=depth_views(inputs.rectifier),
-    )
-    odometry, state, stereo_yaws = adjust_globally(odometry, state, depths, matched, tracks, settings, tools)
+    state = replace(state, landmarks=Landmarks.empty(), rig=rig)
+    chain = replace(chain, odometry=without_doubted(chain.odometry, loops.doubted), state=state)
+    odometry, state, stereo_yaws = refine(match_again(chain, known, settings, tools), settings, tools)
     tools.at("global adjustment", 2, 2)
     frames_of = np.array(odometry.keyframe_frames, np.int64)
     state, odometry, loops, components = keep_largest(state, odometry, loops, settings)
@@ -165,39 +163,38 @@ def adjust_chain(
     state = initial_state(odometry, inputs)
     depths = None
     if inputs.rectifier.camera.baseline_m == 0:
-        depths = MonoDepths(odometry.keyframes, state.camera, settings)
+        depths = MonoDepths(odometry.keyframes, state.rig.camera, settings)
     odometry = _with_depths(odometry, state, depths)
+    state, matched = _with_neighbours(odometry, state, settings, tools)
+    if odometry.inertial:
+        state = replace(state, motion=replace(state.motion, relative=blackout_factors(odometry, state)))
+    if len(state.landmarks.points_map) < _MIN_LANDMARKS:
+        raise SurveyError(
+            f"{len(odometry.keyframes)} keyframes share only {len(state.landmarks.points_map)} landmarks; check the recording with "
+            "`mapserver doctor`: dark, blurred, or the wrong calibration?"
+        )
+    tools.at("local adjustment", 0, 1)
+    # With an IMU all at once: windows fix earlier keyframes, and so lose the heading that odometry has from the gyro.
+    state = bundle_rounds(state, settings, rounds=2) if state.motion.inertial else local_windows(state, settings)
+    return AdjustedChain(_with_depths(odometry, state, depths), state, matched, depths)
+
+
+def _with_neighbours(
+    odometry: OdometryPass, state: SurveyState, settings: SurveySettings, tools: SurveyTools
+) -> tuple[SurveyState, set[tuple[int, int]]]:
+    """Return the state with the landmarks that the first camera sees in neighbouring keyframes, and the matched pairs of them."""
     allowed_m = drift_allowance_m(odometry.covariances[odometry.keyframe_frames], state.map_from_body[:, :3, 3])
-    finder, previous = _pair_finder(odometry, state, settings, tools), settings.pairs.previous
-    near = max(settings.loops.min_gap_keyframes, previous)
-    candidates = finder.candidates(state.map_from_body, previous=previous, only_near=near)
+    posed, previous = _posed(odometry, state), settings.pairs.previous
+    finder = PairFinder(posed, settings.pairs, tools.executor)
+    candidates = finder.candidates(previous=previous, only_near=max(settings.loops.min_gap_keyframes, previous))
     pairs = finder.match(
         candidates,
-        state.map_from_body,
         allowed_m,
         rotation_sigma_rad=_ADJUSTED_SIGMA_RAD if odometry.inertial else None,
         progress=_progress_of(tools, "matching", len(candidates)),
     )
-    landmarks = build_landmarks(_posed(odometry, state), tracks_of(pairs), settings, tools.executor)
-    state = replace(state, landmarks=landmarks)
-    if odometry.inertial:
-        state = replace(state, motion=replace(state.motion, relative=blackout_factors(odometry, state)))
-    if len(landmarks.points_map) < _MIN_LANDMARKS:
-        raise SurveyError(
-            f"{len(odometry.keyframes)} keyframes share only {len(landmarks.points_map)} landmarks; check the recording with "
-            "`mapserver doctor`: dark, blurred, or the wrong calibration?"
-        )
-    matched = {(p.i, p.j) for p in pairs}
-    del pairs, landmarks, finder  # as large as all else in a long survey
-    tools.at("local adjustment", 0, 1)
-    if state.motion.inertial:
-        # All at once: windows fix earlier keyframes, and so lose the heading that odometry has from the gyro.
-        held = [state]
-        del state  # otherwise its observations would be in memory twice
-        state = bundle_rounds(held.pop(), settings, rounds=2)
-    else:
-        state = local_windows(state, settings)
-    return AdjustedChain(_with_depths(odometry, state, depths), state, matched, depths)
+    landmarks = build_landmarks(posed, tracks_of(pairs), settings, tools.executor)
+    return replace(state, landmarks=landmarks), {(p.i, p.j) for p in pairs}
 
 
 def close_loops(
@@ -214,7 +211,7 @@ def close_loops(
         marginals = GraphMarginals(placed, known)
         state = replace(state.moved(placed), priors=learn_priors(marginals, terms))
     groups = find_groups(state, _sigmas_m(odometry), settings.join_sigma_m)
-    posed = _posed(odometry, replace(state, body_from_view=body_from_views(inputs.rectifier)))
+    posed = _posed(odometry, replace(state, rig=rig_of(inputs.rectifier)))
     closer = LoopCloser(
         posed,
         config,
@@ -225,9 +222,9 @@ def close_loops(
         find_groups(state, lambda *_: np.inf, 0.0) if odometry.scale_known else None,
         measures_scale=not odometry.scale_known,
     )
-    for i in range(len(posed.keyframes)):
+    for i in range(len(posed.images)):
         closer.close(i)
-        tools.at("loops", i + 1, len(posed.keyframes))
+        tools.at("loops", i + 1, len(posed.images))
     loops = replace(closer.loops, doubted=closer.doubted())
     if odometry.scale_known:
         return _solved(state, closer.begin, chain, loops)
@@ -256,65 +253,88 @@ def _solved(state: SurveyState, map_from_body: Array, chain: list[PoseEdge], loo
     return state, loops.without_outliers(solved.loop_weights[: len(loops.edges)])
 
 
-def adjust_globally(
-    odometry: OdometryPass,
-    state: SurveyState,
-    depths: MonoDepths | None,
-    matched: set[tuple[int, int]],
-    tracks: Tracks | None,
-    settings: SurveySettings,
-    tools: SurveyTools,
-) -> tuple[OdometryPass, SurveyState, tuple[StereoYaw, ...]]:
-    """Match all views at the poses after loop closure and adjust them together, twice: the first result gives the
-    stereo yaw error of each view.
+@dataclass(frozen=True)
+class GlobalMatch:
+    """A survey after its first global adjustment: redundant keyframes (K,), and map_from_cam (P, 4, 4) at which its images were matched."""
 
-    matched: pairs of the first view that need not be matched again, and their tracks.
+    odometry: OdometryPass
+    state: SurveyState
+    depths: MonoDepths | None
+    redundant: Mask
+    map_from_cam: Array
+
+
+_Known = tuple[set[tuple[int, int]], Tracks]
+
+
+def match_again(
+    chain: AdjustedChain, known: _Known | None, settings: SurveySettings, tools: SurveyTools
+) -> GlobalMatch:
+    """Match the images of all cameras at the poses after loop closure, and adjust them together.
+
+    known: pairs of keyframes whose images by the first camera need not be matched again, and their tracks.
     """
-    views, redundant = state.view_count, np.zeros(len(odometry.keyframes), bool)
-    yaws = [NO_YAW] * views
-    finder = _pair_finder(odometry, state, settings, tools)
-    for round_number in range(2):
-        tools.at("global adjustment", round_number, 2)
-        search = round_number == 0 or depths is not None
-        if depths is not None:
-            odometry = _with_depths(odometry, state, depths)
-            finder = _pair_finder(odometry, state, settings, tools)
-        posed = _posed(odometry, state)
-        if search:
-            every = finder.candidates(state.map_from_view, previous=settings.pairs.previous)
-            known = {(views * i, views * j) for i, j in matched}
-            candidates = [pair for pair in every if pair not in known]
-            pairs = finder.match(
-                candidates,
-                state.map_from_view,
-                fixed_allowance_m(state.map_from_view),
-                rotation_sigma_rad=_ADJUSTED_SIGMA_RAD,
-                progress=_progress_of(tools, "matching again", len(candidates)),
-            )
-            if tracks is not None:
-                tracks = replace(tracks, keyframes=views * tracks.keyframes)
-            joined = tracks_of(pairs, tracks)
-            redundant = redundant_keyframes(joined, posed.keyframes, settings, views)
-            redundant[[term.k for term in state.priors]] = False
-            spared = np.repeat(redundant, views)
-            landmarks = build_landmarks(posed, joined, settings, tools.executor, spared)
-            observed_from = posed.map_from_cam
-            del pairs, joined
-        else:  # a second search finds almost no further matches; its coordinates are more accurate
-            landmarks = refine_observations(posed, state.landmarks, settings, tools.executor, observed_from)
-        corrections_px = [yaw.correction_px for yaw in yaws]
-        held = [replace(state, landmarks=without_stereo_yaw(landmarks, state.camera, *corrections_px))]
-        del landmarks, state  # otherwise observations would be in memory twice
-        tools.release()
-        state = adjust_visits(held.pop(), settings, redundant, rounds=3 if search else 2)
-        priors, believed = judged_priors(state.priors, state.map_from_body)
-        if not believed:
-            state = adjust_visits(replace(state, priors=priors), settings, redundant, rounds=2)
-        if round_number == 0:
-            part = without_redundant(state, redundant)
-            yaws = [estimate_stereo_yaw(part, settings, view) for view in range(views)]
-            del part
-    return odometry, state, tuple(yaws)
+    tools.at("global adjustment", 0, 2)
+    odometry = _with_depths(chain.odometry, chain.state, chain.depths)
+    posed = _posed(odometry, chain.state)
+    landmarks, redundant = _observed(posed, chain.state, known, settings, tools)
+    state = _adjusted(replace(chain.state, landmarks=landmarks), redundant, settings, tools, rounds=3)
+    return GlobalMatch(odometry, state, chain.depths, redundant, posed.map_from_cam)
+
+
+def refine(
+    first: GlobalMatch, settings: SurveySettings, tools: SurveyTools
+) -> tuple[OdometryPass, SurveyState, tuple[StereoYaw, ...]]:
+    """Observe and adjust once more, at the poses of the first adjustment, which give the stereo yaw error of each camera."""
+    yaws = _stereo_yaws(first.state, first.redundant, settings)
+    tools.at("global adjustment", 1, 2)
+    odometry, redundant, rounds = _with_depths(first.odometry, first.state, first.depths), first.redundant, 2
+    posed = _posed(odometry, first.state)
+    if first.depths is None:  # a second search finds almost no further matches; its coordinates are more accurate
+        landmarks = refine_observations(posed, first.state.landmarks, settings, tools.executor, first.map_from_cam)
+    else:
+        landmarks, redundant = _observed(posed, first.state, None, settings, tools)
+        rounds = 3
+    landmarks = without_stereo_yaw(landmarks, posed.rig.camera, *(yaw.correction_px for yaw in yaws))
+    state = _adjusted(replace(first.state, landmarks=landmarks), redundant, settings, tools, rounds)
+    return odometry, state, yaws
+
+
+def _observed(
+    posed: RigImages, state: SurveyState, known: _Known | None, settings: SurveySettings, tools: SurveyTools
+) -> tuple[Landmarks, Mask]:
+    """Return the landmarks of all images, and the keyframes (K,) that their adjustment can do without."""
+    finder = PairFinder(posed, settings.pairs, tools.executor)
+    candidates, tracks = finder.candidates(previous=settings.pairs.previous), None
+    if known is not None:
+        first, (matched, tracks) = posed.numbers[:, 0].tolist(), known
+        done = {(first[i], first[j]) for i, j in matched}
+        candidates = [pair for pair in candidates if pair not in done]
+    pairs = finder.match(
+        candidates,
+        fixed_allowance_m(posed.map_from_body),
+        rotation_sigma_rad=_ADJUSTED_SIGMA_RAD,
+        progress=_progress_of(tools, "matching again", len(candidates)),
+    )
+    tracks = tracks_of(pairs, tracks)
+    redundant = redundant_keyframes(tracks, posed, settings)
+    redundant[[term.k for term in state.priors]] = False
+    return build_landmarks(posed, tracks, settings, tools.executor, redundant), redundant
+
+
+def _adjusted(
+    state: SurveyState, redundant: Mask, settings: SurveySettings, tools: SurveyTools, rounds: int
+) -> SurveyState:
+    """Return the adjusted state; priors that contradict it are then no longer believed."""
+    tools.release()
+    state = adjust_visits(state, settings, redundant, rounds)
+    priors, same = judged_priors(state.priors, state.map_from_body)
+    return state if same else adjust_visits(replace(state, priors=priors), settings, redundant, rounds=2)
+
+
+def _stereo_yaws(state: SurveyState, redundant: Mask, settings: SurveySettings) -> tuple[StereoYaw, ...]:
+    part = without_redundant(state, redundant)
+    return tuple(estimate_stereo_yaw(part, settings, camera) for camera in range(len(part.rig)))
 
 
 def keep_largest(
@@ -329,19 +349,11 @@ def _with_depths(odometry: OdometryPass, state: SurveyState, depths: MonoDepths 
     """Return the keyframes of one camera with depths by their present poses; unchanged for rigs that measure depth."""
     if depths is None:
         return odometry
-    return replace(odometry, keyframes=depths.keyframes_at(state.map_from_body, state.body_from_cam))
+    return replace(odometry, keyframes=depths.keyframes_at(state.map_from_cams[:, 0]))
 
 
-def _pair_finder(
-    odometry: OdometryPass, state: SurveyState, settings: SurveySettings, tools: SurveyTools
-) -> PairFinder:
-    rig = odometry.views(state.view_count), state.camera, state.body_from_cam
-    return PairFinder(*rig, settings.pairs, tools.executor, state.view_count)
-
-
-def _posed(odometry: OdometryPass, state: SurveyState) -> PosedKeyframes:
-    rig = state.body_from_cam, state.camera, state.body_from_view
-    return PosedKeyframes(odometry.views(state.view_count), state.map_from_view, *rig)
+def _posed(odometry: OdometryPass, state: SurveyState) -> RigImages:
+    return RigImages.of(odometry.keyframes, state.map_from_body, state.rig)
 
 
 def _sigmas_m(odometry: OdometryPass) -> SigmaBetween:

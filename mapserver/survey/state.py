@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 from itertools import count
 from typing import Any, Protocol
 
@@ -15,10 +15,12 @@ from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.sensors.calibration import ImuNoise
-from fleetmap.sensors.rectification import RGBD_BASELINE_M, RectifiedFrame, StereoCamera
+from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples
+from mapserver.survey.rig import Rig
 
 Indices = NDArray[np.int64]
+Numbers = NDArray[np.int32]
 Mask = NDArray[np.bool_]
 
 
@@ -79,8 +81,8 @@ class Keyframe:
     """One keyframe: features (N), disparities (N, 2) with sigma, their points; its pictures are in an image store.
 
     from_views: the disparities come from other keyframes, so they locate points but are not measurements. nodes (N, 2): the
-    vocabulary's branches nearest to each feature; None if all descriptors are compared. others: those of the rig's other views at the same
-    moment, converted to the first view's camera, whose disparities are disparity_scale times those of their pictures.
+    vocabulary's branches nearest to each feature; None if all descriptors are compared. others: those of the rig's other cameras at the
+    same moment, converted to the first camera, whose disparities are disparity_scale times those of their pictures.
     """
 
     frame_index: int
@@ -141,22 +143,42 @@ class Keyframe:
 
 
 @dataclass(frozen=True, slots=True)
-class PosedKeyframes:
-    """K keyframes at map_from_body (K, 4, 4), of one camera with the mount body_from_cam (4, 4).
+class RigImages:
+    """The P images by V cameras of K keyframes at map_from_body (K, 4, 4).
 
-    Those of a rig are the views of all its keyframes, in turn: see `SurveyState.body_from_view` and `map_from_view`.
+    images: those of the first keyframe by all cameras, those of the second one, and so on; numbers (K, V) of a keyframe's images.
     """
 
-    keyframes: list[Keyframe]
+    rig: Rig
     map_from_body: Array
-    body_from_cam: Array
-    camera: StereoCamera
-    body_from_view: Array = field(default_factory=lambda: np.eye(4)[None])
+    images: list[Keyframe]
+    numbers: Indices
+
+    @classmethod
+    def of(cls, keyframes: Sequence[Keyframe], map_from_body: Array, rig: Rig) -> "RigImages":
+        """Return the images of keyframes (K,) by the cameras of a rig."""
+        images = [image for keyframe in keyframes for image in (keyframe, *keyframe.others)[: len(rig)]]
+        return cls(rig, map_from_body, images, image_numbers(len(keyframes), len(rig)))
+
+    @property
+    def keyframe(self) -> Indices:
+        """(P,) the keyframe of each image."""
+        return np.asarray(np.indices(self.numbers.shape)[0].ravel(), np.int64)
+
+    @property
+    def camera(self) -> Indices:
+        """(P,) the camera of each image."""
+        return np.asarray(np.indices(self.numbers.shape)[1].ravel(), np.int64)
 
     @property
     def map_from_cam(self) -> Array:
-        """(K, 4, 4)."""
-        return self.map_from_body @ self.body_from_cam
+        """(P, 4, 4)."""
+        return self.rig.map_from_cams(self.map_from_body).reshape(-1, 4, 4)
+
+
+def image_numbers(keyframes: int, cameras: int) -> Indices:
+    """Return (K, V) the numbers of all images, keyframe by keyframe."""
+    return np.arange(keyframes * cameras).reshape(keyframes, cameras)
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,46 +253,37 @@ class OdometryPass:
         """Frame number of each keyframe."""
         return [k.frame_index for k in self.keyframes]
 
-    def views(self, count: int) -> list[Keyframe]:
-        """Return so many views of each keyframe: those of the first keyframe, those of the second one, and so on."""
-        return [view for keyframe in self.keyframes for view in (keyframe, *keyframe.others)[:count]]
-
 
 @dataclass(frozen=True)
 class Landmarks:
     """N landmarks and their M observations, sorted by landmark; the first observation of each is its reference.
 
-    obs_keyframe, obs_landmark, obs_feature (M,); obs_pixels (M, 3) u_left v u_right; obs_sigma_px (M, 2) of pixel and disparity.
+    obs_keyframe, obs_camera, obs_landmark, obs_feature (M,): a feature of the image of a keyframe by a camera; obs_pixels (M, 3) u_left v
+    u_right; obs_sigma_px (M, 2) of pixel and disparity.
     """
 
     points_map: Array
-    obs_keyframe: NDArray[np.int32]
-    obs_landmark: NDArray[np.int32]
-    obs_feature: Indices
+    obs_keyframe: Numbers
+    obs_camera: Numbers
+    obs_landmark: Numbers
+    obs_feature: Numbers
     obs_pixels: Array
     obs_sigma_px: Array
 
     @classmethod
     def empty(cls) -> "Landmarks":
         none = np.zeros(0, np.int32)
-        return cls(np.zeros((0, 3)), none, none, np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2)))
+        return cls(np.zeros((0, 3)), none, none, none, none, np.zeros((0, 3)), np.zeros((0, 2)))
 
     @classmethod
     def concatenated(cls, points_map: Array, parts: "Sequence[Landmarks]") -> "Landmarks":
         """Return landmarks (N, 3) with the concatenated observations of all parts, which share numbers of keyframes and landmarks."""
-        return cls(
-            points_map,
-            np.concatenate([p.obs_keyframe for p in parts]),
-            np.concatenate([p.obs_landmark for p in parts]),
-            np.concatenate([p.obs_feature for p in parts]),
-            np.concatenate([p.obs_pixels for p in parts]),
-            np.concatenate([p.obs_sigma_px for p in parts]),
-        )
+        return cls(points_map, *(np.concatenate([getattr(part, name) for part in parts]) for name in OBSERVATIONS))
 
     def taken(self, rows: Indices | Mask, points_map: Array, keyframes: AnyArray, landmarks: AnyArray) -> "Landmarks":
         """Return some observations, rows (m,), of landmarks (N, 3), with new numbers of their keyframes and landmarks (m,)."""
-        features, pixels, sigmas = self.obs_feature[rows], self.obs_pixels[rows], self.obs_sigma_px[rows]
-        return Landmarks(points_map, keyframes.astype(np.int32), landmarks.astype(np.int32), features, pixels, sigmas)
+        owners = keyframes.astype(np.int32), self.obs_camera[rows], landmarks.astype(np.int32)
+        return Landmarks(points_map, *owners, self.obs_feature[rows], self.obs_pixels[rows], self.obs_sigma_px[rows])
 
     def keep_observations(self, keep: Mask, min_observations: int) -> "Landmarks":
         """Return the landmarks without the other observations, and without landmarks that are then seen too rarely."""
@@ -280,8 +293,13 @@ class Landmarks:
         number = np.cumsum(lasting) - 1
         return self.taken(keep, self.points_map[lasting], self.obs_keyframe[keep], number[self.obs_landmark[keep]])
 
+    def by_image(self, numbers: Indices) -> "Landmarks":
+        """Return the observations by single cameras: each image, with its number (K, V), in place of a keyframe."""
+        images = numbers[self.obs_keyframe, self.obs_camera].astype(np.int32)
+        return replace(self, obs_keyframe=images, obs_camera=np.zeros_like(images))
+
     def of_features(self, columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
-        """Return values of each observation's feature: columns are one array for each keyframe, a row for each feature."""
+        """Return values of each observation's feature: columns are one array for each image, a row for each feature; see `by_image`."""
         return of_features(self.obs_keyframe, self.obs_feature, columns)
 
     @property
@@ -295,8 +313,11 @@ class Landmarks:
         return np.searchsorted(self.obs_landmark, np.arange(len(self.points_map) + 1))
 
 
-def of_features(owners: NDArray[Any], features: Indices, columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
-    """Return values of features (M,) of keyframes `owners` (M,); concatenated columns of a site would be gigabytes."""
+OBSERVATIONS = tuple(field.name for field in fields(Landmarks))[1:]
+
+
+def of_features(owners: AnyArray, features: AnyArray, columns: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Return values of features (M,) of images `owners` (M,); concatenated columns of a site would be gigabytes."""
     out = np.empty((len(owners), *columns[0].shape[1:]), columns[0].dtype)
     order = np.argsort(owners, kind="stable")
     ends = np.cumsum(np.bincount(owners, minlength=len(columns)))
@@ -361,51 +382,39 @@ class KeyframeMotion:
 
 @dataclass(frozen=True)
 class SurveyState:
-    """Variables of the adjustment: K keyframes and the landmarks.
+    """Variables of the adjustment: K keyframes of a rig and the landmarks.
 
-    priors: of its docks, tags and zones, in `map`; a survey with any is itself in `map`. body_from_view (V, 4, 4): one for each view of a
-    rig, the first one the identity: a view sees what `camera` at body_from_cam would see from body_from_view. With V views
-    obs_keyframe of the landmarks is the number of the keyframe times V plus that of the view. depth_views: those
-    of depth cameras.
+    priors: of its docks, tags and zones, in `map`; a survey with any is itself in `map`.
     """
 
     stamps_ns: Indices
     map_from_body: Array
-    body_from_cam: Array
-    camera: StereoCamera
+    rig: Rig
     motion: KeyframeMotion
     landmarks: Landmarks
-    depth_views: frozenset[int] = frozenset()
     priors: Sequence[PriorTerm] = ()
-    body_from_view: Array = field(default_factory=lambda: np.eye(4)[None])
 
     @property
-    def view_count(self) -> int:
-        """Number V of views."""
-        return len(self.body_from_view)
+    def map_from_cams(self) -> Array:
+        """(K, V, 4, 4) of the cameras of all keyframes."""
+        return self.rig.map_from_cams(self.map_from_body)
 
-    @property
-    def map_from_view(self) -> Array:
-        """(K * V, 4, 4): the bodies from which the first view's camera would see what the views see."""
-        return poses_of_views(self.map_from_body, self.body_from_view)
-
-    @property
-    def observers(self) -> NDArray[np.int32]:
-        """(M,) the keyframe of each observation, by whichever view."""
-        return self.landmarks.obs_keyframe // np.int32(self.view_count)
-
-    def apart(self) -> "SurveyState":
-        """Return the same views as keyframes of one camera, each with a pose of its own; their motion is not that of bodies."""
-        if self.view_count == 1:
-            return self
-        stamps_ns = np.repeat(self.stamps_ns, self.view_count)
-        return replace(self, stamps_ns=stamps_ns, map_from_body=self.map_from_view, body_from_view=np.eye(4)[None])
+    def by_image(self) -> "SurveyState":
+        """Return each image as the keyframe of a single camera with a pose of its own; their motion is not that of bodies."""
+        numbers = image_numbers(len(self.stamps_ns), len(self.rig))
+        return replace(
+            self,
+            stamps_ns=np.broadcast_to(self.stamps_ns[:, None], numbers.shape).ravel(),
+            map_from_body=self.rig.as_bodies(self.map_from_body).reshape(-1, 4, 4),
+            rig=self.rig.first,
+            landmarks=self.landmarks.by_image(numbers),
+        )
 
     def of(self, chosen: Mask) -> "SurveyState":
         """Return a separate state of the chosen keyframes (K,) and of the landmarks seen by two of them."""
-        views, number = np.repeat(chosen, self.view_count), np.cumsum(chosen) - 1
-        marks = self.landmarks.keep_observations(views[self.landmarks.obs_keyframe], 2)
-        marks = replace(marks, obs_keyframe=(np.cumsum(views) - 1)[marks.obs_keyframe].astype(np.int32))
+        number = np.cumsum(chosen) - 1
+        marks = self.landmarks.keep_observations(chosen[self.landmarks.obs_keyframe], 2)
+        marks = replace(marks, obs_keyframe=number[marks.obs_keyframe].astype(np.int32))
         return replace(
             self,
             stamps_ns=self.stamps_ns[chosen],
@@ -420,15 +429,3 @@ class SurveyState:
         rotations = map_from_body[:, :3, :3] @ self.map_from_body[:, :3, :3].transpose(0, 2, 1)
         velocities = np.einsum("kij,kj->ki", rotations, self.motion.velocities_mps)
         return replace(self, map_from_body=map_from_body, motion=replace(self.motion, velocities_mps=velocities))
-
-
-def poses_of_views(map_from_body: Array, body_from_view: Array) -> Array:
-    """Return (K * V, 4, 4) of keyframes (K, 4, 4) with views (V, 4, 4)."""
-    if len(body_from_view) == 1:
-        return map_from_body
-    return np.asarray((map_from_body[:, None] @ body_from_view).reshape(-1, 4, 4))
-
-
-def survey_camera(camera: StereoCamera) -> StereoCamera:
-    """Return the camera model of a survey: a single camera gets a baseline, so that depths have disparities, as with a depth sensor."""
-    return camera if camera.baseline_m > 0 else replace(camera, baseline_m=RGBD_BASELINE_M)

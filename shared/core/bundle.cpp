@@ -147,6 +147,7 @@ void BundleSolver::sort_observations() {
                  {weight, weight, has_right ? 1.0 / each.sigma_px[1] : 0.0}};
     if (const int32_t slot = slots_[size_t(each.keyframe)]; slot >= 0) ++slot_starts_[size_t(slot) + 1];
   }
+  problem_.observations = {};
   for (size_t p = 0; p < slots(); ++p) slot_starts_[p + 1] += slot_starts_[p];
   slot_observations_.resize(slot_starts_.back());
   next.assign(slot_starts_.begin(), slot_starts_.end() - 1);

@@ -74,7 +74,7 @@ struct BundleProblem {
   int unknowns;                     // of each keyframe: 6, or 15 with motion
   std::vector<uint8_t> free;        // (K, unknowns)
   bool points_held;
-  std::vector<Observation> observations;
+  std::vector<Observation> observations;  // taken over by the solver
   std::vector<Prior> priors;
   std::vector<Relative> relatives;
   std::vector<Edge> edges;

@@ -678,8 +678,8 @@ class BundleSolver:
     """Bundle adjustment of K keyframes, N landmarks, M observations.
 
     lens (4,): focal, cx, cy, focal times baseline, of the cameras body_from_cams (V, 4, 4) of each keyframe. motions (K, 9): velocity, gyro
-    bias, accelerometer bias, or (K, 0). free (K, 6 or 15): unknowns that move, of pose and motion. obs_keyframe (M,): the keyframe, times
-    V, plus the camera. obs_pixels (M, 3): u and v in the left image, u in the right one, NaN without it.
+    bias, accelerometer bias, or (K, 0). free (K, 6 or 15): unknowns that move, of pose and motion. obs_keyframe, obs_camera, obs_landmark
+    (M,): what sees what. obs_pixels (M, 3): u and v in the left image, u in the right one, NaN without it.
     obs_sigma_px (M, 2): of u and v, and of the disparity. Relative poses i_from_j (R, 4, 4), priors of poses (Q, 4, 4), each with its
     information (6, 6); inertial edges with increments (E, 67) and information (E, 15, 15); motion_mean (K, 9), motion_weight (K, 9)
     1 / sigma^2. huber, cutoff: sigmas of an observation from which its cost is linear, and constant. calibration: further unknowns, theta
@@ -697,8 +697,9 @@ class BundleSolver:
         points_map: _Reals,
         free: _Flags,
         points_held: bool,
-        obs_keyframe: _Indices,
-        obs_landmark: _Indices,
+        obs_keyframe: _Numbers,
+        obs_camera: _Numbers,
+        obs_landmark: _Numbers,
         obs_pixels: _Reals,
         obs_sigma_px: _Reals,
         relative_ends: _Indices,

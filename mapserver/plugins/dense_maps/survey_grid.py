@@ -43,7 +43,7 @@ class DepthView:
 
 def measures_depth(survey: Survey) -> bool:
     """True if its pictures contain depth: the camera of a single-camera survey may also have a baseline, set by the adjustment."""
-    if not survey.state.camera.baseline_m > 0:
+    if not survey.state.rig.camera.baseline_m > 0:
         return False
     frame = survey.odometry.keyframes[0].frame
     return frame.right is not None or frame.disparity_px is not None
@@ -54,7 +54,7 @@ def adding_keyframes(session: MappedSession) -> list[Keyframe]:
     survey, kept = session.survey, list[Keyframe]()
     places, axes = np.zeros((0, 3)), np.zeros((0, 3))
     for keyframe in reversed(survey.odometry.keyframes):
-        map_from_cam = session.map_from_body[keyframe.frame_index] @ survey.state.body_from_cam
+        map_from_cam = session.map_from_body[keyframe.frame_index] @ survey.state.rig.body_from_cam[0]
         place, axis = map_from_cam[:3, 3], map_from_cam[:3, 2]
         alike = (np.linalg.norm(places - place, axis=1) < _ALIKE_M) & (axes @ axis > _ALIKE_COSINE)
         if alike.sum() < _ENOUGH:
@@ -65,11 +65,11 @@ def adding_keyframes(session: MappedSession) -> list[Keyframe]:
 
 def depth_view(session: MappedSession, settings: StereoSettings, keyframe: Keyframe) -> DepthView:
     """Return a keyframe of a session, densely matched."""
-    survey, camera = session.survey, session.survey.state.camera
+    survey, camera = session.survey, session.survey.state.rig.camera
     columns = np.arange(camera.width_px, dtype=np.float64)[:, None]
     yaw_px = (survey.stereo_yaw.correction_px * disparity_shift(camera, columns)).astype(np.float32)
     disparity_px, sigma_px = dense_disparity(keyframe.frame, camera, settings)
-    map_from_cam = session.map_from_body[keyframe.frame_index] @ survey.state.body_from_cam
+    map_from_cam = session.map_from_body[keyframe.frame_index] @ survey.state.rig.body_from_cam[0]
     return DepthView(keyframe, disparity_px - yaw_px, sigma_px, map_from_cam)
 
 
@@ -126,7 +126,7 @@ class GridGrower:
         self.tiles: Tiles = dict(before)
 
     def begin(self, session: MappedSession, some: Sequence[DepthView]) -> str | None:
-        camera = session.survey.state.camera
+        camera = session.survey.state.rig.camera
         floor_m = floor_distance_m(((view.disparity_px, view.map_from_cam) for view in some), camera)
         if floor_m is None:
             return "no floor at one height below the camera: it is carried by hand, looks past the floor, or its map is not level"
@@ -134,12 +134,12 @@ class GridGrower:
         return None
 
     def add(self, view: DepthView) -> None:
-        camera = self._session.survey.state.camera
+        camera = self._session.survey.state.rig.camera
         self._views.add((view.disparity_px, view.nearest_px, view.sigma_px), camera, view.map_from_cam, self._floor_m)
 
     def end(self) -> None:
         survey = self._session.survey
         frames = [keyframe.frame_index for keyframe in survey.odometry.keyframes]
-        places = (self._session.map_from_body[frames] @ survey.state.body_from_cam)[:, :3, 3]
+        places = (self._session.map_from_body[frames] @ survey.state.rig.body_from_cam[0])[:, :3, 3]
         self._views.add_path(places, self._floor_m)
         self.tiles = updated(self._views)

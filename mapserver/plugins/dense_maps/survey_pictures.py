@@ -40,7 +40,7 @@ def kept_pictures(
     for session in sessions:
         survey, taken, last = session.survey, list[SurveyPicture](), None
         for keyframe in survey.odometry.keyframes:
-            map_from_cam = session.map_from_body[keyframe.frame_index] @ survey.state.body_from_cam
+            map_from_cam = session.map_from_body[keyframe.frame_index] @ survey.state.rig.body_from_cam[0]
             if last is not None and np.linalg.norm(map_from_cam[:3, 3] - last) < _EVERY_M:
                 continue
             place, looks = map_from_cam[:3, 3], map_from_cam[:3, 2]

@@ -71,7 +71,7 @@ class SurfelGrower:
         self.surfels = before
 
     def begin(self, session: MappedSession, some: Sequence[DepthView]) -> str | None:
-        self._camera, self._looks = session.survey.state.camera, list[_Look]()
+        self._camera, self._looks = session.survey.state.rig.camera, list[_Look]()
         self._seen: dict[_Place, list[int]] = {}  # by tile, the views that measured something in it or its halo
         self._images: ImageStore = session.survey.odometry.keyframes[0].images
         return None

@@ -32,7 +32,8 @@ from mapserver.survey.loops.loops import LoopCloser, LoopRecord, Loops, LoopVerd
 from mapserver.survey.loops.sim3_loops import gate_covariances, solve_scaled
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, optimize_pose_graph
-from mapserver.survey.state import Keyframe, KeyframeMotion, PosedKeyframes, RelativeTerm, SurveyState, survey_camera
+from mapserver.survey.rig import CameraKind, Rig, survey_camera
+from mapserver.survey.state import Keyframe, KeyframeMotion, RelativeTerm, RigImages, SurveyState
 from mapserver.survey.survey_inputs import SurveyConfig
 from mapserver.survey.tracks.matching import PairFinder
 from mapserver.survey.tracks.mono_depths import MonoDepths
@@ -56,8 +57,11 @@ class LiveMap:
     def __init__(self, options: SurveyConfig, rig: LiveRig) -> None:
         """rig: with one camera, features get their depths from the keyframes of the window."""
         self._options, self._settings, self._rig = options, options.settings, rig
-        self._camera = survey_camera(rig.camera)
-        self._depths = MonoDepths([], self._camera, options.settings) if rig.camera.baseline_m == 0 else None
+        kind = CameraKind.DEPTH if rig.is_depth_camera else CameraKind.STEREO
+        self._mounted = Rig.of_one(survey_camera(rig.camera), rig.body_from_cam, kind)
+        self._depths = None
+        if rig.camera.baseline_m == 0:
+            self._depths = MonoDepths([], self._mounted.camera, options.settings)
         self._keyframes: list[Keyframe] = []
         self._news: list[NewKeyframe] = []
         self._chain_from_body: list[Array] = []  # adjusted in windows, not moved by loops
@@ -206,10 +210,9 @@ class LiveMap:
     def _matched(self, first: int) -> list[PairMatch]:
         """Match the newest keyframe with those of the window that see the same."""
         window, newest = self._keyframes[first:], len(self._keyframes) - 1
-        settings, rig = self._settings.pairs, self._rig
-        finder = PairFinder(window, self._camera, rig.body_from_cam, settings)
-        chain_from_body = np.array(self._chain_from_body[first:])
-        wanted = [p for p in finder.candidates(chain_from_body, previous=settings.previous) if p[1] == newest - first]
+        settings, chain_from_body = self._settings.pairs, np.array(self._chain_from_body[first:])
+        finder = PairFinder(RigImages.of(window, chain_from_body, self._mounted), settings)
+        wanted = [pair for pair in finder.candidates(previous=settings.previous) if pair[1] == newest - first]
 
         def allowed_m(i: int, j: int) -> float:
             gained = self._walked_m2[first + j] - self._walked_m2[first + i]
@@ -217,17 +220,15 @@ class LiveMap:
             return 3.0 * float(np.sqrt(gained + least**2))
 
         sigma = _ROTATION_SIGMA_RAD if self._news[-1].inertial else None
-        found = finder.match(
-            wanted, chain_from_body, allowed_m, rotation_sigma_rad=sigma, progress=lambda _number: None
-        )
+        found = finder.match(wanted, allowed_m, rotation_sigma_rad=sigma, progress=lambda _number: None)
         return [replace(pair, i=pair.i + first, j=pair.j + first) for pair in found]
 
     def _place_features(self, first: int) -> None:
         """Compute depths of one camera's features, from the present poses of the window's keyframes."""
         if self._depths is not None:
             self._depths.grow(self._keyframes)
-            placed = np.array(self._chain_from_body)
-            self._keyframes[first:] = self._depths.keyframes_at(placed, self._rig.body_from_cam, first)
+            placed = np.array(self._chain_from_body) @ self._rig.body_from_cam
+            self._keyframes[first:] = self._depths.keyframes_at(placed, first)
 
     def _step_cov(self, by_odometry: Array, found: Sequence[PairMatch]) -> Array:
         """Return (6, 6) of the step to the newest keyframe: common images may connect a frame lost by odometry to the previous one."""
@@ -299,16 +300,14 @@ class LiveMap:
             accel_bias_mps2=np.array([new.accel_bias_mps2 for new in news]),
             relative=[] if inertial else self._relative(first),
         )
-        posed = PosedKeyframes(self._keyframes[first:], level_from_body, rig.body_from_cam, self._camera)
+        posed = RigImages.of(self._keyframes[first:], level_from_body, self._mounted)
         pairs = [replace(pair, i=pair.i - first, j=pair.j - first) for pair in self._pairs]
         return SurveyState(
-            stamps_ns=np.array([keyframe.stamp_ns for keyframe in posed.keyframes], np.int64),
+            stamps_ns=np.array([keyframe.stamp_ns for keyframe in posed.images], np.int64),
             map_from_body=level_from_body,
-            body_from_cam=rig.body_from_cam,
-            camera=self._camera,
+            rig=self._mounted,
             motion=motion,
             landmarks=build_landmarks(posed, tracks_of(pairs), self._settings),
-            depth_views=frozenset([0] if rig.is_depth_camera else []),
         )
 
     def _relative(self, first: int) -> list[RelativeTerm]:
@@ -350,7 +349,7 @@ class LiveMap:
     def _close(self) -> None:
         """Search revisits of the newest keyframe; with a new loop the pose graph updates all keyframes."""
         newest, rig = len(self._keyframes) - 1, self._rig
-        posed = PosedKeyframes(self._keyframes, self._map_from_body, rig.body_from_cam, self._camera)
+        posed = RigImages.of(self._keyframes, self._map_from_body, self._mounted)
         matched = [(pair.i, pair.j) for pair in self._pairs if pair.j == newest]
         learned = [] if self._closer is None else self._closer.learned
         scale_walk = self._settings.monocular.scale_walk

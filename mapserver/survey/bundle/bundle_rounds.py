@@ -11,7 +11,7 @@ from fleetmap.odometry.sensor_buffer import is_pause
 from fleetmap.sensors.calibration import ImuNoise
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.measured_noise import measured_sigmas
-from mapserver.survey.bundle.problem import BundleProblem, BundleResult, InertialTerms
+from mapserver.survey.bundle.problem import OBSERVED, BundleProblem, BundleResult, InertialTerms
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import RelativeTerm, SurveyState
 
@@ -41,7 +41,7 @@ def bundle_rounds(
         if not last:
             keep = result.squared_sigmas < settings.noise.cut_sigmas**2
             if free is not None:
-                keep |= ~np.isin(state.observers, np.flatnonzero(free))
+                keep |= ~free[state.landmarks.obs_keyframe]
             state = replace(state, landmarks=state.landmarks.keep_observations(keep, settings.min_observations))
         del problem, result  # frees the dropped observations
     return state
@@ -151,20 +151,15 @@ def bundle_problem(state: SurveyState, settings: SurveySettings, free: NDArray[n
         fixed[0] = True
     holds_all = free is None or bool(free[0])
     return BundleProblem(
-        camera=state.camera,
-        body_from_cam=state.body_from_cam,
+        rig=state.rig,
         map_from_body=state.map_from_body,
         fixed=fixed,
         points_map=marks.points_map,
-        obs_keyframe=marks.obs_keyframe,
-        obs_landmark=marks.obs_landmark,
-        obs_pixels=marks.obs_pixels,
-        obs_sigma_px=marks.obs_sigma_px,
+        **{name: getattr(marks, name) for name in OBSERVED},
         inertial=_inertial(state, settings, fixed if not holds_all else None) if motion.inertial else None,
         relative=motion.relative,
         priors=priors,
         gauge="yaw_position" if motion.inertial and holds_all and not priors else "pose",
-        body_from_view=state.body_from_view,
     )
 
 

@@ -34,13 +34,14 @@ def measured_sigmas(problem: BundleProblem, huber_sigmas: float) -> Array:
 
 def _residuals(problem: BundleProblem) -> tuple[Array, Array]:
     """Return lengths (M,) of the residuals of pixel and disparity, NaN if absent."""
-    cam_from_map = se3_inverse(problem.map_from_cam)
+    cam_from_map = se3_inverse(problem.map_from_cams)
     pixel, disparity = np.empty((2, len(problem.obs_keyframe)))
     for first in range(0, len(pixel), _CHUNK):
         rows = slice(first, first + _CHUNK)
-        own, points = cam_from_map[problem.obs_keyframe[rows]], problem.points_map[problem.obs_landmark[rows]]
+        own = cam_from_map[problem.obs_keyframe[rows], problem.obs_camera[rows]]
+        points = problem.points_map[problem.obs_landmark[rows]]
         seen = np.einsum("mij,mj->mi", own[:, :3, :3], points) + own[:, :3, 3]
-        off = problem.camera.pixel_from_point(seen) - problem.obs_pixels[rows]
+        off = problem.rig.camera.pixel_from_point(seen) - problem.obs_pixels[rows]
         pixel[rows], disparity[rows] = np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 0] - off[:, 2])
     return pixel, disparity
 

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.inertial import Preintegrated
-from fleetmap.sensors.rectification import StereoCamera
-from mapserver.survey.state import PriorTerm, RelativeTerm, poses_of_views
+from mapserver.survey.rig import Rig
+from mapserver.survey.state import PriorTerm, RelativeTerm
 
 
 @dataclass(frozen=True)
@@ -78,16 +78,16 @@ class BundleProblem:
     map_from_body (K, 4, 4); fixed (K,): fixed keyframes. With gauge "yaw_position" a fixed keyframe (by default the first one)
     keeps its yaw and position, and gravity determines its roll and pitch. points_map (N, 3). obs_pixels (M,
     3): u_left, v, u_right, NaN without a right image. obs_sigma_px (M, 2): of u_left and v, and of the disparity u_left
-    - u_right; the three are taken as independent. points_held: only keyframes move. body_from_view (V, 4, 4), obs_keyframe (M,): see
-    SurveyState.
+    - u_right; the three are taken as independent. points_held: only keyframes move. obs_keyframe, obs_camera, obs_landmark (M,): see
+    Landmarks.
     """
 
-    camera: StereoCamera
-    body_from_cam: Array
+    rig: Rig
     map_from_body: Array
     fixed: NDArray[np.bool_]
     points_map: Array
     obs_keyframe: AnyArray
+    obs_camera: AnyArray
     obs_landmark: AnyArray
     obs_pixels: Array
     obs_sigma_px: Array
@@ -97,12 +97,18 @@ class BundleProblem:
     gauge: Literal["pose", "yaw_position"] = "pose"
     points_held: bool = False
     calibration: SelfCalibration | None = None
-    body_from_view: Array = field(default_factory=lambda: np.eye(4)[None])
 
     @property
-    def map_from_cam(self) -> Array:
-        """(K * V, 4, 4) of all views."""
-        return poses_of_views(self.map_from_body, self.body_from_view) @ self.body_from_cam
+    def map_from_cams(self) -> Array:
+        """(K, V, 4, 4)."""
+        return self.rig.map_from_cams(self.map_from_body)
+
+    def observed(self, keep: NDArray[np.bool_]) -> "BundleProblem":
+        """Return the problem with the observations to keep (M,)."""
+        return replace(self, **{name: getattr(self, name)[keep] for name in OBSERVED})
+
+
+OBSERVED = ("obs_keyframe", "obs_camera", "obs_landmark", "obs_pixels", "obs_sigma_px")
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 A small rotation of the right camera about its vertical axis shifts all disparities by nearly the same amount, which
 bends depth and so changes the scale of the map. Motion reveals it: only with the true shift do the points triangulated by the pair
-agree with those from several views. The estimated shift minimises the adjusted cost; the cost's slope needs no derivative of
+agree with those from several keyframes. The estimated shift minimises the adjusted cost; the cost's slope needs no derivative of
 the adjustment, because all other derivatives vanish at its optimum.
 """
 
@@ -16,6 +16,7 @@ from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_problem
 from mapserver.survey.bundle.measured_noise import measured_sigmas
 from mapserver.survey.bundle.problem import BundleProblem
+from mapserver.survey.rig import CameraKind
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Landmarks, SurveyState
 
@@ -47,30 +48,30 @@ def disparity_shift(camera: StereoCamera, pixels: Array) -> Array:
 
 
 def without_stereo_yaw(landmarks: Landmarks, camera: StereoCamera, *corrections_px: float) -> Landmarks:
-    """Return the landmarks with all observed disparities reduced by the shift, one for each view of a rig."""
+    """Return the landmarks with all observed disparities reduced by the shift, one for each camera of a rig."""
     if not any(corrections_px):
         return landmarks
-    pixels, view = landmarks.obs_pixels.copy(), landmarks.obs_keyframe % len(corrections_px)
-    pixels[:, 2] += np.array(corrections_px)[view] * disparity_shift(camera, pixels)
+    pixels = landmarks.obs_pixels.copy()
+    pixels[:, 2] += np.array(corrections_px)[landmarks.obs_camera] * disparity_shift(camera, pixels)
     return replace(landmarks, obs_pixels=pixels)
 
 
-def estimate_stereo_yaw(state: SurveyState, settings: SurveySettings, view: int = 0) -> StereoYaw:
-    """Return the yaw error of the pair of a view with the best fit to the adjusted survey; corrected if significantly different from zero.
+def estimate_stereo_yaw(state: SurveyState, settings: SurveySettings, camera: int = 0) -> StereoYaw:
+    """Return the yaw error of a camera's pair with the best fit to the adjusted survey; corrected if significantly different from zero.
 
     sigma_px combines the adjustment's own with `noise.turn_floor_px`, since matching alone is overconfident. NO_YAW if too few
     disparities are known or if the cost has no minimum nearby.
     """
-    measured = np.isfinite(state.landmarks.obs_pixels[:, 2]) & (state.landmarks.obs_keyframe % state.view_count == view)
-    if measured.sum() < _MIN_DISPARITIES or view in state.depth_views:
+    measured = np.isfinite(state.landmarks.obs_pixels[:, 2]) & (state.landmarks.obs_camera == camera)
+    if measured.sum() < _MIN_DISPARITIES or state.rig.kinds[camera] is CameraKind.DEPTH:
         return NO_YAW
     problem = bundle_problem(state, settings, None)
     problem = replace(problem, obs_sigma_px=measured_sigmas(problem, settings.final_bundle.huber_sigmas))
-    slope = _slope(problem, state.landmarks, 0.0, settings, view)
+    slope = _slope(problem, state.landmarks, 0.0, settings, camera)
     shift, curvature = 0.0, 0.0
     step = _FIRST_TRY_PX if slope < 0 else -_FIRST_TRY_PX
     for _ in range(_MAX_STEPS):
-        moved = _slope(problem, state.landmarks, shift + step, settings, view)
+        moved = _slope(problem, state.landmarks, shift + step, settings, camera)
         curvature = (moved - slope) / step
         if not curvature > 0.0:
             return NO_YAW
@@ -83,14 +84,13 @@ def estimate_stereo_yaw(state: SurveyState, settings: SurveySettings, view: int 
     return StereoYaw(float(shift), sigma, corrected=abs(shift) > settings.noise.turn_sigmas * sigma)
 
 
-def _slope(problem: BundleProblem, marks: Landmarks, shift_px: float, settings: SurveySettings, view: int) -> float:
-    """Return the derivative of the adjusted cost by the view's shift, everything else at its optimum for this shift."""
-    camera, shifts_px = problem.camera, np.zeros(len(problem.body_from_view))
-    shifts_px[view] = shift_px
+def _slope(problem: BundleProblem, marks: Landmarks, shift_px: float, settings: SurveySettings, number: int) -> float:
+    """Return the derivative of the adjusted cost by a camera's shift, everything else at its optimum for this shift."""
+    camera, shifts_px = problem.rig.camera, np.zeros(len(problem.rig))
+    shifts_px[number] = shift_px
     marks = without_stereo_yaw(marks, camera, *shifts_px)
     result = optimize(replace(problem, obs_pixels=marks.obs_pixels), settings.final_bundle)
-    map_from_cam = replace(problem, map_from_body=result.map_from_body).map_from_cam
-    ahead = se3_inverse(map_from_cam)[marks.obs_keyframe, 2]
+    ahead = se3_inverse(problem.rig.map_from_cams(result.map_from_body))[marks.obs_keyframe, marks.obs_camera, 2]
     points = result.points_map[marks.obs_landmark]
     depth = np.einsum("mj,mj->m", ahead[:, :3], points) + ahead[:, 3]
     off = marks.obs_pixels[:, 0] - marks.obs_pixels[:, 2] - camera.focal_px * camera.baseline_m / depth
@@ -99,5 +99,5 @@ def _slope(problem: BundleProblem, marks: Landmarks, shift_px: float, settings: 
     weights = np.minimum(1.0, robust.huber_sigmas / np.maximum(norm, 1e-9))
     weights[norm > robust.cutoff_sigmas] = 0.0
     pull = weights * off / problem.obs_sigma_px[:, 1] ** 2
-    own = marks.obs_keyframe % len(shifts_px) == view
+    own = marks.obs_camera == number
     return -float(np.nansum((pull * disparity_shift(camera, marks.obs_pixels))[own]))

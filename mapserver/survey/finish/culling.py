@@ -25,7 +25,7 @@ class Culled:
 def cull(
     state: SurveyState, keyframes: list[Keyframe], sigmas_m: Array, settings: CullSettings
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], Culled]:
-    """Return the kept observations (M,) and keyframes (K,), and the removed ones; `state` is unchanged.
+    """Return the kept observations (M,) and keyframes (K,) of a single camera, and the removed ones; `state` is unchanged.
 
     sigmas_m (N,) of the landmarks.
     """
@@ -42,7 +42,7 @@ def cull(
 def parallax_rad(state: SurveyState) -> Array:
     """Return (N,) the parallax angle of each landmark's observations: largest between any and the first, or across the baseline."""
     marks = state.landmarks
-    centres = (state.map_from_view @ state.body_from_cam)[marks.obs_keyframe, :3, 3]
+    centres = state.map_from_cams[marks.obs_keyframe, marks.obs_camera, :3, 3]
     rays = centres - marks.points_map[marks.obs_landmark]
     distances = np.maximum(np.linalg.norm(rays, axis=1), 1e-6)
     rays /= distances[:, None]
@@ -50,7 +50,7 @@ def parallax_rad(state: SurveyState) -> Array:
     cosines = np.einsum("ij,ij->i", rays, rays[first][marks.obs_landmark])
     angles = np.zeros(len(marks.points_map))
     np.maximum.at(angles, marks.obs_landmark, np.arccos(np.clip(cosines, -1.0, 1.0)))
-    across = np.where(np.isfinite(marks.obs_pixels[:, 2]), state.camera.baseline_m / distances, 0.0)
+    across = np.where(np.isfinite(marks.obs_pixels[:, 2]), state.rig.camera.baseline_m / distances, 0.0)
     np.maximum.at(angles, marks.obs_landmark, across)
     return angles
 

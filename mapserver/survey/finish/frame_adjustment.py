@@ -4,7 +4,7 @@ Keyframes are fixed. Between two of them the frames, and their points tracked by
 together. The IMU constrains neighbouring frames; odometry does without an IMU, or if pictures show too little.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -70,7 +70,7 @@ def place_frames(
     """
     chain = _Chain(odometry, state, settings, correction_px)
     placed, seen = chain.map_from_body.copy(), np.zeros(len(chain.map_from_body), bool)
-    seen[chain.numbers] = np.bincount(state.observers, minlength=len(chain.numbers)) >= MIN_SEEN
+    seen[chain.numbers] = np.bincount(state.landmarks.obs_keyframe, minlength=len(chain.numbers)) >= MIN_SEEN
     if odometry.tracks is None:
         return PlacedFrames(placed, seen)
     ends = pairwise([-1, *chain.numbers.tolist(), len(placed)])
@@ -89,13 +89,7 @@ def _adjust(cut_sigmas: float, intervals: list[_Interval]) -> list[tuple[Indices
         problem = interval.problem
         result = optimize(problem, _ROUGH)
         keep = result.squared_sigmas < cut_sigmas**2
-        problem = replace(
-            continued(problem, result),
-            obs_keyframe=problem.obs_keyframe[keep],
-            obs_landmark=problem.obs_landmark[keep],
-            obs_pixels=problem.obs_pixels[keep],
-            obs_sigma_px=problem.obs_sigma_px[keep],
-        )
+        problem = continued(problem, result).observed(keep)
         result = optimize(problem, _FINAL)
         ties = np.bincount(problem.obs_keyframe[interval.tied[keep]], minlength=len(problem.fixed))
         seen = ties[interval.slots] >= MIN_SEEN
@@ -141,12 +135,12 @@ class _Chain:
         sigmas = np.tile([self._noise.aligned_sigma_px, self._noise.disparity_sigma_px], (len(rows), 1))
         joined = np.flatnonzero((nodes >= max(a, 0)) & (nodes <= b))
         problem = BundleProblem(
-            camera=self._state.camera,
-            body_from_cam=self._state.body_from_cam,
+            rig=self._state.rig.first,
             map_from_body=self.map_from_body[nodes],
             fixed=fixed,
             points_map=points[known],
             obs_keyframe=which,
+            obs_camera=np.zeros_like(which),
             obs_landmark=marks,
             obs_pixels=pixels,
             obs_sigma_px=sigmas,
@@ -166,13 +160,13 @@ class _Chain:
         """Return all observations of the nodes: track (M,), node (M,), pixels (M, 3)."""
         assert self._odometry.tracks is not None
         ids, which, pixels = self._odometry.tracks.of(nodes)
-        pixels[:, 2] += self._correction_px * disparity_shift(self._state.camera, pixels)
+        pixels[:, 2] += self._correction_px * disparity_shift(self._state.rig.camera, pixels)
         return ids, which, pixels
 
     def _points(self, nodes: Indices, which: Indices, marks: Indices, pixels: Array) -> tuple[Array, Mask]:
         """Return initial points_map (N, 3) and which are known: by a disparity, preferably of the nearest keyframe, else by rays."""
-        camera, count = self._state.camera, int(marks.max(initial=-1)) + 1
-        map_from_cam = self.map_from_body[nodes] @ self._state.body_from_cam
+        camera, count = self._state.rig.camera, int(marks.max(initial=-1)) + 1
+        map_from_cam = self.map_from_body[nodes] @ self._state.rig.body_from_cam[0]
         at_keyframe, disparities = self.is_keyframe[nodes][which], pixels[:, 0] - pixels[:, 2]
         with np.errstate(invalid="ignore"):
             measured = np.isfinite(disparities) & (disparities > 0) & (camera.baseline_m > 0)
@@ -191,15 +185,15 @@ class _Chain:
 
     def _crossings(self, map_from_cam: Array, pixels: Array, marks: Indices, count: int) -> tuple[Array, Mask]:
         """Return (count, 3) the nearest point to all rays of each point, and whether their directions differ enough."""
-        camera = self._state.camera
+        camera = self._state.rig.camera
         rays = np.column_stack([(pixels[:, :2] - camera.lens[1:3]) / camera.focal_px, np.ones(len(pixels))])
         rays = np.einsum("mij,mj->mi", map_from_cam[:, :3, :3], rays / np.linalg.norm(rays, axis=1, keepdims=True))
         across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
         systems, sides = np.zeros((count, 3, 3)), np.zeros((count, 3))
         np.add.at(systems, marks, across)
         np.add.at(sides, marks, np.einsum("mij,mj->mi", across, map_from_cam[:, :3, 3]))
-        views = np.bincount(marks, minlength=count)
-        sure = np.linalg.eigvalsh(systems)[:, 0] > _MIN_SPREAD * np.maximum(views, 1)
+        rays_of = np.bincount(marks, minlength=count)
+        sure = np.linalg.eigvalsh(systems)[:, 0] > _MIN_SPREAD * np.maximum(rays_of, 1)
         points = np.full((count, 3), np.nan)
         points[sure] = np.linalg.solve(systems[sure], sides[sure][:, :, None])[:, :, 0]
         return points, sure

@@ -14,7 +14,7 @@ from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.finish.culling import Culled, cull
 from mapserver.survey.finish.frame_adjustment import PlacedFrames
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import Keyframe, Landmarks, OdometryPass, SurveyState
+from mapserver.survey.state import Keyframe, Landmarks, OdometryPass, RigImages, SurveyState
 from mapserver.survey.survey_map import SurveyMap
 
 _PATCH_HALF_PX = 10  # margin so that a scaled or rotated 9 px window still fits
@@ -25,19 +25,20 @@ def assemble(
     state: SurveyState, odometry: OdometryPass, placed: PlacedFrames, settings: SurveySettings
 ) -> tuple[SurveyMap, NDArray[np.int64], Culled]:
     """Return the SurveyMap of an adjusted survey, in the survey's own frame, its landmarks as rows of the state, and the removed ones."""
-    views, state = odometry.views(state.view_count), state.apart()
+    images = RigImages.of(odometry.keyframes, state.map_from_body, state.rig).images
+    state = state.by_image()
     every_sigma = point_sigmas_m(state)
-    seen, kept, culled = cull(state, views, every_sigma, settings.cull)
+    seen, kept, culled = cull(state, images, every_sigma, settings.cull)
     marks, rows = state.landmarks.keep_observations(seen, 1), np.unique(state.landmarks.obs_landmark[seen])
-    keyframes = [k for k, keep in zip(views, kept, strict=True) if keep]
+    keyframes = [k for k, keep in zip(images, kept, strict=True) if keep]
     marks = replace(marks, obs_keyframe=(np.cumsum(kept) - 1)[marks.obs_keyframe].astype(np.int32))
     octaves = marks.of_features([k.features.octaves for k in keyframes])
     frame_stamps = np.array([e.stamp_ns for e in odometry.estimates], np.int64)
     stamps_ns, map_from_kept = state.stamps_ns[kept], state.map_from_body[kept]
     handed_on = replace(state, stamps_ns=stamps_ns, map_from_body=map_from_kept, landmarks=marks)
     survey_map = SurveyMap(
-        camera=state.camera,
-        body_from_cam=state.body_from_cam,
+        camera=state.rig.camera,
+        body_from_cam=state.rig.body_from_cam[0],
         keyframe_stamps_ns=handed_on.stamps_ns,
         map_from_body=handed_on.map_from_body,
         landmark_ids=np.arange(len(marks.points_map), dtype=np.uint32),
@@ -65,15 +66,15 @@ def medoid_descriptors(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[n
 
 
 def point_sigmas_m(state: SurveyState) -> Array:
-    """Return (N,) largest standard deviation of each landmark, for fixed keyframes."""
-    marks, map_from_cam = state.landmarks, state.map_from_body @ state.body_from_cam
+    """Return (N,) largest standard deviation of each landmark, for fixed keyframes of a single camera."""
+    marks, map_from_cam = state.landmarks, state.map_from_cams[:, 0]
     weakest = np.empty(len(marks.points_map))
     for start in range(0, len(weakest), _CHUNK):  # working memory is 0.5 kB per observation
         some = slice(start, min(start + _CHUNK, len(weakest)))
         rows = slice(*np.searchsorted(marks.obs_landmark, [some.start, some.stop]))
         has_right, sigmas = np.isfinite(marks.obs_pixels[rows, 2]), marks.obs_sigma_px[rows]
         cameras, landmarks = map_from_cam[marks.obs_keyframe[rows]], marks.obs_landmark[rows] - start
-        information = point_information(state.camera, cameras, marks.points_map[some], landmarks, has_right, sigmas)
+        information = point_information(state.rig.camera, cameras, marks.points_map[some], landmarks, has_right, sigmas)
         weakest[some] = np.linalg.eigvalsh(information)[:, 0]
     return np.asarray(1.0 / np.sqrt(np.maximum(weakest, 1e-6)))
 

@@ -43,7 +43,7 @@ def scaled_state(state: SurveyState, scale: float) -> SurveyState:
     """Scale the adjusted state as `scaled` does its map."""
     return replace(
         state,
-        map_from_body=_grown(state.map_from_body, state.body_from_cam, scale),
+        map_from_body=_grown(state.map_from_body, state.rig.body_from_cam[0], scale),
         landmarks=replace(state.landmarks, points_map=scale * state.landmarks.points_map),
     )
 

@@ -17,31 +17,26 @@ from mapserver.survey.bundle.bundle_rounds import (
     bundle_rounds,
 )
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import Keyframe, Landmarks, SurveyState
+from mapserver.survey.state import Indices, Landmarks, RigImages, SurveyState, image_numbers, of_features
 from mapserver.survey.tracks.tracks import Tracks
 
 _LONGEST_GAP_S = 3.0  # longest IMU bridge across left-out keyframes
 
 
-def redundant_keyframes(
-    tracks: Tracks, keyframes: list[Keyframe], settings: SurveySettings, views: int = 1
-) -> NDArray[np.bool_]:
+def redundant_keyframes(tracks: Tracks, posed: RigImages, settings: SurveySettings) -> NDArray[np.bool_]:
     """Return (K,) keyframes without which `repeated_visits` other visits still see `repeated_share` of their tracks, as finely.
 
     A visit ends when no keyframe has seen a track for longer than the shortest loop. The last keyframes are removed first, so that
     whole drives remain. None are redundant if no place has more visits than those. Keyframes that then share too
-    few tracks with the others, such as blind ones, are redundant too: their neighbours are more accurate. views: of each, in turn in
-    `keyframes`, to which the tracks refer.
+    few tracks with the others, such as blind ones, are redundant too: their neighbours are more accurate.
     """
     cull = settings.cull
-    first_of = np.cumsum([0, *(len(k.features) for k in keyframes)])
-    octaves = np.concatenate([np.zeros(0, np.int8), *(k.features.octaves for k in keyframes)])
-    starts = np.append(tracks.starts, len(tracks.keyframes))
-    owners = tracks.keyframes // views
+    octaves = of_features(tracks.images, tracks.features, [k.features.octaves for k in posed.images])
+    starts = np.append(tracks.starts, len(tracks.images))
+    owners = posed.keyframe[tracks.images]
     order = np.argsort(owners, kind="stable")
     track = np.repeat(np.arange(len(tracks.starts)), np.diff(starts))
-    row_starts = np.searchsorted(owners[order], np.arange(len(keyframes) // views + 1))
-    octaves = octaves[first_of[tracks.keyframes] + tracks.features]
+    row_starts = np.searchsorted(owners[order], np.arange(len(posed.numbers) + 1))
     gap, least = settings.loops.min_gap_keyframes, settings.loops.alone_inliers
     members = track, starts, owners, octaves
     limits = gap, cull.repeated_visits, cull.repeated_share, least
@@ -77,15 +72,13 @@ def adjust_visits(
 ) -> SurveyState:
     """Run the final adjustment without redundant keyframes (K,), and then localize those among its landmarks."""
     if not redundant.any():
-        held = [state]
-        del state  # otherwise its observations would be in memory twice
-        return bundle_rounds(held.pop(), settings, rounds=rounds, final=True)
+        return bundle_rounds(state, settings, rounds=rounds, final=True)
     part = bundle_rounds(without_redundant(state, redundant), settings, rounds=rounds, final=True)
-    views = np.repeat(redundant, state.view_count)
-    numbers = np.flatnonzero(~views)
-    seen = _seen_by(views, state.landmarks, part.landmarks, numbers)
+    chosen = np.flatnonzero(~redundant).astype(np.int32)
+    adjusted = replace(part.landmarks, obs_keyframe=chosen[part.landmarks.obs_keyframe])
+    seen = _seen_by(redundant, state.landmarks, adjusted, image_numbers(len(redundant), len(state.rig)))
     state = _localize(replace(_with_keyframes_of(state, ~redundant, part), landmarks=seen), settings, redundant)
-    return replace(state, landmarks=_together(part.landmarks, numbers, state.landmarks))
+    return replace(state, landmarks=_together(adjusted, state.landmarks))
 
 
 def _with_keyframes_of(state: SurveyState, used: NDArray[np.bool_], part: SurveyState) -> SurveyState:
@@ -99,14 +92,11 @@ def _with_keyframes_of(state: SurveyState, used: NDArray[np.bool_], part: Survey
     return replace(state, map_from_body=map_from_body, motion=motion)
 
 
-def _seen_by(
-    redundant: NDArray[np.bool_], marks: Landmarks, adjusted: Landmarks, numbers: NDArray[np.int64]
-) -> Landmarks:
-    """Return redundant keyframes' observations of `adjusted`, the rest of `marks`; numbers: of the adjusted keyframes in `marks`."""
-    stride = int(marks.obs_feature.max(initial=0)) + 1
-    codes = marks.obs_keyframe.astype(np.int64) * stride + marks.obs_feature
-    first = adjusted.firsts
-    sought = numbers[adjusted.obs_keyframe[first]] * stride + adjusted.obs_feature[first]
+def _seen_by(redundant: NDArray[np.bool_], marks: Landmarks, adjusted: Landmarks, numbers: Indices) -> Landmarks:
+    """Return redundant keyframes' observations of `adjusted`, the rest of `marks`; numbers (K, V): of the images of both."""
+    stride, first = int(marks.obs_feature.max(initial=0)) + 1, adjusted.firsts
+    codes = numbers[marks.obs_keyframe, marks.obs_camera] * stride + marks.obs_feature
+    sought = numbers[adjusted.obs_keyframe[first], adjusted.obs_camera[first]] * stride + adjusted.obs_feature[first]
     order = np.argsort(codes)
     found = order[np.searchsorted(codes, sought, sorter=order)]
     number = np.full(len(marks.points_map), -1, np.int32)
@@ -125,9 +115,8 @@ def _localize(state: SurveyState, settings: SurveySettings, redundant: NDArray[n
     return state
 
 
-def _together(adjusted: Landmarks, numbers: NDArray[np.int64], placed: Landmarks) -> Landmarks:
+def _together(adjusted: Landmarks, placed: Landmarks) -> Landmarks:
     """Return the same landmarks with the observations of both, the adjusted ones first."""
-    adjusted = replace(adjusted, obs_keyframe=numbers[adjusted.obs_keyframe].astype(np.int32))
     both = Landmarks.concatenated(adjusted.points_map, [adjusted, placed])
     order = np.argsort(both.obs_landmark, kind="stable")
     return both.taken(order, both.points_map, both.obs_keyframe[order], both.obs_landmark[order])

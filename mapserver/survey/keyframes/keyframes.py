@@ -14,7 +14,7 @@ from fleetmap.features.extraction import extract
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from mapserver.survey.executor import SERIAL, Executor
-from mapserver.survey.keyframes.rig_views import frame_of_view
+from mapserver.survey.rig import frame_of_camera
 from mapserver.survey.settings import KeyframeSettings, SurveySettings
 from mapserver.survey.state import ImageStore, Keyframe, MemoryImageStore, Pictures
 
@@ -23,76 +23,75 @@ _BATCH = 2  # frames for one call: 0.05 s each
 
 def make_keyframe(frame: RectifiedFrame, frame_index: int, camera: StereoCamera, settings: SurveySettings) -> Keyframe:
     """Detect, describe and stereo-match one frame; its pictures stay in memory."""
-    return next(make_keyframes([(frame_index, frame)], camera, settings))
+    return next(make_keyframes([(frame_index, frame)], [(0, camera)], settings))
 
 
 def make_keyframes(
     frames: Iterable[tuple[int, RectifiedFrame]],
-    camera: StereoCamera,
+    cameras: Sequence[tuple[int, StereoCamera]],
     settings: SurveySettings,
     images: ImageStore | None = None,
     executor: Executor = SERIAL,
-    others: Sequence[tuple[int, StereoCamera]] = (),
 ) -> Iterator[Keyframe]:
     """Return keyframes of numbered frames; the executor extracts features while the next frames are awaited.
 
-    images: store for the pictures; by default memory. others: see rig_views.
+    cameras: see `rig.used_cameras`. images: store for the pictures; by default memory.
     """
     kept = MemoryImageStore() if images is None else images
     waiting: deque[tuple[int, list[RectifiedFrame | None]]] = deque()
-    cameras, black = [camera, *(other for _, other in others)], list[int]()
-    scales = [_disparity_scale(camera, each) for each in cameras]
+    models, black = [camera for _, camera in cameras], list[int]()
+    first, scales = models[0], [_disparity_scale(models[0], camera) for camera in models]
 
     def batches() -> Iterator[list[list[RectifiedFrame | None]]]:
         source = iter(frames)
         while batch := list(islice(source, _BATCH)):
-            views = [[frame, *(frame_of_view(frame, view) for view, _ in others)] for _, frame in batch]
-            waiting.extend((number, seen) for (number, _), seen in zip(batch, views, strict=True))
-            yield views
+            seen = [[frame_of_camera(frame, camera) for camera, _ in cameras] for _, frame in batch]
+            waiting.extend(zip((number for number, _ in batch), seen, strict=True))
+            yield seen
 
     def stored(frame: RectifiedFrame | None) -> int:
-        """Return the number of its pictures; one for all views without images."""
+        """Return the number of its pictures; one for all cameras without images."""
         if frame is None and black:
             return black[0]
-        left = np.zeros((camera.height_px, camera.width_px), np.uint8) if frame is None else frame.left
+        left = np.zeros((first.height_px, first.width_px), np.uint8) if frame is None else frame.left
         pictured = RectifiedFrame(0, left, left, None) if frame is None else replace(frame, others=())
         number = kept.put(Pictures(pictured, patch_align.half_pyramid(left)))
         black.extend([number] if frame is None else [])
         return number
 
-    for found in executor.map(_extract, (cameras, settings), batches()):
+    for found in executor.map(_extract, (models, settings), batches()):
         for each in found:
-            number, views = waiting.popleft()
-            assert views[0] is not None
-            about, keyframes = (number, views[0].stamp_ns), []
-            for frame, (features, disparities), scale in zip(views, each, scales, strict=True):
-                points = camera.point_from_pixel(features.pixels, disparities[:, 0])
+            number, seen = waiting.popleft()
+            assert seen[0] is not None
+            about, keyframes = (number, seen[0].stamp_ns), []
+            for frame, (features, disparities), scale in zip(seen, each, scales, strict=True):
+                points = first.point_from_pixel(features.pixels, disparities[:, 0])
                 own = Keyframe(*about, features, disparities, points, kept, stored(frame), disparity_scale=scale)
                 keyframes.append(set_aside(own, kept))
             yield replace(keyframes[0], others=tuple(keyframes[1:]))
 
 
 def _disparity_scale(first: StereoCamera, camera: StereoCamera) -> float:
-    """Return the ratio of disparities of the first view's camera to those of a view with its pinhole."""
+    """Return the ratio of disparities of the first camera to those of another one with its pinhole."""
     return first.baseline_m / camera.baseline_m if camera.baseline_m > 0 else 1.0
 
 
 def _extract(
     shared: tuple[list[StereoCamera], SurveySettings], frames: list[list[RectifiedFrame | None]]
 ) -> list[list[tuple[orb.Features, Array]]]:
-    """Return features and disparities of the views of some frames; disparities are those of the first view's baseline."""
+    """Return features and disparities of each camera in some frames; disparities are those of the first camera's baseline."""
     cameras, settings = shared
-    found = []
-    for views in frames:
-        found.append(list[tuple[orb.Features, Array]]())
-        for frame, camera in zip(views, cameras, strict=True):
-            if frame is None:
-                found[-1].append((orb.Features.empty(), np.zeros((0, 2))))
-                continue
-            features = extract(frame.left, settings.orb, camera.clearance_px)
-            disparities = stereo.disparities(frame, camera, features.pixels, settings.stereo)
-            found[-1].append((features, disparities * _disparity_scale(cameras[0], camera)))
-    return found
+    return [[_features_of(*each, cameras[0], settings) for each in zip(seen, cameras, strict=True)] for seen in frames]
+
+
+def _features_of(
+    frame: RectifiedFrame | None, camera: StereoCamera, first: StereoCamera, settings: SurveySettings
+) -> tuple[orb.Features, Array]:
+    if frame is None:
+        return orb.Features.empty(), np.zeros((0, 2))
+    features = extract(frame.left, settings.orb, camera.clearance_px)
+    disparities = stereo.disparities(frame, camera, features.pixels, settings.stereo)
+    return features, disparities * _disparity_scale(first, camera)
 
 
 def set_aside(keyframe: Keyframe, store: ImageStore) -> Keyframe:

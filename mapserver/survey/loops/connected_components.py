@@ -99,7 +99,7 @@ def find_groups(state: SurveyState, sigmas_m: Callable[[int, int], float], join_
 
 
 def _seeing(state: SurveyState) -> NDArray[np.bool_]:
-    return np.bincount(state.observers, minlength=len(state.stamps_ns)) >= MIN_SEEN
+    return np.bincount(state.landmarks.obs_keyframe, minlength=len(state.stamps_ns)) >= MIN_SEEN
 
 
 def bridges(
@@ -133,6 +133,8 @@ class SigmaBetween:
 
 def without_doubted(odometry: OdometryPass, doubted: Sequence[int]) -> OdometryPass:
     """Return odometry that knows nothing of the motion from doubted keyframes to the next ones."""
+    if not doubted:
+        return odometry
     after = np.array(odometry.keyframe_frames)[np.array(doubted, int)]
     steps = np.searchsorted(after, np.arange(len(odometry.covariances)), side="left")
     return replace(odometry, covariances=odometry.covariances + _UNKNOWN_M**2 * steps[:, None, None] * np.eye(6))
@@ -154,7 +156,7 @@ def _shared_landmarks(state: SurveyState, at_least: int) -> tuple[NDArray[np.int
     """Return pairs of keyframes, the older one first, that share at least `at_least` landmarks."""
     marks = state.landmarks
     ones, shape = np.ones(len(marks.obs_keyframe), np.int32), (len(state.stamps_ns), len(marks.points_map))
-    seen = csr_matrix((ones, (state.observers, marks.obs_landmark)), shape)
+    seen = csr_matrix((ones, (state.landmarks.obs_keyframe, marks.obs_landmark)), shape)
     shared = coo_matrix(seen @ seen.T)
     enough = (shared.data >= at_least) & (shared.row < shared.col)
     return shared.row[enough].astype(np.int64), shared.col[enough].astype(np.int64)

@@ -15,7 +15,7 @@ from mapserver.survey.loops.keyframe_groups import KeyframeGroups, Revisit, Wait
 from mapserver.survey.loops.sim3_loops import measured_log_scale
 from mapserver.survey.pose_graph.graph_marginals import CHI2_3_0999, GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint
-from mapserver.survey.state import Keyframe, PosedKeyframes
+from mapserver.survey.state import Keyframe, RigImages
 from mapserver.survey.survey_inputs import SurveyConfig
 from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PairTask, PredictedMotion, match_pair, match_task
 
@@ -98,14 +98,14 @@ class Loops:
 class LoopCloser:
     """Searches a chain of keyframes for revisits: candidates pass a gate, are verified one by one and decided together.
 
-    Every view of a rig is searched among all views. `marginals` narrows with every accepted loop. loops: the outcome so far. learned:
+    Each image is searched among those of all cameras. `marginals` narrows with every accepted loop. loops: the outcome so far. learned:
     loops used to narrow the gate. scales: if measured, the scale difference of each verified loop's keyframes: (log scale, sigma) by
     (new, old).
     """
 
     def __init__(
         self,
-        posed: PosedKeyframes,
+        posed: RigImages,
         config: SurveyConfig,
         marginals: GraphMarginals,
         matched: Iterable[tuple[int, int]],
@@ -117,7 +117,7 @@ class LoopCloser:
     ) -> None:
         """matched: pairs of keyframes matched as neighbours, which are not loops. groups: joined here by certain revisits; None
         if all keyframes belong together. pieces: keyframes that pictures link; None if the motion between them is not to be doubted.
-        Pairs, groups, marginals, records and edges have the numbers of keyframes; each has a view or several, in turn in `posed`.
+        Pairs, groups, marginals, records and edges have the numbers of keyframes, matches those of the images in `posed`.
         """
         self.loops, self.learned = Loops(), list[PoseEdge]()
         self.groups, self.scales = groups, dict[tuple[int, int], tuple[float, float]]()
@@ -131,24 +131,24 @@ class LoopCloser:
         self._index = PlaceIndex(config.vocabulary.word_count)
         self._depths_m = np.zeros(0)
         self._bare: dict[int, Keyframe] = {}
-        self._shared = MatchInputs({}, posed.camera, config.settings.pairs)
+        self._shared = MatchInputs({}, posed.rig.camera, config.settings.pairs)
         self._inputs = replace(self._shared, keyframes=self._bare)
         self.grow(posed, marginals, matched)
 
-    def grow(self, posed: PosedKeyframes, marginals: GraphMarginals, matched: Iterable[tuple[int, int]]) -> None:
+    def grow(self, posed: RigImages, marginals: GraphMarginals, matched: Iterable[tuple[int, int]]) -> None:
         """Extend the chain: all keyframes at their present poses, known ones first; `matched` adds to earlier pairs."""
-        self._views, self._body_from_cams = len(posed.body_from_view), posed.body_from_view @ posed.body_from_cam
-        self._posed, self._map_from_body, self._marginals = posed, posed.map_from_body[:: self._views], marginals
-        vocabulary, new = self._config.vocabulary, posed.keyframes[len(self._vectors) :]
+        self._posed, self._map_from_body, self._marginals = posed, posed.map_from_body, marginals
+        self._keyframe, self._camera = posed.keyframe, posed.camera
+        vocabulary, new = self._config.vocabulary, posed.images[len(self._vectors) :]
         self._vectors += [vocabulary.bow_vector(vocabulary.words(k.features.descriptors)) for k in new]
-        views = range(self._views)
-        for i, j in sorted((self._views * i + v, self._views * j + v) for i, j in matched for v in views):
+        for i, j in sorted(matched):
             self._neighbours.setdefault(i, []).append(j)
             self._neighbours.setdefault(j, []).append(i)
         bare = [replace(k.without_pictures(), nodes=vocabulary.branches(k.features.descriptors)) for k in new]
         self._bare.update(enumerate(bare, len(self._bare)))
-        depths_m = np.array([keyframe.median_depth_m for keyframe in new])
-        self._depths_m = np.append(self._depths_m, depths_m.reshape(-1, self._views).max(axis=1))
+        added = posed.numbers[len(self._depths_m) :].tolist()
+        depths_m = [max(posed.images[n].median_depth_m for n in row) for row in added]
+        self._depths_m = np.append(self._depths_m, depths_m)
 
     @property
     def begin(self) -> Array:
@@ -156,36 +156,39 @@ class LoopCloser:
         return self._marginals.linearised_at
 
     def close(self, i: int) -> None:
-        """Search revisits of view i among the earlier ones, then add it to the index. Call in order."""
+        """Search revisits of image i among the earlier ones, then add it to the index. Call in order."""
         candidates = self._gate(i, self._alike(i))
         self._decide(self._verify(i, candidates))
         self._index.add(i, self._vectors[i])
 
     def _alike(self, i: int) -> "_Candidates":
-        """Return old views that share words with view i and are not matched with it."""
-        ids = self._index.place_ids
-        new = i - ids >= self._settings.min_gap_keyframes * self._views
-        new &= ~np.isin(ids, self._neighbours.get(i, []))
+        """Return old images that share words with image i and are not matched with it."""
+        ids, none = self._index.place_ids, _Candidates(np.zeros(0, np.int64), np.zeros(0), [])
+        numbers, keyframe = self._posed.numbers[:, self._camera[i]], int(self._keyframe[i])
+        if keyframe < self._settings.min_gap_keyframes:
+            return none
+        new = ids <= numbers[keyframe - self._settings.min_gap_keyframes]
+        new &= ~np.isin(ids, numbers[self._neighbours.get(keyframe, [])])
         if not new.any():
-            return _Candidates(np.zeros(0, np.int64), np.zeros(0), [])
+            return none
         ids, scores = self._index.query(self._vectors[i], new, self._settings.depth)
         return _Candidates(ids, scores, [])
 
     def _gate(self, i: int, found: "_Candidates") -> "_Candidates":
-        """Choose at most `top` candidates that may be seen from possible poses of view i.
+        """Choose at most `top` candidates that may be seen from possible poses of image i.
 
         With repeated aisles the most similar candidates may all be in other aisles, so the gate goes down the
         list and records the refused ones.
         """
         far, zoned, beyond = list[int](), list[int](), list[int]()
-        i, bodies = i // self._views, found.ids // self._views
+        i, bodies = int(self._keyframe[i]), self._keyframe[found.ids]
         for start in range(0, len(found.ids), _CHUNK):
             js = bodies[start : start + _CHUNK]
             reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[i], self._depths_m[js])
-            reachable = self._marginals.reachable(i, js, reach_m)
-            # A loop there would add no information; the global adjustment matches common views anyway.
+            reachable, known = self._marginals.gate(i, js, reach_m, _WELL_KNOWN)
+            # A loop there would add no information; the global adjustment matches what both see anyway.
             apart_m = np.linalg.norm(self._map_from_body[js, :3, 3] - self._map_from_body[i, :3, 3], axis=1)
-            known = (apart_m < _ALIAS_REACH * reach_m) & self._marginals.known(i, js, _WELL_KNOWN)
+            known &= apart_m < _ALIAS_REACH * reach_m
             for n, is_reachable in enumerate(reachable.tolist(), start):
                 here, there = self._map_from_body[[i, bodies[n]], :3, 3]
                 if not is_reachable and len(beyond) < self._settings.top and self._are_unlinked(i, int(bodies[n])):
@@ -211,7 +214,7 @@ class LoopCloser:
         verified: list[tuple[PoseEdge, LoopRecord]] = []
         tasks = [PairTask.of([self._predict(i, int(found.ids[n]))], self._inputs) for n in found.chosen]
         matches = self._executor.map(match_task, self._shared, tasks)
-        i, bodies = i // self._views, found.ids // self._views
+        i, bodies = int(self._keyframe[i]), self._keyframe[found.ids]
         for n, (match,) in zip(found.chosen, matches, strict=True):
             j, score = int(bodies[n]), float(found.scores[n])
             others = np.array([edge.j for edge, _ in verified], np.int64)
@@ -233,11 +236,11 @@ class LoopCloser:
     def _examined(
         self, match: PairMatch | None, edge: PoseEdge | None, aliases: NDArray[np.int64]
     ) -> tuple[LoopVerdict, str]:
-        """Return the verdict on one candidate alone, and its reason. aliases: old views as similar to the new one."""
+        """Return the verdict on one candidate alone, and its reason. aliases: old images as similar to the new one."""
         if match is None or edge is None:
             return LoopVerdict.REJECTED, "too few features agree on one motion"
         count, settings = len(match.features), self._settings
-        cells = _cells(self._posed.keyframes[match.j], match.features[:, 1], self._posed.camera)
+        cells = _cells(self._posed.images[match.j], match.features[:, 1], self._posed.rig.camera)
         if count < settings.min_inliers or cells < settings.min_cells:
             return LoopVerdict.REJECTED, f"{count} matches in {cells} of 48 cells are too few or too crowded"
         innovation = self._marginals.innovation_squared(edge)
@@ -323,7 +326,7 @@ class LoopCloser:
     def _unseen_alias(self, match: PairMatch, edge: PoseEdge, aliases: NDArray[np.int64]) -> float | None:
         """Return the possible position error if the site repeats as seen or configured; None if no alias is possible.
 
-        Aliases are similar to the new view; those count that are at other places than the old one and match the new one too, as if
+        Aliases are similar to the new image; those count that are at other places than the old one and match the new one too, as if
         it were somewhere else. The offset to each of them is a step of repetition of the site, perhaps also to a place without
         keyframes so far: a first visit must not be taken for a return. So are the steps shown by aliases anywhere in the site.
         """
@@ -332,7 +335,7 @@ class LoopCloser:
         lengths_m = np.linalg.norm(steps[self._is_possible(edge, steps)], axis=1)
         if len(lengths_m):
             return float(lengths_m.min())
-        bodies = aliases // self._views
+        bodies = self._keyframe[aliases]
         apart = self._are_apart(edge.j, bodies)
         ways = self._map_from_body[bodies[apart], :3, 3] - self._map_from_body[edge.j, :3, 3]
         possible = self._is_possible(edge, ways) | self._is_possible(edge, -ways)
@@ -377,37 +380,40 @@ class LoopCloser:
         return self.groups is None or self.groups.of(edge.i) == self.groups.of(edge.j)
 
     def _cam_from_cam(self, j: int, i: int) -> Array:
-        """Return the motion (4, 4) between the cameras of two views."""
-        (body_j, view_j), (body_i, view_i) = (divmod(n, self._views) for n in (j, i))
-        cam_from_map = se3_inverse(self._body_from_cams[view_j]) @ se3_inverse(self._map_from_body[body_j])
-        return np.asarray(cam_from_map @ self._map_from_body[body_i] @ self._body_from_cams[view_i])
+        """Return the motion (4, 4) between the cameras of two images."""
+        cam_from_map = se3_inverse(self._mount(j)) @ se3_inverse(self._map_from_body[self._keyframe[j]])
+        return np.asarray(cam_from_map @ self._map_from_body[self._keyframe[i]] @ self._mount(i))
+
+    def _mount(self, n: int) -> Array:
+        """Return body_from_cam (4, 4) of an image."""
+        return np.asarray(self._posed.rig.body_from_cam[self._camera[n]])
 
     def _predict(self, i: int, j: int) -> tuple[int, int, PredictedMotion]:
         """Return the predicted motion to match j (as reference) with i; the graph's rotation is used if it is accurate enough."""
-        between = self._marginals.relative_cov(i // self._views, j // self._views)
+        between = self._marginals.relative_cov(int(self._keyframe[i]), int(self._keyframe[j]))
         sigma = float(np.sqrt(np.trace(between[:3, :3])))
         known = max(sigma, 0.02) if sigma < self._settings.rotation_sigma_limit_rad else None
         return j, i, PredictedMotion(self._cam_from_cam(i, j), known)
 
     def _edge(self, match: PairMatch) -> PoseEdge:
         if self._measures_scale:
-            points_old = self._posed.keyframes[match.i].points_cam[match.features[:, 0]]
-            points_new = self._posed.keyframes[match.j].points_cam[match.features[:, 1]]
+            points_old = self._posed.images[match.i].points_cam[match.features[:, 0]]
+            points_new = self._posed.images[match.j].points_cam[match.features[:, 1]]
             self.scales[match.j, match.i] = measured_log_scale(points_old, points_new, match.j_from_i)
-        (i, new_view), (j, old_view) = (divmod(n, self._views) for n in (match.j, match.i))
-        mount, old = self._body_from_cams[new_view], self._posed.keyframes[match.i]
-        edge = replace(body_edge(match, mount, self._body_from_cams[old_view]), i=i, j=j)
+        mount, old = self._mount(match.j), self._posed.images[match.i]
+        edge = body_edge(match, mount, self._mount(match.i))
+        edge = replace(edge, i=int(self._keyframe[edge.i]), j=int(self._keyframe[edge.j]))
         if old.from_views:
             return edge
-        per_px = by_disparity(old.points_cam[match.features[:, 0]], match.j_from_i, self._posed.camera)
+        per_px = by_disparity(old.points_cam[match.features[:, 0]], match.j_from_i, self._posed.rig.camera)
         shared = self._config.settings.noise.disparity_sigma_px * adjoint(mount) @ per_px
         return replace(edge, cov_rot_trans=edge.cov_rot_trans + np.outer(shared, shared))
 
     def _neighbours_agree(self, match: PairMatch) -> bool | None:
         """True if a covisible neighbour of the old keyframe, located by this match, matches too; None if none is visible."""
-        i, j = match.j, match.i
-        tried = 0
-        for n in sorted(self._neighbours.get(j, []), key=lambda n: abs(n - j))[:4]:
+        i, j, keyframe, tried = match.j, match.i, int(self._keyframe[match.i]), 0
+        beside = sorted(self._neighbours.get(keyframe, []), key=lambda k: abs(k - keyframe))[:4]
+        for n in self._posed.numbers[beside, self._camera[j]].tolist():
             if n == i:
                 continue
             predicted = match.j_from_i @ self._cam_from_cam(j, n)
@@ -416,7 +422,7 @@ class LoopCloser:
                 continue
             tried += 1
             off = se3_inverse(predicted) @ other.j_from_i
-            if np.linalg.norm(off[:3, 3]) < 0.1 + 0.05 * self._depths_m[i // self._views]:
+            if np.linalg.norm(off[:3, 3]) < 0.1 + 0.05 * self._depths_m[self._keyframe[i]]:
                 return True
         return False if tried else None
 

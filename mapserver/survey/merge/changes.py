@@ -17,7 +17,7 @@ from mapserver.survey.merge.landmark_persistence import Shift, shifts
 from mapserver.survey.merge.merge import Change
 from mapserver.survey.settings import SessionSettings, SurveySettings
 from mapserver.survey.stages import Survey
-from mapserver.survey.state import Keyframe, Landmarks, poses_of_views
+from mapserver.survey.state import Keyframe, Landmarks, RigImages
 
 _CELLS = COLUMNS * ROWS
 _MIN_IN_CELL = 3  # fewer confirmed landmarks do not prove a gap in the map
@@ -29,6 +29,7 @@ Mask = NDArray[np.bool_]
 def what_changes(
     base: BaseMap,
     survey: Survey,
+    posed: RigImages,
     joint: JointSolution,
     gone: Mask,
     settings: SurveySettings,
@@ -36,14 +37,16 @@ def what_changes(
     anchored: bool,
     limits: SurveyLimits,
 ) -> tuple[Change, int, int]:
-    """Return the change, and how many keyframes and landmarks of the map moved. gone (N,): faded landmarks."""
-    marks, body_from_cam = survey.state.landmarks, survey.state.body_from_cam
-    map_from_cam = poses_of_views(joint.map_from_body, survey.state.body_from_view) @ body_from_cam
+    """Return the change, and how many keyframes and landmarks of the map moved. gone (N,): faded landmarks.
+
+    posed: the survey's images after the joint adjustment, which become keyframes of the map.
+    """
+    marks, map_from_cam = survey.state.landmarks.by_image(posed.numbers), posed.map_from_cam
     moved_keyframes = np.zeros(len(base.map_from_cam), bool)
     moved_keyframes[joint.base_keyframes] = _keyframes_moved(base, joint, settings.sessions) if anchored else True
     moved_keyframes &= ~limits.freezes(base.map_from_cam[:, :3, 3])
     cameras = base.map_from_cam.copy()
-    cameras[joint.base_keyframes] = joint.base_from_body @ body_from_cam
+    cameras[joint.base_keyframes] = joint.base_from_body @ posed.rig.body_from_cam[0]
     judged = shifts(base, map_from_cam, joint.sightings, settings)
     points, moved = _moved_points(base, joint, judged, moved_keyframes, cameras, anchored=anchored)
     frozen = limits.freezes(base.points_map)
@@ -52,8 +55,7 @@ def what_changes(
     keep = ~gone
     keep[judged.rows[alone]] = False
     free = free_observations(marks, joint.sightings)
-    views = survey.odometry.views(survey.state.view_count)
-    fresh = _new_landmarks(base, views, marks, joint, free, settings.sessions)
+    fresh = _new_landmarks(base, posed.images, marks, joint, free, settings.sessions)
     fresh &= known_well(survey, joint, settings)
     fresh &= ~limits.closes(joint.own_points_map, int(survey.map.trajectory.stamps_ns[-1]))
     again = _resighted(base, judged.rows[alone], judged.points_map[alone], joint.sightings)
@@ -109,7 +111,7 @@ def _moved_points(
 
 def _new_landmarks(
     base: BaseMap,
-    keyframes: Sequence[Keyframe],
+    images: Sequence[Keyframe],
     marks: Landmarks,
     joint: JointSolution,
     free: NDArray[np.bool_],
@@ -124,7 +126,7 @@ def _new_landmarks(
     confirmed = (counts >= settings.min_confirmations) & np.isfinite(joint.own_points_map).all(axis=1)
     chosen = free & confirmed[marks.obs_landmark]
     lacking = np.zeros(len(chosen), bool)
-    for k, (_, sighting) in enumerate(zip(keyframes, joint.sightings, strict=True)):
+    for k, (_, sighting) in enumerate(zip(images, joint.sightings, strict=True)):
         own = np.flatnonzero(chosen & (marks.obs_keyframe == k))
         cells = image_cells(marks.obs_pixels[own, :2], base.camera)
         fresh = np.bincount(cells, minlength=_CELLS)
@@ -150,7 +152,8 @@ def _resighted(base: BaseMap, rows: Rows, points_map: Array, sightings: Sequence
     features = np.concatenate([s.features for _, s in seen])[order]
     pixels = np.concatenate([s.pixels for _, s in seen])[order]
     sigmas_px = np.concatenate([s.sigmas_px for _, s in seen])[order]
-    return Landmarks(points_map, keyframe[order], landmark[order], features, pixels, sigmas_px)
+    owners = keyframe[order], np.zeros_like(keyframe), landmark[order]
+    return Landmarks(points_map, *owners, features.astype(np.int32), pixels, sigmas_px)
 
 
 def fewer_keyframes(marks: Landmarks, enough: int) -> Landmarks:

@@ -25,7 +25,7 @@ _BESIDE_PX = 25.0  # distance within which a measured corner hides farther point
 WIDER_VIEW_RAD = 0.17
 _MAX_OCTAVE = 7.0
 _WINDOW_PX, _DISPARITY_PX = 4.0, 2.0  # around a prediction accurate to 1 cm at 2 m
-_MATCHING = FixSettings(guided_distance=60)  # bits: two views of one object differ by about 40, two objects by 128
+_MATCHING = FixSettings(guided_distance=60)  # bits: two looks at one object differ by about 40, two objects by 128
 # An object, and objects that may change together: goods on one pallet, pictures on one wall
 _CELL_M, _BLOCK_M = 0.75, 1.5
 _FIRM_OBSERVATIONS = 4  # keyframes of the map that must observe a landmark to expect it again
@@ -97,7 +97,7 @@ def look(
 def confirmation(
     points_map: Array, looks: Sequence[tuple[Rows, NDArray[np.bool_]]], firm: NDArray[np.bool_], error_rate: float
 ) -> Confirmation:
-    """Return the cells in which `firm` landmarks (N, 3) are expected by two or more views, and those with enough of them seen.
+    """Return the cells in which `firm` landmarks (N, 3) are expected by two or more looks, and those with enough of them seen.
 
     The bounds are those of Clopper and Pearson 1934 for the number of independent cells with the measured variance: blocks of cells
     are the clusters of the sample. Source: Cochran 1977, Sampling Techniques, section 9A.

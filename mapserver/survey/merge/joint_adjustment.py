@@ -7,24 +7,26 @@ et al. 2018) and ORB-SLAM3 (Campos et al. 2021), so that it changes only where t
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import AnyArray, Array, se3_inverse, transform_points
+from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.relocalization.landmark_visibility import Rows
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_problem, inertial_edges
 from mapserver.survey.bundle.measured_noise import measured_sigmas
-from mapserver.survey.bundle.problem import BundleProblem, BundleResult, InertialTerms, continued
+from mapserver.survey.bundle.problem import OBSERVED, BundleProblem, BundleResult, InertialTerms, continued
 from mapserver.survey.merge.base_map import BaseMap, baseline_ratio, with_baseline
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.merge.merge import Change
 from mapserver.survey.pose_graph.odometry_factors import floor_of
 from mapserver.survey.pose_graph.position_priors import in_frame, judged_priors, level_fit
+from mapserver.survey.rig import Rig
 from mapserver.survey.settings import BundleSettings, SessionSettings, SurveySettings
-from mapserver.survey.state import Landmarks, PriorTerm, RelativeTerm, SurveyState, poses_of_views
+from mapserver.survey.state import Landmarks, PriorTerm, RelativeTerm, SurveyState, image_numbers
 from mapserver.survey.survey_map import SurveyMap, history_of
 
 _LONGEST_GAP_NS = 10_000_000_000
@@ -37,15 +39,55 @@ _STEP = floor_of(inertial=True)._replace(rotation_share=0.0, translation_share=0
 class Measured:
     """Constraints of a map, at its optimum: the observations, motion and priors of its keyframes.
 
-    keyframes (K,), landmarks (N,): numbers of those of the map in the problem, where each keyframe is a view; -1 if not included.
+    keyframes (K,), cameras (K,), landmarks (N,): numbers of those of the map in the problem, where each keyframe is an image by a camera;
+    -1 if not included.
     map_from_docks (4, 4): the map keeps the frame of its first survey, whose docks place it only to their own accuracy; None for a map
     without docks.
     """
 
     problem: BundleProblem
     keyframes: Rows
+    cameras: Rows
     landmarks: Rows
     map_from_docks: Array | None = None
+
+
+@dataclass(frozen=True)
+class Joined:
+    """What a survey adds to the problem of a map.
+
+    Numbers there of its images (P,), by the keyframe and the camera, and of its landmarks (N,), -1 if not included. marks: its landmarks by
+    image; rows (m,): their observations that take part. rig: the cameras of both. rig_from_body (4, 4): of the body in the problem.
+    """
+
+    first_keyframe: int
+    keyframe: Rows
+    camera: Rows
+    landmarks: Rows
+    marks: Landmarks
+    rows: Rows
+    rig: Rig
+    rig_from_body: Array
+
+    @classmethod
+    def to(cls, problem: BundleProblem, state: SurveyState, sightings: Sequence[Sighting | None]) -> "Joined":
+        """Return the numbers after the map's. A feature that shows a landmark of the map counts as its observation alone."""
+        old, points = len(problem.map_from_body), len(problem.points_map)
+        rig, cameras = _with_cameras_of(problem.rig, state.rig)
+        numbers = image_numbers(len(state.stamps_ns), len(state.rig))
+        keyframe, camera = np.indices(numbers.shape).reshape(2, -1)
+        marks = state.landmarks.by_image(numbers)
+        free = free_observations(marks, sightings)
+        used = np.bincount(marks.obs_landmark[free], minlength=len(marks.points_map)) >= 2
+        landmarks = np.where(used, np.cumsum(used) - 1 + points, -1)
+        rows = np.flatnonzero(free & used[marks.obs_landmark])
+        rig_from_body = problem.rig.body_from_cam[0] @ se3_inverse(state.rig.body_from_cam[0])
+        return cls(old, old + keyframe, cameras[camera], landmarks, marks, rows, rig, rig_from_body)
+
+    @property
+    def is_alike(self) -> bool:
+        """False for a survey by another mount, which contributes its pictures only."""
+        return bool(np.allclose(self.rig_from_body, np.eye(4), atol=1e-9))
 
 
 @dataclass(frozen=True)
@@ -55,8 +97,8 @@ class JointSolution:
     map_from_body (K, 4, 4) of the new keyframes; base_keyframes (B,) of the map that took part, base_from_body (B, 4, 4) their
     poses; base_rows (R,) landmarks of the map that took part, base_points_map (R, 3); own_points_map (N, 3) of the
     survey's own landmarks, NaN if not included; sightings without outliers. measured: the problem at its optimum,
-    the map's keyframes first; own_numbers (N,): those of the own landmarks in it, -1 if not included. priors_refused: docks, tags and zones
-    of the survey that contradict it or the map. own_views: numbers of the survey's views in the problem.
+    the map's keyframes first; own: the survey's part of it. priors_refused: docks, tags and zones
+    of the survey that contradict it or the map.
     """
 
     map_from_body: Array
@@ -67,8 +109,7 @@ class JointSolution:
     own_points_map: Array
     sightings: list[Sighting | None]
     measured: Measured
-    own_numbers: Rows
-    own_views: Rows
+    own: Joined
     priors_refused: int
 
 
@@ -112,109 +153,96 @@ def _solved(
     how: BundleSettings,
 ) -> JointSolution:
     """Solve one adjustment: first the map's keyframes and landmarks, then the survey's."""
-    marks = state.landmarks
-    seen = [(k, s) for k, s in enumerate(sightings) if s is not None]
-    known = known or _published(base, state, seen, settings.sessions)
-    known, own_views = _with_views_of(known, state)
-    earlier, old, points = known.problem, len(known.problem.map_from_body), len(known.problem.points_map)
-    # A feature that shows a landmark of the map is counted as its observation.
-    free = free_observations(marks, sightings)
-    own_used = np.bincount(marks.obs_landmark[free], minlength=len(marks.points_map)) >= 2
-    own = free & own_used[marks.obs_landmark]
-    own_numbers = np.where(own_used, np.cumsum(own_used) - 1 + points, -1)
-    turn, carried = _carried(state, map_from_body)
-    rig_from_body = earlier.body_from_cam @ se3_inverse(state.body_from_cam)  # of the body in the problem
-    own_rig = bool(np.allclose(rig_from_body, np.eye(4), atol=1e-9))
-    camera = earlier.camera if earlier.camera.baseline_m else state.camera  # only a pair measures distances
-    pixels, sigmas_px = with_baseline(
-        np.concatenate([*(s.pixels for _, s in seen), marks.obs_pixels[own]]),
-        np.concatenate([*(s.sigmas_px for _, s in seen), marks.obs_sigma_px[own]]),
-        baseline_ratio(camera, state.camera),
-    )
-    keyframes = [
-        earlier.obs_keyframe,
-        *(np.full(len(s.rows), own_views[k]) for k, s in seen),
-        own_views[marks.obs_keyframe[own]],
-    ]
-    landmarks = [
-        earlier.obs_landmark,
-        *(known.landmarks[s.rows] for _, s in seen),
-        own_numbers[marks.obs_landmark[own]],
-    ]
-    fixed = np.concatenate([earlier.fixed, np.zeros(len(map_from_body), bool)])
-    fixed[0] |= old == 0
-    problem = replace(
-        earlier,
-        camera=camera,
-        map_from_body=np.concatenate([earlier.map_from_body, map_from_body @ se3_inverse(rig_from_body)]),
-        fixed=fixed,
-        points_map=np.concatenate([earlier.points_map, carried[own_used]]),
-        obs_keyframe=np.concatenate(keyframes).astype(np.int32),
-        obs_landmark=np.concatenate(landmarks).astype(np.int32),
-        obs_pixels=np.concatenate([earlier.obs_pixels, pixels]),
-        obs_sigma_px=np.concatenate([earlier.obs_sigma_px, sigmas_px]),
-    )
-    if own_rig:  # a survey with another mount contributes its pictures only
-        relative = [RelativeTerm(r.i + old, r.j + old, r.i_from_j, r.information) for r in state.motion.relative]
-        priors = [replace(p, k=p.k + old) for p in _placed(state.priors, known) if p.is_believed]
-        problem = replace(problem, relative=earlier.relative + relative, priors=earlier.priors + priors)
-    problem.inertial = _inertial(earlier, state, turn, settings, own_rig)
+    known = known or _published(base, state, sightings, settings.sessions)
+    own = Joined.to(known.problem, state, sightings)
+    problem = _joint_problem(known, own, state, map_from_body, sightings, settings)
     result = optimize(replace(problem, obs_sigma_px=measured_sigmas(problem, how.huber_sigmas)), how)
-    map_from_docks = known.map_from_docks
+    map_from_docks, old = known.map_from_docks, own.first_keyframe
     if map_from_docks is not None:
-        stay = level_fit(earlier.map_from_body[:, :3, 3], result.map_from_body[:old, :3, 3])
+        stay = level_fit(problem.map_from_body[:old, :3, 3], result.map_from_body[:old, :3, 3])
         result, map_from_docks = _in_frame(result, stay), stay @ map_from_docks
         problem.priors = [in_frame(prior, stay) for prior in problem.priors]
 
     fits = result.squared_sigmas < settings.noise.cut_sigmas**2
-    fitting, start = list[Sighting | None](), len(earlier.obs_keyframe)
+    fitting, start = list[Sighting | None](), len(known.problem.obs_keyframe)
     for sighting in sightings:
         count = 0 if sighting is None else len(sighting.rows)
         fitting.append(None if sighting is None else sighting.only(fits[start : start + count]))
         start += count
     base_keyframes, base_rows = np.flatnonzero(known.keyframes >= 0), np.flatnonzero(known.landmarks >= 0)
-    own_points_map = np.full((len(marks.points_map), 3), np.nan)
-    own_points_map[own_used] = result.points_map[points:]
-    map_from_view = poses_of_views(result.map_from_body, problem.body_from_view)
+    places = problem.rig.as_bodies(result.map_from_body)
+    own_points_map = np.full((len(own.landmarks), 3), np.nan)
+    own_points_map[own.landmarks >= 0] = result.points_map[len(known.problem.points_map) :]
     return JointSolution(
-        map_from_body=result.map_from_body[old:] @ rig_from_body,
+        map_from_body=result.map_from_body[old:] @ own.rig_from_body,
         base_keyframes=base_keyframes,
-        base_from_body=map_from_view[known.keyframes[base_keyframes]] @ rig_from_body,
+        base_from_body=places[known.keyframes[base_keyframes], known.cameras[base_keyframes]] @ own.rig_from_body,
         base_rows=base_rows,
         base_points_map=result.points_map[known.landmarks[base_rows]],
         own_points_map=own_points_map,
         sightings=fitting,
-        measured=Measured(continued(problem, result), known.keyframes, known.landmarks, map_from_docks),
-        own_numbers=own_numbers,
-        own_views=own_views,
+        measured=replace(known, problem=continued(problem, result), map_from_docks=map_from_docks),
+        own=own,
         priors_refused=sum(not prior.is_believed for prior in state.priors),
     )
 
 
-def _with_views_of(known: Measured, state: SurveyState) -> tuple[Measured, Rows]:
-    """Return the constraints with the survey's views among those of the problem, and (K * V,) their numbers after all of the map."""
-    problem = known.problem
-    rig_from_body = problem.body_from_cam @ se3_inverse(state.body_from_cam)
-    views, which = list(problem.body_from_view), [0]
-    for own in rig_from_body @ state.body_from_view[1:] @ se3_inverse(rig_from_body):
-        same = [n for n, view in enumerate(views) if np.allclose(view, own, atol=1e-9)]
-        which.append(same[0] if same else len(views))
-        views += [] if same else [own]
-    before, after = len(problem.body_from_view), len(views)
+def _with_cameras_of(rig: Rig, own: Rig) -> tuple[Rig, Rows]:
+    """Return the rig of a problem with the cameras of a survey's rig, and their numbers (V,) in it."""
+    mounts, kinds, which = list(rig.body_from_cam), list(rig.kinds), [0]
+    rig_from_own = rig.body_from_cam[0] @ se3_inverse(own.body_from_cam[0])
+    for mount, kind in zip(rig_from_own @ own.body_from_cam[1:], own.kinds[1:], strict=True):
+        same = [n for n, known in enumerate(mounts) if np.allclose(known, mount, atol=1e-9)]
+        which.append(same[0] if same else len(mounts))
+        if not same:
+            mounts.append(mount)
+            kinds.append(kind)
+    camera = rig.camera if rig.camera.baseline_m else own.camera  # only a pair measures distances
+    return Rig(camera, np.array(mounts), tuple(kinds)), np.array(which)
 
-    def numbered(keyframes: AnyArray) -> AnyArray:
-        return np.where(keyframes < 0, -1, keyframes // before * after + keyframes % before)
 
-    bodies = len(problem.map_from_body) + np.arange(len(state.stamps_ns))
-    own_views = (after * bodies[:, None] + which).ravel()
-    if after == before:
-        return known, own_views
-    problem = replace(problem, obs_keyframe=numbered(problem.obs_keyframe), body_from_view=np.array(views))
-    return replace(known, problem=problem, keyframes=numbered(known.keyframes)), own_views
+def _joint_problem(
+    known: Measured,
+    own: Joined,
+    state: SurveyState,
+    map_from_body: Array,
+    sightings: Sequence[Sighting | None],
+    settings: SurveySettings,
+) -> BundleProblem:
+    """Return the map's problem with the survey's keyframes, landmarks, motion and observations of both."""
+    earlier, marks, old = known.problem, own.marks, own.first_keyframe
+    seen = [(n, s) for n, s in enumerate(sightings) if s is not None]
+    turn, carried = _carried(state, map_from_body)
+    pixels, sigmas_px = with_baseline(
+        np.concatenate([*(s.pixels for _, s in seen), marks.obs_pixels[own.rows]]),
+        np.concatenate([*(s.sigmas_px for _, s in seen), marks.obs_sigma_px[own.rows]]),
+        baseline_ratio(own.rig.camera, state.rig.camera),
+    )
+    images = np.concatenate([*(np.full(len(s.rows), n) for n, s in seen), marks.obs_keyframe[own.rows]])
+    landmarks = [*(known.landmarks[s.rows] for _, s in seen), own.landmarks[marks.obs_landmark[own.rows]]]
+    owners = own.keyframe[images], own.camera[images], np.concatenate(landmarks)
+    columns = zip(OBSERVED, (*owners, pixels, sigmas_px), strict=True)
+    observed: dict[str, Any] = {name: np.concatenate([getattr(earlier, name), column]) for name, column in columns}
+    fixed = np.concatenate([earlier.fixed, np.zeros(len(map_from_body), bool)])
+    fixed[0] |= old == 0
+    problem = replace(
+        earlier,
+        rig=own.rig,
+        map_from_body=np.concatenate([earlier.map_from_body, map_from_body @ se3_inverse(own.rig_from_body)]),
+        fixed=fixed,
+        points_map=np.concatenate([earlier.points_map, carried[own.landmarks >= 0]]),
+        **observed,
+    )
+    if own.is_alike:
+        relative = [RelativeTerm(r.i + old, r.j + old, r.i_from_j, r.information) for r in state.motion.relative]
+        priors = [replace(p, k=p.k + old) for p in _placed(state.priors, known) if p.is_believed]
+        problem = replace(problem, relative=earlier.relative + relative, priors=earlier.priors + priors)
+    problem.inertial = _inertial(earlier, state, turn, settings, own.is_alike)
+    return problem
 
 
 def _published(
-    base: BaseMap, state: SurveyState, seen: Sequence[tuple[int, Sighting]], settings: SessionSettings
+    base: BaseMap, state: SurveyState, sightings: Sequence[Sighting | None], settings: SessionSettings
 ) -> Measured:
     """Return the constraints of a published map: keyframes with landmarks seen by the survey, with an anchor for each.
 
@@ -222,7 +250,7 @@ def _published(
     observations of earlier landmarks by a later survey are not kept. By the new survey's landmarks alone a keyframe with few of
     them would move with their noise, up to 9 mm.
     """
-    rows = np.unique(np.concatenate([s.rows for _, s in seen])) if seen else np.zeros(0, np.int64)
+    rows = np.unique(np.concatenate([np.zeros(0, np.int64), *(s.rows for s in sightings if s is not None)]))
     used = np.zeros(len(base.points_map), bool)
     landmarks, keyframes = np.full(len(base.points_map), -1), np.full(len(base.map_from_body), -1)
     used[rows] = True
@@ -234,19 +262,19 @@ def _published(
     obs = np.flatnonzero(own & used[base.map.obs_landmark])
     sigma = np.array([np.radians(settings.anchor_sigma_deg)] * 3 + [settings.anchor_sigma_m] * 3)
     problem = BundleProblem(
-        camera=base.camera,
-        body_from_cam=state.body_from_cam,
+        rig=Rig.of_one(base.camera, state.rig.body_from_cam[0]),
         map_from_body=base.map_from_body[held],
         fixed=np.zeros(len(held), bool),
         points_map=base.points_map[used],
         obs_keyframe=keyframes[base.map.obs_keyframe[obs]],
+        obs_camera=np.zeros(len(obs), np.int32),
         obs_landmark=landmarks[base.map.obs_landmark[obs]],
         obs_pixels=base.obs_pixels[obs],
         obs_sigma_px=base.obs_sigma_px[obs],
         relative=_steps(base, held),
         priors=[PriorTerm(n, base.map_from_body[k], np.diag(1.0 / sigma**2)) for n, k in enumerate(held)],
     )
-    return Measured(problem, keyframes, landmarks)
+    return Measured(problem, keyframes, np.zeros_like(keyframes), landmarks)
 
 
 def _steps(base: BaseMap, held: Rows) -> list[RelativeTerm]:
@@ -281,12 +309,12 @@ def _carried(state: SurveyState, map_from_body: Array) -> tuple[Array, Array]:
     marks = state.landmarks
     turn = map_from_body[:, :3, :3] @ state.map_from_body[:, :3, :3].transpose(0, 2, 1)
     shift = map_from_body[:, :3, 3] - np.einsum("kij,kj->ki", turn, state.map_from_body[:, :3, 3])
-    first = state.observers[marks.firsts]
+    first = marks.obs_keyframe[marks.firsts]
     return turn, np.einsum("nij,nj->ni", turn[first], marks.points_map) + shift[first]
 
 
 def free_observations(marks: Landmarks, sightings: Sequence[Sighting | None]) -> NDArray[np.bool_]:
-    """Return (M,) observations of the survey's own landmarks whose feature shows no landmark of the map."""
+    """Return (M,) observations of the survey's own landmarks, by image, whose feature shows no landmark of the map."""
     stride = int(marks.obs_feature.max(initial=0)) + 1
     taken = [k * stride + s.features[s.features < stride] for k, s in enumerate(sightings) if s is not None]
     codes = marks.obs_keyframe.astype(np.int64) * stride + marks.obs_feature
@@ -314,30 +342,23 @@ def _inertial(
 
 def begun(state: SurveyState, survey_map: SurveyMap, landmarks: Rows, settings: SurveySettings) -> Measured:
     """Return the constraints of a map's first survey, its state in the map's frame; landmarks (N,): rows of the state in the map."""
-    views = state.view_count
-    keyframes = views * np.searchsorted(state.stamps_ns, survey_map.keyframe_stamps_ns)
-    if views > 1:  # the view at the pose of the map's keyframe
-        beside = state.map_from_view[keyframes[:, None] + np.arange(views)]
-        keyframes += np.abs(beside - survey_map.map_from_body[:, None]).sum(axis=(2, 3)).argmin(axis=1)
+    keyframes = np.searchsorted(state.stamps_ns, survey_map.keyframe_stamps_ns)
+    # The camera that is where the first one would be with a body at the pose of the map's keyframe.
+    beside = state.rig.as_bodies(state.map_from_body)[keyframes]
+    cameras = np.abs(beside - survey_map.map_from_body[:, None]).sum(axis=(2, 3)).argmin(axis=1)
     problem = bundle_problem(state, settings, None)
-    return Measured(problem, keyframes, landmarks, np.eye(4) if problem.priors else None)
+    return Measured(problem, keyframes, cameras, landmarks, np.eye(4) if problem.priors else None)
 
 
 def grown(joint: JointSolution, change: Change, base: BaseMap, after: SurveyMap) -> Measured:
     """Return the constraints of the map after a change; a moved landmark is at its position by the new survey."""
     before, problem, is_new = joint.measured, joint.measured.problem, change.added_rows < 0
-    old = int(joint.own_views[0])
+    own, images = joint.own, np.unique(change.added.obs_keyframe)
     stay = np.isin(base.history.keyframe_ids, history_of(after).keyframe_ids)
-    keyframes = np.concatenate([before.keyframes[stay], joint.own_views[np.unique(change.added.obs_keyframe)]])
-    added = np.where(is_new, joint.own_numbers[change.added_own], before.landmarks[change.added_rows])
+    keyframes = np.concatenate([before.keyframes[stay], own.keyframe[images]])
+    cameras = np.concatenate([before.cameras[stay], own.camera[images]])
+    added = np.where(is_new, own.landmarks[change.added_own], before.landmarks[change.added_rows])
     landmarks = np.concatenate([before.landmarks[change.keep], added])
-    keep = (problem.obs_keyframe >= old) | ~np.isin(problem.obs_landmark, added[~is_new])
+    keep = (problem.obs_keyframe >= own.first_keyframe) | ~np.isin(problem.obs_landmark, added[~is_new])
     problem.points_map[added[~is_new]] = change.added.points_map[~is_new]
-    problem = replace(
-        problem,
-        obs_keyframe=problem.obs_keyframe[keep],
-        obs_landmark=problem.obs_landmark[keep],
-        obs_pixels=problem.obs_pixels[keep],
-        obs_sigma_px=problem.obs_sigma_px[keep],
-    )
-    return Measured(problem, keyframes, landmarks, before.map_from_docks)
+    return Measured(problem.observed(keep), keyframes, cameras, landmarks, before.map_from_docks)

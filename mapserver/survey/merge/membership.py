@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 
 from fleetmap.failure_definition import is_wrong
 from fleetmap.geometry import Array
-from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.landmark_visibility import places_around
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.merge.confirmation import Confirmation, confirmation, look
 from mapserver.survey.merge.session_alignment import (
     Alignment,
+    Images,
     alignments,
     count_places,
     find_fixes,
@@ -107,12 +107,12 @@ class SessionPlace:
 class SessionKeyframes:
     """Input of the test: a session.
 
-    views (K * V) with their features and depths, those of the first keyframe, those of the second one, and so on; survey_from_body
-    (K, 4, 4) and the edges of its motion; camera, body_from_cams (V, 4, 4): of each view. map_from_survey: pose by position priors,
+    images of each keyframe by the cameras at body_from_cams (V, 4, 4), with their features and depths; survey_from_body (K, 4, 4) and the
+    edges of its motion; camera: of all images. map_from_survey: pose by position priors,
     None without any. pieces (K,): equal for keyframes that pictures link, not odometry alone; None if they link all.
     """
 
-    views: Sequence[FrameFeatures]
+    images: Images
     survey_from_body: Array
     chain: Sequence[PoseEdge]
     camera: StereoCamera
@@ -143,10 +143,10 @@ class MembershipTest:
         if by_priors is not None:  # plus as many that priors put near a place of the map
             beside = np.flatnonzero(self._beside_the_map(by_priors).any(axis=1)).tolist()
             ks = sorted({*ks, *_spread(beside, settings.fix_keyframes)})
-        fixes = find_fixes(self._relocalizer, session.views, ks, session.body_from_cams)
+        fixes = find_fixes(self._relocalizer, session.images, ks, session.body_from_cams)
         if by_priors is not None:
             expected = {k: by_priors[k] for k in ks}
-            fixes += fixes_around(self._relocalizer, session.views, expected, session.body_from_cams)
+            fixes += fixes_around(self._relocalizer, session.images, expected, session.body_from_cams)
         self.tried = len(ks)
         found = alignments(fixes, session.survey_from_body, GraphMarginals(session.survey_from_body, session.chain))
         enough = [p for p in found if len(p.fixes) >= settings.min_fixes and p.places >= settings.min_places]
@@ -198,7 +198,7 @@ class MembershipTest:
         return None
 
     def _beside_the_map(self, map_from_body: Array) -> NDArray[np.bool_]:
-        """Return which views (K, V) of keyframes at map_from_body (K, 4, 4) are near a place of the map, with a similar heading."""
+        """Return which images (K, V) of keyframes at map_from_body (K, 4, 4) are near a place of the map, with a similar heading."""
         places, looking = self._relocalizer.view.map_from_cam, map_from_body[:, None] @ self._session.body_from_cams
         beside = [places_around(places, at, _BESIDE_M, _BESIDE_COSINE).any() for at in looking.reshape(-1, 4, 4)]
         return np.reshape(beside, looking.shape[:2])
@@ -217,18 +217,17 @@ class MembershipTest:
     def confirmation(self, map_from_body: Array, chosen: Sequence[int] | None = None) -> Confirmation:
         """Return the share of the map seen by the session with its keyframes, or chosen ones, at map_from_body (K, 4, 4).
 
-        Only views near places of the map are used: parts of the next aisle that a survey saw through gaps in the racks
+        Only images near places of the map are used: parts of the next aisle that a survey saw through gaps in the racks
         may be hidden by other goods from within that aisle. Without any near ones all are used, with few expected landmarks.
         """
         session, view = self._session, self._relocalizer.view
         beside = self._beside_the_map(map_from_body)
         asked = np.isin(np.arange(len(beside)), range(len(beside)) if chosen is None else chosen)[:, None]
         beside = beside & asked if (beside & asked).any() else np.broadcast_to(asked, beside.shape)
-        count = beside.shape[1]
         looks = [
-            look(view, session.camera, session.views[k * count + v], map_from_body[k] @ session.body_from_cams[v])
-            for k in _spread(np.flatnonzero(beside.any(axis=1)).tolist(), _MOST_LOOKS // count)
-            for v in np.flatnonzero(beside[k])
+            look(view, session.camera, session.images[k][c], map_from_body[k] @ session.body_from_cams[c])
+            for k in _spread(np.flatnonzero(beside.any(axis=1)).tolist(), _MOST_LOOKS // beside.shape[1])
+            for c in np.flatnonzero(beside[k]).tolist()
         ]
         return confirmation(view.points_map, looks, self._firm, self._settings.join_error_rate)
 

@@ -129,8 +129,8 @@ class MapMerger:
             return found
         first = self._first_keyframes.get(number, 0)
         problem, frames = self._measured.problem, survey.odometry.keyframe_frames
-        map_from_rig = problem.map_from_body[first : first + len(frames)] @ problem.body_from_cam
-        map_from_body = map_from_rig @ se3_inverse(survey.state.body_from_cam)
+        map_from_cam = problem.map_from_body[first : first + len(frames)] @ problem.rig.body_from_cam[0]
+        map_from_body = map_from_cam @ se3_inverse(survey.state.rig.body_from_cam[0])
         return replace(
             found, frame_from_body=frame_trajectory(found.stamps_ns, found.frame_from_body, frames, map_from_body)
         )

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fleetmap.geometry import Array
+from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.finish.frame_adjustment import frame_trajectory
 from mapserver.survey.loops.connected_components import find_groups
@@ -13,20 +14,21 @@ from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import what_changes
 from mapserver.survey.merge.confirmation import firm_landmarks
 from mapserver.survey.merge.guided_matching import keyframe_features, match_keyframe, session_relocalizer
-from mapserver.survey.merge.joint_adjustment import Measured, adjust_jointly, grown
+from mapserver.survey.merge.joint_adjustment import JointSolution, Measured, adjust_jointly, grown
 from mapserver.survey.merge.landmark_persistence import count_landmarks, faded
 from mapserver.survey.merge.membership import (
     Membership,
     MembershipEvidence,
     MembershipTest,
     SessionKeyframes,
+    SessionPlace,
     contradicts,
 )
 from mapserver.survey.merge.merge import merged
 from mapserver.survey.pose_graph.odometry_factors import chain_edges
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import Survey
-from mapserver.survey.state import poses_of_views
+from mapserver.survey.state import RigImages
 from mapserver.survey.survey_map import SurveyMap
 
 _NO_LIMITS = SurveyLimits()
@@ -81,55 +83,28 @@ def extend(
         return Membership(
             "a survey by one camera without IMU has an unknown scale: it can begin a map, not join one; add an IMU or a camera"
         )
-    base = BaseMap(base_map, state.camera, state.body_from_cam)
+    base = BaseMap(base_map, state.rig.camera, state.rig.body_from_cam[0])
     relocalizer = session_relocalizer(base, survey.vocabulary, settings)
-    views = guess.views(state.view_count)
-    session = SessionKeyframes(
-        views=[keyframe_features(view) for view in views],
-        survey_from_body=state.map_from_body,  # the survey's own frame, called `map` in a single survey
-        chain=[*chain_edges(guess, state), *survey.loops.edges],
-        camera=state.camera,
-        body_from_cams=state.body_from_view @ state.body_from_cam,
-        map_from_survey=map_from_survey,
-        pieces=find_groups(state, lambda *_: np.inf, 0.0).labels(),
-    )
     firm = firm_landmarks(len(base.points_map), base.map.obs_landmark)
-    test = MembershipTest(relocalizer, firm, session, settings.sessions)
-    located = test.locate()
+    test = MembershipTest(relocalizer, firm, _session(survey, map_from_survey), settings.sessions)
+    located = _located(test)
     if isinstance(located, Membership):
         return located
-    refused = test.judged(located, located.seen)
-    if refused is not None and contradicts(located.seen):
-        return refused
-    map_from_body = located.map_from_body
-    for radius_px in (settings.sessions.search_px, settings.sessions.guided_px):
-        sightings = [
-            match_keyframe(base, relocalizer, keyframe, place @ state.body_from_cam, radius_px, settings)
-            for keyframe, place in zip(views, poses_of_views(map_from_body, state.body_from_view), strict=True)
-        ]
-        finely = radius_px == settings.sessions.guided_px
-        joint = adjust_jointly(base, known, state, map_from_body, sightings, settings, finely=finely)
-        map_from_body = joint.map_from_body
-    seen = test.confirmation(map_from_body)
+    joint = _adjusted(base, relocalizer, known, survey, located.map_from_body, settings)
+    seen = test.confirmation(joint.map_from_body)
     refused = test.judged(located, seen)
     if refused is not None:
         return refused
-    map_from_cam = poses_of_views(map_from_body, state.body_from_view) @ state.body_from_cam
-    found = count_landmarks(base, views, map_from_cam, joint.sightings)
-    anchored = known is None
+    posed = RigImages.of(guess.keyframes, joint.map_from_body, state.rig)
+    found, anchored = count_landmarks(base, posed.images, posed.map_from_cam, joint.sightings), known is None
     gone = faded(base, found, settings) if anchored else np.zeros(len(base.points_map), bool)
     gone &= ~limits.freezes(base.points_map)
     change, moved_keyframes, moved_landmarks = what_changes(
-        base, survey, joint, gone, settings, anchored=anchored, limits=limits
+        base, survey, posed, joint, gone, settings, anchored=anchored, limits=limits
     )
-    cameras = change.map_from_cam[:, :3, 3]
-    # Frames between keyframes were located within the survey; they follow their moved keyframes.
-    stamps_ns, survey_from_body = survey.map.trajectory.stamps_ns, survey.map.trajectory.frame_from_body
-    placed = frame_trajectory(stamps_ns, survey_from_body, guess.keyframe_frames, map_from_body)
-    result = replace(
-        merged(base, change, found, views, settings.sessions.new_place_landmarks, limits.freezes(cameras)),
-        trajectory=Trajectory(stamps_ns, placed),
-        trajectory_estimated=survey.map.trajectory_estimated,
+    frozen = limits.freezes(change.map_from_cam[:, :3, 3])
+    result = _with_frames(
+        merged(base, change, found, posed.images, settings.sessions.new_place_landmarks, frozen), survey, joint
     )
     fresh = int((change.added_rows < 0).sum())
     counts = Counts(
@@ -147,6 +122,57 @@ def extend(
         landmarks_added=fresh,
         seen_rate=round(found.rate, 4),
     )
-    return Extension(
-        result, None if known is None else grown(joint, change, base, result), counts, test.evidence(located, seen)
+    measured = None if known is None else grown(joint, change, base, result)
+    return Extension(result, measured, counts, test.evidence(located, seen))
+
+
+def _located(test: MembershipTest) -> SessionPlace | Membership:
+    """Return the pose of a session in the map; why not if it has none, or if its view of the map contradicts it there."""
+    located = test.locate()
+    if isinstance(located, Membership) or not contradicts(located.seen):
+        return located
+    return test.judged(located, located.seen) or located
+
+
+def _session(survey: Survey, map_from_survey: Array | None) -> SessionKeyframes:
+    """Return a survey as the input of the test of membership."""
+    state, guess = survey.state, survey.odometry
+    posed = RigImages.of(guess.keyframes, state.map_from_body, state.rig)
+    return SessionKeyframes(
+        images=[[keyframe_features(posed.images[n]) for n in row] for row in posed.numbers.tolist()],
+        survey_from_body=state.map_from_body,  # the survey's own frame, called `map` in a single survey
+        chain=[*chain_edges(guess, state), *survey.loops.edges],
+        camera=state.rig.camera,
+        body_from_cams=state.rig.body_from_cam,
+        map_from_survey=map_from_survey,
+        pieces=find_groups(state, lambda *_: np.inf, 0.0).labels(),
     )
+
+
+def _adjusted(
+    base: BaseMap,
+    relocalizer: Relocalizer,
+    known: Measured | None,
+    survey: Survey,
+    map_from_body: Array,
+    settings: SurveySettings,
+) -> JointSolution:
+    """Return the joint adjustment with the landmarks of the map that keyframes at map_from_body (K, 4, 4) see, matched twice."""
+    state, sessions = survey.state, settings.sessions
+    for radius_px, finely in ((sessions.search_px, False), (sessions.guided_px, True)):
+        posed = RigImages.of(survey.odometry.keyframes, map_from_body, state.rig)
+        sightings = [
+            match_keyframe(base, relocalizer, image, place, radius_px, settings)
+            for image, place in zip(posed.images, posed.map_from_cam, strict=True)
+        ]
+        joint = adjust_jointly(base, known, state, map_from_body, sightings, settings, finely=finely)
+        map_from_body = joint.map_from_body
+    return joint
+
+
+def _with_frames(survey_map: SurveyMap, survey: Survey, joint: JointSolution) -> SurveyMap:
+    """Return the map with the new survey's frames: located between keyframes within the survey, they follow those."""
+    own = survey.map.trajectory
+    places = frame_trajectory(own.stamps_ns, own.frame_from_body, survey.odometry.keyframe_frames, joint.map_from_body)
+    estimated = survey.map.trajectory_estimated
+    return replace(survey_map, trajectory=Trajectory(own.stamps_ns, places), trajectory_estimated=estimated)

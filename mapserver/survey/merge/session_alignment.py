@@ -40,19 +40,19 @@ class Alignment:
     places: int
 
 
-def find_fixes(
-    relocalizer: Relocalizer, views: Sequence[FrameFeatures], ks: Sequence[int], body_from_cams: Array
-) -> list[SessionFix]:
-    """Return all fixes of keyframes ks by each of their views, several for one view if places of the map look alike.
+Images = Sequence[Sequence[FrameFeatures]]
 
-    views (K * V): those of the first keyframe, those of the second one, and so on; body_from_cams (V, 4, 4).
+
+def find_fixes(relocalizer: Relocalizer, images: Images, ks: Sequence[int], body_from_cams: Array) -> list[SessionFix]:
+    """Return all fixes of keyframes ks by each of their images, several for one image if places of the map look alike.
+
+    images: of each keyframe by the cameras at body_from_cams (V, 4, 4).
     """
-    count = len(body_from_cams)
     return [
         _at_body(k, fix, body_from_cam)
         for k in ks
-        for view, body_from_cam in zip(views[k * count :], body_from_cams, strict=False)
-        for fix in finished(relocalizer.anywhere(view))
+        for image, body_from_cam in zip(images[k], body_from_cams, strict=True)
+        for fix in finished(relocalizer.anywhere(image))
     ]
 
 
@@ -67,14 +67,13 @@ def _at_body(k: int, fix: Fix, body_from_cam: Array) -> SessionFix:
 
 
 def fixes_around(
-    relocalizer: Relocalizer, views: Sequence[FrameFeatures], places: dict[int, Array], body_from_cams: Array
+    relocalizer: Relocalizer, images: Images, places: dict[int, Array], body_from_cams: Array
 ) -> list[SessionFix]:
-    """Return fixes of keyframes near their expected poses, map_from_body (4, 4) by keyframe. Views as of `find_fixes`."""
-    count = len(body_from_cams)
+    """Return fixes of keyframes near their expected poses, map_from_body (4, 4) by keyframe; images as of `find_fixes`."""
     found = (
-        (k, body_from_cam, relocalizer.by_projection(view, place @ body_from_cam, _WIDEST_PX))
+        (k, body_from_cam, relocalizer.by_projection(image, place @ body_from_cam, _WIDEST_PX))
         for k, place in places.items()
-        for view, body_from_cam in zip(views[k * count :], body_from_cams, strict=False)
+        for image, body_from_cam in zip(images[k], body_from_cams, strict=True)
     )
     return [_at_body(k, fix, body_from_cam) for k, body_from_cam, fix in found if fix is not None]
 

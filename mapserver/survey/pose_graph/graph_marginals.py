@@ -6,6 +6,7 @@ matrix products without factorisation, and an accepted loop is an update. First 
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -20,6 +21,13 @@ from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, check_edge
 CHI2_3_0999 = 16.266  # 0.999 of chi-square with 3 degrees of freedom: a position
 CHI2_6_0999 = 22.458  # with 6: a pose
 _FIRST_ORDER_RAD = 0.5  # a loop that rotates the graph further must not be added to first order
+
+
+class Gate(NamedTuple):
+    """Of keyframes j (M,): may they be within reach of keyframe i; is i_from_j known as well as asked, in all directions at once."""
+
+    reachable: NDArray[np.bool_]
+    known: NDArray[np.bool_]
 
 
 class GraphMarginals:
@@ -84,25 +92,31 @@ class GraphMarginals:
         i_from_map = adjoint(se3_inverse(self._map_from_body[i]))
         return np.asarray(i_from_map @ cov_map @ i_from_map.T)
 
+    def gate(self, i: int, js: Indices, reach_m: float | Array, sigmas: Array) -> Gate:
+        """Return what one query of the covariances says about keyframes js (M,); sigmas (6,) of `known`."""
+        covariances = self.relative_covs(i, js)
+        known = np.linalg.eigvalsh(covariances / (sigmas[:, None] * sigmas))[:, -1] < 1.0
+        return Gate(self._may_reach(i, js, reach_m, covariances, CHI2_3_0999), known)
+
     def reachable(self, i: int, js: Indices, reach_m: float | Array, chi2: float = CHI2_3_0999) -> NDArray[np.bool_]:
         """Return (M,) True if keyframe j may be within `reach_m` of keyframe i, given the uncertainty of their distance.
 
         True if (distance - reach)^2 / variance of the distance is at most `chi2`: no position within the reach is
         nearer than that in Mahalanobis distance, so no possible one is excluded.
         """
+        return self._may_reach(i, js, reach_m, self.relative_covs(i, js), chi2)
+
+    def _may_reach(
+        self, i: int, js: Indices, reach_m: float | Array, covariances: Array, chi2: float
+    ) -> NDArray[np.bool_]:
         positions_map = self._map_from_body[:, :3, 3]
         apart = (positions_map[js] - positions_map[i]) @ self._map_from_body[i, :3, :3]  # in the axes of i
         distance_m = np.linalg.norm(apart, axis=1)
         beyond_m = np.maximum(distance_m - reach_m, 0.0)
         direction = apart / np.maximum(distance_m, 1e-12)[:, None]
         # A perturbation (r, t) moves j by r x apart + t; the first part is perpendicular to the direction.
-        variance = np.einsum("ma,mab,mb->m", direction, self.relative_covs(i, js)[:, 3:, 3:], direction)
+        variance = np.einsum("ma,mab,mb->m", direction, covariances[:, 3:, 3:], direction)
         return np.asarray(beyond_m**2 <= chi2 * variance)
-
-    def known(self, i: int, js: Indices, sigmas: Array) -> NDArray[np.bool_]:
-        """Return (M,) True if i_from_j is known to sigmas (6,) or better, in all directions at once."""
-        whitened = self.relative_covs(i, js) / (sigmas[:, None] * sigmas)
-        return np.asarray(np.linalg.eigvalsh(whitened)[:, -1] < 1.0)
 
     def innovation_squared(self, edge: PoseEdge) -> float:
         """Return the squared Mahalanobis distance, 6 degrees of freedom, of a measured edge from the graph's prediction.

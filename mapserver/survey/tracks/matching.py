@@ -7,10 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
-from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.settings import PairSettings
-from mapserver.survey.state import Keyframe
+from mapserver.survey.state import RigImages
 from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PairTask, PredictedMotion, match_task, view_overlap
 
 _NEAR_CANDIDATES = 40
@@ -20,77 +19,68 @@ _NOBODY: list[int] = []
 
 
 class PairFinder:
-    """Matches keyframes that should see the same, given their poses."""
+    """Matches images that should see the same, given their poses."""
 
-    def __init__(
-        self,
-        keyframes: list[Keyframe],
-        camera: StereoCamera,
-        body_from_cam: Array,
-        settings: PairSettings,
-        executor: Executor = SERIAL,
-        views: int = 1,
-    ) -> None:
-        """views: of a rig, in turn in `keyframes`."""
-        self._keyframes, self._camera, self._body_from_cam, self._settings = keyframes, camera, body_from_cam, settings
-        self._executor, self._views = executor, views
-        self._inputs = MatchInputs([k.without_pictures() for k in keyframes], camera, settings)
+    def __init__(self, posed: RigImages, settings: PairSettings, executor: Executor = SERIAL) -> None:
+        self._posed, self._settings, self._executor = posed, settings, executor
+        self._map_from_cam, self._keyframe, self._camera = posed.map_from_cam, posed.keyframe, posed.camera
+        self._inputs = MatchInputs([k.without_pictures() for k in posed.images], posed.rig.camera, settings)
         self._shared = replace(self._inputs, keyframes={})
-        self._depths_m = np.array([k.median_depth_m for k in keyframes])
 
-    def candidates(self, map_from_body: Array, *, previous: int, only_near: int | None = None) -> list[tuple[int, int]]:
-        """Return pairs (i, j), i < j: the last few in time, and the most covisible ones by predicted view.
+    def candidates(self, *, previous: int, only_near: int | None = None) -> list[tuple[int, int]]:
+        """Return pairs of images (i, j), i < j: those of a camera in the last few keyframes, and the most covisible by predicted view.
 
         only_near: maximum distance in keyframes, before loops have been closed.
         """
-        map_from_cam = map_from_body @ self._body_from_cam
-        positions, axes = map_from_cam[:, :3, 3], map_from_cam[:, :3, 2]
-        settings, reach_m = self._settings, 2.0 * self._depths_m
+        positions, axes = self._map_from_cam[:, :3, 3], self._map_from_cam[:, :3, 2]
+        settings, numbers = self._settings, self._posed.numbers
+        reach_m = 2.0 * np.array([image.median_depth_m for image in self._posed.images])
         around = None if only_near is not None else NearPlaces(positions, reach_m)
         found: list[tuple[int, int]] = []
-        for j in range(1, len(map_from_cam)):
-            first = 0 if only_near is None else max(0, j - only_near)
-            until = max(j - previous * self._views, first)
-            chosen = {i for i in range(until, j) if (j - i) % self._views == 0}
-            earlier = np.arange(first, until) if around is None else around.before(j, until)
+        for j, (keyframe, camera) in enumerate(zip(self._keyframe.tolist(), self._camera.tolist(), strict=True)):
+            last = numbers[max(keyframe - previous, 0) : keyframe, camera]
+            if around is not None:
+                earlier = around.before(j, int(numbers[keyframe - previous, camera]) if keyframe >= previous else 0)
+            else:
+                earlier = numbers[max(keyframe - only_near, 0) : max(keyframe - previous, 0)].ravel()
             distance = np.linalg.norm(positions[earlier] - positions[j], axis=1)
             near = (distance < np.maximum(reach_m[earlier], reach_m[j])) & (
                 axes[earlier] @ axes[j] > np.cos(np.radians(_MAX_VIEW_ANGLE_DEG))
             )
             closest = earlier[near][np.argsort(distance[near], kind="stable")][:_NEAR_CANDIDATES]
-            cam_j_from_map = se3_inverse(map_from_cam[j])
+            cam_j_from_map = se3_inverse(self._map_from_cam[j])
             overlap = [
-                (view_overlap(self._keyframes[i], self._camera, cam_j_from_map @ map_from_cam[i]), int(i))
-                for i in closest
+                (view_overlap(self._posed.images[i], self._posed.rig.camera, cam_j_from_map @ self._map_from_cam[i]), i)
+                for i in closest.tolist()
             ]
             best = sorted(overlap, reverse=True)[: settings.covisible]
-            chosen |= {i for share, i in best if share > settings.min_overlap}
+            chosen = {*last.tolist(), *(i for share, i in best if share > settings.min_overlap)}
             found.extend((i, j) for i in sorted(chosen))
         return found
 
     def match(
         self,
         candidates: list[tuple[int, int]],
-        map_from_body: Array,
         allowed_m: Callable[[int, int], float],
         *,
         rotation_sigma_rad: float | None,
         is_known: bool = True,
         progress: Callable[[int], None],
     ) -> list[PairMatch]:
-        """Return verified matches whose measured motion agrees with the predicted one to within allowed_m(i, j)."""
-        map_from_cam = map_from_body @ self._body_from_cam
+        """Return verified matches whose measured motion agrees with the predicted one to within allowed_m of their keyframes."""
         predictions: list[_Prediction] = []
         for i, j in candidates:
-            j_from_i = se3_inverse(map_from_cam[j]) @ map_from_cam[i]
+            j_from_i = se3_inverse(self._map_from_cam[j]) @ self._map_from_cam[i]
             predictions.append((i, j, PredictedMotion(j_from_i, rotation_sigma_rad, is_known)))
         matches, number = [], 0
         batches: list[list[_Prediction]] = in_batches(predictions, _BATCH)
         tasks = (PairTask.of(batch, self._inputs) for batch in batches)
         for batch, found in zip(batches, self._executor.map(match_task, self._shared, tasks), strict=True):
             for (i, j, predicted), match in zip(batch, found, strict=True):
-                if match is not None and _agrees(match.j_from_i, predicted.j_from_i, allowed_m(i, j)):
-                    matches.append(match)
+                if match is not None:
+                    most_m = allowed_m(int(self._keyframe[i]), int(self._keyframe[j]))
+                    if _agrees(match.j_from_i, predicted.j_from_i, most_m):
+                        matches.append(match)
                 progress(number)
                 number += 1
         return matches

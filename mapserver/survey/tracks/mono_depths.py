@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from fleetmap.features.matching import match_mutual
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.odometry.mono.two_view import triangulate_pair
-from fleetmap.sensors.rectification import Rectifier, StereoCamera
-from mapserver.survey.keyframes.rig_views import body_from_views, other_views
+from fleetmap.sensors.rectification import StereoCamera
+from mapserver.survey.rig import CameraKind, Rig
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import Keyframe, OdometryPass, SurveyState
+from mapserver.survey.state import Keyframe, OdometryPass
 
 
 class MonoDepths:
@@ -37,9 +37,11 @@ class MonoDepths:
         """Release a keyframe's pictures."""
         self._keyframes[k] = self._keyframes[k].without_pictures()
 
-    def keyframes_at(self, map_from_body: Array, body_from_cam: Array, first: int = 0) -> list[Keyframe]:
-        """Return the keyframes from `first` on with disparities and points of features on which several agree, the others without."""
-        map_from_cam = map_from_body @ body_from_cam
+    def keyframes_at(self, map_from_cam: Array, first: int = 0) -> list[Keyframe]:
+        """Return the keyframes from `first` on with disparities and points of features on which several agree, the others without.
+
+        map_from_cam (K, 4, 4).
+        """
         found: list[list[Array]] = [[] for _ in self._keyframes]  # rows of feature, inverse depth, its sigma
         for j in range(first, len(self._keyframes)):
             for i in range(max(first, j - self._settings.monocular.depth_views), j):
@@ -77,29 +79,28 @@ class MonoDepths:
         return replace(keyframe, disparities=disparities, points_cam=points, from_views=True)
 
 
-def with_single_views(
-    odometry: OdometryPass, state: SurveyState, rectifier: Rectifier, settings: SurveySettings
+def with_single_cameras(
+    odometry: OdometryPass, map_from_body: Array, rig: Rig, settings: SurveySettings
 ) -> OdometryPass:
-    """Return the keyframes with depths in those of a rig's other views that are single cameras, by the poses of `state`."""
+    """Return the keyframes, at map_from_body (K, 4, 4), with depths in the images of a rig's single cameras beside the first one."""
     keyframes = odometry.keyframes
-    body_from_view = body_from_views(rectifier)[1:]
-    for k, (_, camera) in enumerate(other_views(rectifier)):
-        if camera.baseline_m > 0:
+    for n, kind in enumerate(rig.kinds[1:]):
+        if kind is not CameraKind.SINGLE:
             continue
-        depths = MonoDepths([keyframe.others[k] for keyframe in keyframes], state.camera, settings)
-        seen = depths.keyframes_at(state.map_from_body @ body_from_view[k], state.body_from_cam)
+        depths = MonoDepths([keyframe.others[n] for keyframe in keyframes], rig.camera, settings)
+        seen = depths.keyframes_at(map_from_body @ rig.body_from_cam[1:][n])
         keyframes = [
-            replace(keyframe, others=(*keyframe.others[:k], view, *keyframe.others[k + 1 :]))
-            for keyframe, view in zip(keyframes, seen, strict=True)
+            replace(keyframe, others=(*keyframe.others[:n], image, *keyframe.others[n + 1 :]))
+            for keyframe, image in zip(keyframes, seen, strict=True)
         ]
     return odometry if keyframes is odometry.keyframes else replace(odometry, keyframes=keyframes)
 
 
 def fuse_inverse_depths(rows: Array, count: int, max_sigma_share: float) -> Array:
-    """Return (count, 2) inverse depth and sigma of each feature; NaN if too uncertain or if the views disagree.
+    """Return (count, 2) inverse depth and sigma of each feature; NaN if too uncertain or if the keyframes disagree.
 
-    rows (P, 3): feature, inverse depth, sigma. Views within three sigmas of the most accurate view are averaged with it, and a
-    feature with more contradicting than supporting views is dropped.
+    rows (P, 3): feature, inverse depth, sigma. Values within three sigmas of the most accurate one are averaged with it, and a
+    feature with more contradicting than supporting values is dropped.
     """
     out = np.full((count, 2), np.nan)
     order = np.lexsort((rows[:, 2], rows[:, 0]))

@@ -1,4 +1,4 @@
-"""Landmarks from verified pairs: feature tracks across keyframes, one feature per keyframe, with sub-pixel coordinates."""
+"""Landmarks from verified pairs: feature tracks across keyframes, one feature per image, with sub-pixel coordinates."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -11,45 +11,50 @@ from fleetmap.features import patch_align
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import Keyframe, Landmarks, PosedKeyframes, of_features
+from mapserver.survey.state import Indices, Keyframe, Landmarks, RigImages, of_features
 from mapserver.survey.tracks.pairs import PairMatch
 
 # Of an image: its pyramid, pixels (M, 2), octaves (M,) and angles (M,) of features, and which of them are chosen (N,).
 _PatchFeatures = tuple[patch_align.Pyramid, Array, NDArray[np.int8], NDArray[np.float32], NDArray[np.int64]]
 _SAME_WARP = 0.01  # isotropic change of a patch's shape that moves its rim by less than 0.05 px
 _ROWS = 2**18  # observations per comparison of warps
-_BATCH = 16  # keyframes: their sources overlap, so that few pictures are sent twice
+_BATCH = 16  # images: their sources overlap, so that few pictures are sent twice
 
 
 @dataclass(frozen=True, slots=True)
 class Tracks:
-    """Features connected by pairs: members (M,) of G concatenated tracks, by ascending keyframe; starts (G,) of each."""
+    """Features connected by pairs: members (M,) of G concatenated tracks, by ascending image; starts (G,) of each."""
 
-    keyframes: NDArray[np.int64]
-    features: NDArray[np.int64]
-    starts: NDArray[np.int64]
+    images: Indices
+    features: Indices
+    starts: Indices
 
     @classmethod
-    def of(cls, marks: Landmarks) -> "Tracks":
-        """Return the observations of landmarks, each one's reference first."""
+    def of(cls, marks: Landmarks, numbers: Indices) -> "Tracks":
+        """Return the observations of landmarks, each one's reference first; numbers (K, V) of the images."""
         starts = np.flatnonzero(np.diff(marks.obs_landmark, prepend=-1))
-        return cls(marks.obs_keyframe.astype(np.int64), marks.obs_feature, starts)
+        return cls(numbers[marks.obs_keyframe, marks.obs_camera], marks.obs_feature.astype(np.int64), starts)
+
+    @classmethod
+    def none(cls) -> "Tracks":
+        """Return no tracks."""
+        return cls(*np.zeros((3, 0), np.int64))
 
 
 def tracks_of(pairs: list[PairMatch], known: Tracks | None = None) -> Tracks:
-    """Group features connected by pairs, no keyframe twice in a group; pairs with the most matches are joined first.
+    """Group features connected by pairs, no image twice in a group; pairs with the most matches are joined first.
 
     known: groups joined before any pair.
     Source: union-find, Tarjan 1975; tracks over unordered pairs, Moulon and Monasse 2012.
     """
     ordered = sorted(pairs, key=lambda p: (-len(p.features), p.i, p.j))
-    known = Tracks.of(Landmarks.empty()) if known is None else known
+    known = known or Tracks.none()
     if not ordered and not len(known.starts):
         return known
-    # Keyframes have far fewer features than pairs have matches: each feature is a node, and links stay small.
+    # Images have far fewer features than pairs have matches: each feature is a node, and links stay small.
     stride = 1 + max([int(known.features.max(initial=0)), *(int(p.features.max(initial=0)) for p in ordered)])
-    count = 1 + max([int(known.keyframes.max(initial=0)), *(p.j for p in ordered)])
-    linked = (known.keyframes * stride + known.features).astype(np.int32)
+    count = 1 + max([int(known.images.max(initial=0)), *(p.j for p in ordered)])
+    linked = (known.images * stride + known.features).astype(np.int32)
     follows = np.setdiff1d(np.arange(len(linked)), known.starts, assume_unique=True)
     first = [linked[follows - 1], *((p.i * stride + p.features[:, 0]).astype(np.int32) for p in ordered)]
     second = [linked[follows], *((p.j * stride + p.features[:, 1]).astype(np.int32) for p in ordered)]
@@ -62,7 +67,7 @@ def tracks_of(pairs: list[PairMatch], known: Tracks | None = None) -> Tracks:
 
 
 def build_landmarks(
-    posed: PosedKeyframes,
+    posed: RigImages,
     tracks: Tracks,
     settings: SurveySettings,
     executor: Executor = SERIAL,
@@ -70,33 +75,35 @@ def build_landmarks(
 ) -> Landmarks:
     """Return landmarks of tracks with a stereo point, each observation's coordinate refined against the reference patch.
 
-    Tracks seen by fewer than two keyframes that are not redundant (K,) give no landmark.
+    Tracks in fewer than two images of keyframes that are not redundant (K,) give no landmark.
     """
-    redundant = np.zeros(len(posed.keyframes), bool) if redundant is None else redundant
-    table, points_cam = _tracks_from_reference(posed.keyframes, tracks, redundant)
+    is_redundant = np.zeros(len(tracks.images), bool) if redundant is None else redundant[posed.keyframe][tracks.images]
+    table, points_cam = _tracks_from_reference(posed.images, tracks, is_redundant)
     if not len(table):
         return Landmarks.empty()
     reference = posed.map_from_cam[table[_is_first(table), 0]]
     points_map = np.einsum("nij,nj->ni", reference[:, :3, :3], points_cam) + reference[:, :3, 3]
     pixels, sigmas = _observe(posed, table, points_map, settings, executor)
-    keyframes, landmarks = table[:, :2].astype(np.int32).T.copy()
-    return Landmarks(points_map, keyframes, landmarks, table[:, 2], pixels, sigmas)
+    columns = posed.keyframe[table[:, 0]], posed.camera[table[:, 0]], table[:, 1], table[:, 2]
+    keyframes, cameras, landmarks, features = (column.astype(np.int32) for column in columns)
+    return Landmarks(points_map, keyframes, cameras, landmarks, features, pixels, sigmas)
 
 
 def refine_observations(
-    posed: PosedKeyframes, marks: Landmarks, settings: SurveySettings, executor: Executor, before: Array
+    posed: RigImages, marks: Landmarks, settings: SurveySettings, executor: Executor, before: Array
 ) -> Landmarks:
     """Return the same landmarks with coordinates refined again where better poses improve the warp of patches.
 
-    before: map_from_cam (K, 4, 4) at which they were observed.
+    before: map_from_cam (P, 4, 4) at which they were observed.
     """
-    table = np.column_stack([marks.obs_keyframe, marks.obs_landmark, marks.obs_feature]).astype(np.int64)
+    images, map_from_cam = posed.numbers[marks.obs_keyframe, marks.obs_camera], posed.map_from_cam
+    table = np.column_stack([images, marks.obs_landmark, marks.obs_feature])
     anew = np.zeros(len(marks.points_map), bool)
     reference = table[np.maximum.accumulate(np.where(_is_first(table), np.arange(len(table)), 0)), 0]
     for start in range(0, len(table), _ROWS):  # rotations of a site's observations would be gigabytes
         part = slice(start, start + _ROWS)
         points, seen = marks.points_map[table[part, 1]], (table[part, 0], reference[part])
-        now, then = _warps(seen, points, posed.map_from_cam), _warps(seen, points, before)
+        now, then = _warps(seen, points, map_from_cam), _warps(seen, points, before)
         changed = np.abs(now[0] - then[0]).max(axis=(1, 2)) + np.abs(now[1] - then[1]) > _SAME_WARP
         anew[table[part, 1][changed]] = True
     rows = np.flatnonzero(anew[table[:, 1]])
@@ -111,7 +118,7 @@ def _warps(
 ) -> tuple[Array, Array]:
     """Return rotation (M, 3, 3) from each observation's reference, and the logarithm (M,) of the ratio of their distances.
 
-    seen: the keyframe (M,) of each observation and that of its reference. points_map (M, 3) of their landmarks.
+    seen: the image (M,) of each observation and that of its reference. points_map (M, 3) of their landmarks.
     """
     own, reference = seen
     cam_from_map = se3_inverse(map_from_cam)
@@ -126,18 +133,18 @@ def _is_first(table: NDArray[np.int64]) -> NDArray[np.bool_]:
 
 
 def _tracks_from_reference(
-    keyframes: list[Keyframe], tracks: Tracks, redundant: NDArray[np.bool_]
+    images: list[Keyframe], tracks: Tracks, is_redundant: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], Array]:
-    """Return (M, 3) keyframe, landmark, feature of the tracks with depth, each one's reference first; its points_cam (N, 3).
+    """Return (M, 3) image, landmark, feature of the tracks with depth, each one's reference first; its points_cam (N, 3).
 
-    The reference defines the landmark's patch: with depth, not redundant, finest octave, nearest.
+    The reference defines the landmark's patch: with depth, not redundant (M,), finest octave, nearest.
     """
-    if not len(tracks.keyframes):
+    if not len(tracks.images):
         return np.zeros((0, 3), np.int64), np.zeros((0, 3))
-    owners, features = tracks.keyframes, tracks.features
-    octaves = of_features(owners, features, [k.features.octaves for k in keyframes])
-    disparities = of_features(owners, features, [k.disparities[:, 0] for k in keyframes])
-    members, is_redundant = np.arange(len(owners)), redundant[owners]
+    owners, features = tracks.images, tracks.features
+    octaves = of_features(owners, features, [k.features.octaves for k in images])
+    disparities = of_features(owners, features, [k.disparities[:, 0] for k in images])
+    members = np.arange(len(owners))
     track = np.repeat(np.arange(len(tracks.starts)), np.diff(tracks.starts, append=len(owners)))
     best = np.lexsort((members, -disparities, octaves, is_redundant, ~np.isfinite(disparities), track))[tracks.starts]
     lasting = (
@@ -151,25 +158,25 @@ def _tracks_from_reference(
     order = order[lasting[track[order]]]
     landmark = (np.cumsum(lasting) - 1)[track]
     table, best = np.column_stack([owners, landmark, features])[order], best[lasting]
-    return table, of_features(owners[best], features[best], [k.points_cam for k in keyframes])
+    return table, of_features(owners[best], features[best], [k.points_cam for k in images])
 
 
 def _observe(
-    posed: PosedKeyframes, table: NDArray[np.int64], points_map: Array, settings: SurveySettings, executor: Executor
+    posed: RigImages, table: NDArray[np.int64], points_map: Array, settings: SurveySettings, executor: Executor
 ) -> tuple[Array, Array]:
-    """Return pixels (M, 3) and sigmas (M, 2) of observations (keyframe, landmark, feature), references first in each landmark."""
-    keyframes, map_from_cam, is_reference = posed.keyframes, posed.map_from_cam, _is_first(table)
+    """Return pixels (M, 3) and sigmas (M, 2) of observations (image, landmark, feature), references first in each landmark."""
+    images, map_from_cam, is_reference = posed.images, posed.map_from_cam, _is_first(table)
     reference_row = np.maximum.accumulate(np.where(is_reference, np.arange(len(table)), 0))
     groups = in_batches(np.unique(table[:, 0]).tolist(), _BATCH)
-    by_keyframe = np.argsort(table[:, 0], kind="stable")
-    firsts = np.searchsorted(table[by_keyframe, 0], [group[0] for group in groups])
-    rows_of = [np.sort(rows) for rows in np.split(by_keyframe, firsts[1:])]
+    by_image = np.argsort(table[:, 0], kind="stable")
+    firsts = np.searchsorted(table[by_image, 0], [group[0] for group in groups])
+    rows_of = [np.sort(rows) for rows in np.split(by_image, firsts[1:])]
 
     def batches() -> Iterator[_ObservationBatch]:
         for group, rows in zip(groups, rows_of, strict=True):
             references = table[reference_row[rows]]
             sources = np.unique(references[:, 0]).tolist()
-            known = {k: keyframes[k].with_pyramid() for k in sorted({*group, *sources})}
+            known = {k: images[k].with_pyramid() for k in sorted({*group, *sources})}
             at = {k: map_from_cam[k] for k in known}
             yield _ObservationBatch(table[rows], references, is_reference[rows], points_map[table[rows, 1]], known, at)
 
@@ -182,25 +189,25 @@ def _observe(
 
 @dataclass(frozen=True, slots=True)
 class _ObservationBatch:
-    """Observations (M, 3) of some keyframes, their references (M, 3), a mask of the references among them, their landmarks,
-    and the required keyframes and poses."""
+    """Observations (M, 3) in some images, their references (M, 3), a mask of the references among them, their landmarks,
+    and the required images and poses."""
 
     table: NDArray[np.int64]
     references: NDArray[np.int64]
     is_reference: NDArray[np.bool_]
     points_map: Array
-    keyframes: dict[int, Keyframe]
+    images: dict[int, Keyframe]
     map_from_cam: dict[int, Array]
 
 
 def _observe_batch(settings: SurveySettings, batch: _ObservationBatch) -> tuple[Array, Array]:
     """Return pixels (M, 3) and sigmas (M, 2) of one batch."""
-    noise, align, keyframes = settings.noise, settings.align, batch.keyframes
+    noise, align, images = settings.noise, settings.align, batch.images
     limits = align.half_window_px, align.max_shift_px, align.min_correlation
     pixels, sigmas = np.empty((len(batch.table), 3)), np.empty((len(batch.table), 2))
     for k in np.unique(batch.table[:, 0]).tolist():
         rows = np.flatnonzero(batch.table[:, 0] == k)
-        own = keyframes[k]
+        own = images[k]
         features, references, is_reference = batch.table[rows, 2], batch.references[rows], batch.is_reference[rows]
         points_map = batch.points_map[rows]
         left, sigma = (
@@ -215,7 +222,7 @@ def _observe_batch(settings: SurveySettings, batch: _ObservationBatch) -> tuple[
         for source, inner in zip(sources.tolist(), np.split(others, starts)[1:], strict=True):
             cam_from_source = cam_from_map @ batch.map_from_cam[source]
             points_source = transform_points(se3_inverse(batch.map_from_cam[source]), points_map[inner])
-            theirs = _patch_features(keyframes[source], references[inner, 2])
+            theirs = _patch_features(images[source], references[inner, 2])
             ours = _patch_features(own, features[inner])
             refined = core.align_observations(theirs, ours, points_source, cam_from_source, *limits)
             sure = np.isfinite(refined[:, 0])

@@ -13,6 +13,7 @@ template <int64_t... kShape>
 using Reals = Array<double, kShape...>;
 template <int64_t... kShape>
 using Indices = Array<int64_t, kShape...>;
+using Numbers = Array<int32_t, -1>;
 
 void check(bool holds, const char* message) {
   if (!holds) throw nb::value_error(message);
@@ -82,7 +83,7 @@ ImageRows rows_at(const nb::callable& said, const BundleState& state, bool deriv
 
 void make(BundleSolver* self, const Reals<4>& lens, const Reals<-1, 4, 4>& body_from_cams, const Reals<-1, 4, 4>& map_from_body,
           const Reals<-1, -1>& motions, const Reals<-1, 3>& points_map, const Array<bool, -1, -1>& free, bool points_held,
-          const Indices<-1>& obs_keyframe, const Indices<-1>& obs_landmark, const Reals<-1, 3>& obs_pixels,
+          const Numbers& obs_keyframe, const Numbers& obs_camera, const Numbers& obs_landmark, const Reals<-1, 3>& obs_pixels,
           const Reals<-1, 2>& obs_sigma_px, const Indices<-1, 2>& relative_ends, const Reals<-1, 4, 4>& i_from_j,
           const Reals<-1, 6, 6>& relative_information, const Indices<-1>& prior_keyframe, const Reals<-1, 4, 4>& prior_map_from_body,
           const Reals<-1, 6, 6>& prior_information, const Indices<-1, 2>& edge_ends, const Reals<-1, 67>& increments,
@@ -107,8 +108,8 @@ void make(BundleSolver* self, const Reals<4>& lens, const Reals<-1, 4, 4>& body_
   check(cameras > 0, "body_from_cams: at least one camera");
   check(keyframes * std::max<size_t>(15, cameras) < kMost && landmarks < kMost && observations < kMost,
         "points_map, obs_keyframe: fewer than 2^31");
-  check(obs_landmark.shape(0) == observations && obs_pixels.shape(0) == observations && obs_sigma_px.shape(0) == observations,
-        "obs_landmark, obs_pixels, obs_sigma_px: one for each of obs_keyframe");
+  for (const size_t count : {obs_camera.shape(0), obs_landmark.shape(0), obs_pixels.shape(0), obs_sigma_px.shape(0)})
+    check(count == observations, "obs_camera, obs_landmark, obs_pixels, obs_sigma_px: one for each of obs_keyframe");
   check(i_from_j.shape(0) == relative_ends.shape(0) && relative_information.shape(0) == relative_ends.shape(0),
         "i_from_j, relative_information: one for each of relative_ends");
   check(prior_map_from_body.shape(0) == prior_keyframe.shape(0) && prior_information.shape(0) == prior_keyframe.shape(0),
@@ -116,7 +117,8 @@ void make(BundleSolver* self, const Reals<4>& lens, const Reals<-1, 4, 4>& body_
   check(increments.shape(0) == edge_ends.shape(0) && edge_information.shape(0) == edge_ends.shape(0),
         "increments, edge_information: one for each of edge_ends");
   check(inertial || edge_ends.size() == 0, "edge_ends: of keyframes with motion");
-  check_below(obs_keyframe, keyframes * cameras, "obs_keyframe: keyframes, camera by camera");
+  check_below(obs_keyframe, keyframes, "obs_keyframe: keyframes");
+  check_below(obs_camera, cameras, "obs_camera: cameras");
   check_below(obs_landmark, landmarks, "obs_landmark: landmarks");
   check_below(relative_ends, keyframes, "relative_ends: keyframes");
   check_below(prior_keyframe, keyframes, "prior_keyframe: keyframes");
@@ -128,13 +130,10 @@ void make(BundleSolver* self, const Reals<4>& lens, const Reals<-1, 4, 4>& body_
   problem.unknowns = int(free.shape(1));
   problem.free.assign(free.data(), free.data() + free.size());
   problem.points_held = points_held;
+  problem.observations.reserve(observations);
   for (size_t n = 0; n < observations; ++n) {
-    const size_t view = size_t(obs_keyframe(n));
-    problem.observations.push_back({int32_t(view / cameras),
-                                    int32_t(view % cameras),
-                                    int32_t(obs_landmark(n)),
-                                    vec3(&obs_pixels(n, 0)),
-                                    {obs_sigma_px(n, 0), obs_sigma_px(n, 1)}});
+    const Vec3 pixels = vec3(&obs_pixels(n, 0));
+    problem.observations.push_back({obs_keyframe(n), obs_camera(n), obs_landmark(n), pixels, {obs_sigma_px(n, 0), obs_sigma_px(n, 1)}});
   }
   for (size_t n = 0; n < prior_keyframe.shape(0); ++n)
     problem.priors.push_back({int32_t(prior_keyframe(n)), se3(&prior_map_from_body(n, 0, 0)), copied(&prior_information(n, 0, 0), 36)});
@@ -229,12 +228,12 @@ void bind_bundle(nb::module_& module) {
   const auto damping = "damping"_a;
   nb::class_<BundleSolver>(module, "BundleSolver")
       .def("__init__", &make, "lens"_a.noconvert(), "body_from_cams"_a.noconvert(), "map_from_body"_a.noconvert(), "motions"_a.noconvert(),
-           "points_map"_a.noconvert(), "free"_a.noconvert(), "points_held"_a, "obs_keyframe"_a.noconvert(), "obs_landmark"_a.noconvert(),
-           "obs_pixels"_a.noconvert(), "obs_sigma_px"_a.noconvert(), "relative_ends"_a.noconvert(), "i_from_j"_a.noconvert(),
-           "relative_information"_a.noconvert(), "prior_keyframe"_a.noconvert(), "prior_map_from_body"_a.noconvert(),
-           "prior_information"_a.noconvert(), "edge_ends"_a.noconvert(), "increments"_a.noconvert(), "edge_information"_a.noconvert(),
-           "motion_mean"_a.noconvert(), "motion_weight"_a.noconvert(), "gravity"_a.noconvert(), "huber"_a, "cutoff"_a,
-           "calibration"_a = nb::none())
+           "points_map"_a.noconvert(), "free"_a.noconvert(), "points_held"_a, "obs_keyframe"_a.noconvert(), "obs_camera"_a.noconvert(),
+           "obs_landmark"_a.noconvert(), "obs_pixels"_a.noconvert(), "obs_sigma_px"_a.noconvert(), "relative_ends"_a.noconvert(),
+           "i_from_j"_a.noconvert(), "relative_information"_a.noconvert(), "prior_keyframe"_a.noconvert(),
+           "prior_map_from_body"_a.noconvert(), "prior_information"_a.noconvert(), "edge_ends"_a.noconvert(), "increments"_a.noconvert(),
+           "edge_information"_a.noconvert(), "motion_mean"_a.noconvert(), "motion_weight"_a.noconvert(), "gravity"_a.noconvert(), "huber"_a,
+           "cutoff"_a, "calibration"_a = nb::none())
       .def_prop_ro("unknowns", &BundleSolver::unknowns)
       .def("nodes", &nodes_of)
       .def("factorise_sparsely", &factorise_sparsely, "order"_a.noconvert())

@@ -28,7 +28,7 @@ from mapserver.survey.executor import Executor
 from mapserver.survey.keyframes.keyframes import set_aside
 from mapserver.survey.odometry_pass import OdometryRun, SampleFeed
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import FrameTracks, ImageStore, Keyframe, OdometryPass, Pictures, PosedKeyframes
+from mapserver.survey.state import FrameTracks, ImageStore, Keyframe, OdometryPass, Pictures, RigImages
 from mapserver.survey.survey_inputs import SurveyInputs
 from mapserver.survey.tracks import tracks
 from support.estimator.simulated_run import EstimatorSession
@@ -39,7 +39,6 @@ _ALIGNED_PX, _DISPARITY_PX = (
 )  # errors of aligned coordinates and of disparities, as rendered pictures show them
 _SIZE_PX = (480, 640)
 _TURNING_M = 4.0
-_MOST_VIEWS = 9
 _EVER_NS = -(2**62)
 
 
@@ -197,10 +196,11 @@ def _keyframe(
 @contextmanager
 def drawn_alignment(survey: SimulatedSurvey) -> Iterator[None]:
     """Alignment's results are drawn while this holds; equal arguments give equal results."""
-    number = {id(keyframe.features): k for k, keyframe in enumerate(survey.odometry.views(_MOST_VIEWS))}
+    every = (image for keyframe in survey.odometry.keyframes for image in (keyframe, *keyframe.others))
+    number = {id(image.features): n for n, image in enumerate(every)}
 
     def observe(
-        posed: PosedKeyframes, table: NDArray[np.int64], points_map: Array, settings: SurveySettings, executor: Executor
+        posed: RigImages, table: NDArray[np.int64], points_map: Array, settings: SurveySettings, executor: Executor
     ) -> tuple[Array, Array]:
         """As `tracks._observe`."""
         noise = settings.noise
@@ -209,8 +209,8 @@ def drawn_alignment(survey: SimulatedSurvey) -> Iterator[None]:
         shown, octaves = np.zeros(len(table), np.uint64), np.zeros(len(table), np.int8)
         pixels, own = np.empty((len(table), 3)), np.empty((len(table), 3))
         order = np.argsort(table[:, 0], kind="stable")
-        ends = np.cumsum(np.bincount(table[:, 0], minlength=len(posed.keyframes)))
-        for keyframe, rows in zip(posed.keyframes, np.split(order, ends[:-1]), strict=True):
+        ends = np.cumsum(np.bincount(table[:, 0], minlength=len(posed.images)))
+        for keyframe, rows in zip(posed.images, np.split(order, ends[:-1]), strict=True):
             k, features = number[id(keyframe.features)], table[rows, 2]
             shown[rows], octaves[rows] = survey.landmarks[k][features], keyframe.features.octaves[features]
             drawn = np.random.default_rng([7, k]).standard_normal((len(keyframe.features), 3), np.float32)[features]

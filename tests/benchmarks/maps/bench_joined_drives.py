@@ -166,7 +166,7 @@ def main() -> None:
         surveys = list[Surveyed]()
         parts = [(recorded(given.seed, n, given.work), "::") for n in range(DRIVES)] if name == "drives" else []
         for path, frames in parts or [(DATA / name, f"{half}::2") for half in range(2)]:
-            surveys.append(surveyed(path, frames, surveys[0].survey.state.camera if surveys else None))
+            surveys.append(surveyed(path, frames, surveys[0].survey.state.rig.camera if surveys else None))
         figures[name] = joined(surveys)
     write_results(given.out, figures)
 

@@ -20,7 +20,7 @@ from mapserver.drafting.draft_evidence import JudgedSession, ProbedFrame
 from mapserver.drafting.survey_recordings import OpenRecordings, RecordingOptions, _admission
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.keyframes.keyframes import make_keyframes
-from mapserver.survey.keyframes.rig_views import body_from_views, depth_views, other_views
+from mapserver.survey.rig import CameraKind, rig_of, used_cameras
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyTools
 from support.recordings.rig_samples import images_of, simulated, write_rig
@@ -64,19 +64,18 @@ def test_a_keyframe_has_the_views_of_its_pinhole() -> None:
     calibration, frames = simulated("front-rear", SIZE_PX)
     rectifier = Rectifier(calibration)
     frame = rectifier.rectify(frames[0])
-    others = other_views(rectifier)
-    assert [number for number, _ in others] == [1] and body_from_views(rectifier).shape == (2, 4, 4)
+    cameras = used_cameras(rectifier)
+    assert [number for number, _ in cameras] == [0, 1] and rig_of(rectifier).body_from_cam.shape == (2, 4, 4)
     sides = replace(calibration, cameras=(*calibration.cameras[:2], calibration.cameras[2]))
-    assert [camera.baseline_m for _, camera in other_views(Rectifier(sides))] == [0.0]
     single = Rectifier(sides)
-    (seen,) = next(
-        make_keyframes([(0, single.rectify(frames[0]))], single.camera, SurveySettings(), others=other_views(single))
-    ).others
+    assert rig_of(single).kinds == (CameraKind.STEREO, CameraKind.SINGLE)
+    rows = [(0, single.rectify(frames[0]))]
+    (seen,) = next(make_keyframes(rows, used_cameras(single), SurveySettings())).others
     assert len(seen.features) > 0 and np.isnan(seen.disparities).all()
     one = replace(calibration, cameras=calibration.cameras[1:])
-    assert other_views(Rectifier(one)) == []
+    assert len(used_cameras(Rectifier(one))) == 1
     rows = [(0, frame), *((n, replace(frame, others=(None,))) for n in (1, 2))]
-    first, alone, again = make_keyframes(rows, rectifier.camera, SurveySettings(), others=others)
+    first, alone, again = make_keyframes(rows, cameras, SurveySettings())
     assert alone.others[0].image_number == again.others[0].image_number, "one picture of nothing is enough"
     assert alone.image_number != again.image_number and alone.others[0].stamp_ns == frame.stamp_ns
     assert [len(view.features) > 0 for view in first.others] == [True]
@@ -88,12 +87,10 @@ def test_a_shorter_baseline_of_another_view_is_converted_to_the_first_one() -> N
     """What the view measures is as far away as before."""
     calibration, frames = simulated("front-rear", SIZE_PX)
     rectifier = Rectifier(calibration)
-    frame, others = rectifier.rectify(frames[0]), other_views(rectifier)
-    short = [(number, replace(camera, baseline_m=camera.baseline_m / 2)) for number, camera in others]
-    (same,), (nearer,) = (
-        next(make_keyframes([(0, frame)], rectifier.camera, SurveySettings(), others=how)).others
-        for how in (others, short)
-    )
+    frame, cameras = rectifier.rectify(frames[0]), used_cameras(rectifier)
+    first, (number, rear) = cameras
+    short = [first, (number, replace(rear, baseline_m=rear.baseline_m / 2))]
+    (same,), (nearer,) = (next(make_keyframes([(0, frame)], how, SurveySettings())).others for how in (cameras, short))
     known = np.isfinite(same.points_cam).all(axis=1) & np.isfinite(nearer.points_cam).all(axis=1)
     np.testing.assert_allclose(nearer.points_cam[known], same.points_cam[known] / 2, rtol=1e-9)
 
@@ -102,9 +99,9 @@ def test_depth_of_another_view_is_read_as_disparities_of_the_first_baseline() ->
     """As far away as the sensor says, with the sensor's noise; also where an adjustment reads its picture again."""
     calibration, frames = simulated("front-depth", SIZE_PX)
     rectifier, settings = Rectifier(calibration), SurveySettings()
-    assert depth_views(rectifier) == {1}
+    assert rig_of(rectifier).kinds == (CameraKind.STEREO, CameraKind.DEPTH)
     rows = [(0, rectifier.rectify(frames[0]))]
-    (rear,) = next(make_keyframes(rows, rectifier.camera, settings, others=other_views(rectifier))).others
+    (rear,) = next(make_keyframes(rows, used_cameras(rectifier), settings)).others
     seen = np.flatnonzero(np.isfinite(rear.disparities[:, 0]))
     pixels = rear.features.pixels[seen]
     columns, lines = np.rint(pixels).astype(int).T

@@ -14,7 +14,7 @@ from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.errors import RecordingError, SurveyError
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings import image_series as series
-from fleetmap.sensors.rectification import Rectifier, StereoCamera
+from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import SensorSet
 from mapserver.drafting import mapped_images, survey_recordings
 from mapserver.drafting.admission import CheckedRecording
@@ -29,8 +29,11 @@ from mapserver.drafting.survey_recordings import (
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey import stages
 from mapserver.survey.bundle.stereo_yaw_check import StereoYaw
+from mapserver.survey.loops.loops import Loops
 from mapserver.survey.odometry_pass import parts_between_lifts
+from mapserver.survey.rig import Rig
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.state import Landmarks
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyTools
 from support.recordings.recording_samples import make_sample, write_mcap
 from support.worlds.pinhole_pair import CAMERA
@@ -140,24 +143,25 @@ def test_nobody_holds_what_was_begun_once_its_loops_are_closed(drive: Path, monk
 
     @dataclass
     class State:
-        camera: StereoCamera
-        landmarks: object = None
-        body_from_view: object = None
-        depth_views: object = None
+        rig: object
+        landmarks: Landmarks = Landmarks.empty()  # noqa: RUF009 -- it is not changed
+        map_from_body: object = None
+        stamps_ns: tuple[int, ...] = ()
 
     def adjust(*_: object) -> None:
         raise SurveyError("held" if begun() else "let go of")
 
     with open_recording(drive) as recording:
         rig, camera = recording.calibration, Rectifier(recording.calibration).camera
-    state: Any = State(camera)
+    single: Any = Rig.of_one(camera, np.eye(4))
+    state: Any = State(single)
     parts: Any = SimpleNamespace(keyframes=[], estimates=[]), state, set(), object()
     chain = AdjustedChain(*parts)
     admitted = [Admission(CheckedRecording(rig, [], RigEvidence("", [], {}, {}), {}), begun=chain)]
     begun = weakref.ref(state)
     del chain, parts, state
-    monkeypatch.setattr(stages, "close_loops", lambda *_: (State(camera), None))
-    monkeypatch.setattr(stages, "adjust_globally", adjust)
+    monkeypatch.setattr(stages, "close_loops", lambda *_: (State(single), Loops()))
+    monkeypatch.setattr(stages, "match_again", adjust)
     config = SurveyConfig(SurveySettings(), default_vocabulary())
     with pytest.raises(SurveyError, match="let go of"):
         survey_recording(drive, admitted.pop(), RecordingOptions(), None, config, SurveyTools())
@@ -166,7 +170,7 @@ def test_nobody_holds_what_was_begun_once_its_loops_are_closed(drive: Path, monk
 def test_the_turn_within_each_pair_of_a_rig_is_told_and_judged() -> None:
     """Robots measure depth with the same error by every view."""
     straight, turned = StereoYaw(0.01, 0.05, corrected=False), StereoYaw(-2.0, 0.05, corrected=True)
-    state: Any = SimpleNamespace(camera=CAMERA, priors=())
+    state: Any = SimpleNamespace(rig=Rig.of_one(CAMERA, np.eye(4)), priors=())
     for yaws, words in (
         ((straight, turned), "+2.00 px of view 1"),
         ((turned, turned), "+2.00 px and +2.00 px of view 1"),

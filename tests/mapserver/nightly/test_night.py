@@ -469,7 +469,7 @@ def test_a_fault_of_the_program_leaves_one_recording_out_of_a_build() -> None:
     def survey_one(path: Path, _: object) -> Any:
         if path.name == "fatal":
             raise ZeroDivisionError("division by zero")
-        return [SimpleNamespace(survey=SimpleNamespace(state=SimpleNamespace(camera=None)))]
+        return [SimpleNamespace(survey=SimpleNamespace(state=SimpleNamespace(rig=SimpleNamespace(camera=None))))]
 
     assert len(survey_all([Path("fatal"), Path("sound")], survey_one, None, unusable)) == 1
     assert "ZeroDivisionError: division by zero" in unusable[Path("fatal")]

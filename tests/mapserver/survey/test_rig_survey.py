@@ -91,11 +91,11 @@ def test_a_robot_against_the_survey_finds_itself_by_landmarks_of_the_rear_view(r
 @pytest.mark.parametrize("rig", ["front-rear", "front-depth"])
 def test_views_share_the_pose_of_their_keyframe(rig: str) -> None:
     made, done = surveyed(_ALONG, 2, rig)
-    assert done.state.depth_views == ({1} if rig == "front-depth" else set())
+    assert done.state.rig.kinds == ("stereo", "depth" if rig == "front-depth" else "stereo")
     places = done.map.map_from_body
-    rear = done.state.body_from_view[1]
+    front, rear = done.state.rig.body_from_cam
     assert len(places) == 2 * len(made.odometry.keyframes) == 2 * len(done.state.map_from_body)
-    np.testing.assert_allclose(places[1::2], places[0::2] @ rear, atol=1e-12)
+    np.testing.assert_allclose(places[1::2], places[0::2] @ rear @ se3_inverse(front), atol=1e-12)
     assert set(np.unique(done.map.obs_keyframe % 2)) == {0, 1}
     assert steps_off_m(made, done) <= steps_off_m(*surveyed(_ALONG, 1))
 

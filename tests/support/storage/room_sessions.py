@@ -14,6 +14,7 @@ from mapserver.drafting.extras import MappedSession
 from mapserver.plugins.dense_maps.surfel_map import SurfelTiles
 from mapserver.plugins.dense_maps.survey_grid import GridGrower, grow
 from mapserver.plugins.dense_maps.survey_surfels import SurfelGrower
+from mapserver.survey.rig import Rig
 from mapserver.survey.state import MemoryImageStore
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT, WIDTH
 from support.worlds.box_room import ROOM_M, depth_of, stereo_pair
@@ -39,7 +40,7 @@ def session_at(places: list[Array], camera: StereoCamera = CAMERA, *, has_depth:
         keyframes.append(Seen(RectifiedFrame(number, pair.left, right, disparity), number))
     survey = SimpleNamespace(
         odometry=SimpleNamespace(keyframes=keyframes),
-        state=SimpleNamespace(camera=camera, body_from_cam=BODY_FROM_CAM0),
+        state=SimpleNamespace(rig=Rig.of_one(camera, BODY_FROM_CAM0)),
         stereo_yaw=SimpleNamespace(correction_px=0.0),
     )
     return MappedSession("ride", survey, np.array(places))  # type: ignore[arg-type]

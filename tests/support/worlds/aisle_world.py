@@ -25,7 +25,7 @@ CAMERA = StereoCamera(400.0, 320.0, 240.0, 0.12, 640, 480)
 BODY_FROM_CAM = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
 SETTINGS = SurveySettings()
 STEP_M = 0.4
-_ONE_VIEW = np.eye(4)[None]
+_ONE = np.eye(4)[None]
 _STEP_COV = np.diag([0.003**2] * 3 + [0.015**2] * 3)
 
 
@@ -109,11 +109,12 @@ def membership(
     map_from_body: Array,
     docks_map_from_survey: Array | None,
     seed: int = 0,
-    body_from_views: Array = _ONE_VIEW,
+    body_from_others: Array = _ONE,
 ) -> MembershipTest:
     """The test of a session along these places in an aisle; its own frame begins at its first keyframe, and drifts.
 
-    seen: what each place shows, where it is not the same from all. body_from_views (V, 4, 4): of the rig.
+    seen: what each place shows, where it is not the same from all. body_from_others (V, 4, 4): bodies whose first
+    camera would see what the rig's cameras see.
     """
     rng = np.random.default_rng([7, seed])
     survey_from_body, chain = [np.eye(4)], []
@@ -124,10 +125,9 @@ def membership(
         chain.append(PoseEdge(k, k + 1, step, _STEP_COV, is_loop=False))
     shown = repeat(seen) if isinstance(seen, Aisle) else seen
     frames = [
-        frame(one, place @ body_from_view, rng)
+        [frame(one, place @ body_from_other, rng) for body_from_other in body_from_others]
         for one, place in zip(shown, map_from_body, strict=False)
-        for body_from_view in body_from_views
     ]
-    cameras = CAMERA, body_from_views @ BODY_FROM_CAM
+    cameras = CAMERA, body_from_others @ BODY_FROM_CAM
     visit = SessionKeyframes(frames, np.stack(survey_from_body), chain, *cameras, docks_map_from_survey)
     return MembershipTest(*known, visit, SETTINGS.sessions)

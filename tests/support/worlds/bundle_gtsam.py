@@ -9,10 +9,10 @@ from mapserver.survey.bundle.problem import BundleProblem
 def gtsam_graph(problem: BundleProblem, huber: float) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     """The same residuals, noise and Huber width, and the problem's values."""
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    focal, baseline = problem.camera.focal_px, problem.camera.baseline_m
-    stereo_lens = gtsam.Cal3_S2Stereo(focal, focal, 0, problem.camera.cx_px, problem.camera.cy_px, baseline)
-    lens = gtsam.Cal3_S2(focal, focal, 0, problem.camera.cx_px, problem.camera.cy_px)
-    mount = gtsam.Pose3(problem.body_from_cam)
+    focal, baseline = problem.rig.camera.focal_px, problem.rig.camera.baseline_m
+    stereo_lens = gtsam.Cal3_S2Stereo(focal, focal, 0, problem.rig.camera.cx_px, problem.rig.camera.cy_px, baseline)
+    lens = gtsam.Cal3_S2(focal, focal, 0, problem.rig.camera.cx_px, problem.rig.camera.cy_px)
+    mount = gtsam.Pose3(problem.rig.body_from_cam[0])
     for k, map_from_body in enumerate(problem.map_from_body):
         values.insert(gtsam.symbol("x", k), gtsam.Pose3(map_from_body))
         if problem.fixed[k]:

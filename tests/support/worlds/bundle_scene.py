@@ -8,8 +8,8 @@ from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp, so3_log
 from fleetmap.inertial import GRAVITY_MAP, preintegrate
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
-from mapserver.survey.bundle.problem import BundleProblem, InertialTerms
-from mapserver.survey.state import poses_of_views
+from mapserver.survey.bundle.problem import OBSERVED, BundleProblem, InertialTerms
+from mapserver.survey.rig import CameraKind, Rig
 from support.worlds.inertial_motion import analytic_motion, corrected, sample_motion
 
 CAMERA = StereoCamera(focal_px=400.0, cx_px=320.0, cy_px=240.0, baseline_m=0.12, width_px=640, height_px=480)
@@ -19,7 +19,12 @@ BODY_FROM_CAM = se3(
 )
 GYRO_BIAS, ACCEL_BIAS = np.array([0.01, -0.02, 0.015]), np.array([0.1, -0.05, 0.08])
 NOISE = ImuNoise()
-ONE_VIEW = np.eye(4)[None]
+ONE = np.eye(4)[None]
+
+
+def rig(body_from_others: Array = ONE, camera: StereoCamera = CAMERA, body_from_cam: Array = BODY_FROM_CAM) -> Rig:
+    """Cameras that see what the first one would see with the body at each of body_from_others (V, 4, 4)."""
+    return Rig(camera, body_from_others @ body_from_cam, (CameraKind.STEREO,) * len(body_from_others))
 
 
 @dataclass(frozen=True)
@@ -40,27 +45,28 @@ def make_scene(
     noise_px: float = 0.0,
     inertial: bool = False,
     mono_share: float = 0.2,
-    body_from_view: Array = ONE_VIEW,
+    body_from_others: Array = ONE,
 ) -> Scene:
-    """Keyframes along the analytic motion, landmarks all around; every visible one is observed, by each of the rig's views."""
+    """Keyframes along the analytic motion, landmarks all around; every visible one is observed, by each camera of a `rig`."""
     rng = np.random.default_rng(seed)
     times = 0.5 + step_s * np.arange(keyframes)
     states = [analytic_motion(t) for t in times]
     map_from_body = np.array([s.map_from_body for s in states])
     away = rng.normal(size=(landmarks, 3)) * [1, 1, 0.4]
     points = away / np.linalg.norm(away, axis=1)[:, None] * rng.uniform(4, 9, (landmarks, 1))
-    seen = []
-    for k, map_from_view in enumerate(poses_of_views(map_from_body, body_from_view)):
-        inside = transform_points(se3_inverse(map_from_view @ BODY_FROM_CAM), points)
+    seen, cameras = [], rig(body_from_others)
+    map_from_cams = cameras.map_from_cams(map_from_body)
+    for k, c in np.ndindex(map_from_cams.shape[:2]):
+        inside = transform_points(se3_inverse(map_from_cams[k, c]), points)
         pixels = CAMERA.pixel_from_point(inside)
         visible = (
             (inside[:, 2] > 0.5) & (pixels[:, 0] > 0) & (pixels[:, 0] < 640) & (pixels[:, 1] > 0) & (pixels[:, 1] < 480)
         )
-        seen += [(k, n, *pixels[n]) for n in np.nonzero(visible)[0]]
+        seen += [(k, n, c, *pixels[n]) for n in np.nonzero(visible)[0]]
     table = np.array(seen)[rng.permutation(len(seen))]
     counts = np.bincount(table[:, 1].astype(int), minlength=landmarks)
     table = table[counts[table[:, 1].astype(int)] >= 2]
-    pixels = table[:, 2:].copy()
+    pixels = table[:, 3:].copy()
     sigma = np.stack([rng.uniform(0.4, 1.0, len(table)), rng.uniform(0.3, 0.8, len(table))], axis=1)
     noise = rng.normal(size=(len(table), 3)) * noise_px
     pixels[:, :2] += noise[:, :2] * sigma[:, :1]
@@ -70,16 +76,15 @@ def make_scene(
     fixed[0] = True
     velocities = np.array([s.velocity_map_mps for s in states])
     problem = BundleProblem(
-        camera=CAMERA,
-        body_from_cam=BODY_FROM_CAM,
+        rig=cameras,
         map_from_body=map_from_body,
         fixed=fixed,
         points_map=points,
         obs_keyframe=table[:, 0].astype(np.int32),
+        obs_camera=table[:, 2].astype(np.int32),
         obs_landmark=table[:, 1].astype(np.int32),
         obs_pixels=pixels,
         obs_sigma_px=sigma,
-        body_from_view=body_from_view,
     )
     if inertial:
         problem.inertial = _inertial_terms(times, velocities)
@@ -120,14 +125,11 @@ def plain_residuals(problem: BundleProblem, pose_step: Array, motion_step: Array
     )
     points = problem.points_map + point_step
     parts = []
-    for k, n, pixel, sigma in zip(
-        problem.obs_keyframe, problem.obs_landmark, problem.obs_pixels, problem.obs_sigma_px, strict=True
-    ):
-        body, view = divmod(int(k), len(problem.body_from_view))
-        cam_from_map = se3_inverse(map_from_body[body] @ problem.body_from_view[view] @ problem.body_from_cam)
-        u, v, u_right = problem.camera.pixel_from_point((cam_from_map[:3, :3] @ points[n] + cam_from_map[:3, 3])[None])[
-            0
-        ]
+    for k, c, n, pixel, sigma in zip(*(getattr(problem, name) for name in OBSERVED), strict=True):
+        cam_from_map = se3_inverse(map_from_body[k] @ problem.rig.body_from_cam[c])
+        u, v, u_right = problem.rig.camera.pixel_from_point(
+            (cam_from_map[:3, :3] @ points[n] + cam_from_map[:3, 3])[None]
+        )[0]
         parts.append([(u - pixel[0]) / sigma[0], (v - pixel[1]) / sigma[0]])
         if np.isfinite(pixel[2]):
             parts.append([((u - u_right) - (pixel[0] - pixel[2])) / sigma[1]])

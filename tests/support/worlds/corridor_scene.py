@@ -7,6 +7,7 @@ import numpy as np
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
+from mapserver.survey.rig import Rig
 from mapserver.survey.state import KeyframeMotion, Landmarks, SurveyState
 
 CAMERA = StereoCamera(300.0, 320.0, 240.0, 0.12, 640, 480)
@@ -62,14 +63,17 @@ def scene(keyframes: int, seed: int, *, drift: float, outliers: float = 0.0) -> 
     moved = guessed[reference] @ se3_inverse(map_from_body[reference])
     started = np.einsum("nij,nj->ni", moved[:, :3, :3], points) + moved[:, :3, 3]
     marks = Landmarks(
-        started, keyframe, landmark, np.arange(len(table)), table[:, 2:] + noise,
+        started, keyframe, np.zeros_like(keyframe), landmark, np.arange(len(table), dtype=np.int32), table[:, 2:] + noise,
         np.tile([SIGMA_PX, SIGMA_DISPARITY_PX], (len(table), 1)),
     )  # fmt: skip
     nothing = np.zeros((keyframes, 3))
     motion = KeyframeMotion(False, ImuSamples.empty(), None, 0.0, nothing, nothing.copy(), nothing.copy(), [])
     stamps = np.arange(keyframes, dtype=np.int64) * 100_000_000
     return Scene(
-        SurveyState(stamps, guessed.copy(), BODY_FROM_CAM, CAMERA, motion, marks), map_from_body, points, is_outlier
+        SurveyState(stamps, guessed.copy(), Rig.of_one(CAMERA, BODY_FROM_CAM), motion, marks),
+        map_from_body,
+        points,
+        is_outlier,
     )
 
 

@@ -69,9 +69,9 @@ def survey_state(seed: int) -> SurveyState:
     order = np.lexsort((problem.obs_keyframe, problem.obs_landmark))
     seen, number = np.unique(problem.obs_landmark[order], return_inverse=True)
     marks = Landmarks(
-        problem.points_map[seen], problem.obs_keyframe[order].astype(np.int32), number.astype(np.int32), np.arange(len(order)),
-        problem.obs_pixels[order], problem.obs_sigma_px[order],
+        problem.points_map[seen], problem.obs_keyframe[order], problem.obs_camera[order], number.astype(np.int32),
+        np.arange(len(order), dtype=np.int32), problem.obs_pixels[order], problem.obs_sigma_px[order],
     )  # fmt: skip
     none = np.zeros((12, 3))
     motion = KeyframeMotion(False, ImuSamples.empty(), None, 0.0, none, none.copy(), none.copy(), [])
-    return SurveyState(np.arange(12, dtype=np.int64), problem.map_from_body, BODY_FROM_CAM, CAMERA, motion, marks)
+    return SurveyState(np.arange(12, dtype=np.int64), problem.map_from_body, problem.rig, motion, marks)

@@ -26,7 +26,7 @@ def with_board(session: MappedSession) -> MappedSession:
         cam_from_map = se3_inverse(session.map_from_body[number] @ BODY_FROM_CAM0)
         corners = BOX_M + 0.25 * np.array([[i, 0.0, j] for i in (-1, 1) for j in (-1, 1)])
         points = corners @ cam_from_map[:3, :3].T + cam_from_map[:3, 3]
-        camera = session.survey.state.camera
+        camera = session.survey.state.rig.camera
         pixels = camera.pixel_from_point(points)
         (left, top), (right, bottom) = pixels[:, :2].min(axis=0).astype(int), pixels[:, :2].max(axis=0).astype(int)
         shown = np.s_[max(top, 0) : max(bottom, 0), max(left, 0) : max(right, 0)]

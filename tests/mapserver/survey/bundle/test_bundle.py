@@ -108,6 +108,7 @@ def test_points_behind_and_hardly_seen_points_do_no_harm() -> None:
         start,
         points_map=np.concatenate([start.points_map, extra_points]),
         obs_keyframe=np.concatenate([start.obs_keyframe, [1, 2]]).astype(np.int32),
+        obs_camera=np.concatenate([start.obs_camera, [0, 0]]).astype(np.int32),
         obs_landmark=np.concatenate([start.obs_landmark, [count, count + 1]]).astype(np.int32),
         obs_pixels=np.concatenate([start.obs_pixels, [[300.0, 200.0, 290.0], [pixel[0], pixel[1], np.nan]]]),
         obs_sigma_px=np.concatenate([start.obs_sigma_px, np.ones((2, 2))]),
@@ -130,14 +131,7 @@ def test_relative_terms_carry_over_missing_vision() -> None:
         RelativeTerm(i, j, se3_inverse(map_from_body[i]) @ map_from_body[j], 1e4 * np.eye(6))
         for i, j in ((2, 3), (4, 3))
     ]
-    problem = replace(
-        start,
-        obs_keyframe=start.obs_keyframe[blind],
-        obs_landmark=start.obs_landmark[blind],
-        obs_pixels=start.obs_pixels[blind],
-        obs_sigma_px=start.obs_sigma_px[blind],
-        relative=terms,
-    )
+    problem = replace(start.observed(blind), relative=terms)
     np.testing.assert_allclose(optimize(problem, PRECISE).map_from_body, map_from_body, atol=1e-5)
 
 
@@ -174,14 +168,7 @@ def test_points_alone() -> None:
 
 def test_nothing_seen_at_all() -> None:
     truth = make_scene(keyframes=3, landmarks=80, step_s=0.4, seed=1).problem
-    blind = replace(
-        truth,
-        points_map=np.zeros((0, 3)),
-        obs_keyframe=np.zeros(0, np.int32),
-        obs_landmark=np.zeros(0, np.int32),
-        obs_pixels=np.zeros((0, 3)),
-        obs_sigma_px=np.zeros((0, 2)),
-    )
+    blind = replace(truth.observed(np.zeros(len(truth.obs_camera), bool)), points_map=np.zeros((0, 3)))
     np.testing.assert_allclose(optimize(blind, BundleSettings()).map_from_body, truth.map_from_body)
 
 

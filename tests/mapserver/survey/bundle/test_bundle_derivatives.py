@@ -9,15 +9,21 @@ from mapserver.survey.bundle.bundle_adjustment import solver_of
 from mapserver.survey.bundle.problem import BundleProblem, MotionPrior
 from mapserver.survey.settings import BundleSettings
 from mapserver.survey.state import PriorTerm, RelativeTerm
-from support.worlds.bundle_scene import ONE_VIEW, disturbed, make_scene, plain_residuals
+from support.worlds.bundle_scene import ONE, disturbed, make_scene, plain_residuals
 
 NO_ROBUSTNESS = BundleSettings(huber_sigmas=1e9)
 FRONT_AND_REAR = np.stack([np.eye(4), se3_exp(np.array([0.01, 0.02, np.pi, -0.4, 0.05, 0.02]))])
 
 
-def _problem(*, inertial: bool, body_from_view: Array = ONE_VIEW) -> BundleProblem:
+def _problem(*, inertial: bool, body_from_others: Array = ONE) -> BundleProblem:
     scene = make_scene(
-        keyframes=5, landmarks=40, step_s=0.4, seed=3, noise_px=1.0, inertial=inertial, body_from_view=body_from_view
+        keyframes=5,
+        landmarks=40,
+        step_s=0.4,
+        seed=3,
+        noise_px=1.0,
+        inertial=inertial,
+        body_from_others=body_from_others,
     )
     problem = disturbed(scene.problem, seed=4, rot_rad=0.01, trans_m=0.05, points_m=0.05)
     rng = np.random.default_rng(7)
@@ -76,10 +82,10 @@ def _eliminated(problem: BundleProblem) -> tuple[Array, Array]:
     )
 
 
-@pytest.mark.parametrize("body_from_view", [ONE_VIEW, FRONT_AND_REAR])
+@pytest.mark.parametrize("body_from_others", [ONE, FRONT_AND_REAR])
 @pytest.mark.parametrize("inertial", [False, True])
-def test_reduced_system(inertial: bool, body_from_view: Array) -> None:
-    problem = _problem(inertial=inertial, body_from_view=body_from_view)
+def test_reduced_system(inertial: bool, body_from_others: Array) -> None:
+    problem = _problem(inertial=inertial, body_from_others=body_from_others)
     matrix, rhs = _eliminated(problem)
     lower, ours_rhs = solver_of(problem, NO_ROBUSTNESS).reduced(0.0)
     whole, free = np.tril(lower) + np.tril(lower, -1).T, _free(problem)

@@ -60,13 +60,7 @@ def test_each_class_of_claims_has_its_own_noise() -> None:
 def test_too_few_observations_keep_their_claims() -> None:
     given = scene(3, 4, drift=0.0)
     problem = _at_truth(given, np.tile([0.35, 0.2], (len(given.is_outlier), 1)))
-    few = replace(
-        problem,
-        obs_keyframe=problem.obs_keyframe[:40],
-        obs_landmark=problem.obs_landmark[:40],
-        obs_pixels=problem.obs_pixels[:40],
-        obs_sigma_px=problem.obs_sigma_px[:40],
-    )
+    few = problem.observed(np.arange(len(problem.obs_camera)) < 40)
     np.testing.assert_array_equal(measured_sigmas(few, 1.345), few.obs_sigma_px)
 
 
@@ -98,7 +92,7 @@ def test_disparities_that_are_too_large_at_depth_edges_hardly_change_the_scale()
 
 
 def _exact_pixels(problem: BundleProblem) -> Array:
-    cam_from_map = se3_inverse(problem.map_from_body @ problem.body_from_cam)[problem.obs_keyframe]
+    cam_from_map = se3_inverse(problem.map_from_cams)[problem.obs_keyframe, problem.obs_camera]
     points = problem.points_map[problem.obs_landmark]
     seen = np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], points) + cam_from_map[:, :3, 3]
-    return problem.camera.pixel_from_point(seen)
+    return problem.rig.camera.pixel_from_point(seen)

@@ -7,6 +7,7 @@ import pytest
 
 from mapserver.survey.bundle.bundle_rounds import bundle_rounds
 from mapserver.survey.bundle.stereo_yaw_check import NO_YAW, disparity_shift, estimate_stereo_yaw, without_stereo_yaw
+from mapserver.survey.rig import CameraKind
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import SurveyState
 from support.worlds.corridor_scene import CAMERA, scene
@@ -60,7 +61,7 @@ def test_the_shift_grows_towards_the_rim_as_a_turn_makes_it() -> None:
 
 def test_depth_cameras_and_single_cameras_have_no_pair() -> None:
     state = adjusted(6, 0.0)
-    assert estimate_stereo_yaw(replace(state, depth_views=frozenset({0})), SETTINGS) == NO_YAW
+    assert estimate_stereo_yaw(replace(state, rig=replace(state.rig, kinds=(CameraKind.DEPTH,))), SETTINGS) == NO_YAW
     blind = state.landmarks.obs_pixels.copy()
     blind[:, 2] = np.nan
     assert estimate_stereo_yaw(replace(state, landmarks=replace(state.landmarks, obs_pixels=blind)), SETTINGS) == NO_YAW

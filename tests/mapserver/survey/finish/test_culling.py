@@ -33,8 +33,8 @@ def keyframes(count: int, features: int, seed: int = 0) -> list[Keyframe]:
 def seen_by(table: Array, landmarks: int) -> Landmarks:
     """Observations (landmark, keyframe), sorted."""
     return Landmarks(
-        np.zeros((landmarks, 3)), table[:, 1].astype(np.int32), table[:, 0].astype(np.int32), np.zeros(len(table), np.int64),
-        np.zeros((len(table), 3)), np.ones((len(table), 2)),
+        np.zeros((landmarks, 3)), table[:, 1].astype(np.int32), np.zeros(len(table), np.int32), table[:, 0].astype(np.int32),
+        np.zeros(len(table), np.int32), np.zeros((len(table), 3)), np.ones((len(table), 2)),
     )  # fmt: skip
 
 
@@ -73,7 +73,7 @@ def test_a_double_goes_and_its_neighbours_stay() -> None:
     landmark[rows] = len(counts)
     order = np.argsort(landmark, kind="stable")
     broken = Landmarks(
-        np.vstack([marks.points_map, marks.points_map[split]]), marks.obs_keyframe[order], landmark[order],
+        np.vstack([marks.points_map, marks.points_map[split]]), marks.obs_keyframe[order], marks.obs_camera, landmark[order],
         marks.obs_feature[order], marks.obs_pixels[order], marks.obs_sigma_px[order],
     )  # fmt: skip
     frames = keyframes(12, int(marks.obs_feature.max()) + 1)
@@ -96,7 +96,7 @@ def test_a_double_goes_and_its_neighbours_stay() -> None:
 def test_parallax_is_the_widest_angle_or_the_baselines() -> None:
     state = survey_state(2)
     angles = parallax_rad(state)
-    map_from_cam = state.map_from_body @ state.body_from_cam
+    map_from_cam = state.map_from_cams[:, 0]
     for n in range(0, len(state.landmarks.points_map), 17):
         own = state.landmarks.obs_landmark == n
         rays = map_from_cam[state.landmarks.obs_keyframe[own], :3, 3] - state.landmarks.points_map[n]

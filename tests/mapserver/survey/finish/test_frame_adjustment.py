@@ -58,7 +58,11 @@ def drive(kind: str = "stereo", blind: range = range(0), slipped: float = 0.0) -
     kept = marks.keep_observations(np.isin(marks.obs_keyframe, KEYFRAMES), 1)
     kept = replace(kept, obs_keyframe=np.searchsorted(KEYFRAMES, kept.obs_keyframe).astype(np.int32))
     state = replace(
-        given.state, camera=camera, motion=motion, landmarks=kept, map_from_body=given.map_from_body[KEYFRAMES]
+        given.state,
+        rig=replace(given.state.rig, camera=camera),
+        motion=motion,
+        landmarks=kept,
+        map_from_body=given.map_from_body[KEYFRAMES],
     )
     odom_from_map = se3_exp(np.array([0.0, 0.0, 0.7, 3.0, -2.0, 1.0]))
     odometry = OdometryPass(

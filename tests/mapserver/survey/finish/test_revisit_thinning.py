@@ -10,11 +10,12 @@ from fleetmap.geometry import se3_exp
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_rounds
 from mapserver.survey.finish.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
+from mapserver.survey.rig import Rig
 from mapserver.survey.settings import BundleSettings, CullSettings, SurveySettings
-from mapserver.survey.state import Keyframe, Landmarks, MemoryImageStore
+from mapserver.survey.state import Keyframe, Landmarks, MemoryImageStore, RigImages
 from mapserver.survey.tracks.tracks import Tracks
 from support.worlds.bundle_scene import make_scene
-from support.worlds.corridor_scene import Scene, scene
+from support.worlds.corridor_scene import BODY_FROM_CAM, CAMERA, Scene, scene
 
 FEATURES = 60
 
@@ -32,6 +33,13 @@ def keyframes(octaves: list[int]) -> list[Keyframe]:
         )
         for k, octave in enumerate(octaves)
     ]  # fmt: skip
+
+
+def redundant(tracks: Tracks, octaves: list[int], settings: SurveySettings) -> np.ndarray:
+    """As told of keyframes of one camera with these octaves."""
+    places = np.tile(np.eye(4), (len(octaves), 1, 1))
+    rig = Rig.of_one(CAMERA, BODY_FROM_CAM)
+    return redundant_keyframes(tracks, RigImages.of(keyframes(octaves), places, rig), settings)
 
 
 def tracks_seen_by(who: list[list[int]]) -> Tracks:
@@ -57,27 +65,25 @@ def drive(laps: int, places: int, per_place: int = 20) -> Tracks:
 
 
 def test_of_many_laps_the_first_ones_are_left() -> None:
-    spare = redundant_keyframes(drive(6, 30), keyframes([0] * 180), SurveySettings())
+    spare = redundant(drive(6, 30), [0] * 180, SurveySettings())
     np.testing.assert_array_equal(np.flatnonzero(spare), np.arange(90, 180))
     more = SurveySettings(cull=CullSettings(repeated_visits=4))
-    np.testing.assert_array_equal(
-        np.flatnonzero(redundant_keyframes(drive(6, 30), keyframes([0] * 180), more)), np.arange(120, 180)
-    )
+    np.testing.assert_array_equal(np.flatnonzero(redundant(drive(6, 30), [0] * 180, more)), np.arange(120, 180))
 
 
 @pytest.mark.parametrize("laps", [1, 2, 3])
 def test_a_drive_that_comes_back_twice_at_most_keeps_all(laps: int) -> None:
-    assert not redundant_keyframes(drive(laps, 30), keyframes([0] * 30 * laps), SurveySettings()).any()
+    assert not redundant(drive(laps, 30), [0] * 30 * laps, SurveySettings()).any()
 
 
 def test_a_keyframe_that_sees_more_than_the_others_is_not_spare() -> None:
     """The last lap looks from nearer (an octave that is finer by two), or at things that it alone sees twice."""
-    nearer = keyframes([3] * 120 + [1] * 30)
-    assert not redundant_keyframes(drive(5, 30), nearer, SurveySettings())[120:].any()
+    nearer = [3] * 120 + [1] * 30
+    assert not redundant(drive(5, 30), nearer, SurveySettings())[120:].any()
     old = drive(5, 30, per_place=10)
     own = [[120 + k, 121 + k] for k in range(0, 28, 2) for _ in range(15)]
-    members = [g.tolist() for g in np.split(old.keyframes, old.starts[1:])]
-    spare = redundant_keyframes(tracks_seen_by([*members, *own]), keyframes([0] * 150), SurveySettings())
+    members = [g.tolist() for g in np.split(old.images, old.starts[1:])]
+    spare = redundant(tracks_seen_by([*members, *own]), [0] * 150, SurveySettings())
     assert not spare[120:148].any()
     assert spare[148:].all()  # these two see nothing of their own
 
@@ -85,10 +91,10 @@ def test_a_keyframe_that_sees_more_than_the_others_is_not_spare() -> None:
 def test_blind_keyframes_among_spare_ones_are_spare_too() -> None:
     """In the fourth lap 95 to 97 see nothing, and nobody else does where no keyframe is spare: in the first lap they stay."""
     whole = drive(4, 30)
-    members = [g.tolist() for g in np.split(whole.keyframes, whole.starts[1:])]
+    members = [g.tolist() for g in np.split(whole.images, whole.starts[1:])]
     dark = {3, 4, 5, 95, 96, 97}
-    spare = redundant_keyframes(
-        tracks_seen_by([seen for m in members if (seen := [k for k in m if k not in dark])]), keyframes([0] * 120),
+    spare = redundant(
+        tracks_seen_by([seen for m in members if (seen := [k for k in m if k not in dark])]), [0] * 120,
         SurveySettings(),
     )  # fmt: skip
     assert spare[95:98].all()
@@ -119,7 +125,7 @@ def laps_of(given: Scene, laps: int, seed: int) -> tuple[Scene, np.ndarray]:
     noise[: len(marks.obs_landmark)] = 0.0
     keyframe = np.concatenate([marks.obs_keyframe + lap * count for lap in range(laps)]).astype(np.int32)
     landmarks = Landmarks(
-        marks.points_map, keyframe[order], observed[order], np.arange(len(observed))[order],
+        marks.points_map, keyframe[order], np.zeros_like(keyframe), observed[order], np.arange(len(observed))[order],
         (np.tile(marks.obs_pixels, (laps, 1)) + noise)[order], np.tile(marks.obs_sigma_px, (laps, 1))[order],
     )  # fmt: skip
     guessed, nothing = np.tile(state.map_from_body, (laps, 1, 1)), np.zeros((laps * count, 3))

@@ -16,6 +16,7 @@ from mapserver.survey.loops.connected_components import (
 )
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
+from mapserver.survey.rig import Rig
 from mapserver.survey.state import KeyframeMotion, Landmarks, OdometryPass, RelativeTerm, SurveyState
 
 PER_KEYFRAME = 40
@@ -35,11 +36,17 @@ def survey(seen: list[range], loops: list[tuple[int, int]] | None = None) -> Sur
     points = np.column_stack([np.arange(count), np.zeros(count), np.zeros(count)]).astype(float)
     each = np.column_stack([np.arange(len(seen))] * 3).astype(float)
     marks = Landmarks(
-        points, keyframe, landmark, np.arange(len(pairs)), np.zeros((len(pairs), 3)), np.ones((len(pairs), 2))
+        points,
+        keyframe,
+        np.zeros_like(keyframe),
+        landmark,
+        np.arange(len(pairs), dtype=np.int32),
+        np.zeros((len(pairs), 3)),
+        np.ones((len(pairs), 2)),
     )
     return SurveyState(
-        np.arange(len(seen), dtype=np.int64) * 1_000_000_000, places, np.eye(4),
-        StereoCamera(200.0, 160.0, 120.0, 0.1, 320, 240),
+        np.arange(len(seen), dtype=np.int64) * 1_000_000_000, places,
+        Rig.of_one(StereoCamera(200.0, 160.0, 120.0, 0.1, 320, 240), np.eye(4)),
         KeyframeMotion(
             False, ImuSamples.empty(), None, 0.0, each, each, each,
             [RelativeTerm(k, k + 1, np.eye(4), np.eye(6)) for k in range(len(seen) - 1)],

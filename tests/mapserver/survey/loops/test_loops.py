@@ -20,8 +20,9 @@ from mapserver.survey.loops.keyframe_groups import KeyframeGroups
 from mapserver.survey.loops.loops import LoopCloser, LoopRecord, Loops, LoopVerdict, by_disparity
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
+from mapserver.survey.rig import rig_of
 from mapserver.survey.settings import LoopSettings, SurveySettings
-from mapserver.survey.state import Keyframe, PosedKeyframes
+from mapserver.survey.state import Keyframe, RigImages
 from mapserver.survey.survey_inputs import SurveyConfig
 from mapserver.survey.zones import Zones
 from support.recordings.recording_samples import calibration
@@ -66,7 +67,7 @@ def closed(
         for k in range(steps)
     ]
     closer = LoopCloser(
-        PosedKeyframes(whole, map_from_body, rectifier.body_from_cam, rectifier.camera),
+        RigImages.of(whole, map_from_body, rig_of(rectifier)),
         SurveyConfig(settings, vocabulary, zones or Zones()),
         GraphMarginals(map_from_body, chain),
         {(k, k + 1) for k in range(steps)},
@@ -100,7 +101,7 @@ def looked(
         for k, s in enumerate(sigmas)
     ]
     closer = LoopCloser(
-        PosedKeyframes(whole, path, rectifier.body_from_cam, rectifier.camera),
+        RigImages.of(whole, path, rig_of(rectifier)),
         SurveyConfig(settings, vocabulary, Zones()),
         GraphMarginals(path, chain),
         {(k, k + 1) for k in range(len(chain))},

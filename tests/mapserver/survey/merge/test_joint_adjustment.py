@@ -16,15 +16,16 @@ from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import Sighting
 from mapserver.survey.merge.joint_adjustment import Measured, adjust_jointly
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import KeyframeMotion, Landmarks, PriorTerm, RelativeTerm, SurveyState, poses_of_views
+from mapserver.survey.state import KeyframeMotion, Landmarks, PriorTerm, RelativeTerm, SurveyState
 from mapserver.survey.survey_map import SurveyMap
+from support.worlds.bundle_scene import rig
 
 CAMERA = StereoCamera(420.0, 320.0, 240.0, 0.12, 640, 480)
 BODY_FROM_CAM = se3(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), np.array([0.1, 0.0, 0.0]))
 SETTINGS = SurveySettings()
 CLAIMED_PX = np.array([np.hypot(0.35, 0.1), np.hypot(0.2, 0.13)])
 AISLES_M, LENGTH_M = 4.6, 20.0
-ONE_VIEW = np.eye(4)[None]
+ONE = np.eye(4)[None]
 REAR, ASIDE = (se3(so3_exp(np.array([0, 0, yaw])), np.array([-0.3, 0.05, 0.0])) for yaw in (np.pi, 1.5))
 
 
@@ -68,12 +69,12 @@ def places(corners: list[tuple[float, float]]) -> Array:
 
 
 def drive(
-    points: Array, at_edge: Any, corners: list[tuple[float, float]], rng: np.random.Generator, views: Array = ONE_VIEW
+    points: Array, at_edge: Any, corners: list[tuple[float, float]], rng: np.random.Generator, others: Array = ONE
 ) -> Drive:
     """A drive's survey: planes' disparities are good to 0.06 px, those at far depth edges too large and never too small."""
-    truth = places(corners)
-    keyframe, which, pixels = [], [], []
-    for k, map_from_cam in enumerate(poses_of_views(truth, views) @ BODY_FROM_CAM):
+    truth, cameras = places(corners), rig(others, CAMERA, BODY_FROM_CAM)
+    image, which, pixels = [], [], []
+    for n, map_from_cam in enumerate(cameras.map_from_cams(truth).reshape(-1, 4, 4)):
         cam = (points - map_from_cam[:3, 3]) @ map_from_cam[:3, :3]
         z = np.maximum(cam[:, 2], 1e-3)
         exact = CAMERA.pixel_from_point(np.column_stack([cam[:, :2], z]))
@@ -83,18 +84,19 @@ def drive(
         fattened = np.where(at_edge[rows] & (z[rows] > 6), rng.exponential(0.25, len(rows)), 0.0)
         left = exact[rows, :2] + rng.normal(0, 0.15, (len(rows), 2))
         disparity = exact[rows, 0] - exact[rows, 2] + rng.normal(0, 0.06, len(rows)) + fattened
-        keyframe.append(np.full(len(rows), k))
+        image.append(np.full(len(rows), n))
         which.append(rows)
         pixels.append(np.column_stack([left, left[:, 0] - disparity]))
-    seen_by, seen, observed = np.concatenate(keyframe), np.concatenate(which), np.concatenate(pixels)
+    seen_by, seen, observed = np.concatenate(image), np.concatenate(which), np.concatenate(pixels)
     often = np.flatnonzero(np.bincount(seen, minlength=len(points))[seen] >= 2)
     order = often[np.lexsort((seen_by[often], seen[often]))]
     used, landmark = np.unique(seen[order], return_inverse=True)
     none = np.zeros((len(truth), 3))
     motion = KeyframeMotion(False, ImuSamples.empty(), None, 0.0, none, none, none, [])
-    owners = seen_by[order].astype(np.int32), landmark.astype(np.int32)
-    marks = Landmarks(points[used], *owners, order, observed[order], np.tile(CLAIMED_PX, (len(order), 1)))
-    state = SurveyState(np.arange(len(truth)), truth, BODY_FROM_CAM, CAMERA, motion, marks, body_from_view=views)
+    keyframe, camera = np.divmod(seen_by[order].astype(np.int32), np.int32(len(cameras)))
+    owners = keyframe, camera, landmark.astype(np.int32), order.astype(np.int32)
+    marks = Landmarks(points[used], *owners, observed[order], np.tile(CLAIMED_PX, (len(order), 1)))
+    state = SurveyState(np.arange(len(truth)), truth, cameras, motion, marks)
     state = bundle_rounds(state, SETTINGS, rounds=2, final=True)
     named = state.landmarks.obs_feature[state.landmarks.firsts]
     return Drive(state, truth, seen[named], seen_by, seen, observed)
@@ -118,14 +120,14 @@ def beside(first: Drive, later: Drive, points: int) -> tuple[Measured, list[Sigh
     """What holds the first drive's map, and what the later one sees of it."""
     known = Measured(
         bundle_problem(first.state, SETTINGS, None),
-        np.arange(len(first.state.map_from_view)),
+        *np.indices((len(first.map_from_body), len(first.state.rig))).reshape(2, -1),
         np.arange(len(first.points)),
     )
     row = np.full(points, -1)
     row[first.points] = np.arange(len(first.points))
     sightings: list[Sighting | None] = []
-    for k in range(len(later.state.map_from_view)):
-        features = np.flatnonzero((later.seen_by == k) & (row[later.seen] >= 0))
+    for n in range(len(later.map_from_body) * len(later.state.rig)):
+        features = np.flatnonzero((later.seen_by == n) & (row[later.seen] >= 0))
         sigmas = np.tile(CLAIMED_PX, (len(features), 1))
         sightings.append(Sighting(row[later.seen[features]], features, later.pixels[features], sigmas))
     return known, sightings
@@ -137,9 +139,8 @@ def by(camera: StereoCamera, made: Drive) -> Drive:
     seen = marks.obs_pixels.copy()
     for each in (pixels, seen):
         each[:, 2] = np.nan if camera.baseline_m == 0.0 else each[:, 2]
-    return replace(
-        made, pixels=pixels, state=replace(made.state, camera=camera, landmarks=replace(marks, obs_pixels=seen))
-    )
+    alike = replace(made.state.rig, camera=camera)
+    return replace(made, pixels=pixels, state=replace(made.state, rig=alike, landmarks=replace(marks, obs_pixels=seen)))
 
 
 @pytest.mark.parametrize("seed", [1, 2])
@@ -175,7 +176,7 @@ def test_a_single_camera_and_a_pair_join_each_other(map_m: float, survey_m: floa
     known, sightings = beside(first, later, len(points))
     base: Any = None
     joint = adjust_jointly(base, known, later.state, later.map_from_body, sightings, SETTINGS, finely=True)
-    assert joint.measured.problem.camera.baseline_m == max(map_m, survey_m)
+    assert joint.measured.problem.rig.camera.baseline_m == max(map_m, survey_m)
     assert np.linalg.norm((joint.map_from_body - later.map_from_body)[:, :3, 3], axis=1).max() < 0.1
 
 
@@ -184,20 +185,20 @@ def test_a_single_camera_and_a_pair_join_each_other(map_m: float, survey_m: floa
 def test_rigs_with_different_views_join_each_other(of_map: list[Array], of_survey: list[Array]) -> None:
     rng = np.random.default_rng(3)
     points, at_edge = shelves(rng)
-    map_views, survey_views = (np.array([np.eye(4), *views]) for views in (of_map, of_survey))
-    first = drive(points, at_edge, [(-2, 0), (6, 0)], rng, map_views)
-    later = drive(points, at_edge, [(-2, 0), (6, 0)], rng, survey_views)
+    map_others, survey_others = (np.array([np.eye(4), *others]) for others in (of_map, of_survey))
+    first = drive(points, at_edge, [(-2, 0), (6, 0)], rng, map_others)
+    later = drive(points, at_edge, [(-2, 0), (6, 0)], rng, survey_others)
     known, sightings = beside(first, later, len(points))
     base: Any = None
     joint = adjust_jointly(base, known, later.state, later.map_from_body, sightings, SETTINGS, finely=True)
-    assert len(joint.measured.problem.body_from_view) == 1 + len({id(view) for view in (*of_map, *of_survey)})
+    assert len(joint.measured.problem.rig) == 1 + len({id(view) for view in (*of_map, *of_survey)})
     for found, truth in (
         (joint.map_from_body, later.map_from_body),
-        (joint.base_from_body, poses_of_views(first.map_from_body, map_views)),
+        (joint.base_from_body, first.state.rig.as_bodies(first.map_from_body).reshape(-1, 4, 4)),
     ):
         assert np.linalg.norm((found - truth)[:, :3, 3], axis=1).max() < 0.03
-    tied = joint.base_from_body.reshape(-1, len(map_views), 4, 4)
-    np.testing.assert_allclose(tied, tied[:, :1] @ map_views, atol=1e-9)
+    tied = joint.base_from_body.reshape(-1, len(map_others), 4, 4)
+    np.testing.assert_allclose(tied, tied[:, :1] @ map_others, atol=1e-9)
 
 
 def docked(made: Drive, keyframes: list[int], moved_m: float = 0.0) -> list[PriorTerm]:

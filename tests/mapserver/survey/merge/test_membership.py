@@ -103,9 +103,9 @@ def test_against_the_surveys_direction_nothing_is_decided() -> None:
 def test_against_the_surveys_direction_a_rear_pair_tells_the_place(given: bool) -> None:
     around = se3(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
     places, pairs = drive(20, start_m=4.0)[::-1] @ around, np.stack([np.eye(4), around])
-    located = joined(membership(KNOWN, HOME, places, places[0] if given else None, body_from_views=pairs))
+    located = joined(membership(KNOWN, HOME, places, places[0] if given else None, body_from_others=pairs))
     assert np.linalg.norm((located.map_from_body - places)[:, :3, 3], axis=1).max() < 0.03
-    elsewhere = membership(KNOWN, shared_above(0.8), places[:12], None, body_from_views=pairs)
+    elsewhere = membership(KNOWN, shared_above(0.8), places[:12], None, body_from_others=pairs)
     assert verdict(elsewhere)[0] is not MembershipVerdict.JOINED
 
 

@@ -14,6 +14,7 @@ from mapserver.survey.merge.base_map import BaseMap, as_recorded
 from mapserver.survey.merge.changes import fewer_keyframes, known_well
 from mapserver.survey.merge.membership import Membership, MembershipVerdict
 from mapserver.survey.merge.multi_session import MapMerger, Session, chained
+from mapserver.survey.rig import Rig
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import KeyframeMotion, Landmarks, SurveyState
 from support.worlds.session_scene import session_scene
@@ -48,8 +49,8 @@ def test_each_landmark_keeps_enough_keyframes_and_no_more_are_taken() -> None:
     seen = [(n, k) for n in range(30) for k in range(10)] + [(30, 10)]
     table = np.array(seen)
     marks = Landmarks(
-        np.zeros((31, 3)), table[:, 1].astype(np.int32), table[:, 0].astype(np.int32), np.arange(len(seen)),
-        np.zeros((len(seen), 3)), np.ones((len(seen), 2)),
+        np.zeros((31, 3)), table[:, 1].astype(np.int32), np.zeros(len(seen), np.int32), table[:, 0].astype(np.int32),
+        np.arange(len(seen), dtype=np.int32), np.zeros((len(seen), 3)), np.ones((len(seen), 2)),
     )  # fmt: skip
     fewer = fewer_keyframes(marks, 3)
     assert np.bincount(fewer.obs_landmark).tolist() == [3] * 30 + [1]
@@ -80,15 +81,13 @@ def test_a_landmark_seen_under_no_angle_is_not_taken_into_a_map() -> None:
     """Two landmarks of a drive along x: one beside it, one so far ahead that all rays to it are parallel, and one never adjusted."""
     places = np.stack([se3(np.eye(3), np.array([0.5 * k, 0.0, 0.0])) for k in range(4)])
     points = np.array([[1.0, 3.0, 0.0], [1.5e6, 0.0, 0.0], [np.nan] * 3])
-    keyframes = np.tile(np.arange(4, dtype=np.int32), 3)
-    pixels = np.full((12, 3), np.nan)
-    marks = Landmarks(
-        points, keyframes, np.repeat(np.arange(3, dtype=np.int32), 4), np.zeros(12, np.int64), pixels, np.ones((12, 2))
-    )
+    keyframes, none = np.tile(np.arange(4, dtype=np.int32), 3), np.zeros(12, np.int32)
+    pixels, landmarks = np.full((12, 3), np.nan), np.repeat(np.arange(3, dtype=np.int32), 4)
+    marks = Landmarks(points, keyframes, none, landmarks, none, pixels, np.ones((12, 2)))
     camera = StereoCamera(400.0, 320.0, 240.0, 0.12, 640, 480)
-    none = np.zeros((4, 3))
-    motion = KeyframeMotion(False, ImuSamples.empty(), None, 0.0, none, none, none, [])
-    state = SurveyState(np.arange(4), places, np.eye(4), camera, motion, marks)
+    rest = np.zeros((4, 3))
+    motion = KeyframeMotion(False, ImuSamples.empty(), None, 0.0, rest, rest, rest, [])
+    state = SurveyState(np.arange(4), places, Rig.of_one(camera, np.eye(4)), motion, marks)
     survey: Any = SimpleNamespace(state=state)
     joint: Any = SimpleNamespace(own_points_map=points, map_from_body=places)
     assert known_well(survey, joint, SurveySettings()).tolist() == [True, False, False]

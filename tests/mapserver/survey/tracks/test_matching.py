@@ -11,8 +11,9 @@ from fleetmap.geometry import Array, se3, se3_exp, so3_exp
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.survey.executor import SERIAL, SerialExecutor
 from mapserver.survey.keyframes.keyframes import make_keyframe
+from mapserver.survey.rig import rig_of
 from mapserver.survey.settings import PairSettings, SurveySettings
-from mapserver.survey.state import Keyframe
+from mapserver.survey.state import Keyframe, RigImages
 from mapserver.survey.tracks.matching import (
     NearPlaces,
     PairFinder,
@@ -38,14 +39,14 @@ def seen() -> tuple[list[Keyframe], Array, Rectifier]:
     return keyframes, places, rectifier
 
 
-def finder() -> PairFinder:
+def finder(places: Array) -> PairFinder:
     keyframes, _, rectifier = seen()
-    return PairFinder(keyframes, rectifier.camera, rectifier.body_from_cam, SETTINGS.pairs)
+    return PairFinder(RigImages.of(keyframes, places, rig_of(rectifier)), SETTINGS.pairs)
 
 
 def test_candidates_are_the_last_few_and_those_that_see_the_same() -> None:
     _, places, _ = seen()
-    found = finder().candidates(places, previous=2)
+    found = finder(places).candidates(previous=2)
     assert len(set(found)) == len(found)
     assert all(i < j for i, j in found)
     for j in range(1, 10):
@@ -57,7 +58,7 @@ def test_candidates_are_the_last_few_and_those_that_see_the_same() -> None:
 
 def test_before_loops_are_closed_only_near_ones_are_candidates() -> None:
     _, places, _ = seen()
-    found = finder().candidates(places, previous=2, only_near=4)
+    found = finder(places).candidates(previous=2, only_near=4)
     assert max(j - i for i, j in found) <= 4
     assert {(j - 1, j) for j in range(1, 10)} <= set(found)
 
@@ -67,14 +68,14 @@ def test_places_that_look_away_are_no_candidates() -> None:
     _, places, _ = seen()
     turned = places.copy()
     turned[5:, :3, :3] = so3_exp(np.array([0, 0, np.pi])) @ places[5:, :3, :3]
-    found = finder().candidates(turned, previous=1)
+    found = finder(turned).candidates(previous=1)
     assert {(i, j) for i, j in found if i < 5 <= j} == {(4, 5)}
 
 
 def matches(predicted_places: Array, allowed_m: float, sigma_rad: float | None = 0.02) -> set[tuple[int, int]]:
     candidates = [(3, 4), (4, 5), (0, 9)]
-    found = finder().match(
-        candidates, predicted_places, lambda i, j: allowed_m, rotation_sigma_rad=sigma_rad, is_known=False,
+    found = finder(predicted_places).match(
+        candidates, lambda i, j: allowed_m, rotation_sigma_rad=sigma_rad, is_known=False,
         progress=lambda n: None,
     )  # fmt: skip
     return {(m.i, m.j) for m in found}
@@ -173,12 +174,12 @@ class _Watched(SerialExecutor):
 
 def test_a_process_gets_the_keyframes_of_its_pairs_alone() -> None:
     keyframes, places, rectifier = seen()
-    rig = rectifier.camera, rectifier.body_from_cam, SETTINGS.pairs
+    posed = RigImages.of(keyframes, places, rig_of(rectifier))
     watched, pairs = _Watched(), [(0, 1), (1, 2), (7, 8)]
     allowed_m = fixed_allowance_m(places)
     found = [
-        PairFinder(keyframes, *rig, executor).match(
-            pairs, places, allowed_m, rotation_sigma_rad=0.02, progress=lambda _: None
+        PairFinder(posed, SETTINGS.pairs, executor).match(
+            pairs, allowed_m, rotation_sigma_rad=0.02, progress=lambda _: None
         )
         for executor in (SERIAL, watched)
     ]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fleetmap.sensors.rectification import RGBD_BASELINE_M, StereoCamera
-from mapserver.survey.state import survey_camera
+from mapserver.survey.rig import survey_camera
 from mapserver.survey.tracks.mono_depths import fuse_inverse_depths
 
 

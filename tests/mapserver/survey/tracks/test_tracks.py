@@ -10,8 +10,9 @@ from fleetmap.geometry import Array, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.survey.executor import SERIAL
 from mapserver.survey.keyframes.keyframes import make_keyframe
+from mapserver.survey.rig import rig_of
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import Keyframe, Landmarks, PosedKeyframes
+from mapserver.survey.state import Keyframe, Landmarks, RigImages, image_numbers
 from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PredictedMotion, match_pair
 from mapserver.survey.tracks.tracks import Tracks, build_landmarks, refine_observations, tracks_of
 from support.recordings.recording_samples import calibration
@@ -25,7 +26,7 @@ def pair(i: int, j: int, features: list[tuple[int, int]]) -> PairMatch:
 def groups(pairs: list[PairMatch], known: Tracks | None = None) -> list[list[tuple[int, int]]]:
     """The tracks of some pairs, (keyframe, feature) of each member."""
     found = tracks_of(pairs, known)
-    members = list(zip(found.keyframes.tolist(), found.features.tolist(), strict=True))
+    members = list(zip(found.images.tolist(), found.features.tolist(), strict=True))
     return [members[start:end] for start, end in pairwise([*found.starts.tolist(), len(members)])]
 
 
@@ -43,7 +44,7 @@ def test_what_is_known_comes_first_and_pairs_go_on_from_it() -> None:
     found = groups([pair(2, 3, [(7, 8)]), pair(1, 2, [(5, 4), (9, 2)])], known)
     assert sorted(found) == [[(0, 1), (1, 5), (2, 7), (3, 8)], [(0, 3), (2, 4)], [(1, 9), (2, 2)]]
     assert sorted(groups([], known)) == [[(0, 1), (1, 5), (2, 7)], [(0, 3), (2, 4)]]
-    again = tracks_of([], Tracks.of(views()[3]))
+    again = tracks_of([], Tracks.of(views()[3], image_numbers(4, 1)))
     assert len(again.starts) == len(views()[3].points_map)
 
 
@@ -66,7 +67,8 @@ def test_no_keyframe_is_twice_in_a_track_and_the_order_of_pairs_does_not_matter(
 def test_observations_go_and_landmarks_that_are_seen_too_rarely_with_them() -> None:
     landmark = np.array([0, 0, 0, 1, 1, 2, 2], np.int32)
     marks = Landmarks(
-        np.arange(9.0).reshape(3, 3), np.array([0, 1, 2, 0, 1, 1, 2], np.int32), landmark, np.arange(7),
+        np.arange(9.0).reshape(3, 3), np.array([0, 1, 2, 0, 1, 1, 2], np.int32), np.arange(3, 10, dtype=np.int32), landmark,
+        np.arange(7, dtype=np.int32),
         np.arange(21.0).reshape(7, 3), np.ones((7, 2)),
     )  # fmt: skip
     left = marks.keep_observations(np.array([1, 1, 0, 1, 0, 1, 1], bool), 2)
@@ -74,6 +76,7 @@ def test_observations_go_and_landmarks_that_are_seen_too_rarely_with_them() -> N
     np.testing.assert_array_equal(left.obs_landmark, [0, 0, 1, 1])
     np.testing.assert_array_equal(left.obs_feature, [0, 1, 5, 6])
     np.testing.assert_array_equal(left.obs_keyframe, [0, 1, 1, 2])
+    np.testing.assert_array_equal(left.obs_camera, [3, 4, 8, 9])
 
 
 @lru_cache(maxsize=1)
@@ -96,7 +99,7 @@ def views() -> tuple[list[Keyframe], Array, Rectifier, Landmarks]:
             match = match_pair(i, j, inputs, PredictedMotion(predicted, 0.02))
             assert match is not None
             pairs.append(match)
-    posed = PosedKeyframes(keyframes, map_from_body, rectifier.body_from_cam, rectifier.camera)
+    posed = RigImages.of(keyframes, map_from_body, rig_of(rectifier))
     marks = build_landmarks(posed, tracks_of(pairs), settings)
     return keyframes, map_from_body, rectifier, marks
 
@@ -155,7 +158,7 @@ def test_sigmas_tell_refined_observations_from_others() -> None:
 def test_only_what_better_poses_warp_otherwise_is_observed_anew() -> None:
     """Coordinates are spoiled: those of landmarks that the turned keyframe sees are found again, the others are not touched."""
     keyframes, map_from_body, rectifier, marks = views()
-    posed = PosedKeyframes(keyframes, map_from_body, rectifier.body_from_cam, rectifier.camera)
+    posed = RigImages.of(keyframes, map_from_body, rig_of(rectifier))
     spoiled = replace(marks, obs_pixels=marks.obs_pixels + 5.0)
     same = refine_observations(posed, spoiled, SurveySettings(), SERIAL, posed.map_from_cam)
     np.testing.assert_array_equal(same.obs_pixels, spoiled.obs_pixels)
@@ -173,9 +176,9 @@ def test_spare_keyframes_observe_and_define_nothing() -> None:
     keyframes, map_from_body, rectifier, marks = views()
     order = np.lexsort((marks.obs_keyframe, marks.obs_landmark))
     starts = np.flatnonzero(np.diff(marks.obs_landmark, prepend=-1))
-    tracks = Tracks(marks.obs_keyframe[order].astype(np.int64), marks.obs_feature[order], starts)
+    tracks = Tracks(marks.obs_keyframe[order].astype(np.int64), marks.obs_feature[order].astype(np.int64), starts)
     spare = np.array([True, False, False, True])
-    posed = PosedKeyframes(keyframes, map_from_body, rectifier.body_from_cam, rectifier.camera)
+    posed = RigImages.of(keyframes, map_from_body, rig_of(rectifier))
     left = build_landmarks(posed, tracks, SurveySettings(), redundant=spare)
     first = np.flatnonzero(np.diff(left.obs_landmark, prepend=-1))
     assert not spare[left.obs_keyframe[first]].any()
