@@ -23,7 +23,10 @@ def parse_prior(text: str | None, name: str = "prior") -> PositionPrior | None:
 
 
 def told_prior(told: InitialPoseMessage) -> PositionPrior:
-    """Return an operator's pose as a prior that overrides the tracked pose until fixes outweigh it. LinkError for an invalid pose."""
+    """Return an operator's pose, on the robot's own site, as a prior that overrides the tracked pose until fixes outweigh it.
+
+    LinkError for an invalid one.
+    """
     values = [told.x_map_m, told.y_map_m, told.heading_rad or 0.0, told.sigma_m]
     if not np.isfinite(values).all() or not told.sigma_m >= 1e-3:  # nobody knows a place better than to a millimetre
         raise LinkError(f"invalid initial pose: {values[:2]} m, heading {told.heading_rad} rad, sigma {told.sigma_m} m")
@@ -32,4 +35,4 @@ def told_prior(told: InitialPoseMessage) -> PositionPrior:
     if told.heading_rad is None:
         sigmas[2] = np.inf
     map_from_base = se3(so3_exp(np.array([0.0, 0.0, told.heading_rad or 0.0])), np.array([*values[:2], 0.0]))
-    return PositionPrior(0, map_from_base, np.diag(sigmas**2), is_revisable=True, floor="")
+    return PositionPrior(0, map_from_base, np.diag(sigmas**2), True, "")

@@ -31,8 +31,8 @@ class MarkersSection(Section, frozen=True):
 class MarkerPriors:
     """Finds listed markers in the images of the first camera.
 
-    A marker tells the robot's place once, until the robot has been TRACKING in agreement with it: fixes that contradict it must not be
-    outvoted by repetition.
+    A marker tells the robot's place once until the robot is TRACKING, and not again while it contradicts that: fixes must not be outvoted
+    by repetition.
     """
 
     def __init__(self, listed: MarkerList, mounted: MountedCamera, base_from_body: Array) -> None:
@@ -57,10 +57,7 @@ class MarkerPriors:
             return []
         best = min(new, key=lambda number: float(np.trace(self._seen[number].cov_rot_trans[3:, 3:])))
         self._told.add(best)
-        map_from_base, covariance, site = self._seen[best]
-        return [
-            PositionPrior(frame.stamp_ns, map_from_base, covariance, is_revisable=True, floor=site, is_measured=True)
-        ]
+        return [PositionPrior(frame.stamp_ns, *self._seen[best][:2], True, "", is_measured=True)]
 
     def judge(self, estimate: Estimate) -> str:
         """Compare the frame's markers with its estimate; return a text that names those that stand elsewhere than listed."""
@@ -70,11 +67,9 @@ class MarkerPriors:
             assert estimate.map_from_body is not None and estimate.cov_rot_trans is not None
             claimed = Place(estimate.map_from_body, estimate.cov_rot_trans).of_point(se3_inverse(self._base_from_body))
             for number, place in self._seen.items():
-                if innovation_of(*place[:2], *claimed[:2])[1] > _GATE:
-                    self._contradictions[number] += 1
-                else:
-                    self._contradictions[number] = 0
-                    self._told.discard(number)
+                is_elsewhere = innovation_of(*place[:2], *claimed[:2])[1] > _GATE
+                self._contradictions[number] = self._contradictions[number] + 1 if is_elsewhere else 0
+            self._told = {number for number in self._told if self._contradictions[number]}
         moved = [str(number) for number in sorted(self._markers) if self._is_moved(number)]
         return f"markers that stand elsewhere than listed: {', '.join(moved)}; measure them again" if moved else ""
 
