@@ -3,8 +3,8 @@
 | group | registered by the name of | as |
 |---|---|---|
 | `mapserver.commands` | the command | a function as those of `COMMANDS` in `mapserver/cli.py`, in a module that is quick to import |
-| `mapserver.failure_exports` | `--format` of `mapserver fleet export` | a function as `write_json_lines` in `mapserver/fleet/exports.py` |
 | `mapserver.databases` | the scheme of a URL, or `other` | `DatabaseHook` |
+| `mapserver.failure_exports` | `--format` of `mapserver fleet export` | a function as `write_json_lines` in `mapserver/fleet/exports.py` |
 | `mapserver.objects` | the scheme of a URL, or `other` | `ObjectsHook` |
 | `mapserver.parts` | the plug-in | `PartHook` |
 | `mapserver.routes` | the plug-in | `RouteHook` |
@@ -28,7 +28,6 @@ RouteHook = Callable[[Any, Any, OfferedFile], None]
 
 StageHook = Callable[[Any], dict[str, Any]]
 """Makes more of a draft's surveys than tiles: of a `ChosenDraft` each `Extra` by the key of its report (`mapserver/drafting/extras.py`)."""
-
 
 ObjectsHook = Callable[[str], Any]
 """Opens the `Objects` (`mapserver/store/blobs.py`) under a URL."""

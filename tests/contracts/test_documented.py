@@ -38,7 +38,7 @@ def test_every_command_that_reads_a_recording_takes_the_names_of_its_topics() ->
         for path, command in commands.items()
         if any(p.param_type_name == "argument" and "RECORDING" in (p.metavar or p.name.upper()) for p in command.params)
     }
-    assert len(readers) >= 5
+    assert len(readers) >= 4
     for path in readers | {"mapserver nightly"}:
         assert "--topic" in {option for parameter in commands[path].params for option in parameter.opts}, path
 

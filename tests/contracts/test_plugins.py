@@ -11,7 +11,9 @@ import pytest
 from fleetmap.errors import UsageError
 from fleetmap.hooks import plugins
 from locclient.config import LocclientConfig, read_config, with_plugins
-from mapserver.hooks import command_hooks, route_hooks
+from mapserver.hooks import command_hooks, part_hooks, route_hooks, stage_hooks
+from mapserver.store import MapStore
+from mapserver.store.places import Places, write_places
 from support.fleet.contracts_documents import REPOSITORY, text
 
 SIDES = ("shared/fleetmap", "locclient", "mapserver")
@@ -56,7 +58,13 @@ def test_without_plugins_a_robot_reads_its_file_and_refuses_their_sections(
     for package in packages:
         monkeypatch.setitem(sys.modules, package, None)
     assert with_plugins()[0].__struct_fields__ == LocclientConfig.__struct_fields__
-    assert route_hooks() == command_hooks() == plugins("fleetmap.recordings") == {}
+    assert route_hooks() == command_hooks() == part_hooks() == stage_hooks() == plugins("fleetmap.recordings") == {}
+    for places in (Places(content="s3://bucket"), Places(database="postgresql://host/name")):
+        write_places(tmp_path, places)
+        with pytest.raises(
+            UsageError, match=f"under {(places.content or places.database or '').partition(':')[0]}:// needs a plug-in"
+        ):
+            MapStore.open(tmp_path, create=True)
     file = tmp_path / "robot.toml"
     file.write_text('[vda5050]\nbroker = "mqtts://host"\n')
     with pytest.raises(UsageError, match="vda5050"):
