@@ -23,14 +23,15 @@ Relocalize a single frame, without odometry or history:
 place is ambiguous, as between identical racks.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING
 
+from fleetmap.lazy_names import lazy_names
+
 if TYPE_CHECKING:
-    from fleetmap import __version__
     from fleetmap.relocalization.map_view import MapView
     from fleetmap.relocalization.relocalizer import Fix, Relocalizer
     from fleetmap.time_sliced import finished
+    from fleetmap.version import __version__
     from locclient.localization.estimate import Estimate
     from locclient.localization.localizer import Localizer
     from locclient.localization.settings import LocalizerSettings
@@ -53,27 +54,18 @@ __all__ = [
     "finished",
     "localize",
 ]
-_NAMES = {
-    "fleetmap": "__version__",
-    "fleetmap.time_sliced": "finished",
-    "fleetmap.relocalization.map_view": "MapView",
-    "fleetmap.relocalization.relocalizer": "Fix Relocalizer",
-    "locclient.localization.estimate": "Estimate",
-    "locclient.localization.localizer": "Localizer",
-    "locclient.localization.settings": "LocalizerSettings",
-    "locclient.replay.replay": "LocalizeOptions fetch_map localize",
-    "locclient.replay.run_result": "ReplayResult",
-    "locclient.robot.robot": "Robot",
-}
-_MODULES = {name: module for module, names in _NAMES.items() for name in names.split()}
-
-
-def __getattr__(name: str) -> object:
-    """Import a public name on first use, so that `import locclient` stays fast (PEP 562)."""
-    if name not in _MODULES:
-        raise AttributeError(f"module 'locclient' has no attribute {name!r}")
-    return getattr(import_module(_MODULES[name]), name)
-
-
-def __dir__() -> list[str]:
-    return __all__
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "fleetmap.version": "__version__",
+        "fleetmap.time_sliced": "finished",
+        "fleetmap.relocalization.map_view": "MapView",
+        "fleetmap.relocalization.relocalizer": "Fix Relocalizer",
+        "locclient.localization.estimate": "Estimate",
+        "locclient.localization.localizer": "Localizer",
+        "locclient.localization.settings": "LocalizerSettings",
+        "locclient.replay.replay": "LocalizeOptions fetch_map localize",
+        "locclient.replay.run_result": "ReplayResult",
+        "locclient.robot.robot": "Robot",
+    },
+)

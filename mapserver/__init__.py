@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 from fleetmap.errors import FleetmapError
 
 if TYPE_CHECKING:
-    from fleetmap import __version__
+    from fleetmap.version import __version__
     from mapserver.library import (
         Actor,
         BuildOptions,

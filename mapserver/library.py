@@ -25,7 +25,7 @@ from mapserver.config import survey_settings
 from mapserver.drafting.draft import (
     BuildOptions,
     BuildRequest,
-    Built,
+    BuildResult,
     Draft,
     build_draft,
     picture_png,
@@ -51,7 +51,7 @@ class BuiltMap:
     store: Path
     site: str
     draft: Draft
-    built: Built
+    built: BuildResult
 
     @property
     def version(self) -> int:

@@ -213,7 +213,7 @@ class Runtime:
         if context is not None:
             failure = context.failure
             _log.warning("failure: %s, %s, %s", failure.kind, failure.cause, failure.estimate.status.value)
-            self._figures.count_failure()
+            self._figures.failures += 1
             self._failures.append((context, self._wall_ns() - int(max(failure.duration_s, silent_s) * 1e9)))
 
     def _report(self, now_s: float) -> None:

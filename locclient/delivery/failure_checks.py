@@ -101,7 +101,12 @@ def check_record(record: Any) -> None:
     """Raise RecordingError, naming the field, for an invalid LocalizerRecord."""
     cameras = [record.camera, *(mounted.camera for mounted in record.others)]
     for camera in cameras:
-        _check_camera(camera)
+        sizes = camera.width_px, camera.height_px
+        numbers = camera.focal_px, camera.cx_px, camera.cy_px, camera.baseline_m
+        if not all(map(isfinite, numbers)) or not all(1 <= side <= _MAX_SIDE_PX for side in sizes):
+            raise _refused("camera", f"{sizes[0]}x{sizes[1]} px, focal length and centre {numbers}")
+        if not (0 < camera.focal_px < 1e5 and 0 <= camera.baseline_m < 10 and max(map(abs, numbers)) < 1e5):
+            raise _refused("camera", f"focal length, centre and baseline {numbers}")
     _Walk(cameras).check(record, "")
     stamps = [percept.odometry.stamp_ns for _, percept in record.frames]
     if any(later <= earlier for earlier, later in pairwise(stamps)):
@@ -118,15 +123,6 @@ def check_record(record: Any) -> None:
             raise _refused(f"frames[{place}].query", f"{len(found.pixels)} pixels of {len(found.features)} features")
     if (record.start.map_from_body is None) != (record.start.cov_rot_trans is None):
         raise _refused("start", "a pose without its covariance, or the other way round")
-
-
-def _check_camera(camera: StereoCamera) -> None:
-    sizes = camera.width_px, camera.height_px
-    numbers = camera.focal_px, camera.cx_px, camera.cy_px, camera.baseline_m
-    if not all(map(isfinite, numbers)) or not all(1 <= side <= _MAX_SIDE_PX for side in sizes):
-        raise _refused("camera", f"{sizes[0]}x{sizes[1]} px, focal length and centre {numbers}")
-    if not (0 < camera.focal_px < 1e5 and 0 <= camera.baseline_m < 10 and max(map(abs, numbers)) < 1e5):
-        raise _refused("camera", f"focal length, centre and baseline {numbers}")
 
 
 def _refused(where: str, what: str) -> RecordingError:

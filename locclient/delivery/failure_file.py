@@ -3,7 +3,6 @@
 The recording is for inspection. An attachment holds the localizer's start pose and its percepts since, for a replay.
 """
 
-from collections.abc import Sequence
 from dataclasses import replace
 from math import prod
 from pathlib import Path
@@ -85,9 +84,13 @@ def failure_file(cut: FailureCut, report: FailureReport, profile: RobotProfile, 
         others=profile.others,
     )
     packed = zstandard.ZstdCompressor(level=3).compress(msgspec.msgpack.encode(record, enc_hook=_encoded_array))
+    has_right = any(frame.picture is not None and frame.picture.right is not None for frame in cut.frames)
+    pairs = [has_right, *(each.camera.baseline_m > 0 for each in profile.others)]
+    views = (_reduced_view(profile, view, is_pair=is_pair) for view, is_pair in enumerate(pairs))
+    rig = RigCalibration(tuple(camera for view in views for camera in view), profile.imu, profile.base_from_body)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "failure.mcap"
-        with McapRecordingWriter(path, _reduced_rig(cut.frames, profile), name=f"{report.robot} {report.id}") as writer:
+        with McapRecordingWriter(path, rig, name=f"{report.robot} {report.id}") as writer:
             writer.attach(SUMMARY, "application/msgpack", to_msgpack(summary))
             writer.attach(LOCALIZER, "application/zstd", packed)
             for frame in cut.frames:
@@ -183,16 +186,8 @@ def _step(width_px: int) -> int:
     return max(1, width_px // _WIDTH_PX)
 
 
-def _reduced_rig(frames: Sequence[RingFrame], profile: RobotProfile) -> RigCalibration:
-    """Return the rectified rig at the pictures' size."""
-    has_right = any(frame.picture is not None and frame.picture.right is not None for frame in frames)
-    pairs = [has_right, *(each.camera.baseline_m > 0 for each in profile.others)]
-    reduced = (_reduced_view(profile, view, is_pair=is_pair) for view, is_pair in enumerate(pairs))
-    cameras = tuple(camera for view in reduced for camera in view)
-    return RigCalibration(cameras, profile.imu, profile.base_from_body)
-
-
 def _reduced_view(profile: RobotProfile, view: int, *, is_pair: bool) -> list[CameraCalibration]:
+    """Return the rectified cameras of a view at the pictures' size."""
     camera, body_from_cam = profile.mounted(view)
     step = _step(camera.width_px)
     center = [(value + 0.5) / step - 0.5 for value in (camera.cx_px, camera.cy_px)]

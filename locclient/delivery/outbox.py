@@ -16,11 +16,11 @@ from fleetmap.files import OWN_FILE
 
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS report (
-  number INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT NOT NULL UNIQUE, payload BLOB NOT NULL
+  number INTEGER PRIMARY KEY AUTOINCREMENT, id TEXT NOT NULL UNIQUE, payload BLOB NOT NULL,
+  delivered_ns INTEGER NOT NULL DEFAULT 0 -- 0: it waits
 ) STRICT;
 CREATE TABLE IF NOT EXISTS count (name TEXT PRIMARY KEY, value INTEGER NOT NULL) STRICT;
 """
-_LATER = "ALTER TABLE report ADD COLUMN delivered_ns INTEGER NOT NULL DEFAULT 0"  # 0: it waits
 _RESTORED = "restored_ns"  # of the server, for which reports were sent again
 _KEPT_NS = 7 * 86_400 * 1_000_000_000
 _BUSY_S = 10.0
@@ -64,7 +64,7 @@ class Outbox:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             path.touch(OWN_FILE)
-            path.chmod(OWN_FILE)  # of an earlier version; SQLite gives its other files the same
+            path.chmod(OWN_FILE)  # SQLite gives its other files the same
             try:
                 self._check()
             except sqlite3.DatabaseError as error:
@@ -81,7 +81,16 @@ class Outbox:
         """Store a report; ignore one whose id waits already. Raises StoreError on a disk error."""
         with self._transaction() as database:
             database.execute("INSERT OR IGNORE INTO report (id, payload) VALUES (?, ?)", (report.id, report.payload))
-            self._make_room(database)
+            # The oldest reports make room, delivered ones first, never the newest one.
+            query = "SELECT number, LENGTH(payload), delivered_ns = 0 FROM report ORDER BY delivered_ns = 0, number"
+            rows = database.execute(query).fetchall()
+            total, dropped = sum(size for _, size, _ in rows), 0
+            for number, size, is_waiting in rows[:-1]:
+                if total <= self._max_bytes:
+                    break
+                database.execute("DELETE FROM report WHERE number = ?", (number,))
+                total, dropped = total - size, dropped + is_waiting
+            self._count(database, "dropped", dropped)
 
     def waiting(self, limit: int = 1) -> list[QueuedReport]:
         with self._transaction("DEFERRED") as database:
@@ -110,10 +119,8 @@ class Outbox:
             old_ns = self._wall_ns() - _KEPT_NS
             database.execute("DELETE FROM report WHERE delivered_ns BETWEEN 1 AND ?", (old_ns,))
             known = database.execute("SELECT value FROM count WHERE name = ?", (_RESTORED,)).fetchone()
-            if restored_ns in (
-                0,
-                None if known is None else known[0],
-            ):  # not "before": its clock may have been set back
+            # Not "before": its clock may have been set back.
+            if restored_ns in (0, None if known is None else known[0]):
                 return 0
             database.execute("INSERT OR REPLACE INTO count VALUES (?, ?)", (_RESTORED, restored_ns))
             return database.execute("UPDATE report SET delivered_ns = 0 WHERE delivered_ns").rowcount
@@ -124,18 +131,6 @@ class Outbox:
             known = dict(database.execute("SELECT name, value FROM count").fetchall())
             waiting = database.execute("SELECT COUNT(*) FROM report WHERE delivered_ns = 0").fetchone()[0]
         return {"waiting": waiting, **{name: known.get(name, 0) for name in ("delivered", "dropped", "refused")}}
-
-    def _make_room(self, database: sqlite3.Connection) -> None:
-        """Drop the oldest reports, delivered ones first, never the newest one."""
-        query = "SELECT number, LENGTH(payload), delivered_ns = 0 FROM report ORDER BY delivered_ns = 0, number"
-        rows = database.execute(query).fetchall()
-        total, dropped = sum(size for _, size, _ in rows), 0
-        for number, size, is_waiting in rows[:-1]:
-            if total <= self._max_bytes:
-                break
-            database.execute("DELETE FROM report WHERE number = ?", (number,))
-            total, dropped = total - size, dropped + is_waiting
-        self._count(database, "dropped", dropped)
 
     def _count(self, database: sqlite3.Connection, name: str, more: int) -> None:
         if more:
@@ -148,8 +143,6 @@ class Outbox:
         with closing(self._open()) as database:
             database.execute("PRAGMA journal_mode = WAL")
             database.executescript(_SCHEMA)
-            if "delivered_ns" not in {column for _, column, *_ in database.execute("PRAGMA table_info(report)")}:
-                database.execute(_LATER)
             if database.execute("PRAGMA quick_check").fetchone()[0] != "ok":
                 raise sqlite3.DatabaseError("damaged")
 

@@ -74,10 +74,11 @@ class BuildingMaps:
             key = "" if entry.site == self._own.site else entry.site
             floors[key] = self._floors.get(key, Floor(entry, _UNKNOWN))
             try:
-                source = self._own if not key else self._source(key)
-                loaded = (
-                    self._newest(source, asks=asks) if key else None
-                )  # first: it reads the signed list, which names the files
+                if key and key not in self._sources:
+                    self._sources[key] = self._open_site(key)
+                source = self._sources[key] if key else self._own
+                # First: it reads the signed list, which names the files
+                loaded = self._newest(source, asks=asks) if key else None
                 if key and source.site_file(FLOORS, MAX_FLOORS_BYTES) != data:
                     raise MapFormatError(f"site {key} does not name this building's floors; set the building again")
                 floors[key] = _floor(entry, source, files)
@@ -103,11 +104,6 @@ class BuildingMaps:
         if isinstance(grid, str):
             raise StateError(f"floor {site} has no grid: {grid}")
         return grid
-
-    def _source(self, site: str) -> MapSource:
-        if site not in self._sources:
-            self._sources[site] = self._open_site(site)
-        return self._sources[site]
 
     def _newest(self, source: MapSource, *, asks: bool) -> LoadedMap | None:
         """Return the current version with all of its usable tiles; None if the robot holds it already."""

@@ -177,8 +177,8 @@ class MapClient(MapSource):
     def wanted(self) -> WantedVersion:
         """Return the version that the server wants this robot to run; LinkError without an answer."""
         wanted = decode_message(self._bus.get(self._key("wanted"), timeout_s=self._timeout_s), WantedVersion)
-        if wanted.site != self._site:
-            raise LinkError(f"requested site {self._site}, the server answered for {wanted.site[:80]!r}")
+        if wanted.site != self.site:
+            raise LinkError(f"requested site {self.site}, the server answered for {wanted.site[:80]!r}")
         if self._trust is not None:
             self._trust.refresh()
         self.restored_ns, self.surveys = wanted.restored_ns, wanted.surveys
@@ -194,9 +194,9 @@ class MapClient(MapSource):
 
         def hear(_: str, payload: bytes) -> None:
             told = decode_message(payload, InitialPoseMessage)
-            if (told.site, told.robot) != (self._site, self._robot):
+            if (told.site, told.robot) != (self.site, self._robot):
                 raise LinkError(
-                    f"a pose for robot {told.robot!r} of {told.site!r} was sent to {self._robot} of {self._site}"
+                    f"a pose for robot {told.robot!r} of {told.site!r} was sent to {self._robot} of {self.site}"
                 )
             listener(told)
 
@@ -204,8 +204,8 @@ class MapClient(MapSource):
 
     def active(self) -> WantedVersion | None:
         """Return the active version, complete in the cache; None before the first one."""
-        active = self._cache.active(self._site)
-        return None if active is None else active.wanted(self._site)
+        active = self._cache.active(self.site)
+        return None if active is None else active.wanted(self.site)
 
     def ready(self) -> ReadyVersion:
         """Return the wanted version, complete and active; else the active one; else the wanted one as far as it can be fetched.
@@ -235,7 +235,7 @@ class MapClient(MapSource):
             return active
         try:
             if not asks:
-                raise LinkError(f"the cache has no version of site {self._site} yet")
+                raise LinkError(f"the cache has no version of site {self.site} yet")
             if self._trust is None:
                 raise UntrustedError("signature", "this robot has no signed lists")
             wanted = self._trust.current()
@@ -244,7 +244,7 @@ class MapClient(MapSource):
         except (LinkError, MapFormatError, StoreError) as error:
             if active is None:
                 raise
-            _log.info("site %s: version %s stays active: %s", self._site, active.version, error)
+            _log.info("site %s: version %s stays active: %s", self.site, active.version, error)
             return active
         return wanted
 
@@ -260,19 +260,30 @@ class MapClient(MapSource):
         """
         self._begun = ""
         manifest = self.manifest(wanted)
-        self._cache.reserve(self._site, addresses_of(manifest, wanted.manifest_sha256 or ""))
+        self._cache.reserve(self.site, addresses_of(manifest, wanted.manifest_sha256 or ""))
         self.vocabulary(manifest)
         for entry in manifest.tiles:
             # Decode to validate, do not keep: a large site exceeds a robot's memory.
             checked_tile(entry, manifest.tile_size_m, self.blob(entry.sha256, entry.bytes))
         if self.takes_grids:
-            self._fetch_grid(manifest)
+            try:
+                for entry in grid_blobs(manifest, self.blob):
+                    self.blob(entry.sha256, entry.bytes)
+            except UnreachableError:
+                raise
+            except (LinkError, MapFormatError) as error:  # planners need the grid, localization does not
+                _log.warning("version %s comes without its grid for planners: %s", manifest.version, error)
         return manifest
 
     def activate(self, manifest: Manifest, wanted: WantedVersion) -> None:
         """Make a fetched version the one that the robot starts with; StoreError if a piece of it is missing."""
-        addresses = [*addresses_of(manifest, wanted.manifest_sha256 or ""), *self._grid_addresses(manifest)]
-        self._cache.activate(self._site, manifest.version, addresses)
+        addresses = addresses_of(manifest, wanted.manifest_sha256 or "")
+        with suppress(LinkError, MapFormatError):  # of a grid that is not complete in the cache
+            found = [entry.sha256 for entry in grid_blobs(manifest, CachedMap(self._cache, self.site).blob)]
+            index = grid_index(manifest)
+            if index is not None and all(sha256 in self._cache for sha256 in found):
+                addresses += [index, *found]
+        self._cache.activate(self.site, manifest.version, addresses)
 
     # --- contents of a version ----------------------------------------------------------------------------------------
 
@@ -283,9 +294,14 @@ class MapClient(MapSource):
         MapFormatError for wrong bytes.
         """
         version, sha256 = address_of(wanted)
-        active = self._cache.active(self._site)
+        active = self._cache.active(self.site)
         is_active = active is not None and sha256 == active.blobs[0]
-        max_bytes = MAX_MANIFEST_BYTES if is_active else self._admitted_bytes(wanted, sha256)
+        max_bytes = MAX_MANIFEST_BYTES
+        # By the signed list; the manifest defines all else of a version, by hash and size. An admitted fetch is completed even if the
+        # list has changed meanwhile.
+        if not is_active and self._trust is not None and sha256 != self._begun:
+            max_bytes = self._trust.admitted(wanted).length
+            self._begun = sha256
         return checked_manifest(self._blob(self._key(f"manifests/{version}"), sha256, max_bytes), wanted)
 
     def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
@@ -307,36 +323,6 @@ class MapClient(MapSource):
             self._away = error
             raise
 
-    def _fetch_grid(self, manifest: Manifest) -> None:
-        """Fetch the grid. A failure is only logged: planners need the grid, localization does not."""
-        try:
-            for entry in grid_blobs(manifest, self.blob):
-                self.blob(entry.sha256, entry.bytes)
-        except UnreachableError:
-            raise
-        except (LinkError, MapFormatError) as error:
-            _log.warning("version %s comes without its grid for planners: %s", manifest.version, error)
-
-    def _grid_addresses(self, manifest: Manifest) -> list[str]:
-        """Return the addresses of a grid that is complete in the cache; otherwise none."""
-        with suppress(LinkError, MapFormatError):
-            found = [entry.sha256 for entry in grid_blobs(manifest, CachedMap(self._cache, self._site).blob)]
-            index = grid_index(manifest)
-            if index is not None and all(sha256 in self._cache for sha256 in found):
-                return [index, *found]
-        return []
-
-    def _admitted_bytes(self, wanted: WantedVersion, sha256: str) -> int:
-        """Return the manifest's size by the signed list. The manifest defines all else of a version, by hash and size.
-
-        An admitted fetch is completed even if the list has changed meanwhile.
-        """
-        if self._trust is None or sha256 == self._begun:
-            return MAX_MANIFEST_BYTES
-        length = self._trust.admitted(wanted).length
-        self._begun = sha256
-        return length
-
     def _blob(self, key: str, sha256: str, max_bytes: int) -> bytes:
         """Return the verified bytes of an address, from the cache or the server, and cache them."""
         data = self._cache.get(sha256)
@@ -352,14 +338,14 @@ class MapClient(MapSource):
 
         Errors as of `manifest`; the cached file stays.
         """
-        kept = self._cache.kept_file(self._site, kind)
+        kept = self._cache.kept_file(self.site, kind)
         named = None if self._trust is None else self._trust.files
         if named is None or (kept is not None and sha256_hex(kept) == named.get(kind)):
             return kept
         data = None
         if (sha256 := named.get(kind)) is not None:
             data = verified(self._chunks.read(self._key(f"blobs/{sha256}"), max_bytes=max_bytes), sha256)
-        self._cache.keep_file(self._site, kind, data)
+        self._cache.keep_file(self.site, kind, data)
         return data
 
     def building_frame(self) -> BuildingFrame | None:
@@ -375,7 +361,7 @@ class MapClient(MapSource):
 
     def ack(self, version: int | None, *, stamp_ns: int, refused: str = "") -> None:
         """Report to the server the running version and, if it is not the wanted one, the reason."""
-        own = {"site": self._site, "robot": self._robot}
+        own = {"site": self.site, "robot": self._robot}
         message = RobotAck(**own, stamp_ns=stamp_ns, version=version, refused=refused[:2000])
         self._bus.publish(self._key("ack"), encode_message(message))
 
@@ -396,4 +382,4 @@ class MapClient(MapSource):
         self._bus.publish(self._key("pose"), encode_message(message), may_drop=True)
 
     def _key(self, name: str) -> str:
-        return robot_key(self._site, self._robot, name)
+        return robot_key(self.site, self._robot, name)

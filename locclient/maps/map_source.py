@@ -49,11 +49,7 @@ class MapSource(ABC):
 
     def __init__(self, site: str) -> None:
         """Raises UsageError for an invalid site name."""
-        self._site = check_name(site, "site")
-
-    @property
-    def site(self) -> str:
-        return self._site
+        self.site = check_name(site, "site")
 
     def newest(self, *, asks: bool = True) -> WantedVersion:
         """Return the site's current version, complete where the robot can read it; asks: False for the one on its disk. Errors as of
@@ -107,10 +103,10 @@ class CachedMap(MapSource):
 
     def ready(self) -> ReadyVersion:
         """Return the active version; LinkError before the first one."""
-        active = self._cache.active(self._site)
+        active = self._cache.active(self.site)
         if active is None:
-            raise LinkError(f"the cache has no version of site {self._site} yet; fetch one from a server first")
-        return ReadyVersion(active.wanted(self._site))
+            raise LinkError(f"the cache has no version of site {self.site} yet; fetch one from a server first")
+        return ReadyVersion(active.wanted(self.site))
 
     def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
         """Return the verified bytes of an address; LinkError if not in the cache."""
@@ -141,29 +137,26 @@ class LocalMapSource(MapSource):
 
     def wanted(self) -> WantedVersion:
         """Return the version to run; UsageError for a missing version, StoreError if the store cannot be read."""
-        if self._version is not None:
-            return self._asked(self._version)
-        path = self._folder / current_path(self._site)
+        if (number := self._version) is not None:
+            known = self._rows("SELECT version, manifest_sha256 FROM versions WHERE site = ?")
+            if number not in known:
+                names = ", ".join(str(version) for version in sorted(known)) or "none"
+                raise UsageError(f"site {self.site} has no version {number} in {self._folder}; it has: {names}")
+            return WantedVersion(site=self.site, version=number, manifest_sha256=known[number])
+        path = self._folder / current_path(self.site)
         try:
             sha256 = check_sha256(path.read_text("ascii").strip())
         except FileNotFoundError:
-            return WantedVersion(site=self._site, version=None, manifest_sha256=None)
+            return WantedVersion(site=self.site, version=None, manifest_sha256=None)
         except (OSError, UnicodeDecodeError, MapFormatError) as error:
             raise StoreError(f"{path} cannot be read ({error}); open the store with mapserver to repair it") from error
         version = decode_manifest(self.blob(sha256)).version
-        return WantedVersion(site=self._site, version=version, manifest_sha256=sha256)
+        return WantedVersion(site=self.site, version=version, manifest_sha256=sha256)
 
     def site_file(self, kind: str, max_bytes: int) -> bytes | None:
         """Return the file of this kind that the site keeps beside its versions; None without one. Errors as of `wanted` and `blob`."""
         sha256 = self._rows("SELECT kind, sha256 FROM site_files WHERE site = ?").get(kind)
         return None if sha256 is None else self.blob(sha256)
-
-    def _asked(self, number: int) -> WantedVersion:
-        known = self._rows("SELECT version, manifest_sha256 FROM versions WHERE site = ?")
-        if number not in known:
-            names = ", ".join(str(version) for version in sorted(known)) or "none"
-            raise UsageError(f"site {self._site} has no version {number} in {self._folder}; it has: {names}")
-        return WantedVersion(site=self._site, version=number, manifest_sha256=known[number])
 
     def _rows(self, query: str) -> dict[Any, str]:
         """Return the two columns of a query for this site; StoreError if the database cannot be read."""
@@ -173,7 +166,7 @@ class LocalMapSource(MapSource):
         how = "mode=ro" if os.access(self._folder, os.W_OK) or log.exists() else "mode=ro&immutable=1"
         try:
             with closing(sqlite3.connect(f"{path.absolute().as_uri()}?{how}", uri=True)) as database:
-                return dict(database.execute(query, (self._site,)).fetchall())
+                return dict(database.execute(query, (self.site,)).fetchall())
         except sqlite3.Error as error:
             raise StoreError(
                 f"{path} cannot be read ({error}); check the store with `mapserver verify --store {shlex.quote(str(self._folder))}`"

@@ -46,7 +46,16 @@ class TileCache:
         self._reserved: dict[str, frozenset[str]] = {}
         with disk_errors(f"the cache {folder} cannot be used", "choose another folder"):
             folder.mkdir(parents=True, exist_ok=True)
-            self._sizes = self._scan()
+            for leftover in (*folder.glob("*/*/.*.tmp"), *folder.glob("sites/*/kept/.*.tmp")):
+                with suppress(OSError):
+                    leftover.unlink()  # by a process that died while writing
+            sizes = []
+            for path in folder.glob("blobs/??/*"):
+                with suppress(OSError):
+                    if len(path.name) == 64:
+                        status = path.stat()
+                        sizes.append((status.st_mtime_ns, path.name, status.st_size))
+            self._sizes = {name: size for _, name, size in sorted(sizes)}
             found = ((path.parent.name, self._read_record(path)) for path in folder.glob("sites/*/active"))
             self._active = {site: record for site, record in found if record is not None}
             kept = ((path.parent.parent.name, self._read_record(path)) for path in folder.glob("sites/*/kept/[0-9]*"))
@@ -109,7 +118,7 @@ class TileCache:
                 f"{missing[0]} first; {self._last_fault or 'fetch them again'}"
             )
         record = ActiveVersion(version, tuple(blobs))
-        path = self._folder / "sites" / check_name(site, "site") / "active"
+        path = self._site_path(site) / "active"
         if record != self._active.get(site) and not self._write(path, to_json(record)):
             raise StoreError(f"version {version} of {site} cannot be made active: {self._last_fault}")
         self._active[site] = record
@@ -123,7 +132,7 @@ class TileCache:
         """Keep a complete version until `release`, even in a full cache; errors as of `activate`."""
         missing = [sha256 for sha256 in blobs if sha256 not in self._sizes]
         record = ActiveVersion(version, tuple(blobs))
-        if missing or not self._write(self._kept_path(site, version), to_json(record)):
+        if missing or not self._write(self._site_path(site) / "kept" / str(version), to_json(record)):
             raise StoreError(
                 f"version {version} of {site} is not kept: {self._last_fault or f'{missing[0]} is missing'}"
             )
@@ -132,8 +141,9 @@ class TileCache:
     def release(self, site: str, version: int) -> None:
         """Undo `keep`, and remove files that no other version needs; StoreError on a disk error."""
         with disk_errors(f"version {version} of {site} cannot be removed from the cache", "check its rights"):
-            self._kept_path(site, version).unlink(missing_ok=True)
-            sync_path(self._kept_path(site, version).parent)
+            kept = self._site_path(site) / "kept"
+            (kept / str(version)).unlink(missing_ok=True)
+            sync_path(kept)
         gone = self._kept.pop((site, version), None)
         for sha256 in () if gone is None else set(gone.blobs) - self._used():
             self._remove(sha256)
@@ -144,7 +154,7 @@ class TileCache:
 
     def keep_file(self, site: str, kind: str, data: bytes | None) -> None:
         """Store a site's file beside its versions, until the next one of that kind; None removes it."""
-        path = self._folder / "sites" / check_name(site, "site") / "beside" / check_name(kind, "kind")
+        path = self._site_path(site) / "beside" / check_name(kind, "kind")
         if data is None:
             self._try_unlink(path)
         else:
@@ -152,7 +162,7 @@ class TileCache:
 
     def kept_file(self, site: str, kind: str) -> bytes | None:
         """Return the last file given to `keep_file`; None without one."""
-        path = self._folder / "sites" / check_name(site, "site") / "beside" / check_name(kind, "kind")
+        path = self._site_path(site) / "beside" / check_name(kind, "kind")
         try:
             return path.read_bytes()
         except FileNotFoundError:
@@ -172,18 +182,6 @@ class TileCache:
     def _note(self, fault: str) -> None:
         self._last_fault = fault
         self._faults.append(fault)
-
-    def _scan(self) -> dict[str, int]:
-        found = []
-        for leftover in (*self._folder.glob("*/*/.*.tmp"), *self._folder.glob("sites/*/kept/.*.tmp")):
-            with suppress(OSError):
-                leftover.unlink()  # by a process that died while writing
-        for path in self._folder.glob("blobs/??/*"):
-            with suppress(OSError):
-                if len(path.name) == 64:
-                    status = path.stat()
-                    found.append((status.st_mtime_ns, path.name, status.st_size))
-        return {name: size for _, name, size in sorted(found)}
 
     def _read_record(self, path: Path) -> ActiveVersion | None:
         try:
@@ -223,8 +221,8 @@ class TileCache:
             return False
         return True
 
-    def _kept_path(self, site: str, version: int) -> Path:
-        return self._folder / "sites" / check_name(site, "site") / "kept" / str(version)
+    def _site_path(self, site: str) -> Path:
+        return self._folder / "sites" / check_name(site, "site")
 
     def _remove(self, sha256: str) -> None:
         self._sizes.pop(sha256, None)

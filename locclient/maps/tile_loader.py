@@ -33,7 +33,11 @@ class TileLoader:
 
         Raises FleetmapError if its manifest, its vocabulary or all of its tiles are unusable.
         """
-        version = self._version(wanted)
+        sha256 = wanted.manifest_sha256 or ""
+        if sha256 not in self._versions:
+            manifest = self._source.manifest(wanted)
+            self._versions[sha256] = _Version(manifest, decode_vocabulary(self._source.vocabulary(manifest)))
+        version = self._versions[sha256]
         cells = select_tiles(version.manifest, version.cells, bound, self.settings)
         if cells == version.cells:
             return None
@@ -69,10 +73,3 @@ class TileLoader:
     def keep_only(self, held: list[WantedVersion]) -> None:
         kept = {wanted.manifest_sha256 for wanted in held}
         self._versions = {sha256: version for sha256, version in self._versions.items() if sha256 in kept}
-
-    def _version(self, wanted: WantedVersion) -> _Version:
-        sha256 = wanted.manifest_sha256 or ""
-        if sha256 not in self._versions:
-            manifest = self._source.manifest(wanted)
-            self._versions[sha256] = _Version(manifest, decode_vocabulary(self._source.vocabulary(manifest)))
-        return self._versions[sha256]

@@ -109,7 +109,12 @@ class OnsetRecorder:
         """Add a frame. begun_ns: start of conditions that may become a failure, by kind; odom_from_body as of `Belief`."""
         stamp_ns, last, self._last = estimate.stamp_ns, self._last, (estimate, odom_from_body)
         step_ns = 0 if last is None else stamp_ns - last[0].stamp_ns
-        self._note_belief(estimate, odom_from_body)
+        if estimate.fix is not None:
+            self._fix = (stamp_ns, estimate.fix.landmark_recall)
+        # A claimed pose is one without competitors that is not an unconfirmed candidate.
+        if estimate.map_from_body is not None and estimate.cov_rot_trans is not None and not estimate.hypotheses:
+            claimed = (estimate.map_from_body, estimate.cov_rot_trans, odom_from_body)
+            self._belief = Belief(stamp_ns, *claimed, *self._fix, estimate.floor)
         if self._breaks(estimate, step_ns):
             self._break = self._onset(stamp_ns, frame, odom_from_body, estimate.view)
         for kind, began_ns in begun_ns.items():
@@ -160,15 +165,6 @@ class OnsetRecorder:
         begins, self._was_odometry_lost = is_lost and not self._was_odometry_lost, is_lost
         is_next = step_ns <= _DROPPED_STEPS * self._least_step_ns
         return begins and is_next and estimate.image.cause is Cause.NONE
-
-    def _note_belief(self, estimate: Estimate, odom_from_body: Array) -> None:
-        """Store a claimed pose: one without competitors that is not an unconfirmed candidate."""
-        if estimate.fix is not None:
-            self._fix = (estimate.stamp_ns, estimate.fix.landmark_recall)
-        if estimate.map_from_body is None or estimate.cov_rot_trans is None or estimate.hypotheses:
-            return
-        claimed = (estimate.map_from_body, estimate.cov_rot_trans, odom_from_body)
-        self._belief = Belief(estimate.stamp_ns, *claimed, *self._fix, estimate.floor)
 
     def _onset(self, stamp_ns: int, frame: RectifiedFrame, odom_from_body: Array, view: int) -> Onset:
         before = [self._nearest(stamp_ns - age_ns, stamp_ns) for age_ns in _BEFORE_NS]

@@ -132,6 +132,11 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
     # The server has no place for a pose in another site's map.
     if onset.map_from_body is not None and is_own and not (belief and belief.floor):
         map_from_base = onset.map_from_body @ se3_inverse(profile.base_from_body)
+    tile = None
+    if map_from_base is not None and context.running is not None:
+        x_tile, y_tile = (map_from_base[:2, 3] // context.running.manifest.tile_size_m).tolist()
+        tile = int(x_tile), int(y_tile)
+    camera, body_from_cam = profile.mounted(onset.view)
     matches = _matches(context, profile)
     seen = None if matches is None else int((matches[2] >= 0).sum())
     cause = failure.cause
@@ -150,7 +155,7 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
         status=failure.estimate.status,
         cause=cause,
         version=failure.estimate.map_version if is_own else None,
-        tile=_tile(context, map_from_base),
+        tile=tile,
         map_from_base=None if map_from_base is None else Placement.of(map_from_base),
         radius_95_m=None if belief is None else known_radius_m(belief.cov_rot_trans),
         wrong_by_m=context.evidence.wrong_by_m,
@@ -162,28 +167,15 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
         sharpness=None if image is None else image.sharpness,
         fixes=failure.fixes,
         calibration=failure.estimate.calibration.text[:2000],
-        camera=_camera(profile, onset.view),
+        camera=CameraNote(
+            size_px=(camera.width_px, camera.height_px),
+            focal_px=float(camera.focal_px),
+            centre_px=(float(camera.cx_px), float(camera.cy_px)),
+            base_from_cam=Placement.of(profile.base_from_body @ body_from_cam),
+        ),
         view=onset.view if profile.others else None,
         thumbnails=_thumbnails(context, profile, matches, cause),
     )
-
-
-def _camera(profile: RobotProfile, view: int) -> CameraNote:
-    camera, body_from_cam = profile.mounted(view)
-    return CameraNote(
-        size_px=(camera.width_px, camera.height_px),
-        focal_px=float(camera.focal_px),
-        centre_px=(float(camera.cx_px), float(camera.cy_px)),
-        base_from_cam=Placement.of(profile.base_from_body @ body_from_cam),
-    )
-
-
-def _tile(context: FailureContext, map_from_base: Array | None) -> tuple[int, int] | None:
-    if map_from_base is None or context.running is None:
-        return None
-    size_m = context.running.manifest.tile_size_m
-    x, y = (map_from_base[:2, 3] // size_m).tolist()
-    return int(x), int(y)
 
 
 def _matches(context: FailureContext, profile: RobotProfile) -> Matches | None:

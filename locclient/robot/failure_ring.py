@@ -154,7 +154,13 @@ class FailureRing:
         if now_ns - self._pictured_ns >= (_PICTURES_NS if percept.query is not None else _LATEST_PICTURE_NS):
             self._pictured_ns, kept.picture = now_ns, frame
         self._frames.append(kept)
-        self._follow_onsets(begun_ns)
+        if self._held is not None and self._held.onset_ns not in begun_ns.values():
+            if self._held in self._cuts and not self._held.is_wanted:
+                self._cuts.remove(self._held)
+            self._held = None
+        if self._held is None and begun_ns:
+            self._held = FailureCut(min(begun_ns.values()), is_wanted=False)
+            self._cuts.append(self._held)
         for cut in [cut for cut in self._cuts if now_ns >= cut.onset_ns + AFTER_NS]:
             self._complete(cut)
         oldest_ns = now_ns - BEFORE_NS - AFTER_NS - _QUERY_NS
@@ -176,15 +182,6 @@ class FailureRing:
         """Complete waiting cuts: no frame follows."""
         for cut in list(self._cuts):
             self._complete(cut)
-
-    def _follow_onsets(self, begun_ns: Mapping[FailureKind, int]) -> None:
-        if self._held is not None and self._held.onset_ns not in begun_ns.values():
-            if self._held in self._cuts and not self._held.is_wanted:
-                self._cuts.remove(self._held)
-            self._held = None
-        if self._held is None and begun_ns:
-            self._held = FailureCut(min(begun_ns.values()), is_wanted=False)
-            self._cuts.append(self._held)
 
     def _complete(self, cut: FailureCut) -> None:
         """Set the frames of a cut; copy data that still change."""

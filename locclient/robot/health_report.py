@@ -150,7 +150,7 @@ class HealthFigures:
     """Counts since the start, and durations of the last frames."""
 
     def __init__(self) -> None:
-        self._all_frames = self._frames = self._localised = self._failures = 0
+        self._all_frames = self._frames = self._localised = self.failures = 0
         self._frame_ms: deque[float] = deque(maxlen=_RECENT)
         self._first_ns: int | None = None
         self._first_fix_s: float | None = None
@@ -173,9 +173,6 @@ class HealthFigures:
         self._fixes.handle(estimate, outcome.dock_error_m, outcome.speed_mps)
         self.search.handle(estimate, outcome.speed_mps, may_be_mapped=outcome.may_be_mapped)
 
-    def count_failure(self) -> None:
-        self._failures += 1
-
     def report(self, site: str, robot: str, wall_ns: int, more: Mapping[str, Figure], silent: bool) -> RobotHealth:
         """Return the message; more: figures of other parts. silent: True if the source has stopped sending frames."""
         last = None if self.last is None else self.last.estimate
@@ -187,7 +184,7 @@ class HealthFigures:
             "first_frame_ms": self._first_frame_ms,
             "frame_ms_mean": float(np.mean(self._frame_ms)) if self._frame_ms else None,
             "frame_ms_p99": float(np.percentile(self._frame_ms, 99)) if self._frame_ms else None,
-            "failures": self._failures,
+            "failures": self.failures,
             **self._fixes.take(),
         }
         if last is not None:

@@ -5,8 +5,9 @@ from typing import Annotated, Any, NamedTuple, cast
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 
+from fleetmap.encoding import to_plain
 from fleetmap.mapformat import sha256_hex
-from fleetmap.messages import InitialPoseMessage, report_dict
+from fleetmap.messages import InitialPoseMessage
 from mapserver.api import parameters as p
 from mapserver.api import views
 from mapserver.api.bytes_response import PICTURE_HEADERS, bytes_response
@@ -114,7 +115,7 @@ def failures(store: p.Store, query: Annotated[p.FailureQuery, Query()]) -> views
 def failure(store: p.Store, number: p.Number) -> views.FailureView:
     """One failure with the robot's report."""
     found = store.fleet.failure(number)
-    return views.FailureView(found.failure, report_dict(found.report), found.pictures)
+    return views.FailureView(found.failure, to_plain(found.report), found.pictures)
 
 
 @router.get("/v1/failures/{number}/pictures/{place}", response_class=Response)

@@ -60,11 +60,6 @@ class CheckedRecording:
     corrections: dict[str, float]
     held: Mapping[str, str] = field(default_factory=dict)
 
-    @property
-    def leaves_wheels_out(self) -> bool:
-        """True if all other sensors contradict the wheels."""
-        return leaves_wheels_out(self.findings)
-
     def statements(self) -> list[str]:
         """Each finding that is not good or not judged, as text, with the correction made."""
         return self._with_corrections(f"{f.name}: {f.sentence}" for f in self.findings if f.verdict is not Verdict.OK)

@@ -15,7 +15,7 @@ from fleetmap.encoding import to_json
 from fleetmap.geometry import AnyArray, Array, Rings, inside_any
 from fleetmap.mapformat import Manifest
 from mapserver.drafting.draft_evidence import Before
-from mapserver.drafting.survey_recordings import Surveyed, map_trajectories
+from mapserver.drafting.survey_recordings import RecordingSurvey, map_trajectories
 from mapserver.floor_plan.areas import Area, Areas, CorrectionKind, read_areas
 from mapserver.floor_plan.survey_requests import COVERED_SHARE, near_drives
 from mapserver.survey.merge.area_corrections import Mask, SurveyLimits, is_before
@@ -56,13 +56,21 @@ class AreaCorrections:
     due: Sequence[Area] = ()
 
     def joined(
-        self, base: SurveyMap | None, surveyed: Sequence[Surveyed], settings: SurveySettings
+        self, base: SurveyMap | None, surveyed: Sequence[RecordingSurvey], settings: SurveySettings
     ) -> tuple[MergedMap, "AreaCorrections"]:
         """Join recordings to a map; return the result, and the corrections that it has.
 
         Joined once more if no recording covers one that is due: its landmarks must still be there.
         """
-        merger = MapMerger(None if base is None else self._start(base), settings, self._limits())
+        frozen, unused, forget = (
+            _of(self.areas, kind) for kind in (CorrectionKind.FREEZE, CorrectionKind.NEVER_USE, CorrectionKind.FORGET)
+        )
+        since = [(p, area.correction.since_ns or 0) for area in forget if area.correction for p in area.polygons]
+        limits = SurveyLimits(_polygons(frozen), _polygons(unused), tuple(since))
+        start = base
+        if base is not None and (gone := self._is_gone(base.points_map)).any():
+            start = kept(base, ~gone)
+        merger = MapMerger(start, settings, limits)
         for done in surveyed:
             merger.add(Session(done.survey, done.map_from_survey))
         found = merger.finish()
@@ -98,17 +106,6 @@ class AreaCorrections:
     def configuration(self, site: str) -> dict[str, Any]:
         """Return the entry of the manifest."""
         return {CORRECTIONS_KEY: Areas.of(self.areas).geojson(site)} if self.areas else {}
-
-    def _start(self, base: SurveyMap) -> SurveyMap:
-        gone = self._is_gone(base.points_map)
-        return kept(base, ~gone) if gone.any() else base
-
-    def _limits(self) -> SurveyLimits:
-        frozen, unused, forget = (
-            _of(self.areas, kind) for kind in (CorrectionKind.FREEZE, CorrectionKind.NEVER_USE, CorrectionKind.FORGET)
-        )
-        since = [(p, area.correction.since_ns or 0) for area in forget if area.correction for p in area.polygons]
-        return SurveyLimits(_polygons(frozen), _polygons(unused), tuple(since))
 
     def is_due(self, points_map: AnyArray) -> Mask:
         """Return (N,) which points are forgotten now."""

@@ -41,7 +41,7 @@ from mapserver.drafting.survey_recordings import (
     Admission,
     OpenRecordings,
     RecordingOptions,
-    Surveyed,
+    RecordingSurvey,
     admit_recordings,
     joined_truth,
     map_trajectories,
@@ -146,17 +146,17 @@ class _Run:
 
 
 @dataclass(frozen=True)
-class Built:
+class BuildResult:
     """The surveys and their outcomes: the map in its final frame, its accuracy, its corrections, and whether it is the site's first."""
 
-    surveyed: list[Surveyed]
+    surveyed: list[RecordingSurvey]
     joined: MergedMap
     accuracy: Accuracy
     corrections: AreaCorrections
     is_first: bool
 
     @property
-    def taken(self) -> list[Surveyed]:
+    def taken(self) -> list[RecordingSurvey]:
         """The recordings that were joined to the map."""
         return [s for s, outcome in zip(self.surveyed, self.joined.outcomes, strict=True) if outcome.joined]
 
@@ -173,7 +173,7 @@ class Draft:
 
 def build_draft(
     request: BuildRequest, settings: SurveySettings, unusable: dict[Path, str] | None = None, *, recorded: bool = False
-) -> tuple[Draft, Built]:
+) -> tuple[Draft, BuildResult]:
     """Build a draft; raises FleetmapErrors, before the survey if possible.
 
     With `unusable` a recording that cannot be surveyed is added there with its reason, and the others are used. recorded: as
@@ -191,7 +191,18 @@ def build_draft(
         MappedImageStore(folder) as images,
     ):
         run = _Run(request, reading, settings, zones, unusable, console, times, started_s, images)
-        admitted = _admitted(run)
+        times.begin("examination")
+        with ProgressView(console) as view, open_executor(options.threads, None) as executor:
+            admitted = admit_recordings(
+                request.recordings,
+                reading,
+                console,
+                needs_truth=options.frame_from_ground_truth,
+                unusable=unusable,
+                settings=settings,
+                tools=run.tools(executor, view),
+                look_at=options.look_at,
+            )
         with (
             MapStore.open(request.store, create=True) as maps,
             recorded_job(maps, request.site, "build") if recorded else nullcontext(Job(number=options.job)) as job,
@@ -205,22 +216,6 @@ def build_draft(
             draft = replace(draft, report=draft.report | {"loop_places": loop_places(built.taken, built.joined)})
             job.message, job.report = draft.sentence, draft.report | {"version": draft.version}
             return draft, built
-
-
-def _admitted(run: _Run) -> dict[Path, Admission]:
-    request, options = run.request, run.request.options
-    run.times.begin("examination")
-    with ProgressView(run.console) as view, open_executor(options.threads, None) as executor:
-        return admit_recordings(
-            request.recordings,
-            run.reading,
-            run.console,
-            needs_truth=options.frame_from_ground_truth,
-            unusable=run.unusable,
-            settings=run.settings,
-            tools=run.tools(executor, view),
-            look_at=options.look_at,
-        )
 
 
 def _parent(request: BuildRequest, maps: MapStore) -> Before | None:
@@ -244,7 +239,7 @@ def _parent(request: BuildRequest, maps: MapStore) -> Before | None:
 
 def _survey(
     run: _Run, admitted: dict[Path, Admission], parent: Before | None, areas: Areas, told: JobProgress
-) -> Built:
+) -> BuildResult:
     """Survey all recordings and join them to the current map, with the corrections of the site's areas."""
     options, settings = run.request.options, run.settings
     base, corrections = None if parent is None else parent.survey, AreaCorrections()
@@ -257,7 +252,7 @@ def _survey(
         survey_options = SurveyConfig(settings, default_vocabulary(), run.zones)
         tools = run.tools(executor, view, told)
 
-        def survey_one(path: Path, pinhole: StereoCamera | None) -> list[Surveyed]:
+        def survey_one(path: Path, pinhole: StereoCamera | None) -> list[RecordingSurvey]:
             options.look_at([path])
             return survey_recording(path, admitted.pop(path), run.reading, pinhole, survey_options, tools)
 
@@ -279,20 +274,19 @@ def _survey(
         joined = replace(
             joined, map=transform_map(joined.map, truth_from_estimate(estimated_trajectory(joined.map), truth))
         )
-    return Built(surveyed, joined, found, corrections, is_first=base is None)
+    return BuildResult(surveyed, joined, found, corrections, is_first=base is None)
 
 
-def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Draft:
+def _keep(run: _Run, built: BuildResult, parent: Before | None, maps: MapStore) -> Draft:
     """Cut the map into tiles, measure them, store the draft and write the requested files."""
     site, survey_map = run.request.site, built.joined.map
-    wanted = None if parent is None else parent.wanted_ids(survey_map)
     judged = [
         JudgedSession(trajectory, s.probed, s.survey, s.entry.name)
         for trajectory, s in zip(map_trajectories(built.joined), built.taken, strict=True)
     ]
     run.times.begin("choosing")
-    corrections = built.corrections
-    frozen = corrections.frozen(survey_map.points_map)
+    wanted = None if parent is None else parent.wanted_ids(survey_map)
+    frozen = built.corrections.frozen(survey_map.points_map)
     chooser = TileChooser(survey_map, run.settings.budget, wanted, default_vocabulary(), frozen)
     tiles, views = chooser.choose(asked_views(judged))
     run.times.begin("extras")
@@ -301,7 +295,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         for s, session in zip(built.taken, judged, strict=True)
     ]
     before = None if parent is None else parent.manifest
-    extras = made_extras(ChosenDraft(sessions, run.settings, corrections, before, maps))
+    extras = made_extras(ChosenDraft(sessions, run.settings, built.corrections, before, maps))
     run.times.begin("examining")
     evidence = msgspec.structs.replace(_evidence(run, built, judged, tiles, parent), views=views)
     run.times.begin("storing")
@@ -314,12 +308,11 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
         peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6,
     )
     known_m = None if parent is None else parent.manifest.report.get("alias_step_m")
-    step_m = alias_step_m(evidence.repetition, known_m)
     report = msgspec.structs.replace(
         report,
         surveyed_requests=covered_requests(maps, site, built.joined),
         removed_landmarks={} if parent is None else parent.removed(),
-        alias_step_m=step_m,
+        alias_step_m=alias_step_m(evidence.repetition, known_m),
     )
     said = to_plain(report) | {key: to_plain(extra.report) for key, extra in extras.items()}
     details = _details(run, built, parent, evidence, said)
@@ -345,7 +338,7 @@ def _keep(run: _Run, built: Built, parent: Before | None, maps: MapStore) -> Dra
 
 
 def _details(
-    run: _Run, built: Built, parent: Before | None, evidence: Evidence, report: dict[str, Any]
+    run: _Run, built: BuildResult, parent: Before | None, evidence: Evidence, report: dict[str, Any]
 ) -> DraftDetails:
     starts = None if evidence.starts is None else msgspec.structs.replace(evidence.starts, lookalikes=[])
     camera = built.joined.map.camera
@@ -373,7 +366,7 @@ def covered_requests(maps: MapStore, site: str, joined: MergedMap) -> dict[str, 
 
 
 def _evidence(
-    run: _Run, built: Built, sessions: list[JudgedSession], tiles: list[Tile], before: Before | None
+    run: _Run, built: BuildResult, sessions: list[JudgedSession], tiles: list[Tile], before: Before | None
 ) -> Evidence:
     options, camera = run.request.options, built.joined.map.camera
     replayed = []
@@ -406,7 +399,7 @@ def _configuration(run: _Run, parent: Before | None) -> dict[str, Any]:
     return given | topics | always
 
 
-def picture_png(site: str, draft: Draft, built: Built) -> bytes:
+def picture_png(site: str, draft: Draft, built: BuildResult) -> bytes:
     """Return the map from above as a PNG."""
     from mapserver.drafting.plots import draw_survey
 
@@ -416,7 +409,7 @@ def picture_png(site: str, draft: Draft, built: Built) -> bytes:
     return draw_survey(f"{site}, version {draft.version}", built.joined.map, loops, built.accuracy, report)
 
 
-def _write_files(run: _Run, built: Built, draft: Draft) -> None:
+def _write_files(run: _Run, built: BuildResult, draft: Draft) -> None:
     options, site = run.request.options, run.request.site
     if options.trajectory_out is not None:
         write_tum(options.trajectory_out, built.joined.map.trajectory)

@@ -51,7 +51,12 @@ def end_interrupted(maps: MapStore, now_ns: int) -> list[int]:
     ended, store = [], maps.folder
     for job in maps.running_jobs():
         begun_s = datetime.fromisoformat(job.started).astimezone(UTC).timestamp()
-        if 0 <= now_ns / 1e9 - begun_s < _YOUNG_S or _is_held(maps, job.id):
+        if 0 <= now_ns / 1e9 - begun_s < _YOUNG_S:
+            continue
+        try:
+            with _opened(maps, job.id, waits=False):
+                pass
+        except FleetmapError:  # a living process holds the lock, or that is unknown
             continue
         message = "was interrupted: its process has ended; run it again, a nightly run resumes at the next start"
         maps.update_job(job.id, "failed", message, job.report | {INTERRUPTED: True})
@@ -59,15 +64,6 @@ def end_interrupted(maps: MapStore, now_ns: int) -> list[int]:
             _path(store, job.id).unlink()
         ended.append(job.id)
     return ended
-
-
-def _is_held(maps: MapStore, job: int) -> bool:
-    """True if a living process holds the job's lock, or if that is unknown."""
-    try:
-        with _opened(maps, job, waits=False):
-            return False
-    except FleetmapError:
-        return True
 
 
 def _path(store: Path, job: int) -> Path:
@@ -93,7 +89,7 @@ def logged(store: Path, job: int) -> Iterator[None]:
     except OSError:
         yield
         return
-    copied = _Copied(sys.stderr, file)
+    copied = _LogCopy(sys.stderr, file)
     with file, redirect_stderr(copied):
         try:
             yield
@@ -110,7 +106,7 @@ def log_path(store: Path, job: int) -> Path:
     return store / f"job-{job}.log"
 
 
-class _Copied(io.TextIOBase):
+class _LogCopy(io.TextIOBase):
     """A stream whose text is copied into a log, up to `_LOG_BYTES`. A full disk under either ends neither the other nor the job."""
 
     def __init__(self, stream: TextIO, file: io.RawIOBase) -> None:

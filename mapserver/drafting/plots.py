@@ -77,7 +77,17 @@ def _draw_map(axes: "Axes", survey_map: SurveyMap, flat: list[int], landmarks: A
     guessed = path[~survey_map.trajectory_estimated]
     size = float(np.clip(20_000 / max(len(landmarks), 1), 0.8, 4.0))
     dots(landmarks, s=size, c=_POINT, alpha=0.55, linewidths=0, zorder=1)
-    _draw_loops(axes, places, loops)
+    accepted = [r for r in loops.records if r.verdict is LoopVerdict.ACCEPTED]
+    refused = [r for r in loops.records if r.verdict is not LoopVerdict.ACCEPTED]
+    refused.sort(key=lambda r: (-r.score, r.i, r.j))
+    for records, colour, width, alpha, order, label in (
+        (refused[:_MAX_REFUSED], _BAD, 0.5, 0.35, 2, "loop refused"),
+        (accepted, _GOOD, 1.1, 0.75, 3, "loop accepted"),
+    ):
+        if records:
+            ends = [places[[r.i, r.j]] for r in records]
+            lines = LineCollection(ends, colors=colour, linewidths=width, alpha=alpha, zorder=order, label=label)
+            axes.add_collection(lines)
     stamps_ns = survey_map.trajectory.stamps_ns
     pieces = LineCollection(list(np.stack([path[:-1], path[1:]], axis=1)), cmap=_TIME, linewidths=2.4, zorder=4)
     pieces.set_array((stamps_ns[:-1] - stamps_ns[0]) * 1e-9)
@@ -93,21 +103,6 @@ def _draw_map(axes: "Axes", survey_map: SurveyMap, flat: list[int], landmarks: A
     bar = axes.figure.colorbar(pieces, ax=axes, location="bottom", fraction=0.025, pad=0.02, aspect=60)
     bar.set_label("seconds since the start", color=_QUIET)
     bar.ax.spines[:].set_visible(False)
-
-
-def _draw_loops(axes: "Axes", places: Array, loops: Loops) -> None:
-    """Draw accepted loops, and the most similar refused ones."""
-    accepted = [r for r in loops.records if r.verdict is LoopVerdict.ACCEPTED]
-    refused = [r for r in loops.records if r.verdict is not LoopVerdict.ACCEPTED]
-    refused.sort(key=lambda r: (-r.score, r.i, r.j))
-    for records, colour, width, alpha, order, label in (
-        (refused[:_MAX_REFUSED], _BAD, 0.5, 0.35, 2, "loop refused"),
-        (accepted, _GOOD, 1.1, 0.75, 3, "loop accepted"),
-    ):
-        if records:
-            ends = [places[[r.i, r.j]] for r in records]
-            lines = LineCollection(ends, colors=colour, linewidths=width, alpha=alpha, zorder=order, label=label)
-            axes.add_collection(lines)
 
 
 def _draw_errors(axes: "Axes", found: Accuracy, start_ns: int) -> None:

@@ -43,20 +43,18 @@ class ProgressView:
         self._shown = ""
         self._tasks: dict[str, TaskID] = {}
         columns = (TextColumn("{task.description:<18}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        self._bars = Progress(*columns, console=console) if console.is_terminal else None
+        self._bars = Progress(*columns, console=console, disable=not console.is_terminal)
 
     def __enter__(self) -> Self:
-        if self._bars is not None:
-            self._bars.start()
+        self._bars.start()
         return self
 
     def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
-        if self._bars is not None:
-            self._bars.stop()
+        self._bars.stop()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Show that `done` of `total` parts of a stage are done."""
-        if self._bars is not None:
+        if self._console.is_terminal:
             if stage not in self._tasks:
                 self._tasks[stage] = self._bars.add_task(stage, total=total)
             if self._shown and stage != self._shown:  # "matching again" occurs twice: close the previous bar

@@ -12,13 +12,12 @@ import numpy as np
 
 from fleetmap.encoding import to_plain
 from fleetmap.errors import disk_errors
-from fleetmap.geometry import Array
 from mapserver.drafting.accuracy import Accuracy
-from mapserver.drafting.survey_recordings import Surveyed
+from mapserver.drafting.survey_recordings import RecordingSurvey, map_trajectories
 from mapserver.quality.directions import one_way_words
 from mapserver.quality.figures import Evidence, Starts, SurveyedViews, TileDirections
 from mapserver.quality.probes import lookalike_words
-from mapserver.survey.loops.loops import LoopRecord, LoopVerdict
+from mapserver.survey.loops.loops import LoopVerdict
 from mapserver.survey.merge.multi_session import MergedMap
 
 MAX_REFUSED = 300  # loops of a build, the most alike first: those could have made a wrong map
@@ -60,7 +59,7 @@ class BuildReport(msgspec.Struct, frozen=True, kw_only=True):
 
 
 def make_report(
-    recordings: Sequence[Surveyed],
+    recordings: Sequence[RecordingSurvey],
     joined: MergedMap,
     found: Accuracy,
     evidence: Evidence,
@@ -116,7 +115,7 @@ def make_report(
 
 
 def report_details(
-    surveyed: Sequence[Surveyed], joined: MergedMap, found: Accuracy, stage_s: dict[str, float]
+    surveyed: Sequence[RecordingSurvey], joined: MergedMap, found: Accuracy, stage_s: dict[str, float]
 ) -> dict[str, Any]:
     """Return keys of the full report beside the stable ones, for diagnosis; they may change.
 
@@ -170,38 +169,33 @@ def sentence(site: str, version: int, parent: int | None, report: BuildReport, s
     )
 
 
-def loop_places(taken: Sequence[Surveyed], joined: MergedMap) -> list[dict[str, Any]]:
+def loop_places(taken: Sequence[RecordingSurvey], joined: MergedMap) -> list[dict[str, Any]]:
     """Return loops of the recordings in the map: accepted ones and the most similar refused ones.
 
     Each has its recording, both ends (x, y) in `map`, verdict, reason and score.
     """
-    ends = np.cumsum([len(trajectory) for trajectory in joined.trajectories])
-    parts = np.split(joined.map.trajectory.frame_from_body, ends[:-1])
     accepted: list[dict[str, Any]] = []
     refused: list[dict[str, Any]] = []
-    for recording, map_from_body in zip(taken, parts, strict=True):
+    for recording, trajectory in zip(taken, map_trajectories(joined), strict=True):
         survey = recording.survey
         frames = [keyframe.frame_index for keyframe in survey.odometry.keyframes]
         # Records have keyframe numbers from before components were left out: then their places are unknown.
         for record in survey.loops.records if all(c.kept for c in survey.components) else ():
-            place = _place(recording.entry.name, record, map_from_body[:, :2, 3], frames)
+            start_m, end_m = (
+                [round(float(value), 3) for value in trajectory.positions_m[frames[number], :2]]
+                for number in (record.i, record.j)
+            )
+            place = {
+                "recording": recording.entry.name,
+                "from_map_m": start_m,
+                "to_map_m": end_m,
+                "verdict": record.verdict.value,
+                "reason": record.reason,
+                "score": round(record.score, 4),
+            }
             (accepted if record.verdict is LoopVerdict.ACCEPTED else refused).append(place)
     refused.sort(key=lambda place: (-place["score"], place["recording"], place["from_map_m"], place["to_map_m"]))
     return accepted + refused[:MAX_REFUSED]
-
-
-def _place(name: str, record: LoopRecord, places_map: Array, frames: list[int]) -> dict[str, Any]:
-    start_m, end_m = (
-        [round(float(value), 3) for value in places_map[frames[number]]] for number in (record.i, record.j)
-    )
-    return {
-        "recording": name,
-        "from_map_m": start_m,
-        "to_map_m": end_m,
-        "verdict": record.verdict.value,
-        "reason": record.reason,
-        "score": round(record.score, 4),
-    }
 
 
 def library_versions() -> dict[str, str]:

@@ -36,6 +36,7 @@ from mapserver.drafting.admission import (
     TURN_FRAMES,
     CheckedRecording,
     checked,
+    leaves_wheels_out,
     with_further_views,
 )
 from mapserver.drafting.draft_evidence import ProbedFrame, probed_frames
@@ -50,7 +51,6 @@ from mapserver.survey.merge.multi_session import MergedMap, chained
 from mapserver.survey.odometry_pass import LEAD_NS, parts_between_lifts
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import Survey, begin_survey, finish_survey, survey
-from mapserver.survey.state import SurveyState
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools
 from mapserver.survey.zones import Zones, zones_of
 
@@ -58,7 +58,7 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Surveyed:
+class RecordingSurvey:
     """One recording and its survey.
 
     map_from_survey (4, 4): by its position priors, None without any. findings: the doctor's statements; checks: all of them in one line.
@@ -88,13 +88,15 @@ class Surveyed:
         apart = [c for c in self.survey.odometry.cuts if c.refused is not None]
         whole = [f"not cut after {c.after_s:.0f} s, surveyed as one with the part before: {c.refused}" for c in apart]
         left_out = [component.remark() for component in self.survey.components if not component.kept]
-        return [
-            *self.findings,
-            *turned,
-            *whole,
-            *left_out,
-            *_contradictions(self.survey.state),
-        ]
+        state, unused = self.survey.state, list[str]()
+        for prior in (p for p in state.priors if not p.is_believed):  # the survey contradicts them
+            after_s = 1e-9 * (state.stamps_ns[prior.k] - state.stamps_ns[0])
+            off_m = np.linalg.norm(state.map_from_body[prior.k, :3, 3] - prior.map_from_body[:3, 3])
+            unused.append(
+                f"not used: the position prior {after_s:.1f} s after the first keyframe, {off_m:.2f} m from the place by the survey; "
+                "check the position of this dock or tag"
+            )
+        return [*self.findings, *turned, *whole, *left_out, *unused]
 
     def evidence(self) -> RigEvidence:
         """Evidence on its calibration: the pair is doubted if the survey's disparities contradict the angle accepted by the doctor."""
@@ -109,16 +111,6 @@ class Surveyed:
     def _yaws(self) -> list[tuple[str, StereoYaw]]:
         """Return the error of yaw of the pair of each view, with the view's name; that of the first one is empty."""
         return [(f" of view {n}" if n else "", yaw) for n, yaw in enumerate(self.survey.stereo_yaws)]
-
-
-def _contradictions(state: SurveyState) -> list[str]:
-    """Return the position priors that the survey contradicts, as text."""
-    apart = [(p, state.map_from_body[p.k, :3, 3] - p.map_from_body[:3, 3]) for p in state.priors if not p.is_believed]
-    return [
-        f"not used: the position prior {1e-9 * (state.stamps_ns[p.k] - state.stamps_ns[0]):.1f} s after the first keyframe, "
-        f"{np.linalg.norm(off):.2f} m from the place by the survey; check the position of this dock or tag"
-        for p, off in apart
-    ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -358,7 +350,7 @@ def survey_recording(
     pinhole: StereoCamera | None,
     options: SurveyConfig,
     tools: SurveyTools,
-) -> list[Surveyed]:
+) -> list[RecordingSurvey]:
     """Survey one recording resampled to `pinhole` (or the camera that suits it). The caller drops its references to the first stages.
 
     One from which the robot was lifted has several surveys: each part is a drive of its own, which finds its place in the map or does not.
@@ -367,7 +359,7 @@ def survey_recording(
     with reading.open(path) as (opened, indices):
         rig = with_other_views(found.rig, opened.calibration)
         recording = replace(opened, calibration=rig)
-        if found.leaves_wheels_out:
+        if leaves_wheels_out(found.findings):
             recording = replace(recording, wheel=())
         rectifier = Rectifier(rig, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=pinhole)
         inputs = survey_inputs_of(recording, indices, rectifier, None if given is None else given.trajectory)
@@ -383,7 +375,7 @@ def survey_recording(
             surveys = _by_parts(recording, [indices[p] for p in parts], rectifier, options, tools, said)
         sha256 = recording.content_hash()
         return [
-            Surveyed(
+            RecordingSurvey(
                 entry=RecordingEntry(name=part.name, sha256=sha256, frames=len(chosen)),
                 format=part.format,
                 sensor_set=part.sensor_set,
@@ -457,15 +449,15 @@ def _aligned(done: Survey, recording: Recording) -> tuple[Survey, Array | None]:
 
 def survey_all(
     paths: Sequence[Path],
-    survey_one: Callable[[Path, StereoCamera | None], list[Surveyed]],
+    survey_one: Callable[[Path, StereoCamera | None], list[RecordingSurvey]],
     pinhole: StereoCamera | None,
     unusable: dict[Path, str] | None = None,
-) -> list[Surveyed]:
+) -> list[RecordingSurvey]:
     """Survey all recordings, resampled to one camera: `pinhole`, or that of the first one.
 
     unusable: receives failed ones with the reason; without it, or if all fail, an error is raised.
     """
-    done: list[Surveyed] = []
+    done: list[RecordingSurvey] = []
     for path in paths:
         with _noting(path, unusable):
             done += survey_one(path, pinhole)
@@ -475,7 +467,7 @@ def survey_all(
     return done
 
 
-def say_left_out(console: Console, site: str, surveyed: list[Surveyed], joined: MergedMap) -> None:
+def say_left_out(console: Console, site: str, surveyed: list[RecordingSurvey], joined: MergedMap) -> None:
     """Print the recordings that could not be joined; raises SurveyError if none could."""
     left = [(s, o) for s, o in zip(surveyed, joined.outcomes, strict=True) if not o.joined]
     for recording, outcome in left:
@@ -488,7 +480,7 @@ def say_left_out(console: Console, site: str, surveyed: list[Surveyed], joined: 
         )
 
 
-def joined_truth(surveyed: list[Surveyed], joined: MergedMap) -> Trajectory | None:
+def joined_truth(surveyed: list[RecordingSurvey], joined: MergedMap) -> Trajectory | None:
     """Return the ground truth of the joined recordings on one clock, None if one of them has none."""
     truths = [s.truth for s, outcome in zip(surveyed, joined.outcomes, strict=True) if outcome.joined]
     known = [truth for truth in truths if truth is not None]
@@ -502,10 +494,10 @@ def map_trajectories(joined: MergedMap) -> list[Trajectory]:
     return [Trajectory(t.stamps_ns, part) for t, part in zip(joined.trajectories, parts, strict=True)]
 
 
-class _ZonesFile(Section, frozen=True):
-    zones: dict[str, object]
-
-
 def read_zones(path: Path | None) -> Zones:
     """Read zones from a TOML file: a table [zones] with name = [[x, y], ...] in metres; UsageError if invalid. None gives no zones."""
-    return Zones() if path is None else zones_of(load_toml(path, _ZonesFile).zones, str(path))
+
+    class ZonesFile(Section, frozen=True):
+        zones: dict[str, object]
+
+    return Zones() if path is None else zones_of(load_toml(path, ZonesFile).zones, str(path))

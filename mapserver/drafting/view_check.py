@@ -17,7 +17,7 @@ from fleetmap.relocalization.relocalizer import Fix, is_reliable
 from fleetmap.relocalization.settings import FixSettings
 from mapserver.drafting.draft_evidence import JudgedSession
 from mapserver.quality.figures import BlindView, SurveyedViews
-from mapserver.quality.probes import PRIOR_RADIUS_M, SAME_WAY_COSINE, Probe, relocalized
+from mapserver.quality.probes import PRIOR_RADIUS_M, SAME_WAY_COSINE, Probe, place_xy, relocalized
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.landmark_budget import Sighting, choose_landmarks
@@ -72,7 +72,7 @@ class TileChooser(NamedTuple):
             if _lacking(fixes_again) < _lacking(fixes):
                 tiles, fixes, given_more = again, fixes_again, len(sightings)
         missed = [view for view, fix in zip(views, fixes, strict=True) if fix is None]
-        places = [BlindView(_xy(view), round(view.path_m, 1)) for view in missed]
+        places = [BlindView(place_xy(view.probe.map_from_cam), round(view.path_m, 1)) for view in missed]
         return tiles, SurveyedViews(len(views), given_more, places)
 
     def _tiles(self, sightings: Sequence[Sighting]) -> list[Tile]:
@@ -119,8 +119,3 @@ def _is_sure(fix: Fix) -> bool:
     inliers, seen = (count - 1.645 * np.sqrt(count) for count in (fix.inliers, fix.seen))
     recall = seen / fix.expected if fix.expected else fix.landmark_recall
     return is_reliable(replace(fix, inliers=int(inliers), landmark_recall=recall), FixSettings())
-
-
-def _xy(view: AskedView) -> tuple[float, float]:
-    x, y = view.probe.map_from_cam[:2, 3]
-    return round(float(x), 1), round(float(y), 1)

@@ -4,11 +4,8 @@ import shlex
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Annotated
 
-import msgspec
-
-from fleetmap.config import Section
+from fleetmap.config import Positive, Section
 from fleetmap.errors import StateError
 from fleetmap.messages import Flag, Status
 from mapserver.fleet.fleet import Fleet, RobotStatus
@@ -23,7 +20,6 @@ _LEAST_FREE_SHARE, _LEAST_FREE_BYTES = (
 _RATE_HOURS = 24
 _TOLD_NS = 24 * HOUR_NS  # duration of the alert for a rolled back version
 _LOST = {Status.LOST, Status.AMBIGUOUS, Status.INITIALISING}
-Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class AlertSettings(Section, frozen=True):
@@ -60,9 +56,7 @@ class Alert:
 
 def active_alerts(store: MapStore, fleet: Fleet, settings: AlertSettings, now_ns: int) -> list[Alert]:
     """Return all active alerts, by site, then those of the disk, lists and certificates; errors are the store's."""
-    from mapserver.trust.status import (
-        trust_status,
-    )  # imported late: it needs zenoh, and builds, which read the settings, do not
+    from mapserver.trust.status import trust_status  # late: it needs zenoh, and builds, which read the settings, do not
 
     found = [alert for info in store.sites() for alert in _of_site(store, fleet, settings, info.site, now_ns)]
     disk = store.disk_space()
@@ -81,7 +75,14 @@ def active_alerts(store: MapStore, fleet: Fleet, settings: AlertSettings, now_ns
 
 
 def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site: str, now_ns: int) -> Iterator[Alert]:
-    yield from _failure_rate(store, settings, site, now_ns)
+    counters = store.fleet.counters(site, "site", since_hour=hour_of(now_ns) + 1 - _RATE_HOURS)
+    failures = kpis(counters.get((site, ""), Counters())).failures
+    if failures.low is not None and failures.low > settings.failures_per_robot_day:
+        words = (
+            f"robots of {site} failed {failures.events} times in {_RATE_HOURS} h: {format_rate(failures)} per robot-day, "
+            f"more than {settings.failures_per_robot_day:g}"
+        )
+        yield Alert("FleetmapFailureRate", site, "", now_ns, words)
     for robot in fleet.robots(site):
         health = robot.last_health or {}
         since_ns = lost_since_ns(robot, settings, now_ns)
@@ -103,17 +104,6 @@ def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site: str, 
         if row.state == "rolled_back" and row.ended_ns is not None and now_ns - row.ended_ns < _TOLD_NS:
             words = f"version {row.version} of {site} was rolled back: {row.outcome}"
             yield Alert("FleetmapCanaryRolledBack", site, f"version {row.version}", row.ended_ns, words)
-
-
-def _failure_rate(store: MapStore, settings: AlertSettings, site: str, now_ns: int) -> Iterator[Alert]:
-    counters = store.fleet.counters(site, "site", since_hour=hour_of(now_ns) + 1 - _RATE_HOURS)
-    found = kpis(counters.get((site, ""), Counters())).failures
-    if found.low is not None and found.low > settings.failures_per_robot_day:
-        words = (
-            f"robots of {site} failed {found.events} times in {_RATE_HOURS} h: {format_rate(found)} per robot-day, "
-            f"more than {settings.failures_per_robot_day:g}"
-        )
-        yield Alert("FleetmapFailureRate", site, "", now_ns, words)
 
 
 def dropped_words(metrics: Mapping[str, object]) -> str:

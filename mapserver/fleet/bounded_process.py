@@ -38,7 +38,7 @@ class ProcessLimits:
 
 
 @dataclass(frozen=True, slots=True)
-class Ended:
+class ProcessResult:
     """Result of a program: its status and its output. has_network: the system did not allow running without a network."""
 
     status: int
@@ -57,7 +57,7 @@ def without_network() -> list[str]:
     return words if asked.returncode == 0 else []
 
 
-def run_bounded(command: list[str], limits: ProcessLimits, what: str) -> Ended:
+def run_bounded(command: list[str], limits: ProcessLimits, what: str) -> ProcessResult:
     """Run a command within limits. Raises FleetmapError, naming `what`, if it is killed by a limit or crashes."""
     prefix = without_network()
     with TemporaryFile() as output, TemporaryFile() as errors:
@@ -86,4 +86,4 @@ def run_bounded(command: list[str], limits: ProcessLimits, what: str) -> Ended:
             f"{what} was ended by {signal.Signals(-status).name}: it took more than {most}, or crashed the program; "
             "report it with the recording"
         )
-    return Ended(status, said, complained, has_network=not prefix)
+    return ProcessResult(status, said, complained, has_network=not prefix)

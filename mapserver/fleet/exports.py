@@ -4,9 +4,8 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
-from fleetmap.encoding import to_json
+from fleetmap.encoding import to_json, to_plain
 from fleetmap.files import appearing_file
-from fleetmap.messages import report_dict
 from mapserver.store import FailureDetail, FailureFilter, MapStore
 
 _PAGE = 200
@@ -27,7 +26,7 @@ def write_json_lines(store: MapStore, wanted: FailureFilter, path: Path) -> int:
     count = 0
     with appearing_file(path) as file:
         for found in failures_oldest_first(store, wanted):
-            report = report_dict(found.report)
+            report = to_plain(found.report)
             report.pop("thumbnails")
             pictures = [asdict(picture) for picture in found.pictures]  # by kind and place, without their bytes
             plain = {**asdict(found.failure), "report": report, "pictures": pictures}

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
+from fleetmap.encoding import to_plain
 from fleetmap.errors import LinkError, StoreError, UsageError
 from fleetmap.mapformat import check_name
 from fleetmap.messages import (
@@ -21,7 +22,6 @@ from fleetmap.messages import (
     Status,
     WantedVersion,
     decode_message,
-    report_dict,
 )
 from mapserver.fleet.ingest import Ingest, IngestSettings
 from mapserver.fleet.rate_limit import RateLimit
@@ -170,7 +170,7 @@ class Fleet:
         now_ns = self._clock_ns()
         with self._lock:
             entry = self._entry(site, robot, now_ns, ack.version)
-            entry.report["ack"] = report_dict(ack)
+            entry.report["ack"] = to_plain(ack)
             report, version = dict(entry.report), entry.version
         with self._storing():
             self._store.record_robot_report(site, robot, report, version)
@@ -195,7 +195,7 @@ class Fleet:
                     _log.warning(
                         "two programs report as robot %s of site %s: give each robot its own name", robot, site
                     )
-            entry.report["health"] = report_dict(health)
+            entry.report["health"] = to_plain(health)
             self._ingest.take_health(health, entry.last_estimate, now_ns, dict(entry.report), entry.version)
 
     def take_pose(self, site: str, robot: str, message: PoseMessage) -> None:
@@ -303,7 +303,24 @@ class Fleet:
                 robot.seen_ns = min(robot.seen_ns, now_ns)  # the clock was set back: silence counts from now
             chosen = [(key, robot) for key, robot in sorted(self._robots.items()) if site in {None, key[0]}]
         assignments = {site: _assignment(self._store, site) for site in {key[0] for key, _ in chosen}}
-        return [_status(key, robot, assignments[key[0]], now_ns) for key, robot in chosen]
+        return [
+            RobotStatus(
+                site=site,
+                robot=name,
+                version=robot.version,
+                wanted_version=assignments[site].wanted(name).version,
+                is_canary=assignments[site].is_canary(name),
+                is_present=robot.is_present,
+                is_copied=robot.copied_ns is not None and abs(now_ns - robot.copied_ns) < _COPIED_NS,
+                clock_ahead_s=robot.skew.ahead_s,
+                seconds_since=max(0, now_ns - robot.seen_ns) / 1e9,
+                state_since_ns=robot.report.get("state_since_ns"),
+                last_ack=robot.report.get("ack"),
+                last_health=robot.report.get("health"),
+                last_pose=None if robot.last_estimate is None else to_plain(robot.last_estimate),
+            )
+            for (site, name), robot in chosen
+        ]
 
     @contextmanager
     def _storing(self) -> Iterator[None]:
@@ -332,24 +349,6 @@ class Fleet:
 def _stored(info: RobotInfo) -> _Robot:
     skew = ClockSkew(info.last_report.get("clock_ahead_s"))
     return _Robot(info.version, info.last_seen_ns, dict(info.last_report), skew=skew, is_stored=True)
-
-
-def _status(key: tuple[str, str], robot: _Robot, assignment: _Assignment, now_ns: int) -> RobotStatus:
-    return RobotStatus(
-        site=key[0],
-        robot=key[1],
-        version=robot.version,
-        wanted_version=assignment.wanted(key[1]).version,
-        is_canary=assignment.is_canary(key[1]),
-        is_present=robot.is_present,
-        is_copied=robot.copied_ns is not None and abs(now_ns - robot.copied_ns) < _COPIED_NS,
-        clock_ahead_s=robot.skew.ahead_s,
-        seconds_since=max(0, now_ns - robot.seen_ns) / 1e9,
-        state_since_ns=robot.report.get("state_since_ns"),
-        last_ack=robot.report.get("ack"),
-        last_health=robot.report.get("health"),
-        last_pose=None if robot.last_estimate is None else report_dict(robot.last_estimate),
-    )
 
 
 def _state(status: object) -> object:

@@ -2,22 +2,21 @@
 
 import math
 import threading
-from collections import deque
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any
 
 import msgspec
 
-from fleetmap.config import Section
+from fleetmap.config import Positive, Section
 from fleetmap.errors import FleetmapError, UnknownOutcomeError
 from fleetmap.messages import FailureKind, FailureReport, PoseMessage, RobotHealth
+from mapserver.fleet_statistics.canary_decision import DAY_NS
 from mapserver.fleet_statistics.clock_skew import server_time_ns
 from mapserver.fleet_statistics.health_stream import HealthStream
 from mapserver.fleet_statistics.kpis import Counters, hour_of
 from mapserver.floor_plan.areas import OUTSIDE, Areas
 from mapserver.store import CanaryRow, CounterKey, FleetBatch, FleetRetention, MapStore, TraceRow, tile_key
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
 Days = Annotated[float, msgspec.Meta(gt=0, le=36_500)]  # a century: 64 bits of nanoseconds hold three
 PositiveInt = Annotated[int, msgspec.Meta(ge=1)]
 _CANARIES_KEPT_NS = _AREAS_KEPT_NS = 1_000_000_000
@@ -25,7 +24,6 @@ _LEAST_BETWEEN_TRACES_NS = 900_000_000
 _TRACE_STEP_M = 0.5
 _MAX_CAUSES = 64
 _MAX_KEPT_TRACES = 200_000
-_DAY_NS = 86_400_000_000_000
 
 
 class IngestSettings(Section, frozen=True):
@@ -137,7 +135,7 @@ class Ingest:
 
     def take_failure(self, report: FailureReport, now_ns: int, ahead_s: float | None) -> bool:
         """Write a failure with its sums; False for a duplicate. Raises StoreError."""
-        oldest_ns = now_ns - int(self._settings.failure_days * _DAY_NS)
+        oldest_ns = now_ns - int(self._settings.failure_days * DAY_NS)
         happened_ns = server_time_ns(report.wall_ns, ahead_s, now_ns, oldest_ns)
         grid = self._grid(report.site, report.version)
         canary = self._canary(report.site, now_ns)
@@ -175,30 +173,26 @@ class Ingest:
                 raise
             except FleetmapError:
                 with self._lock:
-                    self._put_back(batch)
+                    newer, self._batch = self._batch, batch
+                    for (site, axis, key, hour), counts in newer.counters.items():
+                        batch.add(site, axis, key, hour, counts)
+                    batch.last_reports |= newer.last_reports
+                    batch.traces = [*batch.traces, *newer.traces][-_MAX_KEPT_TRACES:]
                 raise
 
     def prune(self) -> int:
         """Remove old or excess data from the store; return the number of removed rows."""
         return self._store.fleet.prune(self._settings.retention())
 
-    def _put_back(self, batch: FleetBatch) -> None:
-        newer, self._batch = self._batch, batch
-        for (site, axis, key, hour), counts in newer.counters.items():
-            batch.add(site, axis, key, hour, counts)
-        batch.last_reports |= newer.last_reports
-        kept = deque((*batch.traces, *newer.traces), maxlen=_MAX_KEPT_TRACES)
-        batch.traces = list(kept)
-
     def _is_trace_due(
         self, stream: _Stream, health: RobotHealth, place: tuple[float, float, float] | None, now_ns: int
     ) -> bool:
         """True if a trace row is due by time, or at most once a second by the distance driven or a changed status."""
-        most_rows = _DAY_NS / (self._settings.trace_every_s * 1e9)
+        most_rows = DAY_NS / (self._settings.trace_every_s * 1e9)
         quiet_ns = now_ns - stream.trace_ns
         if quiet_ns < 0:  # the clock was set back
-            quiet_ns = _DAY_NS
-        rows_left = min(most_rows, stream.rows_left + quiet_ns * most_rows / _DAY_NS)
+            quiet_ns = DAY_NS
+        rows_left = min(most_rows, stream.rows_left + quiet_ns * most_rows / DAY_NS)
         here, before = None if place is None else place[:2], stream.trace_map_m
         has_moved = here is not None and (
             before is None or math.dist(here, before) * max(0.0, rows_left - 1) >= _TRACE_STEP_M * most_rows

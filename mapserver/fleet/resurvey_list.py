@@ -1,7 +1,7 @@
 """The re-survey list of a site, from the store's counters, and a route through the current map."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
@@ -52,7 +52,15 @@ def resurvey_list(store: MapStore, site: str, settings: ResurveySettings, now_ns
     if current is None:
         return ResurveyList(site, None, found, [], requests)
     manifest = store.manifest(site, current.version)
-    found = _asked_first(found, _asked(requests, manifest.tile_size_m), recent, before)
+    # Requested tiles come first; a request is a reason beside the statistical ones.
+    asked, known = _asked(requests, manifest.tile_size_m), {concern.tile: concern for concern in found}
+    first = [
+        replace(known[tile], reasons=[*words, *known[tile].reasons])
+        if tile in known
+        else concern_of(tile, words, recent.get(tile, Counters()), before.get(tile, Counters()))
+        for tile, words in asked.items()
+    ]
+    found = [*first, *(concern for concern in found if concern.tile not in asked)]
     entries = {f"{tile.x},{tile.y}": tile for tile in manifest.tiles}
     areas = store.areas(site)
     found = [replace(concern, name=areas.name_tiles(concern.name, manifest.tile_size_m)) for concern in found]
@@ -70,23 +78,6 @@ def _asked(requests: Sequence[SurveyRequest], size_m: float) -> dict[str, list[s
         for x, y in request.tiles(size_m):
             found.setdefault(f"{x},{y}", []).append(f"{request.actor or 'unnamed'} asked for it on {day}{why}")
     return found
-
-
-def _asked_first(
-    found: Sequence[TileConcern],
-    asked: Mapping[str, list[str]],
-    recent: Mapping[str, Counters],
-    before: Mapping[str, Counters],
-) -> list[TileConcern]:
-    """Put requested tiles first; a request is a reason beside the statistical ones."""
-    known = {concern.tile: concern for concern in found}
-    first = [
-        replace(known[tile], reasons=[*words, *known[tile].reasons])
-        if tile in known
-        else concern_of(tile, words, recent.get(tile, Counters()), before.get(tile, Counters()))
-        for tile, words in asked.items()
-    ]
-    return [*first, *(concern for concern in found if concern.tile not in asked)]
 
 
 def _place(store: MapStore, entry: TileEntry, size_m: float) -> tuple[float, float]:

@@ -10,6 +10,7 @@ from mapserver.fleet_statistics.kpis import Counters, Rate, figure, is_enough, k
 
 Verdict = Literal["worse", "better", "no clear change", "too little driving to say"]
 _CONFIDENCE_TAIL = 0.05
+_UNKNOWN: Verdict = "too little driving to say"
 _ORDER: dict[Verdict, int] = {"worse": 0, "no clear change": 1, "better": 2, "too little driving to say": 3}
 
 
@@ -49,18 +50,16 @@ def area_trends(now: Mapping[str, Counters], before: Mapping[str, Counters]) -> 
     pairs = {name: (now.get(name, nothing), before.get(name, nothing)) for name in {*now, *before}}
     told = [name for name, both in pairs.items() if all(is_enough(counts.robot_days) for counts in both)]
     tail = _CONFIDENCE_TAIL / max(1, len(told)) / 2
-    found = [_trend(name, *both, tail if name in told else None) for name, both in pairs.items()]
+    found = []
+    for name, (newer, older) in pairs.items():
+        rates = (rate(newer.position_failures, newer.robot_days), rate(older.position_failures, older.robot_days))
+        shares = (kpis(newer).localised_share_of_all, kpis(older).localised_share_of_all)
+        low, high, verdict = None, None, _UNKNOWN
+        if name in told:
+            low, high = _ratio(*rates, tail)
+            verdict = "worse" if low > 1 else "better" if high is not None and high < 1 else "no clear change"
+        found.append(AreaTrend(name, verdict, *rates, low, high, *shares))
     return sorted(found, key=lambda trend: (_ORDER[trend.verdict], -(trend.low or 0.0), -trend.now.events, trend.name))
-
-
-def _trend(name: str, now: Counters, before: Counters, tail: float | None) -> AreaTrend:
-    rates = (rate(now.position_failures, now.robot_days), rate(before.position_failures, before.robot_days))
-    shares = (kpis(now).localised_share_of_all, kpis(before).localised_share_of_all)
-    if tail is None:
-        return AreaTrend(name, "too little driving to say", *rates, None, None, *shares)
-    low, high = _ratio(rates[0], rates[1], tail)
-    verdict: Verdict = "worse" if low > 1 else "better" if high is not None and high < 1 else "no clear change"
-    return AreaTrend(name, verdict, *rates, low, high, *shares)
 
 
 def _ratio(now: Rate, before: Rate, tail: float) -> tuple[float, float | None]:
@@ -75,7 +74,7 @@ def _ratio(now: Rate, before: Rate, tail: float) -> tuple[float, float | None]:
 def trend_sentence(trends: list[AreaTrend]) -> str:
     """Return a sentence that names the worsened areas."""
     worse = [trend.name for trend in trends if trend.verdict == "worse"]
-    silent = sum(trend.verdict == "too little driving to say" for trend in trends)
+    silent = sum(trend.verdict == _UNKNOWN for trend in trends)
     if worse:
         names = " and ".join([", ".join(worse[:-1]), worse[-1]] if len(worse) > 1 else worse)
         told = f"{names[:1].upper()}{names[1:]} got worse"

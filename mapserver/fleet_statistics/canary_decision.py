@@ -14,10 +14,9 @@ import msgspec
 import numpy as np
 import scipy
 
-from fleetmap.config import Section
+from fleetmap.config import Positive, Section
 from mapserver.fleet_statistics.kpis import Counters, Rate, driven_words, format_rate, rate
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
 Probability = Annotated[float, msgspec.Meta(gt=0, lt=1)]
 Action = Literal["wait", "promote", "roll_back"]
 DAY_NS = 86_400_000_000_000

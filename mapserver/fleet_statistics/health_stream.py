@@ -61,7 +61,11 @@ class HealthStream:
             self._has_fix = self._fix_counted = self.in_failure = False
             self._search, self._search_ns = SearchClock(), 0
             self._blind_since_ns = self._good_since_ns = self._jump_ns = None
-        dt_ms = self._elapsed_ms(health)
+        # Since the last report by the robot's wall clock, which runs while its cameras are silent; else by stamps
+        dt_ms = 0 if self._stamp_ns is None else (health.stamp_ns - self._stamp_ns) // 1_000_000
+        if self._stamp_ns is not None and health.wall_ns is not None and self._wall_ns is not None:
+            dt_ms = (health.wall_ns - self._wall_ns) // 1_000_000
+        dt_ms = dt_ms if 0 < dt_ms <= MAX_GAP_S * 1e3 else 0
         counts = Counters(reports=1, observed_ms=dt_ms)
         speed_mps = figures.get("speed_mps", self._pose_mps)
         counts.driving_ms = dt_ms if speed_mps is not None and is_driving(speed_mps) else 0
@@ -89,15 +93,6 @@ class HealthStream:
         is_set_back = before_ns is not None and 0 < health.wall_ns - before_ns <= MAX_GAP_S * 1e9
         return not (is_set_back and self._wall_ns - health.wall_ns > MAX_GAP_S * 1e9)
 
-    def _elapsed_ms(self, health: RobotHealth) -> int:
-        """Return the time since the last report by the robot's wall clock, which runs while its cameras are silent; else by stamps."""
-        if self._stamp_ns is None:
-            return 0
-        dt_ms = (health.stamp_ns - self._stamp_ns) // 1_000_000
-        if health.wall_ns is not None and self._wall_ns is not None:
-            dt_ms = (health.wall_ns - self._wall_ns) // 1_000_000
-        return dt_ms if 0 < dt_ms <= MAX_GAP_S * 1e3 else 0
-
     def _count_status(
         self, counts: Counters, health: RobotHealth, figures: dict[str, float], dt_ms: int, speed_mps: float | None
     ) -> None:
@@ -121,7 +116,14 @@ class HealthStream:
             counts.localised_ms = dt_ms if is_tracking else 0
             self._watched_ns += dt_ms * 1_000_000
             is_blind_now = is_stale or is_blind(health.status, radius_m)
-            is_new |= self._is_blindness(self._watched_ns, dt_ms, is_blind_now)
+            if dt_ms == 0:
+                self._blind_since_ns = None  # the time in between is unknown
+            since_ns = self._blind_since_ns
+            is_new |= since_ns is not None and self._watched_ns - since_ns > BLIND_S * 1e9
+            if not is_blind_now:  # blindness lasts until the next better report
+                self._blind_since_ns = None
+            elif since_ns is None:
+                self._blind_since_ns = self._watched_ns
         counts.blind_seen = int(is_new and not self.in_failure)
         self.in_failure |= is_new
         if not is_tracking:  # a failure ends after 5 s of good tracking
@@ -130,17 +132,6 @@ class HealthStream:
             self._good_since_ns = self._search_ns
         if self._good_since_ns is not None and self._search_ns - self._good_since_ns >= GOOD_S * 1e9:
             self.in_failure = False
-
-    def _is_blindness(self, watched_ns: int, dt_ms: int, is_blind_now: bool) -> bool:
-        """True if blindness just exceeded the limit. It lasts until the next better report."""
-        if dt_ms == 0:
-            self._blind_since_ns = None  # the time in between is unknown
-        began = self._blind_since_ns is not None and watched_ns - self._blind_since_ns > BLIND_S * 1e9
-        if not is_blind_now:
-            self._blind_since_ns = None
-        elif self._blind_since_ns is None:
-            self._blind_since_ns = watched_ns
-        return began
 
     def _count_fixes(self, counts: Counters, stamp_ns: int, figures: dict[str, float]) -> None:
         if "first_fix_s" in figures and not self._fix_counted:

@@ -12,12 +12,11 @@ from typing import Annotated, Any
 import msgspec
 import scipy
 
-from fleetmap.config import Section
+from fleetmap.config import Positive, Section
 from mapserver.fleet_statistics.kpis import Counters, Rate, kpis, rate
 
 _ALPHA = 0.01  # probability that any tile of an unchanged site is listed
 _MIN_LANDMARKS = 2000  # expected in both periods, for their share to count
-Positive = Annotated[float, msgspec.Meta(gt=0)]
 
 
 class ResurveySettings(Section, frozen=True):
@@ -73,7 +72,11 @@ def concerns(
         if "," not in tile:
             continue
         then = before.get(tile, Counters())
-        reasons = [*_rising(now, then, total, settings, tests), *_fading(now, then, settings)]
+        reasons = _rising(now, then, total, settings, tests)
+        new, old = kpis(now).landmarks_seen_share, kpis(then).landmarks_seen_share
+        is_seen = min(now.landmarks_expected, then.landmarks_expected) >= _MIN_LANDMARKS
+        if new is not None and old is not None and is_seen and new < old - settings.fading:
+            reasons.append(f"{new:.0%} of the landmarks are found, {old:.0%} before")
         if reasons:
             found.append(concern_of(tile, reasons, now, then))
     return sorted(found, key=lambda concern: (-concern.failures.events, concern.tile))
@@ -143,10 +146,3 @@ def _rising(now: Counters, then: Counters, total: Counters, settings: ResurveySe
         return []
     driven = f"{now.driving_ms / 3.6e6:.1f} h of driving"
     return [f"{now.events} failures in {driven}, {events} in {days * 16:.1f} h {words}"]
-
-
-def _fading(now: Counters, then: Counters, settings: ResurveySettings) -> list[str]:
-    new, old = kpis(now).landmarks_seen_share, kpis(then).landmarks_seen_share
-    if new is None or old is None or min(now.landmarks_expected, then.landmarks_expected) < _MIN_LANDMARKS:
-        return []
-    return [f"{new:.0%} of the landmarks are found, {old:.0%} before"] if new < old - settings.fading else []

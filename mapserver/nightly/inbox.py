@@ -66,7 +66,7 @@ class Arrivals:
 
 
 @dataclass(frozen=True, slots=True)
-class Recorded:
+class InboxRecording:
     """A readable recording; found: gaps reported by its reader, as text."""
 
     path: Path
@@ -110,7 +110,7 @@ def arrivals(inbox: Path, settle_s: float, now_ns: int, *, is_brief: bool = Fals
     return Arrivals(tuple(complete), tuple(waiting), tuple(bad), tuple(others))
 
 
-def identify(path: Path, options: OpenOptions) -> Recorded | str | None:
+def identify(path: Path, options: OpenOptions) -> InboxRecording | str | None:
     """Return a recording with its hash, or the reason why it is unreadable; None if it changed meanwhile.
 
     Its memory and time are limited. StoreError if this machine cannot start a process.
@@ -118,7 +118,7 @@ def identify(path: Path, options: OpenOptions) -> Recorded | str | None:
     try:
         before, seconds = _state(path)
         sha256, words = _read(path, options, seconds)
-        found = Recorded(path, sha256, words) if sha256 else words
+        found = InboxRecording(path, sha256, words) if sha256 else words
         return found if _state(path)[0] == before else None
     except FileNotFoundError:
         return None
@@ -141,14 +141,6 @@ def _read(path: Path, options: OpenOptions, seconds: float) -> tuple[str, str]:
         return "", f"{path} cannot be read: {ended.errors.strip().rpartition(chr(10))[2][:500]}"
     sha256, words = json.loads(ended.output)
     return sha256, words
-
-
-def is_openable(path: Path) -> bool:
-    """True if it contains only files and folders."""
-    try:
-        return all(True for _ in _parts(path))
-    except (OSError, RecordingError):
-        return False
 
 
 def _parts(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
@@ -284,14 +276,14 @@ def contents(inbox: Path, settle_s: float, now_ns: int) -> InboxContents:
     reasons = {path.name: "" for path in here.complete} | dict.fromkeys(here.others, known)
     reasons |= {path.name: reason for path, reason in (*here.waiting, *here.bad)}
     waiting = [_entry(inbox / name, reasons[name]) for name in sorted(reasons) if is_safe_name(name)]
-    held, bad = (
-        [
-            _entry(inbox / where / name, _kept_reason(inbox / where / name))
-            for name in _names(inbox / where)[:_MOST_LISTED]
-        ]
-        for where in (HELD, BAD)
-    )
-    return InboxContents(waiting[:_MOST_LISTED], held, bad, len(_names(inbox / DONE)))
+    kept: dict[str, list[InboxEntry]] = {HELD: [], BAD: []}
+    for where, entries in kept.items():
+        for name in _names(inbox / where)[:_MOST_LISTED]:
+            path, reason = inbox / where / name, ""
+            with suppress(OSError), os.fdopen(os.open(f"{path}{_REASON}", _FOR_READING), "rb") as file:
+                reason = (file.read(_REASON_BYTES) or b"").decode("utf-8", "replace").strip()
+            entries.append(_entry(path, reason.replace(f"{inbox}/", "")))
+    return InboxContents(waiting[:_MOST_LISTED], kept[HELD], kept[BAD], len(_names(inbox / DONE)))
 
 
 def _names(folder: Path) -> list[str]:
@@ -308,14 +300,6 @@ def _entry(path: Path, reason: str) -> InboxEntry:
         status = path.lstat()
         size_bytes = status.st_size if stat.S_ISREG(status.st_mode) else None
     return InboxEntry(path.name, size_bytes, printable(reason))
-
-
-def _kept_reason(path: Path) -> str:
-    """Return the first 2000 bytes of the reason beside a held or bad recording; empty if there is none."""
-    with suppress(OSError), os.fdopen(os.open(f"{path}{_REASON}", _FOR_READING), "rb") as file:
-        reason = (file.read(_REASON_BYTES) or b"").decode("utf-8", "replace").strip()
-        return reason.replace(f"{path.parent.parent}/", "")
-    return ""
 
 
 def put_back(inbox: Path, where: str, name: str) -> None:
@@ -379,6 +363,8 @@ def kept(inbox: Path, sha256s: list[str]) -> list[Path]:
     found: dict[str, Path] = {}
     for where in (DONE, HELD):
         for name in _names(inbox / where):
-            if is_openable(inbox / where / name):
+            with suppress(OSError, RecordingError):  # it holds something other than files and folders
+                for _ in _parts(inbox / where / name):
+                    pass
                 found.setdefault(name[:_HASH_SIGNS], inbox / where / name)
     return [found[sha256[:_HASH_SIGNS]] for sha256 in sha256s if sha256[:_HASH_SIGNS] in found]

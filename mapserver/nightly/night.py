@@ -24,7 +24,7 @@ from mapserver.drafting.draft import BuildOptions, BuildRequest, build_draft
 from mapserver.drafting.job_lock import INTERRUPTED, end_interrupted, held, logged, only_one
 from mapserver.library import settings_for
 from mapserver.nightly import inbox as boxes
-from mapserver.nightly.inbox import Recorded
+from mapserver.nightly.inbox import InboxRecording
 from mapserver.nightly.retention import apply_retention
 from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, FleetRetention, MapStore, VersionInfo
@@ -83,7 +83,19 @@ def run_night(request: NightRequest, gate: GateSettings, console: Console) -> st
     site = request.site
     with MapStore.open(request.store, create=True) as maps, only_one(maps, site):
         report = NightReport(maps.begin_job(site, JOB))
-        _resume_killed(maps, site, report)
+        # End the jobs of killed nights: the lock shows that none of them runs. Count their recordings in work.
+        nights = [job for job in maps.jobs(site) if job.kind == JOB and job.id != report.job]
+        killed = [job for job in nights if job.state == "running" or INTERRUPTED in job.report]
+        report.ended = dict(nights[0].report.get("ended", {})) if nights else {}
+        for job in killed:
+            for name in job.report.get("looking_at", []):
+                share = 1.0 if len(job.report["looking_at"]) == 1 else _ENDED_TOGETHER
+                report.ended[name] = report.ended.get(name, 0) + share
+            report.resumes += [job.id, *job.report.get("resumes", [])]
+        maps.update_job(report.job, "running", "", asdict(report))
+        for job in killed:
+            left = {key: value for key, value in job.report.items() if key != INTERRUPTED}
+            maps.update_job(job.id, "failed", f"was interrupted; job {report.job} goes on with it", left)
         end_interrupted(maps, time.time_ns())
         try:
             with held(maps, report.job), logged(request.store, report.job):
@@ -124,22 +136,6 @@ def _current(maps: MapStore, site: str) -> int | None:
     return next((info.current_version for info in maps.sites() if info.site == site), None)
 
 
-def _resume_killed(maps: MapStore, site: str, report: NightReport) -> None:
-    """End the jobs of killed nights: the lock shows that none of them runs. Count their recordings in work."""
-    nights = [job for job in maps.jobs(site) if job.kind == JOB and job.id != report.job]
-    killed = [job for job in nights if job.state == "running" or INTERRUPTED in job.report]
-    report.ended = dict(nights[0].report.get("ended", {})) if nights else {}
-    for job in killed:
-        for name in job.report.get("looking_at", []):
-            share = 1.0 if len(job.report["looking_at"]) == 1 else _ENDED_TOGETHER
-            report.ended[name] = report.ended.get(name, 0) + share
-        report.resumes += [job.id, *job.report.get("resumes", [])]
-    maps.update_job(report.job, "running", "", asdict(report))
-    for job in killed:
-        left = {key: value for key, value in job.report.items() if key != INTERRUPTED}
-        maps.update_job(job.id, "failed", f"was interrupted; job {report.job} goes on with it", left)
-
-
 @dataclass(frozen=True, slots=True)
 class _Night:
     """The steps of a night."""
@@ -175,7 +171,16 @@ class _Night:
             except GateRefusedError as error:
                 refused = error
             recordings = [recorded for recorded in recordings if recorded.path.exists()]
-        self._build_all(self._unknown(recordings))
+        version_of = {
+            entry.sha256: info.version
+            for info in _versions(self._maps, self._request.site)
+            if info.state != "draft"
+            for entry in self._maps.manifest(self._request.site, info.version).recordings
+        }
+        for recorded in recordings:
+            if recorded.sha256 in version_of:
+                self._put_away(recorded.path, boxes.DONE, recorded.sha256, f"in version {version_of[recorded.sha256]}")
+        self._build_all([recorded for recorded in recordings if recorded.sha256 not in version_of])
         if not self._report.published:
             if refused is not None:
                 raise refused
@@ -185,9 +190,9 @@ class _Night:
         counts = ", ".join(f"{fates.count(where)} {where}" for where in (boxes.DONE, boxes.HELD, boxes.BAD))
         return f"site {self._request.site}: version {versions} published, {counts}"
 
-    def _identified(self, paths: tuple[Path, ...]) -> list[Recorded]:
+    def _identified(self, paths: tuple[Path, ...]) -> list[InboxRecording]:
         """Return the readable ones, each once."""
-        found: dict[str, Recorded] = {}
+        found: dict[str, InboxRecording] = {}
         for path in paths:
             name = path.name
             self._say(f"reading {name}")
@@ -211,19 +216,7 @@ class _Night:
         self._look_at([])
         return list(found.values())
 
-    def _unknown(self, recordings: list[Recorded]) -> list[Recorded]:
-        site = self._request.site
-        known: dict[str, int] = {}
-        for info in _versions(self._maps, site):
-            if info.state != "draft":
-                entries = self._maps.manifest(site, info.version).recordings
-                known |= {entry.sha256: info.version for entry in entries}
-        for recorded in recordings:
-            if recorded.sha256 in known:
-                self._put_away(recorded.path, boxes.DONE, recorded.sha256, f"in version {known[recorded.sha256]}")
-        return [recorded for recorded in recordings if recorded.sha256 not in known]
-
-    def _build_all(self, recordings: list[Recorded]) -> None:
+    def _build_all(self, recordings: list[InboxRecording]) -> None:
         """Build recordings together. Those in work when nights ended are built alone, and where a fault ends a build or the gate refuses
         it all are: only the one at fault is blamed.
         """
@@ -250,13 +243,15 @@ class _Night:
         if failed is not None and len(self._report.published) == published:
             raise failed
 
-    def _build(self, recordings: list[Recorded]) -> None:
+    def _build(self, recordings: list[InboxRecording]) -> None:
         request = self._request
         by_hash = {recorded.sha256: recorded for recorded in recordings}
         unusable: dict[Path, str] = {}
+        current = _current(self._maps, request.site)
+        entries = () if current is None else self._maps.manifest(request.site, current).recordings
         options = replace(
             request.options,
-            replay=tuple(self._replayed()),
+            replay=tuple(boxes.kept(request.inbox, [entry.sha256 for entry in entries])),
             actor=self._actor(),
             job=self._report.job,
             look_at=self._look_at,
@@ -279,20 +274,12 @@ class _Night:
         rest = [recorded for recorded in by_hash.values() if recorded.path not in unusable]
         self._publish(self._maps.version(request.site, draft.version), rest)
 
-    def _put_all_away(self, recordings: list[Recorded], unusable: dict[Path, str], reason: str) -> None:
+    def _put_all_away(self, recordings: list[InboxRecording], unusable: dict[Path, str], reason: str) -> None:
         for recorded in recordings:
             where = boxes.BAD if recorded.path in unusable else boxes.HELD
             self._put_away(recorded.path, where, recorded.sha256, recorded.why(unusable.get(recorded.path, reason)))
 
-    def _replayed(self) -> list[Path]:
-        """Return recordings of the current version that are still in the inbox."""
-        current = _current(self._maps, self._request.site)
-        if current is None:
-            return []
-        entries = self._maps.manifest(self._request.site, current).recordings
-        return boxes.kept(self._request.inbox, [entry.sha256 for entry in entries])
-
-    def _publish(self, draft: VersionInfo, recordings: list[Recorded]) -> None:
+    def _publish(self, draft: VersionInfo, recordings: list[InboxRecording]) -> None:
         """Take a draft through the gate and move its recordings; of several in a refused one each must be tried alone."""
         site, version = self._request.site, draft.version
         taken = {entry.sha256 for entry in self._maps.manifest(site, version).recordings}

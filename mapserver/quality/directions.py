@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import scipy
-from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from mapserver.quality.figures import TileDirections
@@ -31,7 +30,13 @@ def tile_directions(places: Mapping[tuple[int, int], Array]) -> list[TileDirecti
     headings = axes_map / np.maximum(lengths, 1e-9)[:, None]
     sectors = np.round(np.arctan2(headings[:, 1], headings[:, 0]) / (np.pi / 4)).astype(int) % len(HEADINGS)
     positions_map = map_from_cam[:, :3, 3]
-    one_way = level & ~_met(positions_map, headings, level)
+    met = np.zeros(len(positions_map), bool)  # places that have another near them that looks the other way
+    if len(positions_map):
+        pairs = scipy.spatial.cKDTree(positions_map).query_pairs(_NEAR_M, output_type="ndarray")
+        first, second = pairs.reshape(-1, 2).T
+        opposed = level[first] & level[second] & ((headings[first] * headings[second]).sum(axis=1) < _OTHER_WAY)
+        met[first[opposed]] = met[second[opposed]] = True
+    one_way = level & ~met
     owners = np.repeat(np.arange(len(places)), [len(of_tile) for of_tile in places.values()])
     found = []
     for number, tile in enumerate(places):
@@ -65,15 +70,3 @@ def missing_words(tile: TileDirections) -> str:
         f"{count} places face {HEADINGS[(HEADINGS.index(heading) + 4) % len(HEADINGS)]} and none near them {heading}"
         for heading, count in tile.missing.items()
     )
-
-
-def _met(positions_map: Array, headings: Array, level: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Return (K,) which places have another near them that looks the other way."""
-    met = np.zeros(len(positions_map), bool)
-    if len(positions_map):
-        first, second = (
-            scipy.spatial.cKDTree(positions_map).query_pairs(_NEAR_M, output_type="ndarray").reshape(-1, 2).T
-        )
-        opposed = level[first] & level[second] & ((headings[first] * headings[second]).sum(axis=1) < _OTHER_WAY)
-        met[first[opposed]] = met[second[opposed]] = True
-    return met

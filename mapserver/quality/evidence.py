@@ -12,7 +12,7 @@ from fleetmap.relocalization.landmark_visibility import places_around
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.samples import Stamps
-from mapserver.quality.figures import Aliasing, Compared, Displaced, Evidence, ProbeFigures, TrajectoryBreaks
+from mapserver.quality.figures import Aliasing, Comparison, Displacement, Evidence, ProbeFigures, TrajectoryBreaks
 from mapserver.quality.probes import (
     ELSEWHERE_M,
     PRIOR_RADIUS_M,
@@ -57,10 +57,14 @@ def examine(
     removed_ids: landmarks of the current version that operators' corrections removed from the draft; None for none.
     """
     frames = probes.frames
+    # Those localised in either: a draft cannot lose positions unknown to robots, and with only those of the current version all its
+    # chance localisations would count against the draft.
+    views = (draft,) if before is None else (before, draft)
+    placed = [p for p in probes.last_version if any(relocalized(view, p, p.map_from_cam) is not None for view in views)]
     return Evidence(
         held_out=compare(draft, before, probes.held_out, removed_ids),
         replayed=compare(draft, before, probes.replayed, removed_ids),
-        last_version=compare(draft, before, _placed_by_either(draft, before, probes.last_version), removed_ids),
+        last_version=compare(draft, before, placed, removed_ids),
         aliasing=aliasing(draft, frames),
         aliasing_before=None if before is None else aliasing(before, frames),
         starts=None,
@@ -68,7 +72,7 @@ def examine(
     )
 
 
-def displaced(recording: str, before: MapView, probes: Sequence[Probe], lookalike_recall: float) -> Displaced:
+def displaced(recording: str, before: MapView, probes: Sequence[Probe], lookalike_recall: float) -> Displacement:
     """Localize a recording's frames anywhere in the version before, and compare.
 
     A frame at a place that looks like another one has a fix there, too. Those count that have none at their own place though that
@@ -92,23 +96,14 @@ def displaced(recording: str, before: MapView, probes: Sequence[Probe], lookalik
     best = max(agreeing, key=np.count_nonzero, default=np.zeros(0, bool))
     number = int(best.sum())
     if number < _JOINED.min_fixes or count_places(drafted[best, :3, 3]) < _JOINED.min_places:
-        return Displaced(recording, here + number, 0, 0.0)
+        return Displacement(recording, here + number, 0, 0.0)
     off_m = float(np.median(np.linalg.norm((seen - drafted)[best, :3, 3], axis=1)))
-    return Displaced(recording, here + number, number, round(off_m, 3))
-
-
-def _placed_by_either(draft: MapView, before: MapView | None, probes: Sequence[Probe]) -> Sequence[Probe]:
-    """Return the probes localised in the draft or the current version: a draft cannot lose positions unknown to robots.
-
-    With only those of the current version, all its chance localisations would count against the draft.
-    """
-    views = (draft,) if before is None else (before, draft)
-    return [p for p in probes if any(relocalized(view, p, p.map_from_cam) is not None for view in views)]
+    return Displacement(recording, here + number, number, round(off_m, 3))
 
 
 def compare(
     draft: MapView, before: MapView | None, probes: Sequence[Probe], removed_ids: NDArray[np.uint32] | None = None
-) -> Compared | None:
+) -> Comparison | None:
     """Relocalize each probe in both maps from a prior at its own position; None without probes.
 
     Matches of removed landmarks do not count in inliers_share: their loss is wanted, a lost fix is not.
@@ -117,12 +112,12 @@ def compare(
         return None
     now = [relocalized(draft, probe, probe.map_from_cam) for probe in probes]
     if before is None:
-        return Compared(_figures(draft, probes, now))
+        return Comparison(_figures(draft, probes, now))
     then = [relocalized(before, probe, probe.map_from_cam) for probe in probes]
     left = [0 if fix is None else _inliers_left(before, fix, removed_ids) for fix in then]
     shares = [a.inliers / inliers for a, inliers in zip(now, left, strict=True) if a is not None and inliers]
     inliers_share = round(float(np.median(shares)), 4) if shares else None
-    return Compared(_figures(draft, probes, now), _figures(before, probes, then), inliers_share)
+    return Comparison(_figures(draft, probes, now), _figures(before, probes, then), inliers_share)
 
 
 def _inliers_left(view: MapView, fix: Fix, removed_ids: NDArray[np.uint32] | None) -> int:

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import msgspec
 
-from fleetmap.errors import MapFormatError
 from fleetmap.mapformat import Manifest
+from fleetmap.mapformat.manifest import manifest_entry
 
 TRUSTED_KEY = "trusted_calibrations"
 """Key of a manifest's configuration with the calibrations trusted by an operator."""
@@ -30,7 +30,7 @@ class ProbeFigures(msgspec.Struct, frozen=True):
     residual_px: float | None
 
 
-class Compared(msgspec.Struct, frozen=True):
+class Comparison(msgspec.Struct, frozen=True):
     """The same frames in the draft and in the current version; inliers_share: draft against before, median over frames found in both."""
 
     draft: ProbeFigures
@@ -45,7 +45,7 @@ class Aliasing(msgspec.Struct, frozen=True):
     accepted_share: float
 
 
-class Displaced(msgspec.Struct, frozen=True):
+class Displacement(msgspec.Struct, frozen=True):
     """Frames of one recording localized anywhere in the version before: their number, and how many of them agree on one other place.
 
     off_m: median distance of these from where the draft has them.
@@ -176,10 +176,7 @@ class TrustedCalibration:
 
 def trusted_calibrations(manifest: Manifest) -> list[TrustedCalibration]:
     """Return the calibrations of a version trusted by an operator; MapFormatError for a damaged entry."""
-    try:
-        return msgspec.convert(manifest.configuration.get(TRUSTED_KEY, []), list[TrustedCalibration])
-    except msgspec.ValidationError as error:
-        raise _damaged(manifest, f"configuration.{TRUSTED_KEY}", error) from error
+    return manifest_entry(manifest, "configuration", TRUSTED_KEY, list[TrustedCalibration]) or []
 
 
 def merged(rigs: Iterable[RigEvidence]) -> list[RigEvidence]:
@@ -195,10 +192,10 @@ def merged(rigs: Iterable[RigEvidence]) -> list[RigEvidence]:
 class Evidence(msgspec.Struct, frozen=True):
     """All evidence; None for a part without data."""
 
-    held_out: Compared | None = None
-    replayed: Compared | None = None
-    last_version: Compared | None = None
-    displaced: list[Displaced] | None = None
+    held_out: Comparison | None = None
+    replayed: Comparison | None = None
+    last_version: Comparison | None = None
+    displaced: list[Displacement] | None = None
     aliasing: Aliasing | None = None
     aliasing_before: Aliasing | None = None
     starts: Starts | None = None
@@ -211,12 +208,4 @@ class Evidence(msgspec.Struct, frozen=True):
 
 def carried_evidence(manifest: Manifest) -> Evidence | None:
     """Return the evidence in a manifest, without directions, starts and views; None if absent. MapFormatError for a damaged entry."""
-    found = manifest.report.get(EVIDENCE_KEY)
-    try:
-        return None if found is None else msgspec.convert(found, Evidence)
-    except msgspec.ValidationError as error:
-        raise _damaged(manifest, f"report.{EVIDENCE_KEY}", error) from error
-
-
-def _damaged(manifest: Manifest, key: str, error: msgspec.ValidationError) -> MapFormatError:
-    return MapFormatError(f"manifest of {manifest.site} version {manifest.version}: {key}: {error}; it is damaged")
+    return manifest_entry(manifest, "report", EVIDENCE_KEY, Evidence)

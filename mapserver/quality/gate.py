@@ -10,7 +10,7 @@ from fleetmap.config import Section
 from fleetmap.encoding import to_plain
 from fleetmap.failure_definition import ERROR_LIMIT_M
 from fleetmap.mapformat import Manifest
-from mapserver.quality.figures import Aliasing, Compared, Displaced, Evidence, TrajectoryBreaks, trusted_calibrations
+from mapserver.quality.figures import Aliasing, Comparison, Displacement, Evidence, trusted_calibrations
 
 CHECKS = {
     "joining": "recordings that belong to the site",
@@ -112,7 +112,9 @@ def judge(
     if examined.motion is None:
         not_judged.append("motion")
     else:
-        checked["motion"] = _motion_reasons(examined.motion, settings)
+        breaks, worst_m = examined.motion.breaks, examined.motion.worst_m
+        torn = f"its trajectory is torn in {breaks} places, by up to {worst_m:.2f} m against odometry; the limit is {settings.max_breaks}"
+        checked["motion"] = [torn] if breaks > settings.max_breaks else []
     if current is None:
         not_judged.append("size_against_last_version")
     else:
@@ -128,7 +130,7 @@ def judge(
 
 
 def _displaced_reasons(
-    draft: Manifest, current: Manifest, recordings: Iterable[Displaced], settings: GateSettings
+    draft: Manifest, current: Manifest, recordings: Iterable[Displacement], settings: GateSettings
 ) -> Iterator[str]:
     if draft.parent != current.version:
         yield f"{CHECKS['version_before']}: compared with version {draft.parent}, and {current.version} is current; build it again"
@@ -138,16 +140,7 @@ def _displaced_reasons(
             yield f"{CHECKS['version_before']}: {frames} on a place {one.off_m:.2f} m from the draft's; build without it"
 
 
-def _motion_reasons(motion: TrajectoryBreaks, settings: GateSettings) -> list[str]:
-    if motion.breaks <= settings.max_breaks:
-        return []
-    return [
-        f"its trajectory is torn in {motion.breaks} places, by up to {motion.worst_m:.2f} m against "
-        f"odometry; the limit is {settings.max_breaks}"
-    ]
-
-
-def _frame_reasons(compared: Compared, settings: GateSettings) -> Iterator[str]:
+def _frame_reasons(compared: Comparison, settings: GateSettings) -> Iterator[str]:
     """Yield reasons from one kind of frames: figures on the wrong side of their limit; the limit itself is allowed."""
     draft, before = compared.draft, compared.before
     localised, error = "share of localised frames", "median error in metres"

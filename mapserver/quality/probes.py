@@ -55,14 +55,6 @@ def relocalized(view: MapView, probe: Probe, prior_map_from_cam: Array) -> Fix |
     return next((fix for fix in near if is_reliable(fix, _ROBOTS.fix)), None)
 
 
-def fixes_elsewhere(view: MapView, probe: Probe, radius_m: float) -> list[Fix]:
-    """Return the fixes of a robot without a prior if nothing within a radius of a probe were mapped."""
-    place_m = probe.map_from_cam[:3, 3]
-    is_far = np.linalg.norm(view.map_from_cam[:, :3, 3] - place_m, axis=1) > radius_m
-    fixes = finished(Relocalizer(view, probe.camera, _ROBOTS).anywhere(probe.features, is_far))
-    return [fix for fix in fixes if np.linalg.norm(fix.map_from_cam[:3, 3] - place_m) > radius_m]
-
-
 def most_similar_beyond(view: MapView, probe: Probe, radius_m: float) -> Array | None:
     """Return (4, 4) map_from_cam of the place most similar to a probe beyond a radius around it; None if absent."""
     is_far = np.linalg.norm(view.map_from_cam[:, :3, 3] - probe.map_from_cam[:3, 3], axis=1) > radius_m
@@ -119,7 +111,12 @@ def starts_without_prior(view: MapView, probes: Sequence[Probe]) -> Starts | Non
     offered = [probe for probe in probes if most_similar_beyond(view, probe, ELSEWHERE_M) is not None]
     if not offered:
         return None
-    found = [(probe, fixes_elsewhere(view, probe, ELSEWHERE_M)) for probe in offered]
+    found = []
+    for probe in offered:  # as if nothing within the radius were mapped
+        place_m = probe.map_from_cam[:3, 3]
+        is_far = np.linalg.norm(view.map_from_cam[:, :3, 3] - place_m, axis=1) > ELSEWHERE_M
+        fixes = finished(Relocalizer(view, probe.camera, _ROBOTS).anywhere(probe.features, is_far))
+        found.append((probe, [f for f in fixes if np.linalg.norm(f.map_from_cam[:3, 3] - place_m) > ELSEWHERE_M]))
     believed = [(probe, [fix for fix in fixes if is_reliable(fix, _ROBOTS.fix)]) for probe, fixes in found]
     taken = [(probe, max(fixes, key=lambda fix: fix.landmark_recall)) for probe, fixes in believed if fixes]
     return Starts(
@@ -128,7 +125,7 @@ def starts_without_prior(view: MapView, probes: Sequence[Probe]) -> Starts | Non
         lookalike_recall=round(max((fix.landmark_recall for _, fix in taken), default=0.0), 4),
         max_wrong_share=round(1 / (len(found) + 1), 4),
         lookalikes=[
-            LookAlike(_xy(probe.map_from_cam), _xy(fix.map_from_cam), round(fix.landmark_recall, 4))
+            LookAlike(place_xy(probe.map_from_cam), place_xy(fix.map_from_cam), round(fix.landmark_recall, 4))
             for probe, fix in taken
         ],
         lookalike_inliers=max((fix.inliers for _, fixes in found for fix in fixes), default=0),
@@ -189,5 +186,6 @@ def lookalike_words(starts: Starts | None) -> str:
     )
 
 
-def _xy(map_from_cam: Array) -> tuple[float, float]:
+def place_xy(map_from_cam: Array) -> tuple[float, float]:
+    """Return x and y of a camera to a decimetre, for reports."""
     return round(float(map_from_cam[0, 3]), 1), round(float(map_from_cam[1, 3]), 1)

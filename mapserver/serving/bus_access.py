@@ -73,7 +73,7 @@ class BusGuard:
         is_changed = access != self.access or tls_state != self._tls_state
         if is_changed:
             self._bus.reopen(access)
-            _log.info("the bus was reopened for %d robots", access.robot_count)
+            _log.info("the bus was reopened for %d robots", len(access.robots))
         self._state, self._tls_state, self.access = state, tls_state, access
         return is_changed
 
@@ -87,7 +87,7 @@ class BusGuard:
         unknown = (name[:64] for name in here if self.access.holder(name) is None)
         found = [f"certificate {name!r} is connected but not enrolled; it may send nothing" for name in unknown]
         sessions: Counter[tuple[str, str]] = Counter()
-        for name in (*here, *self.register.connected_elsewhere(here)):
+        for name in (*here, *self.register.store.files.connected(here)):
             if (holder := self.access.holder(name)) is not None and holder.robot:
                 sessions[holder.site, holder.robot] += 1
         self._twice_s = {who: self._twice_s.get(who, now_s) for who, count in sessions.items() if count > 1}
@@ -100,6 +100,6 @@ class BusGuard:
         for words in sorted(frozenset(found) - self._told):
             self._refusals.warning(words, "%s", words)
         for site, robot in self.copied - self._audited:
-            self.register.note_copied(site, robot)
+            self.register.store.audit("robot connected twice", f"{robot}: was its certificate copied?", site=site)
         self._told, self._audited = frozenset(found), self.copied
         return found

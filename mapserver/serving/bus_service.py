@@ -136,7 +136,7 @@ class BusService:
         """Return site and robot of a robot's key; LinkError for one without permission, even if the bus let it through."""
         site, robot, _ = split_key(key)
         check_name(robot, "robot")
-        if self._guard is not None and not self._guard.access.has_robot(site, robot):
+        if self._guard is not None and (site, robot) not in self._guard.access.robots:
             raise LinkError(
                 f"robot {robot} of site {site[:64]!r} is not enrolled; `mapserver robots enrol {robot} --site {site[:64]}` enrols it"
             )

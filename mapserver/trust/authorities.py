@@ -96,8 +96,8 @@ class Authorities:
         if path.exists():
             raise StateError(f"{path} is an existing key, which is not overwritten; name another folder")
         servers = self._make(SERVERS_CA)
-        self._write_key(path, servers.key, passphrase)
-        self._write(f"{SERVERS_CA}.crt", servers.certificate.public_bytes(_PEM))
+        self._write(path, key_pem(servers.key, passphrase))
+        self._write(self._path(f"{SERVERS_CA}.crt"), servers.certificate.public_bytes(_PEM))
         self._renew_robots_ca(before=b"")
         self._sign_server(servers, checked)
 
@@ -117,11 +117,11 @@ class Authorities:
         """Replace the authority of robots. is_stolen: invalidate all that the last one signed, else it is valid until the next rotation."""
         self._renew_robots_ca(before=b"" if is_stolen else self._robots_ca().certificate.public_bytes(_PEM))
 
-    def sign_robot(self, key: bytes, name: str, purpose: str = "robot") -> bytes:
-        """Return PEM of a certificate for a public key (DER). purpose: robot, enrol or survey."""
+    def sign_robot(self, key: bytes, name: str) -> bytes:
+        """Return PEM of a robot's certificate for a public key (DER)."""
         public = s.load_der_public_key(key)
         assert isinstance(public, ec.EllipticCurvePublicKey)
-        return self._robots_ca().sign(public, name, DAYS[purpose])
+        return self._robots_ca().sign(public, name, DAYS["robot"])
 
     def make_own(self, name: str, purpose: str) -> bytes:
         """Return PEM of a new key and its certificate, for a bundle or a program of this account."""
@@ -155,13 +155,13 @@ class Authorities:
     def _renew_robots_ca(self, before: bytes) -> None:
         made = self._make(ROBOTS_CA)
         # The key first: a certificate without its key would be useless.
-        self._write_key(self._path(f"{ROBOTS_CA}.pem"), made.key, credential(ROBOTS_CA))
-        self._write(f"{ROBOTS_CA}.crt", made.certificate.public_bytes(_PEM) + before)
+        self._write(self._path(f"{ROBOTS_CA}.pem"), key_pem(made.key, credential(ROBOTS_CA)))
+        self._write(self._path(f"{ROBOTS_CA}.crt"), made.certificate.public_bytes(_PEM) + before)
 
     def _sign_server(self, servers: Authority, hosts: Sequence[str]) -> None:
         key = ec.generate_private_key(ec.SECP256R1())
         certificate = servers.sign(key.public_key(), "fleetmap server", DAYS[SERVER], hosts=hosts)
-        self._write(f"{SERVER}.pem", key_pem(key, None) + certificate)
+        self._write(self._path(f"{SERVER}.pem"), key_pem(key, None) + certificate)
 
     def _make(self, name: str) -> Authority:
         key, subject = ec.generate_private_key(ec.SECP256R1()), _name(f"fleetmap {name}")
@@ -174,15 +174,10 @@ class Authorities:
         )
         return Authority(key, built.sign(key, hashes.SHA256()))
 
-    def _write_key(self, path: Path, key: ec.EllipticCurvePrivateKey, passphrase: str | None) -> None:
-        with disk_errors(f"the key {path} cannot be written", "check the folder"):
+    def _write(self, path: Path, data: bytes) -> None:
+        with disk_errors(f"{path} cannot be written", "check the folder"):
             make_folder(path.parent)
-            write_atomically(path, [key_pem(key, passphrase)])
-
-    def _write(self, file: str, data: bytes) -> None:
-        with disk_errors(f"{self._path(file)} cannot be written", "check the folder"):
-            make_folder(self.folder)
-            write_atomically(self._path(file), [data])
+            write_atomically(path, [data])
 
     def _read(self, file: str) -> bytes:
         with disk_errors(f"{self._path(file)} cannot be read", "`mapserver trust init` makes it"):

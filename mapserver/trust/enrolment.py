@@ -36,7 +36,7 @@ _MAX_ROBOTS = 20_000
 _NAME_LENGTH = 40  # a certificate's name has 64 characters at most; the mark after it makes it unique
 
 
-class Enrolled(msgspec.Struct, frozen=True, kw_only=True):
+class EnrolledRobot(msgspec.Struct, frozen=True, kw_only=True):
     """One robot. key: fingerprint of the key that may renew; before: of the key that it replaced, in case the answer was lost.
 
     mark: suffix of the name in its certificates, changed by each renewal, so that rules can distinguish them; mark_before:
@@ -98,41 +98,41 @@ class RobotRegister:
     """The enrolled robots of a store. Thread-safe; sees writes of other processes at once."""
 
     def __init__(self, store: MapStore) -> None:
-        self._store = store
+        self.store = store
         self._keys = store.folder / "keys"
         self._path = self._keys / "robots.json"
 
     @property
     def authorities(self) -> Authorities:
-        return Authorities(self._keys, datetime.fromtimestamp(self._store.now_ns() / 1e9, UTC))
+        return Authorities(self._keys, datetime.fromtimestamp(self.store.now_ns() / 1e9, UTC))
 
     @property
     def tls(self) -> TlsFiles:
         """The server's files; StateError if absent."""
         authorities = self.authorities
         if not authorities.are_there:
-            folder = self._store.folder
+            folder = self.store.folder
             raise StateError(
                 f"{folder} has no certificate for its server; `mapserver trust init --here --host NAME --store {folder}` "
                 "makes one, with the NAME or address of this machine for robots"
             )
         return authorities.tls
 
-    def robots(self, site: str | None = None) -> list[Enrolled]:
+    def robots(self, site: str | None = None) -> list[EnrolledRobot]:
         """Return all robots (of a site), by site and name; StoreError if the file is unreadable."""
         if not self._path.is_file():
             return []
         with disk_errors(f"{self._path} cannot be read", "check the account"):
             data = self._path.read_bytes()
         try:
-            found = msgspec.json.decode(data, type=list[Enrolled])
+            found = msgspec.json.decode(data, type=list[EnrolledRobot])
         except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
             raise StoreError(f"{self._path} cannot be read ({error}); restore it") from error
         return [entry for entry in found if site in {None, entry.site}]
 
     def access(self) -> Access:
         """Return the present rules for the bus."""
-        now_ns, holders = self._store.now_ns(), [SURVEY]
+        now_ns, holders = self.store.now_ns(), [SURVEY]
         for entry in self.robots():
             holders.extend(entry.holders(now_ns, self._floors(entry.site)))
             # Used ones too, while their certificate is valid: the owner of a copy then gets a reason, and it is logged.
@@ -142,11 +142,11 @@ class RobotRegister:
 
     def state(self) -> object:
         """Return a value that changes with robots, buildings, an authority or the server's certificate."""
-        return (_stamp(self._path), self.tls_state(), [self._floors(info.site) for info in self._store.sites()])
+        return (_stamp(self._path), self.tls_state(), [self._floors(info.site) for info in self.store.sites()])
 
     def _floors(self, site: str) -> tuple[str, ...]:
         """Return the other floors of a site's building."""
-        building = self._store.building(site)
+        building = self.store.building(site)
         return () if building is None else tuple(floor.site for floor in building.floors if floor.site != site)
 
     def tls_state(self) -> object:
@@ -159,8 +159,17 @@ class RobotRegister:
         Raises StateError for enrolled robots and an endpoint that is not in the server's certificate, UsageError for invalid names.
         """
         check_name(site, "site")
-        self._check_endpoint(endpoint)
-        authorities, root = self.authorities, self._root()
+        _ = self.tls
+        authorities, lists = self.authorities, SignedLists(self.store.folder)
+        host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
+        if host not in authorities.hosts:
+            raise StateError(
+                f"robots would refuse the server at {endpoint}: its certificate names {', '.join(authorities.hosts)}; name one of "
+                "them, or make another certificate: `mapserver trust rotate server --host ...`"
+            )
+        if not lists.are_there:
+            raise StateError(f"the maps of {self.store.folder} are not signed; `mapserver trust init` comes first")
+        root = lists.path("root", lists.newest("root")).read_text("utf-8")
         bundles = {}
         with self._changing() as entries:
             for robot in dict.fromkeys(robots):
@@ -172,7 +181,7 @@ class RobotRegister:
                 if known is None and len(entries) >= _MAX_ROBOTS:
                     raise StateError(f"{len(entries)} robots are enrolled, the limit of a server; revoke some")
                 mark = secrets.token_hex(4)
-                entry = Enrolled(site=site, robot=robot, mark=mark, key="", enrolled_ns=self._store.now_ns())
+                entry = EnrolledRobot(site=site, robot=robot, mark=mark, key="", enrolled_ns=self.store.now_ns())
                 own = authorities.make_own(entry.bundle, "enrol")
                 entries[site, robot] = msgspec.structs.replace(entry, key=key_fingerprint(own))
                 bundle = Bundle(
@@ -186,7 +195,7 @@ class RobotRegister:
                 )
                 bundles[robot] = to_json(bundle, indent=2) + b"\n"
         for robot in bundles:
-            self._store.audit("robot enrolled", robot, actor=actor, site=site)
+            self.store.audit("robot enrolled", robot, actor=actor, site=site)
         return bundles
 
     def revoke(self, site: str, robots: Sequence[str], *, actor: Actor = NOBODY) -> list[str]:
@@ -194,7 +203,7 @@ class RobotRegister:
         with self._changing() as entries:
             gone = [robot for robot in dict.fromkeys(robots) if entries.pop((site, robot), None) is not None]
         for robot in gone:
-            self._store.audit("robot revoked", robot, actor=actor, site=site)
+            self.store.audit("robot revoked", robot, actor=actor, site=site)
         return gone
 
     def revoke_all(self, *, actor: Actor = NOBODY) -> int:
@@ -225,31 +234,23 @@ class RobotRegister:
                         entry,
                         key=asked.new_fingerprint,
                         before=asked.old_fingerprint,
-                        renewed_ns=self._store.now_ns(),
+                        renewed_ns=self.store.now_ns(),
                         **marks,
                     )
                 certificate = self.authorities.sign_robot(asked.new_key, entry.certificate)
                 entries[site, robot] = entry
         except LinkError as error:
-            self._store.audit("renewal refused", f"{robot[:64]}: {error}"[:2000], site=site[:64])
+            self.store.audit("renewal refused", f"{robot[:64]}: {error}"[:2000], site=site[:64])
             raise
-        self._store.audit("robot renewed", f"{robot}, key {asked.new_fingerprint[:12]}", site=site)
+        self.store.audit("robot renewed", f"{robot}, key {asked.new_fingerprint[:12]}", site=site)
         return encode_message(RenewalAnswer(certificate=certificate.decode(), servers=self.authorities.servers))
-
-    def note_copied(self, site: str, robot: str) -> None:
-        """Log in the site's history that a robot's certificate was on two connections."""
-        self._store.audit("robot connected twice", f"{robot}: was its certificate copied?", site=site)
-
-    def connected_elsewhere(self, here: Sequence[str]) -> list[str]:
-        """Return the certificates connected to other servers of the store, which learn of those connected here. Raises StoreError."""
-        return self._store.files.connected(here)
 
     def survey_tls(self) -> TlsFiles:
         """Return files for a survey of this account on the bus; StateError if the store has no authorities."""
         own = self._keys / "survey.pem"
         authorities = self.authorities
         if not authorities.are_there:
-            raise StateError(f"{self._store.folder} has no certificates; run the survey where the server's store is")
+            raise StateError(f"{self.store.folder} has no certificates; run the survey where the server's store is")
         if not own.is_file() or (certificate_info(own.read_bytes()).ends - datetime.now(UTC)).days < 1:
             with disk_errors(f"{own} cannot be written", "check the account"):
                 write_atomically(own, [authorities.make_own(SURVEY.certificate, "survey")])
@@ -261,28 +262,12 @@ class RobotRegister:
         host = self.authorities.hosts[0]
         return f"{listening.partition('/')[0]}/{f'[{host}]' if ':' in host else host}:{listening.rpartition(':')[2]}"
 
-    def _check_endpoint(self, endpoint: str) -> None:
-        _ = self.tls
-        host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
-        hosts = self.authorities.hosts
-        if host not in hosts:
-            raise StateError(
-                f"robots would refuse the server at {endpoint}: its certificate names {', '.join(hosts)}; name one of them, or "
-                "make another certificate: `mapserver trust rotate server --host ...`"
-            )
-
-    def _root(self) -> str:
-        lists = SignedLists(self._store.folder)
-        if not lists.are_there:
-            raise StateError(f"the maps of {self._store.folder} are not signed; `mapserver trust init` comes first")
-        return lists.path("root", lists.newest("root")).read_text("utf-8")
-
     @contextmanager
-    def _changing(self) -> Iterator[dict[tuple[str, str], Enrolled]]:
+    def _changing(self) -> Iterator[dict[tuple[str, str], EnrolledRobot]]:
         """Yield the robots, to be changed by one process at a time; written at the end unless an error was raised."""
         with disk_errors(f"{self._path} cannot be written", "free some space, and check the account"):
             make_folder(self._keys)
-            with self._store.files.changing("keys") as root:
+            with self.store.files.changing("keys") as root:
                 before = {(entry.site, entry.robot): entry for entry in self.robots()}
                 entries = dict(before)
                 yield entries

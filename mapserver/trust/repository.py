@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Sequence
+from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, cast
@@ -120,11 +121,6 @@ class ListRepository:
         targets.version += 1
         self._sign("targets", targets, root_key, judges=(self.root(),))
 
-    def forget_site(self, site: str) -> None:
-        """Remove all lists of a site, so that its numbers restart; robots accept this only after another online key."""
-        for path in self.lists.folder.glob(f"*.{site_role(site)}.json"):
-            path.unlink(missing_ok=True)
-
     # --- with the keys of the server ----------------------------------------------------------------------------------
 
     def sign_site(self, site: str, admitted: Sequence[AdmittedVersion], key: Signer) -> int:
@@ -143,7 +139,14 @@ class ListRepository:
         _check(root, "targets", targets)
         meta = {"targets.json": MetaFile(targets.signed.version)}
         number, stamped = self.lists.newest("snapshot"), 0
-        before = self._last_snapshot(root)
+        before: Snapshot | None = (
+            None  # the last one, unless a replaced key signed it: then it cannot stay, despite the same content
+        )
+        if number:
+            last = self.lists.metadata("snapshot")
+            with suppress(UnsignedMetadataError):
+                root.verify_delegate("snapshot", last.signed_bytes, last.signatures)
+                before = cast(Snapshot, last.signed)
         for name in self.lists.site_roles():
             if newest := self.lists.newest(name):
                 entry = self._named(targets.signed, name, newest, before)
@@ -159,17 +162,6 @@ class ListRepository:
             online,
             judges=(root,),
         )
-
-    def _last_snapshot(self, root: Root) -> Snapshot | None:
-        """Return the last one if it can stay, else None: one signed by a replaced key cannot, despite the same content."""
-        if not self.lists.newest("snapshot"):
-            return None
-        last = self.lists.metadata("snapshot")
-        try:
-            root.verify_delegate("snapshot", last.signed_bytes, last.signatures)
-        except UnsignedMetadataError:
-            return None
-        return cast(Snapshot, last.signed)
 
     def _named(self, targets: Targets, name: str, newest: int, before: Snapshot | None) -> MetaFile | None:
         """Return the snapshot's entry of a site: its newest list, or the previous entry while another key must sign first.

@@ -40,7 +40,7 @@ def admitted_versions(rows: SiteReleases) -> tuple[AdmittedVersion, ...]:
 
 
 def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
-    """Sign lists changed by releases or expiring soon. No effect if the store has no lists, or the key is elsewhere.
+    """Sign lists changed by releases or expiring soon; called every second. No effect if the store has no lists, or the key is elsewhere.
 
     all_anew: snapshot and timestamp too, after another key or root.
 
@@ -50,8 +50,12 @@ def update_lists(store: MapStore, *, all_anew: bool = False) -> None:
     if not lists.are_there:
         return
     now, keys = _now(store), KeyFolder(store.folder / "keys")
-    if not all_anew and not _due(store, lists, keys, now):
-        return
+    if not all_anew and not (keys.has("online") and _online_is_due(lists, now)):
+        known = lists.site_roles()
+        roles = ((info.site, site_role(info.site)) for info in store.sites())
+        signed_here = (site for site, role in roles if keys.has(role if role in known else "root"))
+        if not any(_site_is_due(lists, store.releases(site), now) for site in signed_here):
+            return
     with store.files.changing("trust") as root:
         repository, faults = _repository(store, root), []
         for info in store.sites():
@@ -167,7 +171,9 @@ def revoke_site(store: MapStore, site: str, root_key: "Signer") -> None:
         if site_role(site) not in repository.lists.site_roles():
             raise UsageError(f"no key may sign maps of site {site}; `mapserver trust status` shows the sites")
         repository.delegate(site, repository.keys.replace(site_role(site)).public_key, root_key)
-        repository.forget_site(site)
+        # So that its numbers restart; robots accept this only after another online key.
+        for path in repository.lists.folder.glob(f"*.{site_role(site)}.json"):
+            path.unlink(missing_ok=True)
         repository.replace_online(root_key)
 
 
@@ -261,18 +267,6 @@ def _entry(info: VersionInfo, state: str, files: Mapping[str, str] = MappingProx
         files=dict(files),
     )
     return AdmittedVersion(info.manifest_sha256, info.manifest_bytes, about)
-
-
-def _due(store: MapStore, lists: SignedLists, keys: KeyFolder, now: datetime) -> bool:
-    """True if a list that can be signed here is due; called every second."""
-    if keys.has("online") and _online_is_due(lists, now):
-        return True
-    known = lists.site_roles()
-    return any(
-        keys.has(role if role in known else "root") and _site_is_due(lists, store.releases(info.site), now)
-        for info in store.sites()
-        for role in [site_role(info.site)]
-    )
 
 
 def _online_is_due(lists: SignedLists, now: datetime) -> bool:

@@ -58,7 +58,18 @@ def trust_status(store: MapStore) -> TrustStatus:
     now = datetime.fromtimestamp(store.now_ns() / 1e9, UTC)
     known = lists.site_roles()
     for name in ("root", "targets", "snapshot", TIMESTAMP, *known):
-        found.roles.append(_role(lists, name, now))
+        number, fault = lists.newest(name), ""
+        if name == TIMESTAMP and lists.path(name, 0).is_file():
+            number = lists.read(name).version
+        if not number:
+            found.roles.append(RoleStatus(name, 0, None, None, "nothing was signed yet"))
+            continue
+        expires = lists.read(name).expires
+        days_left = (expires - now).total_seconds() / 86_400
+        if days_left < _ENDS_SOON.get(name, _SITE_ENDS_SOON):
+            soon = f"ends in {days_left:.1f} days: sign it again"
+            fault = "expired: robots refuse new maps" if days_left <= 0 else soon
+        found.roles.append(RoleStatus(name, number, expires.isoformat(), round(days_left, 2), fault))
     found.faults = [f"{status.role}: {status.fault}" for status in found.roles if status.fault]
     own = KeyFolder(store.folder / "keys")
     for info in store.sites():
@@ -89,17 +100,3 @@ def trust_status(store: MapStore) -> TrustStatus:
     if (authorities.folder / "servers-ca.pem").is_file():
         found.risks.append(f"{authorities.folder}/servers-ca.pem: a thief of this machine can act as the server")
     return found
-
-
-def _role(lists: SignedLists, role: str, now: datetime) -> RoleStatus:
-    number = lists.newest(role)
-    if role == TIMESTAMP and lists.path(role, 0).is_file():
-        number = lists.read(role).version
-    if not number:
-        return RoleStatus(role, 0, None, None, "nothing was signed yet")
-    expires = lists.read(role).expires
-    days_left = (expires - now).total_seconds() / 86_400
-    fault = ""
-    if days_left < _ENDS_SOON.get(role, _SITE_ENDS_SOON):
-        fault = "expired: robots refuse new maps" if days_left <= 0 else f"ends in {days_left:.1f} days: sign it again"
-    return RoleStatus(role, number, expires.isoformat(), round(days_left, 2), fault)

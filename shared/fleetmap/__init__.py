@@ -11,8 +11,9 @@ Names are imported when they are first used, so that `import fleetmap` stays lig
 shared/README.md; every error is a `FleetmapError` whose message names the next step. examples/ holds whole programs.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from fleetmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from fleetmap.errors import CalibrationError, FleetmapError, MapFormatError, RecordingError
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     )
     from fleetmap.recordings.tum import read_tum, write_tum
     from fleetmap.sensors.samples import Trajectory
+    from fleetmap.version import __version__
 
 __all__ = [
     "RECORDING_FORMATS",
@@ -50,34 +52,15 @@ __all__ = [
     "read_tum",
     "write_tum",
 ]
-_NAMES = {
-    "errors": "CalibrationError FleetmapError MapFormatError RecordingError",
-    "odometry": "OdometrySettings make_odometry",
-    "recordings": "FrameSelection OpenOptions Recording RecordingFormat RECORDING_FORMATS Topics open_recording "
-    "read_calibration",
-    "recordings.tum": "read_tum write_tum",
-    "sensors.samples": "Trajectory",
-}
-_MODULES = {name: f"fleetmap.{module}" for module, names in _NAMES.items() for name in names.split()}
-
-
-def _version() -> str:
-    from importlib import metadata  # takes a tenth of a second
-
-    try:
-        return metadata.version("fleetmap")
-    except metadata.PackageNotFoundError:
-        return "0+source"  # a source tree that is not installed
-
-
-def __getattr__(name: str) -> object:
-    """Import a public name at its first use (PEP 562)."""
-    if name == "__version__":
-        return _version()
-    if name not in _MODULES:
-        raise AttributeError(f"module 'fleetmap' has no attribute {name!r}")
-    return getattr(import_module(_MODULES[name]), name)
-
-
-def __dir__() -> list[str]:
-    return __all__
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "fleetmap.errors": "CalibrationError FleetmapError MapFormatError RecordingError",
+        "fleetmap.odometry": "OdometrySettings make_odometry",
+        "fleetmap.recordings": "FrameSelection OpenOptions Recording RecordingFormat RECORDING_FORMATS Topics open_recording "
+        "read_calibration",
+        "fleetmap.recordings.tum": "read_tum write_tum",
+        "fleetmap.sensors.samples": "Trajectory",
+        "fleetmap.version": "__version__",
+    },
+)

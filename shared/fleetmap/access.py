@@ -72,29 +72,20 @@ class Rule:
 
 
 class Access:
-    """Rules for the holders of certificates; all other participants are denied everything."""
+    """Rules for the holders of certificates; all other participants are denied everything. robots: enrolled ones, by site and name."""
 
     def __init__(self, holders: Iterable[Holder]) -> None:
         self._holders = {holder.certificate: holder for holder in holders}
-        self._robots = {(holder.site, holder.robot) for holder in self._holders.values() if holder.robot}
+        self.robots = {(holder.site, holder.robot) for holder in self._holders.values() if holder.robot}
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Access) and self._holders == other._holders
 
     __hash__ = None  # type: ignore[assignment]
 
-    @property
-    def robot_count(self) -> int:
-        """Number of enrolled robots."""
-        return len(self._robots)
-
     def holder(self, certificate: str) -> Holder | None:
         """Holder of the certificate of this name; None if unknown or revoked."""
         return self._holders.get(certificate)
-
-    def has_robot(self, site: str, robot: str) -> bool:
-        """True if the robot is enrolled."""
-        return (site, robot) in self._robots
 
     def zenoh_config(self) -> dict[str, Any]:
         """Sections of zenoh's configuration that enforce the rules and limit rate and size of a participant's messages."""
@@ -110,7 +101,10 @@ class Access:
             "access_control": {
                 "enabled": True,
                 "default_permission": "deny",
-                "rules": [_zenoh_rule(rule) for rule in rules.values()],
+                "rules": [
+                    {"id": r.id, "permission": "allow", "flows": [r.flow], "messages": r.acts, "key_exprs": r.keys}
+                    for r in rules.values()
+                ],
                 "subjects": subjects,
                 "policies": policies,
             },
@@ -154,10 +148,6 @@ def _rules(holder: Holder) -> tuple[Rule, ...]:
         Rule(f"{name}-ordered", Direction.OUT, (Act.PUT,), own(ORDERS)),
         Rule(f"{name}-alive", Direction.IN, (Act.SHOW_ALIVE,), own(ALIVE)),
     )
-
-
-def _zenoh_rule(rule: Rule) -> dict[str, Any]:
-    return {"id": rule.id, "permission": "allow", "flows": [rule.flow], "messages": rule.acts, "key_exprs": rule.keys}
 
 
 def _size_limit(name: str, act: Act, key: str, most_bytes: int) -> dict[str, Any]:

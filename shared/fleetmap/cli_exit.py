@@ -77,7 +77,7 @@ def require_extra(extra: str, program: str) -> None:
         return
     marked = [line for line in project.requires or () if re.search(rf"extra == ['\"]{extra}['\"]", line)]
     names = [re.split(r"[^\w.-]", line, maxsplit=1)[0] for line in marked]
-    missing = [name for name in names if not _is_installed(name)]
+    missing = [name for name in names if not any(metadata.distributions(name=name))]
     if missing:
         tag = re.search(r"^Tag: (\S+)$", project.read_text("WHEEL") or "", re.MULTILINE)
         wheel = f"./fleetmap-{project.version}-{tag[1] if tag else '*'}.whl"
@@ -85,13 +85,3 @@ def require_extra(extra: str, program: str) -> None:
             f"{program} needs the extra `{extra}`, of which {', '.join(missing)} are not installed; install it with "
             f"pip install '{wheel}[{extra}]', or '.[{extra}]' in fleetmap's source folder"
         )
-
-
-def _is_installed(name: str) -> bool:
-    from importlib import metadata
-
-    try:
-        metadata.distribution(name)
-    except metadata.PackageNotFoundError:
-        return False
-    return True

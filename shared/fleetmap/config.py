@@ -7,13 +7,14 @@ field of a section is an internal constant: it has its reason beside it in the c
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 import msgspec
 
 from fleetmap.errors import UsageError
 
 S = TypeVar("S", bound="Section")
+Positive = Annotated[float, msgspec.Meta(gt=0)]
 _MAX_FILE_BYTES = 1 << 20
 # By tier and section ("" is the top of the file), keys separated by spaces, or `*`.
 Tiers = Mapping[str, Mapping[str, str]]

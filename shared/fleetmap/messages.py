@@ -17,12 +17,12 @@ fleetmap/{site}/live/survey              published by a running survey: fleetmap
 """
 
 from enum import StrEnum
-from typing import Annotated, Any, Self, TypeVar
+from typing import Annotated, Self, TypeVar
 
 import msgspec
 import numpy as np
 
-from fleetmap.encoding import MOST, bounded, to_msgpack, to_plain
+from fleetmap.encoding import MOST, bounded, to_msgpack
 from fleetmap.errors import LinkError
 from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
 
@@ -387,12 +387,6 @@ def part_of(data: bytes, question: bytes) -> bytes:
     asked = decode_message(question, ChunkRequest) if question else ChunkRequest()
     part = data[asked.offset : asked.offset + asked.max_bytes]
     return encode_message(Part(total_bytes=len(data), offset=asked.offset, data=part))
-
-
-def report_dict(message: msgspec.Struct) -> dict[str, Any]:
-    """The message as plain values, for reports."""
-    built: dict[str, Any] = to_plain(message)
-    return built
 
 
 def robot_key(site: str, robot: str, what: str) -> str:

@@ -22,7 +22,7 @@ from fleetmap.mapformat.grid_tile import (
     decode_grid_tile,
     encode_grid_tile,
 )
-from fleetmap.mapformat.manifest import Positive, Sha256, TileEntry
+from fleetmap.mapformat.manifest import Positive, Sha256, TileEntry, manifest_entry
 from fleetmap.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 FLOOR_M, SLICE_M, SLICES = 0.10, 0.25, 8  # the ground's unevenness, and the noise of its points
@@ -132,16 +132,7 @@ def known_grid(manifest: Manifest, blob: Callable[[str], bytes]) -> Tiles:
 
 def report_of(manifest: Manifest) -> GridReport | None:
     """The build's report of its grid, None if the build had to make none. MapFormatError for invalid content."""
-    return report_entry(manifest, GRID_KEY, GridReport)
-
-
-def report_entry(manifest: Manifest, key: str, kind: type[T]) -> T | None:
-    """An entry of the build's report, None if absent. MapFormatError for invalid content."""
-    found = manifest.report.get(key)
-    try:
-        return None if found is None else msgspec.convert(found, kind)
-    except msgspec.ValidationError as error:
-        raise MapFormatError(f"manifest of {manifest.site} version {manifest.version}: {key}: {error}") from error
+    return manifest_entry(manifest, "report", GRID_KEY, GridReport)
 
 
 def read_index(data: bytes) -> GridIndex:

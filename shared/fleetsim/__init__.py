@@ -7,32 +7,23 @@
 `prepare` gives the samples and the renderer of a run without writing them. Names are imported at their first use.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING
 
+from fleetmap.lazy_names import lazy_names
+
 if TYPE_CHECKING:
+    from fleetmap.version import __version__
     from fleetsim.commands import record_order
     from fleetsim.recorder import Order, Session, prepare
     from fleetsim.scenarios import SCENARIOS
 
 __all__ = ["SCENARIOS", "Order", "Session", "__version__", "prepare", "record_order"]
-_MODULES = {
-    "SCENARIOS": "fleetsim.scenarios",
-    "Order": "fleetsim.recorder",
-    "Session": "fleetsim.recorder",
-    "prepare": "fleetsim.recorder",
-    "record_order": "fleetsim.commands",
-}
-
-
-def __getattr__(name: str) -> object:
-    """Import a public name at its first use (PEP 562)."""
-    if name == "__version__":
-        return import_module("fleetmap").__version__
-    if name not in _MODULES:
-        raise AttributeError(f"module 'fleetsim' has no attribute {name!r}")
-    return getattr(import_module(_MODULES[name]), name)
-
-
-def __dir__() -> list[str]:
-    return __all__
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "fleetmap.version": "__version__",
+        "fleetsim.commands": "record_order",
+        "fleetsim.recorder": "Order Session prepare",
+        "fleetsim.scenarios": "SCENARIOS",
+    },
+)

@@ -11,22 +11,7 @@ from fleetmap.console import plain_console
 from fleetmap.recordings.images import StoredFrame, png_image
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.samples import CameraFrame
-from fleetsim.recorder import Order, Session, prepare, write_session
-
-
-def _progress() -> Progress:
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=plain_console(stderr=True))
-
-
-def _ready(order: Order, progress: Progress, workers: ThreadPoolExecutor) -> Session:
-    """Build the site and take one image, so that its lighting has its own progress line."""
-    task = progress.add_task("building the warehouse", total=2)
-    session = prepare(order, workers)
-    progress.update(task, advance=1, description="lighting it")
-    session.renderer.shoot(session.frame_times_s[0])
-    progress.update(task, advance=1, description="warehouse ready")
-    return session
+from fleetsim.recorder import Order, prepare, write_session
 
 
 class _PngWriter(McapRecordingWriter):
@@ -49,8 +34,14 @@ def _png_frame(frame: CameraFrame) -> StoredFrame:
 def record_order(order: Order, out: Path) -> str:
     """Record to `out`; print a line with amount and time."""
     started = time.monotonic()
-    with _progress() as progress, ThreadPoolExecutor(2) as workers:
-        session = _ready(order, progress, workers)
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=plain_console(stderr=True)) as progress, ThreadPoolExecutor(2) as workers:
+        # The site is built and one image taken first, so that its lighting has its own progress line.
+        task = progress.add_task("building the warehouse", total=2)
+        session = prepare(order, workers)
+        progress.update(task, advance=1, description="lighting it")
+        session.renderer.shoot(session.frame_times_s[0])
+        progress.update(task, advance=1, description="warehouse ready")
         count = len(session.frame_times_s)
         task = progress.add_task(f"recording {order.scenario}", total=count)
         name = f"{order.scenario}-{order.robot or 'first'}-seed{order.seed}-day{order.day}-{order.light}"

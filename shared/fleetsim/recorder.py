@@ -12,12 +12,13 @@ from fleetmap.errors import UsageError
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Trajectory, WheelSample
-from fleetsim.imaging.pipelines import find_pipeline, process_frame
+from fleetsim.choices import chosen
+from fleetsim.imaging.pipelines import IMAGE_PIPELINES, process_frame
 from fleetsim.motion.body_motion import CarriedMotion, Motion, RouteMotion
 from fleetsim.motion.routes import check_clear
 from fleetsim.render.painter import Look
 from fleetsim.render.renderer import RenderOptions, StereoRenderer
-from fleetsim.scenarios import Run, find_scenario
+from fleetsim.scenarios import SCENARIOS, Run
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.light import LIGHT_STATES
 from fleetsim.scene.world import World
@@ -75,7 +76,7 @@ class Session:
 
     def frames(self) -> Iterator[CameraFrame]:
         """The images, one pair at a time; stamps on the cameras' clock. The next pair is rendered meanwhile."""
-        pipeline = find_pipeline(self.order.camera_pipeline)
+        pipeline = IMAGE_PIPELINES[self.order.camera_pipeline]
 
         def made(time_s: float, stamp_ns: int) -> CameraFrame:
             shot = self.renderer.shoot(time_s)
@@ -120,14 +121,13 @@ def drive(run: Run, kind: RobotKind, layout: Layout, rng: np.random.Generator) -
 
 def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
     """Prepare a run without its images. Raises UsageError for unknown names and routes through obstacles."""
-    scenario = find_scenario(order.scenario)
-    if order.light not in LIGHT_STATES:
-        raise UsageError(f"unknown light {order.light!r}; known are {', '.join(LIGHT_STATES)}")
-    find_pipeline(order.camera_pipeline)
+    scenario = chosen("scenario", order.scenario, SCENARIOS)()
+    chosen("light", order.light, LIGHT_STATES)
+    chosen("camera pipeline", order.camera_pipeline, IMAGE_PIPELINES)
     if order.day < 0 or order.seed < 0:
         raise UsageError(f"seed {order.seed} and day {order.day} must not be negative")
     name, run = scenario.run(order.robot)
-    kind = replace(run.kind.with_lens(order.lens or run.kind.lens).with_rig(order.rig), hidden=order.hidden)
+    kind = replace(run.kind, lens=order.lens or run.kind.lens, rig=order.rig, hidden=order.hidden)
     if order.size_px is not None:
         kind = replace(kind, width_px=order.size_px[0], height_px=order.size_px[1])
     nominal, true = nominal_calibration(kind), true_calibration(kind, _generator(order, name, "mounting"))
@@ -142,6 +142,9 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
     wheel = measure_wheels(motion, kind.body_height_m, kind.wheels, _generator(order, name, "wheels"))
     priors = measure_priors(motion, nominal.base_from_body, run.zone_period_s, _generator(order, name, "priors"))
     last_ns = int(stamps_from_s(np.array([end_s]))[0])
+    # Exact poses at every frame and each 20 ms
+    grid_s = sample_times(min(end_s, motion.duration_s), 1.0 / _TRUTH_STEP_S)
+    truth_s = np.unique(np.rint(np.concatenate([grid_s, times]) * 1e9)) * 1e-9
     return Session(
         order=order,
         world=world,
@@ -153,15 +156,8 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
         imu=plan.spoil_imu(measure_imu(motion, kind.imu, _generator(order, name, "imu"))).between(0, last_ns),
         wheel=tuple(sample for sample in plan.spoil_wheels(wheel) if sample.stamp_ns < last_ns),
         priors=tuple(prior for prior in priors if prior.stamp_ns < last_ns),
-        truth=_truth(motion, times, end_s),
+        truth=Trajectory(stamps_from_s(truth_s), motion.map_from_body(truth_s)),
     )
-
-
-def _truth(motion: Motion, frame_times_s: list[float], end_s: float) -> Trajectory:
-    """Exact map_from_body at every frame and each 20 ms."""
-    grid = sample_times(min(end_s, motion.duration_s), 1.0 / _TRUTH_STEP_S)
-    times = np.unique(np.rint(np.concatenate([grid, frame_times_s]) * 1e9)) * 1e-9
-    return Trajectory(stamps_from_s(times), motion.map_from_body(times))
 
 
 def write_session(
@@ -170,20 +166,19 @@ def write_session(
     on_frame: Callable[[int], None] = lambda done: None,
 ) -> None:
     """Write all samples and images in time order, frame by frame."""
+    truth = session.truth
+
+    def write_between(start_ns: int, end_ns: int) -> None:
+        first, last = np.searchsorted(truth.stamps_ns, [start_ns, end_ns])
+        writer.write_prior(tuple(prior for prior in session.priors if start_ns <= prior.stamp_ns < end_ns))
+        writer.write_imu(session.imu.between(start_ns, end_ns))
+        writer.write_wheel(tuple(sample for sample in session.wheel if start_ns <= sample.stamp_ns < end_ns))
+        writer.write_ground_truth(Trajectory(truth.stamps_ns[first:last], truth.frame_from_body[first:last]))
+
     start_ns = 0
     for done, frame in enumerate(session.frames(), start=1):
-        _write_between(session, writer, start_ns, frame.stamp_ns)
+        write_between(start_ns, frame.stamp_ns)
         writer.write_frame(frame)
         on_frame(done)
         start_ns = frame.stamp_ns
-    _write_between(session, writer, start_ns, 1 << 62)
-
-
-def _write_between(session: Session, writer: McapRecordingWriter, start_ns: int, end_ns: int) -> None:
-    """Write the samples with start <= stamp < end."""
-    truth = session.truth
-    first, last = np.searchsorted(truth.stamps_ns, [start_ns, end_ns])
-    writer.write_prior(tuple(prior for prior in session.priors if start_ns <= prior.stamp_ns < end_ns))
-    writer.write_imu(session.imu.between(start_ns, end_ns))
-    writer.write_wheel(tuple(sample for sample in session.wheel if start_ns <= sample.stamp_ns < end_ns))
-    writer.write_ground_truth(Trajectory(truth.stamps_ns[first:last], truth.frame_from_body[first:last]))
+    write_between(start_ns, 1 << 62)

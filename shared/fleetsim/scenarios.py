@@ -52,13 +52,14 @@ class Scenario:
 
 
 _END_M = 2.7  # distance of the robots' routes from the end walls
+_OVERLAP_M = 8.0  # driven again at the end of a route
 
 
-def _loop(layout: Layout, first: int, last: int, *, overlap_m: float = 8.0, shift_m: float = 0.0) -> Route:
+def _loop(layout: Layout, first: int, last: int, *, shift_m: float = 0.0) -> Route:
     """Up one aisle, down another, and on along the first again."""
     y0, y1 = layout.aisle_y_m(first) + shift_m, layout.aisle_y_m(last) + shift_m
     left, right = layout.dock_m + _END_M, layout.length_m - _END_M
-    return Route(((left, y0), (right, y0), (right, y1), (left, y1), (left, y0), (left + overlap_m, y0)))
+    return Route(((left, y0), (right, y0), (right, y1), (left, y1), (left, y0), (left + _OVERLAP_M, y0)))
 
 
 def _snake(layout: Layout, aisles: range) -> Route:
@@ -70,7 +71,7 @@ def _snake(layout: Layout, aisles: range) -> Route:
         points += [(end, layout.aisle_y_m(aisle)) for end in ends]
     if len(aisles) % 2:
         raise UsageError("a snake that comes home needs an even number of aisles")
-    return Route((*points, points[0], (left + 8.0, points[0][1])))
+    return Route((*points, points[0], (left + _OVERLAP_M, points[0][1])))
 
 
 def _both_ways(layout: Layout) -> Route:
@@ -216,10 +217,3 @@ SCENARIOS = {
     "marked-ends": _marked_ends,
     "fulfilment-centre": _fulfilment_centre,
 }
-
-
-def find_scenario(name: str) -> Scenario:
-    """The named scenario; UsageError naming the known ones."""
-    if name not in SCENARIOS:
-        raise UsageError(f"unknown scenario {name!r}; known are {', '.join(SCENARIOS)}")
-    return SCENARIOS[name]()

@@ -79,9 +79,9 @@ def _fields(*kinds: type) -> set[str]:
 
 
 EVIDENCE = (
-    figures.Evidence, figures.Compared, figures.ProbeFigures, figures.Aliasing, figures.TrajectoryBreaks,
+    figures.Evidence, figures.Comparison, figures.ProbeFigures, figures.Aliasing, figures.TrajectoryBreaks,
     figures.TileDirections, figures.Starts, figures.LookAlike, figures.Repetition, figures.SurveyedViews,
-    figures.BlindView, figures.RigEvidence, figures.Displaced,
+    figures.BlindView, figures.RigEvidence, figures.Displacement,
 )  # fmt: skip
 RUN_KEYS = {"aligned_error_m", "peak_rss_mb", "map_version", "not_localised_m", "failures_detected", "starts"}
 

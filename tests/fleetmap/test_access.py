@@ -71,7 +71,7 @@ class World:
         bus = Bus(self.server.endpoint, tls=self.keys.robot(certificate))
         if self.kind == "client":
             # Whoever attacks chooses the mode; between peers the server's router passes nothing on.
-            tls = bus._tls.connecting()
+            tls = bus._tls.config("connect")
             entries = {"mode": "client", "connect/endpoints": [bus.endpoint], "transport/link/tls": tls}
             bus._session = zenoh.open(_config(entries))
         else:

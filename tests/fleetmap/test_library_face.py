@@ -36,6 +36,7 @@ def test_version_without_installation(monkeypatch: pytest.MonkeyPatch) -> None:
         raise metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(metadata, "version", missing)
+    monkeypatch.delitem(sys.modules, "fleetmap.version", raising=False)
     assert fleetmap.__version__ == "0+source"
 
 

@@ -1,5 +1,7 @@
 """Pictures against the truth: what KLT tracks must lie where calibration, true depth and true motion put it."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -22,7 +24,7 @@ def _renderer(lens: str, *, has_blur: bool) -> tuple[RigCalibration, StereoRende
     world = small_world()
     y = world.layout.aisle_y_m(0), world.layout.aisle_y_m(1)
     route = Route(((2.7, y[0]), (20.0, y[0]), (20.0, y[1]), (12.0, y[1])))
-    kind = ROBOTS["surveyor"].with_lens(lens)
+    kind = replace(ROBOTS["surveyor"], lens=lens)
     motion = RouteMotion(route, kind.limits, kind.body_height_m, kind.shake, np.random.default_rng(0))
     rig = nominal_calibration(kind)
     return rig, StereoRenderer(world, rig, motion, RenderOptions(look=Look(has_blur=has_blur)))

@@ -18,14 +18,14 @@ from fleetmap.messages import FailureReport, Thumbnail  # noqa: E402
 from fleetmap.version_grid import encode_grid, grid_report  # noqa: E402
 from mapserver import releases  # noqa: E402
 from mapserver.fleet.fleet import Fleet  # noqa: E402
-from mapserver.quality.figures import Compared, Evidence, ProbeFigures, TrajectoryBreaks  # noqa: E402
+from mapserver.quality.figures import Comparison, Evidence, ProbeFigures, TrajectoryBreaks  # noqa: E402
 from mapserver.store import DraftContent, MapStore  # noqa: E402
 from mapserver.store.archive import ARCHIVE_FORMAT, encode_archive  # noqa: E402
 from support.storage.dense_samples import surfel_extras, wall  # noqa: E402
 from support.storage.map_samples import draft_details, random_survey, random_tile  # noqa: E402
 
 _LOOKS = ProbeFigures(40, 0.975, 0.0, 0.001, 0.004, 290.0, 1.77)
-EVIDENCE = Evidence(held_out=Compared(_LOOKS, _LOOKS, 1.0), motion=TrajectoryBreaks(100, 0, 0.01))
+EVIDENCE = Evidence(held_out=Comparison(_LOOKS, _LOOKS, 1.0), motion=TrajectoryBreaks(100, 0, 0.01))
 
 
 def write_store(folder: Path) -> None:

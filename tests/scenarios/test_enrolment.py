@@ -43,7 +43,7 @@ def attacker(endpoint: str, identity: RobotIdentity | None) -> zenoh.Session:
     """Somebody in client mode who answers every robot's question for its version."""
     entries = {"mode": "client", "connect/endpoints": [endpoint]}
     session = zenoh.open(
-        _config(entries | ({} if identity is None else {"transport/link/tls": identity.tls.connecting()}))
+        _config(entries | ({} if identity is None else {"transport/link/tls": identity.tls.config("connect")}))
     )
 
     def lie(query: zenoh.Query) -> None:

@@ -57,14 +57,13 @@ def with_depths(
     has_depth = row_of_frame[indices] >= 0
     check_span(recording.frame_stamps_ns[indices], has_depth, recording, other)
     words = f"{int((~has_depth).sum())} of {len(indices)} frames have none in {file.name} and are left out"
-    images = DispImages(file, row_of_frame, camera, other.scale)
     unused = "; the IMU is not used" if len(recording.imu) else ""
     seen = replace(
         recording,
         sensor_set=SensorSet.RGBD,
         calibration=replace(recording.calibration, cameras=(camera,), imu=None),
         imu=ImuSamples.empty(),
-        frames=_DepthFrames(recording.frames, images, np.arange(len(recording)), camera),
+        frames=DepthFrames(recording.frames, file, row_of_frame, camera, other.scale),
         issues=(*recording.issues, DataIssue("depth of another system", words + unused)),
     )
     return seen, indices[has_depth]
@@ -117,50 +116,26 @@ def _pinhole(file: Path, camera: CameraCalibration, shape: tuple[int, ...]) -> A
 
 
 @dataclass(frozen=True)
-class DispImages:
-    """The images in `disps.npy`, one per pose: rows (F,) of the recording's frames, -1 if absent; scale: metres in its unit."""
+class DepthFrames(WrappedFrames):
+    """Frames of `source` with depth from the images in `file`, `disps.npy`. Hashes cover only the recorded data.
+
+    rows (F,): number of each frame's image, -1 if absent. scale: metres in the file's unit.
+    """
 
     file: Path
     rows: NDArray[np.int64]
     camera: CameraCalibration
     scale: float
 
-    @property
-    def shape(self) -> tuple[int, int]:
-        """Height and width of each."""
-        height, width = self._images.shape[1:]
-        return height, width
-
-    @cached_property
-    def pinhole(self) -> Array:
-        """(4,) fx, fy, cx, cy of their pixels."""
-        return _pinhole(self.file, self.camera, self.shape)
-
-    def inverse(self, frame: int) -> NDArray[np.float32] | None:
-        """Return (h, w) for a frame by its number in the recording, 0 if unknown; None for a frame without."""
-        row = int(self.rows[frame])
-        return None if row < 0 else np.array(self._images[row], np.float32)
-
-    @cached_property
-    def _images(self) -> AnyArray:
-        return array_in(self.file)
-
-
-@dataclass(frozen=True)
-class _DepthFrames(WrappedFrames):
-    """Frames of `source` with depth images; numbers (F,): their numbers in `images`. Hashes cover only the recorded data."""
-
-    images: DispImages
-    numbers: NDArray[np.int64]
-    camera: CameraCalibration
-
     def frame(self, index: int) -> CameraFrame:
-        frame, inverse = self.source.frame(index), self.images.inverse(int(self.numbers[index]))
+        frame, row = self.source.frame(index), int(self.rows[index])
         depth_m = np.zeros((self.camera.height_px, self.camera.width_px), np.float32)
-        return CameraFrame(frame.stamp_ns, frame.left, depth_m=depth_m if inverse is None else self._depth_m(inverse))
+        if row >= 0:
+            depth_m = self._depth_m(np.array(self._images[row], np.float32))
+        return CameraFrame(frame.stamp_ns, frame.left, depth_m=depth_m)
 
-    def part(self, indices: NDArray[np.int64]) -> "_DepthFrames":
-        return replace(self, source=self.source.part(indices), numbers=self.numbers[indices])
+    def part(self, indices: NDArray[np.int64]) -> "DepthFrames":
+        return replace(self, source=self.source.part(indices), rows=self.rows[indices])
 
     def _depth_m(self, inverse: NDArray[np.float32]) -> NDArray[np.float32]:
         """Return metres at recorded pixels: inverse depth is linear on planes, so it is interpolated between neighbours of one surface."""
@@ -172,21 +147,21 @@ class _DepthFrames(WrappedFrames):
         known[known] = one_surface[y[known].astype(np.int64), x[known].astype(np.int64)]
         between = cv2.remap(inverse, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         with np.errstate(divide="ignore", over="ignore"):
-            depth_m = np.asarray(np.float32(self.images.scale) / between, np.float32)
+            depth_m = np.asarray(np.float32(self.scale) / between, np.float32)
         return np.where(known & np.isfinite(depth_m), depth_m, np.float32(0))
 
     @cached_property
-    def _places(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        x, y = _places(self.camera, self.images.pinhole).astype(np.float32)
-        return x, y
+    def _images(self) -> AnyArray:
+        return array_in(self.file)
 
-
-def _places(camera: CameraCalibration, pinhole: Array) -> Array:
-    """Return (2, H, W) for each recorded pixel its position x, y in images of a camera without distortion; -9 if outside."""
-    size = camera.height_px, camera.width_px
-    v, u = np.indices(size, np.float64)
-    rays = camera.ray_from_pixel(np.column_stack([u.ravel(), v.ravel()]))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        found = pinhole[:2] * rays[:, :2] / rays[:, 2:] + pinhole[2:]
-    seen = (rays[:, 2] > 0) & np.isfinite(found).all(axis=1)
-    return np.asarray(np.where(seen[:, None], found, -9.0).T.reshape(2, *size))
+    @cached_property
+    def _places(self) -> NDArray[np.float32]:
+        """(2, H, W) for each recorded pixel its position x, y in the images, which have no distortion; -9 if outside."""
+        pinhole = _pinhole(self.file, self.camera, self._images.shape[1:])
+        size = self.camera.height_px, self.camera.width_px
+        v, u = np.indices(size, np.float64)
+        rays = self.camera.ray_from_pixel(np.column_stack([u.ravel(), v.ravel()]))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            found = pinhole[:2] * rays[:, :2] / rays[:, 2:] + pinhole[2:]
+        seen = (rays[:, 2] > 0) & np.isfinite(found).all(axis=1)
+        return np.where(seen[:, None], found, -9.0).T.reshape(2, *size).astype(np.float32)

@@ -88,7 +88,7 @@ class PoseReading:
 
 
 @dataclass(frozen=True)
-class Followed:
+class OwnMotion:
     """Motion of the recording: stamps_ns (F,), frame_from_body (F, 4, 4), and the number of the connected piece (F,) of each frame,
     -1 if lost.
     """
@@ -99,10 +99,10 @@ class Followed:
 
 
 @dataclass(frozen=True)
-class Shown:
+class Reference:
     """Reference for readings: the motion, its stretches (P, 2), and the mount of the camera."""
 
-    followed: Followed
+    followed: OwnMotion
     pairs: NDArray[np.int64]
     body_from_cam: Array
 
@@ -112,7 +112,7 @@ class Shown:
 
 
 @dataclass(frozen=True)
-class Judged:
+class Judgement:
     """A reading against the recording: metres in the file's unit of length and sigma of their logarithm, relative errors (P,) of
     stretches, medians of those of rotations and translations (None with fewer than LEAST_STRETCHES informative ones).
     """
@@ -139,16 +139,6 @@ class Judged:
     def in_metres(self) -> float:
         """The scale, 1 if indistinguishable from it: then the file is in metres, which are more accurate than the fit."""
         return 1.0 if abs(np.log(self.scale)) <= self.scale_within else self.scale
-
-    @property
-    def is_told(self) -> bool:
-        """True if the recording has enough motion to judge."""
-        return self.turn_error is not None or self.way_error is not None
-
-
-def readings(is_camera_body: bool) -> list[PoseReading]:
-    """Return all conventions; a camera that is the body has one frame."""
-    return [PoseReading(*each) for each in product(FRAMES[is_camera_body:], (False, True), (False, True))]
 
 
 def covered(stamps: Stamps, at_ns: Stamps) -> NDArray[np.bool_]:
@@ -179,7 +169,7 @@ def read_as(trajectory: Trajectory, reading: PoseReading) -> Trajectory:
     return Trajectory(trajectory.stamps_ns, se3_inverse(matrices) if reading.is_inverted else matrices)
 
 
-def stretches(followed: Followed, known: NDArray[np.bool_]) -> NDArray[np.int64]:
+def stretches(followed: OwnMotion, known: NDArray[np.bool_]) -> NDArray[np.int64]:
     """Return (P, 2) consecutive numbers of frames with poses: between each pair there was enough rotation, translation or time."""
     found: list[tuple[int, int]] = []
     for piece in np.unique(followed.piece[followed.piece >= 0]):
@@ -196,7 +186,7 @@ def stretches(followed: Followed, known: NDArray[np.bool_]) -> NDArray[np.int64]
     return np.array(found, np.int64).reshape(-1, 2)
 
 
-def judge(as_read: Trajectory, reading: PoseReading, shown: Shown, scale: float | None) -> Judged:
+def judge(as_read: Trajectory, reading: PoseReading, shown: Reference, scale: float | None) -> Judgement:
     """Judge the reading with poses `as_read`, over stretches; scale: metres in the unit of length if known."""
     followed, pairs = shown.followed, shown.pairs
     ends = np.array([pose_at(as_read, int(followed.stamps_ns[k])) for k in pairs.ravel()]).reshape(-1, 2, 4, 4)
@@ -215,10 +205,10 @@ def judge(as_read: Trajectory, reading: PoseReading, shown: Shown, scale: float 
         float(np.median(errors[tell])) if (tell := sizes >= least).sum() >= LEAST_STRETCHES else None
         for errors, sizes, least in ((turn_errors, turn_size, _LEAST_RAD), (way_errors, way_size, _LEAST_M))
     ]
-    return Judged(reading, scale, within, 0.5 * (turn_errors + way_errors), *medians)
+    return Judgement(reading, scale, within, 0.5 * (turn_errors + way_errors), *medians)
 
 
-def undecided(best: Judged, others: list[Judged]) -> list[Judged]:
+def undecided(best: Judgement, others: list[Judgement]) -> list[Judgement]:
     """Return those indistinguishable from the best one: their errors exceed its errors by less than the noise of the difference."""
     found = []
     for other in others:
@@ -287,7 +277,7 @@ def given_poses(recording: Recording, indices: NDArray[np.int64], other: OtherTr
     is_sparse = known.sum() < 2 or np.median(np.diff(stamps_ns[known])) > GAP_NS
     whole = is_sparse or len(stamps_ns) <= _WINDOWS * _WINDOW_FRAMES
     followed = _followed(recording, indices, whole=whole)
-    shown = Shown(followed, stretches(followed, known), recording.calibration.cameras[0].body_from_cam)
+    shown = Reference(followed, stretches(followed, known), recording.calibration.cameras[0].body_from_cam)
     found, words = _judged(other_trajectory, f"{other.file.name} ({written.kind})", shown, recording, other)
     at_frames = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
     at_frames[known] = [pose_at(other_trajectory, int(stamp)) for stamp in stamps_ns[known]]
@@ -351,7 +341,7 @@ def _foreign_stamps(rows: WrittenPoses, recording: Recording, other: OtherTrajec
     )
 
 
-def _followed(recording: Recording, indices: NDArray[np.int64], *, whole: bool) -> Followed:
+def _followed(recording: Recording, indices: NDArray[np.int64], *, whole: bool) -> OwnMotion:
     """Return fleetmap's odometry over all frames, or over some windows of them."""
     count = len(indices)
     spans = [(0, count)]
@@ -373,18 +363,20 @@ def _followed(recording: Recording, indices: NDArray[np.int64], *, whole: bool) 
             pieces += is_lost or number == first  # without an IMU the next frames are not connected to the earlier ones
             piece[number] = pieces
         frame_from_body[first:end] = run.chain.odom_from_body()
-    return Followed(recording.frame_stamps_ns[indices], frame_from_body, piece)
+    return OwnMotion(recording.frame_stamps_ns[indices], frame_from_body, piece)
 
 
 def _judged(
-    trajectory: Trajectory, name: str, shown: Shown, recording: Recording, other: OtherTrajectory
-) -> tuple[Judged, str]:
+    trajectory: Trajectory, name: str, shown: Reference, recording: Recording, other: OtherTrajectory
+) -> tuple[Judgement, str]:
     """Return the poses in the named convention, and text on how well they fit.
 
     RecordingError if another convention fits better, with what to do, or none fits; UsageError if the scale is unknown.
     """
     is_camera_body = bool(np.abs(shown.body_from_cam - np.eye(4)).max() < 1e-3)
-    every = [judge(read_as(trajectory, each), each, shown, other.scale) for each in readings(is_camera_body)]
+    # A camera that is the body has one frame.
+    conventions = [PoseReading(*each) for each in product(FRAMES[is_camera_body:], (False, True), (False, True))]
+    every = [judge(read_as(trajectory, each), each, shown, other.scale) for each in conventions]
     best = min(every, key=lambda judged: float(judged.errors.mean()) if len(judged.errors) else 0.0)
     said = PoseReading(FRAMES[1] if is_camera_body else other.frame)
     (found,) = [each for each in every if each.reading == said]
@@ -404,7 +396,7 @@ def _judged(
             f"{recording.name} does not show the unit of {other.file}; set its metres with --trajectory-scale METRES"
         )
     words = f"trajectory {name}: {said}, scale {found.in_metres:.4g}"
-    if not found.is_told:
+    if found.turn_error is None and found.way_error is None:
         return found, f"{words}, as stated; the recording moves too little to judge it"
     return found, f"{words}: off our own odometry by {found.figures} in the median of {count} stretches"
 
@@ -420,7 +412,7 @@ def check_span(stamps_ns: Stamps, is_placed: NDArray[np.bool_], recording: Recor
         )
 
 
-def _bridged(at_frames: Array, is_placed: NDArray[np.bool_], followed: Followed, other: OtherTrajectory) -> Array:
+def _bridged(at_frames: Array, is_placed: NDArray[np.bool_], followed: OwnMotion, other: OtherTrajectory) -> Array:
     """Return the poses (F, 4, 4); missing ones follow odometry from the previous pose, adjusted to arrive at the next one."""
     out, own, seconds = at_frames.copy(), followed.frame_from_body, followed.stamps_ns * 1e-9
     numbers = np.flatnonzero(is_placed)

@@ -16,8 +16,8 @@ from fleetmap.errors import MapFormatError, StateError
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.mapformat import Manifest, sha256_hex
 from fleetmap.mapformat.container import pack, unpack
-from fleetmap.mapformat.manifest import Positive, Sha256, TileEntry
-from fleetmap.version_grid import decode_index, report_entry
+from fleetmap.mapformat.manifest import Positive, Sha256, TileEntry, manifest_entry
+from fleetmap.version_grid import decode_index
 from mapserver.plugins.dense_maps.exposure import FALLOFF
 
 _log = logging.getLogger(__name__)
@@ -198,7 +198,7 @@ def known_surfels(
 
 def report_of(manifest: Manifest) -> SurfelReport | None:
     """Return the build's report on its surfels, None if they were not enabled. MapFormatError for an invalid entry."""
-    return report_entry(manifest, SURFELS_KEY, SurfelReport)
+    return manifest_entry(manifest, "report", SURFELS_KEY, SurfelReport)
 
 
 def encode_tile(place: tuple[int, int], surfels: Surfels) -> SurfelTile:

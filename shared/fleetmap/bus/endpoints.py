@@ -1,11 +1,12 @@
 """Endpoints of the bus in zenoh's notation, tcp/HOST:PORT; files of mutual TLS; reasons for failed handshakes, which zenoh hides."""
 
+import re
 import socket
 import ssl
 from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from fleetmap.errors import UsageError
 
@@ -61,23 +62,11 @@ class TlsFiles:
     authority: Path
     own: Path
 
-    def listening(self) -> dict[str, Any]:
-        """zenoh's configuration for a server."""
-        own = str(self.own)
-        return self._common() | {"listen_private_key": own, "listen_certificate": own}
-
-    def connecting(self) -> dict[str, Any]:
-        """zenoh's configuration for a robot."""
-        own = str(self.own)
-        return self._common() | {
-            "verify_name_on_connect": True,
-            "connect_private_key": own,
-            "connect_certificate": own,
-        }
-
-    def _common(self) -> dict[str, Any]:
-        authority = str(self.authority)
-        return {"root_ca_certificate": authority, "enable_mtls": True, "close_link_on_expiration": True}
+    def config(self, way: Literal["listen", "connect"]) -> dict[str, Any]:
+        """zenoh's configuration for a server, which listens, or a robot, which connects."""
+        own = {f"{way}_private_key": str(self.own), f"{way}_certificate": str(self.own)}
+        common = {"root_ca_certificate": str(self.authority), "enable_mtls": True, "close_link_on_expiration": True}
+        return common | own | ({"verify_name_on_connect": True} if way == "connect" else {})
 
     def fault(self) -> str:
         """Reason why these files cannot be used; empty if they can. Check first: zenoh closes the old session before it reads them."""
@@ -89,20 +78,18 @@ class TlsFiles:
         return ""
 
 
+_HANDSHAKE_S = 3.0
+_ALERT = re.compile(r"^(TLSV1|TLSV13|SSLV3)_ALERT_")  # before some reasons, by the version of TLS
 _WORDS = {
     "CERTIFICATE_REQUIRED": "the server demands a certificate; enrol this robot",
-    "TLSV13_ALERT_CERTIFICATE_REQUIRED": "the server demands a certificate; enrol this robot",
     "UNKNOWN_CA": "the server does not know who signed this robot's certificate; enrol it again",
-    "TLSV1_ALERT_UNKNOWN_CA": "the server does not know who signed this robot's certificate; enrol it again",
     "DECRYPT_ERROR": "the server does not know who signed this robot's certificate; enrol it again",
-    "TLSV1_ALERT_DECRYPT_ERROR": "the server does not know who signed this robot's certificate; enrol it again",
     "CERTIFICATE_EXPIRED": "this robot's certificate has expired by the server's clock; enrol it again",
-    "SSLV3_ALERT_CERTIFICATE_EXPIRED": "this robot's certificate has expired by the server's clock; enrol it again",
     "WRONG_VERSION_NUMBER": "the server does not use TLS",
 }
 
 
-def handshake_fault(endpoint: str, files: TlsFiles, timeout_s: float = 3.0) -> str:
+def handshake_fault(endpoint: str, files: TlsFiles) -> str:
     """Reason why a connection fails, by a TLS handshake of the standard library; empty if the server accepts it.
 
     Only for tls/HOST:PORT; empty for QUIC, whose handshake the standard library lacks.
@@ -116,7 +103,7 @@ def handshake_fault(endpoint: str, files: TlsFiles, timeout_s: float = 3.0) -> s
     context.load_cert_chain(str(files.own))
     try:
         with (
-            socket.create_connection((host, int(port)), timeout_s) as raw,
+            socket.create_connection((host, int(port)), _HANDSHAKE_S) as raw,
             context.wrap_socket(raw, server_hostname=host) as connection,
         ):
             connection.settimeout(0.5)
@@ -128,6 +115,6 @@ def handshake_fault(endpoint: str, files: TlsFiles, timeout_s: float = 3.0) -> s
     except ssl.SSLCertVerificationError as error:
         return f"the server's certificate is refused: {error.verify_message}; is this robot's clock right, and {host} its name?"
     except ssl.SSLError as error:
-        return _WORDS.get(str(error.reason), f"TLS fails: {error.reason}")
+        return _WORDS.get(_ALERT.sub("", str(error.reason)), f"TLS fails: {error.reason}")
     except OSError as error:
         return f"{host}:{port} cannot be reached ({error})"

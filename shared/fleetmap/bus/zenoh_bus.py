@@ -7,7 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import zenoh
 import zenoh.ext
@@ -30,7 +30,7 @@ MAX_MESSAGE_BYTES = 1 << 20  # larger content is sent in parts, because one larg
 _MAX_LATCHED_BYTES = 1 << 26  # a robot's own programs take a map in one message
 _RETRY_S = 0.05
 _REOPEN_WITHIN_S = 10.0
-_MAX_ALIVE = 1 << 17
+_MAX_ALIVE, _ALIVE_WITHIN_S = 1 << 17, 2.0
 _HEARTBEAT_S = 0.5  # period after which a subscriber detects that the last message was lost; same as in rmw_zenoh
 _MAX_SESSIONS = 20_000  # zenoh's default is 1000: further robots would get no response
 # Connections without a session yet, each for at most 10 s. At zenoh's default, 100, so many silent ones would shut out all robots.
@@ -73,7 +73,7 @@ class LatchedPublisher(Handle):
         self._put(payload, attachment)
 
 
-class _Declared:
+class _Declaration:
     """A declaration: function that declares it on a session, zenoh's object for it, and resources that end with it."""
 
     def __init__(self, declare: Callable[[Any], Any], stop: Callable[[], None]) -> None:
@@ -112,7 +112,7 @@ class Bus:
         self._session: Any = None
         self._is_closed = False
         # A declaration lives as long as its object: without this list a token would vanish with a discarded handle.
-        self._declared: list[_Declared] = []
+        self._declared: list[_Declaration] = []
 
     @classmethod
     def listen(cls, endpoint: str, *, tls: TlsFiles | None = None, access: Access | None = None) -> Self:
@@ -295,11 +295,11 @@ class Bus:
         """Declare a liveliness token under `key` until the handle or the bus is closed, or the process dies."""
         return self._declare(lambda session: session.liveliness().declare_token(key))
 
-    def alive(self, key_expr: str, *, timeout_s: float = 2.0) -> list[str]:
+    def alive(self, key_expr: str) -> list[str]:
         """Keys of all live tokens, sorted."""
         # A router replies from its own table before `get` returns: a full channel would block it forever.
         channel: Any = zenoh.handlers.FifoChannel(_MAX_ALIVE)
-        replies = self._guarded(lambda session: session.liveliness().get(key_expr, channel, timeout=timeout_s))
+        replies = self._guarded(lambda session: session.liveliness().get(key_expr, channel, timeout=_ALIVE_WITHIN_S))
         return sorted({str(reply.ok.key_expr) for reply in replies if reply.ok is not None})
 
     def certificates(self) -> list[str]:
@@ -329,10 +329,10 @@ class Bus:
 
     def _open(self) -> None:
         """Open a new session with all declarations. The caller holds the lock."""
-        way = "listen" if self._is_server else "connect"
+        way: Literal["listen", "connect"] = "listen" if self._is_server else "connect"
         entries: dict[str, Any] = {f"{way}/endpoints": [self.endpoint]}
         if self._tls is not None:
-            entries["transport/link/tls"] = self._tls.listening() if self._is_server else self._tls.connecting()
+            entries["transport/link/tls"] = self._tls.config(way)
         if self._is_server:
             files, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
             entries |= _SERVER | {"transport/unicast/accept_pending": min(_MAX_PENDING, files // 4)}
@@ -347,15 +347,15 @@ class Bus:
     def _declare(self, declare: Callable[[Any], Any], stop: Callable[[], None] = lambda: None) -> Handle:
         return Handle(partial(self._undeclare, self._declared_now(declare, stop)))
 
-    def _declared_now(self, declare: Callable[[Any], Any], stop: Callable[[], None] = lambda: None) -> _Declared:
-        declared = _Declared(declare, stop)
+    def _declared_now(self, declare: Callable[[Any], Any], stop: Callable[[], None] = lambda: None) -> _Declaration:
+        declared = _Declaration(declare, stop)
         with self._lock:
             if self._session is not None:
                 declared.current = self._guarded(declare)
             self._declared.append(declared)
         return declared
 
-    def _undeclare(self, declared: _Declared) -> None:
+    def _undeclare(self, declared: _Declaration) -> None:
         with self._lock:
             if declared in self._declared:
                 self._declared.remove(declared)

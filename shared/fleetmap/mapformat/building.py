@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
-from fleetmap.errors import FleetmapError, MapFormatError
+from fleetmap.errors import MapFormatError, UsageError
 from fleetmap.geometry import Array, Rings, inside_any, se3, se3_inverse, so3_exp, transform_points
 from fleetmap.mapformat.names import check_name
 
@@ -101,26 +101,24 @@ class Floor:
         )
 
 
-def check_building(building: Building) -> Building:
-    """Return the building with its floors from below; MapFormatError for repeated sites, levels or heights."""
-    for floor in building.floors:
-        check_name(floor.site, "site")
+def read_building(data: bytes) -> Building:
+    """Read a site's file of kind FLOORS, with its floors from below; MapFormatError for anything else, and for repeated sites, levels or
+    heights.
+    """
+    try:
+        building = msgspec.json.decode(data, type=Building)
+        for floor in building.floors:
+            check_name(floor.site, "site")
+    except UsageError as error:
+        raise MapFormatError(str(error)) from error
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise MapFormatError(f"a building of these floors cannot be read ({error}); set the building again") from error
     for what in ("site", "level", "height_m"):
         values = [getattr(floor, what) for floor in building.floors]
         if twice := [value for value in values if values.count(value) > 1]:
             words = f"two floors have the same {what.removesuffix('_m')}, {twice[0]}"
             raise MapFormatError(f"building {building.name!r}: {words}")
     return msgspec.structs.replace(building, floors=tuple(sorted(building.floors, key=lambda floor: floor.height_m)))
-
-
-def read_building(data: bytes) -> Building:
-    """Read a site's file of kind FLOORS; MapFormatError for anything else."""
-    try:
-        return check_building(msgspec.json.decode(data, type=Building))
-    except FleetmapError as error:
-        raise MapFormatError(str(error)) from error
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise MapFormatError(f"a building of these floors cannot be read ({error}); set the building again") from error
 
 
 class _Shape(msgspec.Struct):

@@ -62,10 +62,7 @@ def unpack(magic: bytes, format_number: int, data: bytes, what: str, max_bytes: 
         )
     if size > max_bytes:
         raise MapFormatError(f"{what} declares {size} bytes, the limit is {max_bytes}; it is damaged or not ours")
-    return _decompress(data[_HEADER.size :], size, what)
-
-
-def _decompress(frame: bytes, size: int, what: str) -> bytes:
+    frame = data[_HEADER.size :]
     try:
         declared = zstandard.get_frame_parameters(frame).content_size
         if declared != size:

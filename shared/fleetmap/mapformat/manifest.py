@@ -1,6 +1,6 @@
 """The manifest: the content of a version as canonical JSON. Its SHA-256 is the version's identity."""
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
@@ -9,6 +9,7 @@ from fleetmap.errors import MapFormatError, NewerFormatError
 from fleetmap.mapformat.building import BUILDING_KEY, BuildingFrame
 from fleetmap.mapformat.names import NAME_PATTERN, SHA256_PATTERN
 
+T = TypeVar("T")
 MANIFEST_FORMAT = 1
 MAX_MANIFEST_BYTES = 64 << 20
 
@@ -122,12 +123,15 @@ def decode_manifest(data: bytes) -> Manifest:
 
 def building_frame(manifest: Manifest) -> BuildingFrame | None:
     """The building's frame at the time when the version was made; None if absent. MapFormatError for an invalid one."""
-    found = manifest.configuration.get(BUILDING_KEY)
-    if found is None:
-        return None
+    return manifest_entry(manifest, "configuration", BUILDING_KEY, BuildingFrame)
+
+
+def manifest_entry(manifest: Manifest, part: Literal["configuration", "report"], key: str, kind: type[T]) -> T | None:
+    """An entry of a manifest's configuration or of the build's report, None if absent. MapFormatError for invalid content."""
+    found = getattr(manifest, part).get(key)
     try:
-        return msgspec.convert(found, BuildingFrame)
+        return None if found is None else msgspec.convert(found, kind)
     except msgspec.ValidationError as error:
         raise MapFormatError(
-            f"manifest of {manifest.site} version {manifest.version}: configuration.building: {error}; it is damaged"
+            f"manifest of {manifest.site} version {manifest.version}: {part}.{key}: {error}; it is damaged"
         ) from error

@@ -166,7 +166,21 @@ def encode_tile(tile: Tile) -> bytes:
     references = sum(len(ids) for ids in tile.place_landmark_ids)
     counts = (len(tile), len(tile.place_ids), references)
     head = _HEAD.pack(tile.tile_x, tile.tile_y, tile.size_m, z_base, *counts)
-    parts = [head, *_landmark_columns(tile, z_codes - z_base), *_place_columns(tile)]
+    steps = (tile.points_map[:, :2] - tile.origin_m) / (tile.size_m / _SIDE_STEPS)
+    plane_codes = np.clip(np.round(steps), 0, _SIDE_STEPS - 1).astype(np.uint32)
+    parts = [
+        head,
+        planes(differences(tile.landmark_ids), 4),
+        planes(plane_codes[:, 0], 2),
+        planes(plane_codes[:, 1], 2),
+        planes((z_codes - z_base).astype(np.uint32), 3),
+        np.ascontiguousarray(tile.descriptors, np.uint8).tobytes(),
+        direction_code(tile.view_directions_map, _DIRECTION_STEPS).T.tobytes(),
+        half_angle_code(tile.view_half_angle_rad, _HALF_ANGLE_STEPS).tobytes(),
+        log_code(tile.max_distance_m, *_DISTANCE_M).tobytes(),
+        log_code(tile.sigma_m, *_SIGMA_M).tobytes(),
+        *_place_columns(tile),
+    ]
     size = sum(len(part) for part in parts)
     if size > MAX_TILE_PAYLOAD_BYTES or len(tile.place_ids) > MAX_TILE_PLACES:
         raise MapFormatError(
@@ -225,41 +239,22 @@ def decode_tile(data: bytes) -> Tile:
     return check_tile(tile)
 
 
-def _landmark_columns(tile: Tile, z_codes: Array) -> list[bytes]:
-    steps = (tile.points_map[:, :2] - tile.origin_m) / (tile.size_m / _SIDE_STEPS)
-    plane_codes = np.clip(np.round(steps), 0, _SIDE_STEPS - 1).astype(np.uint32)
-    return [
-        planes(differences(tile.landmark_ids), 4),
-        planes(plane_codes[:, 0], 2),
-        planes(plane_codes[:, 1], 2),
-        planes(z_codes.astype(np.uint32), 3),
-        np.ascontiguousarray(tile.descriptors, np.uint8).tobytes(),
-        direction_code(tile.view_directions_map, _DIRECTION_STEPS).T.tobytes(),
-        half_angle_code(tile.view_half_angle_rad, _HALF_ANGLE_STEPS).tobytes(),
-        log_code(tile.max_distance_m, *_DISTANCE_M).tobytes(),
-        log_code(tile.sigma_m, *_SIGMA_M).tobytes(),
-    ]
-
-
 def _place_columns(tile: Tile) -> list[bytes]:
     steps = np.round(tile.map_from_cam[:, :3, 3] * _PLACE_STEPS_PER_M)
     if (np.abs(steps) >= 1 << 31).any():
         raise MapFormatError(f"{tile.name}: a place lies more than 32 km from the origin of the map; check the survey")
     rotations = [rotation_code(rotation) for rotation in tile.map_from_cam[:, :3, :3]]
+    ratios = np.array([ratios for _, ratios in rotations], np.int16).reshape(-1, 3).view(np.uint16).astype(np.uint32)
     counts = np.array([len(ids) for ids in tile.place_landmark_ids], np.uint32)
     lists = [differences(ids) for ids in tile.place_landmark_ids]
     places = [
         planes(differences(tile.place_ids), 4),
         *(planes(steps[:, axis].astype(np.int32).view(np.uint32), 4) for axis in range(3)),
         np.array([index for index, _ in rotations], np.uint8).tobytes(),
-        *(planes(_column16(rotations, component), 2) for component in range(3)),
+        *(planes(column, 2) for column in ratios.T),
         planes(counts, 4),
     ]
     return [b"".join(places), planes(np.concatenate([np.zeros(0, np.uint32), *lists]), 4)]
-
-
-def _column16(rotations: list[tuple[int, NDArray[np.int16]]], component: int) -> Ids:
-    return np.array([ratios[component] for _, ratios in rotations], np.int16).view(np.uint16).astype(np.uint32)
 
 
 def _map_from_cam(columns: Columns, places: int) -> Array:

@@ -3,8 +3,9 @@
 Names are imported at their first use, so that reading settings stays light.
 """
 
-from importlib import import_module
 from typing import TYPE_CHECKING
+
+from fleetmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from fleetmap.odometry.estimate import ContinuousFrame, OdometryEstimate, OdometryStatus, is_away
@@ -22,17 +23,12 @@ __all__ = [
     "is_away",
     "make_odometry",
 ]
-_NAMES = {
-    "estimate": "ContinuousFrame OdometryEstimate OdometryStatus is_away",
-    "mono.mono_modes": "MonocularOdometry make_odometry",
-    "odometry": "Odometry",
-    "settings": "OdometrySettings",
-}
-_MODULES = {name: f"fleetmap.odometry.{module}" for module, names in _NAMES.items() for name in names.split()}
-
-
-def __getattr__(name: str) -> object:
-    """Import a public name at its first use (PEP 562)."""
-    if name not in _MODULES:
-        raise AttributeError(f"module 'fleetmap.odometry' has no attribute {name!r}")
-    return getattr(import_module(_MODULES[name]), name)
+__getattr__, __dir__ = lazy_names(
+    __name__,
+    {
+        "fleetmap.odometry.estimate": "ContinuousFrame OdometryEstimate OdometryStatus is_away",
+        "fleetmap.odometry.mono.mono_modes": "MonocularOdometry make_odometry",
+        "fleetmap.odometry.odometry": "Odometry",
+        "fleetmap.odometry.settings": "OdometrySettings",
+    },
+)

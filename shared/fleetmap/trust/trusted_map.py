@@ -3,8 +3,7 @@
 import fcntl
 import logging
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -80,7 +79,11 @@ class TrustedMap:
             f"the folder {self._folder} for signed lists cannot be used", "check the disk and whose it is"
         ):
             self._folder.mkdir(parents=True, exist_ok=True)
-            self._clock = self._read_clock()
+            try:
+                heard, signed, number = (self._folder / "clock").read_text("ascii").split()
+                self._clock = _Clock(max(0.0, float(heard)), max(0.0, float(signed)), int(number))
+            except (FileNotFoundError, ValueError):
+                self._clock = _Clock(0.0, 0.0, 0)
             self._kept_clock_s = self._clock.heard_s
         self._is_open = True
 
@@ -89,7 +92,11 @@ class TrustedMap:
         try:
             if not self._is_open:
                 self._open()
-            with disk_errors(f"the signed lists in {self._folder} cannot be written", "make space"), self._locked():
+            with (
+                disk_errors(f"the signed lists in {self._folder} cannot be written", "make space"),
+                (self._folder / "lock").open("a") as lock,  # of a cache shared by programs of one machine
+            ):
+                fcntl.flock(lock, fcntl.LOCK_EX)
                 self._refresh()
             self._fault = None
         except (LinkError, StoreError) as error:
@@ -185,7 +192,10 @@ class TrustedMap:
         if self._files() != before or abs(wall_s - self._kept_clock_s) > _CLOCK_EVERY_S:
             write_atomically(self._folder / "clock", [" ".join(map(str, self._clock)).encode()], mode=0o666)
             self._kept_clock_s = wall_s
-            self._sync(before)
+            # python-tuf renames without fsync: after a power cut the guard against rollback would be gone.
+            changed = [path for path, data in self._files().items() if before.get(path) != data]
+            for path in [*changed, *sorted({path.parent for path in changed})]:
+                sync_path(path)
 
     def _root(self) -> bytes:
         if self._pinned_root is None:
@@ -203,29 +213,6 @@ class TrustedMap:
         """Content of the folder; every file is small."""
         names = [*self._folder.glob("*.json"), *self._folder.glob("root_history/*.json"), *self._folder.glob("clock")]
         return {path: path.read_bytes() for path in names if not path.is_symlink()}
-
-    def _read_clock(self) -> _Clock:
-        try:
-            heard, signed, number = (self._folder / "clock").read_text("ascii").split()
-            return _Clock(max(0.0, float(heard)), max(0.0, float(signed)), int(number))
-        except (FileNotFoundError, ValueError):
-            return _Clock(0.0, 0.0, 0)
-
-    def _sync(self, before: dict[Path, bytes]) -> None:
-        """python-tuf renames without fsync: after a power cut the guard against rollback would be gone.
-
-        before: content already on the disk.
-        """
-        changed = [path for path, data in self._files().items() if before.get(path) != data]
-        for path in [*changed, *sorted({path.parent for path in changed})]:
-            sync_path(path)
-
-    @contextmanager
-    def _locked(self) -> Iterator[None]:
-        """Lock a cache shared by programs of one machine."""
-        with (self._folder / "lock").open("a") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
-            yield
 
 
 def _time(seconds: float) -> str:

@@ -40,7 +40,7 @@ class ListFetcher(FetcherInterface):
         self.fault: FleetmapError | None = None
 
     def _fetch(self, url: str) -> Iterator[bytes]:
-        name = self._name(url)
+        name = url.rpartition("/")[2]
         try:
             data = self._ask(name)
         except FleetmapError as error:
@@ -49,9 +49,6 @@ class ListFetcher(FetcherInterface):
         if data is None:
             raise DownloadHTTPError(f"the server has no {name}", 404)
         return iter([data])
-
-    def _name(self, url: str) -> str:
-        return url.rpartition("/")[2]
 
 
 def update_lists(folder: Path, site: str, root: bytes, ask: Callable[[str], bytes | None]) -> None:

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.errors import UsageError
 from fleetmap.sensors.samples import CameraFrame, Image
 
 Grey = NDArray[np.float32]
@@ -132,13 +131,6 @@ IMAGE_PIPELINES = {
     ),
     "night-gain": ImagePipeline(blur_px=0.8, corner_loss=0.3, flicker=0.15, gain=16.0),
 }  # fmt: skip
-
-
-def find_pipeline(name: str) -> ImagePipeline:
-    """The pipeline of that name; UsageError otherwise."""
-    if name not in IMAGE_PIPELINES:
-        raise UsageError(f"unknown camera pipeline {name!r}; known are {', '.join(IMAGE_PIPELINES)}")
-    return IMAGE_PIPELINES[name]
 
 
 def process_frame(frame: CameraFrame, pipeline: ImagePipeline, seed: int, first_camera: int = 0) -> CameraFrame:

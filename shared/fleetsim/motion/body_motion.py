@@ -49,15 +49,11 @@ class UniformSpline:
     def __init__(self, start_s: float, knot_s: float, control: Array) -> None:
         self._start_s, self._knot_s, self._control = start_s, knot_s, control
 
-    @property
-    def span_s(self) -> tuple[float, float]:
-        """First and last time at which all six control points exist."""
-        reach_s = (DEGREE - 1) / 2 * self._knot_s
-        return self._start_s + reach_s, self._start_s + (len(self._control) - 1) * self._knot_s - reach_s
-
     def at(self, times_s: Array, derivative: int = 0) -> Array:
-        """(N, D) values, or the given derivative per s^derivative, at times (N,). Clamped to the span."""
-        position = (np.clip(times_s, *self.span_s) - self._start_s) / self._knot_s + (DEGREE + 1) / 2
+        """(N, D) values, or the given derivative per s^derivative, at times (N,), clamped to where all six control points exist."""
+        reach_s = (DEGREE - 1) / 2 * self._knot_s
+        last_s = self._start_s + (len(self._control) - 1) * self._knot_s - reach_s
+        position = (np.clip(times_s, self._start_s + reach_s, last_s) - self._start_s) / self._knot_s + (DEGREE + 1) / 2
         segment = np.clip(np.floor(position).astype(np.int64), DEGREE, len(self._control) - 1)
         u = position - segment
         powers = np.zeros((len(u), DEGREE + 1))
@@ -104,13 +100,8 @@ class RouteMotion:
 
     def __init__(self, route: Route, limits: Limits, height_m: float, shake: Shake, rng: np.random.Generator) -> None:
         path = time_path(route, limits)
-        self._duration_s = float(path.times_s[-1])
+        self.duration_s = float(path.times_s[-1])  # from the first to the last moment of rest
         self._spline = UniformSpline(-6 * KNOT_S, KNOT_S, _control_points(path, height_m, shake, rng))
-
-    @property
-    def duration_s(self) -> float:
-        """From the first to the last moment of rest."""
-        return self._duration_s
 
     def map_from_body(self, times_s: Array) -> Array:
         """(N, 4, 4) at times (N,)."""
@@ -156,11 +147,7 @@ class CarriedMotion:
         last = len(motions) - 1
         lifts_s = [LIFT_S * ((number > 0) + (number < last)) for number in range(len(motions))]
         self._ends_s = np.cumsum([m.duration_s + lift_s for m, lift_s in zip(motions, lifts_s, strict=True)])
-
-    @property
-    def duration_s(self) -> float:
-        """Of all pieces."""
-        return float(self._ends_s[-1])
+        self.duration_s = float(self._ends_s[-1])
 
     def map_from_body(self, times_s: Array) -> Array:
         """(N, 4, 4); jumps where one piece ends."""

@@ -68,22 +68,16 @@ def _corner_arc(before: Array, corner: Array, after: Array, radius_m: float) -> 
     )
 
 
-def round_path(way_points_map: Array, radius_m: float) -> Array:
-    """(N, 2) points each centimetre along the polyline with its corners rounded."""
-    pieces = [way_points_map[:1]]
-    for before, corner, after in zip(way_points_map[:-2], way_points_map[1:-1], way_points_map[2:], strict=True):
-        pieces.append(_corner_arc(before, corner, after, radius_m))
-    pieces.append(way_points_map[-1:])
-    points = np.concatenate(pieces)
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    even = np.arange(0.0, along[-1], STEP_M)
-    return np.stack([np.interp(even, along, points[:, axis]) for axis in range(2)], axis=1)
-
-
 def time_path(route: Route, limits: Limits) -> TimedPath:
     """The route within the limits: rest, drive, stops, rest. Speeds by a forward and a backward sweep over the path."""
     way_points = np.array(route.way_points_map, np.float64)
-    points = round_path(way_points, limits.corner_radius_m)
+    pieces = [way_points[:1]]
+    for before, corner, after in zip(way_points[:-2], way_points[1:-1], way_points[2:], strict=True):
+        pieces.append(_corner_arc(before, corner, after, limits.corner_radius_m))
+    rounded = np.concatenate([*pieces, way_points[-1:]])
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(rounded, axis=0), axis=1))])
+    even = np.arange(0.0, along[-1], STEP_M)
+    points = np.stack([np.interp(even, along, rounded[:, axis]) for axis in range(2)], axis=1)
     tangents = np.gradient(points, STEP_M, axis=0)
     yaw = np.unwrap(np.arctan2(tangents[:, 1], tangents[:, 0]))
     curvature = np.convolve(np.pad(np.abs(np.gradient(yaw, STEP_M)), 15, "edge"), np.ones(31) / 31, "valid")

@@ -11,7 +11,7 @@ from fleetmap import core
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.samples import Image
 from fleetsim.render.optics import Optics
-from fleetsim.scene.light import Exposure
+from fleetsim.scene.light import GREY_PER_MS, Exposure
 from fleetsim.scene.movers import AnyMover, add_movers, mover_light
 from fleetsim.scene.world import Scene, World
 
@@ -85,7 +85,14 @@ class Painter:
             shift = (0.5 + _R2_SEQUENCE * (number + 0.5)) % 1.0 - 0.5 if count > 1 else np.zeros(2)
             instant = _Instant(samples, (float(shift[0]), float(shift[1])), 1.0 / count, number == count // 2)
             self._add(canvas, instant, path(moment), moment)
-        return Shot(self._develop(canvas.radiance, exposure, noise_key), canvas.depth_m, canvas.faces, count)
+        shot, read = 0.0, 0.0
+        if self._look.has_noise:
+            shot = exposure.gain / _ELECTRONS_PER_GREY
+            read = float(np.hypot(_AFTER_GAIN_GREY, exposure.gain * _READ_ELECTRONS / _ELECTRONS_PER_GREY))
+        noise = (shot, read, self._normals, noise_key * 2 + self._number)
+        grey_per_radiance = GREY_PER_MS * 1e3 * exposure.time_s * exposure.gain
+        image = core.develop(canvas.radiance, grey_per_radiance, *noise, self._optics.vignetting)
+        return Shot(image, canvas.depth_m, canvas.faces, count)
 
     def subframes(self, path: Path, t_s: float, exposure: Exposure) -> int:
         """Number of pictures to average so that a thing 1.5 m away moves at most 1.2 px from one to the next."""
@@ -94,14 +101,6 @@ class Painter:
         moved = float(np.linalg.norm(after[:3, 3] - before[:3, 3])) / _NEAR_THINGS_M
         wanted = np.ceil(self._optics.planes[0].pinhole[0] * (turned + moved) / _BLUR_STEP_PX)
         return int(np.clip(wanted, 1, _MOST_SUBFRAMES))
-
-    def _develop(self, radiance: Array, exposure: Exposure, noise_key: int) -> Image:
-        shot, read = 0.0, 0.0
-        if self._look.has_noise:
-            shot = exposure.gain / _ELECTRONS_PER_GREY
-            read = float(np.hypot(_AFTER_GAIN_GREY, exposure.gain * _READ_ELECTRONS / _ELECTRONS_PER_GREY))
-        noise = (shot, read, self._normals, noise_key * 2 + self._number)
-        return core.develop(radiance, exposure.grey_per_radiance, *noise, self._optics.vignetting)
 
     def _prepare(self, scene: Scene, groups: Array, t_s: float) -> None:
         """Own copies of the scene's columns with room for the movers at the end; light for this moment."""
@@ -126,17 +125,12 @@ class Painter:
             floor_light = [self._world.lamps.floor_light(groups, x, y) for x, y, _ in places]
             self._light[scene.light.shape[1] :] = mover_light(self._mover_faces, self._movers, floor_light, t_s)
 
-    def _move(self, t_s: float) -> Array:
-        """Place the movers at time t; return their soft shadows."""
-        if not self._movers:
-            return np.zeros((0, 3))
-        builder = self._world.builder()
-        shadows = add_movers(builder, self._movers, self._world.textures, t_s)
-        self._quads[-len(self._mover_faces) :] = builder.finish().quads
-        return shadows
-
     def _add(self, canvas: "_Canvas", instant: _Instant, map_from_cam: Array, t_s: float) -> None:
-        shadows = self._move(t_s)
+        shadows = np.zeros((0, 3))  # of the movers, which stand at their places at time t now
+        if self._movers:
+            builder = self._world.builder()
+            shadows = add_movers(builder, self._movers, self._world.textures, t_s)
+            self._quads[-len(self._mover_faces) :] = builder.finish().quads
         cam_from_map = np.ascontiguousarray(se3_inverse(map_from_cam)[:3, :3])
         centre, world, atlas = np.ascontiguousarray(map_from_cam[:3, 3]), self._world, self._world.textures.atlas
         faces = (self._quads, self._values, self._numbers, self._light, self._groups)

@@ -128,9 +128,14 @@ class FaceBuilder:
         material = np.concatenate([numbers[box_of, 7], single_numbers[:, 1]])
         group = np.concatenate([numbers[box_of, 8], single_numbers[:, 2]])
         scramble = np.concatenate([numbers[box_of, 9] * 6 + side_of, single_numbers[:, 3]])
-        offsets = _dirt_offsets(scramble)
+        # Whole texels in 0..1023, well mixed. Source: the finaliser of splitmix64.
+        mixed = scramble.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
+        mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+        mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+        mixed ^= mixed >> np.uint64(31)
+        offsets = np.stack([mixed & np.uint64(1023), (mixed >> np.uint64(20)) & np.uint64(1023)], axis=1)
         fixed = np.concatenate([np.full((len(box_of), 2), -1.0), single_values[:, 2:]])
-        offsets = np.where(fixed >= 0, fixed, offsets)
+        offsets = np.where(fixed >= 0, fixed, offsets.astype(np.float64))
         tint = np.concatenate([boxes[box_of, 8], single_values[:, 0]])
         emission = np.concatenate([boxes[box_of, 9], single_values[:, 1]])
         lengths = np.stack([np.linalg.norm(quads[:, 3:6], axis=1), np.linalg.norm(quads[:, 6:9], axis=1)], axis=1)
@@ -167,12 +172,3 @@ def _quads_of_boxes(boxes: Array, box_of: NDArray[np.int64], side_of: NDArray[np
     )
     turned[:, 0] += boxes[box_of, :3]
     return turned.reshape(-1, 9)
-
-
-def _dirt_offsets(scramble: NDArray[np.int64]) -> Array:
-    """(N, 2) whole texels in 0..1023, well mixed. Source: the finaliser of splitmix64."""
-    mixed = scramble.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
-    mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
-    mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
-    mixed ^= mixed >> np.uint64(31)
-    return np.stack([mixed & np.uint64(1023), (mixed >> np.uint64(20)) & np.uint64(1023)], axis=1).astype(np.float64)

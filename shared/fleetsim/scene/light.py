@@ -22,11 +22,6 @@ class Exposure:
     time_s: float
     gain: float
 
-    @property
-    def grey_per_radiance(self) -> float:
-        """Factor from radiance to grey levels."""
-        return GREY_PER_MS * 1e3 * self.time_s * self.gain
-
 
 class LampField:
     """All lamps of a site, to compute the light at a place without tracing rays."""

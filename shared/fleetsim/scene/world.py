@@ -4,9 +4,9 @@ A chunk is one aisle wide and about four bays long. Near the camera chunks are d
 plain. A chunk's look depends on site, seed and day alone, never on the order of visits.
 """
 
-from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ LAMP_GROUPS = 3
 NEAR_COLUMNS, NEAR_ROWS = 3, 2  # detailed chunks on each side of the camera's own
 _CELL_M = 0.7
 _PLAIN_LIGHT = 0.55  # plain chunks are lit without shadows
-_MOST_BAKED_CHUNKS, _MOST_BUILT_CHUNKS = 128, 256
+_MOST_BAKED_CHUNKS, _MOST_BUILT_CHUNKS, _MOST_SCENES = 128, 256, 3
 _DECAL_CELLS = 64
 
 
@@ -77,20 +77,14 @@ class World:
         self.lamps = LampField(every_lamp, layout.length_m * layout.width_m)
         self.decals = self._lay_decals()
         self.floor_numbers = np.array([self.textures.concrete_coarse, self.textures.dirt], np.int32)
-        self._built: OrderedDict[tuple[int, int], Faces] = OrderedDict()
-        self._lit: OrderedDict[tuple[int, int], LitFaces] = OrderedDict()
-        self._plain: dict[tuple[int, int], LitFaces] = {}
-        self._scenes: OrderedDict[tuple[int, int], Scene] = OrderedDict()
+        self._built = lru_cache(_MOST_BUILT_CHUNKS)(lambda key: self._build(key, is_plain=False))
+        self._lit = lru_cache(_MOST_BAKED_CHUNKS)(self._light_detailed)
+        self._plain = lru_cache(None)(self._light_plain)
+        self._scenes = lru_cache(_MOST_SCENES)(self._assemble)
 
     def scene_around(self, x_m: float, y_m: float) -> Scene:
         """The scene for a camera at (x, y) in map. Not for several threads at once."""
-        centre = self.layout.chunk_at(x_m, y_m)
-        if centre not in self._scenes:
-            self._scenes[centre] = self._assemble(centre)
-            if len(self._scenes) > 3:
-                self._scenes.popitem(last=False)
-        self._scenes.move_to_end(centre)
-        return self._scenes[centre]
+        return self._scenes(self.layout.chunk_at(x_m, y_m))
 
     def builder(self) -> FaceBuilder:
         """An empty builder that knows the site's textures."""
@@ -98,13 +92,7 @@ class World:
 
     def detailed_faces(self, column: int, row: int) -> Faces:
         """The detailed version of a chunk, without light."""
-        key = (column, row)
-        if key not in self._built:
-            self._built[key] = self._build(key, is_plain=False)
-            if len(self._built) > _MOST_BUILT_CHUNKS:
-                self._built.popitem(last=False)
-        self._built.move_to_end(key)
-        return self._built[key]
+        return self._built((column, row))
 
     def _lay_decals(self) -> NDArray[np.int32]:
         """(rows, columns) decal texture * 4 + quarter turns, -1 for none; the pattern repeats after 82 m."""
@@ -122,9 +110,10 @@ class World:
         column, row = key
         self._hall.add_chunk(builder, column, row)
         add = self._racks.add_plain_bay if is_plain else self._racks.add_bay
+        middles_m = [layout.bay_x_m(bay) + layout.bay_m / 2 for bay in range(layout.bays)]
+        own = {bay for bay, x_m in enumerate(middles_m) if layout.chunk_at(x_m, 0.0)[0] == column}
         runs = [
-            (first, behind, [bay for bay in range(first, behind) if self._column_of_bay(bay) == column])
-            for first, behind in layout.rack_runs
+            (first, behind, [bay for bay in range(first, behind) if bay in own]) for first, behind in layout.rack_runs
         ]
         for rack_row in (2 * row, 2 * row + 1):
             for first, behind, bays in runs:
@@ -141,9 +130,6 @@ class World:
             if layout.chunk_at(x, y) == key:
                 self._racks.add_packing_station(builder, number, x, y)
         return builder.finish()
-
-    def _column_of_bay(self, bay: int) -> int:
-        return self.layout.chunk_at(self.layout.bay_x_m(bay) + self.layout.bay_m / 2, 0.0)[0]
 
     def _neighbours(self, key: tuple[int, int], columns: int, rows: int) -> list[tuple[int, int]]:
         return [other for other in self._keys if abs(other[0] - key[0]) <= columns and abs(other[1] - key[1]) <= rows]
@@ -176,22 +162,12 @@ class World:
             light *= _PLAIN_LIGHT
         return LitFaces(faces, light, faces.bounds_m())
 
-    def _part(self, key: tuple[int, int], centre: tuple[int, int]) -> LitFaces:
-        is_near = abs(key[0] - centre[0]) <= NEAR_COLUMNS and abs(key[1] - centre[1]) <= NEAR_ROWS
-        if not is_near:
-            if key not in self._plain:
-                faces = self._build(key, is_plain=True)
-                self._plain[key] = self._bake(faces, key, np.zeros((0, 8)), 0, has_shadows=False)
-            return self._plain[key]
-        if key not in self._lit:
-            self._lit[key] = self._light_detailed(key)
-            if len(self._lit) > _MOST_BAKED_CHUNKS:
-                self._lit.popitem(last=False)
-        self._lit.move_to_end(key)
-        return self._lit[key]
+    def _light_plain(self, key: tuple[int, int]) -> LitFaces:
+        return self._bake(self._build(key, is_plain=True), key, np.zeros((0, 8)), 0, has_shadows=False)
 
     def _assemble(self, centre: tuple[int, int]) -> Scene:
-        parts = [self._part(key, centre) for key in self._keys]
+        near = set(self._neighbours(centre, NEAR_COLUMNS, NEAR_ROWS))
+        parts = [self._lit(key) if key in near else self._plain(key) for key in self._keys]
         counts = np.array([len(part.faces) for part in parts])
         samples = np.array([part.faces.light_samples for part in parts])
         ends, first_sample = np.cumsum(counts), np.concatenate([[0], np.cumsum(samples)[:-1]])

@@ -7,6 +7,7 @@ import numpy as np
 
 from fleetmap.errors import UsageError
 from fleetmap.sensors.samples import ImuSamples, WheelSample
+from fleetsim.choices import chosen
 from fleetsim.sensors.measurements import START_NS
 
 FAULTS = {
@@ -40,8 +41,7 @@ def parse_fault(text: str) -> Fault:
     """Parse a fault written as NAME@START+DURATION, seconds; UsageError otherwise."""
     name, _, times = text.partition("@")
     start, _, duration = times.partition("+")
-    if name not in FAULTS:
-        raise UsageError(f"unknown fault {name!r}; known are {', '.join(FAULTS)}")
+    chosen("fault", name, FAULTS)
     try:
         start_s, duration_s = float(start), float(duration or 1.0)
     except ValueError as error:

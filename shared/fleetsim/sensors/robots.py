@@ -5,9 +5,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
+from fleetsim.choices import chosen
 from fleetsim.motion.body_motion import Shake
 from fleetsim.motion.routes import Limits
 
@@ -104,18 +104,6 @@ class RobotKind:
     wheels: WheelErrors = field(default_factory=WheelErrors)
     hidden: HiddenErrors = field(default_factory=HiddenErrors)
 
-    def with_lens(self, lens: str) -> "RobotKind":
-        """A copy with another lens; UsageError naming the known ones."""
-        if lens not in LENSES:
-            raise UsageError(f"unknown lens {lens!r}; known are {', '.join(LENSES)}")
-        return replace(self, lens=lens)
-
-    def with_rig(self, rig: str) -> "RobotKind":
-        """A copy with another rig; UsageError naming the known ones."""
-        if rig not in RIGS:
-            raise UsageError(f"unknown rig {rig!r}; known are {', '.join(RIGS)}")
-        return replace(self, rig=rig)
-
 
 ROBOTS = {
     "surveyor": RobotKind(Limits(1.5, 0.8, 1.0, 0.8), Shake()),
@@ -129,7 +117,7 @@ ROBOTS = {
 
 def nominal_calibration(kind: RobotKind) -> RigCalibration:
     """Nominal calibration, as used by the robot."""
-    model, distortion, focal_share = LENSES[kind.lens]
+    model, distortion, focal_share = chosen("lens", kind.lens, LENSES)
     focal = focal_share * kind.width_px
     intrinsics = np.array([focal, focal, (kind.width_px - 1) / 2, (kind.height_px - 1) / 2])
     cosine, sine = np.cos(kind.pitch_rad), np.sin(kind.pitch_rad)
@@ -137,7 +125,7 @@ def nominal_calibration(kind: RobotKind) -> RigCalibration:
     cameras = list[CameraCalibration]()
     height_m = kind.camera_height_m - kind.body_height_m
     front = ViewMount(0.0, kind.camera_forward_m, 0.0, kind.baseline_m)
-    for view in (front, *RIGS[kind.rig]):
+    for view in (front, *chosen("rig", kind.rig, RIGS)):
         middle = np.array([view.forward_m, view.left_m, height_m])
         turn = so3_exp(np.array([0.0, 0.0, view.yaw_rad])) if view.yaw_rad else np.eye(3)
         for side in (0.5, -0.5) if view.baseline_m else (0.0,):

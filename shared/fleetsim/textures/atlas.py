@@ -1,6 +1,6 @@
 """All textures in one flat store with their mip pyramids, the input of shading."""
 
-from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,19 +11,11 @@ TEXEL_M = 0.0025  # metres per texel: with a 420 px lens one texel is one pixel 
 LEVELS = 12
 
 
-@dataclass(frozen=True, slots=True)
 class Atlas:
-    """texels: every level of every texture, row by row.
+    """Collects textures; `add` gives each its number.
 
-    table (T, 2 + LEVELS): log2 width, log2 height, offset of each level.
+    texels: every level of every texture, row by row. table (T, 2 + LEVELS): log2 width, log2 height, offset of each level.
     """
-
-    texels: NDArray[np.uint8]
-    table: NDArray[np.int32]
-
-
-class AtlasBuilder:
-    """Collects textures; `add` gives each its number."""
 
     def __init__(self) -> None:
         self._parts: list[NDArray[np.uint8]] = []
@@ -52,6 +44,10 @@ class AtlasBuilder:
         self._rows.append([width.bit_length() - 1, height.bit_length() - 1, *offsets])
         return len(self._rows) - 1
 
-    def finish(self) -> Atlas:
-        """The atlas of everything added."""
-        return Atlas(np.concatenate(self._parts), np.array(self._rows, np.int32))
+    @cached_property
+    def texels(self) -> NDArray[np.uint8]:
+        return np.concatenate(self._parts)
+
+    @cached_property
+    def table(self) -> NDArray[np.int32]:
+        return np.array(self._rows, np.int32)

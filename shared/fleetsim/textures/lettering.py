@@ -20,14 +20,10 @@ LETTERS = "ABCDEFGHIJKLMNOPQRSTUVWXYZ"
 _GLYPH_WIDTH, _GLYPH_HEIGHT = 6, 8  # with the gap to the next
 
 
-def _glyph(character: str) -> NDArray[np.uint8]:
-    dots = np.zeros((_GLYPH_HEIGHT, _GLYPH_WIDTH), np.uint8)
-    for row, digit in enumerate(_ROWS[character]):
-        dots[row, :5] = [(int(digit, 32) >> (4 - column)) & 1 for column in range(5)]
-    return dots
-
-
-_GLYPHS = {character: _glyph(character) for character in _ROWS}
+_GLYPHS = {character: np.zeros((_GLYPH_HEIGHT, _GLYPH_WIDTH), np.uint8) for character in _ROWS}
+for _character, _digits in _ROWS.items():
+    for _row, _digit in enumerate(_digits):
+        _GLYPHS[_character][_row, :5] = [(int(_digit, 32) >> (4 - column)) & 1 for column in range(5)]
 
 
 def write_text(image: Texture, x: int, y: int, text: str, dot: int, grey: float) -> None:

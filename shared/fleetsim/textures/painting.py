@@ -28,13 +28,6 @@ def shipping_label(rng: np.random.Generator, width: int = 64, height: int = 64) 
     return image
 
 
-def _paint_tape(image: Texture, rng: np.random.Generator, base: float) -> None:
-    height = image.shape[0]
-    centre = height // 2 + int(rng.integers(-height // 6, height // 6 + 1))
-    band = image[max(centre - 12, 0) : centre + 12]
-    band[:] = 0.5 * band + 0.5 * (base + rng.uniform(20, 55))
-
-
 def _paint_logo(image: Texture, rng: np.random.Generator, ink: float) -> None:
     height, width = image.shape
     centre_x, centre_y = int(rng.integers(30, width - 30)), int(rng.integers(25, height - 25))
@@ -66,7 +59,9 @@ def carton(rng: np.random.Generator, width_m: float, height_m: float, *, has_lab
     ink = base * rng.uniform(0.25, 0.55)
     design = int(rng.integers(0, 5))
     if rng.random() < 0.8:
-        _paint_tape(image, rng, base)
+        centre = height // 2 + int(rng.integers(-height // 6, height // 6 + 1))
+        band = image[max(centre - 12, 0) : centre + 12]
+        band[:] = 0.5 * band + 0.5 * (base + rng.uniform(20, 55))
     if design in (0, 1):
         left, top = int(rng.integers(6, width // 3)), int(rng.integers(6, height // 2))
         write_text(image, left, top, random_word(rng, int(rng.integers(3, 7))), int(rng.integers(3, 6)), ink)

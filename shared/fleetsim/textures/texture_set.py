@@ -6,7 +6,7 @@ from functools import lru_cache
 import numpy as np
 
 from fleetsim.textures import painting
-from fleetsim.textures.atlas import AtlasBuilder
+from fleetsim.textures.atlas import Atlas
 from fleetsim.textures.lettering import noise
 
 SKUS, LABELS, POSTERS, RACK_LABELS = 28, 64, 24, 512
@@ -25,23 +25,12 @@ class Sku:
     top: int
 
 
-def _paint_skus(rng: np.random.Generator, atlas: AtlasBuilder) -> tuple[Sku, ...]:
-    skus = []
-    for _ in range(SKUS):
-        width, depth, height = rng.uniform(0.30, 0.62), rng.uniform(0.30, 0.60), rng.uniform(0.22, 0.50)
-        front = atlas.add(painting.carton(rng, width, height, has_label=True))
-        side = atlas.add(painting.carton(rng, depth, height, has_label=False))
-        top = atlas.add(painting.carton(rng, width, depth, has_label=False))
-        skus.append(Sku(width, depth, height, front, side, top))
-    return tuple(skus)
-
-
 class Textures:
     """Numbers of a site's textures in `atlas`, painted from its seed. `stretched` are those that fill a face of any size."""
 
     def __init__(self, seed: int, aisles: int, *, are_aisles_identical: bool, markers: tuple[int, ...] = ()) -> None:
         """Identical aisles all carry the same sign and rack labels. markers: numbers of AprilTags."""
-        rng, atlas = np.random.default_rng([seed, 1]), AtlasBuilder()
+        rng, atlas = np.random.default_rng([seed, 1]), Atlas()
         add = atlas.add
         self.dirt = add(128 + 9 * noise(rng, 1024, range(2, 7), 0.85) + 5 * noise(rng, 1024, range(7, 9), 0.9))
         self.concrete = add(painting.concrete(rng))
@@ -54,7 +43,14 @@ class Textures:
         self.hazard = add(painting.hazard_stripes(rng))
         self.wall = add(painting.wall_panel(rng))
         self.wood = add(painting.planks(rng))
-        self.skus = _paint_skus(rng, atlas)
+        skus = []
+        for _ in range(SKUS):
+            width, depth, height = rng.uniform(0.30, 0.62), rng.uniform(0.30, 0.60), rng.uniform(0.22, 0.50)
+            front = add(painting.carton(rng, width, height, has_label=True))
+            side = add(painting.carton(rng, depth, height, has_label=False))
+            top = add(painting.carton(rng, width, depth, has_label=False))
+            skus.append(Sku(width, depth, height, front, side, top))
+        self.skus = tuple(skus)
         self.labels = tuple(add(painting.shipping_label(rng)) for _ in range(LABELS))
         self.posters = tuple(add(painting.poster(rng)) for _ in range(POSTERS))
         self.cloth = tuple(add(painting.plain(rng, grey_level, 10)) for grey_level in (40, 70, 110, 190))
@@ -79,7 +75,7 @@ class Textures:
                 *self.cloth,
             )
         )
-        self.atlas = atlas.finish()
+        self.atlas = atlas
 
 
 @lru_cache(maxsize=4)

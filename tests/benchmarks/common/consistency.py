@@ -12,7 +12,7 @@ from fleetmap.sensors.samples import ImuSamples
 from fleetsim.motion.body_motion import RouteMotion
 from fleetsim.motion.routes import Route
 from fleetsim.recorder import Order, Session, prepare
-from fleetsim.scenarios import find_scenario
+from fleetsim.scenarios import SCENARIOS
 from fleetsim.sensors.faults import Fault, FaultPlan
 from fleetsim.sensors.measurements import START_NS, measure_imu, measure_wheels, sample_times
 from fleetsim.sensors.robots import nominal_calibration, true_calibration
@@ -45,7 +45,7 @@ class Site:
         self._base = prepare(Order(_SCENARIO))
         self._base.renderer.close()
         self._field = LandmarkField(self._base.world)
-        self._robots = list(find_scenario(_SCENARIO).runs)
+        self._robots = list(SCENARIOS[_SCENARIO]().runs)
 
     def session(
         self, seed: int, robot: str | None = None, rest_s: float | None = None, faults: tuple[Fault, ...] = (), *,
@@ -55,7 +55,7 @@ class Site:
 
         camera_delay_s: by so much frames are stamped too early. lost_share of the frames is missing, here and there.
         """
-        name, run = find_scenario(_SCENARIO).run(robot or self._robots[seed % len(self._robots)])
+        name, run = SCENARIOS[_SCENARIO]().run(robot or self._robots[seed % len(self._robots)])
         rng = np.random.default_rng([seed, 77])
         kind, route = run.kind, run.routes[0]
         shifts = rng.uniform(-_SIDEWAYS_M, _SIDEWAYS_M, (len(route.way_points_map), 2))

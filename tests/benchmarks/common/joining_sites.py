@@ -16,7 +16,7 @@ from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.samples import SensorSet
 from fleetsim import recorder
 from fleetsim.motion.routes import Route
-from fleetsim.scenarios import SCENARIOS, Run, Scenario, find_scenario
+from fleetsim.scenarios import SCENARIOS, Run, Scenario
 from fleetsim.scene.world import World
 from mapserver.config import survey_settings
 from mapserver.survey.merge.confirmation import firm_landmarks
@@ -41,7 +41,7 @@ class Site:
 
     def route(self, *, is_reversed: bool = False) -> Route:
         """The survey's route."""
-        points = next(iter(find_scenario(self.scenario).runs.values())).routes[0].way_points_map
+        points = next(iter(SCENARIOS[self.scenario]().runs.values())).routes[0].way_points_map
         return Route(points[::-1] if is_reversed else points)
 
 
@@ -114,12 +114,12 @@ def _field(scenario: str, seed: int, day: int) -> LandmarkField:
 
 @lru_cache(maxsize=6)
 def _world(scenario: str, seed: int, day: int) -> World:
-    return World(find_scenario(scenario).layout, seed=seed, day=day, workers=None)
+    return World(SCENARIOS[scenario]().layout, seed=seed, day=day, workers=None)
 
 
 def session(site: Site, day: int, route: Route, name: str, robot: str = "surveyor") -> EstimatorSession:
     """A run of a robot of this name along a route on a day; names make noise of their own."""
-    base = find_scenario(site.scenario)
+    base = SCENARIOS[site.scenario]()
 
     def make() -> Scenario:
         return replace(base, runs={name: Run(robot, (route,), rate_hz=RATE_HZ)})

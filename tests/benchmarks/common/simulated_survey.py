@@ -23,7 +23,7 @@ from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import wheel_between
 from fleetsim import recorder
 from fleetsim.motion.routes import Route
-from fleetsim.scenarios import SCENARIOS, find_scenario
+from fleetsim.scenarios import SCENARIOS
 from mapserver.survey.executor import Executor
 from mapserver.survey.keyframes.keyframes import set_aside
 from mapserver.survey.odometry_pass import OdometryRun, SampleFeed
@@ -123,7 +123,7 @@ def session_of(
     scenario: str, robots: Sequence[str], seed: int = 0, rate_hz: float = 7.5, frames: int | None = None
 ) -> EstimatorSession:
     """A scenario's runs, driven one after the other without a break, at another frame rate."""
-    base, name = find_scenario(scenario), "+".join(robots)
+    base, name = SCENARIOS[scenario](), "+".join(robots)
     runs = [base.runs[robot] for robot in robots]
     joined = replace(runs[0], rate_hz=rate_hz, routes=(_one_after_the_other([run.routes[0] for run in runs]),))
     with patch.dict(SCENARIOS, {scenario: lambda: replace(base, runs={name: joined})}):

@@ -31,7 +31,7 @@ from fleetsim.recorder import Order
 from fleetsim.scenarios import SCENARIOS, Run, Scenario
 from fleetsim.scene.layout import Layout
 from mapserver.config import survey_settings
-from mapserver.drafting.survey_recordings import RecordingOptions, Surveyed, admit_recordings, survey_recording
+from mapserver.drafting.survey_recordings import RecordingOptions, RecordingSurvey, admit_recordings, survey_recording
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.survey.merge import pipeline
 from mapserver.survey.merge.base_map import BaseMap
@@ -70,7 +70,7 @@ def recorded(seed: int, n: int, work: Path) -> Path:
     return path
 
 
-def surveyed(path: Path, frames: str, pinhole: StereoCamera | None) -> Surveyed:
+def surveyed(path: Path, frames: str, pinhole: StereoCamera | None) -> RecordingSurvey:
     """The survey of a recording's frames, without a store."""
     reading = RecordingOptions(frames)
     admitted = admit_recordings([path], reading, Console(quiet=True), needs_truth=True)
@@ -80,7 +80,7 @@ def surveyed(path: Path, frames: str, pinhole: StereoCamera | None) -> Surveyed:
     return survey_recording(path, admitted[path], reading, pinhole, config, SurveyTools())[0]
 
 
-def ate_m(trajectories: Sequence[Trajectory], surveys: Sequence[Surveyed]) -> float:
+def ate_m(trajectories: Sequence[Trajectory], surveys: Sequence[RecordingSurvey]) -> float:
     """Of all estimated frames, after one alignment."""
     found, true = list[Array](), list[Array]()
     for trajectory, survey in zip(trajectories, surveys, strict=True):
@@ -96,12 +96,12 @@ def ate_m(trajectories: Sequence[Trajectory], surveys: Sequence[Surveyed]) -> fl
     ).rmse_m
 
 
-def path_m(survey: Surveyed) -> float:
+def path_m(survey: RecordingSurvey) -> float:
     """Of the survey's frames."""
     return float(np.linalg.norm(np.diff(survey.survey.map.trajectory.positions_m, axis=0), axis=1).sum())
 
 
-def added(base: SurveyMap | None, surveys: Sequence[Surveyed]) -> MergedMap:
+def added(base: SurveyMap | None, surveys: Sequence[RecordingSurvey]) -> MergedMap:
     """The map with these sessions; RuntimeError if one is not joined."""
     settings = survey_settings(None, surveys[0].sensor_set)
     if path_m(surveys[0]) < _SHORT_M:  # whether such halves belong together is no question here
@@ -133,7 +133,7 @@ def noted_moves() -> Iterator[list[Array]]:
         yield moves
 
 
-def joined(surveys: Sequence[Surveyed]) -> dict[str, Any]:
+def joined(surveys: Sequence[RecordingSurvey]) -> dict[str, Any]:
     """Errors alone, joined in one night, and joined one by one to a published map."""
     alone = [ate_m([each.survey.map.trajectory], [each]) for each in surveys]
     shares = [float(each.survey.map.trajectory_estimated.mean()) for each in surveys]
@@ -163,7 +163,7 @@ def main() -> None:
     given = parsed(__doc__, ("drives", *REAL), seed=60817)
     figures = {}
     for name in given.only or ("drives", *REAL):
-        surveys = list[Surveyed]()
+        surveys = list[RecordingSurvey]()
         parts = [(recorded(given.seed, n, given.work), "::") for n in range(DRIVES)] if name == "drives" else []
         for path, frames in parts or [(DATA / name, f"{half}::2") for half in range(2)]:
             surveys.append(surveyed(path, frames, surveys[0].survey.state.rig.camera if surveys else None))

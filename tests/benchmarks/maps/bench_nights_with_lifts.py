@@ -33,7 +33,7 @@ from fleetmap.sensors.samples import CameraFrame
 from fleetsim.commands import record_order
 from fleetsim.motion.routes import Route
 from fleetsim.recorder import Order, Session
-from fleetsim.scenarios import SCENARIOS, Run, find_scenario
+from fleetsim.scenarios import SCENARIOS, Run
 from fleetsim.sensors.faults import Fault
 from fleetsim.sensors.robots import HiddenErrors
 from locclient.localization.settings import LocalizerSettings
@@ -45,7 +45,7 @@ from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, MapStore
 from mapserver.store.archive import decode_archive
 
-SITE, CLIP = "hall", find_scenario("clip")
+SITE, CLIP = "hall", SCENARIOS["clip"]()
 AISLE_M, ASIDE_M = CLIP.layout.aisle_y_m(0), CLIP.layout.aisle_y_m(1)  # nobody surveys the second one
 GHOST_M, LOST_SHARE = 0.2, 0.9
 PIECES = {

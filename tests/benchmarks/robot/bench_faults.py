@@ -15,7 +15,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from benchmarks.common.recorded_runs import parsed, played, recorded, surveyed, write_results
-from fleetsim.scenarios import find_scenario
+from fleetsim.scenarios import SCENARIOS
 from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
 from locclient.replay.run_result import ReplayResult
@@ -60,7 +60,7 @@ class Outcome:
 
 def window_s(fault: str, result: ReplayResult) -> tuple[float, float]:
     """When the fault is in force, from the first frame on; a kidnapped robot's is the moment at which the truth jumps."""
-    run = find_scenario("faults").run(fault)[1]
+    run = SCENARIOS["faults"]().run(fault)[1]
     if run.faults:
         return run.faults[0].start_s, run.faults[0].end_s
     positions = [truth[:3, 3] for truth in result.truths if truth is not None]

@@ -24,7 +24,7 @@ from fleetmap.messages import Status
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, wheel_between
 from fleetmap.sources.sensor_bundle import SensorBundle
-from fleetsim.imaging.pipelines import find_pipeline, process_frame
+from fleetsim.imaging.pipelines import IMAGE_PIPELINES, process_frame
 from fleetsim.recorder import Order, Session, prepare
 from locclient.identity import MapAddress
 from locclient.localization.settings import LocalizerSettings
@@ -125,7 +125,7 @@ def main() -> None:
         session.renderer.close()
         rest = without_around(loaded, session.motion.map_from_body(np.zeros(1))[0][:3, 3])
         for name, (mapped, unmapped) in found.items():
-            shown = [process_frame(frame, find_pipeline(name), number) for frame in frames]
+            shown = [process_frame(frame, IMAGE_PIPELINES[name], number) for frame in frames]
             mapped.append(start(session, shown, loaded))
             unmapped.append(start(session, shown, rest))
             print(f"{time_s:5.1f} s, {name:10} {mapped[-1]} {unmapped[-1].is_wrong}", flush=True)

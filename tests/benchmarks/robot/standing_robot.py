@@ -8,7 +8,7 @@ from fleetmap.geometry import Array
 from fleetsim.motion.body_motion import GRAVITY_MPS2
 from fleetsim.recorder import Session
 from fleetsim.render.renderer import RenderOptions, StereoRenderer
-from fleetsim.scenarios import find_scenario
+from fleetsim.scenarios import SCENARIOS
 from fleetsim.sensors.measurements import measure_imu, measure_wheels, sample_times
 
 
@@ -44,7 +44,7 @@ def standing(drive: Session, time_s: float, number: int, duration_s: float, rate
     Its pictures have threads of their own until `renderer.close`.
     """
     order = drive.order
-    kind, rng = find_scenario(order.scenario).run(order.robot)[1].kind, np.random.default_rng([order.seed, number])
+    kind, rng = SCENARIOS[order.scenario]().run(order.robot)[1].kind, np.random.default_rng([order.seed, number])
     motion = Standing(drive.motion.map_from_body(np.array([time_s])), duration_s)
     return replace(
         drive,

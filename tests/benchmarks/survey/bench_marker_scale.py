@@ -19,7 +19,7 @@ from fleetmap.encoding import to_json
 from fleetmap.messages import Placement
 from fleetmap.plugins.markers import Marker, MarkerList
 from fleetmap.recordings import format_calibration, open_recording
-from fleetsim.scenarios import find_scenario
+from fleetsim.scenarios import SCENARIOS
 from mapserver.plugins.markers.measurement import scaled
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
@@ -49,7 +49,7 @@ def built(drive: Path, store: Path, calibration: Path, version: int) -> float:
 def main() -> None:
     """Print the figures; write them as JSON where asked."""
     arguments = parsed(__doc__, seed=0)
-    layout = find_scenario(SCENARIO).layout
+    layout = SCENARIOS[SCENARIO]().layout
     places = {n: facing(np.array([x, y, z]), yaw_rad) for n, x, y, z, yaw_rad in layout.markers}
     known = MarkerList(
         markers=tuple(

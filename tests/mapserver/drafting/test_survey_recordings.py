@@ -23,7 +23,7 @@ from mapserver.drafting.survey_recordings import (
     BegunSurvey,
     OpenRecordings,
     RecordingOptions,
-    Surveyed,
+    RecordingSurvey,
     survey_recording,
 )
 from mapserver.quality.figures import RigEvidence
@@ -178,7 +178,7 @@ def test_the_turn_within_each_pair_of_a_rig_is_told_and_judged() -> None:
         survey: Any = SimpleNamespace(stereo_yaws=yaws, odometry=SimpleNamespace(cuts=()), components=(), state=state)
         nothing: Any = None
         rest = nothing, RigEvidence("", [], {}, {}), {}, []
-        surveyed = Surveyed(nothing, nothing, nothing, (), nothing, survey, nothing, (), *rest)
+        surveyed = RecordingSurvey(nothing, nothing, nothing, (), nothing, survey, nothing, (), *rest)
         assert len(surveyed.remarks()) == sum(yaw.corrected for yaw in yaws)
         assert "disparities of view 1 by +2.00 px" in surveyed.remarks()[-1]
         assert words in surveyed.evidence().doubted["pair geometry"]

@@ -19,7 +19,7 @@ from mapserver import BuildOptions, build_map
 from mapserver.drafting.trajectory import GivenPoses, OtherTrajectory, given_poses
 from mapserver.drafting.trajectory import given as given_module
 from mapserver.drafting.trajectory.formats import WrittenPoses
-from mapserver.drafting.trajectory.given import Followed, fitted_scale, stamps_on_clock
+from mapserver.drafting.trajectory.given import OwnMotion, fitted_scale, stamps_on_clock
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.survey.given_poses import poses_as_odometry
 from mapserver.survey.state import OdometryPass
@@ -27,7 +27,7 @@ from support.recordings.recording_samples import BODY_FROM_CAM0, START_NS, Sampl
 from support.worlds.box_room import out_and_back, ride_sample
 
 FRAMES = 61
-FOLLOWED: dict[tuple[object, ...], Followed] = {}
+FOLLOWED: dict[tuple[object, ...], OwnMotion] = {}
 OTHER_FROM_MAP = se3(so3_exp(np.array([0.4, -0.3, 0.2])), np.array([3.0, 1.0, 0.5]))
 
 
@@ -46,7 +46,7 @@ def followed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Our odometry runs once over the same frames."""
     follow = given_module._followed
 
-    def once(recording: Recording, indices: NDArray[np.int64], *, whole: bool) -> Followed:
+    def once(recording: Recording, indices: NDArray[np.int64], *, whole: bool) -> OwnMotion:
         key = recording.path, recording.sensor_set, len(indices), whole
         if key not in FOLLOWED:
             FOLLOWED[key] = follow(recording, indices, whole=whole)

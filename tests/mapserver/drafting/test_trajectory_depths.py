@@ -14,7 +14,7 @@ from fleetmap.sensors.samples import CameraFrame, SensorSet
 from mapserver import BuildOptions, build_map
 from mapserver.drafting.survey_recordings import RecordingOptions
 from mapserver.drafting.trajectory import OtherTrajectory
-from mapserver.drafting.trajectory.depths import DispImages, _DepthFrames
+from mapserver.drafting.trajectory.depths import DepthFrames
 from support.recordings.recording_samples import BODY_FROM_CAM0, HEIGHT, WIDTH, Sample, write_mcap
 from support.worlds.box_room import out_and_back, points_seen, ride_sample
 
@@ -109,11 +109,8 @@ def test_a_lens_bends_the_recorded_pixels_alone(tmp_path: Path, width: int, heig
     rays = ((places + 0.5) / per_px - 0.5 - camera.intrinsics_px[2:]) / camera.intrinsics_px[:2]
     np.save(tmp_path / "disps.npy", ((rays @ normal[:2] + 1.0) * METRES / distance_m)[None].astype(np.float32))
     picture = CameraFrame(0, np.zeros((480, 752), np.uint8))
-    source, images = (
-        SimpleNamespace(frame=lambda _: picture),
-        DispImages(tmp_path / "disps.npy", np.array([0]), camera, METRES),
-    )
-    depth_m = _DepthFrames(source, images, np.array([0]), camera).frame(0).depth_m
+    source = SimpleNamespace(frame=lambda _: picture)
+    depth_m = DepthFrames(source, tmp_path / "disps.npy", np.array([0]), camera, METRES).frame(0).depth_m
     assert depth_m is not None
     v, u = np.nonzero(depth_m)
     assert len(v) > 0.65 * 480 * 752  # the corners lie outside of a picture without distortion

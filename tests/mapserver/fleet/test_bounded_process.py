@@ -14,7 +14,7 @@ from mapserver.fleet.bounded_process import ProcessLimits, run_bounded, without_
 LIMITS = ProcessLimits(memory_bytes=1 << 30, cpu_s=2, wall_s=60.0, file_bytes=1 << 20, open_files=32)
 
 
-def run(program: str, limits: ProcessLimits = LIMITS) -> bounded_process.Ended:
+def run(program: str, limits: ProcessLimits = LIMITS) -> bounded_process.ProcessResult:
     return run_bounded([sys.executable, "-c", program], limits, "the replay of failure 1")
 
 

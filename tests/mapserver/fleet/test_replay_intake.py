@@ -14,7 +14,7 @@ from fleetmap.errors import LinkError, UsageError
 from fleetmap.failure_summary import ReplayPart
 from fleetmap.messages import FailureAck, encode_message
 from mapserver.fleet import replay_intake
-from mapserver.fleet.bounded_process import Ended, ProcessLimits
+from mapserver.fleet.bounded_process import ProcessLimits, ProcessResult
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.ingest import IngestSettings
 from mapserver.store import MapStore
@@ -144,7 +144,9 @@ def test_a_recording_without_a_report_and_one_too_large_are_refused(server: Serv
 
 
 def test_uploads_and_rates_are_bounded(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(replay_intake, "run_bounded", lambda *_: Ended(1, "", "no recording", has_network=False))
+    monkeypatch.setattr(
+        replay_intake, "run_bounded", lambda *_: ProcessResult(1, "", "no recording", has_network=False)
+    )
     for number in range(replay_intake.MAX_UPLOADS + 1):
         server.report("f1", robot=f"r{number}")
         part = encode_message(ReplayPart(id="f1", total_bytes=1000, offset=0, data=b"x"))

@@ -483,7 +483,7 @@ def test_a_fault_of_the_program_leaves_one_recording_out_of_a_build() -> None:
 )
 def test_reading_has_limits(hall: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: object, said: str) -> None:
     monkeypatch.setattr(boxes, "_read", READ)
-    assert isinstance(boxes.identify(hall / "inbox/monday", OpenOptions()), boxes.Recorded)
+    assert isinstance(boxes.identify(hall / "inbox/monday", OpenOptions()), boxes.InboxRecording)
     monkeypatch.setattr(boxes, limit, value)
     found = boxes.identify(hall / "inbox/monday", OpenOptions())
     assert isinstance(found, str)

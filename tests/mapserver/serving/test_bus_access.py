@@ -23,7 +23,7 @@ from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from mapserver.trust import init_here
 from mapserver.trust.authorities import Authorities, Authority
-from mapserver.trust.enrolment import Enrolled, RobotRegister
+from mapserver.trust.enrolment import EnrolledRobot, RobotRegister
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import publish_samples
 
@@ -65,7 +65,7 @@ def register(tmp_path: Path) -> Iterator[RobotRegister]:
 def test_tls_needs_certificates_and_loopback_nothing(
     tmp_path: Path, register: RobotRegister, caplog: pytest.LogCaptureFixture
 ) -> None:
-    store = register._store
+    store = register.store
     bus, guard = prepare_bus(store, "tcp/127.0.0.1:0", insecure=False)
     assert (bus.access, guard) == (None, None)
     bus, guard = prepare_bus(store, "tls/0.0.0.0:0", insecure=False)
@@ -109,14 +109,16 @@ def test_a_key_that_is_not_the_certificates_is_an_error_at_start(register: Robot
     certificate = path.read_text().partition("-----END PRIVATE KEY-----\n")[2]
     path.write_text(enrolment.new_key().decode() + certificate)
     with pytest.raises(UsageError, match="rotate server"):
-        prepare_bus(register._store, "tls/127.0.0.1:0", insecure=False)
+        prepare_bus(register.store, "tls/127.0.0.1:0", insecure=False)
 
 
 def test_what_was_signed_while_the_clock_was_ahead_counts_once_it_is_right(register: RobotRegister) -> None:
     """A certificate begins with its authority; a session, bundle or old certificate of the future lives no longer for it."""
     made = register.authorities.make_own("r1.1", "robot")
     assert load_pem_x509_certificate(made).not_valid_before_utc <= datetime.now(UTC) - timedelta(minutes=10)
-    entry = Enrolled(site="lab", robot="r1", mark="2", mark_before="1", key="", enrolled_ns=0, renewed_ns=400 * DAY_NS)
+    entry = EnrolledRobot(
+        site="lab", robot="r1", mark="2", mark_before="1", key="", enrolled_ns=0, renewed_ns=400 * DAY_NS
+    )
     assert {holder.purpose for holder in entry.holders(35 * DAY_NS) if holder.certificate == "r1.1"} == {Purpose.ENROL}
 
 
@@ -128,7 +130,7 @@ def health(robot: str) -> bytes:
 def test_row_9_invented_robots(register: RobotRegister, monkeypatch: pytest.MonkeyPatch, is_guarded: bool) -> None:
     """The program refuses them too, where the bus let them through."""
     monkeypatch.setattr(fleet_module, "MAX_ROBOTS", 200)
-    store, hub = register._store, MemoryHub()
+    store, hub = register.store, MemoryHub()
     register.enrol("lab", ["r1"], "tls/127.0.0.1:7447")
     with MemoryBus(hub) as bus, MemoryBus(hub) as anybody:
         fleet = Fleet(store)
@@ -150,10 +152,10 @@ def test_rules_follow_the_register(register: RobotRegister, caplog: pytest.LogCa
     hub = MemoryHub()
     with MemoryBus(hub) as bus:
         register.enrol("lab", ["r1"], "tls/127.0.0.1:7447")
-        clock, fleet = {"s": 0.0}, Fleet(register._store)
+        clock, fleet = {"s": 0.0}, Fleet(register.store)
         guard = BusGuard(register, bus, lambda: clock["s"])
         bus.reopen(guard.access)
-        service = BusService(register._store, fleet, bus, lambda *_: None, guard)
+        service = BusService(register.store, fleet, bus, lambda *_: None, guard)
         assert not guard.follow()
         bundle = enrolment.decode_bundle(register.enrol("lab", ["r2"], "tls/127.0.0.1:7447")["r2"])
         register.revoke("lab", ["r1"])
@@ -182,10 +184,10 @@ def test_rules_follow_the_register(register: RobotRegister, caplog: pytest.LogCa
                 assert [words for words in guard.look() if "connected 2 times" in words]
                 guard.look()
                 fleet.take_copied(guard.copied)
-            assert [event.kind for event in register._store.events("lab")].count("robot connected twice") == 1
+            assert [event.kind for event in register.store.events("lab")].count("robot connected twice") == 1
             (status,) = fleet.robots("lab")
             assert status.is_copied
-            found = active_alerts(register._store, fleet, AlertSettings(), register._store.now_ns())
+            found = active_alerts(register.store, fleet, AlertSettings(), register.store.now_ns())
             assert [(alert.name, alert.about) for alert in found if alert.about] == [("FleetmapRobotCopied", "r2")]
             clock["s"] += COPIED_AFTER_S
             guard.look()

@@ -18,7 +18,7 @@ from fleetmap.sensors.samples import SensorSet
 from fleetmap.time_sliced import finished
 from fleetsim.motion.routes import Route
 from fleetsim.recorder import Order, prepare
-from fleetsim.scenarios import SCENARIOS, find_scenario
+from fleetsim.scenarios import SCENARIOS
 from mapserver.config import survey_settings
 from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.stages import Survey, survey_from
@@ -34,7 +34,7 @@ _BACK = "back"  # and back on the other side of the aisle
 
 def driven(name: str, day: int = 0, rig: str = "front-rear") -> list[EstimatorSession]:
     """All views of a drive in an aisle."""
-    base = find_scenario("clip")
+    base = SCENARIOS["clip"]()
     y = base.layout.aisle_y_m(0)
     way = ((4.5, y - 0.4), (8.5, y - 0.4)) + (((8.5, y + 0.4), (4.5, y + 0.4)) if name == _BACK else ())
     runs = {name: replace(base.runs["survey"], routes=(Route(way, rest_s=0.5),), rate_hz=5.0)}

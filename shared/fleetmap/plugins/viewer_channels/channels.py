@@ -42,9 +42,9 @@ from foxglove.messages import (
 )
 from mcap.writer import CompressionType, Writer
 
-from fleetmap.encoding import to_json
+from fleetmap.encoding import to_json, to_plain
 from fleetmap.geometry import Array, quat_wxyz_from_rotation
-from fleetmap.messages import FailureKind, FailureReport, Status, report_dict
+from fleetmap.messages import FailureKind, FailureReport, Status
 from fleetmap.recordings.images import jpeg_image
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Image
@@ -294,7 +294,7 @@ def failure(
             found.append(place("/failures/place", stamp_ns, placed.target_from_source))
     for kind, data in pictures:
         found.append(jpeg("/failures/matches" if kind == "matches" else "/failures/frame", stamp_ns, data))
-    plain = report_dict(report)
+    plain = to_plain(report)
     plain.pop("thumbnails")
     found.append(ChannelMessage("/failures/report", stamp_ns, to_json(plain, order="sorted")))
     return found
