@@ -17,7 +17,7 @@ from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOC
 
 ROOM_M = np.array([[-4.0, -3.0, -1.5], [4.0, 3.0, 1.5]])
 GRAVITY_MPS2 = 9.81
-_TEXEL_M = 0.01
+_TEXEL_M, _TEXELS = 0.01, 800
 _WALL = 3  # the face at y = 3
 Ride = Callable[[float], Array]
 
@@ -68,21 +68,16 @@ def _imu(ride: Ride, t_s: float, h_s: float = 1e-3) -> tuple[Array, Array]:
 
 def _render(map_from_cam: Array) -> NDArray[np.uint8]:
     """One grey image: for each pixel the face of the room that its ray leaves by."""
-    rays = _rays() @ map_from_cam[:3, :3].T
-    origin = map_from_cam[:3, 3]
-    image = np.zeros((HEIGHT, WIDTH), np.uint8)
+    rays, origin = _rays() @ map_from_cam[:3, :3].T, map_from_cam[:3, 3]
     reach = _reach(rays, origin)
     axis = np.argmin(reach, axis=2)
-    hits = origin + rays * np.min(reach, axis=2)[..., None]
-    for face in range(6):
-        side, on = face % 2, face // 2
-        inside = (axis == on) & ((rays[..., on] > 0) == bool(side))
-        if inside.any():
-            first, second = (k for k in range(3) if k != on)
-            at = ((hits[..., [first, second]] - ROOM_M[0, [first, second]]) / _TEXEL_M).astype(np.float32)
-            seen = cv2.remap(_texture(face), at, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT)  # type: ignore[call-overload]
-            image[inside] = seen[inside]
-    return image
+    at = (origin + rays * np.min(reach, axis=2)[..., None] - ROOM_M[0]) / _TEXEL_M
+    face = 2 * axis + (np.take_along_axis(rays, axis[..., None], 2)[..., 0] > 0)
+    across = np.where(axis == 0, at[..., 1], at[..., 0]).astype(np.float32)
+    along = np.where(axis == 2, at[..., 1], at[..., 2]).astype(np.float32)
+    # In steps of OpenCV's interpolation: as exact on the last face as on the first.
+    along = np.rint(along * 32) / 32 + (face * _TEXELS).astype(np.float32)
+    return np.asarray(cv2.remap(_textures(), across, along, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT), np.uint8)
 
 
 @lru_cache(maxsize=1)
@@ -91,9 +86,14 @@ def _rays() -> Array:
     return np.stack([(u - (WIDTH / 2 - 0.5)) / FOCAL, (v - (HEIGHT / 2 - 0.5)) / FOCAL, np.ones_like(u, float)], -1)
 
 
-@lru_cache(maxsize=6)
+@lru_cache(maxsize=1)
+def _textures() -> NDArray[np.uint8]:
+    """800 x 800 texels for each face, one under another."""
+    return np.concatenate([_texture(face) for face in range(6)])
+
+
 def _texture(face: int) -> NDArray[np.uint8]:
-    """800 x 800 texels of soft noise under hard-edged patches, different on each face."""
+    """Soft noise under hard-edged patches, different on each face."""
     rng = np.random.default_rng(100 + face)
     noise = sum(
         (cv2.resize(rng.random((n, n)), (800, 800), interpolation=cv2.INTER_CUBIC) for n in (10, 40, 110)),
@@ -112,7 +112,7 @@ def poster(seed: int, corners_m: Array, shift_m: float = 0.0) -> Iterator[None]:
 
     corners_m: x and z of the lower left and the upper right one.
     """
-    texture = _texture(_WALL)
+    texture = _textures()[_WALL * _TEXELS : (_WALL + 1) * _TEXELS]
     before = texture.copy()
     (left, low), (right, high) = np.rint((corners_m - ROOM_M[0, [0, 2]]) / _TEXEL_M).astype(int)
     rng = np.random.default_rng(seed)

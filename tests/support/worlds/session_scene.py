@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse, transform_points
-from fleetmap.sensors.samples import ImuSamples, Trajectory
+from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import Sighting
-from mapserver.survey.state import KeyframeMotion, Landmarks, SurveyState
 from mapserver.survey.survey_map import History, SurveyMap
 from support.worlds.bundle_scene import BODY_FROM_CAM, CAMERA, make_scene
 
@@ -61,17 +60,3 @@ def session_scene(seed: int, *, landmarks: int = 300, history: History | None = 
     return SessionScene(
         BaseMap(survey_map, CAMERA, BODY_FROM_CAM), problem.map_from_body[1::2] @ BODY_FROM_CAM, visible
     )
-
-
-def survey_state(seed: int) -> SurveyState:
-    """A survey of twelve keyframes at its truth, all landmarks seen at least twice, no motion."""
-    problem = make_scene(keyframes=12, landmarks=200, step_s=0.3, seed=seed, mono_share=0.0).problem
-    order = np.lexsort((problem.obs_keyframe, problem.obs_landmark))
-    seen, number = np.unique(problem.obs_landmark[order], return_inverse=True)
-    marks = Landmarks(
-        problem.points_map[seen], problem.obs_keyframe[order], problem.obs_camera[order], number.astype(np.int32),
-        np.arange(len(order), dtype=np.int32), problem.obs_pixels[order], problem.obs_sigma_px[order],
-    )  # fmt: skip
-    none = np.zeros((12, 3))
-    motion = KeyframeMotion(False, ImuSamples.empty(), None, 0.0, none, none.copy(), none.copy(), [])
-    return SurveyState(np.arange(12, dtype=np.int64), problem.map_from_body, problem.rig, motion, marks)

@@ -11,7 +11,7 @@ from fleetmap.geometry import Array
 from mapserver.survey.finish.culling import cull, parallax_rad, redundant
 from mapserver.survey.settings import CullSettings
 from mapserver.survey.state import Keyframe, Landmarks, MemoryImageStore
-from support.worlds.session_scene import CAMERA, survey_state
+from support.worlds.corridor_scene import CAMERA, scene
 
 
 def keyframes(count: int, features: int, seed: int = 0) -> list[Keyframe]:
@@ -64,7 +64,7 @@ def test_what_only_few_see_keeps_its_keyframes() -> None:
 
 def test_a_double_goes_and_its_neighbours_stay() -> None:
     """A landmark's observations are split in two, as if a track had broken: one of the two goes, with a like descriptor only."""
-    state = survey_state(1)
+    state = scene(12, 1, drift=0.0).state
     marks = state.landmarks
     counts = np.bincount(marks.obs_landmark)
     split = int(np.argmax(counts))
@@ -94,7 +94,7 @@ def test_a_double_goes_and_its_neighbours_stay() -> None:
 
 
 def test_parallax_is_the_widest_angle_or_the_baselines() -> None:
-    state = survey_state(2)
+    state = scene(12, 2, drift=0.0).state
     angles = parallax_rad(state)
     map_from_cam = state.map_from_cams[:, 0]
     for n in range(0, len(state.landmarks.points_map), 17):
