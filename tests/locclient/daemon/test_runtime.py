@@ -461,7 +461,7 @@ def test_planners_get_the_grid_of_the_floor(tmp_path: Path, has_grid: bool) -> N
         )
         made = Runtime.__new__(Runtime)
         made._parts, made._server, made._publisher, made._shown_grid = parts, None, listener, None  # type: ignore[assignment]
-        for made._floor in ("", "high", "high", ""):
+        for made._site in ("", "high", "high", ""):
             made._show_grid(low)
     shown = [grid for _, grid, _ in listener.grids]
     if has_grid:
