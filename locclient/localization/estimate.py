@@ -169,6 +169,11 @@ def _of_confirmed(
     return _with_pose(estimate, confirmed.now, settings)
 
 
+def map_cov(settings: TrackSettings) -> Array:
+    """Return the covariance (6, 6) of the map itself at a place, rotation first."""
+    return np.diag([settings.map_sigma_rad**2] * 3 + [settings.map_sigma_m**2] * 3)
+
+
 def _with_pose(estimate: Estimate, place: Place, settings: TrackSettings) -> Estimate:
     """Add the pose, and the map's own uncertainty, which is common to all fixes and does not average out.
 
@@ -176,8 +181,8 @@ def _with_pose(estimate: Estimate, place: Place, settings: TrackSettings) -> Est
     """
     if np.isnan(place.map_from_body).any() or np.isnan(place.cov_rot_trans).any():
         return estimate
-    of_map = np.diag([settings.map_sigma_rad**2] * 3 + [settings.map_sigma_m**2] * 3)
-    return replace(estimate, **place._replace(cov_rot_trans=place.cov_rot_trans + of_map)._asdict())
+    covariance = place.cov_rot_trans + map_cov(settings)
+    return replace(estimate, **place._replace(cov_rot_trans=covariance)._asdict())
 
 
 def _published(hypotheses: Sequence[PoseHypothesis]) -> tuple[Hypothesis, ...]:

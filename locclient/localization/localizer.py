@@ -16,7 +16,7 @@ from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame, Stereo
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from locclient.localization.calibration.monitor import CalibrationMonitor, with_calibration
 from locclient.localization.calibration.watch import Mounting
-from locclient.localization.estimate import Estimate, QueryResult, assemble
+from locclient.localization.estimate import Estimate, QueryResult, assemble, map_cov
 from locclient.localization.held_maps import HeldMap, HeldMaps
 from locclient.localization.map_query import MapQuery
 from locclient.localization.percept import Percept
@@ -150,6 +150,11 @@ class Localizer:
             self._judge_cameras(percept, frame)
         result = self._query.step(percept, frame, is_riding=self._lift.is_riding)
         if frame is not None:
+            finished = self._query.finished
+            if finished is not None and finished.fix is not None:
+                place = tracker.place_by(finished.fix)
+                of_fix = place.map_from_body, place.cov_rot_trans + map_cov(self._settings.track)
+                self.perception.odometry.handle_fix(finished.odometry, *of_fix, is_confirmed=finished.is_confirmed)
             if self._query.finished is not None and self._query.view == 0:
                 self._calibration.add(self._query.finished)
             percept.calibration = self._calibration.state

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
+from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, interpolate_se3, se3_inverse
 from fleetmap.odometry import OdometryEstimate
 from fleetmap.relocalization.frame_features import FrameFeatures
@@ -25,7 +26,8 @@ from locclient.localization.settings import LocalizerSettings
 
 _SPREAD_SHARE = 0.45  # of the query interval: if frames are farther apart, a query is not spread over frames
 _HYPOTHESES_AT_ONCE = 3  # in one time slice of a search
-# Per frame, where a late estimate does no harm: from an unchanged viewpoint, in the first searches without a prior, and after lost tracks.
+# Per frame, where a late estimate does no harm: from an unchanged viewpoint, in the first searches without a prior, after lost tracks, and
+# for a pose that is too vague.
 _MORE_SLICES = 3
 _TORN_SLICES = 2  # among places that the next looks may tell apart; three find the right one a fifteenth sooner
 _COUNTERPART_M = 3.0  # around the place of a fix on another floor, whose map may lie so far off in the building
@@ -161,7 +163,11 @@ class MapQuery:
         self._begun_ns = odometry.stamp_ns
         is_at_rest = tracker.confirmed is None and not self._gates[view].is_new(odometry.odom_from_body)
         is_unknown = tracker.confirmed is None and tracker.prior is None
-        is_eager = is_at_rest or is_urgent or (is_unknown and self.failed < _FIRST_SEARCHES)
+        is_wide = (
+            tracker.confirmed is not None
+            and radius_95_m(tracker.confirmed.now.cov_rot_trans) > self._track.degraded_radius_m
+        )
+        is_eager = is_at_rest or is_urgent or is_wide or (is_unknown and self.failed < _FIRST_SEARCHES)
         is_torn = self._track.is_whole_site_mapped and len(tracker.candidates.hypotheses) > 1
         few = _TORN_SLICES if is_torn and tracker.confirmed is None else 1
         self._is_urgent, self._slices = is_urgent, _MORE_SLICES if is_eager else few

@@ -213,6 +213,8 @@ class PoseTracker:
         step = np.eye(4) if last is None else se3_inverse(last) @ odometry.odom_from_body
         if odometry.previous_from_body is not None:
             step = odometry.previous_from_body
+        elif (before := dict(odometry.revised).get(odometry.frame_index - 1)) is not None:
+            step = se3_inverse(before) @ odometry.odom_from_body
         for hypothesis in self._tracked():
             hypothesis.propagate(motions, odometry, step, self.settings)
             hypothesis.has_broken |= has_broken
@@ -300,7 +302,7 @@ class PoseTracker:
     def observations(self, fixes: Sequence[Fix]) -> Observations:
         """Return the fixes of the running query with their poses at present."""
         assert self._query_frame is not None
-        found = [(fix, PoseHypothesis.at_query(self._query_frame, self._place_by(fix))) for fix in fixes]
+        found = [(fix, PoseHypothesis.at_query(self._query_frame, self.place_by(fix))) for fix in fixes]
         return found if self.prior is None else self.prior.weighed(found)
 
     def is_reliable(self, fix: Fix) -> bool:
@@ -329,7 +331,8 @@ class PoseTracker:
         _, innovation = innovation_of(*at.now[:2], *known.now[:2])
         return innovation <= self.settings.innovation_limit
 
-    def _place_by(self, fix: Fix) -> Place:
+    def place_by(self, fix: Fix) -> Place:
+        """Return the place of the body by a fix of the last query."""
         return Place(fix.map_from_cam, fix.cov_rot_trans, fix.floor).of_point(se3_inverse(self.body_from_cam))
 
     def drops_prior(self, fixes: Sequence[Fix]) -> bool:
@@ -351,7 +354,7 @@ class PoseTracker:
         if not fixes:
             return NO_AGREEMENT
         map_from_body, covariance, _ = confirmed.then
-        innovations = [(fix, *innovation_of(*self._place_by(fix)[:2], map_from_body, covariance)) for fix in fixes]
+        innovations = [(fix, *innovation_of(*self.place_by(fix)[:2], map_from_body, covariance)) for fix in fixes]
         # A fix near the prediction is tested by the gate alone; one found by search must also be reliable.
         limit = self.settings.innovation_limit
         gated = [entry for entry in innovations if entry[2] <= limit and (is_near or self.is_reliable(entry[0]))]
@@ -363,7 +366,7 @@ class PoseTracker:
                 return QueryResult(None, f"{len(gated)} places match the image", innovation)
             reason = f"the fix is {off_m:.2f} m off, more than its covariance admits"
             return QueryResult(None, reason, innovation, off_m if is_near else None)
-        updated = kalman_update(map_from_body, covariance, error, self._place_by(fix).cov_rot_trans)
+        updated = kalman_update(map_from_body, covariance, error, self.place_by(fix).cov_rot_trans)
         self.confirmed = PoseHypothesis.at_query(self._query_frame, Place(*updated, confirmed.now.floor))
         self.confirmed.support = confirmed.support + 1
         self.candidates.reset()

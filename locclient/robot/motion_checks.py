@@ -3,13 +3,14 @@
 from cmath import phase, rect
 from collections import deque
 from collections.abc import Iterable, Sequence
+from itertools import pairwise
 from math import dist, hypot
 
 import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse, so3_exp, so3_log
 from fleetmap.messages import Flag, Status
-from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.odometry import OdometryEstimate, OdometryStatus, SeenWay
 from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.sensors.axes import speed_in_words
 from fleetmap.sensors.calibration import RigCalibration
@@ -171,6 +172,7 @@ class WheelAgreement:
     def __init__(self, base_from_body: Array) -> None:
         self._base_from_body = base_from_body
         self._last_ns: int | None = None
+        self._rolled = list[WheelSample]()  # since the last way that images have shown
         self._against_m = 0.0
         self._seen_squares, self._products = 0.0, 0j
         self._is_compared = False
@@ -205,6 +207,30 @@ class WheelAgreement:
         duration_s = (odometry.stamp_ns - last_ns) * 1e-9
         seen_mps = (self._base_from_body @ moved @ se3_inverse(self._base_from_body))[:2, 3] / duration_s
         rolled_mps = np.mean([sample.velocity_base_mps[:2] for sample in wheel], axis=0)
+        self._compare(seen_mps, rolled_mps, duration_s)
+
+    def handle_way(self, wheel: Sequence[WheelSample], way: SeenWay | None, base_from_cam: Array) -> None:
+        """Add a frame of a robot whose images show the direction of its camera's way alone, which is as long as the wheels say.
+
+        It speaks for all that they rolled since the way before it.
+        """
+        self._rolled.extend(wheel)
+        if way is None:
+            return
+        samples, self._rolled = self._rolled, self._rolled[-1:]
+        turned_m = np.array([-base_from_cam[1, 3], base_from_cam[0, 3]])  # by a turn of one radian
+        during = [s.velocity_base_mps[:2] + s.yaw_rate_radps * turned_m for s in samples if s.stamp_ns > way.since_ns]
+        if not during:
+            return
+        rolled_mps = np.mean(during, axis=0)
+        seen_mps = way.direction_base[:2] * hypot(*rolled_mps) / max(hypot(*way.direction_base[:2]), 1e-9)
+        if seen_mps @ rolled_mps > np.cos(_SAME_WAY_RAD) * (rolled_mps @ rolled_mps):
+            seen_mps = rolled_mps
+        gaps_s = (min((b.stamp_ns - a.stamp_ns) * 1e-9, 1.0) for a, b in pairwise(samples))
+        way_m = sum(hypot(*s.velocity_base_mps[:2]) * gap_s for s, gap_s in zip(samples[1:], gaps_s, strict=True))
+        self._compare(seen_mps, rolled_mps, way_m / max(hypot(*rolled_mps), 0.01))
+
+    def _compare(self, seen_mps: Array, rolled_mps: Array, duration_s: float) -> None:
         seen, rolled = float(np.linalg.norm(seen_mps)), float(np.linalg.norm(rolled_mps))
         step_m = min(max(seen, min(rolled, 1.0)), 10.0) * duration_s
         if np.linalg.norm(rolled_mps - seen_mps) > max(_OFF_MPS, _OFF_SHARE * min(seen, rolled)):

@@ -9,6 +9,7 @@ from fleetmap.geometry import Array
 from fleetmap.mapformat.building import BuildingFrame, Floor
 from fleetmap.mapformat.manifest import building_frame
 from fleetmap.messages import Cause, Flag, PoseMessage, Status
+from fleetmap.odometry import WheelOdometry
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
@@ -219,8 +220,12 @@ class Robot:
         level = self.building[self._site].entry.level if self.building else ""
         published = replace(self._odom.handle(estimate), building_from_map=self._building_from_map(), level=level)
         speed_mps = self._speed.handle(wheel, estimate.odometry, published.odom_from_base)
-        self._wheels.handle(wheel if self._wheels_fault else bundle.wheel, estimate.odometry)
+        rolled = wheel if self._wheels_fault else bundle.wheel
         odometry, percept = self.localizer.perception.odometry, self.localizer.perception.percept
+        if isinstance(odometry, WheelOdometry):
+            self._wheels.handle_way(rolled, odometry.seen_way, self.base_from_body @ self._rectifier.body_from_cam)
+        else:
+            self._wheels.handle(rolled, estimate.odometry)
         self._images_refused = self._views.refused(self._wheels, odometry.accelerometer)
         self.localizer.handle_contradiction("".join(self._images_refused.values()))
         is_covered = self._may_be_mapped(estimate)

@@ -9,7 +9,8 @@ from fleetmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from fleetmap.odometry.estimate import ContinuousFrame, OdometryEstimate, OdometryStatus, is_away
-    from fleetmap.odometry.mono.mono_modes import MonocularOdometry, make_odometry
+    from fleetmap.odometry.mono.mono_modes import MonocularOdometry, WheelOdometry, make_odometry
+    from fleetmap.odometry.mono.wheel_mode import SeenWay
     from fleetmap.odometry.odometry import Odometry
     from fleetmap.odometry.settings import OdometrySettings
 
@@ -20,6 +21,8 @@ __all__ = [
     "OdometryEstimate",
     "OdometrySettings",
     "OdometryStatus",
+    "SeenWay",
+    "WheelOdometry",
     "is_away",
     "make_odometry",
 ]
@@ -27,7 +30,8 @@ __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "fleetmap.odometry.estimate": "ContinuousFrame OdometryEstimate OdometryStatus is_away",
-        "fleetmap.odometry.mono.mono_modes": "MonocularOdometry make_odometry",
+        "fleetmap.odometry.mono.mono_modes": "MonocularOdometry WheelOdometry make_odometry",
+        "fleetmap.odometry.mono.wheel_mode": "SeenWay",
         "fleetmap.odometry.odometry": "Odometry",
         "fleetmap.odometry.settings": "OdometrySettings",
     },

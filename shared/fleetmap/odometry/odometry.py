@@ -95,6 +95,11 @@ class Odometry:
         self._mode, self._frame_index = step.mode, frame_index + 1
         return self._mode.estimate(frame.stamp_ns, frame_index, tracked, step)
 
+    def handle_fix(
+        self, at: OdometryEstimate, map_from_body: Array, cov_rot_trans: Array, *, is_confirmed: bool
+    ) -> None:
+        """Take the pose of an earlier frame in a map whose z points up, with covariance (6, 6). A pair of cameras needs none."""
+
     @property
     def refuses_imu(self) -> bool:
         """True if the images contradicted the IMU's rotation, so that it is no longer used."""

@@ -1,5 +1,6 @@
 """Odometry with one camera: metric once the IMU has determined the scale; before that, or without an IMU, up to scale and marked so."""
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import NamedTuple
@@ -9,15 +10,17 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.features.settings import StereoSettings
-from fleetmap.geometry import Array, se3_inverse, transform_points
+from fleetmap.geometry import Array, se3, se3_inverse, transform_points
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.filter.msckf import InvariantFilter
 from fleetmap.odometry.filter.nav_state import InitialState, NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.init.imu_alignment import mono_inertial_initialization
 from fleetmap.odometry.init.static_initialization import static_initialization
 from fleetmap.odometry.modes import ImuInputs, InertialMode, Mode, StartingMode, Step, VisualMode, WindowMode
+from fleetmap.odometry.mono.map_start import MapStart, knows_direction, knows_speed
 from fleetmap.odometry.mono.mono_vo import VisualEstimate, VisualOdometry
-from fleetmap.odometry.mono.wheel_mode import WheelMode
+from fleetmap.odometry.mono.wheel_mode import SeenWay, WheelMode
 from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.odometry_checks import is_image_still
 from fleetmap.odometry.settings import OdometrySettings, TrackerSettings
@@ -40,6 +43,7 @@ class MonocularWindow(SlidingWindow):
 
     def __init__(self, rig: OdometryRig, state: NavState, covariance: Array, stamp_ns: int) -> None:
         super().__init__(rig, state, covariance, stamp_ns)
+        self.is_blind = False  # its speed is not known well enough to place points by its way
         self._sightings: dict[int, list[tuple[int, Array]]] = {}
 
     def points_in_camera(self, ids: Ids) -> Array:
@@ -74,6 +78,12 @@ class MonocularWindow(SlidingWindow):
             self.scene_depth_m = float(np.median(points[known, 2]))
         return points
 
+    def update(self, frame_index: int, tracked: Tracked, chunk_frames: int, iterations: int) -> NDArray[np.int8]:
+        """As SlidingWindow's."""
+        if self.is_blind:
+            tracked = replace(tracked, ids=tracked.ids[:0], pixels=tracked.pixels[:0], earlier=())
+        return super().update(frame_index, tracked, chunk_frames, iterations)
+
     @property
     def _first_depth_m(self) -> float:
         return self.scene_depth_m
@@ -101,7 +111,7 @@ class MonocularMode(Mode):
 
     def __init__(self, rig: OdometryRig, imu: ImuInputs | None) -> None:
         self._rig, self.imu = rig, imu
-        self._stamp_ns = 0
+        self._stamp_ns, self._stamps_ns = 0, deque[int](maxlen=_UNSCALED_FRAMES)  # of the present frame; of all
         self._visual_odometry = VisualOdometry(rig.camera, rig.settings.monocular)
         self._visual = VisualEstimate(None, np.zeros((6, 6)))
         self._unscaled: list[_UnscaledFrame] = []
@@ -115,15 +125,17 @@ class MonocularMode(Mode):
     def stamp_ns(self) -> int:
         return self._stamp_ns
 
-    def resume(self, mode: VisualMode) -> None:
+    def resume(self, mode: Mode) -> None:
         """Continue after the filter was abandoned; vision restarts without scale.
 
         Without the IMU if that was abandoned, else by those of its samples that caused no wrong start.
         """
         self._stamp_ns, self._still_since_ns = mode.stamp_ns, None
+        self._stamps_ns.clear()
+        self._unscaled.clear()
         if isinstance(mode, StartingMode):
             self._not_before_ns = mode.not_before_ns
-        else:
+        elif isinstance(mode, VisualMode):
             self.imu = None
 
     def points_in_camera(self, ids: Ids) -> Array:
@@ -132,21 +144,31 @@ class MonocularMode(Mode):
 
     def predict(self, stamp_ns: int) -> None:
         self._stamp_ns = stamp_ns
+        self._stamps_ns.append(stamp_ns)
 
     def cam_from_earlier(self, frame_index: int) -> Array | None:
         """See Mode: repeats the last motion, for the frame before."""
         return self._visual_odometry.motion_guess()
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
-        """See Mode: none while the image stands still, of any scale; else unknown in metres."""
-        if not self._still_from <= frame_index <= self._frame_index:
+        """See Mode: none while the image stands still, of any scale. Else the gyro's turn, and a way of unknown direction and speed."""
+        if self._still_from <= frame_index <= self._frame_index:
+            sigma_rad = self._rig.settings.monocular.still_px / self._rig.camera.focal_px
+            sigmas = np.repeat([sigma_rad, sigma_rad * self._visual.depth], 3)
+            return np.eye(4), (self._frame_index - frame_index) * np.diag(sigmas**2)
+        number = frame_index - self._frame_index - 1
+        if self.imu is None or -number > len(self._stamps_ns):
             return None
-        sigma_rad = self._rig.settings.monocular.still_px / self._rig.camera.focal_px
-        sigmas = np.repeat([sigma_rad, sigma_rad * self._visual.depth], 3)
-        return np.eye(4), (self._frame_index - frame_index) * np.diag(sigmas**2)
+        since_ns, settings = self._stamps_ns[number], self._rig.settings
+        duration_s = (self._stamp_ns - since_ns) * 1e-9
+        turned = self.imu.samples.rotation_between(since_ns, self._stamp_ns, self.imu.noise)
+        sigma_rad = np.pi if turned is None else settings.start.steady_gyro_mean_radps * duration_s
+        sigma_m = settings.filter.initial_velocity_sigma_mps * duration_s
+        covariance = np.diag(np.square(np.repeat([min(sigma_rad, np.pi), sigma_m], 3)))
+        return np.eye(4) if turned is None else se3(turned, np.zeros(3)), covariance
 
     def will_forget(self, frame_index: int) -> bool:
-        return frame_index < self._still_from
+        return frame_index - self._frame_index - 1 <= -_UNSCALED_FRAMES
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
         """See Mode; switches to the filter once the scale is known, and revises earlier frames then."""
@@ -325,12 +347,46 @@ class MonocularTracker(Tracker):
 class MonocularOdometry(Odometry):
     """The class `Odometry` for one camera; its estimates are metric if `scale_known`."""
 
+    _new_odom_from_old_odom: Array | None = None  # by a fix since the last frame
+    _last: OdometryEstimate | None = None
+
     def handle_stereo(self, frame: RectifiedFrame) -> OdometryEstimate:
         """Return the estimate at `frame`, which has one image in spite of the name and must be newer than any before."""
-        if isinstance(self._mode, VisualMode):  # the IMU was abandoned, or its filter diverged
-            self._vision.resume(self._mode)
+        mode, blind, settings = self._mode, self._blind, self._rig.settings.filter
+        # the IMU was abandoned, or its filter diverged, or no fix came any more
+        if isinstance(mode, VisualMode) or (blind is not None and not knows_speed(blind.filter.covariance, settings)):
+            self._vision.resume(mode)
             self._mode = self._vision
-        return super().handle_stereo(frame)
+        change, self._new_odom_from_old_odom = self._new_odom_from_old_odom, None
+        estimate = super().handle_stereo(frame)
+        if change is not None:
+            later = estimate.new_odom_from_old_odom
+            estimate = replace(estimate, new_odom_from_old_odom=change if later is None else later @ change)
+        self._last = estimate
+        return estimate
+
+    def handle_fix(
+        self, at: OdometryEstimate, map_from_body: Array, cov_rot_trans: Array, *, is_confirmed: bool
+    ) -> None:
+        """See Odometry: take scale, speed and gravity from fixes as long as images do not show them."""
+        last, imu = self._last, self._vision.imu
+        if imu is None or last is None or self._by_map is None:
+            return
+        offset_ns = int(self._rig.imu_minus_cam_s * 1e9)
+        needed = 2 if is_confirmed else 3
+        start = self._by_map.handle(at.stamp_ns + offset_ns, map_from_body, cov_rot_trans, needed=needed)
+        if start is None or (last.scale_known and last.status is not OdometryStatus.DEGRADED and self._blind is None):
+            return
+        window = MonocularWindow(self._rig, start.state, start.covariance, start.stamp_ns)
+        window.filter = InvariantFilter(start.state, start.covariance, self._rig.settings.filter, self._rig.mounted)
+        window.is_blind = not knows_direction(start)
+        ids, pixels, self._mode = last.track_ids, last.track_pixels, InertialMode(window, imu)
+        assert pixels is not None
+        if at.frame_index < last.frame_index:
+            window.seed(at.frame_index, Tracked(ids[:0], pixels[:0], (), None, 0.0, by_descriptors=False))
+            self._mode.predict(last.stamp_ns + offset_ns)
+        window.seed(last.frame_index, Tracked(ids, pixels, (), None, 0.0, by_descriptors=False))
+        self._new_odom_from_old_odom = window.filter.odom_from_body() @ se3_inverse(last.odom_from_body)
 
     @property
     def refuses_imu(self) -> bool:
@@ -342,7 +398,13 @@ class MonocularOdometry(Odometry):
         self._tracker = MonocularTracker(rig.camera, rig.settings.tracker, self._points_in_camera)
         imu = None if rig.imu is None else ImuInputs(rig, rig.imu, self._samples, self._clock)
         self._vision = MonocularMode(rig, imu)
+        self._by_map = None if imu is None else MapStart(rig, imu)
         return self._vision
+
+    @property
+    def _blind(self) -> MonocularWindow | None:
+        window = self._mode.window if isinstance(self._mode, WindowMode) else None
+        return window if isinstance(window, MonocularWindow) and window.is_blind else None
 
     def _points_in_camera(self, ids: NDArray[np.int64]) -> Array:
         """(N, 3) tracked points in the camera of the frame before, NaN where unknown."""
@@ -358,4 +420,10 @@ class WheelOdometry(Odometry):
         rig = self._rig
         unknown = np.full(3, np.nan)
         self._tracker = MonocularTracker(rig.camera, rig.settings.tracker, lambda ids: np.tile(unknown, (len(ids), 1)))
-        return WheelMode(rig, self._samples)
+        self._wheels = WheelMode(rig, self._samples)
+        return self._wheels
+
+    @property
+    def seen_way(self) -> SeenWay | None:
+        """The way of the camera by the images alone, if one ends with the last frame."""
+        return self._wheels.seen_way

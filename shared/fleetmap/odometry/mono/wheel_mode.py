@@ -9,12 +9,14 @@ from fleetmap.geometry import Array, length, rotation_angle_rad, se3_exp, se3_in
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter.sliding_window import OdometryRig
 from fleetmap.odometry.modes import Mode, Step
+from fleetmap.odometry.mono.two_view import two_view_motion
 from fleetmap.odometry.sensor_buffer import SensorBuffer
 from fleetmap.odometry.tracking.tracker import Tracked
 from fleetmap.sensors.samples import WheelSample
 
 _KEPT_FRAMES = 64
 _SILENT_NS = 200_000_000  # without samples the motion is unknown
+_WAY_SIGMAS = 10.0  # of a point's motion in the image, from which on it shows where the camera went
 
 
 class _Rolled(NamedTuple):
@@ -31,6 +33,14 @@ class _Frame(NamedTuple):
     frame_index: int
     odom_from_body: Array
     rolled: _Rolled
+    stamp_ns: int = 0
+
+
+class SeenWay(NamedTuple):
+    """The way of the camera by two images: since when, and its direction (3,), of length 1, in axes of the base at that moment."""
+
+    since_ns: int
+    direction_base: Array
 
 
 class WheelMode(Mode):
@@ -42,6 +52,8 @@ class WheelMode(Mode):
         self._newest: WheelSample | None = None
         self._stamp_ns, self._velocity_mps = 0, np.zeros(3)
         self._is_silent = True
+        self.seen_way: SeenWay | None = None  # until this frame
+        self._way_begins: tuple[int, Tracked, float] | None = None  # and the motion in the image that it needs, pixels
 
     @property
     def stamp_ns(self) -> int:
@@ -56,7 +68,7 @@ class WheelMode(Mode):
         parts = [(sample.stamp_ns, sample) for sample in samples]
         if self._newest is not None and not self._is_silent:
             parts.append((stamp_ns, self._newest))
-        number, before, rolled = self._frames[-1] if self._frames else _Frame(-1, np.eye(4), _Rolled())
+        number, before, rolled, _ = self._frames[-1] if self._frames else _Frame(-1, np.eye(4), _Rolled())
         odom_from_base = before @ se3_inverse(self._rig.base_from_body)
         for until_ns, sample in parts:
             duration_s, at_ns = (until_ns - at_ns) * 1e-9, until_ns
@@ -68,7 +80,7 @@ class WheelMode(Mode):
             rolled = _Rolled(*np.add(rolled, new).tolist())
         odom_from_body = odom_from_base @ self._rig.base_from_body
         self._velocity_mps = (odom_from_body - before)[:3, 3] / max((stamp_ns - since_ns) * 1e-9, 1e-3)
-        self._frames.append(_Frame(number + 1, odom_from_body, rolled))
+        self._frames.append(_Frame(number + 1, odom_from_body, rolled, stamp_ns))
 
     def cam_from_earlier(self, frame_index: int) -> Array | None:
         motion = self.motion_since(frame_index)
@@ -76,8 +88,39 @@ class WheelMode(Mode):
         return None if motion is None else np.asarray(rig.cam_from_body @ se3_inverse(motion[0]) @ rig.body_from_cam)
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
-        """See Mode: nothing corrects it."""
-        return Step(self, np.zeros(0, np.int8), is_lost=self._is_silent or tracked.lost)
+        """See Mode: nothing corrects it, but images that show another direction."""
+        self.seen_way = way = self._see_way(tracked)
+        return Step(self, np.zeros(0, np.int8), is_lost=self._is_silent or tracked.lost or self._contradicts(way))
+
+    def _see_way(self, tracked: Tracked) -> SeenWay | None:
+        """Return the way since an earlier frame as soon as its points have moved enough in the image."""
+        s = self._rig.settings.monocular
+        anew = self._stamp_ns, tracked, _WAY_SIGMAS * s.sigma_px
+        since_ns, before, wanted_px = self._way_begins or anew
+        _, a, b = np.intersect1d(before.ids, tracked.ids, return_indices=True)
+        pixels_a, pixels_b = before.pixels[a, :2], tracked.pixels[b, :2]
+        if self._way_begins is None or tracked.lost or len(a) < s.first_min_points:
+            self._way_begins = anew
+            return None
+        moved_px = float(np.median(np.linalg.norm(pixels_a - pixels_b, axis=1)))
+        if moved_px < wanted_px:
+            return None
+        found = two_view_motion(self._rig.camera, pixels_a, pixels_b, threshold_px=1.0, seed=len(a))
+        if found is None or found.inliers.mean() < 0.6 or found.parallax_rad < np.radians(s.min_angle_deg):
+            self._way_begins = since_ns, before, 1.5 * moved_px  # a turn, or too flat a scene
+            return None
+        self._way_begins = anew
+        b_from_a, base_from_cam = found.b_from_a, self._rig.base_from_body[:3, :3] @ self._rig.body_from_cam[:3, :3]
+        return SeenWay(since_ns, -base_from_cam @ b_from_a[:3, :3].T @ b_from_a[:3, 3])
+
+    def _contradicts(self, way: SeenWay | None) -> bool:
+        """Return True if the camera went the other way by the wheels."""
+        begun = next((frame for frame in self._frames if way and frame.stamp_ns == way.since_ns), None)
+        if way is None or begun is None:
+            return False
+        base_from_odom = self._rig.base_from_body @ se3_inverse(begun.odom_from_body)
+        then, now = (base_from_odom @ f.odom_from_body @ self._rig.body_from_cam for f in (begun, self._frames[-1]))
+        return bool((now - then)[:3, 3] @ way.direction_base < 0.0)
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         number = frame_index - self._frames[0].frame_index
@@ -104,7 +147,7 @@ class WheelMode(Mode):
 
     def estimate(self, stamp_ns: int, frame_index: int, tracked: Tracked, step: Step) -> OdometryEstimate:
         """See Mode; biases are unknown, reported as zero."""
-        _, odom_from_body, rolled = self._frames[-1]
+        _, odom_from_body, rolled, _ = self._frames[-1]
         return OdometryEstimate(
             stamp_ns=stamp_ns,
             frame_index=frame_index,
