@@ -62,6 +62,9 @@ class ScriptedOdometry:
     def will_forget(self, frame_index: int) -> bool:
         return frame_index <= max(0, len(self.odom_from_body) - CLONES)
 
+    def handle_fix(self, *_: object, is_confirmed: bool) -> None:
+        """It knows its scale."""
+
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         if frame_index < len(self.odom_from_body) - CLONES:
             return None

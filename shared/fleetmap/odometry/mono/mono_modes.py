@@ -111,6 +111,7 @@ class MonocularMode(Mode):
 
     def __init__(self, rig: OdometryRig, imu: ImuInputs | None) -> None:
         self._rig, self.imu = rig, imu
+        self.is_in_map = False  # a robot's, whose motion counts in metres
         self._stamp_ns, self._stamps_ns = 0, deque[int](maxlen=_UNSCALED_FRAMES)  # of the present frame; of all
         self._visual_odometry = VisualOdometry(rig.camera, rig.settings.monocular)
         self._visual = VisualEstimate(None, np.zeros((6, 6)))
@@ -157,7 +158,7 @@ class MonocularMode(Mode):
             sigmas = np.repeat([sigma_rad, sigma_rad * self._visual.depth], 3)
             return np.eye(4), (self._frame_index - frame_index) * np.diag(sigmas**2)
         number = frame_index - self._frame_index - 1
-        if self.imu is None or -number > len(self._stamps_ns):
+        if self.imu is None or not self.is_in_map or -number > len(self._stamps_ns):
             return None
         since_ns, settings = self._stamps_ns[number], self._rig.settings
         duration_s = (self._stamp_ns - since_ns) * 1e-9
@@ -168,7 +169,8 @@ class MonocularMode(Mode):
         return np.eye(4) if turned is None else se3(turned, np.zeros(3)), covariance
 
     def will_forget(self, frame_index: int) -> bool:
-        return frame_index - self._frame_index - 1 <= -_UNSCALED_FRAMES
+        oldest = self._frame_index + 1 - _UNSCALED_FRAMES if self.is_in_map else self._still_from - 1
+        return frame_index <= oldest
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
         """See Mode; switches to the filter once the scale is known, and revises earlier frames then."""
@@ -314,7 +316,10 @@ def make_odometry(
     kind = (
         Odometry if camera.baseline_m else WheelOdometry if by_wheels and calibration.imu is None else MonocularOdometry
     )
-    return kind(calibration, camera, body_from_cam, imu_minus_cam_s, settings, stereo_settings, others)
+    made = kind(calibration, camera, body_from_cam, imu_minus_cam_s, settings, stereo_settings, others)
+    if isinstance(made, MonocularOdometry):
+        made.vision.is_in_map = by_wheels
+    return made
 
 
 class MonocularTracker(Tracker):
@@ -355,8 +360,8 @@ class MonocularOdometry(Odometry):
         mode, blind, settings = self._mode, self._blind, self._rig.settings.filter
         # the IMU was abandoned, or its filter diverged, or no fix came any more
         if isinstance(mode, VisualMode) or (blind is not None and not knows_speed(blind.filter.covariance, settings)):
-            self._vision.resume(mode)
-            self._mode = self._vision
+            self.vision.resume(mode)
+            self._mode = self.vision
         change, self._new_odom_from_old_odom = self._new_odom_from_old_odom, None
         estimate = super().handle_stereo(frame)
         if change is not None:
@@ -369,7 +374,7 @@ class MonocularOdometry(Odometry):
         self, at: OdometryEstimate, map_from_body: Array, cov_rot_trans: Array, *, is_confirmed: bool
     ) -> None:
         """See Odometry: take scale, speed and gravity from fixes as long as images do not show them."""
-        last, imu = self._last, self._vision.imu
+        last, imu = self._last, self.vision.imu
         if imu is None or last is None or self._by_map is None:
             return
         offset_ns = int(self._rig.imu_minus_cam_s * 1e9)
@@ -391,15 +396,15 @@ class MonocularOdometry(Odometry):
     @property
     def refuses_imu(self) -> bool:
         """As Odometry's, also after vision continues without the IMU."""
-        return super().refuses_imu or (self._rig.imu is not None and self._vision.imu is None)
+        return super().refuses_imu or (self._rig.imu is not None and self.vision.imu is None)
 
     def _first_mode(self) -> Mode:
         rig = self._rig
         self._tracker = MonocularTracker(rig.camera, rig.settings.tracker, self._points_in_camera)
         imu = None if rig.imu is None else ImuInputs(rig, rig.imu, self._samples, self._clock)
-        self._vision = MonocularMode(rig, imu)
+        self.vision = MonocularMode(rig, imu)
         self._by_map = None if imu is None else MapStart(rig, imu)
-        return self._vision
+        return self.vision
 
     @property
     def _blind(self) -> MonocularWindow | None:
@@ -410,7 +415,7 @@ class MonocularOdometry(Odometry):
         """(N, 3) tracked points in the camera of the frame before, NaN where unknown."""
         if isinstance(self._mode, WindowMode) and isinstance(self._mode.window, MonocularWindow):
             return self._mode.window.points_in_camera(ids)
-        return self._vision.points_in_camera(ids)
+        return self.vision.points_in_camera(ids)
 
 
 class WheelOdometry(Odometry):
