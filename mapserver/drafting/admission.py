@@ -165,7 +165,7 @@ def _unconfirmed(checks: CheckResults, gyro_s: float | None) -> dict[str, str]:
 
 
 def with_further_views(result: CheckedRecording, recording: Recording) -> CheckedRecording:
-    """Add the findings of a rig's views but the first. RecordingError if a decisive check of one failed, or a mounting is wrong."""
+    """Add the findings of a rig's cameras but the first. RecordingError if a decisive check of one failed, or a mounting is wrong."""
     beside = further_findings(recording)
     _refuse(recording, beside)
     return replace(result, findings=[*result.findings, *beside])

@@ -46,7 +46,7 @@ _HELD_OUT = 2 * PROBES  # every second one has a say in the landmarks for robots
 
 @dataclass(frozen=True, slots=True)
 class ProbedFrame:
-    """A frame of a surveyed recording, or one of a rig's other views: its number among the selected ones, its camera and features.
+    """A frame of a surveyed recording, or one by a rig's other cameras: its number among the selected ones, its camera and features.
 
     is_held_out: True if the build did not use it; else an end of the drive that is a keyframe. view: its number.
     """
@@ -72,7 +72,7 @@ class JudgedSession(NamedTuple):
     name: str = ""
 
     def asked(self, recordings: int) -> list[ProbedFrame]:
-        """Return the frames whose views get landmarks: every second held-out one of one of so many recordings, and both ends."""
+        """Return the frames for which landmarks are chosen: every second held-out one of one of so many recordings, and both ends."""
         ends = {frame.number for frame in (*self.probed[:1], *self.probed[-1:])}
         return [*self._held_out(recordings, 1), *(frame for frame in self.probed if frame.number in ends)]
 
@@ -82,7 +82,7 @@ class JudgedSession(NamedTuple):
         return [frame for frame in self._held_out(recordings, 0) if frame.number not in asked]
 
     def _held_out(self, recordings: int, first: int) -> list[ProbedFrame]:
-        """Return all views of every second held-out frame of one of so many recordings."""
+        """Return the images of every second held-out frame of one of so many recordings."""
         numbers = list(dict.fromkeys(frame.number for frame in self.probed if frame.is_held_out))
         chosen = set(numbers[::recordings][first::2])
         return [frame for frame in self.probed if frame.number in chosen]

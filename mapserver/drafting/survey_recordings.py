@@ -236,7 +236,7 @@ class BegunSurvey:
     def __init__(
         self, whole: Recording, indices: NDArray[np.int64], settings: SurveySettings, tools: SurveyTools
     ) -> None:
-        """whole: with all views of its rig, of which the calibration concerns the first. indices (F,): of the selected frames."""
+        """whole: with all cameras of its rig, of which the calibration concerns the first. indices (F,): of the selected frames."""
         self._whole, self._indices, self._settings, self._tools = whole, indices, settings, tools
         self._made: tuple[RigCalibration, AdjustedChain] | None = None
 

@@ -1,9 +1,9 @@
 """Choice of the landmarks for robots: those best for localization, within a budget per metre of path. Pure.
 
-A survey has many more landmarks than a robot needs. Every keyframe represents future views of robots: its picture is divided into bins, and
-a landmark's gain in a bin shrinks with the number already there, so that they are spread over the picture and over near and far. Every view
-gets the landmarks for a certain fix before any gets more: at the end of a drive few keyframes see landmarks that others do not. Landmarks
-seen often, from many directions, and with small uncertainty count more, because they will be seen again.
+A survey has many more landmarks than a robot needs. Every keyframe stands for what robots will see there: its picture is divided into bins,
+and a landmark's gain in a bin shrinks with the number already there, so that they are spread over the picture and over near and far. Every
+view gets the landmarks for a certain fix before any gets more: at the end of a drive few keyframes see landmarks that others do not.
+Landmarks seen often, from many directions, and with small uncertainty count more, because they will be seen again.
 """
 
 from collections.abc import Sequence
@@ -146,7 +146,7 @@ def _weights(survey: SurveyMap, map_from_cam: Array) -> Array:
     """Return (N,) weights: probability that a landmark is seen again, times its information.
 
     The share of looks in which later surveys saw it, with some looks at the rate of all by Laplace's rule for n - 1 repeated
-    observations; up to twice that for views 20 degrees apart; less the more pixels its own uncertainty spans.
+    observations; up to twice that for directions 20 degrees apart; less the more pixels its own uncertainty spans.
     """
     landmark, count = survey.obs_landmark, len(survey.landmark_ids)
     seen = np.bincount(landmark, minlength=count)

@@ -259,7 +259,7 @@ def thinning(count: int, most: int) -> NDArray[np.int64]:
 
 
 def missing_directions(map_from_cam: Array) -> list[LiveMissing]:
-    """Return headings without views, although keyframes (K, 4, 4) passed the other way; by square, as in `quality.directions`."""
+    """Return headings without pictures, although keyframes (K, 4, 4) passed the other way; by square, as in `quality.directions`."""
     cells_of = np.floor(map_from_cam[:, :2, 3] / COVERAGE_CELL_M).astype(np.int64)
     cells = {(x, y): map_from_cam[(cells_of == (x, y)).all(axis=1)] for x, y in np.unique(cells_of, axis=0).tolist()}
     found = []

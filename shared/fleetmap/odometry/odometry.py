@@ -40,7 +40,7 @@ class Odometry:
         stereo_settings: StereoSettings | None = None,
         others: Sequence[MountedCamera] = (),
     ) -> None:
-        """others: cameras of further views, see `follow`."""
+        """others: further cameras, see `follow`."""
         cam_from_body, base_from_body = se3_inverse(body_from_cam), calibration.base_from_body
         mounted = (MountedCamera(camera, body_from_cam), *others)
         self._rig = OdometryRig(

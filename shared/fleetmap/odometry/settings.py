@@ -85,10 +85,10 @@ class StartSettings(Section, frozen=True):
 class MonocularSettings(Section, frozen=True):
     """Visual odometry of one camera, and the initialization of its scale by the IMU."""
 
-    first_depth: float = 5.0  # the unit of length: assumed median depth of the points common to the first two views
-    first_parallax_px: float = 18.0  # median image motion between the first two views
-    first_min_points: int = 40  # common to the first two views
-    min_angle_deg: float = 1.0  # median angle between the rays of the first two views
+    first_depth: float = 5.0  # the unit of length: assumed median depth of the points common to the first two frames
+    first_parallax_px: float = 18.0  # median image motion between the first two frames
+    first_min_points: int = 40  # common to the first two frames
+    min_angle_deg: float = 1.0  # median angle between the rays of the first two frames
     point_angle_deg: float = 0.6  # between two rays that triangulate a point
     view_parallax_px: float = 14.0  # median image motion that makes a new view
     view_overlap: float = 0.75  # share of the last view's points below which a new view is made
@@ -97,9 +97,9 @@ class MonocularSettings(Section, frozen=True):
     max_error_px: float = 2.5  # of an inlier
     min_points: int = 15  # that must locate a frame
     drift_share: float = 0.03  # growth of the covariance, as a share of the way
-    sample_interval_s: float = 0.2  # between the views that are aligned with the IMU
-    metric_samples: int = 10  # such views that the scale needs
-    metric_max_samples: int = 30  # such views used at most
+    sample_interval_s: float = 0.2  # between the frames that are aligned with the IMU
+    metric_samples: int = 10  # such frames that the scale needs
+    metric_max_samples: int = 30  # such frames used at most
     max_scale_sigma_share: float = 0.08  # relative sigma of the scale above which the start waits for more motion
     still_px: float = 0.3  # median image motion below which the image stands still
 

@@ -92,7 +92,7 @@ def pnp_with_rotation(
 ) -> PnpResult | None:
     """As `ransac_pnp` with a nearly known rotation (from the IMU).
 
-    One correspondence proposes the translation. Needs depth in both views. Finds the pose among far more wrong matches
+    One correspondence proposes the translation. Needs depth in both images. Finds the pose among far more wrong matches
     than three points can; none below min_inliers.
     """
     rotation = np.ascontiguousarray(cam_from_source_rotation)

@@ -27,8 +27,8 @@ _ROTATION_OFF = 0.02  # as of a quaternion whose length is 1 % off
 
 @dataclass(frozen=True)
 class RecordingParts:
-    """Parts read by a format, input of `finalize`. The name is the path's unless given. others: numbers of the calibration's cameras of
-    further views, with images."""
+    """Parts read by a format, input of `finalize`. The name is the path's unless given. others: numbers of the calibration's cameras
+    beside the first one or pair, with images."""
 
     path: Path
     format: str
@@ -138,9 +138,9 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
 
 def _check_depths(parts: RecordingParts) -> None:
     """Raise CalibrationError for a camera of another view that should have depth and has none."""
-    views = parts.frames.others if isinstance(parts.frames, SeriesFrames) else ()
+    others = parts.frames.others if isinstance(parts.frames, SeriesFrames) else ()
     firsts = [number for number in parts.others if parts.calibration.cameras[number].has_depth]
-    if len(firsts) > sum(view.depth is not None for view in views):
+    if len(firsts) > sum(other.depth is not None for other in others):
         names = " and ".join(f"cam{number} (--topic cam{number}_depth=/NAME)" for number in firsts)
         raise CalibrationError(
             f"{parts.path}: the calibration says has_depth of {names}, and not all of these have depth images; name the topic, or take "

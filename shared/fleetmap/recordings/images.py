@@ -166,7 +166,7 @@ class StoredImage:
 class StoredFrame:
     """One moment of the rig with its images as stored.
 
-    Depth is registered to left, in mm if whole numbers, else m. others: of the rig's other views, None for one without images.
+    Depth is registered to left, in mm if whole numbers, else m. others: of the rig's other cameras, None for one without images.
     """
 
     stamp_ns: int

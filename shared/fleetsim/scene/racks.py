@@ -27,7 +27,7 @@ class RackMaker:
             self._add_goods(builder, Slot(row, bay, level))
 
     def add_plain_bay(self, builder: FaceBuilder, row: int, bay: int) -> None:
-        """Add a bay for distant views: one block of cartons per slot, beams, posts."""
+        """Add a bay to be seen from afar: one block of cartons per slot, beams, posts."""
         layout, textures = self._layout, self._textures
         x, y = layout.bay_x_m(bay), layout.row_y_m(row)
         depth = layout.rack_depth_m / 2

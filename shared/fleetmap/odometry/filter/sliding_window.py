@@ -25,8 +25,8 @@ _LEAST_TAKEN, _JUDGED_TRACKS, _JUDGED_UPDATES = 0.2, 10, 3
 class OdometryRig:
     """The rectified camera on its body that the odometry follows, and the calibration of the other sensors.
 
-    body_from_cam, cam_from_body and base_from_body are (4, 4); imu is None for a rig without noise figures. mounted: the cameras of all
-    views, of which this one has the number `followed`.
+    body_from_cam, cam_from_body and base_from_body are (4, 4); imu is None for a rig without noise figures. mounted: all cameras of
+    the rig, of which this one has the number `followed`.
     """
 
     camera: StereoCamera

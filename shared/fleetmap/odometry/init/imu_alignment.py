@@ -20,7 +20,7 @@ _MAX_BIAS_SIGMAS = 6.0  # a larger accelerometer bias indicates a wrong fit
 
 @dataclass(frozen=True, slots=True)
 class VisualMotion:
-    """K views in axes of vision: rotations (K, 3, 3) vision_from_body, positions (K, 3) positions_m + scale * unscaled.
+    """K frames in axes of vision: rotations (K, 3, 3) vision_from_body, positions (K, 3) positions_m + scale * unscaled.
 
     unscaled (K, 3) is None if vision is metric. Sigmas are those of one interval's position and velocity;
     gravity_weights are those of the first, linear step.

@@ -62,14 +62,14 @@ class MonocularWindow(SlidingWindow):
             seen = [(held[c], p) for c, p in self._sightings.get(track_id, []) if c in held]
             if len(seen) < 2:
                 continue
-            views, pixels = np.array([k for k, _ in seen], np.int64), np.array([p for _, p in seen])
+            frames, pixels = np.array([k for k, _ in seen], np.int64), np.array([p for _, p in seen])
             rays = np.column_stack([(pixels[[0, -1], :2] - lens[1:3]) / lens[0], np.ones(2)])
             rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-            if (rotations[views[0]] @ rays[0]) @ (rotations[views[-1]] @ rays[1]) > max_cosine:
+            if (rotations[frames[0]] @ rays[0]) @ (rotations[frames[-1]] @ rays[1]) > max_cosine:
                 continue
-            point = positions[views[-1]] + self.scene_depth_m * rotations[views[-1]] @ rays[1]
+            point = positions[frames[-1]] + self.scene_depth_m * rotations[frames[-1]] @ rays[1]
             out[n] = core.triangulate(
-                odom_from_cam, views, pixels, lenses, 1.0 / settings.filter.pixel_sigma_px, 1.0, point
+                odom_from_cam, frames, pixels, lenses, 1.0 / settings.filter.pixel_sigma_px, 1.0, point
             )
         points = transform_points(se3_inverse(odom_from_cam[-1]), out)
         with np.errstate(invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Relative motion of two views of one camera up to scale, and the points that both see."""
+"""Relative motion of two images of one camera up to scale, and the points that both see."""
 
 from dataclasses import dataclass
 

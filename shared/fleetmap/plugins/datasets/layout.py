@@ -62,7 +62,7 @@ class FileReader:
 def rig_frames(
     root: Path, log: ReadLog, cameras: Sequence[ImageFiles], calibration: RigCalibration
 ) -> tuple[RigCalibration, SeriesFrames[Path]]:
-    """The calibration in the order of the views, and the frames of all cameras (see `rig_images`); CalibrationError for more cameras than
+    """The calibration in the order of a rig, and the frames of all cameras (see `rig_images`); CalibrationError for more cameras than
     described."""
     described = len(calibration.cameras)
     if described < len(cameras):

@@ -218,7 +218,7 @@ def assemble(
     elif depth is not None:
         left, depth = pair_images(left, depth, log, DEPTH_TOLERANCE_NS)
     calibration, described = calibrate(imu_frame)
-    views = tuple[ViewSeries[Source], ...]()
+    others = tuple[ViewSeries[Source], ...]()
     if depth is None and len(calibration.cameras) > 1:
         read = {"left": left, "right": right}
         cameras, depths = {}, {}
@@ -228,7 +228,7 @@ def assemble(
                 cameras[n] = f"{role} ({roles[role][0].channel.topic})", images
                 if calibration.cameras[n].has_depth and f"{role}_depth" in roles:
                     depths[n] = _images(roles[f"{role}_depth"], f"depth images of cam{n}", log)
-        calibration, (left, right, _), views = rig_images(calibration, cameras, log, depths)
+        calibration, (left, right, _), others = rig_images(calibration, cameras, log, depths)
     elif right is not None:
         left, right = pair_images(left, right, log)
     if depth is not None and (beside := [role for role in CAMERA_ROLES[2:] if role in roles]):
@@ -244,7 +244,7 @@ def assemble(
         if stream.damaged and not isinstance(stream, ImageStream):
             what = f"{stream.channel.topic}: damaged messages"
             log.note(what, f"{stream.damaged} left out, {len(stream.messages)} were found")
-    frames = SeriesFrames(MessageReader(opener, container, log.files), left, right, depth, others=views)
+    frames = SeriesFrames(MessageReader(opener, container, log.files), left, right, depth, others=others)
     return image_parts(container.path, "", calibration, frames, name=container.name, **sensors)
 
 
