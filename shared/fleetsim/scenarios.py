@@ -158,7 +158,7 @@ def _marker_loop() -> Scenario:
     """Distances between its two markers give the scale of a survey."""
     loop = _small_loop()
     (x_m, end_m), (y0, y1) = (0.02, loop.layout.length_m - 0.02), (loop.layout.aisle_y_m(aisle) for aisle in (0, 1))
-    markers = ((1, end_m, y0 - 1.0, 1.0, pi), (2, x_m, y1 + 1.0, 1.0, 0.0))
+    markers = ((1, end_m, y0 - 0.6, 1.0, pi), (2, x_m, y1 + 0.6, 1.0, 0.0))  # beside the pallets
     layout = msgspec.structs.replace(loop.layout, markers=markers)
     return replace(loop, description="the small loop with a marker at each end", layout=layout)
 

@@ -31,6 +31,9 @@ KINDS = {
     "moved, signs at the ends": ("marked-ends", 2.0, 10.0),
 }
 SIZE_M, NUMBER, IN_TIME_S = 0.2, 1, 1.0
+_PAINTED_EVERY = 8  # frames while the robot knows its place: half a second, as the plug-in looks
+
+_GREY = np.full((48, 64), 120, np.uint8)
 
 
 @dataclass
@@ -42,16 +45,20 @@ class Start:
     source: MarkerPriors
     rng: np.random.Generator
     named: str = ""
+    is_known: bool = False
     estimates: list[Estimate] = field(default_factory=list)
 
     def priors(self, frame: int) -> list[PositionPrior]:
         """What the plug-in tells by the painted picture of a frame."""
+        if frame % _PAINTED_EVERY and self.is_known:
+            return self.source.priors(RectifiedFrame(self.session.stamps_ns[frame], _GREY, None, None))
         map_from_cam = self.session.map_from_body[frame] @ self.session.body_from_cam
         picture = painted(self.session.camera, map_from_cam, {NUMBER: self.map_from_marker}, SIZE_M, self.rng)
         return self.source.priors(RectifiedFrame(self.session.stamps_ns[frame], picture, None, None))
 
     def judge(self, estimate: Estimate) -> bool:
         self.named = self.named or self.source.judge(estimate)
+        self.is_known = estimate.status is Status.TRACKING
         return False
 
     @property
