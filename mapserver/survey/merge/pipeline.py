@@ -102,10 +102,8 @@ def extend(
     change, moved_keyframes, moved_landmarks = what_changes(
         base, survey, posed, joint, gone, settings, anchored=anchored, limits=limits
     )
-    frozen = limits.freezes(change.map_from_cam[:, :3, 3])
-    result = _with_frames(
-        merged(base, change, found, posed.images, settings.sessions.new_place_landmarks, frozen), survey, joint
-    )
+    frozen, least = limits.freezes(change.map_from_cam[:, :3, 3]), settings.sessions.new_place_landmarks
+    result = _with_frames(merged(base, change, found, posed.images, least, frozen), survey, joint)
     fresh = int((change.added_rows < 0).sum())
     counts = Counts(
         fixes=test.tried,
