@@ -122,15 +122,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         stack.enter_context(gc_frozen())
         maps, first, caches, server = _local_map(run, site) if bus is None else _server_map(run, address, bus, outbox)
         keeps_replay = server is not None and not is_alone and run.replays != "off"
-        robot = Robot(
-            calibration,
-            rectifier,
-            config.localizer,
-            run.trial,
-            time.thread_time,
-            keeps_replay=keeps_replay,
-            image_priors=image_priors_of(config, rectifier.mounted[0], calibration.base_from_body),
-        )
+        robot = _new_robot(config, calibration, rectifier, keeps_replay=keeps_replay)
         if prior is not None:
             robot.localizer.handle_prior(prior)
         publisher = _opened_publisher(stack, config, address, None if is_alone else bus, calibration, intake)
@@ -160,6 +152,20 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             building=building,
             drives=None if server is None else server.drives,
         )
+
+
+def _new_robot(
+    config: LocclientConfig, calibration: RigCalibration, rectifier: Rectifier, *, keeps_replay: bool
+) -> Robot:
+    return Robot(
+        calibration,
+        rectifier,
+        config.localizer,
+        config.run.trial,
+        time.thread_time,
+        keeps_replay=keeps_replay,
+        image_priors=image_priors_of(config, rectifier.mounted[0], calibration.base_from_body),
+    )
 
 
 def _opened_outbox(file: Path, max_bytes: int) -> Outbox:

@@ -13,7 +13,7 @@ from fleetmap.odometry import WheelOdometry
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
-from fleetmap.sensors.samples import PositionPrior
+from fleetmap.sensors.samples import PositionPrior, WheelSample
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
@@ -174,18 +174,7 @@ class Robot:
 
     def handle(self, bundle: SensorBundle) -> Outcome | None:
         """Return results of a bundle with a frame; None without one that the localizer uses. RecordingError for unreadable images."""
-        self.localizer.handle_imu(bundle.imu)
-        if bundle.wheel and self._wheels_fault and not self._wheels_unused:
-            self._wheels_unused = {Flag.WHEELS_UNMOUNTED: f"the wheels are left out: {self._wheels_fault}"}
-        is_bad = self._wheels.is_doubted or self._wheels.is_refused or self._wheels_fault
-        wheel = [] if is_bad else bundle.wheel
-        self.localizer.handle_wheel(wheel)
-        if self.ring is not None:
-            self.ring.handle_samples(replace(bundle, wheel=wheel))
-        if bundle.forget:
-            self.localizer.forget_pose()
-        for prior in bundle.priors:
-            self.localizer.handle_prior(prior)
+        wheel = self._take_samples(bundle)
         if bundle.frame is None:
             return None
         begun_s = self._clock_s()
@@ -240,6 +229,22 @@ class Robot:
             estimate, published, cpu_s, stage_s, context, dock_error_m, speed_mps, is_covered,
             {**self._left_out(), **refused, **bundle.left_out}, self._load.dropped_share,
         )  # fmt: skip
+
+    def _take_samples(self, bundle: SensorBundle) -> Sequence[WheelSample]:
+        """Pass on what arrived beside the frame, and return the samples of wheels that may be used."""
+        self.localizer.handle_imu(bundle.imu)
+        if bundle.wheel and self._wheels_fault and not self._wheels_unused:
+            self._wheels_unused = {Flag.WHEELS_UNMOUNTED: f"the wheels are left out: {self._wheels_fault}"}
+        is_bad = self._wheels.is_doubted or self._wheels.is_refused or self._wheels_fault
+        wheel = [] if is_bad else bundle.wheel
+        self.localizer.handle_wheel(wheel)
+        if self.ring is not None:
+            self.ring.handle_samples(replace(bundle, wheel=wheel))
+        if bundle.forget:
+            self.localizer.forget_pose()
+        for prior in bundle.priors:
+            self.localizer.handle_prior(prior)
+        return wheel
 
     def _left_out(self) -> dict[Flag, str]:
         odometry = self.localizer.perception.odometry

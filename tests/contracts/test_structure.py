@@ -1,6 +1,7 @@
-"""No module of the project imports itself by way of others."""
+"""No module imports itself by way of others, no function is longer than a screen, and features keep to their rooms."""
 
 import ast
+import re
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
@@ -15,6 +16,8 @@ PACKAGES = {
     "mapserver": REPOSITORY / "mapserver",
     "locclient": REPOSITORY / "locclient",
 }
+
+_LONGEST_FUNCTION = 60  # lines
 
 
 @cache
@@ -51,3 +54,27 @@ def test_nothing_imports_itself_by_way_of_others() -> None:
         TopologicalSorter({module: _imports(module, path) for module, path in _modules().items()}).prepare()
     except CycleError as error:
         pytest.fail(" -> ".join(error.args[1]))
+
+
+def test_no_function_is_longer_than_a_screen() -> None:
+    functions = [
+        (f"{module}.{node.name}", node.end_lineno - node.lineno + 1)
+        for module, path in _modules().items()
+        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and node.end_lineno
+    ]
+    assert [function for function in functions if function[1] > _LONGEST_FUNCTION] == []
+
+
+@pytest.mark.parametrize(
+    ("word", "rooms", "files"),
+    [("views", ("sensors", "api", "dashboard"), 42), ("floors?", ("floor_plan", "api", "dashboard"), 35)],
+)
+def test_a_feature_is_mentioned_in_few_files_outside_its_rooms(word: str, rooms: tuple[str, ...], files: int) -> None:
+    """The aim for views is 25 files: a number here only becomes smaller. Rounding down is no floor."""
+    outside = [
+        module
+        for module, path in _modules().items()
+        if not {*module.split(".")} & {*rooms} and re.search(rf"(?<!np\.|th\.)\b{word}\b", path.read_text("utf-8"))
+    ]
+    assert len(outside) <= files, outside
