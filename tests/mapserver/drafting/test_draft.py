@@ -74,7 +74,7 @@ def done(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_the_report_has_the_stable_keys_with_their_meanings(done: Path) -> None:
     """Against the files that the same build left, counted independently."""
     report = json.loads((done / "r.json").read_text())
-    assert [key for key in report if key in KEYS] == KEYS
+    assert [key for key in KEYS if key in report] == KEYS
     positions = read_tum(done / "t.tum")[:, 1:4]
     assert len(positions) == report["frames"] == FRAMES
     assert report["recordings"] == ["walk"]

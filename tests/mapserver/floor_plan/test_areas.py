@@ -138,7 +138,7 @@ def test_what_two_polygons_of_an_area_share_is_inside(turned: int) -> None:
         assert ((cells == 100) >= inside).all()
         assert (cells[22:38, 22:38] == 0).all(), "but for cells at its edge the hole is free"
         points = np.c_[x.ravel(), y.ravel(), np.full(x.size, 7.0)]
-        np.testing.assert_array_equal(AreaCorrections(areas.areas, areas.areas)._is_due(points), inside.ravel())
+        np.testing.assert_array_equal(AreaCorrections(areas.areas, areas.areas).is_due(points), inside.ravel())
         lifts = read_lifts(json.dumps(areas.geojson("hall")).encode(), BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0))
         floor = Floor(
             FloorEntry(site="hall", level="0", height_m=0.0), BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0), lifts

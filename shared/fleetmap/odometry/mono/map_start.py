@@ -81,13 +81,13 @@ class MapStart:
     def _begin(self, stamp_ns: int, map_from_body: Array, cov_rot_trans: Array) -> None:
         """Begin at a fix, of any speed and with the biases that sensors may have."""
         settings, position_m = self._rig.settings, map_from_body[:3, 3]
-        from_pose = np.zeros((15, 6))
-        from_pose[:3, :3] = from_pose[6:9, 3:] = np.eye(3)
-        from_pose[6:9, :3] = skew(position_m)
+        jacobian = np.zeros((15, 6))
+        jacobian[:3, :3] = jacobian[6:9, 3:] = np.eye(3)
+        jacobian[6:9, :3] = skew(position_m)
         gyro, accel = settings.start.steady_gyro_mean_radps, settings.filter.initial_accel_bias_sigma_mps2
         own = np.diag(np.square(np.repeat([0.0, _ANY_SPEED_MPS, 0.0, gyro, accel], 3)))
         state = NavState(rotation=map_from_body[:3, :3], position_m=position_m)
-        self._start = InitialState(state, own + from_pose @ cov_rot_trans @ from_pose.T, stamp_ns)
+        self._start = InitialState(state, own + jacobian @ cov_rot_trans @ jacobian.T, stamp_ns)
         self._tested = 0
 
     def _with_gyro_bias(self, start: InitialState, stamp_ns: int, map_from_body: Array) -> InitialState:

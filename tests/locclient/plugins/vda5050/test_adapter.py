@@ -184,7 +184,7 @@ def test_each_floor_has_its_map_id() -> None:
     assert prior.floor == "hall-2"
     np.testing.assert_allclose(prior.map_from_base[:2, 3], [2.0, 1.0])
     assert adapter.ask("initializePosition", "b", mapId="hall-3", **given)["actionStatus"] == "FAILED"
-    here, other = Position(1.0, 2.0, 0.0), Position(1.0, 2.0, 0.0, floor="hall-2")
+    here, other = Position(1.0, 2.0, 0.0), Position(1.0, 2.0, 0.0, site="hall-2")
     assert here.away_from(other)[0] == np.inf
     adapter.map_id = "hall-2"  # as configured for the own site: it names one map
     assert "mobileRobotPosition" not in adapter.said()

@@ -17,9 +17,9 @@ from fleetmap.recordings import OpenOptions, Topics, open_recording
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from fleetmap.sources.intake import Intake
 from mapserver.cli import app
-from mapserver.commands import live as live_command
 from mapserver.config import survey_settings
 from mapserver.drafting.draft import BuildOptions
+from mapserver.plugins.live_surveys import command as live_command
 from mapserver.plugins.live_surveys import drives, live_survey
 from mapserver.plugins.live_surveys.drives import RecordedDrive, SensorDrive
 from mapserver.plugins.live_surveys.live_survey import LiveRequest, run_live
