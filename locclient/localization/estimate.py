@@ -39,7 +39,7 @@ class Estimate:
     distance between fix and prediction; innovation_m: metres, for fixes that were accepted or found at the predicted place. moved_m: for
     a pose confirmed with this frame, its distance from the pose that was claimed until fixes contradicted it, if beyond its
     covariance: one of the two was wrong. hypotheses: the competing poses while AMBIGUOUS. stage_s: seconds by stage, by the given
-    clock. calibration: its state by the map. views: faults of the images of each of the rig's views, NONE for good ones;
+    clock. calibration: its state by the map. view_causes: faults of the images of each view of the rig, NONE for good ones;
     view: the one of the last map query.
     floor: site whose map the pose and map_version are of, in a building; empty for the robot's own. Without a pose the last known one.
     """
@@ -61,7 +61,7 @@ class Estimate:
     innovation_m: float | None = None
     moved_m: float | None = None
     calibration: CalibrationState = NOT_JUDGED
-    views: tuple[Cause, ...] = (Cause.NONE,)
+    view_causes: tuple[Cause, ...] = (Cause.NONE,)
     view: int = 0
     floor: str = ""
 
@@ -73,12 +73,12 @@ class Estimate:
     @property
     def views_in_words(self) -> str:
         """Return the state of each view, and which one is compared with the map; empty for a rig of one view."""
-        if len(self.views) == 1:
+        if len(self.view_causes) == 1:
             return ""
-        used = (" (compared with the map)" if number == self.view else "" for number in range(len(self.views)))
+        used = (" (compared with the map)" if number == self.view else "" for number in range(len(self.view_causes)))
         return ", ".join(
             f"view {n}: {cause.value or 'good'}{use}"
-            for n, (cause, use) in enumerate(zip(self.views, used, strict=True))
+            for n, (cause, use) in enumerate(zip(self.view_causes, used, strict=True))
         )
 
 

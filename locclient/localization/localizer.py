@@ -183,7 +183,7 @@ class Localizer:
             stage_s={},
             cause=Cause.RIDING if is_riding else cause,
             image=percept.image,
-            views=percept.views,
+            view_causes=percept.view_causes,
             view=self._query.view,
             floor=tracker.floor,
             **result._asdict(),

@@ -154,7 +154,7 @@ class MapQuery:
             # The last one as long as it gives fixes, else the next one with good images.
             count, first = len(self._gates), self.view + bool(self.failed)
             order = [(first + k) % count for k in range(count)]
-            chosen = next((k for k in order if percept.views[k] not in UNUSABLE), self.view)
+            chosen = next((k for k in order if percept.view_causes[k] not in UNUSABLE), self.view)
             percept.query = QueryInput(view=chosen)
         self.view = view = percept.query.view
         frame = None if frame is None else frame.view(view) or frame

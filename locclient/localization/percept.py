@@ -29,7 +29,7 @@ class Percept:
 
     motions: of the odometry, from start frames of hypotheses. is_reversed: images of a pair or of two cameras are exchanged, or mirrored.
     calibration: its state by the map before this frame. query: of a map query that begins with this frame. image: of the view that the
-    odometry follows; views: faults of the images of each view. ride: motion in a lift, None for a robot without a building.
+    odometry follows; view_causes: faults of the images of each view. ride: motion in a lift, None for a robot without a building.
     """
 
     odometry: OdometryEstimate
@@ -38,7 +38,7 @@ class Percept:
     is_reversed: bool = False
     calibration: CalibrationState = NOT_JUDGED
     query: QueryInput | None = None
-    views: tuple[Cause, ...] = (Cause.NONE,)
+    view_causes: tuple[Cause, ...] = (Cause.NONE,)
     ride: Ride | None = None
 
     @property

@@ -88,7 +88,10 @@ class Perception:
             image = replace(image, cause=self._images[number].judge_depth(odometry.scene_depth_m))
         self.stage_s = {"image_quality": judged_s - begun_s, "odometry": self._clock() - judged_s}
         causes = [image.cause if k == number else each.cause for k, each in enumerate(images)]
-        last, self.percept = self.percept, Percept(odometry, image, self._motions(motions_from), views=tuple(causes))
+        last, self.percept = (
+            self.percept,
+            Percept(odometry, image, self._motions(motions_from), view_causes=tuple(causes)),
+        )
         if self.gauges:
             if self.odometry.refuses_imu or self.odometry.accelerometer_fault:
                 self.gauge.doubt()

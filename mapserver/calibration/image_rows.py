@@ -93,26 +93,26 @@ class Observations:
         sigmas[~np.isfinite(right).all(axis=1), 2:] = np.inf
         return cls(rig, axes, camera, left, right, np.where(np.isfinite(sigmas), sigmas, np.inf))
 
-    def measured(self, theta: Array, views: tuple[StereoCamera, StereoCamera] | None = None) -> Measured:
-        """Return what is seen in the image rectified by theta, at the scale of `views`."""
-        views = views or self.views(theta)
-        left = self._left_by_raw(theta, views)
-        return Measured(self._rows(theta, left, views), self._as_given(left))
+    def measured(self, theta: Array, pair: tuple[StereoCamera, StereoCamera] | None = None) -> Measured:
+        """Return what is seen in the image rectified by theta, at the scale of `pair`."""
+        pair = pair or self.pair(theta)
+        left = self._left_by_raw(theta, pair)
+        return Measured(self._rows(theta, left, pair), self._as_given(left))
 
-    def _rows(self, theta: Array, left: Array, views: tuple[StereoCamera, StereoCamera]) -> Array:
+    def _rows(self, theta: Array, left: Array, pair: tuple[StereoCamera, StereoCamera]) -> Array:
         """Return (M, 4) rows from those of `_left_by_raw`."""
         if self.axes.baseline_m == 0:
             return np.column_stack([left[..., 0], np.zeros_like(left[..., 0])])
         rig, (rect_from_right, _) = corrected_rig(self.calibration, self.axes, theta), right_camera(self.axes, theta)
-        right = _pixels(rig.cameras[1].ray_from_pixel(self.right_px) @ rect_from_right.T, views[1])
+        right = _pixels(rig.cameras[1].ray_from_pixel(self.right_px) @ rect_from_right.T, pair[1])
         return np.column_stack([left[..., 0], left[..., 0] - right])
 
-    def _left_by_raw(self, theta: Array, views: tuple[StereoCamera, StereoCamera]) -> Array:
+    def _left_by_raw(self, theta: Array, pair: tuple[StereoCamera, StereoCamera]) -> Array:
         """Return (M, 2, 3) the left image's rectified pixels, and their derivatives by the raw pixel's x and y."""
         camera = corrected_rig(self.calibration, self.axes, theta).cameras[0]
         steps = _STEP_PX * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
         rays = [camera.ray_from_pixel(self.left_px + step) @ self.axes.rect_from_cam[0].T for step in steps]
-        here, *beside = (_pixels(each, views[0]) for each in rays)
+        here, *beside = (_pixels(each, pair[0]) for each in rays)
         return np.stack([here, *((each - here) / _STEP_PX for each in beside)], axis=2)
 
     def _as_given(self, left: Array) -> Array:
@@ -126,9 +126,9 @@ class Observations:
     @cached_property
     def _given_by_raw(self) -> Array:
         none = np.zeros(UNKNOWNS)
-        return self._left_by_raw(none, self.views(none))[..., 1:]
+        return self._left_by_raw(none, self.pair(none))[..., 1:]
 
-    def views(self, theta: Array) -> tuple[StereoCamera, StereoCamera]:
+    def pair(self, theta: Array) -> tuple[StereoCamera, StereoCamera]:
         """Return the left and right pinholes, each with the focal length of its lens."""
         left = self.camera.focal_px * (1.0 + float(theta[INDEX[P.FOCAL]]))
         right = left * (1.0 + float(theta[INDEX[P.FOCAL_RATIO]]))
@@ -136,19 +136,19 @@ class Observations:
 
     def measured_slopes(self, theta: Array) -> Measured:
         """Return derivatives of `measured` by central differences at a fixed scale of the pinholes; zero if absent."""
-        views, count = self.views(theta), len(self.left_px)
+        pair, count = self.pair(theta), len(self.left_px)
         slopes, left = (
             Measured(np.zeros((count, 4, UNKNOWNS)), np.zeros((count, 2, 2, UNKNOWNS))),
-            self._left_by_raw(theta, views),
+            self._left_by_raw(theta, pair),
         )
         for column, size in _LENS_STEPS.items():
             step = size * (np.arange(UNKNOWNS) == column)
             if column in _LEFT_LENS:
-                more, less = self.measured(theta + step, views), self.measured(theta - step, views)
+                more, less = self.measured(theta + step, pair), self.measured(theta - step, pair)
                 change = more.rows - less.rows
                 slopes.as_given[..., column] = (more.as_given - less.as_given) / (2.0 * size)
             else:
-                change = self._rows(theta + step, left, views) - self._rows(theta - step, left, views)
+                change = self._rows(theta + step, left, pair) - self._rows(theta - step, left, pair)
             slopes.rows[..., column] = np.where(np.isfinite(change), change / (2.0 * size), 0.0)
         return slopes
 
@@ -198,10 +198,10 @@ def image_rows(
 
     scales (4,): factors on the rows' sigmas.
     """
-    view, views, positions = _view(seen, data, state, theta), seen.views(theta), state.map_from_body[:, :3, 3]
+    view, pair, positions = _view(seen, data, state, theta), seen.pair(theta), state.map_from_body[:, :3, 3]
     is_ahead, is_seen = view.in_left[:, 2] > _MIN_DEPTH_M, np.isfinite(seen.row_sigmas)
     usable = is_ahead[:, None] & is_seen
-    off = np.where(usable, measured.rows - _predicted(view, views), 0.0).reshape(
+    off = np.where(usable, measured.rows - _predicted(view, pair), 0.0).reshape(
         -1, 2, 2
     )  # of the pixel, of the pair's difference
     back = measured.as_given
@@ -210,11 +210,11 @@ def image_rows(
     residuals = np.where(is_ahead[:, None] | ~is_seen, errors * factor, _BEHIND_SIGMAS)
     if fixed is None:
         return ImageRows(residuals, np.zeros((0, 4, 3)), np.zeros((0, 4, UNKNOWNS)), positions)
-    by_left = _projection_slopes(view.in_left, views[0])
+    by_left = _projection_slopes(view.in_left, pair[0])
     by_cam = np.concatenate([by_left, np.zeros_like(by_left)], axis=1)
     by_calibration = fixed.slopes.rows.copy()
     if seen.axes.baseline_m > 0:
-        by_right = _projection_slopes(view.in_left - view.right_m, views[1])
+        by_right = _projection_slopes(view.in_left - view.right_m, pair[1])
         by_cam[:, 2:] = by_left - by_right
         by_calibration[:, 2:, _PLACE] -= np.einsum("mij,jk->mik", by_right, _right_place_slopes(seen.axes, theta))
     by_point = -np.einsum("mij,mjk->mik", by_cam, view.rect_from_map)
@@ -238,11 +238,11 @@ def _right_place_slopes(axes: RigAxes, theta: Array) -> Array:
     return np.stack(moved, axis=1) / 2e-6
 
 
-def _predicted(view: _View, views: tuple[StereoCamera, StereoCamera]) -> Array:
-    left = views[0].pixel_from_point(view.in_left)[:, :2]
+def _predicted(view: _View, pair: tuple[StereoCamera, StereoCamera]) -> Array:
+    left = pair[0].pixel_from_point(view.in_left)[:, :2]
     if not view.right_m.any():
         return np.column_stack([left, np.zeros_like(left)])
-    right = views[1].pixel_from_point(view.in_left - view.right_m)[:, :2]
+    right = pair[1].pixel_from_point(view.in_left - view.right_m)[:, :2]
     return np.column_stack([left, left - right])
 
 

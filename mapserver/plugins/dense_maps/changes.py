@@ -1,6 +1,6 @@
 """Changes between two versions of a site: surfels that only one of them has, at places seen by the other. Pure.
 
-A surfel of one version has changed if views of the other saw through its place, by the rule of the planner grid. Without views of
+A surfel of one version has changed if images of the other saw through its place, by the rule of the planner grid. Without images of
 the other version it counts as not seen, not as gone.
 """
 
@@ -24,7 +24,7 @@ CELL_M = 0.1
 APPEARED, VANISHED = "appeared", "vanished"
 _VOXEL_LEVEL = 3
 _VOXEL_M = EDGE_M * 2**_VOXEL_LEVEL
-_FINEST = 2  # coarser surfels come from distant views with inaccurate depth
+_FINEST = 2  # coarser surfels come from distant images with inaccurate depth
 _REACH_M = 0.15  # a surfel of the other version this near to a voxel's middle is the same surface
 _LEAST_AREA_M2 = 0.05  # of surfels in a patch: a face of a small carton
 _LEAST_SHARE = 0.3  # of a voxel's face that its surfels cover
@@ -153,7 +153,7 @@ def _only_in(one: Surfels, other: Surfels) -> _Voxels:
 
 
 def _verdicts(voxels: _Voxels, other: SeenSite) -> NDArray[np.uint8]:
-    """Return (M,) verdicts of the other version's views on the voxels."""
+    """Return (M,) verdicts of the other version's images on the voxels."""
     through, seen = np.zeros((2, len(voxels.points_map)))
     focal_px = 0.5 * _VIEW_PX / other.tangent
     centre_px = (_VIEW_PX - 1) / 2

@@ -84,14 +84,14 @@ def nearest_around(disparity_px: NDArray[np.float32], reach_px: int) -> NDArray[
     return np.asarray(cv2.dilate(np.fmax(disparity_px, np.float32(0.0)), block), np.float32)
 
 
-def floor_distance_m(views: Iterable[tuple[NDArray[np.float32], Array]], camera: StereoCamera) -> float | None:
-    """Return the distance of the ground below the camera, from disparities (H, W) and map_from_cam (4, 4) of some views.
+def floor_distance_m(images: Iterable[tuple[NDArray[np.float32], Array]], camera: StereoCamera) -> float | None:
+    """Return the distance of the ground below the camera, from disparities (H, W) and map_from_cam (4, 4) of some images.
 
-    Per view the most frequent height of near points below the camera; the median, if most views agree. None if
+    Per view the most frequent height of near points below the camera; the median, if most images agree. None if
     they do not: the camera is carried by hand, or the map is not level.
     """
     found = []
-    for disparity_px, map_from_cam in views:
+    for disparity_px, map_from_cam in images:
         v, u = np.nonzero(disparity_px > camera.focal_px * camera.baseline_m / _FLOOR_REACH_M)
         pixels = np.stack([u, v], axis=1).astype(np.float64)
         points = camera.point_from_pixel(pixels, disparity_px[v, u].astype(np.float64))

@@ -20,7 +20,7 @@ FAR_M = 40.0
 RADIUS_EDGES = 1.2  # of a disc: more than half of the diagonal of a voxel's face
 MOST_PIXELS = 1 << 21
 _RIM = 0.1  # of the width: discs with a centre this far outside may reach in
-_ALIKE_M, _ALIKE_RAD = 0.5, 0.3  # views this near to each other have the same exposure
+_ALIKE_M, _ALIKE_RAD = 0.5, 0.3  # images this near to each other have the same exposure
 _MOST_SQUARED = 1.0  # limit of the squared tangent of the angle to the axis for the lens model
 
 
@@ -49,7 +49,7 @@ def resized(camera: CameraCalibration, width_px: int) -> CameraCalibration:
 
 
 def expected_view(surfels: Surfels, camera: CameraCalibration, map_from_cam: Array) -> ExpectedView:
-    """Draw the image of `camera` at map_from_cam (4, 4), as bright as the survey's views. Unknown pixels are filled and marked.
+    """Draw the image of `camera` at map_from_cam (4, 4), as bright as the survey's images. Unknown pixels are filled and marked.
 
     Raises UsageError for a picture that is too large and for an invalid pose.
     """
@@ -133,7 +133,7 @@ def filled(picture: NDArray[np.float32], unknown: NDArray[np.bool_]) -> NDArray[
 
 
 def brightness(surfels: Surfels, map_from_cam: Array) -> float:
-    """Return the brightness of the drives' views near this place with this heading, as exposed by their camera."""
+    """Return the brightness of the drives' images near this place with this heading, as exposed by their camera."""
     if not len(surfels.exposures):
         return 1.0
     off_m = np.linalg.norm(surfels.exposures[:, :3] - map_from_cam[:3, 3], axis=1)

@@ -1,4 +1,4 @@
-"""Expected views of stored versions, one at a time, with the latest surfels in memory; and changes between two versions."""
+"""Expected images of stored versions, one at a time, with the latest surfels in memory; and changes between two versions."""
 
 import threading
 
@@ -56,7 +56,7 @@ class SurfelChanges:
         self._kept: dict[tuple[str, str], Changes] = {}
 
     def between(self, site: str, before: int, after: int) -> Changes:
-        """Return the changes from one version to another. StateError for one without surfels or with too many views."""
+        """Return the changes from one version to another. StateError for one without surfels or with too many images."""
         key = self._store.version(site, before).manifest_sha256, self._store.version(site, after).manifest_sha256
         with self._lock:
             if key not in self._kept:

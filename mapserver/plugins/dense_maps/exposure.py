@@ -1,4 +1,4 @@
-"""Brightness of each view of a drive, and vignetting of its lens, from points seen in several views."""
+"""Brightness of each view of a drive, and vignetting of its lens, from points seen in several images."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,14 +19,14 @@ class Sample(NamedTuple):
     """N observations of points: point and view (N,), squared tangent of the angle to the axis (N,), logarithm of the grey level (N,)."""
 
     points: NDArray[np.int64]
-    views: NDArray[np.int64]
+    images: NDArray[np.int64]
     squared: Array
     logs: Array
 
 
 @dataclass(frozen=True, slots=True)
 class Exposure:
-    """Logarithms of the views' brightness (K,) with mean 0, and coefficients (FALLOFF,) of the lens."""
+    """Logarithms of the images' brightness (K,) with mean 0, and coefficients (FALLOFF,) of the lens."""
 
     logs: Array
     falloff: Array
@@ -47,7 +47,7 @@ def lens_factor(squared: Array, falloff: Array) -> Array:
     return np.asarray(np.exp(_powers(squared) @ falloff))
 
 
-def estimate_exposure(samples: Sequence[Sample], views: int) -> Exposure:
+def estimate_exposure(samples: Sequence[Sample], images: int) -> Exposure:
     """Estimate by least squares on logarithms with Huber's weights; neutral for too few observations.
 
     Source: Goldman and Chen 2005, vignette and exposure calibration, with the response of the camera taken as linear.
@@ -55,16 +55,16 @@ def estimate_exposure(samples: Sequence[Sample], views: int) -> Exposure:
     every = Sample(*(np.concatenate([np.zeros(0), *(sample[i] for sample in samples)]) for i in range(4)))
     count = len(every.logs)
     if count < _MIN_SAMPLES:
-        return Exposure(np.zeros(views), np.zeros(FALLOFF))
+        return Exposure(np.zeros(images), np.zeros(FALLOFF))
     _, shown = np.unique(every.points, return_inverse=True)
-    # Columns of the lens and of the views; the points' own are eliminated by the Schur complement.
-    first = FALLOFF + views
-    columns = np.column_stack([np.tile(np.arange(FALLOFF), (count, 1)), FALLOFF + every.views]).astype(np.int32)
+    # Columns of the lens and of the images; the points' own are eliminated by the Schur complement.
+    first = FALLOFF + images
+    columns = np.column_stack([np.tile(np.arange(FALLOFF), (count, 1)), FALLOFF + every.images]).astype(np.int32)
     values = np.column_stack([_powers(every.squared), np.ones(count)])
     starts = np.arange(0, values.size + 1, FALLOFF + 1)
     design = scipy.sparse.csr_array((values.ravel(), columns.ravel(), starts), (count, first))
     points = scipy.sparse.csr_array((np.ones(count), (np.arange(count), shown)))
-    # Gauge: brighter views with darker points are equivalent. Unobserved values stay 0.
+    # Gauge: brighter images with darker points are equivalent. Unobserved values stay 0.
     prior = _PRIOR**2 * scipy.sparse.eye_array(first)
     weights, start = np.ones(count), np.zeros(first)
     for _ in range(_ROUNDS):

@@ -69,7 +69,7 @@ def refine(
     site: SiteName,
     store: StoreFolder,
     steps: Annotated[int, typer.Option(min=1, max=100_000, help="Steps of gradient descent, each on one view.")] = 300,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of the order of the views.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the order of the images.")] = 0,
     topic: TopicNames = None,
 ) -> None:
     """Write the surfels as in `map splats`, with colours, sizes and opacities fitted to the pictures of their recording."""
@@ -95,10 +95,10 @@ def refine(
             names = ", ".join(entry.name for entry in manifest.recordings)
             raise UsageError(f"{recording} is not of version {version} of site {site}, which was built from: {names}")
         own_rig = len(manifest.recordings) == 1
-        views = looks_of(opened.view(0), decode_archive(archive), surfels, own_rig=own_rig)
-    done = refined_by(Splats.of(surfels), views, steps, np.random.default_rng(seed))
+        images = looks_of(opened.view(0), decode_archive(archive), surfels, own_rig=own_rig)
+    done = refined_by(Splats.of(surfels), images, steps, np.random.default_rng(seed))
     said = (
-        f"{done.held_out} held-out views: PSNR {done.before.psnr_db:.2f} dB before, {done.after.psnr_db:.2f} dB after, "
+        f"{done.held_out} held-out images: PSNR {done.before.psnr_db:.2f} dB before, {done.after.psnr_db:.2f} dB after, "
         f"SSIM {done.before.ssim:.3f} before, {done.after.ssim:.3f} after"
     )
     if not done.is_better:
@@ -108,7 +108,7 @@ def refine(
         )
     data = splat_ply(done.splats)
     write_output(file, data)
-    typer.echo(f"{said}, from {done.learned} other views; {file} has {len(surfels)} splats, {len(data) / 1e6:.1f} MB")
+    typer.echo(f"{said}, from {done.learned} other images; {file} has {len(surfels)} splats, {len(data) / 1e6:.1f} MB")
 
 
 MAP = Group("Surfels of a version.", {"splats": splats, "changes": changes, "refine": refine})

@@ -42,7 +42,7 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class Likeness:
-    """Means over held-out views, on initially covered pixels; known: their share."""
+    """Means over held-out images, on initially covered pixels; known: their share."""
 
     psnr_db: float
     ssim: float
@@ -51,7 +51,7 @@ class Likeness:
 
 @dataclass(frozen=True, slots=True)
 class Refined:
-    """Splats after refinement, and the similarity of held-out views before and after."""
+    """Splats after refinement, and the similarity of held-out images before and after."""
 
     splats: Splats
     before: Likeness
@@ -61,12 +61,12 @@ class Refined:
 
     @property
     def is_better(self) -> bool:
-        """By the PSNR of held-out views."""
+        """By the PSNR of held-out images."""
         return self.after.psnr_db > self.before.psnr_db
 
 
 class Views(NamedTuple):
-    """Training views, and held-out views."""
+    """Training images, and held-out images."""
 
     learned: Sequence[Look]
     held_out: Sequence[Look]
@@ -121,7 +121,7 @@ def looks_of(recording: Recording, survey: SurveyMap, surfels: Surfels, *, own_r
 
 def refine(
     splats: Splats,
-    views: Views,
+    images: Views,
     steps: int,
     rng: np.random.Generator,
     renderer: Renderer = draw,
@@ -131,12 +131,12 @@ def refine(
 
     Source of the loss: Charbonnier et al. 1994; of not updating unseen splats: Mallick et al. 2024, Taming 3DGS.
     """
-    parameters, (learned, held_out) = parameters_of(splats), views
+    parameters, (learned, held_out) = parameters_of(splats), images
     known = [
         1.0 - renderer(splats, parameters, look.camera, look.map_from_cam).through > _MIN_KNOWN for look in held_out
     ]
     if not any(where.any() for where in known):
-        raise StateError("the held-out views show no surfels; choose the recording of this version")
+        raise StateError("the held-out images show no surfels; choose the recording of this version")
     before = _likeness(splats, parameters, held_out, known, renderer)
     low, high = bounds()
     mean, square, seen = np.zeros_like(parameters), np.zeros_like(parameters), np.zeros(len(parameters))

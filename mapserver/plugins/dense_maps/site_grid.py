@@ -1,4 +1,4 @@
-"""The grid of a site: views of each cell by surveys, tile by tile, and its occupancy for a robot of a given height."""
+"""The grid of a site: images of each cell by surveys, tile by tile, and its occupancy for a robot of a given height."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -15,8 +15,8 @@ from fleetmap.version_grid import FLOOR_M, HEIGHT_STEP_M, LOWEST_M, SLICE_M, SLI
 from mapserver.plugins.dense_maps.dense_stereo import BLOCK_PX
 
 _RANGE_CELLS = 160  # of a view
-# A view that hits a voxel counts as two that pass it, since rays also pass at its rim. An earlier state stays until two more views
-# contradict it, and is unknown until the deciding number: few views see into an emptied slot, and one night must suffice.
+# A view that hits a voxel counts as two that pass it, since rays also pass at its rim. An earlier state stays until two more images
+# contradict it, and is unknown until the deciding number: few images see into an emptied slot, and one night must suffice.
 HIT, OCCUPIED, FREE, AGAINST = 2, 4, 4, 2
 # A pixel's depth may belong to any point in the matched block, and its ray represents the pixels up to the next one.
 REACH_PX = (BLOCK_PX + core.GRID_RAY_STRIDE_PX) // 2
@@ -26,7 +26,7 @@ _SAME_STEPS = 10  # smaller differences of height are ignored
 
 @dataclass(frozen=True, slots=True)
 class SessionViews:
-    """Counts of the views of one recording, by tile: hits, passes, hidden (N, N, SLICES) and heights (N, N, 4).
+    """Counts of the images of one recording, by tile: hits, passes, hidden (N, N, SLICES) and heights (N, N, 4).
 
     before: earlier state. Hidden lies behind a newly appeared object: its depth may be unobservable.
     """
@@ -102,11 +102,11 @@ def _parts(corner: NDArray[np.int64], size: int) -> Iterator[_Part]:
             yield (x, y), tile, window  # type: ignore[misc]
 
 
-def updated(views: SessionViews) -> Tiles:
+def updated(images: SessionViews) -> Tiles:
     """Return the tiles updated by a session; unseen cells are unchanged, except behind new objects."""
-    tiles = dict(views.before)
-    for place, (hits, passes, hidden, heights) in views.tiles.items():
-        old = views.before.get(place, np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8))
+    tiles = dict(images.before)
+    for place, (hits, passes, hidden, heights) in images.tiles.items():
+        old = images.before.get(place, np.zeros((TILE_CELLS, TILE_CELLS, 4), np.uint8))
         was_occupied, was_free = (np.unpackbits(old[..., i, None], axis=-1, bitorder="little") > 0 for i in (0, 1))
         score = HIT * hits.astype(np.int16) - passes
         occupied = (score >= OCCUPIED) | (was_occupied & (score > -AGAINST))
@@ -114,7 +114,7 @@ def updated(views: SessionViews) -> Tiles:
         free = ~occupied & ((score <= -FREE) | (was_free & (score < AGAINST) & ~is_hidden))
         bits = [np.packbits(mask, axis=-1, bitorder="little")[..., 0] for mask in (occupied, free)]
         low, high = (_height(old[..., 2 + i], heights[..., 1 + 2 * i]) for i in (0, 1))
-        # An object seen there by a few views only has left no voxel.
+        # An object seen there by a few images only has left no voxel.
         levels = np.where(bits[0] > 0, np.log2(np.maximum(bits[0], 1)).astype(np.int64) + 1, 0)
         top = 1 + ((FLOOR_M + SLICE_M * levels - LOWEST_M) / HEIGHT_STEP_M).astype(np.uint8)
         tiles[place] = np.stack([*bits, np.minimum(low, top), np.minimum(high, top)], axis=-1)

@@ -43,7 +43,7 @@ class Surfels:
     """N discs in `map`: points_map (N, 3), unit normals (N, 3) towards the camera, level (N,) of their voxels, grey (N,).
 
     An edge of their voxels is EDGE_M times two to the power of the level. falloff: vignetting of the lens (see exposure), removed from
-    the greys. exposures (K, 7): positions, viewing directions and logarithms of the brightness of the drives' views.
+    the greys. exposures (K, 7): positions, viewing directions and logarithms of the brightness of the drives' images.
     """
 
     points_map: NDArray[np.float32]
@@ -139,8 +139,8 @@ class SurfelTiles:
             TileEntry(x=x, y=y, sha256=sha256_hex(tile.data), bytes=len(tile.data), landmarks=tile.surfels)
             for (x, y), tile in sorted(self.tiles.items())
         ]
-        views = tuple(tuple(row) for row in self.exposures[:_MOST_EXPOSURES].round(4).tolist())
-        index = SurfelIndex(falloff=self.falloff, exposures=views, tiles=tuple(entries))
+        images = tuple(tuple(row) for row in self.exposures[:_MOST_EXPOSURES].round(4).tolist())
+        index = SurfelIndex(falloff=self.falloff, exposures=images, tiles=tuple(entries))
         blobs = [self.tiles[place].data for place in sorted(self.tiles)]
         return [to_json(index, order="deterministic"), *blobs] if blobs else []
 

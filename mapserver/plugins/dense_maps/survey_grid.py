@@ -20,7 +20,7 @@ from mapserver.survey.stages import Survey
 from mapserver.survey.state import Keyframe
 
 _FLOOR_VIEWS = 15
-# Later views from the same place take an earlier one's part once they are as many as free a voxel for sure: what they disagree on has
+# Later images from the same place take an earlier one's part once they are as many as free a voxel for sure: what they disagree on has
 # changed meanwhile. Keyframes of one drive are further apart; ten degrees are an eighth of a usual lens's view.
 _ALIKE_M, _ALIKE_COSINE, _ENOUGH = 0.5, math.cos(math.radians(10.0)), FREE
 _NO_DEPTH = "one camera measures no depth; that needs a stereo pair or a depth camera"
@@ -77,7 +77,7 @@ class Grower(Protocol):
     """A product of densely matched keyframes, updated session by session."""
 
     def begin(self, session: MappedSession, some: Sequence[DepthView]) -> str | None:
-        """Begin a session, of which `some` views are spread over it; return the reason if it adds nothing, None if it adds its views."""
+        """Begin a session, of which `some` images are spread over it; return the reason if it adds nothing, None if it adds its images."""
 
     def add(self, view: DepthView) -> None:
         """Add a keyframe of the session."""

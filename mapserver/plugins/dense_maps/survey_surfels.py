@@ -34,7 +34,7 @@ from mapserver.survey.state import ImageStore
 
 _SEEN = 1
 _KEPT_STEP_PX = 4  # pixel step of the depths kept per view, to test for free space
-_BLOCK_M = 4.0  # surfels are judged by the views near their block
+_BLOCK_M = 4.0  # surfels are judged by the images near their block
 _HALO_M = 0.32  # around a tile, where finer surfels may replace its coarse ones: two of the coarsest voxels
 _OWN_LIGHT_M = 2.0
 _DARK, _MIN_ALIKE = 5, 50  # grey levels; common voxels needed to compare the exposure of two drives
@@ -64,7 +64,7 @@ class _Look(NamedTuple):
 class SurfelGrower:
     """The surfels of a site: a session removes those that it saw through, and its equally fine or finer ones replace old ones.
 
-    Memory holds one tile at a time; what is kept of the views lies in the image store.
+    Memory holds one tile at a time; what is kept of the images lies in the image store.
     """
 
     def __init__(self, before: SurfelTiles) -> None:
@@ -72,7 +72,7 @@ class SurfelGrower:
 
     def begin(self, session: MappedSession, some: Sequence[DepthView]) -> str | None:
         self._camera, self._looks = session.survey.state.rig.camera, list[_Look]()
-        self._seen: dict[_Place, list[int]] = {}  # by tile, the views that measured something in it or its halo
+        self._seen: dict[_Place, list[int]] = {}  # by tile, the images that measured something in it or its halo
         self._images: ImageStore = session.survey.odometry.keyframes[0].images
         return None
 
@@ -93,10 +93,10 @@ class SurfelGrower:
         self._looks.append(look)
 
     def end(self) -> None:
-        before, views = self.surfels, _Views(self._looks, self._camera)
-        exposure = self._exposure(views)
-        grown = {place: self._grown(place, views, exposure) for place in sorted(self._seen)}
-        old = {place: self._left(place, views) for place in before.tiles if views.near(place)}
+        before, images = self.surfels, _Images(self._looks, self._camera)
+        exposure = self._exposure(images)
+        grown = {place: self._grown(place, images, exposure) for place in sorted(self._seen)}
+        old = {place: self._left(place, images) for place in before.tiles if images.near(place)}
         shift = self._brightness_shift([(old[place], grown[place]) for place in sorted(old.keys() & grown.keys())])
         tiles = dict(before.tiles)
         for place in sorted({*old, *grown}):
@@ -111,8 +111,8 @@ class SurfelGrower:
             self._images.release()
         self.surfels = SurfelTiles(tiles, *self._light(before, exposure, shift))
 
-    def _exposure(self, views: "_Views") -> Exposure:
-        """Estimate the brightness of the views, by a raster of points of each that others see, of a long drive by fewer of each."""
+    def _exposure(self, images: "_Images") -> Exposure:
+        """Estimate the brightness of the images, by a raster of points of each that others see, of a long drive by fewer of each."""
         raster = [_points(look, self._camera, _SAMPLE_STEP).astype(np.float32) for look in self._looks]
         points_map = np.concatenate(raster)
         points_map = points_map[:: max(1, math.ceil(len(points_map) / _MOST_SAMPLED))]
@@ -120,8 +120,8 @@ class SurfelGrower:
         points_map, levels, samples = points_map[order], np.zeros(len(order), np.uint8), []
         last = np.array([self._camera.width_px, self._camera.height_px]) - 1
         for rows in blocks:
-            for number in views.seeing(points_map[rows]):
-                marks, pixels = core.look_at(points_map[rows], levels[rows], *views.depths(number))
+            for number in images.seeing(points_map[rows]):
+                marks, pixels = core.look_at(points_map[rows], levels[rows], *images.depths(number))
                 seen = np.flatnonzero(marks == _SEEN)
                 column, row = np.clip(pixels[seen].round().astype(np.int64), 0, last).T
                 greys = self._looks[number].picture[row, column].astype(np.float64)
@@ -133,8 +133,8 @@ class SurfelGrower:
             self._images.release()
         return estimate_exposure(samples, len(self._looks))
 
-    def _grown(self, place: _Place, views: "_Views", exposure: Exposure) -> Surfels:
-        """Return the new surfels of a tile and its halo, with colours that near views dominate, corrected for exposure and vignetting."""
+    def _grown(self, place: _Place, images: "_Images", exposure: Exposure) -> Surfels:
+        """Return the new surfels of a tile and its halo, with colours that near images dominate, corrected for exposure and vignetting."""
         low = np.array(place) * TILE_SIZE_M
         box, table = np.array([low - _HALO_M, low + TILE_SIZE_M + _HALO_M]), core.VoxelTable()
         for number in self._seen[place]:
@@ -144,7 +144,7 @@ class SurfelGrower:
         del table
         order, blocks = _blocks(points_map)
         new = Surfels(points_map, normals, levels, np.zeros_like(levels))[order]
-        sums = self._weighed(new, blocks, views, exposure)
+        sums = self._weighed(new, blocks, images, exposure)
         is_sure = HIT * np.maximum(sums[:, 0], seen[order]) - sums[:, 1] >= OCCUPIED
         new, sums = new[is_sure], sums[is_sure]
         finest = ~_known_finer(new, new, finer_by=1) & (sums[:, 3] > 0)
@@ -154,25 +154,25 @@ class SurfelGrower:
         self._images.release()
         return Surfels(*kept)
 
-    def _left(self, place: _Place, views: "_Views") -> Surfels:
+    def _left(self, place: _Place, images: "_Images") -> Surfels:
         """Return the earlier surfels of a tile but those that the session saw through."""
         old = self.surfels.surfels(place)
         order, blocks = _blocks(old.points_map)
         old = old[order]
-        sums = self._weighed(old, blocks, views, Exposure(np.zeros(len(self._looks)), np.zeros(len(NO_FALLOFF))))
+        sums = self._weighed(old, blocks, images, Exposure(np.zeros(len(self._looks)), np.zeros(len(NO_FALLOFF))))
         old = old[HIT * sums[:, 0] - sums[:, 1] > -AGAINST]
         kept: list[Any] = self._images.keep([old.points_map, old.normals, old.levels, old.greys])
         self._images.release()
         return Surfels(*kept)
 
-    def _weighed(self, surfels: Surfels, blocks: Sequence[slice], views: "_Views", exposure: Exposure) -> Array:
-        """Return (N, 4) the sums of `core.weigh` over all views; hits and passes are counted as in the planner grid."""
+    def _weighed(self, surfels: Surfels, blocks: Sequence[slice], images: "_Images", exposure: Exposure) -> Array:
+        """Return (N, 4) the sums of `core.weigh` over all images; hits and passes are counted as in the planner grid."""
         sums = np.zeros((len(surfels), 4))
         for rows in blocks:
             points_map, levels = surfels.points_map[rows], surfels.levels[rows]
-            for number in views.seeing(points_map):
+            for number in images.seeing(points_map):
                 light = self._looks[number].picture, exposure.falloff, float(exposure.logs[number])
-                core.weigh(points_map, levels, *(*views.depths(number), *light, sums[rows]))
+                core.weigh(points_map, levels, *(*images.depths(number), *light, sums[rows]))
         return sums
 
     def _brightness_shift(self, tiles: Sequence[tuple[Surfels, Surfels]]) -> float:
@@ -204,8 +204,8 @@ class SurfelGrower:
         return tuple(exposure.falloff.round(6).tolist()), np.concatenate([new, old])
 
 
-class _Views:
-    """Poses of the views, to find those that may see a block: near ones into whose pyramid it reaches."""
+class _Images:
+    """Poses of the images, to find those that may see a block: near ones into whose pyramid it reaches."""
 
     def __init__(self, looks: Sequence[_Look], camera: StereoCamera) -> None:
         self._looks, self._lens = looks, camera.lens
@@ -220,7 +220,7 @@ class _Views:
         return bool((off_tile_m(place, self._places) < MAX_RANGE_M).any())
 
     def seeing(self, points_map: NDArray[np.float32]) -> list[int]:
-        """Return the numbers of the views that may see some of these points (N, 3)."""
+        """Return the numbers of the images that may see some of these points (N, 3)."""
         low, high = points_map.min(axis=0).astype(np.float64), points_map.max(axis=0).astype(np.float64)
         middle, half = (low + high) / 2 - self._places, (high - low) / 2
         is_near = np.linalg.norm(np.maximum(np.abs(middle) - half, 0.0), axis=1) < MAX_RANGE_M

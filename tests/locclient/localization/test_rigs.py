@@ -80,7 +80,7 @@ def test_with_the_front_covered_all_along_the_rear_view_localises_it(rig: str) -
     west_bound = ((EAST_M - 1.0, Y_M), (WEST_M, Y_M))
     estimates = driven(west_bound, ALWAYS, has_rear=True, rig=rig)
     assert share(estimates) > 0.9
-    assert all(estimate.views == (Cause.DARK, Cause.NONE) for estimate in estimates)
+    assert all(estimate.view_causes == (Cause.DARK, Cause.NONE) for estimate in estimates)
     assert share(driven(west_bound, ALWAYS, has_rear=False)) == 0.0
 
 
@@ -137,7 +137,7 @@ def test_odometry_goes_on_with_the_other_pair_and_a_camera_comes_back(sensors: S
         assert odometry.status is not OdometryStatus.DEGRADED, time_s
         if odometry.previous_from_body is not None:
             moved = moved @ odometry.previous_from_body
-        views_of.append(estimate.views)
+        views_of.append(estimate.view_causes)
     truth = se3_inverse(Ride().map_from_body(0.0)) @ Ride().map_from_body(4.45)
     assert np.linalg.norm((moved - truth)[:3, 3]) < 0.03
     front, rear = ([views[k] is not Cause.NONE for views in views_of] for k in (0, 1))

@@ -1,4 +1,4 @@
-"""Visual odometry of one camera, up to scale: initialized from two views, refined over a window of views."""
+"""Visual odometry of one camera, up to scale: initialized from two keyframes, refined over a window of keyframes."""
 
 from dataclasses import dataclass, field
 
@@ -15,13 +15,13 @@ from fleetmap.sensors.rectification import StereoCamera
 Ids = NDArray[np.int64]
 _HUBER_SIGMAS = 2.5
 _ITERATIONS = 8
-# Points share the errors of their views: a resection's own sigma is too small by about this factor.
+# Points share the errors of their keyframes: a resection's own sigma is too small by about this factor.
 _CORRELATION = 3.0
 _LONGEST_WAIT = 60  # frames without a first pair before the search starts again from a later one
 
 
 @dataclass(frozen=True, slots=True)
-class View:
+class Keyframe:
     """One camera of the window: vision_from_cam (4, 4), its observed ids (N,) and their pixels (N, 2)."""
 
     frame_index: int
@@ -32,7 +32,7 @@ class View:
 
 @dataclass(frozen=True, slots=True)
 class VisualEstimate:
-    """Result of one frame: vision_from_cam, None before the first pair of views and after lost tracking.
+    """Result of one frame: vision_from_cam, None before the first pair of keyframes and after lost tracking.
 
     cov_rot_trans (6, 6) in vision axes. revised: earlier frames that are located only now, (frame index, vision_from_cam).
     lost: this frame has no link to earlier ones, and `vision` restarts. depth: median along the optical axis.
@@ -47,9 +47,9 @@ class VisualEstimate:
 
 @dataclass
 class _LocalMap:
-    """The window's views and their points, by track id; for tracks without a point, their vision_from_cam and pixels."""
+    """The window's keyframes and their points, by track id; for tracks without a point, their vision_from_cam and pixels."""
 
-    views: list[View] = field(default_factory=list)
+    keyframes: list[Keyframe] = field(default_factory=list)
     points: dict[int, Array] = field(default_factory=dict)
     first_seen: dict[int, tuple[Array, Array]] = field(default_factory=dict)
 
@@ -70,7 +70,7 @@ class VisualOdometry:
     @property
     def started(self) -> bool:
         """True if there are points to locate frames by."""
-        return bool(self._local_map.views)
+        return bool(self._local_map.keyframes)
 
     def points_in_camera(self, ids: Ids) -> Array:
         """(N, 3) points of these tracks in the last frame's camera, NaN where unknown."""
@@ -90,14 +90,14 @@ class VisualOdometry:
             self._local_map, self._waiting = _LocalMap(), [(frame_index, ids, pixels)]
             self._step = np.eye(4)
             return VisualEstimate(None, self._covariance, lost=True, depth=self.depth)
-        view = View(frame_index, located[0], ids, pixels)
-        self._place_new(view)
-        if self._is_new(view):
-            self._local_map.views.append(view)
+        keyframe = Keyframe(frame_index, located[0], ids, pixels)
+        self._place_new(keyframe)
+        if self._is_new(keyframe):
+            self._local_map.keyframes.append(keyframe)
             self._grow()
-            view = self._local_map.views[-1]
-        self._advance(view.vision_from_cam, located[1])
-        return VisualEstimate(view.vision_from_cam, self._covariance.copy(), depth=self.depth)
+            keyframe = self._local_map.keyframes[-1]
+        self._advance(keyframe.vision_from_cam, located[1])
+        return VisualEstimate(keyframe.vision_from_cam, self._covariance.copy(), depth=self.depth)
 
     def _advance(self, vision_from_cam: Array, cov: Array) -> None:
         self._step = se3_inverse(self._last) @ vision_from_cam
@@ -112,7 +112,7 @@ class VisualOdometry:
             self.depth = float(np.median(depths))
 
     def _seen_points(self, vision_from_cam: Array) -> Array:
-        newest = self._local_map.views[-1]
+        newest = self._local_map.keyframes[-1]
         known = [self._local_map.points[i] for i in newest.ids.tolist() if i in self._local_map.points]
         points = transform_points(se3_inverse(vision_from_cam), np.array(known).reshape(-1, 3))
         return points[points[:, 2] > 0]
@@ -150,8 +150,8 @@ class VisualOdometry:
         points = transform_points(vision_from_first, unit * found.points_a[found.inliers])
         self._local_map = _LocalMap(
             [
-                View(first[0], vision_from_first, first[1], first[2]),
-                View(last[0], vision_from_first @ se3_inverse(now_from_first), last[1], last[2]),
+                Keyframe(first[0], vision_from_first, first[1], first[2]),
+                Keyframe(last[0], vision_from_first @ se3_inverse(now_from_first), last[1], last[2]),
             ],
             dict(zip(ids[found.inliers].tolist(), points, strict=True)),
         )
@@ -162,42 +162,44 @@ class VisualOdometry:
             return None
         self._normalise(vision_from_first, placed)
         self._waiting = []
-        located = self._locate(last[1], last[2], self._local_map.views[-1].vision_from_cam)
+        located = self._locate(last[1], last[2], self._local_map.keyframes[-1].vision_from_cam)
         self._last = placed[-2][1] if len(placed) > 1 else vision_from_first
-        self._advance(self._local_map.views[-1].vision_from_cam, np.eye(6) * 1e-6 if located is None else located[1])
+        self._advance(
+            self._local_map.keyframes[-1].vision_from_cam, np.eye(6) * 1e-6 if located is None else located[1]
+        )
         return VisualEstimate(
-            self._local_map.views[-1].vision_from_cam,
+            self._local_map.keyframes[-1].vision_from_cam,
             self._covariance.copy(),
             revised=tuple(placed[:-1]),
             depth=self.depth,
         )
 
     def _place_between(self) -> list[tuple[int, Array]] | None:
-        """Locate all waiting frames by the points of the first and the last; None if one fails. Some become views.
+        """Locate all waiting frames by the points of the first and the last; None if one fails. Some become keyframes.
 
-        Twice, with an adjustment between: two views of a flat scene alone can leave the rotation between them off by many degrees.
+        Twice, with an adjustment between: two keyframes of a flat scene alone can leave the rotation between them off by many degrees.
         """
         between = self._located_between()
         if between is None:
             return None
         stride = max(1, -(-len(between) // (self._settings.window_views - 3)))
-        self._local_map.views[1:1] = between[stride // 2 :: stride]
+        self._local_map.keyframes[1:1] = between[stride // 2 :: stride]
         self._adjust(held=1)
-        first, last = self._local_map.views[0], self._local_map.views[-1]
+        first, last = self._local_map.keyframes[0], self._local_map.keyframes[-1]
         between = self._located_between()
         if between is None:
             return None
         return [(v.frame_index, v.vision_from_cam) for v in (first, *between, last)]
 
-    def _located_between(self) -> list[View] | None:
-        guess = self._local_map.views[0].vision_from_cam
+    def _located_between(self) -> list[Keyframe] | None:
+        guess = self._local_map.keyframes[0].vision_from_cam
         found = []
         for frame_index, ids, pixels in self._waiting[1:-1]:
             located = self._locate(ids, pixels, guess)
             if located is None:
                 return None
             guess = located[0]
-            found.append(View(frame_index, guess, ids, pixels))
+            found.append(Keyframe(frame_index, guess, ids, pixels))
         return found
 
     def _normalise(self, vision_from_first: Array, placed: list[tuple[int, Array]]) -> None:
@@ -212,8 +214,8 @@ class VisualOdometry:
 
         origin = vision_from_first[:3, 3]
         self._local_map.points = {i: origin + unit * (p - origin) for i, p in self._local_map.points.items()}
-        self._local_map.views = [
-            View(v.frame_index, scaled(v.vision_from_cam), v.ids, v.pixels) for v in self._local_map.views
+        self._local_map.keyframes = [
+            Keyframe(v.frame_index, scaled(v.vision_from_cam), v.ids, v.pixels) for v in self._local_map.keyframes
         ]
         placed[:] = [(number, scaled(there)) for number, there in placed]
 
@@ -235,37 +237,37 @@ class VisualOdometry:
             found = again if again is not None and again.inliers.sum() >= 0.4 * len(rows) else None
         return None if found is None else (_orthonormal(se3_inverse(found.cam_from_source)), found.cov_rot_trans)
 
-    def _is_new(self, view: View) -> bool:
-        s, last = self._settings, self._local_map.views[-1]
-        shared, a, b = np.intersect1d(last.ids, view.ids, return_indices=True)
+    def _is_new(self, keyframe: Keyframe) -> bool:
+        s, last = self._settings, self._local_map.keyframes[-1]
+        shared, a, b = np.intersect1d(last.ids, keyframe.ids, return_indices=True)
         if len(shared) < s.view_overlap * len(last.ids):
             return True
-        known = sum(i in self._local_map.points for i in view.ids.tolist())
-        wanted_px = s.view_parallax_px * (0.4 if known < 0.5 * len(view.ids) else 1.0)
-        return bool(np.median(np.linalg.norm(last.pixels[a] - view.pixels[b], axis=1)) > wanted_px)
+        known = sum(i in self._local_map.points for i in keyframe.ids.tolist())
+        wanted_px = s.view_parallax_px * (0.4 if known < 0.5 * len(keyframe.ids) else 1.0)
+        return bool(np.median(np.linalg.norm(last.pixels[a] - keyframe.pixels[b], axis=1)) > wanted_px)
 
     def _grow(self) -> None:
-        """Adjust the window and forget views and points that left it."""
+        """Adjust the window and forget keyframes and points that left it."""
         self._adjust(held=2)
-        self._local_map.views = self._local_map.views[-self._settings.window_views :]
-        seen = {i for v in self._local_map.views for i in v.ids.tolist()}
+        self._local_map.keyframes = self._local_map.keyframes[-self._settings.window_views :]
+        seen = {i for v in self._local_map.keyframes for i in v.ids.tolist()}
         self._local_map.points = {i: p for i, p in self._local_map.points.items() if i in seen}
 
-    def _place_new(self, view: View) -> None:
+    def _place_new(self, keyframe: Keyframe) -> None:
         """Triangulate every track whose parallax since its first observation is large enough."""
         points, first_seen = self._local_map.points, self._local_map.first_seen
-        wanted = np.array([i not in points for i in view.ids.tolist()], bool)
-        for track_id, pixel in zip(view.ids[wanted].tolist(), view.pixels[wanted], strict=True):
-            first_seen.setdefault(track_id, (view.vision_from_cam, pixel))
-        alive = set(view.ids.tolist())
+        wanted = np.array([i not in points for i in keyframe.ids.tolist()], bool)
+        for track_id, pixel in zip(keyframe.ids[wanted].tolist(), keyframe.pixels[wanted], strict=True):
+            first_seen.setdefault(track_id, (keyframe.vision_from_cam, pixel))
+        alive = set(keyframe.ids.tolist())
         for gone in [i for i in first_seen if i not in alive]:
             del first_seen[gone]
         if not wanted.any():
             return
-        ids, now = view.ids[wanted], view.pixels[wanted]
+        ids, now = keyframe.ids[wanted], keyframe.pixels[wanted]
         first = np.array([first_seen[i][0] for i in ids.tolist()])
         before = np.array([first_seen[i][1] for i in ids.tolist()])
-        found = self._between(first, before, view.vision_from_cam, now)
+        found = self._between(first, before, keyframe.vision_from_cam, now)
         for track_id, point in zip(ids.tolist(), found, strict=True):
             if np.isfinite(point[0]):
                 points[track_id] = point
@@ -290,9 +292,9 @@ class VisualOdometry:
         return np.asarray(points, np.float64)
 
     def _adjust(self, held: int) -> None:
-        """Bundle adjustment of the window; its `held` oldest views stay, points that do not fit go."""
-        views, points = self._local_map.views, self._local_map.points
-        rows = [{i: n for n, i in enumerate(v.ids.tolist())} for v in views]
+        """Bundle adjustment of the window; its `held` oldest keyframes stay, points that do not fit go."""
+        keyframes, points = self._local_map.keyframes, self._local_map.points
+        rows = [{i: n for n, i in enumerate(v.ids.tolist())} for v in keyframes]
         numbers: list[int] = []
         starts, obs_views = [0], list[int]()
         pixels: list[Array] = []
@@ -302,11 +304,11 @@ class VisualOdometry:
                 continue
             numbers.append(track_id)
             obs_views.extend(seen)
-            pixels.extend(views[k].pixels[rows[k][track_id]] for k in seen)
+            pixels.extend(keyframes[k].pixels[rows[k][track_id]] for k in seen)
             starts.append(len(obs_views))
-        if len(numbers) < self._settings.min_points or len(views) <= held:
+        if len(numbers) < self._settings.min_points or len(keyframes) <= held:
             return
-        bounds, placed = np.array(starts, np.int64), np.array([v.vision_from_cam for v in views])
+        bounds, placed = np.array(starts, np.int64), np.array([v.vision_from_cam for v in keyframes])
         observed = bounds, np.array(obs_views, np.int64), np.array(pixels)
         limits = self._settings.sigma_px, _HUBER_SIGMAS, _ITERATIONS
         values = np.array([points[i] for i in numbers])
@@ -318,8 +320,8 @@ class VisualOdometry:
                 points[track_id] = value
             else:
                 del points[track_id]
-        self._local_map.views = [
-            View(v.frame_index, _orthonormal(placed[k]), v.ids, v.pixels) for k, v in enumerate(views)
+        self._local_map.keyframes = [
+            Keyframe(v.frame_index, _orthonormal(placed[k]), v.ids, v.pixels) for k, v in enumerate(keyframes)
         ]
 
 
