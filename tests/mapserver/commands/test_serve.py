@@ -28,7 +28,7 @@ from support.storage.map_samples import draft_details, random_tile
 
 _ENDS = """
 import atexit, sys, threading
-from mapserver.commands import serve
+from mapserver import server
 class Kept:
     def __del__(self): print("taken apart", flush=True)
 class Reports:
@@ -41,9 +41,9 @@ atexit.register(print, "at exit")
 @pytest.mark.parametrize(
     ("ends", "told"),
     [
-        ("serve._end_process()", ["at exit"]),
+        ("server.end_process()", ["at exit"]),
         (
-            "serve._END_WITHIN_S = 0.2; serve._bound_the_end(Reports()); threading.Thread(target=threading.Event().wait).start()",
+            "server._END_WITHIN_S = 0.2; server._bound_the_end(Reports()); threading.Thread(target=threading.Event().wait).start()",
             ["reports are kept", "at exit"],
         ),
     ],
