@@ -7,15 +7,11 @@ from typing import TYPE_CHECKING
 
 from fleetmap.cli_exit import require_extra, run_cli
 from fleetmap.cli_options import Commands, ConfigFile, Options, Version, make_app
-from mapserver.commands.align import align
-from mapserver.commands.areas import AREAS_GROUP
-from mapserver.commands.build import build
-from mapserver.commands.building import BUILDING
-from mapserver.commands.convert import convert
-from mapserver.commands.doctor import doctor
+from mapserver.commands.build import build, nightly
+from mapserver.commands.building import AREAS, BUILDING, align
 from mapserver.commands.fleet import FLEET
-from mapserver.commands.nightly import nightly
 from mapserver.commands.operators import OPERATORS
+from mapserver.commands.recordings import convert, doctor
 from mapserver.commands.releases import diff, inspect, promote, publish, rollback, versions
 from mapserver.commands.robots import ROBOTS
 from mapserver.commands.serve import serve
@@ -45,7 +41,7 @@ COMMANDS: Commands = {
     "convert": convert,
     "doctor": doctor,
     "align": align,
-    "areas": AREAS_GROUP,
+    "areas": AREAS,
     "building": BUILDING,
     "fleet": FLEET,
     "robots": ROBOTS,

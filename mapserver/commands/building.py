@@ -1,19 +1,204 @@
-"""`mapserver building`: sites that are the floors of one building."""
+"""`mapserver align`, `areas` and `building`: a site in its building, its named areas, and sites that are floors."""
 
+from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fleetmap.cli_options import Group, expand_options
-from fleetmap.errors import UsageError
-from mapserver.commands.options import ActorOptions, Json, StoreFolder, open_store, print_json
+from fleetmap.errors import UsageError, disk_errors
+from mapserver.commands.options import (
+    ActorOptions,
+    Json,
+    SiteOptions,
+    StoreFolder,
+    check_output,
+    open_store,
+    print_json,
+    print_result,
+)
 
 if TYPE_CHECKING:
+    from fleetmap.geometry import Array
     from fleetmap.mapformat.building import Building, FloorEntry
+    from mapserver.floor_plan.alignment import Alignment
     from mapserver.store import MapStore
 
 _Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the building.")]
 _FORM = "SITE=LEVEL@HEIGHT"
+
+
+@expand_options
+def align(
+    *,
+    where: SiteOptions,
+    plan: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Drawing of the building from above, a picture.")
+    ] = None,
+    pin: Annotated[
+        list[str] | None,
+        typer.Option(metavar="NAME=PX,PY:X,Y", help="Point of the plan (pixels) and of the map (metres); repeat it."),
+    ] = None,
+    metres_per_pixel: Annotated[
+        float | None, typer.Option(min=1e-6, max=1e3, help="Scale of the plan; default: estimated from the pins.")
+    ] = None,
+    show: Annotated[bool, typer.Option("--show", help="Print the stored alignment; change nothing.")] = False,
+    level: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Name of the level for Open-RMF; default: the building's, else L1."),
+    ] = None,
+    json: Json = False,
+    by: ActorOptions,
+    forget: Annotated[bool, typer.Option("--forget", help="Forget the alignment and the plan.")] = False,
+) -> None:
+    """Estimate the pose of the map in the building's drawing, and store it; robots get it with the signed list."""
+    from mapserver.fleet import building
+    from mapserver.floor_plan.pins import parse_pin
+    from mapserver.floor_plan.plan_file import read_plan
+
+    named = plan is not None or bool(pin)
+    if show + forget + named != 1:
+        raise UsageError("name --pin (and --plan) to align, --show to print the stored alignment, or --forget")
+    with open_store(where.store, read_only=show) as maps:
+        corners = building.current_corners_m(maps, where.site)
+        if forget:
+            building.forget_alignment(maps, where.site, by.named())
+            typer.echo(f"site {where.site}: the alignment is forgotten; robots use the alignment of their version")
+            return
+        if named:
+            pins, drawing = [parse_pin(text) for text in pin or []], None if plan is None else read_plan(plan)
+            _, fit = building.align(maps, where.site, pins, drawing, metres_per_pixel, by.named())
+            if not fit.is_checked:
+                words = "the pins lie on one line and cannot reveal a mirrored plan; add a pin beside the line"
+                typer.echo(f"note: {words}", err=True)
+            off_m = 2 * fit.far_sigma_m
+            typer.echo(f"at the far end of the map positions in the building are known to {off_m:.2f} m (95 %)")
+        alignment, tower = maps.alignment(where.site), maps.building(where.site)
+    if level is None:
+        levels = {} if tower is None else {floor.site: floor.level for floor in tower.floors}
+        level = levels.get(where.site, "L1")
+    if alignment is None:
+        raise UsageError(f"site {where.site} is not aligned; `mapserver align --plan FILE --pin ...` does it")
+    print_result(alignment, _alignment_words(alignment, corners, level), json=json)
+
+
+def _alignment_words(found: "Alignment", corners: "Array", level: str) -> Iterator[str]:
+    from mapserver.fleet.building import alignment_words
+    from mapserver.floor_plan.alignment import reference_coordinates
+
+    frame = found.frame
+    numbers = f"--x {frame.x_m:.4f} --y {frame.y_m:.4f} --yaw {frame.yaw_rad:.6f}"
+    yield alignment_words(found)
+    yield from (f"pin {name}: {off_m:.3f} m left" for name, off_m in found.off_m.items())
+    yield f"\n# Open-RMF, fleet adapter\n{reference_coordinates(frame, level, corners)}"
+    yield "\n# ROS 2: building -> map, if no robot publishes it"
+    yield f"ros2 run tf2_ros static_transform_publisher {numbers} --frame-id building --child-frame-id map"
+
+
+@expand_options
+def import_(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="GeoJSON of polygons, in metres.")],
+    where: SiteOptions,
+    by: ActorOptions,
+) -> None:
+    """Replace the areas of the site by those of FILE; reports, pages and metrics then use them."""
+    from mapserver.fleet.building import keep_areas
+    from mapserver.floor_plan.areas import MAX_AREAS_BYTES
+
+    with disk_errors(f"{file} cannot be read", "check the path and its rights", UsageError), file.open("rb") as opened:
+        data = opened.read(MAX_AREAS_BYTES + 1)
+    if len(data) > MAX_AREAS_BYTES:
+        raise UsageError(f"{file} has more than {MAX_AREAS_BYTES} bytes; draw the areas with fewer corners")
+    with open_store(where.store) as maps:
+        names = keep_areas(maps, where.site, data, f"areas of {file.name}", by.named()).names
+    typer.echo(f"site {where.site}: {len(names)} areas ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})")
+
+
+@expand_options
+def remove_areas(where: SiteOptions, by: ActorOptions) -> None:
+    """Delete the areas of a site; their past counts stay."""
+    from mapserver.fleet.building import keep_areas
+
+    with open_store(where.store) as maps:
+        keep_areas(maps, where.site, None, "no areas", by.named())
+    typer.echo(f"site {where.site} has no areas")
+
+
+@expand_options
+def correct(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="An area of the site.")],
+    kind: Annotated[str, typer.Argument(metavar="forget|never-use|freeze|nothing", help="What maps do there.")],
+    where: SiteOptions,
+    by: ActorOptions,
+) -> None:
+    """Let an area correct the map, from the next build on, with --reason; `nothing` ends that."""
+    from mapserver.fleet.building import correct_area
+    from mapserver.floor_plan.areas import CorrectionKind
+
+    kinds = {kind.value: kind for kind in CorrectionKind}
+    if kind not in (*kinds, "nothing"):
+        raise UsageError(f"{kind!r} is none of {', '.join(kinds)} and nothing")
+    with open_store(where.store) as maps:
+        areas = correct_area(maps, where.site, name, kinds.get(kind), by.named())
+    (changed,) = (area for area in areas.areas if area.name == name)
+    typer.echo(f"{name}: {changed.size_m2:.1f} m2{changed.effects}")
+
+
+@expand_options
+def undo(where: SiteOptions, by: ActorOptions) -> None:
+    """Bring back the areas and corrections as before their last change; once more, and they are as now."""
+    from mapserver.fleet.building import undo_areas
+
+    with open_store(where.store) as maps:
+        names = undo_areas(maps, where.site, by.named()).names
+    typer.echo(f"site {where.site}: {len(names)} areas, as before the last change")
+
+
+@expand_options
+def list_areas(where: SiteOptions, json: Json = False) -> None:
+    """List the areas of a site; as JSON it is GeoJSON, in the frame `map`."""
+    with open_store(where.store, read_only=True) as maps:
+        maps.current(where.site)  # raises for an unknown site
+        areas = maps.areas(where.site)
+    ordered = sorted(areas.areas, key=lambda area: area.name)
+    lines = [f"{area.name}: {area.size_m2:.1f} m2{area.effects}" for area in ordered]
+    print_result(areas.geojson(where.site), [*lines, f"{len(lines)} areas"], json=json)
+
+
+@expand_options
+def export(
+    where: SiteOptions,
+    keep_out: Annotated[
+        Path | None, typer.Option(metavar="OUT.yaml", help="Write the mask of nav2's KeepoutFilter, and its image.")
+    ] = None,
+    speed: Annotated[
+        Path | None, typer.Option(metavar="OUT.yaml", help="Write the mask of nav2's SpeedFilter, and its image.")
+    ] = None,
+) -> None:
+    """Write the areas with a mask for nav2's costmap filters, in the frame of the map."""
+    from fleetmap.occupancy_grid import write_grid
+    from mapserver.floor_plan.areas import MaskKind
+    from mapserver.floor_plan.masks import mask_grid
+
+    asked = {MaskKind.KEEP_OUT: keep_out, MaskKind.SPEED: speed}
+    if not any(asked.values()):
+        raise UsageError("name a file by --keep-out or --speed")
+    for kind, file in asked.items():
+        check_output(f"--{kind.value}", file, ".yaml")
+    with open_store(where.store, read_only=True) as maps:
+        maps.current(where.site)
+        areas = maps.areas(where.site)
+    grids = {file: mask_grid(areas, kind) for kind, file in asked.items() if file is not None}
+    for file, grid in grids.items():
+        write_grid(file, grid)
+        typer.echo(str(file))
+
+
+AREAS = Group(
+    "Named areas of a site.",
+    {"import": import_, "list": list_areas, "remove": remove_areas, "export": export, "correct": correct, "undo": undo},
+)
 
 
 @expand_options
@@ -39,17 +224,17 @@ def set_(
 
 
 @expand_options
-def remove(name: _Name, *, store: StoreFolder, by: ActorOptions) -> None:
+def remove_building(name: _Name, *, store: StoreFolder, by: ActorOptions) -> None:
     """Let the floors of a building be sites of their own again; their maps stay."""
-    from mapserver.fleet.floors import remove_building
+    from mapserver.fleet import floors
 
     with open_store(store) as maps:
-        removed = remove_building(maps, name, by.named())
+        removed = floors.remove_building(maps, name, by.named())
     typer.echo(f"{name}: {', '.join(floor.site for floor in removed.floors)} are no floors of one building any more")
 
 
 @expand_options
-def list_(*, store: StoreFolder, json: Json = False) -> None:
+def list_buildings(*, store: StoreFolder, json: Json = False) -> None:
     """List the buildings with their floors and lifts."""
     from mapserver.fleet.floors import buildings
 
@@ -89,4 +274,6 @@ def _print(maps: "MapStore", building: "Building") -> None:
         typer.echo(f"  {floor.level}  {floor.site}  {floor.height_m:g} m  {words}")
 
 
-BUILDING = Group("Sites that are the floors of one building.", {"set": set_, "list": list_, "remove": remove})
+BUILDING = Group(
+    "Sites that are the floors of one building.", {"set": set_, "list": list_buildings, "remove": remove_building}
+)

@@ -2,6 +2,7 @@
 
 import sys
 import time
+from collections.abc import Iterator
 from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
@@ -13,7 +14,7 @@ import typer
 from fleetmap.cli_options import ConfigFile, Group, expand_options, settings_of
 from fleetmap.errors import StateError, UsageError
 from fleetmap.log_lines import printable
-from mapserver.commands.options import ActorOptions, Json, SiteName, StoreFolder, open_store, print_json, write_output
+from mapserver.commands.options import ActorOptions, Json, SiteName, StoreFolder, open_store, print_result, write_output
 
 if TYPE_CHECKING:
     from mapserver.fleet.resurvey_list import ResurveyList
@@ -90,16 +91,15 @@ def resurvey(
         found = resurvey_list(maps, site, settings, time.time_ns())
     if route is not None:
         _write_route(found, route)
-    if json:
-        print_json(found)
-        return
-    for concern in found.tiles:
-        typer.echo(f"{concern.name}: {'; '.join(concern.reasons)}")
-    for request in found.requests:
-        typer.echo(
-            f"request {request.id} of {request.actor or 'unnamed'}: {len(request.corners_map_m)} corners, {request.reason or '-'}"
-        )
-    typer.echo(f"{len(found.tiles)} tiles to survey again, {len(found.route)} waypoints")
+    print_result(found, _words(found), json=json)
+
+
+def _words(found: "ResurveyList") -> Iterator[str]:
+    yield from (f"{concern.name}: {'; '.join(concern.reasons)}" for concern in found.tiles)
+    for asked in found.requests:
+        corners = f"{len(asked.corners_map_m)} corners"
+        yield f"request {asked.id} of {asked.actor or 'unnamed'}: {corners}, {asked.reason or '-'}"
+    yield f"{len(found.tiles)} tiles to survey again, {len(found.route)} waypoints"
 
 
 def _write_route(found: "ResurveyList", path: Path) -> None:

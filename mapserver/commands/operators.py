@@ -6,7 +6,7 @@ import typer
 
 from fleetmap.cli_options import Group, expand_options
 from fleetmap.errors import UsageError
-from mapserver.commands.options import ActorOptions, Json, StoreFolder, open_store, print_json
+from mapserver.commands.options import ActorOptions, Json, StoreFolder, open_store, print_json, print_table
 from mapserver.operators.roles import Role, Scope
 
 Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the operator.")]
@@ -80,9 +80,6 @@ def token(
 
 def list_(store: StoreFolder, json: Json = False) -> None:
     """List operators and programs with their roles, sessions and tokens."""
-    from rich.table import Table
-
-    from fleetmap.console import plain_console
     from mapserver.operators.operators import Operators
 
     with open_store(store, read_only=True) as maps:
@@ -91,10 +88,8 @@ def list_(store: StoreFolder, json: Json = False) -> None:
         shown = ("name", "role", "is_disabled", "sessions", "tokens")
         print_json([{name: getattr(row, name) for name in shown} for row in found])
         return
-    table = Table("name", "role", "sessions", "tokens", "")
-    for row in found:
-        table.add_row(row.name, row.role, str(row.sessions), str(row.tokens), "disabled" if row.is_disabled else "")
-    plain_console().print(table)
+    rows = ((r.name, r.role, r.sessions, r.tokens, "disabled" if r.is_disabled else "") for r in found)
+    print_table(("name", "role", "sessions", "tokens", ""), rows)
 
 
 def _chosen(*, ask: bool) -> str | None:
@@ -108,12 +103,5 @@ def _shown(chosen: str | None, made: str) -> str:
 
 OPERATORS = Group(
     "Accounts of operators and programs.",
-    {
-        "add": add,
-        "password": password,
-        "role": role,
-        "disable": disable,
-        "token": token,
-        "list": list_,
-    },
+    {"add": add, "password": password, "role": role, "disable": disable, "token": token, "list": list_},
 )

@@ -2,6 +2,8 @@
 
 import getpass
 import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -131,3 +133,36 @@ def print_json(value: object) -> None:
     from fleetmap.encoding import to_json
 
     typer.echo(to_json(value, indent=2).decode())
+
+
+def print_result(value: object, lines: Iterable[str], *, json: bool) -> None:
+    """Print the result of a command to stdout: a value as JSON, or else its lines."""
+    if json:
+        print_json(value)
+        return
+    for line in lines:
+        typer.echo(line)
+
+
+def print_table(columns: Sequence[str], rows: Iterable[Iterable[object]], title: str | None = None) -> None:
+    """Print rows to stdout; the cell of None is empty."""
+    from rich.table import Table
+
+    from fleetmap.console import plain_console
+
+    table = Table(*columns, title=title)
+    for row in rows:
+        table.add_row(*("" if cell is None else str(cell) for cell in row))
+    plain_console().print(table)
+
+
+@contextmanager
+def shown_progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Yield a function that shows how many are done of how many."""
+    from rich.progress import Progress
+
+    from fleetmap.console import plain_console
+
+    with Progress(console=plain_console(stderr=True), transient=True) as bars:
+        bar = bars.add_task(what, total=None)
+        yield lambda done, total: bars.update(bar, completed=done, total=total)

@@ -1,5 +1,6 @@
 """`mapserver versions`, `inspect`, `diff`, `publish`, `promote` and `rollback`: versions of a site and changes of the current one."""
 
+from collections.abc import Iterator
 from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Annotated
@@ -8,7 +9,17 @@ import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options, settings_of
 from fleetmap.errors import UsageError
-from mapserver.commands.options import ActorOptions, Json, SiteName, SiteOptions, StoreFolder, open_store, print_json
+from mapserver.commands.options import (
+    ActorOptions,
+    Json,
+    SiteName,
+    SiteOptions,
+    StoreFolder,
+    open_store,
+    print_json,
+    print_result,
+    print_table,
+)
 
 if TYPE_CHECKING:
     from fleetmap.mapformat import Manifest
@@ -18,26 +29,17 @@ if TYPE_CHECKING:
 
 def versions(site: SiteName, store: StoreFolder, json: Json = False) -> None:
     """List the versions of a site with their states, oldest first."""
-    from rich.table import Table
-
-    from fleetmap.console import plain_console
-
     with open_store(store, read_only=True) as maps:
         infos = maps.versions(site)
         trusted = {info.version: maps.trusted(info) for info in infos}
     if json:
         print_json([asdict(info) | {"trusted_calibrations": trusted[info.version]} for info in infos])
         return
-    table = Table("version", "state", "parent", "created", "tiles", "landmarks", "bytes")
-    for info in infos:
-        parent = "" if info.parent is None else str(info.parent)
-        sizes = (str(info.tiles), str(info.landmarks), str(info.map_bytes))
-        table.add_row(str(info.version), info.state, parent, info.created, *sizes)
-    console = plain_console()
-    console.print(table)
+    columns = ("version", "state", "parent", "created", "tiles", "landmarks")
+    print_table((*columns, "bytes"), ((*(getattr(i, name) for name in columns), i.map_bytes) for i in infos))
     for version, choices in trusted.items():
         for choice in choices:
-            console.print(f"version {version}: {choice.sentence}")
+            typer.echo(f"version {version}: {choice.sentence}")
 
 
 def inspect(
@@ -54,22 +56,10 @@ def inspect(
         manifest = maps.manifest(site, info.version)
         verdicts = maps.verdicts(site, info.version)
         history = [event for event in maps.events(site) if event.version == info.version]
-    if not json:
-        _print_words(info, manifest, verdicts, history)
-        return
-    from fleetmap.encoding import to_plain
-
-    print_json(
-        {
-            "state": info.state,
-            "manifest_sha256": info.manifest_sha256,
-            "map_bytes": info.map_bytes,
-            "bytes_per_m": bytes_per_m(info, manifest),
-            "verdicts": verdicts,
-            "history": history,
-            "manifest": to_plain(manifest),
-        }
-    )
+    per_m = _bytes_per_m(info, manifest)
+    shown = {name: getattr(info, name) for name in ("state", "manifest_sha256", "map_bytes")}
+    shown |= {"bytes_per_m": per_m, "verdicts": verdicts, "history": history, "manifest": manifest}
+    print_result(shown, _words(info, manifest, per_m, verdicts, history), json=json)
 
 
 def _chosen(maps: "MapStore", site: str, version: int | None) -> "VersionInfo":
@@ -81,7 +71,7 @@ def _chosen(maps: "MapStore", site: str, version: int | None) -> "VersionInfo":
     return maps.current(site) or infos[-1]
 
 
-def bytes_per_m(info: "VersionInfo", manifest: "Manifest") -> float | None:
+def _bytes_per_m(info: "VersionInfo", manifest: "Manifest") -> float | None:
     """Return the size of the map per metre of surveyed path, None if the report has no path length."""
     path_m = manifest.report.get("path_m")
     return info.map_bytes / path_m if isinstance(path_m, int | float) and path_m > 0 else None
@@ -96,40 +86,39 @@ _FIGURES = {
 """Text for keys of a build's report; --json has all keys."""
 
 
-def _print_words(
-    info: "VersionInfo", manifest: "Manifest", verdicts: "list[VerdictRow]", history: "list[Event]"
-) -> None:
-    from fleetmap.console import plain_console
+def _words(
+    info: "VersionInfo",
+    manifest: "Manifest",
+    per_m: float | None,
+    verdicts: "list[VerdictRow]",
+    history: "list[Event]",
+) -> Iterator[str]:
     from mapserver.quality.figures import trusted_calibrations
 
-    console, report, per_m = plain_console(), manifest.report, bytes_per_m(info, manifest)
+    report, findings = manifest.report, manifest.report.get("findings")
     built_on = "the first" if info.parent is None else f"built on version {info.parent}"
-    console.print(f"site {info.site} version {info.version}: {info.state}, {built_on}, created {info.created}")
+    yield f"site {info.site} version {info.version}: {info.state}, {built_on}, created {info.created}"
     sizes = f"{info.tiles} tiles of {manifest.tile_size_m:g} m, {info.landmarks} landmarks, {info.map_bytes} bytes for a robot"
-    console.print(sizes + ("" if per_m is None else f", {per_m:.0f} bytes per metre"))
+    yield sizes + ("" if per_m is None else f", {per_m:.0f} bytes per metre")
     figures = [words.format(report[key]) for key, words in _FIGURES.items() if isinstance(report.get(key), int | float)]
     if isinstance(loops := report.get("loops"), dict):
         figures.append(f"{loops.get('accepted', 0)} of {loops.get('candidates', 0)} possible loops accepted")
     if figures:
-        console.print(", ".join(figures))
-    console.print(f"manifest {info.manifest_sha256}, vocabulary {manifest.vocabulary.sha256}")
-    findings = report.get("findings")
+        yield ", ".join(figures)
+    yield f"manifest {info.manifest_sha256}, vocabulary {manifest.vocabulary.sha256}"
     for recording in manifest.recordings:
-        console.print(f"recording {recording.name}: {recording.frames} frames, SHA-256 {recording.sha256[:16]}")
-        for words in findings.get(recording.name, ()) if isinstance(findings, dict) else ():
-            console.print(f"  {words}")
-    for choice in trusted_calibrations(manifest):
-        console.print(choice.sentence)
+        yield f"recording {recording.name}: {recording.frames} frames, SHA-256 {recording.sha256[:16]}"
+        yield from (f"  {found}" for found in (findings.get(recording.name, ()) if isinstance(findings, dict) else ()))
+    yield from (choice.sentence for choice in trusted_calibrations(manifest))
     for verdict in verdicts:
         word = "accepted" if verdict.accepted else "published by force" if verdict.forced else "refused"
-        console.print(f"gate: {word}, {_moment(verdict.stamp_ns)}")
-        for reason in verdict.reasons:
-            console.print(f"  {reason}")
+        yield f"gate: {word}, {_moment(verdict.stamp_ns)}"
+        yield from (f"  {reason}" for reason in verdict.reasons)
     for event in history:
         if event.kind not in ("refused", "forced"):  # shown above with the gate
             who = f" by {event.actor}" if event.actor else ""
             why = f" ({event.reason})" if event.reason else ""
-            console.print(f"{_moment(event.stamp_ns)} {event.kind}{who}{why}: {event.detail}")
+            yield f"{_moment(event.stamp_ns)} {event.kind}{who}{why}: {event.detail}"
 
 
 def _moment(stamp_ns: int) -> str:
@@ -155,28 +144,18 @@ def diff(
 
 
 def _print_difference(found: "Difference") -> None:
-    from rich.table import Table
-
-    from fleetmap.console import plain_console
-
-    console = plain_console()
-    table = Table("", "added", "changed", "removed", "kept", title=f"{found.site}: {found.before} to {found.after}")
-    for name, *counts in (
+    counts = [
         ("tiles", found.tiles_added, found.tiles_changed, found.tiles_removed, found.tiles_kept),
         ("landmarks", found.landmarks_added, found.landmarks_moved, found.landmarks_removed, found.landmarks_kept),
-    ):
-        table.add_row(name, *(str(count) for count in counts))
-    console.print(table)
+    ]
+    title = f"{found.site}: {found.before} to {found.after}"
+    print_table(("", "added", "changed", "removed", "kept"), counts, title)
     if found.moved_max_m is not None and found.moved_median_m is not None:
-        console.print(
-            f"landmarks moved by {found.moved_median_m:.4f} m in the median, {found.moved_max_m:.4f} m at most"
-        )
+        typer.echo(f"landmarks moved by {found.moved_median_m:.4f} m in the median, {found.moved_max_m:.4f} m at most")
     share = found.fetch_bytes / max(1, found.full_bytes)
-    console.print(f"a robot with version {found.before} fetches {found.fetch_bytes} bytes ({share:.1%} of everything)")
-    quality = Table("quality", str(found.before), str(found.after))
-    for key, both in found.quality.items():
-        quality.add_row(key, *("" if figure is None else str(figure) for figure in (both.before, both.after)))
-    console.print(quality)
+    typer.echo(f"a robot with version {found.before} fetches {found.fetch_bytes} bytes ({share:.1%} of everything)")
+    quality = ((key, both.before, both.after) for key, both in found.quality.items())
+    print_table(("quality", str(found.before), str(found.after)), quality)
 
 
 @expand_options

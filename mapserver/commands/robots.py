@@ -8,28 +8,20 @@ import typer
 
 from fleetmap.cli_options import Group, expand_options
 from fleetmap.errors import UsageError, disk_errors
-from mapserver.commands.options import ActorOptions, Json, SiteOptions, StoreFolder, open_store, print_json
+from mapserver.commands.options import ActorOptions, Json, SiteOptions, StoreFolder, open_store, print_json, print_table
 
 Robots = Annotated[list[str], typer.Argument(metavar="ROBOT...", help="Names of robots.")]
 
 
 @expand_options
-def remove(
-    robots: Robots,
-    where: SiteOptions,
-    by: ActorOptions,
-) -> None:
+def remove(robots: Robots, where: SiteOptions, by: ActorOptions) -> None:
     """Remove robots from lists; `gc` need not keep their versions any more. Their past counts stay.
 
     A running server removes them within seconds; a robot that reports again is added again.
     """
     with open_store(where.store) as maps:
         removed = maps.remove_robots(where.site, robots, actor=by.named())
-    for robot in removed:
-        typer.echo(f"site {where.site}: robot {robot} is removed")
-    missing = [robot for robot in robots if robot not in removed]
-    if missing:
-        raise UsageError(f"site {where.site} knows no robot {', '.join(missing)}; the other named robots are removed")
+    _tell(robots, removed, where.site, "removed", "knows no robot")
 
 
 @expand_options
@@ -71,11 +63,14 @@ def revoke(robots: Robots, where: SiteOptions, by: ActorOptions) -> None:
 
     with open_store(where.store) as maps:
         gone = RobotRegister(maps).revoke(where.site, robots, actor=by.named())
+    _tell(robots, gone, where.site, "revoked", "has not enrolled")
+
+
+def _tell(asked: list[str], gone: list[str], site: str, done: str, fault: str) -> None:
     for robot in gone:
-        typer.echo(f"site {where.site}: robot {robot} is revoked")
-    missing = [robot for robot in robots if robot not in gone]
-    if missing:
-        raise UsageError(f"site {where.site} has not enrolled {', '.join(missing)}; the other named robots are revoked")
+        typer.echo(f"site {site}: robot {robot} is {done}")
+    if missing := [robot for robot in asked if robot not in gone]:
+        raise UsageError(f"site {site} {fault} {', '.join(missing)}; the other named robots are {done}")
 
 
 def list_(
@@ -84,9 +79,6 @@ def list_(
     json: Json = False,
 ) -> None:
     """Show the enrolled robots, the names in their certificates, and the days until they expire."""
-    from rich.table import Table
-
-    from fleetmap.console import plain_console
     from mapserver.trust.enrolment import RobotRegister
 
     with open_store(store, read_only=True) as maps:
@@ -94,11 +86,10 @@ def list_(
     if json:
         print_json(rows)
         return
-    table = Table("site", "robot", "certificate", "enrolled", "state")
     for row in rows:
-        enrolled = datetime.fromtimestamp(int(row["enrolled_ns"]) / 1e9, UTC).strftime("%Y-%m-%d %H:%M")
-        table.add_row(*(str(row[name]) for name in ("site", "robot", "certificate")), enrolled, str(row["state"]))
-    plain_console().print(table)
+        row["enrolled"] = f"{datetime.fromtimestamp(row['enrolled_ns'] / 1e9, UTC):%Y-%m-%d %H:%M}"
+    columns = ("site", "robot", "certificate", "enrolled", "state")
+    print_table(columns, ([row[name] for name in columns] for row in rows))
 
 
 ROBOTS = Group(

@@ -1,8 +1,8 @@
 """`mapserver verify`, `gc`, `attach`, `export`, `import` and `audit`: the store as a whole, and versions as files."""
 
 import shlex
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator
+from contextlib import ExitStack
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleetmap.cli_options import ConfigFile, expand_options, settings_of
-from fleetmap.console import plain_console
 from fleetmap.errors import BusyError, StoreError, UsageError
 from mapserver.commands.options import (
     ActorOptions,
@@ -20,36 +19,36 @@ from mapserver.commands.options import (
     StoreFolder,
     check_output,
     open_store,
-    print_json,
+    print_result,
+    shown_progress,
     version_named,
 )
 
 if TYPE_CHECKING:
     from mapserver.store import AuditLine, MapStore
-    from mapserver.store.upkeep import Garbage
+    from mapserver.store.upkeep import Garbage, StoreFindings
 
 EXIT_STATUS_FAULTS = 3
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Print what would be removed; remove nothing.")]
 
 
 def verify(store: StoreFolder, json: Json = False) -> None:
     """Check every hash and every reference of a store, and its database; status 3 if there is a fault."""
     with open_store(store, read_only=True) as maps:
         found = maps.verify()
-    if json:
-        print_json(found)
-    else:
-        typer.echo(f"{found.sites} sites, {found.versions} versions, {found.blobs} blobs of {found.blob_bytes} bytes")
-        if found.orphans or found.leftovers:
-            typer.echo(
-                f"{found.orphans + found.leftovers} unreferenced files; `mapserver gc --store {shlex.quote(str(store))}` removes them"
-            )
-        if found.open_to_others:
-            typer.echo(f"other users of this machine can read the store; `chmod -R go= {store}` prevents that")
-        for fault in found.faults:
-            typer.echo(f"fault: {fault}")
-        typer.echo("clean" if not found.faults else f"{len(found.faults)} faults; import the versions again or restore")
+    print_result(found, _findings(store, found), json=json)
     if found.faults:
         raise typer.Exit(EXIT_STATUS_FAULTS)
+
+
+def _findings(store: Path, found: "StoreFindings") -> Iterator[str]:
+    yield f"{found.sites} sites, {found.versions} versions, {found.blobs} blobs of {found.blob_bytes} bytes"
+    if unreferenced := found.orphans + found.leftovers:
+        yield f"{unreferenced} unreferenced files; `mapserver gc --store {shlex.quote(str(store))}` removes them"
+    if found.open_to_others:
+        yield f"other users of this machine can read the store; `chmod -R go= {store}` prevents that"
+    yield from (f"fault: {fault}" for fault in found.faults)
+    yield "clean" if not found.faults else f"{len(found.faults)} faults; import the versions again or restore"
 
 
 @expand_options
@@ -63,7 +62,7 @@ def gc(
         float, typer.Option(min=0, help="Days for which a silent robot still counts as using its version.")
     ] = 30.0,
     by: ActorOptions,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what would be removed; remove nothing.")] = False,
+    dry_run: DryRun = False,
     json: Json = False,
 ) -> None:
     """Remove drafts and retired versions beyond retention, and unreferenced files.
@@ -92,14 +91,11 @@ def gc(
             garbage = collect()  # the disk was full
         finally:
             keep_reserve(store)
-    if json:
-        print_json(garbage)
-        return
     would = "would be " if dry_run else ""
-    for word, versions in (("retired", garbage.retired), ("removed", garbage.removed)):
-        for site, version in versions:
-            typer.echo(f"site {site}: version {version} {would}{word}")
-    typer.echo(f"{garbage.files} files {would}removed, {garbage.freed_bytes} bytes {would}freed")
+    words = [f"site {site}: version {version} {would}retired" for site, version in garbage.retired]
+    words += [f"site {site}: version {version} {would}removed" for site, version in garbage.removed]
+    words.append(f"{garbage.files} files {would}removed, {garbage.freed_bytes} bytes {would}freed")
+    print_result(garbage, words, json=json)
 
 
 @expand_options
@@ -110,7 +106,7 @@ def retention(
     inbox: Annotated[
         Path | None, typer.Option(metavar="DIR", help="An inbox, or the folder with an inbox for each site.")
     ] = None,
-    dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what would be removed; remove nothing.")] = False,
+    dry_run: DryRun = False,
     config: ConfigFile = None,
     json: Json = False,
 ) -> None:
@@ -128,11 +124,8 @@ def retention(
         removed = apply_retention(maps, settings_of(context).ingest.retention(), free, dry_run=dry_run)
     for each in sorted({*inboxes} - {*free}):
         typer.echo(f"{each}: a night reads its recordings; it removed what was old at its start", err=True)
-    if json:
-        print_json(removed)
-        return
-    for name, count in removed.items():
-        typer.echo(f"{name}: {count} {'would be ' if dry_run else ''}removed")
+    would = "would be " if dry_run else ""
+    print_result(removed, (f"{name}: {count} {would}removed" for name, count in removed.items()), json=json)
 
 
 def _is_free(maps: "MapStore", site: str, locks: ExitStack) -> bool:
@@ -185,27 +178,16 @@ def audit(
     from mapserver.store import chain_faults
 
     with open_store(store, read_only=True) as maps:
-        if not verify:
-            _print(maps.audit_lines(last), json=json)
-            return
-        lines = maps.audit_lines()
+        lines = maps.audit_lines(None if verify else last)
+    if not verify:
+        print_result(lines, map(_words, lines), json=json)
+        return
     faults = chain_faults(lines)
-    if json:
-        print_json({"lines": len(lines), "faults": faults})
-    else:
-        for fault in faults:
-            typer.echo(f"fault: {fault}")
-        typer.echo(f"{len(lines)} lines, {f'{len(faults)} faults' if faults else 'clean'}")
+    summary = f"{len(lines)} lines, {f'{len(faults)} faults' if faults else 'clean'}"
+    told = [*(f"fault: {fault}" for fault in faults), summary]
+    print_result({"lines": len(lines), "faults": faults}, told, json=json)
     if faults:
         raise typer.Exit(EXIT_STATUS_FAULTS)
-
-
-def _print(lines: "list[AuditLine]", *, json: bool) -> None:
-    if json:
-        print_json(lines)
-        return
-    for line in lines:
-        typer.echo(_words(line))
 
 
 def _words(line: "AuditLine") -> str:
@@ -238,13 +220,3 @@ def attach(
     typer.echo(
         f"{store} uses {content or 'its content'} and {'the named' if database else 'its'} database; {copied} bytes of content were copied"
     )
-
-
-@contextmanager
-def shown_progress(what: str) -> Iterator[Callable[[int, int], None]]:
-    """Yield a function that shows how many are done of how many."""
-    from rich.progress import Progress
-
-    with Progress(console=plain_console(stderr=True), transient=True) as bars:
-        bar = bars.add_task(what, total=None)
-        yield lambda done, total: bars.update(bar, completed=done, total=total)

@@ -11,7 +11,7 @@ import typer
 
 from fleetmap.cli_options import Group
 from fleetmap.errors import UsageError
-from mapserver.commands.options import Json, StoreFolder, open_store, print_json
+from mapserver.commands.options import Json, StoreFolder, open_store, print_json, print_table
 
 if TYPE_CHECKING:
     from mapserver.store import MapStore
@@ -153,8 +153,6 @@ def revoke(site: SiteArgument, store: StoreFolder, key: KeyFile = None) -> None:
 
 def status(store: StoreFolder, json: Json = False) -> None:
     """Show every role with its keys and days until expiry; status 1 if robots cannot accept new maps, now or soon."""
-    from rich.table import Table
-
     from fleetmap.console import plain_console
     from mapserver.trust.status import trust_status
 
@@ -163,16 +161,11 @@ def status(store: StoreFolder, json: Json = False) -> None:
     if json:
         print_json(found)
     else:
-        table = Table("role", "number", "days left", "")
-        for role in found.roles:
-            left = "" if role.days_left is None else f"{role.days_left:.1f}"
-            table.add_row(role.role, str(role.number), left, role.fault)
-        console = plain_console()
-        console.print(table)
-        for words in found.risks:
-            console.print(words, style="yellow", markup=False, highlight=False)
-        for words in found.faults:
-            console.print(words, style="red", markup=False, highlight=False)
+        rows = ((r.role, r.number, r.days_left and f"{r.days_left:.1f}", r.fault) for r in found.roles)
+        print_table(("role", "number", "days left", ""), rows)
+        for style, lines in (("yellow", found.risks), ("red", found.faults)):
+            for words in lines:
+                plain_console().print(words, style=style)
     if found.faults:
         raise typer.Exit(1)
 

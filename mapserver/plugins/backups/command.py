@@ -1,13 +1,17 @@
 """`mapserver backup`, `restore` and `backups`: copies of a store in a folder or an object store."""
 
+from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from fleetmap.cli_options import expand_options
-from mapserver.commands.options import ActorOptions, Json, StoreFolder, open_store, print_json
-from mapserver.commands.store import EXIT_STATUS_FAULTS, shown_progress
+from mapserver.commands.options import ActorOptions, Json, StoreFolder, open_store, print_result, shown_progress
+from mapserver.commands.store import EXIT_STATUS_FAULTS
+
+if TYPE_CHECKING:
+    from mapserver.plugins.backups.restore import RestoreReport
 
 Where = Annotated[str, typer.Argument(metavar="TARGET", help="Folder, or s3://BUCKET/PREFIX; for one store alone.")]
 
@@ -31,17 +35,11 @@ def backup(
     key = recipient_of(recipient)
     with open_store(store, read_only=True) as maps, shown_progress("blobs") as progress:
         done = back_up(maps, BackupTarget(target, create=True), recipient=key, keep=keep, progress=progress)
-    if json:
-        print_json(done)
-    else:
-        typer.echo(
-            f"snapshot {done.snapshot}: {done.bytes} bytes, {done.uploaded_bytes} of them copied; "
-            f"{'keys encrypted' if done.has_keys else 'without keys (--recipient)'}; {len(done.removed)} older ones removed"
-        )
-        for address in done.missing:
-            typer.echo(
-                f"fault: blob {address} is lost or damaged in the store, and in no backup; `mapserver verify` says of what"
-            )
+    keys = "keys encrypted" if done.has_keys else "without keys (--recipient)"
+    sizes = f"{done.bytes} bytes, {done.uploaded_bytes} of them copied"
+    lost = "is lost or damaged in the store, and in no backup; `mapserver verify` says of what"
+    lines = [f"snapshot {done.snapshot}: {sizes}; {keys}; {len(done.removed)} older ones removed"]
+    print_result(done, [*lines, *(f"fault: blob {address} {lost}" for address in done.missing)], json=json)
     if done.missing:
         raise typer.Exit(EXIT_STATUS_FAULTS)
 
@@ -70,25 +68,22 @@ def restore(
         done = restored(
             BackupTarget(target), store, by.named(), name=snapshot, identities=identities, progress=progress
         )
-    if json:
-        print_json(done)
-        return
+    print_result(done, _restored(done, store), json=json)
+
+
+def _restored(done: "RestoreReport", store: Path) -> Iterator[str]:
     counts = f"{done.versions} versions of {done.sites} sites, {done.robots} enrolled robots, {done.people} people and programs"
-    typer.echo(f"{store} holds snapshot {done.snapshot}: {counts}, {len(done.keys)} key files")
+    rotate = f"`mapserver trust rotate online --key ROOT --store {store}`"
+    yield f"{store} holds snapshot {done.snapshot}: {counts}, {len(done.keys)} key files"
     if "server.pem" in done.keys and not done.robots:
-        typer.echo(f"robots are enrolled again by `mapserver robots enrol ROBOT --site SITE --store {store}`")
+        yield f"robots are enrolled again by `mapserver robots enrol ROBOT --site SITE --store {store}`"
     if done.lists == "ahead":
-        typer.echo(
-            "the root key is elsewhere: if sites or keys were added after the backup, robots refuse the lists until "
-            f"`mapserver trust rotate online --key ROOT --store {store}` has run twice"
-        )
+        words = "the root key is elsewhere: if sites or keys were added after the backup, robots refuse the lists until"
+        yield f"{words} {rotate} has run twice"
     elif done.lists == "old":
-        typer.echo(
-            "the signed lists are those of the backup, and robots that know later ones refuse them: restore with --identity, or put the "
-            f"keys into {store / 'keys'} and run `mapserver trust rotate online --key ROOT --store {store}` twice"
-        )
-    for address in done.missing:
-        typer.echo(f"blob {address} was lost or damaged already when the backup was made")
+        words = "the signed lists are those of the backup, and robots that know later ones refuse them: restore with --identity"
+        yield f"{words}, or put the keys into {store / 'keys'} and run {rotate} twice"
+    yield from (f"blob {address} was lost or damaged already when the backup was made" for address in done.missing)
 
 
 def backups(
@@ -103,19 +98,12 @@ def backups(
     where = BackupTarget(target)
     if not verify:
         names = where.snapshots()
-        if json:
-            print_json(names)
-        else:
-            typer.echo("\n".join(names) or "no snapshots")
+        print_result(names, names or ["no snapshots"], json=json)
         return
     with shown_progress("objects") as progress:
         found = verified(where, progress)
-    if json:
-        print_json(found)
-    else:
-        typer.echo(f"{found.snapshots} snapshots, {found.objects} objects of {found.bytes} bytes")
-        for fault in found.faults:
-            typer.echo(f"fault: {fault}")
-        typer.echo(f"{len(found.faults)} faults" if found.faults else "clean")
+    lines = [f"{found.snapshots} snapshots, {found.objects} objects of {found.bytes} bytes"]
+    lines += [f"fault: {fault}" for fault in found.faults]
+    print_result(found, [*lines, f"{len(found.faults)} faults" if found.faults else "clean"], json=json)
     if found.faults:
         raise typer.Exit(EXIT_STATUS_FAULTS)

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from fleetmap.cli_options import ConfigFile
-from mapserver.commands.options import Json, print_json
+from mapserver.commands.options import Json, print_json, print_table
 
 
 def evaluate(
@@ -25,9 +25,6 @@ def evaluate(
     config: ConfigFile = None,
 ) -> None:
     """Print the errors of a trajectory: aligned rigidly, aligned with scale, unaligned, between stamps, and its drift."""
-    from rich.table import Table
-
-    from fleetmap.console import plain_console
     from fleetmap.recordings.ordering import ReadLog
     from fleetmap.recordings.tum import read_truth, read_tum
     from mapserver.plugins.trajectory_errors.covariances import read_covariances
@@ -42,7 +39,5 @@ def evaluate(
     if json:
         print_json(found)
         return
-    table = Table("error", "value", title=f"{estimate.name} against {ground_truth.name}")
-    for key, value in found.items():
-        table.add_row(key, f"{value:.5g}" if isinstance(value, float) else str(value))
-    plain_console().print(table)
+    rows = ((key, f"{value:.5g}" if isinstance(value, float) else str(value)) for key, value in found.items())
+    print_table(("error", "value"), rows, f"{estimate.name} against {ground_truth.name}")

@@ -11,7 +11,7 @@ from typer.testing import CliRunner, Result
 from fleetmap.errors import CalibrationError, UsageError
 from fleetmap.recordings import open_recording
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
-from mapserver.commands.convert import convert
+from mapserver.commands.recordings import convert
 from support.recordings.recording_samples import make_sample, write_euroc
 
 SAMPLE = make_sample(3)

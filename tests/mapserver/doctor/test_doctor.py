@@ -17,7 +17,7 @@ from fleetmap.recordings.sensor_subset import reduced
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps
 from mapserver.calibration import CalibrationParameter
-from mapserver.commands.doctor import doctor
+from mapserver.commands.recordings import doctor
 from mapserver.doctor import Finding, Verdict, run_checks
 from mapserver.doctor.camera_motion import CameraTurns, body_motion
 from mapserver.doctor.findings import grouped, not_judged, summary
