@@ -2,6 +2,7 @@
 
 | group | registered by the name of | as |
 |---|---|---|
+| `mapserver.alerts` | the setting of `[alerts]` that names a receiver | `AlertHook` |
 | `mapserver.commands` | the command | a function as those of `COMMANDS` in `mapserver/cli.py`, in a module that is quick to import |
 | `mapserver.databases` | the scheme of a URL, or `other` | `DatabaseHook` |
 | `mapserver.failure_exports` | `--format` of `mapserver fleet export` | a function as `write_json_lines` in `mapserver/fleet/exports.py` |
@@ -28,6 +29,9 @@ RouteHook = Callable[[Any, Any, OfferedFile], None]
 
 StageHook = Callable[[Any], dict[str, Any]]
 """Makes more of a draft's surveys than tiles: of a `ChosenDraft` each `Extra` by the key of its report (`mapserver/drafting/extras.py`)."""
+
+AlertHook = Callable[[Any], Any]
+"""Opens the receiver that `AlertSettings` name (`mapserver/fleet/alerts.py`), with `host`, `tell` of the active alerts, `test`, `close`."""
 
 ObjectsHook = Callable[[str], Any]
 """Opens the `Objects` (`mapserver/store/blobs.py`) under a URL."""

@@ -21,6 +21,7 @@ from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
 from fleetmap.bus import Bus
 from fleetmap.errors import UsageError
+from fleetmap.hooks import plugin
 from fleetmap.log_lines import log_to_stderr
 from fleetmap.threads import ended_by_threads
 from mapserver.api.app import Lifespan, create_app
@@ -38,7 +39,6 @@ from mapserver.serving.bus_access import BusGuard
 from mapserver.serving.bus_service import BusService
 from mapserver.serving.http_connections import BACKLOG, MAX_HEAD_BYTES, BoundedListener
 from mapserver.serving.night_runs import NightRuns
-from mapserver.serving.webhook import Webhook
 from mapserver.store import MapStore
 from mapserver.trust.http_certificate import HttpCertificate
 
@@ -113,7 +113,9 @@ class Server:
         """Return the application, its periodic work in groups that do not wait for each other, and what is closed at the end."""
         maps, nights, settings = self.maps, self.nights, self.settings
         metrics = Metrics(maps, fleet, settings.alerts, self.certificate)
-        webhook = None if settings.alerts.webhook is None else Webhook(settings.alerts)
+        webhook = None
+        if settings.alerts.webhook is not None:
+            webhook = plugin("mapserver.alerts", "webhook", "[alerts] webhook")(settings.alerts)
         drives = None if nights is None else RobotDrives(maps, nights)
         take = None if drives is None else drives.take
         bus_service = BusService(maps, fleet, self.bus, metrics.count_bus, self.robots, take)

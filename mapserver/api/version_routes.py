@@ -2,7 +2,7 @@
 
 import shlex
 import time
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 from fastapi import FastAPI, Request
 from starlette.exceptions import HTTPException
@@ -19,7 +19,6 @@ from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
 from mapserver.serving.night_runs import NightRuns
-from mapserver.serving.webhook import Webhook
 from mapserver.store import CanaryRow, MapStore, VersionInfo
 from mapserver.trust.http_certificate import HttpCertificate
 
@@ -34,7 +33,7 @@ class ApiSettings(NamedTuple):
     alerts: AlertSettings = AlertSettings()
     ingest: IngestSettings = IngestSettings()
     certificate: HttpCertificate | None = None
-    webhook: Webhook | None = None
+    webhook: Any = None
     nights: NightRuns | None = None
 
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 from fleetmap.errors import BusyError, FleetmapError
 from fleetmap.log_lines import LogLimit
@@ -16,7 +17,6 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.serving.bus_access import BusGuard
 from mapserver.serving.bus_service import BusService
-from mapserver.serving.webhook import AlertWatch, Webhook
 from mapserver.store import MapStore
 from mapserver.trust import update_lists
 
@@ -75,17 +75,14 @@ def server_tasks(
     ]
 
 
-def alert_tasks(
-    store: MapStore, fleet: Fleet, settings: AlertSettings, webhook: Webhook | None
-) -> list[BackgroundTask]:
-    """Return the task that finds alerts for the webhook; empty without one."""
-    if webhook is None:
+def alert_tasks(store: MapStore, fleet: Fleet, settings: AlertSettings, receiver: Any) -> list[BackgroundTask]:
+    """Return the task that tells a receiver of alerts (`AlertHook` of `mapserver/hooks.py`); empty without one."""
+    if receiver is None:
         return []
-    watch = AlertWatch(lambda: active_alerts(store, fleet, settings, time.time_ns()), webhook.put, time.time_ns)
 
     def look() -> None:
         if store.leads():
-            watch.look()
+            receiver.tell(active_alerts(store, fleet, settings, now_ns := time.time_ns()), now_ns)
 
     return [BackgroundTask("looking for alerts", _ALERTS_EVERY_S, look)]
 

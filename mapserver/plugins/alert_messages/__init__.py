@@ -10,7 +10,7 @@ import queue
 import socket
 import ssl
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
@@ -32,7 +32,7 @@ Body = dict[str, Any]
 
 
 class Webhook:
-    """Sends messages in order until `close`; those that wait too long or fail four times are dropped and logged."""
+    """Sends messages in order until `close`; those that wait too long or fail four times are dropped and logged. host: the receiver's."""
 
     def __init__(self, settings: AlertSettings) -> None:
         """UsageError for a forbidden address or an unreadable token."""
@@ -42,12 +42,25 @@ class Webhook:
         self._headers = {"Content-Type": "application/json", "User-Agent": "fleetmap"}
         if settings.token_file is not None:
             self._headers["Authorization"] = f"Bearer {_token(Path(settings.token_file))}"
+        self._known: dict[tuple[str, str, str], Alert] = {}
         self._waiting: queue.Queue[bytes] = queue.Queue(_MOST_WAITING)
         self._ended = threading.Event()
         self._refusals = LogLimit(_log)
         self._testing = threading.Lock()
         self._thread = threading.Thread(target=self._run, name="webhook", daemon=True)
         self._thread.start()
+
+    def tell(self, alerts: Sequence[Alert], now_ns: int) -> None:
+        """Send what is new among the active alerts, and what has ended. After a restart of the server active ones are sent again."""
+        now = {alert.key: alert for alert in alerts}
+        begun = [alert for key, alert in now.items() if key not in self._known]
+        ended = [alert for key, alert in self._known.items() if key not in now]
+        self._known = {key: self._known.get(key, alert) for key, alert in now.items()}
+        for status, changed in (("firing", begun), ("resolved", ended)):
+            if changed:
+                self.put(message(changed[:_MOST_ALERTS], status, now_ns))
+            if len(changed) > _MOST_ALERTS:
+                _log.warning("%d alerts at once; only the first %d are sent", len(changed), _MOST_ALERTS)
 
     def put(self, body: Body) -> None:
         try:
@@ -109,28 +122,6 @@ class Webhook:
             watch.cancel()
             made.close()
         return 200 <= status < 300, f"status {status}"
-
-
-class AlertWatch:
-    """Notifies the webhook of new and ended alerts. After a restart of the server active alerts are sent again."""
-
-    def __init__(
-        self, look: Callable[[], Sequence[Alert]], put: Callable[[Body], None], clock_ns: Callable[[], int]
-    ) -> None:
-        self._look, self._put, self._clock_ns = look, put, clock_ns
-        self._known: dict[tuple[str, str, str], Alert] = {}
-
-    def look(self) -> None:
-        """Compare the active alerts with the last time."""
-        now = {alert.key: alert for alert in self._look()}
-        begun = [alert for key, alert in now.items() if key not in self._known]
-        ended = [alert for key, alert in self._known.items() if key not in now]
-        self._known = {key: self._known.get(key, alert) for key, alert in now.items()}
-        for status, alerts in (("firing", begun), ("resolved", ended)):
-            if alerts:
-                self._put(message(alerts[:_MOST_ALERTS], status, self._clock_ns()))
-                if len(alerts) > _MOST_ALERTS:
-                    _log.warning("%d alerts at once; only the first %d are sent", len(alerts), _MOST_ALERTS)
 
 
 def message(alerts: Sequence[Alert], status: str, now_ns: int) -> Body:
