@@ -4,6 +4,7 @@ import hashlib
 import os
 import re
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 from fleetmap.errors import FleetmapError, RecordingError
@@ -65,6 +66,13 @@ def read_text(
         raise error_type(f"{path} cannot be read ({error.strerror}); check the path, {expected}") from error
     except UnicodeDecodeError as error:
         raise error_type(f"{path} is not a text file (byte {error.start} is not UTF-8); {expected}") from error
+
+
+def lines_of(text: str, where: object) -> Iterator[tuple[str, str]]:
+    """The lines of a table, each with its place for messages, without empty ones and those that begin with #."""
+    for number, line in enumerate(text.splitlines(), start=1):
+        if line.strip() and not line.lstrip().startswith("#"):
+            yield f"{where}, line {number}", line
 
 
 def hash_file(path: Path, digest: "hashlib._Hash") -> None:

@@ -10,12 +10,12 @@ from fleetmap.encoding import MOST
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array
 from fleetmap.recordings.calibration_files import CalibrationFile, calibration_files, load_calibration
-from fleetmap.recordings.image_series import SeriesFrames, T
+from fleetmap.recordings.image_series import SeriesFrames
 from fleetmap.recordings.images import grey_bits, grey_peak, is_mosaic, is_wide
 from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS, ReadLog, check_together
-from fleetmap.recordings.recording import FrameSource, OpenOptions, Recording
+from fleetmap.recordings.recording import FrameSource, OpenOptions, Recording, sensors_of_view
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, SensorSet, Stamps, Trajectory, WheelSample
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Stamps, Trajectory, WheelSample
 
 _MIN_SAMPLES = 50
 _TRIED_FRAMES = 5
@@ -46,19 +46,20 @@ class RecordingParts:
 
 
 def image_parts(
-    path: Path, format_: str, calibration: RigCalibration, frames: SeriesFrames[T], **others: Any
+    path: Path, format_: str, calibration: RigCalibration, frames: SeriesFrames, **others: Any
 ) -> RecordingParts:
-    """The parts of a format that pairs series of images. others: fields of RecordingParts, as of other sensors."""
-    has_right, has_depth = frames.right is not None, frames.depth is not None
-    stamps_ns, numbers = frames.left.stamps_ns, frames.other_numbers
-    return RecordingParts(path, format_, calibration, stamps_ns, frames, has_right, has_depth, numbers, **others)
+    """The parts of a format that pairs series of images, of cameras that follow one another view by view. others: fields of
+    RecordingParts, as of other sensors."""
+    first, *_ = counts = [1 + ("right" in view.images) for view in frames.views]
+    has_depth, numbers = "depth" in frames.views[0].images, tuple(range(first, sum(counts)))
+    return RecordingParts(
+        path, format_, calibration, frames.stamps_ns, frames, first == 2, has_depth, numbers, **others
+    )
 
 
 def calibration_of_options(options: OpenOptions, log: ReadLog) -> CalibrationFile | None:
     """The calibration chosen by the caller, None to use the recording's own."""
-    if options.calibration_file is None:
-        return None
-    return logged_calibration(options.calibration_file, log)
+    return None if options.calibration_file is None else logged_calibration(options.calibration_file, log)
 
 
 def logged_calibration(file: Path, log: ReadLog) -> CalibrationFile:
@@ -99,12 +100,14 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
     if len(cameras) > len(recorded) and not parts.has_depth:
         log.note("cameras missing", f"the calibration describes {len(cameras)}, there are images of {len(recorded)}")
     imu, wheel, truth = parts.imu, parts.wheel, parts.ground_truth
-    check_together(imu.stamps_ns, "imu", parts.frame_stamps_ns)
-    for what, values in (("wheel odometry", wheel), ("position priors", parts.priors)):
-        check_together(np.array([value.stamp_ns for value in values], np.int64), what, parts.frame_stamps_ns)
-    if truth is not None:
-        check_together(truth.stamps_ns, "ground truth", parts.frame_stamps_ns)
-        truth = _sound_truth(truth, log)
+    for what, stamps_ns in {
+        "imu": imu.stamps_ns,
+        "wheel odometry": [sample.stamp_ns for sample in wheel],
+        "position priors": [prior.stamp_ns for prior in parts.priors],
+        "ground truth": () if truth is None else truth.stamps_ns,
+    }.items():
+        check_together(np.array(stamps_ns, np.int64), what, parts.frame_stamps_ns)
+    truth = None if truth is None else _sound_truth(truth, log)
     if len(imu) and parts.calibration.imu is None:
         how = "the mounting of the IMU is unknown; pass a calibration with --calibration FILE"
         log.note("imu not used", f"{len(imu)} samples, but {how}")
@@ -118,7 +121,7 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
         # A file's name may be no UTF-8, which reports cannot hold.
         name=(parts.name or parts.path.resolve().name).encode("utf-8", "backslashreplace").decode(),
         format=parts.format,
-        sensor_set=_sensor_set(parts, imu),
+        sensor_set=sensors_of_view(parts.has_right, parts.has_depth, len(imu) > 0),
         calibration=replace(parts.calibration, cameras=recorded, imu=parts.calibration.imu if len(imu) else None),
         frame_stamps_ns=np.ascontiguousarray(parts.frame_stamps_ns, np.int64),
         imu=imu,
@@ -138,22 +141,14 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
 
 def _check_depths(parts: RecordingParts) -> None:
     """Raise CalibrationError for a camera of another view that should have depth and has none."""
-    others = parts.frames.others if isinstance(parts.frames, SeriesFrames) else ()
+    others = parts.frames.views[1:] if isinstance(parts.frames, SeriesFrames) else ()
     firsts = [number for number in parts.others if parts.calibration.cameras[number].has_depth]
-    if len(firsts) > sum(other.depth is not None for other in others):
+    if len(firsts) > sum("depth" in other.images for other in others):
         names = " and ".join(f"cam{number} (--topic cam{number}_depth=/NAME)" for number in firsts)
         raise CalibrationError(
             f"{parts.path}: the calibration says has_depth of {names}, and not all of these have depth images; name the topic, or take "
             "has_depth out of the calibration to use the camera without its depth. Depth beside a pair is read from MCAP files and bags"
         )
-
-
-def _sensor_set(parts: RecordingParts, imu: ImuSamples) -> SensorSet:
-    if parts.has_depth:
-        return SensorSet.RGBD
-    if parts.has_right:
-        return SensorSet.STEREO_INERTIAL if len(imu) else SensorSet.STEREO
-    return SensorSet.MONO_INERTIAL if len(imu) else SensorSet.MONO
 
 
 def _damaged_moments(damaged_ns: list[int], frame_stamps_ns: Stamps) -> Stamps:
@@ -176,12 +171,12 @@ def _first_frame(recording: Recording) -> CameraFrame:
     raise faults[0]
 
 
-def _grey_bits(frames: SeriesFrames) -> int:  # type: ignore[type-arg]
+def _grey_bits(frames: SeriesFrames) -> int:
     """Number of bits used in 16-bit left images, from a few of them: drivers store 10 and 12 bits in the lower ones."""
-    peak = 0
-    for index in sorted({round(share * (len(frames.left) - 1)) for share in np.linspace(0, 1, _TRIED_FRAMES)}):
+    peak, left = 0, frames.views[0].images["left"]
+    for index in sorted({round(share * (len(left) - 1)) for share in np.linspace(0, 1, _TRIED_FRAMES)}):
         try:
-            image = frames.reader.read(frames.left.sources[index], int(frames.left.stamps_ns[index]))
+            image = frames.reader.read(left.sources[index], int(left.stamps_ns[index]))
             if index == 0 and not is_wide(image):
                 return 16  # the usual case: nothing more is read
             peak = max(peak, grey_peak(image))

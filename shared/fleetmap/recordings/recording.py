@@ -134,27 +134,18 @@ class Recording:
         """
         self._check_index(index)
         frame = self.frames.frame(index)
-        views = zip((frame, *frame.others), self.calibration.views, strict=False)
-        images = [
-            (view, *each)
-            for view, numbers in views
-            if view
-            for each in zip((view.left, view.right), numbers, strict=False)
-        ]
-        for view, image, number in images:
-            camera = self.calibration.cameras[number]
-            if image is not None and image.shape != (camera.height_px, camera.width_px):
+        for view, numbers in zip((frame, *frame.others), self.calibration.views, strict=False):
+            for number, image in zip(numbers, (view.left, view.right) if view else (), strict=False):
+                camera = self.calibration.cameras[number]
+                if view and image is not None and image.shape != (camera.height_px, camera.width_px):
+                    raise RecordingError(
+                        f"{self.path}: the cam{number} image at {view.stamp_ns} is {_size(image)} px, the calibration says "
+                        f"{camera.width_px}x{camera.height_px}; pass the matching one with --calibration FILE"
+                    )
+            if view and view.depth_m is not None and view.depth_m.shape != view.left.shape:
                 raise RecordingError(
-                    f"{self.path}: the cam{number} image at {view.stamp_ns} is {image.shape[1]}x{image.shape[0]} px, "
-                    f"the calibration says {camera.width_px}x{camera.height_px}; pass the matching one with "
-                    "--calibration FILE"
-                )
-        for view in (frame, *(other for other in frame.others if other is not None)):
-            if view.depth_m is not None and view.depth_m.shape != view.left.shape:
-                (height, width), (colour_height, colour_width) = view.depth_m.shape, view.left.shape
-                raise RecordingError(
-                    f"{self.path}: the depth image at {view.stamp_ns} is {width}x{height} px, the colour image "
-                    f"{colour_width}x{colour_height}; record depth registered to colour"
+                    f"{self.path}: the depth image at {view.stamp_ns} is {_size(view.depth_m)} px, the colour image "
+                    f"{_size(view.left)}; record depth registered to colour"
                 )
         return frame
 
@@ -203,26 +194,19 @@ class Recording:
 
     def view(self, number: int) -> "Recording":
         """The recording of one of a rig's views alone, with its own stamps; the content's hash is that of all views for the first one."""
-        cameras, views = self.calibration.cameras, self.calibration.views
+        views = self.calibration.views
         if len(views) == 1:
             return self
-        calibration = replace(self.calibration, cameras=tuple(cameras[camera] for camera in views[number]))
-        if number == 0:
-            if not isinstance(
-                self.frames, SeriesFrames
-            ):  # other views of its frames find no camera in that calibration
-                return replace(self, calibration=calibration)
-            return replace(self, calibration=calibration, frames=replace(self.frames, has_others=False))
-        series: Any = self.frames
-        while not isinstance(series, SeriesFrames):
-            series = series.source  # of frames that are kept, or some of all
-        of_pair = {SensorSet.MONO: SensorSet.STEREO, SensorSet.MONO_INERTIAL: SensorSet.STEREO_INERTIAL}
-        of_one = {pair: one for one, pair in of_pair.items()}
-        sensor_set = (of_pair if len(views[number]) == 2 else of_one).get(self.sensor_set, self.sensor_set)
-        if calibration.cameras[0].has_depth:
-            sensor_set = SensorSet.RGBD
-        frames = series.of_view(number)
-        stamps_ns = frames.left.stamps_ns
+        calibration = replace(self.calibration, cameras=tuple(self.calibration.cameras[n] for n in views[number]))
+        frames: Any = self.frames
+        if number == 0:  # other views of wrapped frames find no camera in that calibration
+            shown = frames.of_view(0) if isinstance(frames, SeriesFrames) else frames
+            return replace(self, calibration=calibration, frames=shown)
+        while not isinstance(frames, SeriesFrames):
+            frames = frames.source  # of frames that are kept, or some of all
+        frames, has_imu = frames.of_view(number), self.sensor_set.endswith("-inertial")
+        sensor_set = sensors_of_view(len(views[number]) == 2, calibration.cameras[0].has_depth, has_imu)
+        stamps_ns = frames.stamps_ns
         return replace(self, calibration=calibration, frames=frames, frame_stamps_ns=stamps_ns, sensor_set=sensor_set)
 
     def content_hash(self) -> str:
@@ -246,6 +230,17 @@ class Recording:
             raise RecordingError(
                 f"{self.path}: frame {index} was asked for, there are {len(self)} (0 to {len(self) - 1})"
             )
+
+
+def _size(image: NDArray[Any]) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
+
+
+def sensors_of_view(has_right: bool, has_depth: bool, has_imu: bool) -> SensorSet:
+    """The sensor set of a recording by its first view and its IMU, which a depth camera does not use."""
+    if has_depth:
+        return SensorSet.RGBD
+    return SensorSet(("stereo" if has_right else "mono") + ("-inertial" if has_imu else ""))
 
 
 @dataclass(frozen=True, slots=True)

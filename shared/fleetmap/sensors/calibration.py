@@ -141,6 +141,11 @@ def _set_numbers(record: object, kind: type[int] | type[float], *names: str) -> 
         object.__setattr__(record, name, kind(getattr(record, name)))
 
 
+def intrinsics_of(matrix: Array) -> Array:
+    """(4,) fx fy cx cy of a camera matrix (3, 3)."""
+    return matrix[[0, 1, 0, 1], [0, 1, 2, 2]]
+
+
 def check_camera(camera: CameraCalibration, name: str) -> CameraCalibration:
     """Return `camera`; raise CalibrationError naming the first invalid value."""
     if camera.model not in CAMERA_MODELS:

@@ -7,20 +7,9 @@ import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.plugins.datasets.layout import (
-    existing_images,
-    read_ground_truth,
-    read_image_list,
-    read_imu,
-    rig_frames,
-)
+from fleetmap.plugins.datasets.layout import existing_images, read_ground_truth, read_image_list, read_imu, rig_frames
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
-from fleetmap.recordings.calibration_files import (
-    calibration_files,
-    camera_of,
-    imu_noise,
-    read_yaml,
-)
+from fleetmap.recordings.calibration_files import calibration_files, camera_of, imu_noise, read_yaml
 from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts, logged_calibration
 from fleetmap.recordings.ordering import ReadLog
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
@@ -69,21 +58,18 @@ def _calibration(root: Path, count: int, options: OpenOptions, log: ReadLog) -> 
     if given := calibration_of_options(options, log):
         return given.calibration, euroc_from_imu
     camera_files = [root / f"mav0/cam{i}/sensor.yaml" for i in range(count)]
-    missing = next((file for file in camera_files if not file.is_file()), None)
-    if missing is None:
-        log.files += [part for file in camera_files for part in calibration_files(file)]
-        log.files += [imu_file] if noise is not None else []
-        cameras = [read_camera(file) for file in camera_files]
-        if not np.array_equal(euroc_from_imu, np.eye(4)):
-            imu_from_euroc = se3_inverse(euroc_from_imu)
-            cameras = [replace(c, body_from_cam=imu_from_euroc @ c.body_from_cam) for c in cameras]
-        return RigCalibration(tuple(cameras), noise), euroc_from_imu
-    for name in _CAMCHAINS:
-        if (root / name).is_file():
-            return logged_calibration(root / name, log).calibration, euroc_from_imu
-    raise CalibrationError(
-        f"{missing} is missing and there is no camchain.yaml; pass a calibration with --calibration FILE"
-    )
+    if missing := [file for file in camera_files if not file.is_file()]:
+        for chain in (root / name for name in _CAMCHAINS if (root / name).is_file()):
+            return logged_calibration(chain, log).calibration, euroc_from_imu
+        lack = f"{missing[0]} is missing and there is no camchain.yaml"
+        raise CalibrationError(f"{lack}; pass a calibration with --calibration FILE")
+    log.files += [part for file in camera_files for part in calibration_files(file)]
+    log.files += [imu_file] if noise is not None else []
+    cameras = [read_camera(file) for file in camera_files]
+    if not np.array_equal(euroc_from_imu, np.eye(4)):
+        imu_from_euroc = se3_inverse(euroc_from_imu)
+        cameras = [replace(c, body_from_cam=imu_from_euroc @ c.body_from_cam) for c in cameras]
+    return RigCalibration(tuple(cameras), noise), euroc_from_imu
 
 
 def read_camera(path: Path) -> CameraCalibration:

@@ -9,23 +9,14 @@ import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse
-from fleetmap.plugins.datasets.layout import (
-    FileReader,
-    ImageFiles,
-    existing_images,
-    optional_truth,
-    read_image,
-    read_numbers,
-    read_table,
-    rig_frames,
-)
+from fleetmap.plugins.datasets import layout
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
-from fleetmap.recordings.files import natural_key
+from fleetmap.recordings.files import lines_of, natural_key
 from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
-from fleetmap.recordings.image_series import SeriesFrames, pair_images
+from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, paired
 from fleetmap.recordings.images import decode_grey
 from fleetmap.recordings.ordering import ReadLog, check_seconds
-from fleetmap.sensors.calibration import CameraCalibration, RigCalibration, check_camera
+from fleetmap.sensors.calibration import CameraCalibration, RigCalibration, check_camera, intrinsics_of
 from fleetmap.sensors.cameras import lens_of
 from fleetmap.sensors.samples import Stamps, Trajectory
 
@@ -57,53 +48,60 @@ def open_kitti_raw(path: Path, options: OpenOptions) -> Recording:
         files = [folder / "calib_cam_to_cam.txt" for folder in (path, path.resolve().parent)]
         file = next((each for each in files if each.is_file()), files[0])
         calibration = RigCalibration(
-            tuple(
-                _raw_camera(file, name[-2:], series.sources[0]) for name, series in zip(present, cameras, strict=True)
-            )
+            tuple(_raw_camera(file, name[-2:], _size_px(series)) for name, series in zip(present, cameras, strict=True))
         )
         log.files.append(file)
-    return finalize(image_parts(path, "kitti-raw", *rig_frames(path, log, cameras, calibration)), log)
+    return finalize(image_parts(path, "kitti-raw", *layout.rig_frames(path, log, cameras, calibration)), log)
 
 
 def _raw_stamps(file: Path, log: ReadLog) -> Stamps:
     """Stamps of lines such as `2011-09-26 13:02:25.964389445`."""
     stamps = []
-    for number, line in enumerate(read_table(file).split("\n"), start=1):
-        if not line.strip():
-            continue
+    for where, line in lines_of(layout.read_table(file), file):
         try:
             stamps.append(int(np.datetime64(line.strip().replace(" ", "T"), "ns").astype(np.int64)))
         except ValueError:
-            raise RecordingError(f"{file}, line {number}: {line[:60]!r} is not a date and a time") from None
+            raise RecordingError(f"{where}: {line[:60]!r} is not a date and a time") from None
     log.files.append(file)
     return np.array(stamps, np.int64)
 
 
-def _raw_camera(file: Path, number: str, first_image: Path) -> CameraCalibration:
+def _size_px(images: ImageSeries) -> tuple[int, int]:
+    """Width and height of the first image."""
+    height, width = decode_grey(layout.read_image(images.sources[0])).shape
+    return width, height
+
+
+def _raw_camera(file: Path, number: str, size_px: tuple[int, int]) -> CameraCalibration:
     """A camera, by the size of its images: of rectified ones by P_rect, else by K and D, and R and T, which lead from camera 0 to it."""
-    if not file.is_file():
-        raise CalibrationError(f"{file} is missing; add it or pass a calibration with --calibration FILE")
-    rows = dict(line.split(":", 1) for line in read_table(file).splitlines() if ":" in line)
+    rows = dict(line.split(":", 1) for line in _calibration_lines(file) if ":" in line)
 
     def numbers(name: str, count: int) -> Array:
-        try:
-            values = np.array([float(word) for word in rows[f"{name}_{number}"].split()])
-        except (KeyError, ValueError):
-            values = np.zeros(0)
-        if len(values) != count or not np.isfinite(values).all():
+        values = _floats(rows.get(f"{name}_{number}", ""))
+        if values is None or len(values) != count or not np.isfinite(values).all():
             raise CalibrationError(f"{file}: {name}_{number} are not {count} numbers; copy the file again")
         return values
 
-    height, width = decode_grey(read_image(first_image)).shape
-    size_px = width, height
     if np.array_equal(numbers("S_rect", 2), size_px):
         return _projected(numbers("P_rect", 12).reshape(3, 4), size_px, f"{file}: P_rect_{number}")
     matrix, turn = (numbers(name, 9).reshape(3, 3) for name in "KR")
-    intrinsics = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
     body_from_cam = se3_inverse(se3(turn, numbers("T", 3)))
     model, distortion = lens_of("radtan", numbers("D", 5), f"{file}: D_{number}")
-    camera = CameraCalibration(model, *size_px, intrinsics, distortion, body_from_cam)
+    camera = CameraCalibration(model, *size_px, intrinsics_of(matrix), distortion, body_from_cam)
     return check_camera(camera, f"{file}: camera {number}")
+
+
+def _calibration_lines(file: Path) -> list[str]:
+    if not file.is_file():
+        raise CalibrationError(f"{file} is missing; add it or pass a calibration with --calibration FILE")
+    return layout.read_table(file).splitlines()
+
+
+def _floats(words: str) -> Array | None:
+    try:
+        return np.array([float(word) for word in words.split()])
+    except ValueError:
+        return None
 
 
 def open_kitti(path: Path, options: OpenOptions) -> Recording:
@@ -115,22 +113,22 @@ def open_kitti(path: Path, options: OpenOptions) -> Recording:
     times_file, stamps_of_number = path / "times.txt", None
     if times_file.is_file():
         log.files.append(times_file)
-        seconds = read_numbers(times_file, (1,))[:, 0]
+        seconds = layout.read_numbers(times_file, (1,))[:, 0]
         check_seconds(float(np.abs(seconds).max()), str(times_file))
         stamps_of_number = np.round(seconds * 1e9).astype(np.int64)
     left, right = (_images(path / name, stamps_of_number, log) for name in (left_name, right_name))
     if given := calibration_of_options(options, log):
         calibration = given.calibration
     else:
-        calibration = _calibration(path / "calib.txt", left.sources[0], (left_row, right_row))
+        calibration = _calibration(path / "calib.txt", _size_px(left), (left_row, right_row))
         log.files.append(path / "calib.txt")
-    left, right = pair_images(left, right, log, tolerance_ns=0)
-    truth = optional_truth(path / "poses.txt", log, lambda file: _ground_truth(file, stamps_of_number, log))
-    frames = SeriesFrames(FileReader(path, log.files), left, right)
+    view = paired(left, {"right": right}, log, 0)
+    truth = layout.optional_truth(path / "poses.txt", log, lambda file: _ground_truth(file, stamps_of_number, log))
+    frames = SeriesFrames(layout.FileReader(path, log.files), (view,))
     return finalize(image_parts(path, "kitti", calibration, frames, ground_truth=truth), log)
 
 
-def _images(folder: Path, stamps_of_number: Stamps | None, log: ReadLog) -> ImageFiles:
+def _images(folder: Path, stamps_of_number: Stamps | None, log: ReadLog) -> ImageSeries:
     if not folder.is_dir():
         raise RecordingError(f"{folder} is missing, the other camera's folder is there; copy the recording again")
     paths = sorted(
@@ -138,33 +136,33 @@ def _images(folder: Path, stamps_of_number: Stamps | None, log: ReadLog) -> Imag
     )
     if not paths:
         raise RecordingError(f"{folder} holds no numbered image such as 000000.png; copy the recording again")
-    numbers = [int(path.stem) for path in paths]
+    numbers = np.array([int(path.stem) for path in paths], object)  # of any size
     most = _MOST_NUMBER if stamps_of_number is None else len(stamps_of_number) - 1
-    beyond = next((path for path, number in zip(paths, numbers, strict=True) if number > most), None)
-    if beyond is not None and stamps_of_number is None:
+    for path in [path for path, number in zip(paths, numbers, strict=True) if number > most]:
+        if stamps_of_number is not None:
+            raise RecordingError(f"{path} has no line in times.txt, which ends with number {most}")
         raise RecordingError(
-            f"{beyond}: invalid frame number {beyond.stem}; count from 0, and write the seconds to times.txt"
+            f"{path}: invalid frame number {path.stem}; count from 0, and write the seconds to times.txt"
         )
-    if beyond is not None:
-        raise RecordingError(f"{beyond} has no line in times.txt, which ends with number {most}")
-    if stamps_of_number is None:
-        return existing_images(np.array(numbers, np.int64) * _PERIOD_NS, paths, folder.name, log)
-    return existing_images(stamps_of_number[numbers], paths, folder.name, log)
+    of_folder = numbers.astype(np.int64)
+    stamps_ns = of_folder * _PERIOD_NS if stamps_of_number is None else stamps_of_number[of_folder]
+    return layout.existing_images(stamps_ns, paths, folder.name, log)
 
 
-def _calibration(file: Path, first_image: Path, numbers: tuple[int, int]) -> RigCalibration:
-    if not file.is_file():
-        raise CalibrationError(f"{file} is missing; add it or pass a calibration with --calibration FILE")
-    rows = _projections(file)
-    height, width = decode_grey(read_image(first_image)).shape
-    cameras = []
-    for number in numbers:
-        if number not in rows:
-            raise CalibrationError(
-                f"{file} has no P{number}; it describes {', '.join(f'P{r}' for r in rows) or 'no camera'}"
-            )
-        cameras.append(_projected(rows[number], (width, height), f"{file}: P{number}"))
-    return RigCalibration(tuple(cameras))
+def _calibration(file: Path, size_px: tuple[int, int], numbers: tuple[int, int]) -> RigCalibration:
+    """The cameras of these numbers, from lines of twelve numbers with or without a leading `P0:`."""
+    rows: dict[int, Array] = {}
+    for line in _calibration_lines(file):
+        label, colon, words = line.partition(":") if ":" in line else ("", "", line)
+        values = _floats(words)
+        if values is None:
+            raise CalibrationError(f"{file}: {line[:60]!r} are not twelve numbers")
+        if len(values) == 12 and (not colon or re.fullmatch(r"P\d{1,3}", label)):
+            rows[int(label[1:]) if colon else len(rows)] = values.reshape(3, 4)
+    for number in (number for number in numbers if number not in rows):
+        described = ", ".join(f"P{row}" for row in rows) or "no camera"
+        raise CalibrationError(f"{file} has no P{number}; it describes {described}")
+    return RigCalibration(tuple(_projected(rows[number], size_px, f"{file}: P{number}") for number in numbers))
 
 
 def _projected(projection: Array, size_px: tuple[int, int], where: str) -> CameraCalibration:
@@ -173,27 +171,12 @@ def _projected(projection: Array, size_px: tuple[int, int], where: str) -> Camer
     if np.linalg.det(matrix) == 0:
         raise CalibrationError(f"{where} is {projection.tolist()}, which is not a camera's projection")
     body_from_cam = se3(np.eye(3), np.asarray(-np.linalg.solve(matrix, projection[:, 3]), np.float64))
-    intrinsics = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
-    camera = CameraCalibration("radial-tangential", *size_px, intrinsics, np.zeros(0), body_from_cam)
+    camera = CameraCalibration("radial-tangential", *size_px, intrinsics_of(matrix), np.zeros(0), body_from_cam)
     return check_camera(camera, where)
 
 
-def _projections(file: Path) -> dict[int, Array]:
-    """Read the projection matrices by number, from lines of twelve numbers with or without a leading `P0:`."""
-    rows: dict[int, Array] = {}
-    for line in read_table(file).splitlines():
-        label, colon, numbers = line.partition(":") if ":" in line else ("", "", line)
-        try:
-            values = [float(word) for word in numbers.split()]
-        except ValueError:
-            raise CalibrationError(f"{file}: {line[:60]!r} are not twelve numbers") from None
-        if len(values) == 12 and (not colon or re.fullmatch(r"P\d{1,3}", label)):
-            rows[int(label[1:]) if colon else len(rows)] = np.array(values).reshape(3, 4)
-    return rows
-
-
 def _ground_truth(file: Path, stamps_of_number: Stamps | None, log: ReadLog) -> Trajectory:
-    rows = read_numbers(file, (12, 16), log)
+    rows = layout.read_numbers(file, (12, 16), log)
     stamps_ns = np.arange(len(rows)) * _PERIOD_NS if stamps_of_number is None else stamps_of_number
     if len(stamps_ns) != len(rows):
         raise RecordingError(f"poses.txt has {len(rows)} rows, times.txt {len(stamps_ns)}")

@@ -7,29 +7,40 @@ import os
 import re
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import AnyArray, Array
-from fleetmap.recordings.files import hash_file, read_text, what_instead
-from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, rig_images
-from fleetmap.recordings.images import StoredImage, file_kind, image_size, is_cut, is_damaged_png
+from fleetmap.recordings.files import hash_file, lines_of, read_text, what_instead
+from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, rig_views
+from fleetmap.recordings.images import (
+    StoredFrame,
+    StoredImage,
+    decode_depth,
+    decode_frame,
+    file_kind,
+    image_size,
+    is_cut,
+    is_damaged_png,
+)
 from fleetmap.recordings.limits import MAX_IMAGE_BYTES
-from fleetmap.recordings.ordering import ReadLog, clean_imu, trajectory_of_rows, usual_size, wrong_unit
+from fleetmap.recordings.ordering import LAST_NS, ReadLog, clean_imu, trajectory_of_rows, usual_size, wrong_unit
 from fleetmap.recordings.tum import parse_stamp_ns
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.samples import ImuSamples, Stamps, Trajectory
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, Stamps, Trajectory
 
 _HEAD_BYTES, _TAIL_BYTES = 4096, 8192
-_LAST_NS = 2**63 - 1
+Depth = NDArray[np.float32]
 _IMU_NAMES = {
     "gyro": ("w_", "wx", "wy", "wz", "gyr", "gx", "gy", "gz", "omega", "ang"),
     "accel": ("a_", "ax", "ay", "az", "acc", "lin"),
 }
-ImageFiles = ImageSeries[Path]
 
 
 @dataclass(frozen=True)
@@ -60,9 +71,9 @@ class FileReader:
 
 
 def rig_frames(
-    root: Path, log: ReadLog, cameras: Sequence[ImageFiles], calibration: RigCalibration
-) -> tuple[RigCalibration, SeriesFrames[Path]]:
-    """The calibration in the order of a rig, and the frames of all cameras (see `rig_images`); CalibrationError for more cameras than
+    root: Path, log: ReadLog, cameras: Sequence[ImageSeries], calibration: RigCalibration
+) -> tuple[RigCalibration, SeriesFrames]:
+    """The calibration in the order of a rig, and the frames of all cameras (see `rig_views`); CalibrationError for more cameras than
     described."""
     described = len(calibration.cameras)
     if described < len(cameras):
@@ -71,8 +82,36 @@ def rig_frames(
             "pass one that has all with --calibration FILE"
         )
     named = {number: (f"camera {number}", series) for number, series in enumerate(cameras)}
-    ordered, (left, right, _), others = rig_images(calibration, named, log)
-    return ordered, SeriesFrames(FileReader(root, log.files), left, right, others=others)
+    ordered, views = rig_views(calibration, named, log)
+    return ordered, SeriesFrames(FileReader(root, log.files), views)
+
+
+@dataclass
+class RegisteredFrames(SeriesFrames):
+    """Frames with depth that is stored unregistered, and returned to one mm.
+
+    register: reprojects depth in metres, named for messages, into the pixels of the left image: (H, W) metres, 0 where unknown.
+    """
+
+    register: Callable[[Depth, str], Depth] = field(kw_only=True)
+
+    def stored(self, index: int) -> StoredFrame:
+        """Frame `index` with its images as stored; depth as PNG in whole mm."""
+        stored = super().stored(index)
+        depth: Any = stored.depth
+        depth_mm = self._registered_mm(decode_depth(depth), depth.where)
+        _, png = cv2.imencode(".png", depth_mm.astype(np.uint16))
+        return replace(stored, depth=StoredImage("file", png.tobytes(), depth.where))
+
+    def frame(self, index: int) -> CameraFrame:
+        stored: Any = super().stored(index)
+        frame = decode_frame(stored)
+        depth_m: Any = frame.depth_m
+        depth_mm = self._registered_mm(depth_m, stored.depth.where)
+        return replace(frame, depth_m=depth_mm.astype(np.float32) / np.float32(1000.0))
+
+    def _registered_mm(self, depth_m: Depth, where: str) -> Depth:
+        return np.round(self.register(depth_m, where) * 1000)
 
 
 def read_image(path: Path) -> StoredImage:
@@ -87,7 +126,7 @@ def read_image(path: Path) -> StoredImage:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); copy the recording again") from error
 
 
-def existing_images(stamps_ns: Stamps, paths: Sequence[Path], what: str, log: ReadLog) -> ImageFiles:
+def existing_images(stamps_ns: Stamps, paths: Sequence[Path], what: str, log: ReadLog) -> ImageSeries:
     """Select the images with increasing stamps that exist, are whole and have the most frequent size; the others are noted in `log`.
 
     RecordingError if none is left.
@@ -101,13 +140,11 @@ def existing_images(stamps_ns: Stamps, paths: Sequence[Path], what: str, log: Re
     left_out: dict[str, list[str]] = {}
     kept, sizes_px = [], []
     for index, path in enumerate(series.sources):
-        fault, size_px = "missing", None
-        if str(path) in file_bytes:
-            fault, size_px = _fault_and_size(path, file_bytes[str(path)])
-            if fault:
-                log.damaged_ns.append(int(series.stamps_ns[index]))
+        size = file_bytes.get(str(path))
+        fault, size_px = ("missing", None) if size is None else _fault_and_size(path, size)
         if fault:
             left_out.setdefault(fault, []).append(path.name)
+            log.damaged_ns += [] if fault == "missing" else [int(series.stamps_ns[index])]
         else:
             kept.append(index)
             sizes_px.append(size_px)
@@ -137,10 +174,8 @@ def _fault_and_size(path: Path, file_bytes: int) -> tuple[str, tuple[int, int] |
         return f"that cannot be read ({error.strerror})", None
     if fault := what_instead(head):
         return f"that are {fault}", None
-    if is_cut(head, tail):
-        return "cut off", None
-    if is_damaged:
-        return "damaged inside", None
+    if is_damaged or is_cut(head, tail):
+        return "cut off" if is_cut(head, tail) else "damaged inside", None
     size_px = image_size(head)
     if size_px is None and file_kind(head) == "other" and not head.startswith((b"II*\0", b"MM\0*")):
         return "of no format that is read", None  # the header of a TIFF file may be at its end
@@ -161,17 +196,14 @@ def read_image_list(path: Path, log: ReadLog, *, seconds: bool = False) -> tuple
     RecordingError for an invalid line other than a header, and for files outside the list's folder.
     """
     stamps, files = [], []
-    for number, line in enumerate(read_table(path).splitlines(), start=1):
-        if not line.strip() or line.lstrip().startswith("#"):
-            continue
-        where = f"{path}, line {number}"
+    for where, line in lines_of(read_table(path), path):
         columns = re.split(r"[,;\t]", line) if re.search(r"[,;\t]", line) else line.split()
         stamp, name, *_ = [*(column.strip(' \t"') for column in columns), ""]
-        if number == 1 and name and not stamp[:1].isdecimal() and not seconds:
+        if where.endswith("line 1") and name and not stamp[:1].isdecimal() and not seconds:
             continue  # names of columns
         try:
             stamp_ns = parse_stamp_ns(stamp) if seconds else _whole_ns(stamp, where)
-            if not name or stamp_ns > _LAST_NS:
+            if not name or stamp_ns > LAST_NS:
                 raise ValueError("the line is too short" if not name else "the stamp is too large")
         except ValueError as error:
             unit = "seconds" if seconds else "ns"
@@ -190,15 +222,20 @@ def _whole_ns(word: str, where: str) -> int:
     """RecordingError for a number with a decimal point or exponent, naming its likely unit; ValueError for other text."""
     if word.isdecimal():
         return int(word)
-    try:
-        value = float(word)
-    except ValueError:
-        value = np.nan
+    value = _float(word)
     if word.lstrip("+-").isdecimal() or not np.isfinite(value):
         raise ValueError(f"stamp {word[:40]!r}")
     names = {1e17: "nanoseconds that a program rounded", 1e14: "microseconds", 1e11: "milliseconds", 0.0: "seconds"}
     unit = next(name for least, name in names.items() if abs(value) >= least)
     raise wrong_unit(f"{where}:", unit, f"{word[:40]} is not a whole number", "write all digits of the nanoseconds")
+
+
+def _float(word: str) -> float:
+    """The number in a word; NaN if it is none."""
+    try:
+        return float(word)
+    except ValueError:
+        return np.nan
 
 
 def read_stamped_rows(path: Path, columns: int, log: ReadLog) -> tuple[Stamps, Array]:
@@ -233,16 +270,15 @@ def read_stamped_rows(path: Path, columns: int, log: ReadLog) -> tuple[Stamps, A
 def _whole_rows(path: Path, text: str, dtype: "np.dtype[np.void]", log: ReadLog) -> AnyArray:
     columns = dtype["values"].shape[0]
     rows, bad = [], 0
-    for words in (line.partition("#")[0].split() for line in text.splitlines()):
+    for _, line in lines_of(text, path):
+        first, *words = line.partition("#")[0].split()
         try:
-            stamp, values = int(words[0]), [float(word) for word in words[1 : columns + 1]]
-        except (ValueError, IndexError):
-            bad += bool(words)
-            continue
-        if len(values) == columns and abs(stamp) <= _LAST_NS:
-            rows.append((stamp, values))
-        else:
-            bad += 1
+            stamp, values = int(first), [float(word) for word in words[:columns]]
+        except ValueError:
+            stamp, values = 0, []
+        is_whole = len(values) == columns and abs(stamp) <= LAST_NS
+        rows += [(stamp, values)] if is_whole else []
+        bad += not is_whole
     log.note(f"{path.name}: unreadable lines", f"{bad} of {bad + len(rows)} lines lack a stamp and {columns} numbers")
     return np.array(rows, dtype)
 
@@ -263,9 +299,8 @@ def read_imu(path: Path, log: ReadLog) -> ImuSamples:
         if kind and word[-1:] in "xyz":
             found[kind + word[-1]] = number
     order = [found.get(kind + axis, -1) for kind in _IMU_NAMES for axis in "xyz"]
-    if -1 in order:
-        order = list(range(6))
-    return clean_imu(stamps_ns, rows[:, order[:3]], rows[:, order[3:]], log)
+    rows = rows if -1 in order else rows[:, order]
+    return clean_imu(stamps_ns, rows[:, :3], rows[:, 3:], log)
 
 
 def read_ground_truth(path: Path, log: ReadLog) -> Trajectory | None:
@@ -291,17 +326,10 @@ def read_numbers(path: Path, widths: Sequence[int], log: ReadLog | None = None) 
     rows: list[list[float]] = []
     expected = " or ".join(str(width) for width in widths)
     bad = list[str]()
-    for number, line in enumerate(read_table(path).splitlines(), start=1):
-        words = line.partition("#")[0].replace(",", " ").split()
-        if not words:
-            continue
-        try:
-            row = [float(word) for word in words]
-        except ValueError:
-            row = []
+    for where, line in lines_of(read_table(path), path):
+        row = [_float(word) for word in line.partition("#")[0].replace(",", " ").split()]
         if len(row) not in widths or not np.isfinite(row).all():
-            what = f"{line[:60]!r} are not {expected} finite numbers"
-            bad.append(f"{path}, line {number}: {what}; copy the recording again")
+            bad.append(f"{where}: {line[:60]!r} are not {expected} finite numbers; copy the recording again")
             row = []
         else:
             widths = (len(row),)

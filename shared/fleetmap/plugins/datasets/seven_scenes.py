@@ -6,20 +6,18 @@ nominal position in their sensor. A calibration file's cam0 is the colour camera
 depth camera. The poses were computed from depth, so they are the depth camera's.
 """
 
-from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse
-from fleetmap.plugins.datasets.layout import FileReader, ImageFiles, existing_images, read_image, read_table
+from fleetmap.plugins.datasets import layout
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
-from fleetmap.recordings.image_series import SeriesFrames, pair_images
+from fleetmap.recordings.image_series import ImageSeries, paired
 from fleetmap.recordings.images import decode_depth, decode_grey
 from fleetmap.recordings.ordering import ReadLog
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
@@ -30,7 +28,6 @@ _COLOUR_FOCAL_PX, _DEPTH_FOCAL_PX = 525.0, 585.0  # of images that are 640 px wi
 # Of a Kinect. In the red kitchen sequence, edges in depth and colour align best with 28 mm and these focal lengths.
 _DEPTH_LEFT_OF_COLOUR_M = 0.025
 _FRAME_RATE_HZ = 30
-Depth = NDArray[np.float32]
 
 
 def recognises(path: Path) -> bool:
@@ -41,7 +38,8 @@ def recognises(path: Path) -> bool:
 def open_seven_scenes(path: Path, options: OpenOptions) -> Recording:
     """Open the recording in a 7-Scenes folder. The body is the colour camera; depth is returned registered to colour."""
     log = ReadLog()
-    colour, depth = pair_images(_files(path, "color", log), _files(path, "depth", log), log, tolerance_ns=0)
+    view = paired(_files(path, "color", log), {"depth": _files(path, "depth", log)}, log, 0)
+    colour, depth = (view.images[field] for field in ("left", "depth"))
     if len(colour) == 0:
         raise RecordingError(f"{path}: no colour image has its depth image; copy the recording again")
     given = calibration_of_options(options, log)
@@ -50,7 +48,7 @@ def open_seven_scenes(path: Path, options: OpenOptions) -> Recording:
     register = DepthRegistration(colour_camera, depth_camera).registered
     calibration = RigCalibration((colour_camera,), None, calibration.base_from_body)
     truth = _ground_truth(colour, se3_inverse(depth_camera.body_from_cam), log)
-    frames = SeriesFrames(FileReader(path, log.files), colour, depth=depth, register=register)
+    frames = layout.RegisteredFrames(layout.FileReader(path, log.files), (view,), register=register)
     return finalize(image_parts(path, "7scenes", calibration, frames, ground_truth=truth), log)
 
 
@@ -73,18 +71,17 @@ class DepthRegistration:
             self._rays_depth = rays / np.where(rays[:, 2:] > 0, rays[:, 2:], np.nan)
             self._lens = CAMERA_MODELS[colour.model].core_lens(colour.distortion)
 
-    def registered(self, depth_m: Depth, where: str) -> Depth:
+    def registered(self, depth_m: layout.Depth, where: str) -> layout.Depth:
         """(H, W) metres along the colour camera's axis, 0 where unknown, of a depth image in the depth camera's pixels.
 
         With a common centre the nearest depth pixel is taken. Otherwise points are projected one by one and the
         nearest surface wins, so that thin gaps stay unknown.
         """
         if depth_m.shape != self._depth_size:
-            height, width = self._depth_size
-            raise RecordingError(
-                f"{where}: the depth image is {depth_m.shape[1]}x{depth_m.shape[0]} px, the calibration says "
-                f"{width}x{height}; pass the matching one with --calibration FILE"
+            sizes = "the depth image is {1}x{0} px, the calibration says {3}x{2}".format(
+                *depth_m.shape, *self._depth_size
             )
+            raise RecordingError(f"{where}: {sizes}; pass the matching one with --calibration FILE")
         if self._is_same_place:
             return np.asarray(cv2.remap(depth_m, self._map, None, cv2.INTER_NEAREST, borderValue=0.0), np.float32)  # type: ignore[call-overload]
         colour, motion = self._colour, self._colour_from_depth
@@ -94,13 +91,13 @@ class DepthRegistration:
         )
 
 
-def _files(path: Path, kind: str, log: ReadLog) -> ImageFiles:
+def _files(path: Path, kind: str, log: ReadLog) -> ImageSeries:
     found = sorted((_number(file), file) for file in path.glob(f"frame-*.{kind}.*"))
     if not found:
         raise RecordingError(f"{path} holds no frame-NNNNNN.{kind} file; copy the recording again")
     numbers = np.array([number for number, _ in found], np.int64)
     stamps_ns = np.round(numbers * (1e9 / _FRAME_RATE_HZ)).astype(np.int64)
-    return existing_images(stamps_ns, [file for _, file in found], f"{kind} images", log)
+    return layout.existing_images(stamps_ns, [file for _, file in found], f"{kind} images", log)
 
 
 def _number(file: Path) -> int:
@@ -111,40 +108,35 @@ def _number(file: Path) -> int:
 
 
 def _default_calibration(colour: Path, depth: Path) -> RigCalibration:
-    colour_camera = _centred(decode_grey(read_image(colour)).shape, _COLOUR_FOCAL_PX)
-    depth_camera = _centred(decode_depth(read_image(depth)).shape, _DEPTH_FOCAL_PX)
     colour_from_depth = se3(np.eye(3), np.array([-_DEPTH_LEFT_OF_COLOUR_M, 0.0, 0.0]))
-    return RigCalibration((colour_camera, replace(depth_camera, body_from_cam=colour_from_depth)))
+    colour_camera = _centred(decode_grey(layout.read_image(colour)).shape, _COLOUR_FOCAL_PX, np.eye(4))
+    depth_camera = _centred(decode_depth(layout.read_image(depth)).shape, _DEPTH_FOCAL_PX, colour_from_depth)
+    return RigCalibration((colour_camera, depth_camera))
 
 
-def _centred(shape: tuple[int, ...], focal_px: float) -> CameraCalibration:
+def _centred(shape: tuple[int, ...], focal_px: float, body_from_cam: Array) -> CameraCalibration:
     height, width = shape
     focal = focal_px * width / 640
     intrinsics = np.array([focal, focal, width / 2, height / 2])
-    return CameraCalibration("radial-tangential", width, height, intrinsics, np.zeros(0), np.eye(4))
+    return CameraCalibration("radial-tangential", width, height, intrinsics, np.zeros(0), body_from_cam)
 
 
-def _ground_truth(colour: ImageFiles, depth_from_body: Array, log: ReadLog) -> Trajectory | None:
-    stamps_ns, frame_from_body, found = [], [], 0
-    for stamp_ns, image in zip(colour.stamps_ns.tolist(), colour.sources, strict=True):
-        file = image.with_name(image.name.partition(".")[0] + ".pose.txt")
-        if not file.is_file():
-            continue
-        found += 1
-        log.files.append(file)
-        frame_from_depth = _rigid(file)
-        if frame_from_depth is not None:
-            stamps_ns.append(stamp_ns)
-            frame_from_body.append(frame_from_depth @ depth_from_body)
-    if len(stamps_ns) < found:
-        log.note("ground truth: no rigid transform", f"{found - len(stamps_ns)} of {found} files left out")
-    return Trajectory(np.array(stamps_ns, np.int64), np.stack(frame_from_body)) if stamps_ns else None
+def _ground_truth(colour: ImageSeries, depth_from_body: Array, log: ReadLog) -> Trajectory | None:
+    files = [image.with_name(image.name.partition(".")[0] + ".pose.txt") for image in colour.sources]
+    stamped = [(stamp_ns, file) for stamp_ns, file in zip(colour.stamps_ns, files, strict=True) if file.is_file()]
+    log.files += [file for _, file in stamped]
+    rigid = [(stamp_ns, pose) for stamp_ns, file in stamped if (pose := _rigid(file)) is not None]
+    if lost := len(stamped) - len(rigid):
+        log.note("ground truth: no rigid transform", f"{lost} of {len(stamped)} files left out")
+    if not rigid:
+        return None
+    return Trajectory(np.array([ns for ns, _ in rigid]), np.stack([pose @ depth_from_body for _, pose in rigid]))
 
 
 def _rigid(file: Path) -> Array | None:
     """(4, 4) pose in a file; None if the data set's tracking had failed or the file is damaged."""
     try:
-        matrix = np.array(read_table(file).split(), np.float64).reshape(4, 4)
+        matrix = np.array(layout.read_table(file).split(), np.float64).reshape(4, 4)
     except (ValueError, RecordingError):
         return None
     is_rotation = np.allclose(matrix[:3, :3] @ matrix[:3, :3].T, np.eye(3), atol=1e-2)
@@ -152,8 +144,8 @@ def _rigid(file: Path) -> Array | None:
 
 
 def _pixels(camera: CameraCalibration) -> Array:
-    u, v = np.meshgrid(np.arange(camera.width_px, dtype=np.float64), np.arange(camera.height_px, dtype=np.float64))
-    return np.stack([u.ravel(), v.ravel()], axis=1)
+    rows, columns = np.indices((camera.height_px, camera.width_px), np.float64)
+    return np.stack([columns.ravel(), rows.ravel()], axis=1)
 
 
 FORMAT = RecordingFormat("a folder with frame-NNNNNN.color.* and .depth.png", recognises, open_seven_scenes, rank=-2)

@@ -7,20 +7,13 @@ layout itself holds none. Source: Sturm et al. 2012, "A benchmark for the evalua
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import se3_inverse
-from fleetmap.plugins.datasets.layout import (
-    FileReader,
-    ImageFiles,
-    existing_images,
-    optional_truth,
-    read_image_list,
-)
+from fleetmap.plugins.datasets import layout
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
-from fleetmap.recordings.image_series import SeriesFrames, pair_images
+from fleetmap.recordings.image_series import ImageSeries, paired
 from fleetmap.recordings.ordering import DEPTH_TOLERANCE_NS, ReadLog, pair_stamps
 from fleetmap.recordings.tum import read_truth as read_tum_truth
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
@@ -42,11 +35,11 @@ def recognises(path: Path) -> bool:
 def open_tum_rgbd(path: Path, options: OpenOptions) -> Recording:
     """Open the recording in a TUM RGB-D folder. The body is the colour camera unless a calibration file differs. Depth: to one mm."""
     log = ReadLog()
-    colour_files, depth_files = _images(path / "rgb.txt", log), _images(path / "depth.txt", log)
-    colour, depth = pair_images(colour_files, depth_files, log, DEPTH_TOLERANCE_NS)
-    if len(colour) == 0:
-        firsts, seconds = pair_stamps(colour_files.stamps_ns, depth_files.stamps_ns, 1 << 62)
-        nearest_s = np.abs(colour_files.stamps_ns[firsts] - depth_files.stamps_ns[seconds]).min() * 1e-9
+    colour, depth = (_images(path / f"{name}.txt", log) for name in ("rgb", "depth"))
+    view = paired(colour, {"depth": depth}, log)
+    if len(view.rows) == 0:
+        firsts, seconds = pair_stamps(colour.stamps_ns, depth.stamps_ns, 1 << 62)
+        nearest_s = np.abs(colour.stamps_ns[firsts] - depth.stamps_ns[seconds]).min() * 1e-9
         raise RecordingError(
             f"{path}: no image of rgb.txt has one of depth.txt within {DEPTH_TOLERANCE_NS * 1e-9:g} s, the nearest is "
             f"{nearest_s:.3f} s apart; take both lists from one recording and one clock"
@@ -63,25 +56,24 @@ def open_tum_rgbd(path: Path, options: OpenOptions) -> Recording:
         return Trajectory(written.stamps_ns, np.array(frame_from_body).reshape(-1, 4, 4))
 
     calibration = RigCalibration(calibration.cameras[:1], None, calibration.base_from_body)
-    truth = optional_truth(path / "groundtruth.txt", log, read_truth)
-    frames = SeriesFrames(FileReader(path, log.files), colour, depth=depth, register=_metres)
+    truth = layout.optional_truth(path / "groundtruth.txt", log, read_truth)
+    frames = layout.RegisteredFrames(layout.FileReader(path, log.files), (view,), register=_metres)
     return finalize(image_parts(path, "tum-rgbd", calibration, frames, ground_truth=truth), log)
 
 
-def _metres(depth: NDArray[np.float32], _: str) -> NDArray[np.float32]:
+def _metres(depth: layout.Depth, _: str) -> layout.Depth:
     """Metres of depth that is registered already, and was read as if its unit were a mm."""
     return depth / np.float32(_UNITS_PER_MM)
 
 
-def _images(table: Path, log: ReadLog) -> ImageFiles:
-    stamps_ns, files = read_image_list(table, log, seconds=True)
-    return existing_images(stamps_ns, files, f"{table.stem} images", log)
+def _images(table: Path, log: ReadLog) -> ImageSeries:
+    stamps_ns, files = layout.read_image_list(table, log, seconds=True)
+    return layout.existing_images(stamps_ns, files, f"{table.stem} images", log)
 
 
 def _published(path: Path) -> RigCalibration:
-    name = path.resolve().name.lower()
     for camera, (intrinsics, distortion) in _CAMERAS.items():
-        if camera in name:
+        if camera in path.resolve().name.lower():
             lens = np.array(intrinsics), np.array(distortion)
             return RigCalibration((CameraCalibration("radial-tangential", 640, 480, *lens, np.eye(4)),))
     raise CalibrationError(

@@ -5,17 +5,11 @@ from pathlib import Path
 import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
-from fleetmap.plugins.datasets.layout import (
-    ImageFiles,
-    existing_images,
-    read_ground_truth,
-    read_imu,
-    read_table,
-    rig_frames,
-)
+from fleetmap.plugins.datasets.layout import existing_images, read_ground_truth, read_imu, read_table, rig_frames
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.files import natural_key
 from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts, logged_calibration
+from fleetmap.recordings.image_series import ImageSeries
 from fleetmap.recordings.ordering import ReadLog, check_seconds
 from fleetmap.recordings.tum import parse_stamp_ns
 
@@ -40,7 +34,7 @@ def open_tumvi(path: Path, options: OpenOptions) -> Recording:
     return finalize(image_parts(path, "tumvi", *frames, imu=imu, ground_truth=truth), log)
 
 
-def _images(folder: Path, name: str, log: ReadLog) -> ImageFiles:
+def _images(folder: Path, name: str, log: ReadLog) -> ImageSeries:
     """List the images by times.txt (`name seconds exposure`), or by their names in ns if that is absent."""
     files = {p.stem: p for p in (folder / "images").iterdir() if p.is_file()}
     times = folder / "times.txt"
@@ -49,14 +43,12 @@ def _images(folder: Path, name: str, log: ReadLog) -> ImageFiles:
         rows = [line.split() for line in read_table(times).splitlines() if not line.startswith("#")]
         stamp_of = {row[0]: _stamp_ns(row[1], times) for row in rows if len(row) >= 2}
     else:
-        stamp_of = {
-            stem: int(stem) for stem in sorted(files, key=natural_key) if stem.isdecimal() and int(stem) < 1 << 63
-        }
+        numbers = [stem for stem in sorted(files, key=natural_key) if stem.isdecimal() and int(stem) < 1 << 63]
+        stamp_of = {stem: int(stem) for stem in numbers}
     listed = [stem for stem in stamp_of if stem in files]
     if not listed:
-        raise RecordingError(
-            f"{folder / 'images'} holds none of the {len(stamp_of)} images listed; copy the recording again"
-        )
+        lack = f"holds none of the {len(stamp_of)} images listed"
+        raise RecordingError(f"{folder / 'images'} {lack}; copy the recording again")
     if len(listed) < len(stamp_of):
         log.note(f"{name}: images missing", f"{len(stamp_of) - len(listed)} of {len(stamp_of)} in times.txt")
     stamps_ns = np.array([stamp_of[stem] for stem in listed], np.int64)

@@ -17,6 +17,7 @@ from fleetmap.sensors.calibration import (
     ImuNoise,
     RigCalibration,
     check_camera,
+    intrinsics_of,
 )
 from fleetmap.sensors.cameras import lens_of
 
@@ -167,8 +168,7 @@ def _lens(camera: InfoCamera, where: str) -> CameraCalibration:
     matrix = info.projection[:, :3] if camera.is_rectified else info.matrix
     name, coefficients = ("", np.zeros(0)) if camera.is_rectified else (info.lens, info.distortion)
     model, distortion = lens_of(name, coefficients, f"{where}: CameraInfo of {info.frame_id}")
-    intrinsics = np.array([matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2]])
-    return CameraCalibration(model, info.width_px, info.height_px, intrinsics, distortion, np.eye(4))
+    return CameraCalibration(model, info.width_px, info.height_px, intrinsics_of(matrix), distortion, np.eye(4))
 
 
 def _left_from_right(cameras: Sequence[InfoCamera], links: Sequence[FrameLink], where: str) -> Array:

@@ -20,7 +20,7 @@ from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.files import file_head, hash_file
 from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
-from fleetmap.recordings.image_series import ImageSeries, SeriesFrames
+from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, paired
 from fleetmap.recordings.images import StoredImage, grey_image
 from fleetmap.recordings.limits import MAX_PIXELS, MAX_VIDEO_TABLE_BYTES
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS, ReadLog
@@ -52,7 +52,7 @@ def open_video(path: Path, options: OpenOptions) -> Recording:
     try:
         if rotation := reader.rotation(series.sources[0], int(series.stamps_ns[0])):
             log.note("video turned", f"players turn it by {rotation} degrees; images are used as the sensor gave them")
-        frames = SeriesFrames(reader, series)
+        frames = SeriesFrames(reader, (paired(series, {}, log),))
         return finalize(image_parts(path, "video", given.calibration, frames, name=path.stem), log)
     except BaseException:
         reader.close()
@@ -187,7 +187,7 @@ def _errors() -> tuple[type[Exception], ...]:
     return (av.error.FFmpegError, OSError, ValueError)
 
 
-def _index(path: Path, log: ReadLog) -> tuple[ImageSeries[int], list[int]]:
+def _index(path: Path, log: ReadLog) -> tuple[ImageSeries, list[int]]:
     """Index the frames by the container's packets, and the times of its key frames; RecordingError if there are none."""
     with ExitStack() as files:
         container, stream = _opened(path, files)

@@ -17,11 +17,11 @@ from fleetmap.geometry import Array
 from fleetmap.recordings.calibration_files import CalibrationFile, parse_calibration
 from fleetmap.recordings.files import hash_file
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize, image_parts
-from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, ViewSeries, pair_images, rig_images
+from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, ViewImages, paired, rig_views
 from fleetmap.recordings.images import StoredImage, check_image
 from fleetmap.recordings.mcap.container import CALIBRATION_ATTACHMENT, UNDECODABLE, Channel, Container, Place
 from fleetmap.recordings.ordering import (
-    DEPTH_TOLERANCE_NS,
+    LAST_NS,
     ReadLog,
     as_logged,
     clean_imu,
@@ -34,7 +34,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples, Stamps, Trajectory
 from fleetmap.sensors.source_settings import CAMERA_ROLES, IMAGE_ROLES, Topics, transports
 
-_LAST_NS = 2**63 - 1  # MCAP's times have a bit more
+_FIRST_ROLES = ("left", "right", "depth")  # those of a recording with one view
 _TYPES = {
     **dict.fromkeys(IMAGE_ROLES, ("sensor_msgs/Image", "sensor_msgs/CompressedImage")),
     "imu": ("sensor_msgs/Imu",),
@@ -190,7 +190,7 @@ def collect(
             unused[channel.id] = channel
             continue
         streams[channel.id] = stream
-        stream.take(bytes(data), place, min(logged_ns, _LAST_NS), log)
+        stream.take(bytes(data), place, min(logged_ns, LAST_NS), log)  # MCAP's times have a bit more
     log.issues += container.issues
     log.files[:0] = container.files
     return list(streams.values()), list(unused.values())
@@ -210,30 +210,29 @@ def assemble(
     calibrate: by the frame of the IMU's messages, the calibration and the roles of its cameras. usable: (N,) by role, images to take.
     """
     imu, imu_frame = _imu(roles.get("imu", ()), log)
-    left = _images(roles["left"], "left images", log, usable.get("left"))
-    right = _images(roles["right"], "right images", log, usable.get("right")) if "right" in roles else None
-    depth = _images(roles["depth"], "depth images", log) if "depth" in roles else None
-    if right is not None:
-        depth = None
-    elif depth is not None:
-        left, depth = pair_images(left, depth, log, DEPTH_TOLERANCE_NS)
+    images = {
+        role: _images(roles[role], f"{role} images", log, usable.get(role)) for role in _FIRST_ROLES if role in roles
+    }
+    views = tuple[ViewImages, ...]()
+    if "depth" in images and "right" not in images:
+        views = (paired(images["left"], {"depth": images["depth"]}, log),)
     calibration, described = calibrate(imu_frame)
-    others = tuple[ViewSeries[Source], ...]()
-    if depth is None and len(calibration.cameras) > 1:
-        read = {"left": left, "right": right}
+    if views:
+        if beside := [role for role in CAMERA_ROLES[2:] if role in roles]:
+            how = "let a stereo pair be left and right, and the depth camera cam2, with its depth on cam2_depth"
+            what = f"{', '.join(beside)}: beside a depth camera as first view no other is used"
+            log.note("images not used", f"{what}; {how}")
+    elif len(calibration.cameras) > 1:
         cameras, depths = {}, {}
         for n, role in enumerate(described[: len(calibration.cameras)]):
             if role in roles:
-                images = read.get(role) or _images(roles[role], f"{role} images", log, usable.get(role))
-                cameras[n] = f"{role} ({roles[role][0].channel.topic})", images
+                series = images.get(role) or _images(roles[role], f"{role} images", log, usable.get(role))
+                cameras[n] = f"{role} ({roles[role][0].channel.topic})", series
                 if calibration.cameras[n].has_depth and f"{role}_depth" in roles:
                     depths[n] = _images(roles[f"{role}_depth"], f"depth images of cam{n}", log)
-        calibration, (left, right, _), others = rig_images(calibration, cameras, log, depths)
-    elif right is not None:
-        left, right = pair_images(left, right, log)
-    if depth is not None and (beside := [role for role in CAMERA_ROLES[2:] if role in roles]):
-        how = "let a stereo pair be left and right, and the depth camera cam2, with its depth on cam2_depth"
-        log.note("images not used", f"{', '.join(beside)}: beside a depth camera as first view no other is used; {how}")
+        calibration, views = rig_views(calibration, cameras, log, depths)
+    else:
+        views = (paired(images["left"], {role: images[role] for role in images if role == "right"}, log),)
     sensors = {
         "imu": imu,
         "wheel": _samples(roles.get("wheel", ()), "wheel odometry", log),
@@ -244,13 +243,13 @@ def assemble(
         if stream.damaged and not isinstance(stream, ImageStream):
             what = f"{stream.channel.topic}: damaged messages"
             log.note(what, f"{stream.damaged} left out, {len(stream.messages)} were found")
-    frames = SeriesFrames(MessageReader(opener, container, log.files), left, right, depth, others=others)
+    frames = SeriesFrames(MessageReader(opener, container, log.files), views)
     return image_parts(container.path, "", calibration, frames, name=container.name, **sensors)
 
 
 def _images(
     streams: Sequence[ImageStream], what: str, log: ReadLog, usable: NDArray[np.bool_] | None = None
-) -> ImageSeries[Source]:
+) -> ImageSeries:
     damaged = sum(stream.damaged for stream in streams)
     sources = tuple((stream.channel, place) for stream in streams for place in stream.places)
     if damaged:
