@@ -8,10 +8,10 @@ identity.json  site, robot and endpoint
 
 import os
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from datetime import datetime, timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
 
@@ -78,7 +78,7 @@ class RobotIdentity:
 
         Raises LinkError if the server is unreachable or refuses, StoreError on a disk error. The old ones stay then.
         """
-        self._ask(bus, self._read("robot.pem"), _ANSWER_S)
+        self._ask(bus, self._read("robot.pem"))
 
     @classmethod
     def enrol(cls, folder: Path, bundle: bytes) -> Self:
@@ -116,19 +116,16 @@ class RobotIdentity:
         if fault := handshake_fault(who.endpoint, first):
             raise LinkError(f"{who.endpoint}: {fault}")
         with Bus.connect(who.endpoint, tls=first) as bus:
-            made._ask(bus, given.own.encode(), _ANSWER_S)
+            made._ask(bus, given.own.encode())
         (folder / "bundle.pem").unlink(missing_ok=True)
         return made
 
-    def _ask(self, bus: Bus, old: bytes, timeout_s: float) -> None:
+    def _ask(self, bus: Bus, old: bytes) -> None:
         from fleetmap.trust import enrolment
 
         key = self._next_key(old)
-        question = enrolment.renewal_request(old, key)
-        answer = decode_message(
-            bus.get(robot_key(self.who.site, self.who.robot, "renew"), question, timeout_s=timeout_s),
-            enrolment.RenewalAnswer,
-        )
+        renew, question = robot_key(self.who.site, self.who.robot, "renew"), enrolment.renewal_request(old, key)
+        answer = decode_message(bus.get(renew, question, timeout_s=_ANSWER_S), enrolment.RenewalAnswer)
         if enrolment.certificate_info(answer.certificate.encode()).fingerprint != enrolment.key_fingerprint(key):
             raise LinkError("the server answered with a certificate of another key; who answers there?")
         # Written before the certificate: with it the robot may connect to a server signed by another authority.
@@ -169,8 +166,8 @@ class MapAddress:
     site: str
     robot: str
     server: str | None = None
-    store: str | None = None
-    root: str | None = None
+    store: str | Path | None = None
+    root: str | Path | None = None
     identity: RobotIdentity | None = None
     version: int | None = None
 
@@ -183,14 +180,21 @@ class MapAddress:
 class GivenAddress:
     """Settings of the map's address; missing ones come from the identity."""
 
-    site: str | None
-    robot: str | None
-    server: str | None
-    store: str | None
-    root: str | None
-    identity: str | None
-    insecure: bool
+    site: str | None = None
+    robot: str | None = None
+    server: str | None = None
+    store: str | Path | None = None
+    root: str | Path | None = None
+    identity: str | Path | None = None
+    insecure: bool = False
+    version: int | None = None
     sign: str = ""  # before the names in messages
+
+    @classmethod
+    def of(cls, settings: object, **more: Any) -> Self:
+        """Take the settings of these names from an object, but for those in `more`."""
+        names = [field.name for field in fields(cls) if hasattr(settings, field.name)]
+        return cls(**{name: getattr(settings, name) for name in names} | more)
 
     def resolve(self, usual_robot: str | None = None, *, may_be_alone: bool = False) -> MapAddress:
         """Return the address. usual_robot: the name of a robot that has none. may_be_alone: with neither, if a link brings its maps.
@@ -212,13 +216,18 @@ class GivenAddress:
             check_reach(server, insecure=self.insecure)
         elif identity is None:
             raise UsageError(f"this robot has no identity in {folder}, which {server} asks for; {_ENROL}")
+        if self.version is not None and self.store is None:
+            raise UsageError(
+                f"{self.sign}version {self.version} needs {self.sign}store DIR: a server gives the version that its robots should run"
+            )
         return MapAddress(
             site=check_name(self._named("site", identity, None), "site"),
             robot=check_name(self._named("robot", identity, usual_robot), "robot"),
             server=server,
             store=self.store,
-            root=self.root or (None if identity is None else str(folder / "root.json")),
+            root=self.root or (None if identity is None else folder / "root.json"),
             identity=identity,
+            version=self.version,
         )
 
     def _named(self, what: str, identity: RobotIdentity | None, usual: str | None) -> str:

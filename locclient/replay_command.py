@@ -53,15 +53,7 @@ class MapOptions:
         """Return the map's address; UsageError unless the options name one map, and for a version with a server."""
         from locclient.identity import GivenAddress
 
-        words = {name: None if value is None else str(value) for name, value in vars(self).items()}
-        named = ("site", "robot", "server", "store", "root", "identity")
-        given = GivenAddress(**{name: words[name] for name in named}, insecure=self.insecure, sign="--")
-        address = given.resolve("replay")
-        if version is not None and address.store is None:
-            raise UsageError(
-                f"--version {version} needs --store DIR: a server gives the version that its robots should run"
-            )
-        return replace(address, version=version)
+        return GivenAddress.of(self, version=version, sign="--").resolve("replay")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -164,9 +156,9 @@ def _replay_failure(
     summary, record = read_failure_file(path)
     used = record.used.site_of(summary.site) if record.used else summary.site
     address = replace(map_options, site=map_options.site or used).address(version)
-    with connected(address, map_options.cache, map_options.cache_bytes) as connection:
-        sha256 = None if version is None else connection.source.ready().wanted.manifest_sha256
-        found = compare_failure((summary, record), connection.source, sha256)
+    with connected(address, map_options.cache, map_options.cache_bytes) as maps:
+        sha256 = None if version is None else maps.ready().wanted.manifest_sha256
+        found = compare_failure((summary, record), maps, sha256)
     if files.report is not None:
         answer = {"answer": found.answer, "version": found.version, "is_same": found.first_difference_ns is None}
         told = {"apart_m": found.apart_m, "then": summary.moments, "now": found.now}
@@ -196,11 +188,11 @@ def _run(
     from fleetmap.recordings.sensor_subset import named_sensor_set, reduced
     from fleetmap.sources.replay_source import ReplaySource
     from locclient.config import image_priors_of
+    from locclient.localization.priors.given import parse_prior
     from locclient.maps.connection import connected
-    from locclient.prior_option import parse_prior
     from locclient.replay.replay import ReplayOptions, load_map
     from locclient.replay.replay import replay as play
-    from locclient.replay.starts import spread_starts, start_frames, starts
+    from locclient.replay.starts import spread_starts, starts
 
     opening_export: AbstractContextManager[RunExport | None] = nullcontext()
     if files.mcap is not None:
@@ -214,22 +206,22 @@ def _run(
         recording = reduced(stack.enter_context(open_recording(path, opening)), use)
         source = ReplaySource.of(recording, selection, reverse=playback.reverse)
         export = stack.enter_context(opening_export)
-        connection = stack.enter_context(connected(address, map_options.cache, map_options.cache_bytes))
+        maps = stack.enter_context(connected(address, map_options.cache, map_options.cache_bytes))
         with Progress(console=console, disable=not console.is_terminal) as bar:
             for issue in recording.issues:
                 console.print(f"note: {issue.what}: {issue.detail}".rstrip(": "))
             task = bar.add_task("replay", total=len(source))
             how = settings.localizer, playback.realtime, lambda _: bar.advance(task), export
-            options = ReplayOptions(*how, partial(image_priors_of, settings))
-            result = play(source, connection, options, prior)
-        report, anew = result.report, []
+            options = ReplayOptions(*how, partial(image_priors_of, settings), address.robot)
+            result = play(source, maps, options, prior)
+        report, more = result.report, dict[str, object]()
         if playback.starts:
-            numbers = spread_starts(source, playback.starts)
-            anew = [
-                start_frames(found)
-                for found in starts(source, numbers, load_map(connection.source)[0], settings.localizer)
+            numbers, loaded = spread_starts(source, playback.starts), load_map(maps)[0]
+            more["starts"] = [
+                [{"stamp_ns": e.stamp_ns, "status": e.status, "map_from_body": e.map_from_body} for e in found]
+                for found in starts(source, numbers, loaded, settings.localizer)
             ]
-    files.write(result, report | ({"starts": anew} if playback.starts else {}))
+    files.write(result, report | more)
     table = Table("measure", "value")
     for name, value in report.items():
         table.add_row(name, _shown(value))

@@ -148,7 +148,7 @@ class Runtime:
         spools = [spool for spool in (self._parts.outbox, server.replays) if spool is not None]
         until_s = time.monotonic() + _DELIVERED_WITHIN_S
         with suppress(Exception):  # a faulty spool; logged by the network thread
-            while time.monotonic() < until_s and server.client.connected() and any(s.waiting() for s in spools):
+            while time.monotonic() < until_s and server.client.bus.connected() and any(s.waiting() for s in spools):
                 if self._stop.wait(_IDLE_S):
                     return
 
@@ -165,8 +165,6 @@ class Runtime:
         while self._parts.building is not None and self._parts.building.changes:
             robot.use_building(*self._parts.building.changes.popleft())
             give_back_free_memory()
-        while server is not None and server.priors:
-            intake.put_prior(server.priors.popleft())
         outcome = None
         try:
             outcome = robot.handle(bundle)
@@ -207,7 +205,7 @@ class Runtime:
         server = None if self._server is None or self._server.is_alone else self._server
         if server is not None and message is not None and estimate.stamp_ns - self._pose_ns >= _POSE_EVERY_NS:
             self._pose_ns = estimate.stamp_ns
-            _send(partial(server.client.publish_pose, message))
+            _send(partial(server.client.publish, "pose", message, may_drop=True))
 
     def _note_failure(self, context: FailureContext | None, silent_s: float) -> None:
         if context is not None:
@@ -250,7 +248,8 @@ class Runtime:
             "cache_faults": self._cache_faults,
         }
         if self._server is not None:
-            counts["map_word_hours"] = self._server.client.word_hours
+            trust = self._server.client.trust
+            counts["map_word_hours"] = None if trust is None else trust.word_hours
         profile, more = self._parts.profile, {**counts, **self._outbox_counts, **tiles}
         return self._figures.report(profile.site, profile.robot, self._wall_ns(), more, self._is_silent())
 

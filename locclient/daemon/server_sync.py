@@ -15,9 +15,9 @@ from locclient.delivery.outbox import Outbox
 from locclient.delivery.report_delivery import deliver, deliver_replay_part
 from locclient.delivery.survey_drives import SurveyDrives
 from locclient.hooks import RobotLink
+from locclient.localization.priors.given import told_prior
 from locclient.maps.building_maps import BuildingMaps
 from locclient.maps.map_client import MapClient
-from locclient.prior_option import told_prior
 from locclient.robot.version_trial import Change, VersionChange
 
 _ASK_EVERY_S = 60.0
@@ -32,7 +32,7 @@ class ServerSync:
     """In each `step`: fetches the wanted version, delivers failures, acknowledges, reports health.
 
     Other threads append to `health`, `changes` and `refetch` (a held version with damaged pieces on the disk), and take fetched
-    versions from `fetched` and operators' poses from `priors`. While the server is unreachable, reports wait in the outbox.
+    versions from `fetched`. While the server is unreachable, reports wait in the outbox.
     """
 
     def __init__(
@@ -44,8 +44,10 @@ class ServerSync:
         clock_s: Callable[[], float] = time.monotonic,
         wall_ns: Callable[[], int] = time.time_ns,
         upkeep: Callable[[], None] = lambda: None,
+        put_prior: Callable[[PositionPrior], None] = lambda _: None,
     ) -> None:
-        """retry_s: delay before a postponed version is offered again. upkeep: called once an hour; its errors are logged."""
+        """retry_s: delay before a postponed version is offered again. upkeep: called once an hour; its errors are logged. put_prior:
+        called with operators' poses, on a thread of the bus."""
         self.replays: Outbox | None = None  # recordings of failures, which may be large
         self.drives: SurveyDrives | None = None  # through areas that operators want to be surveyed
         self.building: BuildingMaps | None = None
@@ -76,11 +78,10 @@ class ServerSync:
         self._connected_s, self._is_away_told = clock_s(), False
         self._announced: deque[WantedVersion] = deque(maxlen=1)
         self._last_ack: tuple[int | None, str] | None = None
-        self.priors: deque[PositionPrior] = deque(maxlen=4)  # poses set by operators
         self._handles = [
             client.announce_presence(),
             client.on_wanted(self._announced.append),
-            client.on_initial_pose(lambda told: self.priors.append(told_prior(told))),
+            client.on_initial_pose(lambda told: put_prior(told_prior(told))),
         ]
 
     def step(self) -> None:
@@ -105,7 +106,7 @@ class ServerSync:
 
     def _is_connected(self, now_s: float) -> bool:
         """True if a peer is reachable. The log says once that none is, and when one is again."""
-        if self.client.connected():
+        if self.client.bus.connected():
             if self._is_away_told:
                 self._ask_at_s = 0.0  # it may have been restored from a backup
                 self._refusals.warning("connected again", "connected to the map server again")
@@ -115,7 +116,7 @@ class ServerSync:
             self._is_away_told = True
             running = "no map until then" if self._running is None else f"version {self._running.version} goes on"
             words = "no connection to the map server for %.0f s: is it running, and is %s its zenoh endpoint? %s"
-            self._refusals.warning("no connection", words, now_s - self._connected_s, self.client.endpoint, running)
+            self._refusals.warning("no connection", words, now_s - self._connected_s, self.client.bus.endpoint, running)
         return False
 
     def close(self) -> None:
@@ -264,4 +265,4 @@ class ServerSync:
 
     def _publish_health(self) -> None:
         while self.health:
-            self.client.publish_health(self.health.popleft())
+            self.client.publish("health", self.health.popleft())

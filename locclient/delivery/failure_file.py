@@ -26,7 +26,7 @@ from fleetmap.recordings.images import StoredFrame, StoredImage
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
-from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame, StereoCamera
+from fleetmap.sensors.rectification import MountedCamera, MountedRig, RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Image
 from locclient.delivery.failure_checks import MAX_ROWS, check_record
 from locclient.localization.percept import Percept
@@ -58,8 +58,8 @@ class LocalizerRecord(msgspec.Struct, frozen=True, kw_only=True):
     others: Annotated[tuple[MountedCamera, ...], msgspec.Meta(max_length=15)] = ()  # the rig's other cameras
 
 
-def failure_file(cut: FailureCut, report: FailureReport, profile: RobotProfile, pictures: str) -> bytes:
-    """Return the MCAP file of a complete cut. pictures: one of PICTURES."""
+def failure_file(cut: FailureCut, report: FailureReport, profile: RobotProfile) -> bytes:
+    """Return the MCAP file of a complete cut, with pictures by the profile: one of PICTURES."""
     assert cut.frames
     used = cut.used or next((f.commands.used for f in cut.frames if f.commands.used is not None), None)
     summary = FailureSummary(
@@ -70,37 +70,40 @@ def failure_file(cut: FailureCut, report: FailureReport, profile: RobotProfile, 
         version=None if used is None else used.version,
         manifest_sha256=None if used is None else used.manifest_sha256,
         client=str(fleetmap.__version__),
-        pictures=pictures,
+        pictures=profile.pictures,
         moments=tuple(frame.moment for frame in cut.frames),
     )
+    (camera, body_from_cam), *others = profile.rig.mounted
+    calibration = profile.rig.calibration
     record = LocalizerRecord(
         settings=profile.settings,
-        camera=profile.camera,
-        body_from_cam=profile.body_from_cam,
-        base_from_body=profile.base_from_body,
+        camera=camera,
+        body_from_cam=body_from_cam,
+        base_from_body=calibration.base_from_body,
         start=cut.start,
         used=cut.used,
         frames=[(frame.commands, _with_depth(frame, profile)) for frame in cut.frames],
-        others=profile.others,
+        others=tuple(others),
     )
     packed = zstandard.ZstdCompressor(level=3).compress(msgspec.msgpack.encode(record, enc_hook=_encoded_array))
     has_right = any(frame.picture is not None and frame.picture.right is not None for frame in cut.frames)
-    pairs = [has_right, *(each.camera.baseline_m > 0 for each in profile.others)]
-    views = (_reduced_view(profile, view, is_pair=is_pair) for view, is_pair in enumerate(pairs))
-    rig = RigCalibration(tuple(camera for view in views for camera in view), profile.imu, profile.base_from_body)
+    pairs = [has_right, *(each.camera.baseline_m > 0 for each in others)]
+    views = (_reduced_view(profile.rig, view, is_pair=is_pair) for view, is_pair in enumerate(pairs))
+    cameras = tuple(camera for view in views for camera in view)
+    rig = RigCalibration(cameras, calibration.imu, calibration.base_from_body)
     with TemporaryDirectory() as folder:
         path = Path(folder) / "failure.mcap"
         with McapRecordingWriter(path, rig, name=f"{report.robot} {report.id}") as writer:
             writer.attach(SUMMARY, "application/msgpack", to_msgpack(summary))
             writer.attach(LOCALIZER, "application/zstd", packed)
             for frame in cut.frames:
-                for samples in frame.imu if profile.imu is not None else ():
+                for samples in frame.imu if calibration.imu is not None else ():
                     writer.write_imu(samples)
                 writer.write_wheel(frame.wheel)
                 writer.write_prior(frame.commands.priors)
                 if frame.picture is not None:
                     view = 0 if frame.percept.query is None else frame.percept.query.view
-                    writer.write_frame(_reduced(frame.picture, pictures, view))
+                    writer.write_frame(_reduced(frame.picture, profile.pictures, view))
         return path.read_bytes()
 
 
@@ -149,7 +152,10 @@ def _with_depth(frame: RingFrame, profile: RobotProfile) -> Percept:
     if query is None or query.features is None:
         return frame.percept
     found, pixels = query.features.features, query.features.pixels.copy()
-    shown, (camera, _) = None if frame.picture is None else frame.picture.view(query.view), profile.mounted(query.view)
+    shown, camera = (
+        None if frame.picture is None else frame.picture.view(query.view),
+        profile.rig.mounted[query.view].camera,
+    )
     if shown is not None:
         is_tried = query.features.is_tried
         untried = np.ones(len(found), bool) if is_tried is None else ~is_tried
@@ -186,9 +192,9 @@ def _step(width_px: int) -> int:
     return max(1, width_px // _WIDTH_PX)
 
 
-def _reduced_view(profile: RobotProfile, view: int, *, is_pair: bool) -> list[CameraCalibration]:
+def _reduced_view(rig: MountedRig, view: int, *, is_pair: bool) -> list[CameraCalibration]:
     """Return the rectified cameras of a view at the pictures' size."""
-    camera, body_from_cam = profile.mounted(view)
+    camera, body_from_cam = rig.mounted[view]
     step = _step(camera.width_px)
     center = [(value + 0.5) / step - 0.5 for value in (camera.cx_px, camera.cy_px)]
     left = CameraCalibration(
@@ -198,7 +204,7 @@ def _reduced_view(profile: RobotProfile, view: int, *, is_pair: bool) -> list[Ca
         np.array([camera.focal_px / step, camera.focal_px / step, *center]),
         np.zeros(4),
         body_from_cam,
-        profile.imu_minus_cam_s,
+        rig.imu_minus_cam_s,
     )
     body_from_right = body_from_cam @ se3(np.eye(3), np.array([camera.baseline_m, 0.0, 0.0]))
     return [left, replace(left, body_from_cam=body_from_right)] if is_pair else [left]

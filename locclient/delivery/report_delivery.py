@@ -9,7 +9,7 @@ import msgspec
 from fleetmap.encoding import to_json, to_plain
 from fleetmap.errors import FleetmapError, LinkError, UnreachableError, disk_errors
 from fleetmap.failure_summary import MAX_FILE_BYTES, ReplayPart
-from fleetmap.messages import PART_BYTES, FailureReport, decode_message
+from fleetmap.messages import PART_BYTES, FailureReport, decode_message, encode_message
 from locclient.delivery.failure_file import failure_file
 from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.maps.map_client import MapClient
@@ -23,9 +23,8 @@ _log = logging.getLogger(__name__)
 class ReplayQueue:
     """Failures whose recording is not yet complete; `work` moves complete ones to the outbox. For one thread."""
 
-    def __init__(self, outbox: Outbox, profile: RobotProfile, pictures: str) -> None:
-        """pictures: one of failure_file.PICTURES."""
-        self.outbox, self._profile, self._pictures = outbox, profile, pictures
+    def __init__(self, outbox: Outbox, profile: RobotProfile) -> None:
+        self.outbox, self._profile = outbox, profile
         self._pending: deque[tuple[FailureReport, FailureCut]] = deque(maxlen=_MAX_PENDING)
 
     def add(self, report: FailureReport, cut: FailureCut | None) -> None:
@@ -40,7 +39,7 @@ class ReplayQueue:
         for report, cut in [entry for entry in self._pending if entry[1].frames is not None]:
             self._pending.remove((report, cut))
             try:
-                data = failure_file(cut, report, self._profile, self._pictures)
+                data = failure_file(cut, report, self._profile)
                 if len(data) > MAX_FILE_BYTES:
                     _log.warning("the recording of failure %s has %d bytes and is not sent", report.id, len(data))
                     continue
@@ -60,10 +59,9 @@ def deliver_replay_part(client: MapClient, outbox: Outbox, received_bytes: dict[
     replay = waiting[0]
     offset = received_bytes.get(replay.id, 0)
     data = replay.payload[offset : offset + PART_BYTES]
+    part = ReplayPart(id=replay.id, total_bytes=len(replay.payload), offset=offset, data=data)
     try:
-        ack = client.send_replay_part(
-            ReplayPart(id=replay.id, total_bytes=len(replay.payload), offset=offset, data=data)
-        )
+        ack = client.deliver("replays", encode_message(part))
     except LinkError as error:  # an older server does not accept recordings: reports and maps continue
         _log.info("the recording of failure %s waits: %s", replay.id, error)
         return False
@@ -95,7 +93,7 @@ def deliver(client: MapClient, outbox: Outbox) -> bool:
             outbox.refused(report.id)
             continue
         try:
-            ack = client.report_failure(report.payload)
+            ack = client.deliver("failures", report.payload)
         except UnreachableError:
             raise
         except LinkError as error:

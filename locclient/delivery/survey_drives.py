@@ -16,7 +16,7 @@ from fleetmap.errors import FleetmapError, LinkError, disk_errors
 from fleetmap.failure_summary import MAX_DRIVE_BYTES, ReplayPart
 from fleetmap.geometry import Array, inside_rings
 from fleetmap.mapformat.building import edge_distance_m
-from fleetmap.messages import PART_BYTES, Status, SurveyArea
+from fleetmap.messages import PART_BYTES, Status, SurveyArea, encode_message
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_grey, jpeg_image, store_frame
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
@@ -98,7 +98,7 @@ class SurveyDrives:
             request, _, name = path.stem.partition("-")
             part = ReplayPart(id=name, total_bytes=size, offset=offset, data=data, survey=request)
             try:
-                ack = client.send_replay_part(part)
+                ack = client.deliver("replays", encode_message(part))
             except LinkError as error:
                 _log.info("a drive for survey %s waits: %s", request, error)
                 return False

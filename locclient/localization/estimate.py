@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -12,11 +11,10 @@ from fleetmap.messages import Cause, Status
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.relocalizer import Fix
 from locclient.localization.calibration.parameters import NOT_JUDGED, CalibrationState
-from locclient.localization.hypothesis_set import HypothesisSet
 from locclient.localization.image_quality import GOOD_IMAGE, ImageQuality
 from locclient.localization.place import Place
 from locclient.localization.pose_hypothesis import PoseHypothesis
-from locclient.localization.priors.prior import Prior
+from locclient.localization.pose_tracker import PoseTracker
 from locclient.localization.settings import TrackSettings
 
 
@@ -82,43 +80,24 @@ class Estimate:
         )
 
 
-class QueryResult(NamedTuple):
-    """Result of a map query; fields as in Estimate."""
-
-    fix: Fix | None = None
-    refused: str = ""
-    innovation: float | None = None
-    innovation_m: float | None = None
-    moved_m: float | None = None
-    fix_stamp_ns: int | None = None
-
-
-def assemble(
-    estimate: Estimate,
-    settings: TrackSettings,
-    *,
-    confirmed: PoseHypothesis | None,
-    candidates: HypothesisSet,
-    prior: Prior | None,
-    has_failed: bool,
-    was_tracking: bool,
-) -> Estimate:
+def assemble(estimate: Estimate, tracker: PoseTracker, *, has_failed: bool) -> Estimate:
     """Return `estimate`, whose cause is that of its images, completed by status, pose and cause.
 
     has_failed: the last map query found no fix.
     """
-    if confirmed is not None:
-        return _of_confirmed(estimate, confirmed, candidates.hypotheses, has_failed, settings)
+    if tracker.confirmed is not None:
+        return _of_confirmed(estimate, tracker, tracker.confirmed, has_failed)
+    candidates, prior, settings = tracker.candidates, tracker.prior, tracker.settings
     ranking, competitors = candidates.ranking()
     is_open = bool(competitors) or (bool(ranking) and candidates.may_be_lookalike(ranking[0]))
-    status = Status.AMBIGUOUS if is_open else Status.LOST if was_tracking else Status.INITIALISING
+    status = Status.AMBIGUOUS if is_open else Status.LOST if tracker.was_tracking else Status.INITIALISING
     estimate = replace(estimate, status=status, hypotheses=_published(ranking))
     rides = [] if prior is None or prior.names_floor or is_open else prior.places()
     if rides:
         places = tuple(Hypothesis(place.map_from_body, 1, place.floor) for place in rides)
         return replace(estimate, status=Status.AMBIGUOUS, hypotheses=places)
     known = None if prior is None else prior.hypothesis
-    if ranking and (is_open or known is None or not was_tracking):
+    if ranking and (is_open or known is None or not tracker.was_tracking):
         return estimate if is_open else _with_pose(estimate, ranking[0].now, settings)
     if known is None or estimate.map_version is None:
         return estimate
@@ -135,13 +114,8 @@ def _cause(estimate: Estimate, *, has_failed: bool) -> Cause:
     return Cause.UNMATCHED if has_failed else Cause.NONE
 
 
-def _of_confirmed(
-    estimate: Estimate,
-    confirmed: PoseHypothesis,
-    elsewhere: Sequence[PoseHypothesis],
-    has_failed: bool,
-    settings: TrackSettings,
-) -> Estimate:
+def _of_confirmed(estimate: Estimate, tracker: PoseTracker, confirmed: PoseHypothesis, has_failed: bool) -> Estimate:
+    elsewhere, settings = tracker.candidates.hypotheses, tracker.settings
     is_known = not np.isnan(confirmed.now.map_from_body).any()
     radius_m = radius_95_m(confirmed.now.cov_rot_trans) if is_known else float("inf")
     age_s = (estimate.odometry.stamp_ns - confirmed.stamp_ns) * 1e-9

@@ -10,7 +10,7 @@ from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import ViewpointGate, log_odds, mark_shared
-from locclient.localization.pose_covariance import boxminus
+from locclient.localization.place import boxminus
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
 

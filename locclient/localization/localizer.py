@@ -4,24 +4,23 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
 from fleetmap.bow import Vocabulary
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.mapformat.building import Floor
 from fleetmap.messages import Cause, Status
 from fleetmap.odometry import is_away
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
-from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame, StereoCamera
+from fleetmap.sensors.rectification import MountedRig, RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from locclient.localization.calibration.monitor import CalibrationMonitor, with_calibration
 from locclient.localization.calibration.watch import Mounting
-from locclient.localization.estimate import Estimate, QueryResult, assemble, map_cov
+from locclient.localization.estimate import Estimate, assemble, map_cov
 from locclient.localization.held_maps import HeldMap, HeldMaps
 from locclient.localization.map_query import MapQuery
 from locclient.localization.percept import Percept
 from locclient.localization.perception import Perception
-from locclient.localization.pose_tracker import PoseTracker, Start
+from locclient.localization.pose_tracker import PoseTracker, QueryResult, Start
 from locclient.localization.priors.given import GivenPrior
 from locclient.localization.priors.lift_ride import LiftRide
 from locclient.localization.priors.prior import PriorSource
@@ -35,25 +34,15 @@ class Localizer:
     `MapQuery` correct it; `CalibrationMonitor` judges the cameras by them.
     """
 
-    def __init__(
-        self,
-        calibration: RigCalibration,
-        camera: StereoCamera,
-        body_from_cam: Array,
-        imu_minus_cam_s: float,
-        settings: LocalizerSettings,
-        clock: Callable[[], float] = lambda: 0.0,
-        others: Sequence[MountedCamera] = (),
-    ) -> None:
-        """clock: seconds, measures the stages; the default measures nothing. others: the rig's other cameras."""
-        self._clock, self._settings = clock, settings
-        self._mounted = (MountedCamera(camera, body_from_cam), *others)
-        self.perception = Perception(calibration, camera, body_from_cam, imu_minus_cam_s, settings, clock, others)
-        self._mounting = Mounting(se3_inverse(body_from_cam), calibration.base_from_body)
-        self._calibration = CalibrationMonitor(self._mounting, settings.relocalizer, imu_minus_cam_s)
+    def __init__(self, rig: MountedRig, settings: LocalizerSettings, clock: Callable[[], float] = lambda: 0.0) -> None:
+        """clock: seconds, measures the stages; the default measures nothing."""
+        self._rig, self._settings, self._clock = rig, settings, clock
+        self.perception = Perception(rig, settings, clock)
+        self._mounting = Mounting(se3_inverse(rig.mounted[0].body_from_cam), rig.base_from_body)
+        self._calibration = CalibrationMonitor(self._mounting, settings.relocalizer, rig.imu_minus_cam_s)
         self.maps = HeldMaps()
-        self._tracker = PoseTracker(settings, self._mounted, calibration.base_from_body, self.maps)
-        self._query = MapQuery(self._tracker, self.maps, settings, len(self._mounted))
+        self._tracker = PoseTracker(settings, rig.mounted, rig.base_from_body, self.maps)
+        self._query = MapQuery(self._tracker, self.maps, settings, len(rig.mounted))
         self._tracker.on_restart.append(self._calibration.give_up)
         self._given = GivenPrior(self._tracker)
         self._lift = LiftRide(self._tracker, self.perception.gauge)
@@ -102,7 +91,7 @@ class Localizer:
         places look alike. site: of another one's map in the building, see `handle_building`; empty for the robot's own.
         """
         view = MapView(tiles, vocabulary, survey_focal_px)
-        relocalizers = tuple(Relocalizer(view, camera, self._settings.relocalizer) for camera, _ in self._mounted)
+        relocalizers = tuple(Relocalizer(view, camera, self._settings.relocalizer) for camera, _ in self._rig.mounted)
         self.maps.use(site, HeldMap(version, relocalizers, lookalikes, alias_step_m))
         self._query.begin_anew()
         self._calibration.give_up()
@@ -188,15 +177,7 @@ class Localizer:
             floor=tracker.floor,
             **result._asdict(),
         )
-        estimate = assemble(
-            estimate,
-            self._settings.track,
-            confirmed=tracker.confirmed,
-            candidates=tracker.candidates,
-            prior=tracker.prior,
-            has_failed=self._query.failed > 0,
-            was_tracking=tracker.was_tracking,
-        )
+        estimate = assemble(estimate, tracker, has_failed=self._query.failed > 0)
         if estimate.floor != tracker.floor:
             estimate = replace(estimate, map_version=self.maps.version_on(estimate.floor))
         fixed_ns = None if tracker.confirmed is None or percept.is_reversed else tracker.confirmed.stamp_ns

@@ -16,12 +16,11 @@ from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, Relocalizer
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import ViewpointGate
-from locclient.localization.estimate import QueryResult
 from locclient.localization.held_maps import HeldMaps
 from locclient.localization.image_quality import UNUSABLE
 from locclient.localization.percept import Percept, QueryInput
 from locclient.localization.pose_hypothesis import PoseHypothesis
-from locclient.localization.pose_tracker import PoseTracker
+from locclient.localization.pose_tracker import PoseTracker, QueryResult
 from locclient.localization.settings import LocalizerSettings
 
 _SPREAD_SHARE = 0.45  # of the query interval: if frames are farther apart, a query is not spread over frames

@@ -5,11 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from fleetmap.geometry import Array
 from fleetmap.messages import Cause
 from fleetmap.odometry import make_odometry
-from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame, StereoCamera
+from fleetmap.sensors.rectification import MountedRig, RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, WheelSample
 from locclient.localization.image_quality import UNUSABLE, ImageQuality, ImageQualityMonitor
 from locclient.localization.percept import Percept
@@ -27,22 +25,13 @@ class Perception:
     stage_s: seconds by stage of the last frame, by the given clock.
     """
 
-    def __init__(
-        self,
-        calibration: RigCalibration,
-        camera: StereoCamera,
-        body_from_cam: Array,
-        imu_minus_cam_s: float,
-        settings: LocalizerSettings,
-        clock: Callable[[], float],
-        others: Sequence[MountedCamera],
-    ) -> None:
+    def __init__(self, rig: MountedRig, settings: LocalizerSettings, clock: Callable[[], float]) -> None:
         """Arguments as of `Localizer`."""
-        self._clock, self._mounted = clock, (MountedCamera(camera, body_from_cam), *others)
-        rig = (calibration, camera, body_from_cam, imu_minus_cam_s)
-        self.odometry = make_odometry(*rig, settings.odometry, settings.stereo, others, by_wheels=True)
-        self.gauge, self.gauges = RideGauge(calibration.imu), False
-        self._imu_minus_cam_ns = int(imu_minus_cam_s * 1e9)
+        self._clock, self._mounted, shift_s = clock, rig.mounted, rig.imu_minus_cam_s
+        followed = (rig.calibration, *rig.mounted[0], shift_s, settings.odometry, settings.stereo)
+        self.odometry = make_odometry(*followed, rig.mounted[1:], by_wheels=True)
+        self.gauge, self.gauges = RideGauge(rig.calibration.imu), False
+        self._imu_minus_cam_ns = int(shift_s * 1e9)
         self.percept: Percept | None = None
         self.view = 0
         self.stage_s: dict[str, float] = {}

@@ -1,15 +1,57 @@
-"""Where a robot is: a pose with its covariance, in the map of one floor. Pure."""
+"""Where a robot is: a pose in the map of one floor, and first-order algebra of its covariance. Pure.
+
+Covariances are rotation first, in map axes, about the body. A perturbation (6,) rotates a pose from the left and shifts its position,
+independently of each other: SO(3) x R^3. Sources: Barfoot and Furgale 2014 for compounding, Hertzberg et al. 2013 for boxplus and boxminus.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.geometry import Array
-from locclient.localization.pose_covariance import compose_cov, compose_end_cov, transport_cov
+from fleetmap import core
+from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log, turn_both
+
+
+def boxminus(measured: Array, predicted: Array) -> Array:
+    """Return the perturbation (6,) that leads from `predicted` to `measured`. Source: Hertzberg et al. 2013."""
+    return np.concatenate([so3_log(measured[:3, :3] @ predicted[:3, :3].T), measured[:3, 3] - predicted[:3, 3]])
+
+
+def boxplus(map_from_body: Array, rot_trans: Array) -> Array:
+    """Return `map_from_body` perturbed by `rot_trans` (6,), the inverse of `boxminus`. Source: Hertzberg et al. 2013."""
+    return se3(so3_exp(rot_trans[:3]) @ map_from_body[:3, :3], map_from_body[:3, 3] + rot_trans[3:])
+
+
+def innovation_of(measured: Array, cov_measured: Array, predicted: Array, covariance: Array) -> tuple[Array, float]:
+    """Return the innovation (6,) of a measured pose (4, 4), and its squared Mahalanobis distance."""
+    error = boxminus(measured, predicted)
+    return error, float(error @ np.linalg.solve(covariance + cov_measured, error))
+
+
+def kalman_update(map_from_body: Array, covariance: Array, error: Array, cov_measured: Array) -> tuple[Array, Array]:
+    """Return a pose and its covariance updated by a measured pose, which is off by `error` (6,). Source: Bucy and Joseph 1968."""
+    gain = np.linalg.solve(covariance + cov_measured, covariance).T  # K = P (P + R)^-1
+    rest = np.eye(6) - gain
+    updated = rest @ covariance @ rest.T + gain @ cov_measured @ gain.T  # (I - K) P (I - K)^T + K R K^T
+    return boxplus(map_from_body, gain @ error), updated
+
+
+def transport_cov(cov_rot_trans: Array, lever_m: Array) -> Array:
+    """Return the covariance about a point of the same rigid body at `lever_m` (map axes) from the point of `cov_rot_trans`."""
+    adjoint = np.eye(6)
+    adjoint[3:, :3] = -skew(lever_m)
+    return np.asarray(adjoint @ cov_rot_trans @ adjoint.T)
+
+
+def bounded_turn(covariance: Array) -> Array:
+    """Return the covariance (6, 6) with each rotation sigma limited to pi; it remains positive semidefinite."""
+    scale = np.ones(6)
+    scale[:3] = np.pi / np.maximum(np.sqrt(np.diag(covariance)[:3]), np.pi)
+    return scale[:, None] * covariance * scale
 
 
 class Place(NamedTuple):
-    """Pose of the body, map_from_body (4, 4), with cov_rot_trans (6, 6; map axes, rotation first, about the body).
+    """Pose of the body, map_from_body (4, 4), with cov_rot_trans (6, 6).
 
     floor: the site whose map it is in, of the robot's building; empty for the robot's own.
     """
@@ -31,18 +73,29 @@ class Place(NamedTuple):
         return self.map_from_body[:3, 3]
 
     def moved(self, body_from_next: Array, cov_step: Array) -> "Place":
-        """Return the place after a step, by `compose_cov`."""
-        return Place(*compose_cov(self.map_from_body, self.cov_rot_trans, body_from_next, cov_step), self.floor)
+        """Return the place after a step. cov_step: a left perturbation in the body's axes about the body."""
+        step = map(np.ascontiguousarray, (*self[:2], body_from_next, cov_step))
+        return Place(*core.compose_pose(*step), self.floor)
 
     def at_end_of(self, way: "Place") -> "Place":
-        """Return the place after a way from here, by `compose_end_cov`."""
-        end = compose_end_cov(self.map_from_body, self.cov_rot_trans, way.map_from_body, way.cov_rot_trans)
-        return Place(*end, self.floor)
+        """As `moved`, with the covariance of the way about its end, as for a hypothesis whose map is the body."""
+        turn = turn_both(self.map_from_body[:3, :3])
+        lever_m = self.map_from_body[:3, :3] @ way.position_m
+        covariance = transport_cov(self.cov_rot_trans, lever_m) + turn @ way.cov_rot_trans @ turn.T
+        return Place(self.map_from_body @ way.map_from_body, covariance, self.floor)
+
+    def before(self, way: "Place") -> "Place":
+        """Return the place from which the way led here, the inverse of `at_end_of`."""
+        map_from_earlier = self.map_from_body @ se3_inverse(way.map_from_body)
+        turn = turn_both(map_from_earlier[:3, :3])
+        cov_way = turn @ transport_cov(way.cov_rot_trans, -way.position_m) @ turn.T
+        lever_m = map_from_earlier[:3, 3] - self.position_m
+        return Place(map_from_earlier, transport_cov(self.cov_rot_trans, lever_m) + cov_way, self.floor)
 
     def of_point(self, body_from_point: Array) -> "Place":
         """Return the place of another frame of the same rigid body."""
         map_from_point = self.map_from_body @ body_from_point
-        lever_m = map_from_point[:3, 3] - self.map_from_body[:3, 3]
+        lever_m = map_from_point[:3, 3] - self.position_m
         return Place(map_from_point, transport_cov(self.cov_rot_trans, lever_m), self.floor)
 
 

@@ -9,8 +9,7 @@ import numpy as np
 from fleetmap.geometry import Array, length
 from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from locclient.localization.alias_disambiguation import ObservationHistory
-from locclient.localization.place import ORIGIN, Place
-from locclient.localization.pose_covariance import bounded_turn, boxminus
+from locclient.localization.place import ORIGIN, Place, bounded_turn, boxminus
 from locclient.localization.settings import TrackSettings
 
 # Sigmas of one step: radians, metres, share of the distance.

@@ -16,11 +16,9 @@ from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, is_reliable
 from fleetmap.sensors.rectification import MountedCamera
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import is_other_viewpoint
-from locclient.localization.estimate import QueryResult
 from locclient.localization.held_maps import HeldMaps
 from locclient.localization.hypothesis_set import HypothesisSet, Observations
-from locclient.localization.place import Place
-from locclient.localization.pose_covariance import innovation_of, kalman_update
+from locclient.localization.place import Place, innovation_of, kalman_update
 from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
 from locclient.localization.priors.prior import Prior
 from locclient.localization.settings import LocalizerSettings
@@ -28,6 +26,19 @@ from locclient.localization.settings import LocalizerSettings
 _OWN_FIX_M = 0.3  # between a fix and the hypothesis that it supports
 _EARLIER = 3  # frames that a query may pool with its own: of a metre of a drive
 _MISSED_STEPS = 1.5  # shortest steps between frames: a longer one missed some
+
+
+class QueryResult(NamedTuple):
+    """Result of a map query; fields as in Estimate."""
+
+    fix: Fix | None = None
+    refused: str = ""
+    innovation: float | None = None
+    innovation_m: float | None = None
+    moved_m: float | None = None
+    fix_stamp_ns: int | None = None
+
+
 NO_AGREEMENT = QueryResult(refused="nothing in the map matches this frame")
 ONE_OF_FLOORS = "another floor may look the same from here: drive a metre, pass a dock, or send a pose with its floor"
 OUTSIDE_PRIOR = QueryResult(refused="what the map matches lies outside the given initial pose")

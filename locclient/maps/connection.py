@@ -4,7 +4,6 @@ import logging
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 from fleetmap.bus import Bus, is_loopback
@@ -20,15 +19,6 @@ _NOWHERE = "tcp/127.0.0.1:7447"
 _PATIENCE_S = 120.0  # without an answer during a fetch; long enough for a server's restart
 
 
-@dataclass(frozen=True)
-class MapConnection:
-    """Map source of a recording, and the robot's identity."""
-
-    source: MapSource
-    site: str
-    robot: str
-
-
 def open_bus(address: MapAddress) -> Bus:
     """Open a connection to the server, with the robot's identity if it has one. Without a server the bus stays closed."""
     if address.server is None:
@@ -36,40 +26,41 @@ def open_bus(address: MapAddress) -> Bus:
     return Bus.connect(str(address.server), tls=address.tls)
 
 
-def trusted_map(bus: Bus, address: MapAddress, cache: Path) -> TrustedMap:
-    """Return the signed lists of a site; UsageError if a required root is missing or cannot be read."""
-    site, server, root = address.site, str(address.server), address.root
-    folder, data = cache / "trust" / site, None
-    if root is not None:
-        with disk_errors(f"the root {root} cannot be read", "copy 1.root.json of the server's store", UsageError):
-            data = Path(root).read_bytes()
+def map_client(bus: Bus, cache: TileCache, address: MapAddress, **how: float) -> MapClient:
+    """Return the client of a site's maps, which demands signed lists of a server; it has none if a fleet manager brings the maps.
+
+    how: arguments of `MapClient`. UsageError if a required root is missing or cannot be read.
+    """
+    site, server, data = address.site, address.server, None
+    client = MapClient(bus, cache, site, address.robot, **{"patience_s": _PATIENCE_S} | how)
+    if server is None:
+        return client
+    if address.root is not None:
+        with disk_errors(
+            f"the root {address.root} cannot be read", "copy 1.root.json of the server's store", UsageError
+        ):
+            data = Path(address.root).read_bytes()
     elif not is_loopback(server):
         raise UsageError(
             f"{server} needs a root of trust for its maps: copy trust/1.root.json of the server's store to the robot and set root"
         )
-    return TrustedMap(folder, site, data, ask_over(bus, site, address.robot))
+    client.trust = TrustedMap(cache.folder / "trust" / site, site, data, ask_over(bus, site, address.robot))
+    return client
 
 
 @contextmanager
 def connected(
     address: MapAddress, cache_setting: Path | None = None, cache_bytes: int = DEFAULT_MAX_BYTES
-) -> Iterator[MapConnection]:
-    """Open a connection to a map's address, with a cache of at most so many bytes; close it afterwards."""
-    site, robot = address.site, address.robot
+) -> Iterator[MapSource]:
+    """Open the maps of an address, with a cache of at most so many bytes; close them afterwards."""
     if address.store is not None:
-        yield MapConnection(LocalMapSource(Path(address.store), site, address.version), site, robot)
+        yield LocalMapSource(Path(address.store), address.site, address.version)
         return
-    folder = cache_folder(cache_setting)
-    cache = TileCache(folder, max_bytes=cache_bytes)
-    bus = open_bus(address)
-    try:
-        client = MapClient(bus, cache, site, robot, patience_s=_PATIENCE_S)
-        client.require(trusted_map(bus, address, folder))
-        yield MapConnection(client, site, robot)
+    cache = TileCache(cache_folder(cache_setting), max_bytes=cache_bytes)
+    with open_bus(address) as bus:
+        yield map_client(bus, cache, address)
         for fault in cache.take_faults():
             _log.warning("tile cache: %s", fault)
-    finally:
-        bus.close()
 
 
 def outbox_path(site: str, robot: str, cache: str | Path | None = None) -> Path:

@@ -9,7 +9,6 @@ import msgspec
 
 from fleetmap.bus import Bus, Handle
 from fleetmap.errors import LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
-from fleetmap.failure_summary import ReplayPart
 from fleetmap.mapformat import (
     MAX_MANIFEST_BYTES,
     Manifest,
@@ -25,9 +24,7 @@ from fleetmap.messages import (
     FailureAck,
     InitialPoseMessage,
     Part,
-    PoseMessage,
     RobotAck,
-    RobotHealth,
     SurveyArea,
     WantedVersion,
     decode_message,
@@ -123,7 +120,7 @@ class MapClient(MapSource):
     """Fetches maps through a cache, and sends reports.
 
     Cached bytes are not fetched again: a known version can be read while the server is unreachable, and of a new one only the
-    changed tiles are fetched.
+    changed tiles are fetched. trust: signed list that admits new versions, None for any; the active version stays in any case.
     """
 
     def __init__(
@@ -131,63 +128,45 @@ class MapClient(MapSource):
     ) -> None:
         """patience_s: maximum interruption of a fetch. Raises UsageError for names that cannot be keys."""
         super().__init__(site)
-        self._bus, self._cache = bus, cache
+        self.bus, self._cache = bus, cache
         self._robot = check_name(robot, "robot")
         self._timeout_s = timeout_s
         self._chunks = ChunkReader(bus, timeout_s=timeout_s, patience_s=patience_s)
-        self._trust: TrustedMap | None = None
+        self.trust: TrustedMap | None = None
         self.takes_grids = False  # for planners, if versions have them; localization does not need them
         self.surveys: tuple[SurveyArea, ...] = ()  # that robots may make, by its last answer
         self.restored_ns = 0  # when the server's store was restored from a backup, by its last answer
         self._away: UnreachableError | None = None  # while tiles are read
         self._begun = ""  # the manifest's address of the version that was admitted last
 
-    def require(self, trust: TrustedMap | None) -> None:
-        """Accept only new versions that the site's signed list admits; None: any. The active version stays in any case."""
-        self._trust = trust
-
     def check_admitted(self, wanted: WantedVersion) -> None:
         """Fetch the signed lists, and raise UntrustedError or UnreachableError unless they admit this version now."""
-        if self._trust is None:
+        if self.trust is None:
             raise UntrustedError("signature", "this robot has no signed lists; it needs a server, not a folder")
-        self._trust.refresh()
-        self._trust.admitted(wanted)
-
-    @property
-    def word_hours(self) -> float | None:
-        """Return hours since the last valid signed list of admitted versions; None without one, or if not required."""
-        return None if self._trust is None else self._trust.word_hours
+        self.trust.refresh()
+        self.trust.admitted(wanted)
 
     @property
     def received_bytes(self) -> int:
         """Return the number of map bytes received over the bus so far."""
         return self._chunks.received_bytes
 
-    @property
-    def endpoint(self) -> str:
-        """Return the endpoint of the map server."""
-        return self._bus.endpoint
-
-    def connected(self) -> bool:
-        """Return True if a peer is reachable now."""
-        return self._bus.connected()
-
     # --- versions -----------------------------------------------------------------------------------------------------
 
     def wanted(self) -> WantedVersion:
         """Return the version that the server wants this robot to run; LinkError without an answer."""
-        wanted = decode_message(self._bus.get(self._key("wanted"), timeout_s=self._timeout_s), WantedVersion)
+        wanted = decode_message(self.bus.get(self._key("wanted"), timeout_s=self._timeout_s), WantedVersion)
         if wanted.site != self.site:
             raise LinkError(f"requested site {self.site}, the server answered for {wanted.site[:80]!r}")
-        if self._trust is not None:
-            self._trust.refresh()
+        if self.trust is not None:
+            self.trust.refresh()
         self.restored_ns, self.surveys = wanted.restored_ns, wanted.surveys
         return msgspec.structs.replace(wanted, restored_ns=0, surveys=())
 
     def on_wanted(self, listener: Callable[[WantedVersion], None]) -> Handle:
         """Call `listener`, on a thread of the bus, whenever the server wants another version."""
         key = self._key("wanted")
-        return self._bus.subscribe(key, lambda _, payload: listener(decode_message(payload, WantedVersion)))
+        return self.bus.subscribe(key, lambda _, payload: listener(decode_message(payload, WantedVersion)))
 
     def on_initial_pose(self, listener: Callable[[InitialPoseMessage], None]) -> Handle:
         """Call `listener`, on a thread of the bus, whenever an operator sets this robot's pose at the server."""
@@ -200,7 +179,7 @@ class MapClient(MapSource):
                 )
             listener(told)
 
-        return self._bus.subscribe(self._key("initial_pose"), hear)
+        return self.bus.subscribe(self._key("initial_pose"), hear)
 
     def active(self) -> WantedVersion | None:
         """Return the active version, complete in the cache; None before the first one."""
@@ -236,9 +215,9 @@ class MapClient(MapSource):
         try:
             if not asks:
                 raise LinkError(f"the cache has no version of site {self.site} yet")
-            if self._trust is None:
+            if self.trust is None:
                 raise UntrustedError("signature", "this robot has no signed lists")
-            wanted = self._trust.current()
+            wanted = self.trust.current()
             if wanted != active:
                 self.bring(wanted)
         except (LinkError, MapFormatError, StoreError) as error:
@@ -299,8 +278,8 @@ class MapClient(MapSource):
         max_bytes = MAX_MANIFEST_BYTES
         # By the signed list; the manifest defines all else of a version, by hash and size. An admitted fetch is completed even if the
         # list has changed meanwhile.
-        if not is_active and self._trust is not None and sha256 != self._begun:
-            max_bytes = self._trust.admitted(wanted).length
+        if not is_active and self.trust is not None and sha256 != self._begun:
+            max_bytes = self.trust.admitted(wanted).length
             self._begun = sha256
         return checked_manifest(self._blob(self._key(f"manifests/{version}"), sha256, max_bytes), wanted)
 
@@ -339,7 +318,7 @@ class MapClient(MapSource):
         Errors as of `manifest`; the cached file stays.
         """
         kept = self._cache.kept_file(self.site, kind)
-        named = None if self._trust is None else self._trust.files
+        named = None if self.trust is None else self.trust.files
         if named is None or (kept is not None and sha256_hex(kept) == named.get(kind)):
             return kept
         data = None
@@ -357,29 +336,22 @@ class MapClient(MapSource):
 
     def announce_presence(self) -> Handle:
         """Announce this robot to the server, until the handle or the bus is closed."""
-        return self._bus.declare_alive(self._key("alive"))
+        return self.bus.declare_alive(self._key("alive"))
 
     def ack(self, version: int | None, *, stamp_ns: int, refused: str = "") -> None:
         """Report to the server the running version and, if it is not the wanted one, the reason."""
         own = {"site": self.site, "robot": self._robot}
         message = RobotAck(**own, stamp_ns=stamp_ns, version=version, refused=refused[:2000])
-        self._bus.publish(self._key("ack"), encode_message(message))
+        self.publish("ack", message)
 
-    def report_failure(self, payload: bytes) -> FailureAck:
-        """Send an encoded FailureReport and return the server's answer, once stored on its disk; errors as of `wanted`."""
-        return decode_message(self._bus.get(self._key("failures"), payload, timeout_s=self._timeout_s), FailureAck)
+    def deliver(self, name: str, payload: bytes) -> FailureAck:
+        """Send an encoded FailureReport to `failures`, or a ReplayPart to `replays`, and return the server's answer, once stored on its
+        disk; errors as of `wanted`."""
+        return decode_message(self.bus.get(self._key(name), payload, timeout_s=self._timeout_s), FailureAck)
 
-    def send_replay_part(self, part: ReplayPart) -> FailureAck:
-        """Send a part and return the number of bytes of the recording that the server has; errors as of `wanted`."""
-        answer = self._bus.get(self._key("replays"), encode_message(part), timeout_s=self._timeout_s)
-        return decode_message(answer, FailureAck)
-
-    def publish_health(self, health: RobotHealth) -> None:
-        self._bus.publish(self._key("health"), encode_message(health))
-
-    def publish_pose(self, message: PoseMessage) -> None:
-        """Send an estimate, which may be dropped on a congested network: the next one replaces it."""
-        self._bus.publish(self._key("pose"), encode_message(message), may_drop=True)
+    def publish(self, name: str, message: msgspec.Struct, *, may_drop: bool = False) -> None:
+        """Publish a message of the robot; may_drop: on a congested network, where the next one replaces it."""
+        self.bus.publish(self._key(name), encode_message(message), may_drop=may_drop)
 
     def _key(self, name: str) -> str:
         return robot_key(self.site, self._robot, name)

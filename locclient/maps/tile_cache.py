@@ -39,7 +39,7 @@ class TileCache:
 
     def __init__(self, folder: Path, *, max_bytes: int = DEFAULT_MAX_BYTES) -> None:
         """Create the folder; StoreError if that fails."""
-        self._folder = folder
+        self.folder = folder
         self._max_bytes = max_bytes
         self._faults: deque[str] = deque(maxlen=_MAX_FAULTS)
         self._last_fault = ""
@@ -222,7 +222,7 @@ class TileCache:
         return True
 
     def _site_path(self, site: str) -> Path:
-        return self._folder / "sites" / check_name(site, "site")
+        return self.folder / "sites" / check_name(site, "site")
 
     def _remove(self, sha256: str) -> None:
         self._sizes.pop(sha256, None)
@@ -235,4 +235,4 @@ class TileCache:
             self._note(f"{path} cannot be removed ({error.strerror}); check the rights of the cache")
 
     def _path(self, sha256: str) -> Path:
-        return self._folder / blob_path(sha256)
+        return self.folder / blob_path(sha256)

@@ -20,6 +20,7 @@ from fleetmap.failure_summary import FailureSummary, Moment
 from fleetmap.mapformat import check_sha256, decode_manifest
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import MountedCamera, MountedRig
 from locclient.delivery.failure_file import LocalizerRecord
 from locclient.localization.localizer import Localizer
 from locclient.maps.loaded_map import LoadedMap
@@ -34,8 +35,8 @@ Load = Callable[[UsedMap], LoadedMap]
 
 def replay_failure(record: LocalizerRecord, load: Load) -> list[Moment]:
     """Return the results of the present localizer for every frame. Errors as of `load`."""
-    rig = RigCalibration((), None, record.base_from_body)
-    localizer = Localizer(rig, record.camera, record.body_from_cam, 0.0, record.settings, others=record.others)
+    mounted = (MountedCamera(record.camera, record.body_from_cam), *record.others)
+    localizer = Localizer(MountedRig(RigCalibration((), None, record.base_from_body), mounted), record.settings)
     if record.used is not None:
         load(record.used).show(localizer, record.used.site_of(""))
     localizer.begin(record.start)

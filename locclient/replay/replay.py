@@ -11,8 +11,8 @@ from typing import Protocol
 import cv2
 
 from fleetmap.bow import decode_vocabulary
-from fleetmap.errors import LinkError, RecordingError, UsageError
-from fleetmap.free_memory import give_back_free_memory
+from fleetmap.errors import LinkError, RecordingError
+from fleetmap.free_memory import gc_frozen, give_back_free_memory
 from fleetmap.geometry import Array, rotation_angle_rad
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording
 from fleetmap.recordings.sensor_subset import reduced
@@ -23,14 +23,13 @@ from fleetmap.sources.replay_source import ReplaySource
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.identity import GivenAddress, MapAddress
 from locclient.localization.settings import LocalizerSettings
-from locclient.maps.connection import MapConnection, connected
+from locclient.maps.connection import connected
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.map_source import FetchedTiles, MapSource
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
 from locclient.replay.run_metrics import FrameRecord
 from locclient.replay.run_result import ReplayResult
 from locclient.robot.failure_report import RobotProfile
-from locclient.robot.gc_freeze import gc_frozen
 from locclient.robot.robot import ImagePriors, Outcome, Robot
 from locclient.robot.version_trial import TrialSettings
 
@@ -51,13 +50,14 @@ class RunExport(Protocol):
 @dataclass(frozen=True)
 class ReplayOptions:
     """Settings of the localizer, playback at recorded speed, progress callback with the number of each frame, export file;
-    open_priors: as of `PriorHook.open`."""
+    open_priors: as of `PriorHook.open`. robot: name for the server and the export; default: the identity's, else `replay`."""
 
     settings: LocalizerSettings = field(default_factory=LocalizerSettings)
     realtime: bool = False
     progress: Callable[[int], None] = lambda _: None
     export: RunExport | None = None
     open_priors: Callable[[MountedCamera, Array], Sequence[ImagePriors]] = lambda *_: ()
+    robot: str | None = None
 
 
 def load_map(source: MapSource) -> tuple[LoadedMap, FetchedTiles, str]:
@@ -79,7 +79,7 @@ def load_map(source: MapSource) -> tuple[LoadedMap, FetchedTiles, str]:
 
 @gc_frozen()
 def replay(
-    source: ReplaySource, connection: MapConnection, options: ReplayOptions, prior: PositionPrior | None = None
+    source: ReplaySource, maps: MapSource, options: ReplayOptions, prior: PositionPrior | None = None
 ) -> ReplayResult:
     """Play the source; prior: a coarse pose at its beginning.
 
@@ -87,12 +87,10 @@ def replay(
     unreadable.
     """
     cv2.setNumThreads(1)  # one thread, so that figures are those of one core
-    loaded, tiles, note = load_map(connection.source)
+    loaded, tiles, note = load_map(maps)
     rectifier = Rectifier(source.calibration, has_depth=source.recording.sensor_set is SensorSet.RGBD)
     found = options.open_priors(rectifier.mounted[0], source.calibration.base_from_body)
-    robot = Robot(
-        source.calibration, rectifier, options.settings, TrialSettings(), time.process_time, image_priors=found
-    )
+    robot = Robot(rectifier, options.settings, TrialSettings(), time.process_time, image_priors=found)
     robot.use(loaded)
     give_back_free_memory()
     if prior is not None:
@@ -101,10 +99,7 @@ def replay(
     result = ReplayResult([], [], [], loaded.manifest, tiles, [note] if note else [], truth_in_map=truth_in_map)
     begun_s, first_ns = time.monotonic(), source.played_stamp_ns(source.recorded_stamp_ns(0))
     if options.export is not None:
-        mounting = (robot.base_from_body, rectifier.body_from_cam, rectifier.camera)
-        clock = (source.calibration.imu, rectifier.imu_minus_cam_s)
-        others = rectifier.mounted[1:]
-        profile = RobotProfile(connection.site, connection.robot, *mounting, options.settings, *clock, others=others)
+        profile = RobotProfile(maps.site, options.robot or "replay", rectifier.rig, options.settings)
         options.export.begin(first_ns, loaded, profile, rectifier)
     unread: list[str] = []
     for number, imu in enumerate(source.imu_before_each()):
@@ -186,9 +181,8 @@ class LocalizeOptions(ReplayOptions):
     """Options of `localize` in addition to those of every replay.
 
     frames: Python slice of the recording's frames. reverse: backwards, with new stamps and without IMU. use: only the sensors of a
-    smaller set. calibration, topics: for opening a recording by its path. robot: name for the server; default: the identity's, else
-    `replay`. root, identity, insecure: as of the command. cache, cache_bytes: folder and size of the tile cache. version: in a store's
-    folder, drafts included.
+    smaller set. calibration, topics: for opening a recording by its path. root, identity, insecure: as of the command. cache, cache_bytes:
+    folder and size of the tile cache. version: in a store's folder, drafts included.
     """
 
     frames: str = ":"
@@ -196,7 +190,6 @@ class LocalizeOptions(ReplayOptions):
     use: SensorSet | None = None
     calibration: Path | None = None
     topics: Topics = field(default_factory=Topics)
-    robot: str | None = None
     root: Path | None = None
     identity: Path | None = None
     insecure: bool = False
@@ -228,31 +221,19 @@ def localize(
         recording = reduced(recording, options.use)
         selection = FrameSelection.parse(options.frames)
         address = _address(maps, site, options)
-        connection = stack.enter_context(connected(address, options.cache, options.cache_bytes))
+        source_of_maps = stack.enter_context(connected(address, options.cache, options.cache_bytes))
         source = ReplaySource.of(recording, selection, reverse=options.reverse)
         stack.callback(cv2.setNumThreads, cv2.getNumThreads())
-        return replay(source, connection, options, prior)
+        return replay(source, source_of_maps, replace(options, robot=address.robot), prior)
 
 
 def fetch_map(maps: str | Path, site: str, options: LocalizeOptions = _DEFAULTS) -> LoadedMap:
     """Fetch the current map of a site with all of its tiles, for a `MapView`; arguments and errors as of `localize`."""
-    with connected(_address(maps, site, options), options.cache, options.cache_bytes) as connection:
-        return load_map(connection.source)[0]
+    with connected(_address(maps, site, options), options.cache, options.cache_bytes) as source:
+        return load_map(source)[0]
 
 
 def _address(maps: str | Path, site: str, options: LocalizeOptions) -> MapAddress:
     is_server = isinstance(maps, str) and _ENDPOINT.match(maps) is not None
-    if is_server and options.version is not None:
-        raise UsageError(
-            f"version {options.version} needs a store's folder: a server gives the one that its robots should run"
-        )
-    address = GivenAddress(
-        site=site,
-        robot=options.robot,
-        server=str(maps) if is_server else None,
-        store=None if is_server else str(maps),
-        root=None if options.root is None else str(options.root),
-        identity=None if options.identity is None else str(options.identity),
-        insecure=options.insecure,
-    ).resolve("replay")
-    return replace(address, version=options.version)
+    place: dict[str, str | Path] = {"server" if is_server else "store": maps}
+    return GivenAddress.of(options, site=site, **place).resolve("replay")

@@ -111,14 +111,17 @@ def stage_ms(frames: Frames) -> dict[str, float]:
 
 def error_m(frames: Frames) -> dict[str, float] | None:
     """Return unaligned position errors of localized frames with ground truth."""
-    values = [f.error_m for f, good in zip(frames, localised(frames), strict=True) if good]
-    return spread([v for v in values if v is not None], ("median", "p95", "p99", "max"))
+    return spread([f.error_m for f in _good(frames) if f.error_m is not None], ("median", "p95", "p99", "max"))
 
 
 def error_deg(frames: Frames) -> dict[str, float] | None:
     """Return unaligned orientation errors of localized frames with ground truth."""
-    values = [f.error_rad for f, good in zip(frames, localised(frames), strict=True) if good]
-    return spread([float(np.degrees(v)) for v in values if v is not None], ("median", "p99"))
+    errors_rad = [f.error_rad for f in _good(frames) if f.error_rad is not None]
+    return spread([float(np.degrees(error_rad)) for error_rad in errors_rad], ("median", "p99"))
+
+
+def _good(frames: Frames) -> list[FrameRecord]:
+    return [frame for frame, is_localised in zip(frames, localised(frames), strict=True) if is_localised]
 
 
 def status_share(frames: Frames) -> dict[str, float]:
@@ -140,14 +143,10 @@ def position_failures(frames: Frames) -> int:
     """
     start = first_fix(frames)
     after = list(frames[start:]) if start is not None else []
-    spans = (
-        _episodes(frames, _is_silent, SILENT_S)
-        + _episodes(after, _is_blind, BLIND_S)
-        + _episodes(frames, _is_overconfident, SILENT_S)
-        + not_found(frames)
-    )
+    kinds = ((frames, _is_silent, SILENT_S), (after, _is_blind, BLIND_S), (frames, is_outside_its_bound, SILENT_S))
+    spans = not_found(frames) + [span for kind in kinds for span in _episodes(*kind)]
     good = localised(frames)
-    bad = [any(test(f, good[k]) for test in (_is_silent, _is_blind, _is_overconfident)) for k, f in enumerate(frames)]
+    bad = [any(is_bad(f, good[k]) for _, is_bad, _ in kinds) for k, f in enumerate(frames)]
     return len(_merged(sorted(spans), [(f.stamp_ns, good[k] and not bad[k]) for k, f in enumerate(frames)]))
 
 
@@ -177,15 +176,11 @@ def _is_blind(frame: FrameRecord, is_localised: bool) -> bool:
     return not is_localised and failure_definition.is_blind(frame.status, frame.radius_95_m)
 
 
-def is_outside_its_bound(frame: FrameRecord) -> bool:
+def is_outside_its_bound(frame: FrameRecord, _is_localised: bool = False) -> bool:
     """Return True if the ground truth lies outside the 99.9 % bound of the frame's position."""
     if frame.error_map_m is None or frame.cov_rot_trans is None:
         return False
     return failure_definition.is_outside_bound(frame.error_map_m, frame.cov_rot_trans)
-
-
-def _is_overconfident(frame: FrameRecord, is_localised: bool) -> bool:
-    return is_outside_its_bound(frame)
 
 
 def _episodes(
@@ -195,18 +190,16 @@ def _episodes(
 
     A period lasts until the next frame that is not bad. Periods without 5 s of good tracking between them are one failure.
     """
-    good = localised(frames)
-    stretches: list[tuple[int, int]] = []
-    begin = None
-    for index, frame in enumerate(frames):
-        bad = is_bad(frame, good[index])
-        if bad and begin is None:
-            begin = frame.stamp_ns
-        if begin is not None and (not bad or index + 1 == len(frames)):
-            if frame.stamp_ns - begin > longer_than_s * 1e9:
-                stretches.append((begin, frame.stamp_ns))
-            begin = None if not bad else begin
-    return _merged(stretches, [(f.stamp_ns, good[k] and not is_bad(f, good[k])) for k, f in enumerate(frames)])
+    good, stamps_ns = localised(frames), [frame.stamp_ns for frame in frames]
+    bad = [is_bad(frame, good[k]) for k, frame in enumerate(frames)]
+    long = [(begin, end) for begin, end in _runs(stamps_ns, bad) if end - begin > longer_than_s * 1e9]
+    return _merged(long, [(stamp_ns, good[k] and not bad[k]) for k, stamp_ns in enumerate(stamps_ns)])
+
+
+def _runs(stamps_ns: Sequence[int], flags: Sequence[bool]) -> list[tuple[int, int]]:
+    """Return (begin, end) stamps of the runs of True, each until the next False or the last stamp."""
+    edges = np.flatnonzero(np.diff(np.array([0, *flags, 0], int))).reshape(-1, 2)
+    return [(stamps_ns[first], stamps_ns[min(after, len(flags) - 1)]) for first, after in edges.tolist()]
 
 
 def _merged(stretches: list[tuple[int, int]], fine: list[tuple[int, bool]]) -> list[tuple[int, int]]:
@@ -222,15 +215,9 @@ def _merged(stretches: list[tuple[int, int]], fine: list[tuple[int, bool]]) -> l
 
 def _longest_fine_ns(fine: list[tuple[int, bool]], since_ns: int, until_ns: int) -> int:
     """Return the duration of the longest period of good tracking between two stamps, up to the frame that ends it."""
-    longest, begin = 0, None
-    for stamp, is_fine in fine:
-        if since_ns <= stamp <= until_ns:
-            if is_fine and begin is None:
-                begin = stamp
-            if begin is not None:
-                longest = max(longest, stamp - begin)
-                begin = begin if is_fine else None
-    return longest
+    between = [each for each in fine if since_ns <= each[0] <= until_ns]
+    runs = _runs([stamp_ns for stamp_ns, _ in between], [is_fine for _, is_fine in between])
+    return max((end - begin for begin, end in runs), default=0)
 
 
 def spread(values: list[float], names: tuple[str, ...]) -> dict[str, float] | None:

@@ -1,12 +1,10 @@
 """Starts without a guess: a robot that is switched on somewhere in a recording, looks around for some seconds, and knows nothing."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from fleetmap.geometry import Array
-from fleetmap.messages import Status
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from fleetmap.sources.replay_source import ReplaySource
@@ -19,15 +17,6 @@ from locclient.robot.version_trial import TrialSettings
 
 LOOK_S = 3.0
 _IMU_LEAD_NS = 100_000_000  # of a robot's own samples before its first frame
-
-
-@dataclass(frozen=True, slots=True)
-class StartFrame:
-    """One frame of a start; map_from_body (4, 4) is None without a pose."""
-
-    stamp_ns: int
-    status: Status
-    map_from_body: Array | None
 
 
 def spread_starts(source: ReplaySource, count: int) -> list[int]:
@@ -49,7 +38,7 @@ def starts(
         shown = {k: frame for k, frame in shown.items() if k >= start}
         shown |= {k: source.frame(k) for k in range(start, end) if k not in shown}
         part = replace(source, indices=source.indices[start:end])
-        robot = Robot(source.calibration, rectifier, settings, TrialSettings())
+        robot = Robot(rectifier, settings, TrialSettings())
         robot.use(loaded)
         found = []
         for number, before in enumerate(part.imu_before_each()):
@@ -59,8 +48,3 @@ def starts(
             if outcome is not None:
                 found.append(outcome.estimate)
         yield found
-
-
-def start_frames(estimates: Sequence[Estimate]) -> list[StartFrame]:
-    """Return the estimates of one start as they are reported."""
-    return [StartFrame(e.stamp_ns, e.status, e.map_from_body) for e in estimates]

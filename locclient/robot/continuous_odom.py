@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.odometry import ContinuousFrame
 from locclient.localization.estimate import Estimate
-from locclient.localization.pose_covariance import transport_cov
+from locclient.localization.place import transport_cov
 
 
 @dataclass(frozen=True, slots=True)

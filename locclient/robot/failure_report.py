@@ -13,8 +13,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.messages import MAX_THUMBNAIL_BYTES, CameraNote, Cause, FailureReport, Placement, Thumbnail
 from fleetmap.relocalization.landmark_visibility import cones_of_tiles, match_visible, visible_landmarks
-from fleetmap.sensors.calibration import ImuNoise
-from fleetmap.sensors.rectification import MountedCamera, StereoCamera
+from fleetmap.sensors.rectification import MountedRig, StereoCamera
 from fleetmap.sensors.samples import Image
 from locclient.localization.settings import LocalizerSettings
 from locclient.robot.failure_onset import PICTURE_WIDTH_PX
@@ -106,23 +105,13 @@ _MATCHES_WIDTH_PX = 800
 
 @dataclass(frozen=True)
 class RobotProfile:
-    """Common data of all reports of a robot: site, name, mounting, rectified camera, settings, noise and clock of the IMU, the privacy of
-    its pictures: full, blurred or off (none), and the rectified other cameras."""
+    """Common data of all reports of a robot: site, name, rig, settings, and the privacy of its pictures: full, blurred or off (none)."""
 
     site: str
     robot: str
-    base_from_body: Array
-    body_from_cam: Array
-    camera: StereoCamera
+    rig: MountedRig
     settings: LocalizerSettings
-    imu: ImuNoise | None = None
-    imu_minus_cam_s: float = 0.0
     pictures: str = "blurred"
-    others: tuple[MountedCamera, ...] = ()
-
-    def mounted(self, view: int) -> MountedCamera:
-        """Return the camera of a view."""
-        return self.others[view - 1] if view else MountedCamera(self.camera, self.body_from_cam)
 
 
 def failure_report(context: FailureContext, profile: RobotProfile, *, report_id: str, wall_ns: int) -> FailureReport:
@@ -131,12 +120,12 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
     belief, map_from_base, is_own = onset.belief, None, failure.estimate.is_at_home
     # The server has no place for a pose in another site's map.
     if onset.map_from_body is not None and is_own and not (belief and belief.floor):
-        map_from_base = onset.map_from_body @ se3_inverse(profile.base_from_body)
+        map_from_base = onset.map_from_body @ se3_inverse(profile.rig.base_from_body)
     tile = None
     if map_from_base is not None and context.running is not None:
         x_tile, y_tile = (map_from_base[:2, 3] // context.running.manifest.tile_size_m).tolist()
         tile = int(x_tile), int(y_tile)
-    camera, body_from_cam = profile.mounted(onset.view)
+    camera, body_from_cam = profile.rig.mounted[onset.view]
     matches = _matches(context, profile)
     seen = None if matches is None else int((matches[2] >= 0).sum())
     cause = failure.cause
@@ -171,9 +160,9 @@ def failure_report(context: FailureContext, profile: RobotProfile, *, report_id:
             size_px=(camera.width_px, camera.height_px),
             focal_px=float(camera.focal_px),
             centre_px=(float(camera.cx_px), float(camera.cy_px)),
-            base_from_cam=Placement.of(profile.base_from_body @ body_from_cam),
+            base_from_cam=Placement.of(profile.rig.base_from_body @ body_from_cam),
         ),
-        view=onset.view if profile.others else None,
+        view=onset.view if len(profile.rig.mounted) > 1 else None,
         thumbnails=_thumbnails(context, profile, matches, cause),
     )
 
@@ -185,7 +174,7 @@ def _matches(context: FailureContext, profile: RobotProfile) -> Matches | None:
         return None
     if onset.belief is not None and onset.belief.floor != context.failure.estimate.floor:
         return None
-    camera, body_from_cam = profile.mounted(onset.view)
+    camera, body_from_cam = profile.rig.mounted[onset.view]
     map_from_cam = onset.map_from_body @ body_from_cam
     return expected_matches(onset.left, camera, map_from_cam, running.tiles.values(), profile.settings)
 

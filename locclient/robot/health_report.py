@@ -104,78 +104,54 @@ _RECENT = 300
 Figure = float | int | str | bool | None
 
 
-class FixFigures:
-    """Figures of HEALTH_FIGURES from fixes, docks and odometry; the largest since the last report.
+class HealthFigures:
+    """Counts since the start, durations of the last frames, and the largest errors since the last report.
 
     Errors in metres count only while TRACKING: a robot that reports LOST and is found elsewhere was not wrong. A claimed pose
     disproved by later fixes beyond its covariance counts as well.
     """
 
     def __init__(self) -> None:
-        self._expected = self._seen = 0
-        self._largest: dict[str, float] = {}
-        self._last: Estimate | None = None
-        self._speed_mps: float | None = None
-
-    def handle(self, estimate: Estimate, dock_error_m: float | None, speed_mps: float | None = None) -> None:
-        self._speed_mps = speed_mps
-        was_tracking = self._last is not None and self._last.status is Status.TRACKING
-        self._last = estimate
-        self._note("fix_innovation", estimate.innovation)
-        self._note("fix_innovation_m", estimate.innovation_m if was_tracking else None)
-        self._note("fix_innovation_m", estimate.moved_m)
-        self._note("dock_error_m", dock_error_m)
-        if estimate.fix is not None:
-            self._expected += estimate.fix.expected
-            self._seen += estimate.fix.seen
-
-    def take(self) -> dict[str, Figure]:
-        """Return the figures of a report, and reset the largest values."""
-        figures: dict[str, Figure] = {
-            name: self._largest.get(name) for name in ("fix_innovation", "fix_innovation_m", "dock_error_m")
-        }
-        self._largest = {}
-        figures |= {"landmarks_expected": self._expected, "landmarks_seen": self._seen}
-        if self._last is not None:
-            figures["speed_mps"] = self._speed_mps
-            figures["radius_95_m"] = known_radius_m(self._last.cov_rot_trans)
-        return figures
-
-    def _note(self, name: str, value: float | None) -> None:
-        if value is not None:
-            self._largest[name] = max(self._largest.get(name, 0.0), float(value))
-
-
-class HealthFigures:
-    """Counts since the start, and durations of the last frames."""
-
-    def __init__(self) -> None:
         self._all_frames = self._frames = self._localised = self.failures = 0
+        self._expected = self._seen = 0  # landmarks
         self._frame_ms: deque[float] = deque(maxlen=_RECENT)
         self._first_ns: int | None = None
         self._first_fix_s: float | None = None
         self._first_frame_ms: float | None = None
-        self._fixes = FixFigures()
+        self._largest: dict[str, float] = {}
         self.last: Outcome | None = None  # the last frame
         self.search = SearchWay()
 
     def handle(self, outcome: Outcome) -> None:
-        estimate = outcome.estimate
+        estimate, last = outcome.estimate, self.last
         self.last = outcome
         self._frame_ms.append(1e3 * outcome.cpu_s)
         if self._first_ns is None:
             self._first_ns, self._first_frame_ms = estimate.stamp_ns, 1e3 * outcome.cpu_s
-        if estimate.fix is not None and self._first_fix_s is None:
-            self._first_fix_s = (estimate.stamp_ns - self._first_ns) * 1e-9
+        if estimate.fix is not None:
+            if self._first_fix_s is None:
+                self._first_fix_s = (estimate.stamp_ns - self._first_ns) * 1e-9
+            self._expected += estimate.fix.expected
+            self._seen += estimate.fix.seen
         self._all_frames += 1
         self._frames += self._first_fix_s is not None
         self._localised += estimate.status is Status.TRACKING
-        self._fixes.handle(estimate, outcome.dock_error_m, outcome.speed_mps)
+        was_tracking = last is not None and last.estimate.status is Status.TRACKING
+        for name, value in (
+            ("fix_innovation", estimate.innovation),
+            ("fix_innovation_m", estimate.innovation_m if was_tracking else None),
+            ("fix_innovation_m", estimate.moved_m),
+            ("dock_error_m", outcome.dock_error_m),
+        ):
+            if value is not None:
+                self._largest[name] = max(self._largest.get(name, 0.0), float(value))
         self.search.handle(estimate, outcome.speed_mps, may_be_mapped=outcome.may_be_mapped)
 
     def report(self, site: str, robot: str, wall_ns: int, more: Mapping[str, Figure], silent: bool) -> RobotHealth:
-        """Return the message; more: figures of other parts. silent: True if the source has stopped sending frames."""
-        last = None if self.last is None else self.last.estimate
+        """Return the message, and reset the largest errors; more: figures of other parts. silent: True if the source has stopped sending
+        frames."""
+        outcome, largest = self.last, self._largest
+        self._largest = {}
         flags: list[Flag | Cause] = [Cause.NO_FRAMES] if silent else []
         figures: dict[str, Figure] = {
             "localised_share_of_all": self._localised / self._all_frames if self._all_frames else None,
@@ -185,22 +161,14 @@ class HealthFigures:
             "frame_ms_mean": float(np.mean(self._frame_ms)) if self._frame_ms else None,
             "frame_ms_p99": float(np.percentile(self._frame_ms, 99)) if self._frame_ms else None,
             "failures": self.failures,
-            **self._fixes.take(),
+            **{name: largest.get(name) for name in ("fix_innovation", "fix_innovation_m", "dock_error_m")},
+            "landmarks_expected": self._expected,
+            "landmarks_seen": self._seen,
         }
-        if last is not None:
-            figures["exposure"], figures["sharpness"] = last.image.exposure, last.image.sharpness
-            figures |= last.calibration.figures
-            figures |= {"views": last.views_in_words} if last.views_in_words else {}
-            flags += [Cause.CALIBRATION] if last.calibration.is_wrong else []
-            flags += [Flag.BLIND] if is_blind(last.status, radius_95_m(last.cov_rot_trans)) else []
-            flags += [last.image.cause] if last.image.cause else []
-            flags += [] if self.last is None or self.last.may_be_mapped else [Flag.OFF_MAP]
-            flags += [Flag.NOT_LOCALISED] if self.search.is_long and not self.search.is_off_map else []
-            flags += [Cause.NO_MAP] if last.map_version is None else []
-            figures["not_localised_m"] = self.search.metres
-            figures["frames_dropped_share"] = 0.0 if self.last is None else self.last.dropped_share
-            flags += [] if self.last is None else self.last.left_out
-            figures |= {"floor": last.floor} if last.floor else {}
+        last = None if outcome is None else outcome.estimate
+        if outcome is not None:
+            more = {**self._figures_of(outcome), **more}
+            flags += self._flags_of(outcome)
         return RobotHealth(
             site=site,
             robot=robot,
@@ -211,3 +179,29 @@ class HealthFigures:
             flags=tuple(flags),
             metrics={**figures, **more},
         )
+
+    def _figures_of(self, outcome: Outcome) -> dict[str, Figure]:
+        last = outcome.estimate
+        named = {"views": last.views_in_words, "floor": last.floor}
+        return {
+            "speed_mps": outcome.speed_mps,
+            "radius_95_m": known_radius_m(last.cov_rot_trans),
+            "exposure": last.image.exposure,
+            "sharpness": last.image.sharpness,
+            **last.calibration.figures,
+            "not_localised_m": self.search.metres,
+            "frames_dropped_share": outcome.dropped_share,
+            **{name: text for name, text in named.items() if text},
+        }
+
+    def _flags_of(self, outcome: Outcome) -> list[Flag | Cause]:
+        last = outcome.estimate
+        known: tuple[tuple[Flag | Cause, bool], ...] = (
+            (Cause.CALIBRATION, last.calibration.is_wrong),
+            (Flag.BLIND, is_blind(last.status, radius_95_m(last.cov_rot_trans))),
+            (last.image.cause, bool(last.image.cause)),
+            (Flag.OFF_MAP, not outcome.may_be_mapped),
+            (Flag.NOT_LOCALISED, self.search.is_long and not self.search.is_off_map),
+            (Cause.NO_MAP, last.map_version is None),
+        )
+        return [*(flag for flag, is_on in known if is_on), *outcome.left_out]

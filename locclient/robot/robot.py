@@ -11,7 +11,6 @@ from fleetmap.mapformat.manifest import building_frame
 from fleetmap.messages import Cause, Flag, PoseMessage, Status
 from fleetmap.odometry import WheelOdometry
 from fleetmap.recordings.images import StoredFrame, decode_frame
-from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import PositionPrior, WheelSample
 from fleetmap.sources.sensor_bundle import SensorBundle
@@ -98,7 +97,6 @@ class Robot:
 
     def __init__(
         self,
-        calibration: RigCalibration,
         rectifier: Rectifier,
         settings: LocalizerSettings,
         trial: TrialSettings,
@@ -109,9 +107,9 @@ class Robot:
     ) -> None:
         """clock_s: measures CPU time; the default measures nothing. keeps_replay: record the seconds around a failure."""
         self._rectifier, self._clock_s, self._image_priors = rectifier, clock_s, image_priors
+        calibration = rectifier.calibration
         self.base_from_body = calibration.base_from_body
-        mounting = (rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s)
-        self.localizer = Localizer(calibration, *mounting, settings, clock_s, rectifier.mounted[1:])
+        self.localizer = Localizer(rectifier.rig, settings, clock_s)
         self.ring = FailureRing() if keeps_replay else None
         self._versions = VersionTrials(trial, self._show)
         self._odom = ContinuousOdom(calibration.base_from_body)

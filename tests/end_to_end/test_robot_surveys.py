@@ -41,7 +41,7 @@ def drive(recording: Path, store: Path, area: SurveyArea, folder: Path) -> Surve
     """A robot on its way, whose client may survey."""
     with open_recording(recording) as opened:
         source = ReplaySource.of(opened, FrameSelection.parse("::"), reverse=False)
-        robot = Robot(source.calibration, Rectifier(source.calibration), LocalizerSettings(), TrialSettings())
+        robot = Robot(Rectifier(source.calibration), LocalizerSettings(), TrialSettings())
         robot.use(fetch_map(store, "lab"))
         drives = SurveyDrives(folder, source.calibration)
         drives.requests = (area,)

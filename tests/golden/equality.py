@@ -99,9 +99,7 @@ def in_a_building(drive: Path, store: Path) -> Iterable[Estimate]:
     held.refresh()
     change = held.changes.popleft()
     with open_recording(drive) as recording:
-        robot = Robot(
-            recording.calibration, Rectifier(recording.calibration), LocalizerSettings(), TrialSettings(), lambda: 0.0
-        )
+        robot = Robot(Rectifier(recording.calibration), LocalizerSettings(), TrialSettings(), lambda: 0.0)
         robot.use(load_map(own)[0])
         robot.use_building(change.building, change.maps)
         source = ReplaySource(recording, np.arange(len(recording.frame_stamps_ns)), reverse=False)

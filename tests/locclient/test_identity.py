@@ -128,9 +128,7 @@ def test_a_server_that_is_not_the_bundles(tmp_path: Path, server: Server, monkey
     assert time.monotonic() - begun_s < 40
 
 
-GIVEN = GivenAddress(
-    site="lab", robot="r1", server=None, store=None, root=None, identity="nowhere", insecure=False, sign="--"
-)
+GIVEN = GivenAddress(site="lab", robot="r1", identity="nowhere", sign="--")
 
 
 @pytest.mark.parametrize(
@@ -157,7 +155,7 @@ def test_addresses(tmp_path: Path, server: Server) -> None:
     bare = replace(GIVEN, site=None, robot=None, identity=str(folder))
     found = bare.resolve()
     assert (found.site, found.robot, found.server) == ("lab", "r1", identity.who.endpoint)
-    assert found.root == str(folder / "root.json")
+    assert found.root == folder / "root.json"
     assert found.tls == TlsFiles(folder / "servers.ca", folder / "robot.pem")
     with pytest.raises(UsageError, match="robot r2 is asked for"):
         replace(bare, robot="r2").resolve()

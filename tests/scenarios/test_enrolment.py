@@ -72,11 +72,9 @@ def test_two_robots_from_an_empty_folder(site: TlsSite) -> None:
             thief = stack.enter_context(attacker(site.endpoint, one))
             honest = stack.enter_context(Bus.connect(two.who.endpoint, tls=two.tls))
             assert [wanted(honest, "r2") for _ in range(10)] == [1] * 10
-            given = GivenAddress(
-                site=None, robot=None, server=None, store=None, root=None, identity=str(two.folder), insecure=False
-            )
-            with connected(given.resolve(), site.folder / "cache", 10**8) as connection:
-                assert (connection.source.ready().wanted.version, connection.robot) == (1, "r2")
+            address = GivenAddress(identity=two.folder).resolve()
+            with connected(address, site.folder / "cache", 10**8) as maps:
+                assert (maps.ready().wanted.version, address.robot) == (1, "r2")
         # Row 2: the same while the server starts; who was connected before is there first.
         with site.serving(site.endpoint):
             assert [wanted(honest, "r2") for _ in range(10)] == [1] * 10

@@ -91,7 +91,7 @@ class Robot:
         folder, root = drill.folder / name, (drill.lists.folder / "1.root.json").read_bytes()
         self.client = MapClient(bus, TileCache(folder), SITE, name)
         self.trust = TrustedMap(folder / "trust", SITE, root, ask_over(bus, SITE, name))
-        self.client.require(self.trust)
+        self.client.trust = self.trust
 
     def ready(self) -> tuple[int | None, str]:
         """The version that it runs now, and why not the wanted one."""
@@ -205,9 +205,9 @@ def test_the_root_expires(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> No
     drill.run("admit", SITE, *drill.key)
     with served(drill):
         robot = drill.robot("r1")
-        robot.client.require(None)
+        robot.client.trust = None
         assert robot.ready() == (2, "")  # what it has, from a time when all was valid
-        robot.client.require(robot.trust)
+        robot.client.trust = robot.trust
         drill.publish(seed=2)
         version, note = robot.ready()
         assert version == 2

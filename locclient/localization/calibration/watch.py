@@ -30,7 +30,7 @@ from locclient.localization.calibration.parameters import (
     Drift,
 )
 from locclient.localization.map_query import FinishedQuery
-from locclient.localization.pose_covariance import transport_cov
+from locclient.localization.place import transport_cov
 
 _STEP_M, _FIRST_STEP_M, _STEP_RAD = 1.0, 0.5, 0.35  # between two looks, and between the first ones
 _MIN_NEW_SHARE = 0.1  # weight of a look without landmarks new to the window

@@ -14,7 +14,6 @@ from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.hypothesis_set import HypothesisSet, Observations
 from locclient.localization.percept import Percept
 from locclient.localization.place import ORIGIN, Place
-from locclient.localization.pose_covariance import compose_inverse_cov
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
 
@@ -129,9 +128,8 @@ class Prior:
         floors."""
         if place.floor not in self.floors:
             return False
-        since, prior_from_map = self._since.now, self.floors[place.floor]
-        map_from_then, covariance = compose_inverse_cov(*place[:2], *since[:2])
-        map_from_base, cov_m2 = map_from_then @ se3_inverse(self._base_from_body), covariance[3:5, 3:5]
+        prior_from_map, then = self.floors[place.floor], place.before(self._since.now)
+        map_from_base, cov_m2 = then.map_from_body @ se3_inverse(self._base_from_body), then.cov_rot_trans[3:5, 3:5]
         if prior_from_map is not None:
             map_from_base = prior_from_map @ map_from_base
             cov_m2 = prior_from_map[:2, :2] @ cov_m2 @ prior_from_map[:2, :2].T

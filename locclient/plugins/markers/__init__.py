@@ -13,8 +13,7 @@ from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame
 from fleetmap.sensors.samples import PositionPrior
 from locclient.hooks import PriorHook
 from locclient.localization.estimate import Estimate
-from locclient.localization.place import Place
-from locclient.localization.pose_covariance import boxminus, innovation_of
+from locclient.localization.place import Place, boxminus, innovation_of
 
 _CHECK_NS = 500_000_000  # between two looks for markers while the robot knows its place
 _GATE = 22.458  # squared Mahalanobis distance: 0.999 of chi-square, 6 degrees of freedom

@@ -22,8 +22,7 @@ from locclient.daemon.daemon import check_run, configured_outbox
 from locclient.delivery.outbox import Outbox
 from locclient.identity import MapAddress
 from locclient.localization.calibration.pair_order import FAULTS, PairOrder, pair_order
-from locclient.maps.connection import cache_folder, open_bus, trusted_map
-from locclient.maps.map_client import MapClient
+from locclient.maps.connection import cache_folder, map_client, open_bus
 from locclient.maps.map_source import LocalMapSource
 from locclient.maps.tile_cache import TileCache
 
@@ -180,7 +179,7 @@ def _clock(now_ns: int, synchronised: bool) -> Finding:
 
 
 def _outbox(config: LocclientConfig, address: MapAddress) -> Iterator[Finding]:
-    path = configured_outbox(config.run, address.site, address.robot)
+    path = configured_outbox(config.run, address)
     outbox = Outbox(path, max_bytes=config.run.outbox_bytes)
     counts = outbox.counts()
     text = f"{path}: {counts['waiting']} reports wait, {counts['delivered']} delivered, {counts['dropped']} dropped"
@@ -215,8 +214,8 @@ def _identity(address: MapAddress, now: datetime) -> Iterator[Finding]:
 
 def _cache_and_server(config: LocclientConfig, address: MapAddress) -> Iterator[Finding]:
     run, site = config.run, address.site
-    folder = cache_folder(run.cache)
-    cache = TileCache(folder, max_bytes=run.cache_bytes)
+    cache = TileCache(cache_folder(run.cache), max_bytes=run.cache_bytes)
+    folder = cache.folder
     free_bytes = shutil.disk_usage(folder).free
     if free_bytes < _MIN_FREE_BYTES:
         yield Finding(WARN, "disk", f"{free_bytes / 1e6:.0f} MB free beside {folder}; make room for new versions")
@@ -230,18 +229,14 @@ def _cache_and_server(config: LocclientConfig, address: MapAddress) -> Iterator[
         yield _pieces("cache", active.version, len(active.blobs) - damaged, reasons)
     if address.server is None:
         return
-    bus = open_bus(address)
     try:
-        client = MapClient(bus, cache, site, address.robot, timeout_s=_ANSWER_S)
-        trust = trusted_map(bus, address, folder)
-        client.require(trust)
-        wanted = client.wanted()
+        with open_bus(address) as bus:
+            client = map_client(bus, cache, address, timeout_s=_ANSWER_S)
+            wanted = client.wanted()
     except UnreachableError as error:
         hint = "" if active is None else f"; version {active.version} works without it"
         yield Finding(FAIL if active is None else WARN, "connection", f"{error}{hint}")
         return
-    finally:
-        bus.close()
     if wanted.version is None:
         hint = f"publish one with `mapserver publish --site {site} --store DIR` on the server"
         yield Finding(FAIL, "connection", f"site {site} has no published version; {hint}")
@@ -249,8 +244,9 @@ def _cache_and_server(config: LocclientConfig, address: MapAddress) -> Iterator[
     is_here = active is not None and wanted == active.wanted(site)
     hint = ", which is here" if is_here else "; it is fetched when the robot runs"
     yield Finding(OK, "connection", f"{address.server} wants version {wanted.version}{hint}")
+    assert client.trust is not None
     try:
-        trust.admitted(wanted)
+        client.trust.admitted(wanted)
     except LinkError as error:
         yield Finding(WARN if is_here else FAIL, "signed list", str(error))
     else:

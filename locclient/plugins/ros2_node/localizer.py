@@ -8,11 +8,12 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 
 import numpy as np
 
 from fleetmap.bus import Bus
-from fleetmap.errors import FleetmapError
+from fleetmap.errors import FleetmapError, UsageError
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse, so3_log
 from fleetmap.messages import Status
@@ -27,9 +28,11 @@ from fleetmap.recordings.ros2.messages import (
 )
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import PositionPrior
+from fleetmap.sensors.source_settings import Topics
 from fleetmap.sources.intake import Intake
+from locclient.hooks import OutputHook
 from locclient.localization.estimate import Estimate
-from locclient.localization.pose_covariance import transport_cov
+from locclient.localization.place import transport_cov
 from locclient.output_section import OutputSection
 from locclient.plugins.ros2_node.driver_odometry import DriverOdometry
 from locclient.plugins.ros2_node.graph import LATCHED, Qos, key_layout
@@ -449,3 +452,21 @@ def sensor_links(section: OutputSection, calibration: RigCalibration) -> list[Fr
     for number, camera in enumerate(calibration.cameras):
         links.append(FrameLink(body, f"{section.sensor_frames}cam{number}_optical", camera.body_from_cam))
     return links
+
+
+def _check(section: OutputSection, topics: Topics) -> None:
+    """Raise UsageError for frame names that tf2 rejects, and for odometry that would come back as that of the wheels."""
+    frames = (section.map_frame, section.odom_frame, section.base_frame)
+    if len(set(frames)) < 3 or any(not name or name.startswith("/") for name in frames):
+        raise UsageError(
+            f"[output] map_frame, odom_frame and base_frame = {', '.join(map(repr, frames))}: tf2 needs three different names "
+            "that do not begin with a slash"
+        )
+    if section.odom_topic.lstrip("/") == topics.wheel.lstrip("/"):
+        raise UsageError(
+            f"[output] odom_topic = {section.odom_topic!r} is also the topic of [topics] wheel: the robot would take its own "
+            'odometry for that of its wheels; set wheel = "" if it has none'
+        )
+
+
+OUTPUT = OutputHook(Ros2Localizer, _check, partial(Bus.connect, is_ros=True))

@@ -1,7 +1,8 @@
 """Instant actions on maps and position: their parameters, states and errors."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from fleetmap.errors import LinkError
@@ -23,20 +24,27 @@ _MOST_STATES = 200
 _MOST_SIGNS = 2000
 
 
-def parameters(action: Action) -> dict[str, Any]:
-    """Return the action's parameters by name; LinkError for missing, unknown or invalid ones."""
-    kinds = PARAMETERS[action.action_type]
-    given = {parameter.key: parameter.value for parameter in action.action_parameters}
-    for key in given:
-        if key not in kinds:
-            raise LinkError(f"{action.action_type} has no parameter {key[:80]!r}; it has {', '.join(kinds) or 'none'}")
+class RefusedActionError(LinkError):
+    """An instant action that fails at once, with the type of its error."""
+
+    def __init__(self, error_type: str, words: str) -> None:
+        super().__init__(words)
+        self.error_type = error_type
+
+
+def parameters(action: Action, robot_actions: Sequence[str] = ()) -> dict[str, Any]:
+    """Return the action's parameters by name; RefusedActionError for an unknown action, and for missing, unknown or invalid ones."""
+    refused, name = partial(RefusedActionError, "INVALID_INSTANT_ACTION"), action.action_type
+    if name not in PARAMETERS:
+        raise refused(f"{name[:80]!r} is unknown here; known are {', '.join([*PARAMETERS, *robot_actions])}")
+    kinds, given = PARAMETERS[name], {parameter.key: parameter.value for parameter in action.action_parameters}
+    for key in [key for key in given if key not in kinds]:
+        raise refused(f"{name} has no parameter {key[:80]!r}; it has {', '.join(kinds) or 'none'}")
     for key, kind in kinds.items():
         if key not in given and not kind.endswith("?"):
-            raise LinkError(f"{action.action_type} needs the parameter {key}")
+            raise refused(f"{name} needs the parameter {key}")
         if key in given and not _fits(given[key], kind.rstrip("?")):
-            raise LinkError(
-                f"{key} = {str(given[key])[:80]!r} of {action.action_type} must be a {kind.rstrip('?').lower()}"
-            )
+            raise refused(f"{key} = {str(given[key])[:80]!r} of {name} must be a {kind.rstrip('?').lower()}")
     return given
 
 

@@ -5,6 +5,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from fleetmap.mapformat.building import Floor
 from fleetmap.messages import Status, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from locclient.hooks import LinkedRobot
-from locclient.plugins.vda5050.actions import MAP_ACTIONS, PARAMETERS, ActionBook, parameters
+from locclient.plugins.vda5050.actions import MAP_ACTIONS, ActionBook, RefusedActionError, parameters
 from locclient.plugins.vda5050.fleet_maps import DuplicateMapError, FleetMaps, NoRoomError
 from locclient.plugins.vda5050.localization import Localization, Position
 from locclient.plugins.vda5050.messages import Action, Error, InstantActions, Order, RobotPart, decode
@@ -126,53 +127,43 @@ class FleetAdapter:
                 self._part, self._part_s = part, self._clock_s()
                 if part.order_id not in ("", self._order_id):
                     self._order_id = part.order_id
-                    if (
-                        self._section.version != "3.0.0"
-                    ):  # 2.x keeps action states until a new order; 3.0 until clearInstantActions
+                    if self._section.version != "3.0.0":  # which keeps action states until clearInstantActions
                         self._book.clear()
             self.changed.set()
 
     def _begin(self, action: Action) -> None:
         kind = action.action_type
-        if kind not in PARAMETERS:
-            known = ", ".join([*PARAMETERS, *self._section.robot_actions])
-            return self._book.fail(
-                action, "INVALID_INSTANT_ACTION", f"{kind[:80]!r} is unknown here; known are {known}"
-            )
         try:
-            given = parameters(action)
-        except LinkError as error:
-            return self._book.fail(action, "INVALID_INSTANT_ACTION", str(error))
-        self._book.accepted(action)
-        if kind in MAP_ACTIONS:
-            return self._queue(action, given)
-        if kind == "initializePosition":
-            return self._initialize(action, given)
-        if kind == "clearInstantActions":
-            self._book.clear()
-        if kind == "factsheetRequest":
-            if self._section.factsheet is None:
-                return self._book.fail(action, "FACTSHEET_MISSING", "[vda5050] factsheet names no file on this robot")
-            self.factsheet_wanted.set()
-        self._book.set(action, "FINISHED")
+            given = parameters(action, self._section.robot_actions)
+            self._book.accepted(action)
+            if kind in MAP_ACTIONS:
+                return self._queue(action, given)
+            if kind == "initializePosition":
+                return self._initialize(action, given)
+            if kind == "clearInstantActions":
+                self._book.clear()
+            if kind == "factsheetRequest":
+                if self._section.factsheet is None:
+                    raise RefusedActionError("FACTSHEET_MISSING", "[vda5050] factsheet names no file on this robot")
+                self.factsheet_wanted.set()
+            self._book.set(action, "FINISHED")
+        except RefusedActionError as error:
+            self._book.fail(action, error.error_type, str(error))
         return None
 
     # --- maps ---------------------------------------------------------------------------------------------------------
 
     def _queue(self, action: Action, given: dict[str, Any]) -> None:
+        refused, version = partial(RefusedActionError, "MAP_ACTION_FAILED"), given["mapVersion"]
         if self._maps is None:
-            words = 'the map server selects this robot\'s map: [vda5050] versions = "map server"'
-            return self._book.fail(action, "MAP_ACTION_FAILED", words)
-        if given["mapId"] != self.map_id or not (given["mapVersion"].isascii() and given["mapVersion"].isdecimal()):
-            words = f"map {given['mapId'][:80]!r} version {given['mapVersion'][:80]!r}: this robot's are {self.map_id!r} 1, 2, 3..."
-            return self._book.fail(action, "UNKNOWN_MAP_ID", words)
+            raise refused('the map server selects this robot\'s map: [vda5050] versions = "map server"')
+        if given["mapId"] != self.map_id or not (version.isascii() and version.isdecimal()):
+            words = f"map {given['mapId'][:80]!r} version {version[:80]!r}: this robot's are {self.map_id!r} 1, 2, 3..."
+            raise RefusedActionError("UNKNOWN_MAP_ID", words)
         if len(self._jobs) >= _MOST_JOBS:
-            return self._book.fail(
-                action, "MAP_ACTION_FAILED", f"{_MOST_JOBS} actions on maps wait already; send it again later"
-            )
+            raise refused(f"{_MOST_JOBS} actions on maps wait already; send it again later")
         self._book.set(action, "WAITING")
         self._jobs.append((action, given))
-        return None
 
     def work(self) -> None:
         """Execute one action on maps, which may take as long as a download; on the thread that owns the cache."""
@@ -246,29 +237,29 @@ class FleetAdapter:
         fleet_from_map = self._fleet_from_map
         if section.frame == "building" and self._building:
             fleet_from_map = self._building[site].frame.building_from_map
-        words = ""
+        refused = partial(RefusedActionError, "INITIALIZE_POSITION_FAILED")
         is_own = given["mapId"] == self.map_id and any(is_enabled for _, is_enabled in self._versions)
         if not (site or is_own):
-            words = f"map {given['mapId'][:80]!r} is not enabled here"
-        elif abs(given["theta"]) > np.pi + 1e-6:
-            words = f"theta = {given['theta']} is beyond -pi to pi"
-        elif now.stamp_ns is None or now.is_silent:
-            words = "no images come from the cameras"
-        elif fleet_from_map is None:
-            words = "the map does not define its pose in the building, the frame of positions by [vda5050] frame"
-        if now.stamp_ns is None or fleet_from_map is None or words:
-            return self._book.fail(action, "INITIALIZE_POSITION_FAILED", words)
+            raise refused(f"map {given['mapId'][:80]!r} is not enabled here")
+        if abs(given["theta"]) > np.pi + 1e-6:
+            raise refused(f"theta = {given['theta']} is beyond -pi to pi")
+        if now.estimate is None or now.is_silent:
+            raise refused("no images come from the cameras")
+        if fleet_from_map is None:
+            raise refused("the map does not define its pose in the building, the frame of positions by [vda5050] frame")
         if self._placing is not None:
             self._book.set(self._placing[0], "FAILED", "replaced by another initializePosition")
         place = Position(float(given["x"]), float(given["y"]), float(given["theta"]), site=site)
         self._placing = (action, place, self._clock_s() + section.initialize_s)
         self._book.set(action, "RUNNING")
-        if now.status == Status.TRACKING:  # a pose confirmed by fixes is not dropped for an operator's
+        if now.estimate.status is Status.TRACKING:  # a pose confirmed by fixes is not dropped for an operator's
             return self._judge_position(is_last=True)
         sigmas = [_TILT_SIGMA_RAD] * 2 + [section.initial_sigma_rad] + [section.initial_sigma_m] * 2 + [_HEIGHT_SIGMA_M]
         fleet_from_base = se3(so3_exp(np.array([0.0, 0.0, place.theta_rad])), np.array([place.x_m, place.y_m, 0.0]))
         map_from_base = se3_inverse(fleet_from_map) @ fleet_from_base
-        self._robot.put_prior(PositionPrior(now.stamp_ns + 1, map_from_base, np.diag(np.square(sigmas)), False, site))
+        self._robot.put_prior(
+            PositionPrior(now.estimate.stamp_ns + 1, map_from_base, np.diag(np.square(sigmas)), False, site)
+        )
         return None
 
     def after_frame(

@@ -6,6 +6,7 @@ from math import atan2, hypot, pi
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.messages import Cause, Status
+from locclient.localization.estimate import Estimate
 from locclient.plugins.vda5050.messages import Error
 from locclient.robot.robot import Outcome
 
@@ -52,16 +53,13 @@ class Position:
 
 @dataclass(frozen=True)
 class Localization:
-    """The last estimate. position: the last known one, also if the robot is not localized; None before the first."""
+    """The last estimate, None before the first. position: the last known one, also if the robot is not localized."""
 
-    status: str = Status.INITIALISING
-    cause: str = ""
-    stamp_ns: int | None = None
+    estimate: Estimate | None = None
     position: Position | None = None
     is_localized: bool = False
     is_driving: bool = False
     is_silent: bool = True
-    has_map: bool = False
     is_aligned: bool = True
 
     def after(
@@ -81,17 +79,8 @@ class Localization:
             heading_rad = float(atan2(fleet_from_base[1, 0], fleet_from_base[0, 0]))
             position = Position(x_m, y_m, heading_rad, radius_95_m(estimate.cov_rot_trans), estimate.floor)
             is_localized = estimate.status in {Status.TRACKING, Status.DEGRADED} and position.radius_m <= lost_radius_m
-        return Localization(
-            estimate.status,
-            estimate.cause,
-            estimate.stamp_ns,
-            position,
-            is_localized,
-            is_driving,
-            is_silent=False,
-            has_map=estimate.map_version is not None,
-            is_aligned=fleet_from_map is not None,
-        )
+        is_aligned = fleet_from_map is not None
+        return Localization(estimate, position, is_localized, is_driving, is_silent=False, is_aligned=is_aligned)
 
     def mobile_robot_position(self, map_id: str, lost_radius_m: float) -> dict[str, object] | None:
         """Return the object of the state; None before the first pose. The score is 1 for an exact pose, 0 at lost_radius_m.
@@ -99,17 +88,11 @@ class Localization:
         map_id: of the robot's own site; other maps are called by their sites.
         """
         place, is_localized = self.position, self.is_localized and not self.is_silent
-        if (
-            place is None or place.site == map_id
-        ):  # a configured id that is another site: fleet managers would take it for the own
+        # A configured id that is another site: fleet managers would take it for the own.
+        if place is None or place.site == map_id:
             return None
-        found: dict[str, object] = {
-            "x": place.x_m,
-            "y": place.y_m,
-            "theta": place.theta_rad,
-            "mapId": place.site or map_id,
-        }
-        found |= {"localized": is_localized, "localizationScore": 0.0}
+        found: dict[str, object] = {"x": place.x_m, "y": place.y_m, "theta": place.theta_rad}
+        found |= {"mapId": place.site or map_id, "localized": is_localized, "localizationScore": 0.0}
         if is_localized:
             found["localizationScore"] = max(0.0, 1.0 - place.radius_m / lost_radius_m)
             found["deviationRange"] = place.radius_m
@@ -117,18 +100,19 @@ class Localization:
 
     def error(self) -> Error | None:
         """Return LOCALIZATION_ERROR with the text of its cause; None for a localized robot."""
-        if self.is_localized and not self.is_silent:
-            return None
-        hint = _WORDS.get(Cause(self.cause)) if self.cause in set(Cause) else self.cause
-        if self.is_silent:
+        estimate = None if self.is_silent else self.estimate
+        if estimate is None:
             hint = _NO_FRAMES
-        elif not self.has_map:
+        elif self.is_localized:
+            return None
+        elif estimate.map_version is None:
             hint = _NO_MAP
         elif not self.is_aligned:
             hint = _NO_BUILDING
-        elif not hint:
-            hint = _STATUS_WORDS.get(Status(self.status), "the robot has no reliable pose")
-        said = "no images" if self.is_silent else self.status
+        else:
+            unknown = _STATUS_WORDS.get(estimate.status, "the robot has no reliable pose")
+            hint = _WORDS.get(estimate.cause) or unknown
+        said = "no images" if estimate is None else estimate.status
         return Error(
             error_type="LOCALIZATION_ERROR",
             error_level="FATAL",

@@ -35,14 +35,14 @@ class RunExport:
         self._profile, self._rectifier = profile, rectifier
         landmarks = np.concatenate([tile.points_map for tile in loaded.tiles.values()])
         self._write(channels.points(first_ns, landmarks))
-        self._write(channels.lens(first_ns, profile.camera))
+        self._write(channels.lens(first_ns, rectifier.camera))
 
     def handle(self, frame: CameraFrame, outcome: Outcome) -> None:
         """Write the results of a frame, with its images as recorded."""
         estimate, published, profile = outcome.estimate, outcome.published, self._profile
         stamp_ns = estimate.stamp_ns
         self._write(channels.picture(stamp_ns, self._rectifier.rectify(frame).left))
-        base_from_cam = profile.base_from_body @ profile.body_from_cam
+        base_from_cam = profile.rig.base_from_body @ profile.rig.mounted[0].body_from_cam
         joined = [(ODOM, BASE, published.odom_from_base), (BASE, CAMERA, base_from_cam)]
         if published.map_from_odom is not None:
             joined.append((MAP, ODOM, published.map_from_odom))
@@ -67,7 +67,7 @@ class RunExport:
 
     def _marks(self, estimate: Estimate) -> list[RobotMark]:
         """Return marks of the robot's pose, or of its possible poses."""
-        robot, body_from_base = self._profile.robot, se3_inverse(self._profile.base_from_body)
+        robot, body_from_base = self._profile.robot, se3_inverse(self._profile.rig.base_from_body)
         if estimate.map_from_body is not None:
             return [RobotMark(robot, estimate.map_from_body @ body_from_base, estimate.status)]
         places = [hypothesis.map_from_body @ body_from_base for hypothesis in estimate.hypotheses]
@@ -79,7 +79,7 @@ class RunExport:
             return
         cam_from_map = se3_inverse(fix.map_from_cam)
         points_cam = fix.matched.points_source @ cam_from_map[:3, :3].T + cam_from_map[:3, 3]
-        pixels, expected = fix.matched.pixels[:, :2], self._profile.camera.pixel_from_point(points_cam)[:, :2]
+        pixels, expected = fix.matched.pixels[:, :2], self._rectifier.camera.pixel_from_point(points_cam)[:, :2]
         kept = np.isfinite(expected).all(axis=1)
         self._write(channels.matches(stamp_ns, pixels[kept], expected[kept]))
 

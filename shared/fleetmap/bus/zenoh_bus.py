@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
+from operator import methodcaller
 from typing import Any, Literal, Self
 
 import zenoh
@@ -222,16 +223,15 @@ class Bus:
         check_size(payload, key)
         deadline = time.monotonic() + timeout_s
         while (left_s := deadline - time.monotonic()) > 0:
-            ask = partial(_ask, key=key, payload=payload, timeout_s=left_s)
-            replies = self._guarded(ask)
-            reasons = []
-            for reply in replies:
+            # The reply inherits the query's congestion control; dropping would lose large replies.
+            how = {"timeout": left_s, "payload": payload, "congestion_control": zenoh.CongestionControl.BLOCK}
+            refusals = []
+            for reply in self._guarded(methodcaller("get", key, **how)):
                 if reply.ok is not None:
                     return bytes(reply.ok.payload.to_bytes())
-                reasons.append(reply.err.payload.to_string())
-            refusals = [reason for reason in reasons if reason != "Timeout"]
-            if refusals:
-                raise query_refused(key, refusals[0])
+                refusals.append(reply.err.payload.to_string())
+            if (refusal := next((reason for reason in refusals if reason != "Timeout"), None)) is not None:
+                raise query_refused(key, refusal)
             time.sleep(min(_RETRY_S, max(0.0, deadline - time.monotonic())))
         raise no_answer(key, self.endpoint, timeout_s, is_silenced=self._tls is not None and self.connected())
 
@@ -419,12 +419,6 @@ def no_answer(key: str, endpoint: str, timeout_s: float, *, is_silenced: bool = 
 def query_refused(key: str, reason: str) -> LinkError:
     """Error of a query that the other side refused."""
     return LinkError(f"{key} was refused: {reason}")
-
-
-def _ask(session: Any, *, key: str, payload: bytes, timeout_s: float) -> Any:
-    # The reply inherits the query's congestion control; dropping would lose large replies.
-    control = zenoh.CongestionControl.BLOCK
-    return session.get(key, timeout=timeout_s, payload=payload, congestion_control=control)
 
 
 def _size(message: Any, key: str) -> int:

@@ -80,6 +80,18 @@ class MountedCamera(NamedTuple):
     body_from_cam: Array
 
 
+class MountedRig(NamedTuple):
+    """A calibrated rig with the rectified cameras of its views; imu_minus_cam_s: clock of the IMU against the first one's."""
+
+    calibration: RigCalibration
+    mounted: tuple[MountedCamera, ...]
+    imu_minus_cam_s: float = 0.0
+
+    @property
+    def base_from_body(self) -> Array:
+        return self.calibration.base_from_body
+
+
 @dataclass(frozen=True)
 class RectifiedFrame:
     """A CameraFrame rectified to the StereoCamera. disparity_px (H, W) float32 (NaN unknown) only with a depth sensor.
@@ -147,6 +159,7 @@ class Rectifier:
         """numbers: of the cameras in messages, by default as in the calibration."""
         if not calibration.cameras:
             raise CalibrationError("the calibration holds no camera; pass one with --calibration FILE")
+        self.calibration = calibration
         view, *others = calibration.views
         cameras = tuple(calibration.cameras[number] for number in view)
         self._numbers = numbers or view
@@ -196,6 +209,10 @@ class Rectifier:
     def mounted(self) -> tuple[MountedCamera, ...]:
         """The cameras of all views."""
         return tuple(MountedCamera(each.camera, each.body_from_cam) for each in (self, *self.others))
+
+    @property
+    def rig(self) -> MountedRig:
+        return MountedRig(self.calibration, self.mounted, self.imu_minus_cam_s)
 
     def rectify(self, frame: CameraFrame) -> RectifiedFrame:
         """Rectify a frame, its other views once they are needed; RecordingError for images of other sizes than the calibration's. Another

@@ -21,7 +21,7 @@ from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.rectification import MountedCamera, OtherView, RectifiedFrame, StereoCamera
+from fleetmap.sensors.rectification import MountedCamera, MountedRig, OtherView, RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, PositionPrior, wheel_between
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.estimate import Estimate
@@ -283,9 +283,8 @@ def run_localizer(
     """The localizer's estimates over a session in a map; the last one is that for which `until` holds. others: the rig's other views.
     priors: those before each frame."""
     nominal, views = session.session.nominal, (session, *others)
-    rig = nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s
-    mounted = [MountedCamera(other.camera, other.body_from_cam) for other in others]
-    localizer = Localizer(*rig, settings, others=mounted)
+    mounted = tuple(MountedCamera(view.camera, view.body_from_cam) for view in views)
+    localizer = Localizer(MountedRig(nominal, mounted, nominal.cameras[0].imu_minus_cam_s), settings)
 
     def new_tracker(first_frame: int, first_id: int) -> Tracker:
         followed = views[localizer.perception.odometry._rig.followed]

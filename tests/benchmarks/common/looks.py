@@ -63,7 +63,7 @@ class Look:
 def map_of(store: Path) -> LoadedMap:
     """The version that robots of a store run."""
     with connected(MapAddress(site=SITE, robot="bench", store=str(store))) as link:
-        return load_map(link.source)[0]
+        return load_map(link)[0]
 
 
 def looks(

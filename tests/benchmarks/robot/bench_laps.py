@@ -38,8 +38,8 @@ def main() -> None:
             laps *= 2
         source = ReplaySource.of(repeated(once, laps), FrameSelection.parse(":"), reverse=False)
         rectifier = Rectifier(source.calibration)
-        robot = Robot(source.calibration, rectifier, LocalizerSettings(), TrialSettings(), keeps_replay=True)
-        robot.use(load_map(link.source)[0])
+        robot = Robot(rectifier, LocalizerSettings(), TrialSettings(), keeps_replay=True)
+        robot.use(load_map(link)[0])
         for number, imu in enumerate(source.imu_before_each()):
             raw = source.frame(number)
             outcome = robot.handle(SensorBundle(raw, imu, source.wheel_before(number), source.priors_before(number)))

@@ -70,7 +70,7 @@ def without_around(loaded: LoadedMap, position_m: Array) -> LoadedMap:
 def start(session: Session, frames: Sequence[CameraFrame], loaded: LoadedMap) -> Start:
     """The outcome of waking up there."""
     rectifier = Rectifier(session.nominal)
-    robot = Robot(session.nominal, rectifier, LocalizerSettings(), TrialSettings())
+    robot = Robot(rectifier, LocalizerSettings(), TrialSettings())
     robot.use(loaded)
     truth_m = session.motion.map_from_body(np.zeros(1))[0][:3, 3]
     fix_s = tracking_s = None
@@ -116,7 +116,7 @@ def main() -> None:
     cv2.setNumThreads(1)
     store = str(surveyed(arguments.work, arguments.seed))
     with connected(MapAddress(site=SITE, robot="bench", store=store)) as link:
-        loaded = load_map(link.source)[0]
+        loaded = load_map(link)[0]
     drive = prepare(Order("small-loop", seed=arguments.seed, day=_DAY, light=_LIGHT, robot=_ROBOT))
     found: dict[str, tuple[list[Start], list[Start]]] = {name: ([], []) for name in arguments.only or PIPELINES}
     for number, time_s in enumerate(np.linspace(0.5, drive.motion.duration_s - 0.5, arguments.starts).tolist()):

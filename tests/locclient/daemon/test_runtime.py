@@ -120,7 +120,7 @@ class World:
         intake = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=True, imu_wait_s=1.0)
         rig, settings = robot_world.rectifier(), robot_world.SETTINGS
         return RuntimeParts(
-            profile=RobotProfile("room", "r1", robot.base_from_body, rig.body_from_cam, rig.camera, settings),
+            profile=RobotProfile("room", "r1", rig.rig, settings),
             source=source,
             intake=intake,
             robot=robot,
@@ -235,12 +235,12 @@ def test_a_robot_that_is_too_slow_for_its_frames_stays_exact_and_people_see_it(w
 def test_the_recording_of_a_failure_at_the_end_has_arrived(
     world: World, monkeypatch: pytest.MonkeyPatch, is_stopped: bool
 ) -> None:
-    robot = Robot(calibration(), robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
+    robot = Robot(robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
     bundles = list(robot_world.bundles(110, dark=range(60, 110)))
     plain = world.parts(ScriptedSource(bundles, ready=lambda: robot.running is not None), robot, Listener())
     assert plain.server is not None
     spool = plain.server.replays = Outbox(world.folder / "replays", max_bytes=10**8)
-    made = Runtime(replace(plain, replays=ReplayQueue(spool, plain.profile, "blurred")), ServiceManager(""))
+    made = Runtime(replace(plain, replays=ReplayQueue(spool, plain.profile)), ServiceManager(""))
 
     def ctrl_c(_: object) -> FailureAck:
         made.stop()

@@ -22,6 +22,7 @@ from fleetmap.messages import (
     encode_message,
     robot_key,
 )
+from fleetmap.sensors.samples import PositionPrior
 from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.maps.map_client import MapClient
@@ -296,10 +297,13 @@ def test_a_persons_word_is_a_prior_that_fixes_may_outweigh(
     world: World, changes: dict[str, object], is_taken: bool
 ) -> None:
     told = msgspec.structs.replace(InitialPoseMessage(site="lab", robot="r1", x_map_m=3.0, y_map_m=-2.0), **changes)
+    priors: list[PositionPrior] = []
+    sync = ServerSync(world.client, world.outbox, retry_s=600.0, put_prior=priors.append)
     with MemoryBus(world.hub) as server:
         server.publish(robot_key("lab", "r1", "initial_pose"), encode_message(told))
-    assert len(world.sync.priors) == is_taken
-    for prior in world.sync.priors:
+    sync.close()
+    assert len(priors) == is_taken
+    for prior in priors:
         assert prior.is_revisable
         assert prior.floor == "", "the server knows the robot's own site alone"
         assert prior.map_from_base[:3, 3].tolist() == [3.0, -2.0, 0.0]

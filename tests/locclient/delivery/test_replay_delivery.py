@@ -70,7 +70,7 @@ def test_what_the_server_refuses_is_not_sent_again(outbox: Outbox) -> None:
 def test_more_failures_than_are_held_are_named(outbox: Outbox, caplog: pytest.LogCaptureFixture) -> None:
     unfinished: Any = SimpleNamespace(frames=None)
     profile: Any = None
-    queue = ReplayQueue(outbox, profile, "full")
+    queue = ReplayQueue(outbox, profile)
     with caplog.at_level(logging.WARNING):
         for number in range(5):
             report: Any = SimpleNamespace(id=f"f{number}")

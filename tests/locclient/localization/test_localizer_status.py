@@ -11,7 +11,6 @@ from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Cause, FailureKind, Status
 from fleetmap.relocalization.relocalizer import Fix
 from locclient.localization.estimate import assemble
-from locclient.localization.hypothesis_set import HypothesisSet
 from locclient.localization.place import Place
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
@@ -474,18 +473,11 @@ def test_metres_of_an_innovation_are_told_of_what_lies_near_or_was_believed(trac
 
 
 @pytest.mark.parametrize("broken", ["cov_rot_trans", "map_from_body"])
-def test_a_pose_of_nan_is_none(broken: str) -> None:
+def test_a_pose_of_nan_is_none(tracking: Robot, broken: str) -> None:
     """Such as odometry leaves where a robot has lost most of its frames."""
     known = Place(np.eye(4), 1e-4 * np.eye(6))
     place = known._replace(**{broken: np.nan * getattr(known, broken)})
-    found = assemble(
-        estimate_at(0.1, known=False),
-        TrackSettings(),
-        confirmed=PoseHypothesis(0, 0, place, place),
-        candidates=HypothesisSet(TrackSettings()),
-        prior=None,
-        has_failed=False,
-        was_tracking=True,
-    )
+    tracking.localizer._tracker.confirmed = PoseHypothesis(0, 0, place, place)
+    found = assemble(estimate_at(0.1, known=False), tracking.localizer._tracker, has_failed=False)
     assert (found.map_from_body, found.cov_rot_trans) == (None, None)
     assert found.status is Status.LOST

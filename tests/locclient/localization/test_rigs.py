@@ -120,8 +120,7 @@ def test_odometry_goes_on_with_the_other_pair_and_a_camera_comes_back(sensors: S
     """Of the front pair from 2 to 3.2 s and of the rear pair from 3.4 s on: no frame is lost, and the way is as accurate as before."""
     calibration = rig_of_two(sensors)
     rectifier = Rectifier(calibration)
-    mounting = rectifier.camera, rectifier.body_from_cam, 0.0
-    localizer = Localizer(calibration, *mounting, LocalizerSettings(), others=rectifier.mounted[1:])
+    localizer = Localizer(rectifier.rig, LocalizerSettings())
     moved, views_of, last = np.eye(4), [], None
     for stamp_ns in range(0, 4_500_000_000, FRAME_NS):
         frame, time_s = seen_at(stamp_ns), stamp_ns * 1e-9
@@ -151,8 +150,7 @@ def test_a_slower_or_dying_rear_pair_is_not_taken_for_the_front(front: str) -> N
     calibration, is_single = rig_of_two(SensorSet.STEREO_INERTIAL), front == "single camera"
     calibration = replace(calibration, cameras=calibration.cameras[is_single and 1 :])
     rectifier = Rectifier(calibration)
-    mounting = rectifier.camera, rectifier.body_from_cam, 0.0
-    localizer = Localizer(calibration, *mounting, LocalizerSettings(), others=rectifier.mounted[1:])
+    localizer = Localizer(rectifier.rig, LocalizerSettings())
     places, lost = [], 0
     for number, stamp_ns in enumerate(range(0, 4_500_000_000, FRAME_NS)):
         frame = with_noise(seen_at(stamp_ns), np.random.default_rng(stamp_ns))

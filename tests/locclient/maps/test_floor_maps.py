@@ -40,7 +40,7 @@ class Network:
 
         def client(site: str) -> MapClient:
             made = MapClient(bus, cache, site, ROBOT, timeout_s=0.2)
-            made.require(TrustedMap(self.cache / "trust" / site, site, root, ask_over(bus, site, ROBOT, 0.2)))
+            made.trust = TrustedMap(self.cache / "trust" / site, site, root, ask_over(bus, site, ROBOT, 0.2))
             return made
 
         own = client("low")

@@ -73,7 +73,7 @@ class World:
             def wall_s() -> float:
                 return datetime.now(UTC).timestamp() + self.ahead_s
 
-            client.require(TrustedMap(folder, SITE, root, ask, wall_s))
+            client.trust = TrustedMap(folder, SITE, root, ask, wall_s)
         return client
 
     def publish(self, seed: int) -> int:
@@ -189,7 +189,7 @@ def test_row_12_news_are_held_back(world: World) -> None:
     want(world, 1)
     ready = client.ready()
     assert "version 2 stays active: freeze: " in ready.note
-    assert client.word_hours == pytest.approx(31.0, abs=0.05)
+    assert client.trust.word_hours == pytest.approx(31.0, abs=0.05)
     ready = world.client("victim", trusting=False).ready()  # the control: without lists no word is ever too old
     assert (ready.wanted.version, ready.note) == (1, "")
     world.ahead_s = 20 * 3600.0  # within its day a word is believed
@@ -280,7 +280,7 @@ def test_a_server_without_lists_is_told_from_an_attack(tmp_path: Path) -> None:
         publish_samples(store, 1)
         service = BusService(store, Fleet(store), bus, lambda *_: None)
         client = MapClient(robot_bus, TileCache(tmp_path / "cache"), SITE, ROBOT)
-        client.require(TrustedMap(tmp_path / "trust", SITE, None, ask_over(robot_bus, SITE, ROBOT)))
+        client.trust = TrustedMap(tmp_path / "trust", SITE, None, ask_over(robot_bus, SITE, ROBOT))
         with pytest.raises(UntrustedError, match="the server has no signed lists"):
             client.fetch(client.wanted())
         init_here(store)

@@ -86,7 +86,7 @@ def test_a_prior_at_its_beginning_is_kept(carried: Carried) -> None:
     """A robot that has seen nothing of the map yet: its place is the prior and its way since."""
     rig = robot_world.rectifier()
     with MapStore.open(carried.folder / "store", read_only=True) as store:
-        robot = Robot(calibration(), rig, robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
+        robot = Robot(rig, robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
         robot.use(robot_world.loaded(store))
     first, *later = robot_world.bundles(90, dark=range(90))
     prior = PositionPrior(0, robot_world.truth(0) @ se3_inverse(robot.base_from_body), 0.04 * np.eye(6))
@@ -95,7 +95,7 @@ def test_a_prior_at_its_beginning_is_kept(carried: Carried) -> None:
         robot.handle(bundle)
     cut = robot.ring.cut(first.frame.stamp_ns + 7_000_000_000)
     robot.ring.finish()
-    (carried.folder / "prior.mcap").write_bytes(failure_file(cut, carried.report, profile(robot), "full"))
+    (carried.folder / "prior.mcap").write_bytes(failure_file(cut, carried.report, profile(pictures="full")))
     failure = read_failure_file(carried.folder / "prior.mcap")
     assert not failure[1].start.is_confirmed
     found = compare_failure(failure, LocalMapSource(carried.folder / "store", "room"))
@@ -124,7 +124,7 @@ def test_another_version_is_asked_for_its_own_places(carried: Carried) -> None:
 
 def test_a_failure_on_another_floor_is_replayed_in_that_floors_map(carried: Carried, tmp_path: Path) -> None:
     """A robot of the lower floor that knows its place on the upper one when the recording begins."""
-    robot = Robot(calibration(), robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
+    robot = Robot(robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
     with house(tmp_path, strange(robot_world.tiles()), robot_world.tiles(), x_m=3.0):
         floors = BuildingMaps(LocalMapSource(tmp_path, "low"), lambda site: LocalMapSource(tmp_path, site))
         floors.refresh()
@@ -135,7 +135,7 @@ def test_a_failure_on_another_floor_is_replayed_in_that_floors_map(carried: Carr
         robot.handle(bundle)
     cut = robot.ring.cut(bundles[0].frame.stamp_ns + 10_500_000_000)
     robot.ring.finish()
-    (tmp_path / "failure.mcap").write_bytes(failure_file(cut, carried.report, profile(robot), "full"))
+    (tmp_path / "failure.mcap").write_bytes(failure_file(cut, carried.report, profile(pictures="full")))
     summary, record = read_failure_file(tmp_path / "failure.mcap")
     assert record.start.is_confirmed and record.start.floor == "high" and record.used.floor == "high"
     found = compare_failure((summary, record), LocalMapSource(tmp_path, "high"))

@@ -10,9 +10,9 @@ import pytest
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
+from locclient.localization.priors.given import parse_prior
 from locclient.maps.map_client import MapClient
 from locclient.maps.map_source import LocalMapSource
-from locclient.prior_option import parse_prior
 from mapserver.store import MapStore
 from support.command_line import status
 from support.recordings.recording_samples import calibration, make_sample, write_euroc, write_mcap

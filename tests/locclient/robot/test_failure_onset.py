@@ -141,7 +141,7 @@ def reported(bundles: Iterable[SensorBundle], store: MapStore) -> list[FailureRe
         outcome = robot.handle(bundle)
         if outcome is not None and outcome.failure is not None:
             contexts.append(outcome.failure)
-    profile = RobotProfile("room", "r1", np.eye(4), rig.body_from_cam, rig.camera, robot_world.SETTINGS)
+    profile = RobotProfile("room", "r1", rig.rig, robot_world.SETTINGS)
     profile = replace(profile, pictures="full")
     return [failure_report(context, profile, report_id="ab" * 16, wall_ns=7) for context in contexts]
 
@@ -190,7 +190,7 @@ def test_a_changed_map_is_named(store: MapStore, monkeypatch: pytest.MonkeyPatch
         outcome = robot.handle(bundle)
         if outcome is not None and outcome.failure is not None:
             contexts.append(outcome.failure)
-    profile = RobotProfile("room", "r1", np.eye(4), rig.body_from_cam, rig.camera, robot_world.SETTINGS)
+    profile = RobotProfile("room", "r1", rig.rig, robot_world.SETTINGS)
     (report,) = [failure_report(context, profile, report_id="ab" * 16, wall_ns=7) for context in contexts]
     assert report.cause == "map_changed"
     assert report.landmarks_expected is not None

@@ -82,7 +82,8 @@ def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
     assert told[0].failure.estimate.cause is told[0].failure.estimate.image.cause is told[0].failure.cause
     rig = robot_world.rectifier()
     base_from_body = se3(so3_exp(np.array([0.0, 0.1, 0.4])), np.array([0.2, -0.1, 0.5]))
-    profile = RobotProfile("room", "r1", base_from_body, rig.body_from_cam, rig.camera, robot_world.SETTINGS)
+    mounting = replace(rig.calibration, base_from_body=base_from_body)
+    profile = RobotProfile("room", "r1", rig.rig._replace(calibration=mounting), robot_world.SETTINGS)
     report = failure_report(told[0], profile, report_id="ab" * 16, wall_ns=7)
     assert (report.kind, report.cause, report.version) == ("blind", "dark", 1)
     assert report.status in {"DEGRADED", "LOST"}

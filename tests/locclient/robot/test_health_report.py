@@ -1,6 +1,7 @@
 """The figures of a health report: what the server counts with, and since when."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from fleetmap.messages import HEALTH_FIGURES, Cause, Status
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.estimate import Estimate
 from locclient.robot.continuous_odom import ContinuousOdom
-from locclient.robot.health_report import FixFigures, HealthFigures
+from locclient.robot.health_report import HealthFigures
 from locclient.robot.robot import Outcome
 from mapserver.fleet_statistics.health_stream import HealthStream
 from mapserver.store import MapStore
@@ -29,35 +30,44 @@ def look(
     return replace(said, innovation_m=off_m, fix=replace(said.fix, expected=expected, seen=seen))
 
 
+def handle(figures: HealthFigures, said: Estimate, dock_error_m: float | None = None, speed_mps: float = 0.0) -> None:
+    published = ContinuousOdom(np.eye(4)).handle(said)
+    figures.handle(Outcome(said, published, 0.01, {}, None, dock_error_m, speed_mps))
+
+
+def taken(figures: HealthFigures) -> dict[str, Any]:
+    return figures.report("lab", "r1", 0, {}, silent=False).metrics
+
+
 def test_the_largest_since_the_report_before_and_sums_since_the_beginning() -> None:
-    figures = FixFigures()
+    figures = HealthFigures()
     for stamp_s, innovation, off_m in ((0.0, 1.0, 0.9), (0.2, 9.0, 0.02), (0.4, 2.0, 0.05)):
-        figures.handle(look(stamp_s, innovation, off_m, 100, 60), 0.01 if stamp_s else None, speed_mps=1.0)
-    first = figures.take()
+        handle(figures, look(stamp_s, innovation, off_m, 100, 60), 0.01 if stamp_s else None, speed_mps=1.0)
+    first = taken(figures)
     # The very first frame's metres do not count: nothing had been claimed.
     assert (first["fix_innovation"], first["fix_innovation_m"], first["dock_error_m"]) == (9.0, 0.05, 0.01)
     assert (first["landmarks_expected"], first["landmarks_seen"]) == (300, 180)
     assert first["speed_mps"] == pytest.approx(1.0)
-    figures.handle(estimate(0.6), None)
-    second = figures.take()
+    handle(figures, estimate(0.6))
+    second = taken(figures)
     assert second["fix_innovation"] is second["fix_innovation_m"] is second["dock_error_m"] is None
     assert (second["landmarks_expected"], second["landmarks_seen"]) == (300, 180)
 
 
 @pytest.mark.parametrize("before", [Status.DEGRADED, Status.LOST])
 def test_who_says_that_he_is_lost_is_not_silently_wrong(before: Status) -> None:
-    figures = FixFigures()
-    figures.handle(estimate(0.0, before), None)
-    figures.handle(look(0.2, 3.0, 0.8, 10, 5), None)
-    taken = figures.take()
-    assert (taken["fix_innovation"], taken["fix_innovation_m"]) == (3.0, None)
+    figures = HealthFigures()
+    handle(figures, estimate(0.0, before))
+    handle(figures, look(0.2, 3.0, 0.8, 10, 5))
+    told = taken(figures)
+    assert (told["fix_innovation"], told["fix_innovation_m"]) == (3.0, None)
 
 
 def test_a_robot_that_is_found_elsewhere_than_it_said_tells_how_far() -> None:
-    figures = FixFigures()
-    figures.handle(estimate(0.0, Status.LOST), None)
-    figures.handle(replace(look(0.2, 3.0, 0.8, 10, 5), moved_m=0.6), None)
-    assert figures.take()["fix_innovation_m"] == 0.6
+    figures = HealthFigures()
+    handle(figures, estimate(0.0, Status.LOST))
+    handle(figures, replace(look(0.2, 3.0, 0.8, 10, 5), moved_m=0.6))
+    assert taken(figures)["fix_innovation_m"] == 0.6
 
 
 def test_a_robot_tells_all_that_the_server_counts_with(store: MapStore) -> None:
@@ -86,8 +96,7 @@ def test_the_server_counts_what_a_robot_tells() -> None:
     figures, watch, sums = HealthFigures(), HealthStream(), []
     for number in range(50):
         said = look(0.1 * number, 4.0, 0.4 if number == 35 else 0.02, 50, 40)
-        dock_error_m = 0.5 if number == 25 else None
-        figures.handle(Outcome(said, ContinuousOdom(np.eye(4)).handle(said), 0.01, {}, None, dock_error_m))
+        handle(figures, said, 0.5 if number == 25 else None)
         if number % 10 == 0 or number == 49:
             health = figures.report(robot_world.SITE, "r1", said.stamp_ns, {}, silent=False)
             added = watch.take_health(health)
@@ -107,6 +116,5 @@ def test_a_rig_says_which_of_its_views_are_in_use_and_why_others_are_not(
     views: tuple[Cause, ...], words: str | None
 ) -> None:
     figures, seen = HealthFigures(), replace(estimate(0.0), views=views, view=len(views) - 1)
-    published = ContinuousOdom(np.eye(4)).handle(seen)
-    figures.handle(Outcome(seen, published, 0.0, {}, None))
-    assert figures.report("lab", "r1", 0, {}, silent=False).metrics.get("views") == words
+    handle(figures, seen)
+    assert taken(figures).get("views") == words

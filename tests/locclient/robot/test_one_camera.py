@@ -29,7 +29,7 @@ def driven(store: MapStore, *, imu: bool, wheels: float, first: int = 0, frames:
     """What a robot tells of a ride to and fro, by the left camera and these sensors; wheels: factor on their speed, 0 for none."""
     whole = calibration()
     rig = replace(whole, cameras=whole.cameras[:1], imu=whole.imu if imu else None)
-    robot = Robot(rig, Rectifier(rig), SETTINGS, TRIAL, lambda: 0.0)
+    robot = Robot(Rectifier(rig), SETTINGS, TRIAL, lambda: 0.0)
     robot.use(robot_world.loaded(store))
     outcomes, last_ns = list[Outcome](), 0
     for number, bundle in list(enumerate(robot_world.bundles(first + frames)))[first:]:

@@ -75,7 +75,7 @@ def driven(store: MapStore, *, views: int = 1, imu: float | None = 1, wheels: fl
     rig = calibration()
     rear = [replace(c, body_from_cam=se3(TURNED, np.zeros(3)) @ c.body_from_cam) for c in rig.cameras]
     rig = replace(rig, cameras=(*rig.cameras, *rear[: 2 * views - 2]), imu=None if imu is None else rig.imu)
-    robot = Robot(rig, Rectifier(rig), robot_world.SETTINGS, robot_world.TRIAL)
+    robot = Robot(Rectifier(rig), robot_world.SETTINGS, robot_world.TRIAL)
     robot.use(robot_world.loaded(store))
     outcomes = []
     for number, bundle in enumerate(robot_world.bundles(FRAMES)):
@@ -142,7 +142,7 @@ def test_an_image_that_is_exchanged_with_one_of_another_view_is_named(store: Map
     front = calibration()
     rear_cameras = [replace(c, body_from_cam=se3(TURNED, np.zeros(3)) @ c.body_from_cam) for c in front.cameras]
     both = replace(front, cameras=(*front.cameras, *rear_cameras))
-    robot = Robot(both, Rectifier(both), robot_world.SETTINGS, robot_world.TRIAL)
+    robot = Robot(Rectifier(both), robot_world.SETTINGS, robot_world.TRIAL)
     robot.use(robot_world.loaded(store))
     outcomes = []
     for bundle in robot_world.bundles(30):
@@ -158,7 +158,7 @@ def test_an_image_that_is_exchanged_with_one_of_another_view_is_named(store: Map
 
 def test_while_a_gyro_contradicts_the_images_nobody_knows_which_of_them_is_right(store: MapStore) -> None:
     """Its sign is reversed in the middle of a turn: one frame may be the images' fault, two are DEGRADED at once."""
-    robot, outcomes = Robot(calibration(), robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL), []
+    robot, outcomes = Robot(robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL), []
     robot.use(robot_world.loaded(store))
     for number, bundle in enumerate(robot_world.bundles(60)):
         sign = 1.0 if number < 35 else -1.0

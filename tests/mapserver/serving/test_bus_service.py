@@ -189,10 +189,10 @@ def test_new_versions_are_announced_to_known_robots(world: World) -> None:
 
 def test_reports_reach_the_fleet_and_survive_a_restart(world: World) -> None:
     world.link.ack(1, stamp_ns=5, refused="tile (0, 0): damaged")
-    world.link.publish_health(
-        RobotHealth(site="lab", robot="r1", stamp_ns=6, version=1, status="TRACKING", metrics={"matches": 80})
+    world.link.publish(
+        "health", RobotHealth(site="lab", robot="r1", stamp_ns=6, version=1, status="TRACKING", metrics={"matches": 80})
     )
-    world.link.publish_pose(PoseMessage.of(7, np.eye(4), np.eye(6), "TRACKING", 1))
+    world.link.publish("pose", PoseMessage.of(7, np.eye(4), np.eye(6), "TRACKING", 1))
     (status,) = world.fleet.robots()
     assert (status.site, status.robot, status.version, status.wanted_version, status.seconds_since) == (
         "lab",

@@ -25,11 +25,8 @@ from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
 
 
-def profile(robot: Robot, rig: Rectifier | None = None) -> RobotProfile:
-    rig = rig or robot_world.rectifier()
-    mounting = (robot.base_from_body, rig.body_from_cam, rig.camera)
-    clock = calibration().imu, rig.imu_minus_cam_s
-    return RobotProfile("room", "r1", *mounting, robot_world.SETTINGS, *clock, others=rig.mounted[1:])
+def profile(rig: Rectifier | None = None, pictures: str = "blurred") -> RobotProfile:
+    return RobotProfile("room", "r1", (rig or robot_world.rectifier()).rig, robot_world.SETTINGS, pictures)
 
 
 def failed(
@@ -37,7 +34,7 @@ def failed(
 ) -> tuple[FailureReport, bytes, list[str]] | None:
     """The first failure of a ride: its report, its recording, and the robot's estimates for its frames."""
     rectifier = robot_world.rectifier() if rig is None else Rectifier(rig)
-    robot = Robot(rig or calibration(), rectifier, robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
+    robot = Robot(rectifier, robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
     robot.use(loaded)
     context, said = None, {}
     for bundle in ride:
@@ -50,8 +47,8 @@ def failed(
         return None
     robot.ring.finish()
     stamps = [frame.stamp_ns for frame in context.cut.frames]
-    report = failure_report(context, profile(robot, rectifier), report_id="f1", wall_ns=10**18)
-    data = failure_file(context.cut, report, profile(robot, rectifier), pictures)
+    report = failure_report(context, profile(rectifier), report_id="f1", wall_ns=10**18)
+    data = failure_file(context.cut, report, profile(rectifier, pictures))
     return report, data, [said[stamp_ns] for stamp_ns in stamps]
 
 

@@ -15,7 +15,7 @@ from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
-from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.rectification import MountedCamera, MountedRig, RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization import localizer as module
 from locclient.localization.estimate import Estimate
@@ -110,7 +110,9 @@ class Robot:
         lens = CameraCalibration("radial-tangential", 640, 480, focal, np.zeros(4), BODY_FROM_CAM)
         camera = StereoCamera(400.0, 320.0, 240.0, 0.1, 640, 480)
         settings = LocalizerSettings(track=TrackSettings(**track))
-        self.localizer = Localizer(RigCalibration((lens,)), camera, BODY_FROM_CAM, 0.0, settings)
+        self.localizer = Localizer(
+            MountedRig(RigCalibration((lens,)), (MountedCamera(camera, BODY_FROM_CAM),)), settings
+        )
         self.odometry = ScriptedOdometry()
         self.localizer.perception.odometry = self.odometry
         self.frames = 0

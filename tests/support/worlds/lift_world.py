@@ -14,7 +14,7 @@ from fleetmap.messages import Status
 from fleetmap.relocalization.map_view import CovisibleLandmarks
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration
-from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.rectification import MountedCamera, MountedRig, RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import ImuSamples, WheelSample
 from locclient.localization import localizer as module
 from locclient.localization.estimate import Estimate
@@ -121,7 +121,9 @@ class LiftWorld:
             StereoCamera(400.0, 320.0, 240.0, 0.1, 640, 480),
             LocalizerSettings(track=TrackSettings(**self.track)),
         )
-        self.localizer = Localizer(RigCalibration((lens,), imu), camera, BODY_FROM_CAM, 0.0, settings)
+        self.localizer = Localizer(
+            MountedRig(RigCalibration((lens,), imu), (MountedCamera(camera, BODY_FROM_CAM),)), settings
+        )
         self.odometry = self.localizer.perception.odometry = Odometry()  # type: ignore[assignment]
         # Each map has its own origin and heading in the building.
         frames = [BuildingFrame(x_m=5.0 * n, y_m=-2.0 * n, yaw_rad=0.4 * n) for n in range(self.floors)]

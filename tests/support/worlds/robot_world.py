@@ -215,4 +215,4 @@ def _shifted(map_from_cam: Array, offset_m: Array) -> Array:
 
 
 def new_robot(trial: TrialSettings = TRIAL) -> Robot:
-    return Robot(calibration(), rectifier(), SETTINGS, trial)
+    return Robot(rectifier(), SETTINGS, trial)

@@ -13,7 +13,7 @@ from fleetmap.messages import Placement, Status
 from fleetmap.plugins.markers import Marker, MarkerList, read_markers
 from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import PositionPrior
-from locclient.localization.pose_covariance import boxminus
+from locclient.localization.place import boxminus
 from locclient.plugins.markers import PRIORS, MarkerPriors, MarkersSection
 from support.fleet.estimates import estimate as estimate_at
 from support.painted_markers import facing, painted

@@ -17,8 +17,7 @@ from fleetmap.sources.intake import Intake
 from locclient.localization.estimate import Estimate
 from locclient.output_section import OutputSection
 from locclient.plugins.ros2_node.graph import RmwZenohKeys
-from locclient.plugins.ros2_node.localizer import Ros2Localizer
-from locclient.plugins.ros2_node.output import OUTPUT
+from locclient.plugins.ros2_node.localizer import OUTPUT, Ros2Localizer
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
 from support.fleet.memory_bus import MemoryBus, MemoryHub

@@ -30,7 +30,7 @@ from locclient.localization.estimate import Estimate
 from locclient.output_section import OutputSection
 from locclient.plugins.ros2_node.driver_odometry import Missing, PoseHistory
 from locclient.plugins.ros2_node.graph import RmwZenohKeys
-from locclient.plugins.ros2_node.output import OUTPUT
+from locclient.plugins.ros2_node.localizer import OUTPUT
 from locclient.publisher import Publisher
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.contracts_documents import REPOSITORY

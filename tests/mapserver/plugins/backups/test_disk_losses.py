@@ -67,7 +67,7 @@ class Robot:
         root, clock = (server.folder / "trust" / "1.root.json").read_bytes(), server.clock
         self.client = MapClient(bus, TileCache(folder / name), SITE, name)
         trust = TrustedMap(folder / name / "trust", SITE, root, ask_over(bus, SITE, name), lambda: clock.now_ns / 1e9)
-        self.client.require(trust)
+        self.client.trust = trust
         self.outbox = Outbox(folder / f"{name}.spool", max_bytes=10**6, wall_ns=clock)
         self.sync = ServerSync(self.client, self.outbox, retry_s=1.0, clock_s=lambda: clock.now_ns / 1e9, wall_ns=clock)
         self.failed: set[str] = set()

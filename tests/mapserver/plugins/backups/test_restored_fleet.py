@@ -30,7 +30,7 @@ def drive(site: TlsSite, name: str, outbox: Outbox, over: threading.Event) -> No
     identity = RobotIdentity.enrol(site.folder / name, (site.folder / f"{name}.fleetmap").read_bytes())
     address = MapAddress(site=SITE, robot=name, server=identity.who.endpoint, identity=identity)
     with connected(address, identity.folder / "tiles") as connection:
-        sync = ServerSync(connection.source, outbox, retry_s=1.0)
+        sync = ServerSync(connection, outbox, retry_s=1.0)
         while not over.wait(1.0):
             now_ns = time.time_ns()
             sync.health.append(RobotHealth(site=SITE, robot=name, stamp_ns=now_ns, version=1, status="TRACKING"))

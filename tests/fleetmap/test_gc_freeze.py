@@ -3,7 +3,7 @@
 import gc
 import weakref
 
-from locclient.robot.gc_freeze import gc_frozen
+from fleetmap.free_memory import gc_frozen
 
 
 class Ring:

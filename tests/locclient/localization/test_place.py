@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
-from locclient.localization.pose_covariance import boxminus, boxplus, compose_end_cov, compose_inverse_cov
+from locclient.localization.place import Place, boxminus, boxplus
 
 SAMPLES = 4000
 
@@ -26,14 +26,11 @@ def drawn(mean: Array, covariance: Array, rng: np.random.Generator) -> list[Arra
 @pytest.mark.parametrize("seed", range(3))
 def test_a_place_led_back_along_the_way_and_a_place_led_on(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    map_from_body, covariance, way, cov_way = place(rng), spd(rng), place(rng), spd(rng)
-    pairs = list(zip(drawn(map_from_body, covariance, rng), drawn(way, cov_way, rng), strict=True))
-    for (mean, claimed), found in (
-        (
-            compose_inverse_cov(map_from_body, covariance, way, cov_way),
-            [at @ se3_inverse(since) for at, since in pairs],
-        ),
-        (compose_end_cov(map_from_body, covariance, way, cov_way), [at @ since for at, since in pairs]),
+    known, way = Place(place(rng), spd(rng)), Place(place(rng), spd(rng))
+    pairs = list(zip(drawn(*known[:2], rng), drawn(*way[:2], rng), strict=True))
+    for (mean, claimed, _), found in (
+        (known.before(way), [at @ se3_inverse(since) for at, since in pairs]),
+        (known.at_end_of(way), [at @ since for at, since in pairs]),
     ):
         errors = np.array([boxminus(sample, mean) for sample in found])
         scale = np.sqrt(np.diag(claimed))
@@ -45,8 +42,7 @@ def test_a_place_led_back_along_the_way_and_a_place_led_on(seed: int) -> None:
 
 def test_there_and_back_is_where_one_began() -> None:
     rng = np.random.default_rng(5)
-    map_from_body, way, nothing = place(rng), place(rng), np.zeros((6, 6))
-    covariance = spd(rng)
-    again, claimed = compose_inverse_cov(*compose_end_cov(map_from_body, covariance, way, nothing), way, nothing)
-    np.testing.assert_allclose(again, map_from_body, atol=1e-12)
-    np.testing.assert_allclose(claimed, covariance, atol=1e-12)
+    known, way = Place(place(rng), spd(rng)), Place(place(rng), np.zeros((6, 6)))
+    again = known.at_end_of(way).before(way)
+    np.testing.assert_allclose(again.map_from_body, known.map_from_body, atol=1e-12)
+    np.testing.assert_allclose(again.cov_rot_trans, known.cov_rot_trans, atol=1e-12)
