@@ -11,7 +11,7 @@ from rich.console import Console
 
 from fleetmap.encoding import to_json
 from fleetmap.failure_summary import ReplayPart
-from fleetmap.messages import FailureAck, SurveyArea
+from fleetmap.messages import FailureAck, SurveyArea, decode_message
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.replay_source import ReplaySource
@@ -86,10 +86,10 @@ def test_from_request_to_use_with_two_robots(tmp_path: Path) -> None:
             robot = f"r{number}"
             drives = drive(way, store, area, tmp_path / robot)
 
-            def send(part: ReplayPart, robot: str = robot) -> FailureAck:
-                return intake.take("lab", robot, part)
+            def send(_: str, payload: bytes, robot: str = robot) -> FailureAck:
+                return intake.take("lab", robot, decode_message(payload, ReplayPart))
 
-            client: Any = SimpleNamespace(send_replay_part=send)
+            client: Any = SimpleNamespace(deliver=send)
             clock.now_ns += 20 * 60 * 10**9
             while drives.deliver_part(client):
                 pass

@@ -242,13 +242,17 @@ def test_the_recording_of_a_failure_at_the_end_has_arrived(
     spool = plain.server.replays = Outbox(world.folder / "replays", max_bytes=10**8)
     made = Runtime(replace(plain, replays=ReplayQueue(spool, plain.profile)), ServiceManager(""))
 
-    def ctrl_c(_: object) -> FailureAck:
+    sent = plain.server.client.deliver
+
+    def ctrl_c(name: str, payload: bytes) -> FailureAck:
+        if name != "replays":
+            return sent(name, payload)
         made.stop()
         raise LinkError("later")
 
     if is_stopped:
         monkeypatch.setattr(runtime, "_DELIVERED_WITHIN_S", 10**6)
-        monkeypatch.setattr(plain.server.client, "send_replay_part", ctrl_c)
+        monkeypatch.setattr(plain.server.client, "deliver", ctrl_c)
     made.run()
     (failure,) = world.store.fleet.failures(FailureFilter(site="room"))
     assert (world.store.fleet.replay_summary(failure.number) is None) == is_stopped

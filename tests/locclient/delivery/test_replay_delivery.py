@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from fleetmap.failure_summary import ReplayPart
-from fleetmap.messages import PART_BYTES, FailureAck
+from fleetmap.messages import PART_BYTES, FailureAck, decode_message
 from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.delivery.report_delivery import ReplayQueue, deliver_replay_part
 
@@ -25,7 +25,8 @@ class Server:
     refuses: str = ""
     parts: list[int] = field(default_factory=list)
 
-    def send_replay_part(self, part: ReplayPart) -> FailureAck:
+    def deliver(self, _: str, payload: bytes) -> FailureAck:
+        part = decode_message(payload, ReplayPart)
         self.parts.append(part.offset)
         assert len(part.data) <= PART_BYTES
         if part.offset == self.forgets:

@@ -12,7 +12,7 @@ import pytest
 from fleetmap.errors import UnreachableError
 from fleetmap.failure_summary import ReplayPart
 from fleetmap.geometry import se3
-from fleetmap.messages import FailureAck, Status, SurveyArea
+from fleetmap.messages import FailureAck, Status, SurveyArea, decode_message
 from fleetmap.recordings import open_recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame
@@ -131,7 +131,8 @@ def test_parts_are_sent_in_order_and_begun_again(tmp_path: Path) -> None:
     (path,) = tmp_path.glob("*.mcap")
     data, taken, faults = path.read_bytes(), bytearray(), ["away", "", "restarted"]
 
-    def send(part: ReplayPart) -> FailureAck:
+    def send(_: str, payload: bytes) -> FailureAck:
+        part = decode_message(payload, ReplayPart)
         fault = faults.pop(0) if faults else ""
         if fault == "away":
             raise UnreachableError("nobody answers")
@@ -142,7 +143,7 @@ def test_parts_are_sent_in_order_and_begun_again(tmp_path: Path) -> None:
         taken.extend(part.data)
         return FailureAck(id=part.id, received_bytes=len(taken))
 
-    client: Any = SimpleNamespace(send_replay_part=send)
+    client: Any = SimpleNamespace(deliver=send)
     assert not drives.deliver_part(client)
     for _ in range(50):
         drives.deliver_part(client)
