@@ -89,7 +89,11 @@ def deliver(client: MapClient, outbox: Outbox) -> bool:
     """
     is_open = True
     for report in outbox.waiting(_DELIVERED_PER_STEP):
-        if not _is_whole(report):
+        try:
+            if (about := decode_message(report.payload, FailureReport).id) != report.id:
+                raise LinkError(f"it is about {about}")
+        except LinkError as error:
+            _log.warning("the report of failure %s is damaged and dropped: %s", report.id, error)
             outbox.refused(report.id)
             continue
         try:
@@ -108,18 +112,6 @@ def deliver(client: MapClient, outbox: Outbox) -> bool:
         else:
             outbox.done(report.id)
     return is_open
-
-
-def _is_whole(report: QueuedReport) -> bool:
-    """Return True if a report is undamaged; log the damage otherwise."""
-    try:
-        decoded_id = decode_message(report.payload, FailureReport).id
-    except LinkError as error:
-        _log.warning("the report of failure %s is damaged and dropped: %s", report.id, error)
-        return False
-    if decoded_id != report.id:
-        _log.warning("the report of failure %s is damaged and dropped: it is about %s", report.id, decoded_id)
-    return decoded_id == report.id
 
 
 def write_failure(folder: Path, report: FailureReport) -> Path:

@@ -46,16 +46,12 @@ class ReplayResult:
     @property
     def map_from_body(self) -> Array:
         """Return estimated poses (N, 4, 4); NaN if absent."""
-        unknown = np.full((4, 4), np.nan)
-        found = [unknown if e.map_from_body is None else e.map_from_body for e in self.estimates]
-        return np.array(found).reshape(-1, 4, 4)
+        return _stacked([estimate.map_from_body for estimate in self.estimates], 4)
 
     @property
     def cov_rot_trans(self) -> Array:
         """Return covariances of the poses (N, 6, 6) in map axes, rotation first; NaN if absent."""
-        unknown = np.full((6, 6), np.nan)
-        found = [unknown if e.cov_rot_trans is None else e.cov_rot_trans for e in self.estimates]
-        return np.array(found).reshape(-1, 6, 6)
+        return _stacked([estimate.cov_rot_trans for estimate in self.estimates], 6)
 
     @property
     def statuses(self) -> list[Status]:
@@ -92,17 +88,18 @@ class ReplayResult:
 
     @property
     def report(self) -> dict[str, object]:
-        built: dict[str, object] = {name: metric(self.frames) for name, metric in METRICS.items()}
-        built["aligned_error_m"] = self.aligned_error_m()
-        built["peak_rss_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0
-        built["map_version"] = self.manifest.version
-        built["site"] = self.manifest.site
-        built["tiles"] = len(self.tiles.tiles)
-        built["tiles_refused"] = {f"{x},{y}": reason for (x, y), reason in sorted(self.tiles.refused.items())}
-        built["not_localised_m"] = self.search.metres
-        built["failures_detected"] = self.failures
-        built["notes"] = self.notes
-        return built
+        return {
+            **{name: metric(self.frames) for name, metric in METRICS.items()},
+            "aligned_error_m": self.aligned_error_m(),
+            "peak_rss_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024.0,
+            "map_version": self.manifest.version,
+            "site": self.manifest.site,
+            "tiles": len(self.tiles.tiles),
+            "tiles_refused": {f"{x},{y}": reason for (x, y), reason in sorted(self.tiles.refused.items())},
+            "not_localised_m": self.search.metres,
+            "failures_detected": self.failures,
+            "notes": self.notes,
+        }
 
     @property
     def trajectory(self) -> Trajectory:
@@ -112,13 +109,17 @@ class ReplayResult:
 
     def save_picture(self, path: str | Path) -> None:
         """Draw path, landmarks and errors into a PNG file; UsageError if it cannot be written."""
-        known = [truth if self.truth_in_map else None for truth in self.truths]
-        truths_m = [np.full(3, np.nan) if truth is None else truth[:3, 3] for truth in known]
+        truths = _stacked([truth if self.truth_in_map else None for truth in self.truths], 4)
         plot = RunPlot(
             title=f"{self.manifest.site}, version {self.manifest.version}",
             frames=self.frames,
             positions_map_m=self.map_from_body[:, :3, 3],
-            truths_map_m=np.array(truths_m).reshape(-1, 3),
+            truths_map_m=truths[:, :3, 3],
             landmarks_map_m=np.concatenate([tile.points_map for tile in self.tiles.tiles.values()]),
         )
         save_picture(plot, Path(path))
+
+
+def _stacked(matrices: list[Array | None], size: int) -> Array:
+    """Return matrices as (N, size, size), NaN for those that are absent."""
+    return np.array([np.full((size, size), np.nan) if m is None else m for m in matrices]).reshape(-1, size, size)

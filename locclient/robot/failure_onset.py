@@ -43,10 +43,9 @@ class Belief:
     def carried_on(self, odom_from_body: Array) -> Array:
         return self.map_from_body @ se3_inverse(self.odom_from_body) @ odom_from_body
 
-    @property
-    def radius_95_m(self) -> float:
-        """Return the 95 % radius of the position."""
-        return radius_95_m(self.cov_rot_trans)
+    def off_m(self, map_from_body: Array, odom_from_body: Array) -> float:
+        """Return the distance of a pose from the belief, carried on."""
+        return float(np.linalg.norm(map_from_body[:3, 3] - self.carried_on(odom_from_body)[:3, 3]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,14 +141,15 @@ class OnsetRecorder:
         """Return evidence for the cause of a failure detected with this estimate."""
         found = self._open.get(kind)
         belief = self._belief if found is None else found.belief
-        elsewhere = [
-            h for h in estimate.hypotheses if belief is None or _is_beyond(h.map_from_body, belief, odom_from_body)
-        ]
+        elsewhere = estimate.hypotheses
+        if belief is not None:  # beyond the error limit and its radius
+            limit_m = max(ERROR_LIMIT_M, radius_95_m(belief.cov_rot_trans))
+            elsewhere = tuple(h for h in elsewhere if belief.off_m(h.map_from_body, odom_from_body) > limit_m)
         agreed = [h for h in elsewhere if h.support >= _AGREEING_FIXES]
         wrong_by_m = estimate.moved_m
         if wrong_by_m is None and belief is not None and agreed:
             best = max(agreed, key=lambda hypothesis: hypothesis.support)
-            wrong_by_m = _distance_m(best.map_from_body, belief.carried_on(odom_from_body))
+            wrong_by_m = belief.off_m(best.map_from_body, odom_from_body)
         had_fix = belief is not None and began_ns - belief.fix_ns <= _RECENT_FIX_NS
         places = sum(hypothesis.support >= 2 for hypothesis in elsewhere)
         return Evidence(wrong_by_m, self._is_break_of(began_ns), had_fix, places)
@@ -178,16 +178,6 @@ class OnsetRecorder:
         known = [picture for picture in self._pictures if picture[0] < before_ns]
         nearest = min(known, key=lambda picture: abs(picture[0] - wanted_ns), default=None)
         return nearest if nearest is not None and abs(nearest[0] - wanted_ns) <= 2 * _EVERY_NS else None
-
-
-def _is_beyond(map_from_body: Array, belief: Belief, odom_from_body: Array) -> bool:
-    """Return True if a pose contradicts a belief: farther than the error limit and than the belief's radius."""
-    off_m = _distance_m(map_from_body, belief.carried_on(odom_from_body))
-    return off_m > max(ERROR_LIMIT_M, belief.radius_95_m)
-
-
-def _distance_m(one: Array, other: Array) -> float:
-    return float(np.linalg.norm(one[:3, 3] - other[:3, 3]))
 
 
 def _left(frame: RectifiedFrame, view: int) -> Image:

@@ -42,14 +42,6 @@ class VersionChange:
     reason: str = ""
 
 
-class TrialVerdict(StrEnum):
-    """Result of a trial so far."""
-
-    UNDECIDED = "UNDECIDED"
-    CONFIRMED = "CONFIRMED"
-    FAILED = "FAILED"
-
-
 class VersionTrial:
     """Counts the fixes of one version, from the first frame compared with it.
 
@@ -68,8 +60,8 @@ class VersionTrial:
         self._fixes = self._contradictions = 0
         self.reason = "no frame was compared with it"
 
-    def handle(self, estimate: Estimate) -> TrialVerdict:
-        """Return the verdict with this frame; `reason` has its text."""
+    def handle(self, estimate: Estimate) -> bool | None:
+        """Return whether the version is confirmed or has failed with this frame, None while undecided; `reason` has its text."""
         off_m = self._off_m(estimate)
         limit_m = self._settings.agreement_m + _DRIFT_SHARE * self._path_m
         age_s = (estimate.stamp_ns - self._begun_ns) * 1e-9
@@ -80,12 +72,12 @@ class VersionTrial:
         self.reason = f"{self._fixes} fixes and {self._contradictions} that contradict it in {age_s:.0f} s"
         if off_m > limit_m and estimate.status is Status.TRACKING:
             self.reason = f"it puts the robot {off_m:.1f} m from where it was"
-            return TrialVerdict.FAILED
+            return False
         if self._contradictions >= self._settings.contradicting_looks and self._contradictions > self._fixes:
-            return TrialVerdict.FAILED
+            return False
         if self._fixes >= self._settings.confirming_fixes:
-            return TrialVerdict.CONFIRMED
-        return TrialVerdict.FAILED if age_s > self._settings.patience_s else TrialVerdict.UNDECIDED
+            return True
+        return False if age_s > self._settings.patience_s else None
 
     def _off_m(self, estimate: Estimate) -> float:
         """Return the distance from the initial pose as propagated by odometry; 0 if either is unknown."""
@@ -153,10 +145,9 @@ class VersionTrials:
         if self._trial is None:
             self._begin_trial()
         assert self._trial is not None
-        verdict = self._trial.handle(estimate)
-        if verdict is TrialVerdict.UNDECIDED:
+        is_confirmed = self._trial.handle(estimate)
+        if is_confirmed is None:
             return
-        is_confirmed = verdict is TrialVerdict.CONFIRMED
         if self._failed_reason is not None:
             failed = f"of version {self._candidate.version} {self._failed_reason}"
             good = f"version {self._good.version}"

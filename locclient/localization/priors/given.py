@@ -37,7 +37,7 @@ class GivenPrior:
                 return None
             tracker.forget()
             confirmed = before = None
-        floors: Mapping[str, Array | None] | None = None
+        floors: Mapping[str, Array | None] = {}
         is_open = not given.is_revisable or (before is not None and not before.names_floor)
         building = tracker.maps.plan_from_map
         if given.floor is None and confirmed is None and is_open and len(building) > 1:

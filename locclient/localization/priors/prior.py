@@ -1,6 +1,7 @@
 """A prior of the robot's place: from a dock, an operator, a ride or an earlier pose, in force until the map has confirmed a pose. Pure."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import numpy as np
@@ -47,38 +48,32 @@ class PriorSource(Protocol):
         """Return what it tells at this frame that it has not told before."""
 
 
+@dataclass(eq=False)
 class Prior:
     """A prior, and the robot's motion since its moment.
 
-    hypothesis: the pose by both, published while the map gives none; None for priors with an unknown heading. contradictions: places
-    of fixes outside a revisable prior. is_told: True for a prior from outside, such as a dock, a zone or an operator; else it is the
-    robot's own estimate by odometry. floors: those on which the robot may be, with prior_from_map (4, 4), from each one's map to that of
-    the prior; None for the same map. is_ride: the robot may have ridden a lift to any of them. is_measured: as of `PositionPrior`.
+    base: place of the base, at the frame of `since`, the origin. hypothesis: the pose of the body by both, published while the map gives
+    none; None for priors with an unknown heading. contradictions: places of fixes outside a revisable prior. is_told: True for a prior from
+    outside, such as a dock, a zone or an operator; else it is the robot's own estimate by odometry. floors: those on which the robot may
+    be, with prior_from_map (4, 4), from each one's map to that of the prior, None for the same map; default: that of the place alone.
+    is_ride: the robot may have ridden a lift to any of them. is_measured: as of `PositionPrior`.
     """
 
-    def __init__(
-        self,
-        base: Place,
-        since: PoseHypothesis,
-        known: PoseHypothesis | None,
-        base_from_body: Array,
-        settings: TrackSettings,
-        *,
-        is_revisable: bool,
-        is_told: bool = False,
-        is_measured: bool = False,
-        is_ride: bool = False,
-        travelled_m: float = 0.0,
-        floors: Mapping[str, Array | None] | None = None,
-    ) -> None:
-        """base: place of the base. since: its frame, as the origin. known: of the body there. floors: default: that of the place alone."""
-        self._base, self._since, self.hypothesis = base, since, known
-        self._base_from_body, self._settings = base_from_body, settings
-        self.is_revisable, self.is_told, self.is_ride = is_revisable, is_told, is_ride
-        self.is_measured = is_measured
-        self.travelled_m = travelled_m
-        self.floors: Mapping[str, Array | None] = floors or {base.floor: None}
-        self.contradictions = HypothesisSet(settings)
+    base: Place
+    since: PoseHypothesis
+    hypothesis: PoseHypothesis | None
+    base_from_body: Array
+    settings: TrackSettings
+    is_revisable: bool
+    is_told: bool = False
+    is_measured: bool = False
+    is_ride: bool = False
+    travelled_m: float = 0.0
+    floors: Mapping[str, Array | None] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.floors = self.floors or {self.base.floor: None}
+        self.contradictions = HypothesisSet(self.settings)
 
     @classmethod
     def given(
@@ -99,10 +94,8 @@ class Prior:
     @classmethod
     def at(cls, known: PoseHypothesis, base_from_body: Array, settings: TrackSettings, **how: Any) -> "Prior":
         """Return a pose at a frame of the odometry as a prior. how: arguments of the constructor."""
-        base, since = (
-            known.start.of_point(se3_inverse(base_from_body)),
-            PoseHypothesis(known.frame_index, known.stamp_ns, ORIGIN, ORIGIN),
-        )
+        base = known.start.of_point(se3_inverse(base_from_body))
+        since = PoseHypothesis(known.frame_index, known.stamp_ns, ORIGIN, ORIGIN)
         return cls(base, since, known, base_from_body, settings, **how)
 
     @property
@@ -121,19 +114,19 @@ class Prior:
         return found
 
     def tracked(self) -> list[PoseHypothesis]:
-        return [*filter(None, (self.hypothesis, self._since)), *self.contradictions.hypotheses]
+        return [*filter(None, (self.hypothesis, self.since)), *self.contradictions.hypotheses]
 
     def is_compatible(self, place: Place) -> bool:
         """Return True if a present place, traced back by the robot's motion, lies within the bound of the prior's position, on one of its
         floors."""
         if place.floor not in self.floors:
             return False
-        prior_from_map, then = self.floors[place.floor], place.before(self._since.now)
-        map_from_base, cov_m2 = then.map_from_body @ se3_inverse(self._base_from_body), then.cov_rot_trans[3:5, 3:5]
+        prior_from_map, then = self.floors[place.floor], place.before(self.since.now)
+        map_from_base, cov_m2 = then.map_from_body @ se3_inverse(self.base_from_body), then.cov_rot_trans[3:5, 3:5]
         if prior_from_map is not None:
             map_from_base = prior_from_map @ map_from_base
             cov_m2 = prior_from_map[:2, :2] @ cov_m2 @ prior_from_map[:2, :2].T
-        off_m = map_from_base[:2, 3] - self._base.position_m[:2]
+        off_m = map_from_base[:2, 3] - self.base.position_m[:2]
         return bool(off_m @ np.linalg.solve(self._cov_m2(_WIDER) + cov_m2, off_m) < _CHI2_999)
 
     def is_contradicted(self, observations: Observations, lookalikes: LookAlikes | None) -> bool:
@@ -148,8 +141,8 @@ class Prior:
         order, competitors = found.ranking()
         if not order or competitors:
             return False
-        has_more = order[0].support > self._settings.confirming_fixes
-        is_telling = not self.is_told and order[0].speaks_against_others(self._settings)  # as against a confirmed pose
+        has_more = order[0].support > self.settings.confirming_fixes
+        is_telling = not self.is_told and order[0].speaks_against_others(self.settings)  # as against a confirmed pose
         return has_more and (is_telling or found.is_supported(order[0])) and not found.may_be_lookalike(order[0])
 
     def is_near(self, positions_map: Array, floor: str = "") -> NDArray[np.bool_]:
@@ -157,7 +150,7 @@ class Prior:
         prior_from_map = self.floors[floor]
         if prior_from_map is not None:
             positions_map = transform_points(prior_from_map, positions_map)
-        off_m = np.linalg.norm(positions_map[:, :2] - self._base.position_m[:2], axis=1)
+        off_m = np.linalg.norm(positions_map[:, :2] - self.base.position_m[:2], axis=1)
         return np.asarray(off_m < _BOUND_SIGMAS * self._sigma_m(_WIDER) + self.travelled_m + _PLACE_REACH_M)
 
     def weighed(self, observations: Observations) -> Observations:
@@ -165,14 +158,14 @@ class Prior:
         instead."""
         for _, hypothesis in observations if self.is_revisable and self.is_told else ():
             if self.is_compatible(hypothesis.now):
-                share = self._settings.wrong_prior_share
+                share = self.settings.wrong_prior_share
                 hypothesis.told_log_odds = float(np.log1p(-share) - np.log(share))
         return observations
 
     def confirms(self, hypothesis: PoseHypothesis) -> bool:
         """Return True if the prior is told and so tight that one fix within it confirms a pose; an operator's, only at its own place."""
         is_named = self.names_floor and (not self.is_revisable or hypothesis.told_log_odds > 0.0)
-        return self.is_told and is_named and self.is_tight(self._settings.tight_prior_sigma_m)
+        return self.is_told and is_named and self.is_tight(self.settings.tight_prior_sigma_m)
 
     def known_pose(self, radius_m: float) -> PoseHypothesis | None:
         """Return the pose by an exact source and the motion since, while its 95 % radius is at most `radius_m`; else None."""
@@ -190,4 +183,4 @@ class Prior:
         """Return the covariance (2, 2) of the horizontal position, the prior's own part times `scale`. It grows with the distance
         travelled, so that unmodelled drift, a push or an operator's error do not prevent localization forever."""
         added = _SIGMA_M**2 + (_DRIFT_SHARE * self.travelled_m) ** 2
-        return np.asarray(scale * self._base.cov_rot_trans[3:5, 3:5] + added * np.eye(2))
+        return np.asarray(scale * self.base.cov_rot_trans[3:5, 3:5] + added * np.eye(2))

@@ -59,9 +59,10 @@ class RigFrames:
     view's stamps, that view leads: frames have its stamps and are black in the first view, so that the others carry on.
     """
 
-    def __init__(self, calibration: RigCalibration) -> None:
+    def __init__(self, calibration: RigCalibration, *, has_depth: bool = False) -> None:
+        """has_depth: whether the first view is a camera with depth."""
         self._views = calibration.views
-        self._has_depth = [calibration.cameras[view[0]].has_depth for view in self._views]
+        self._has_depth = [has_depth, *(calibration.cameras[view[0]].has_depth for view in self._views[1:])]
         self._pairs = [
             StereoPairs() if len(view) > 1 or has_depth else None
             for view, has_depth in zip(self._views, self._has_depth, strict=True)
@@ -162,8 +163,6 @@ class Ros2Source:
         """
         self._bus, self._layout = bus, layout
         self.calibration, self.has_depth = calibration, has_depth
-        self._pairs = StereoPairs()
-        self._rig: RigFrames | None = None  # of a rig with several views
         self._grey_peak = 0  # used bits of 16-bit images, until one has more than 12
         self._topics: list[tuple[str, Take]] = [
             (topics.wheel, _take_wheel),
@@ -172,19 +171,14 @@ class Ros2Source:
         if calibration.imu is not None:
             self._topics.append((topics.imu, _take_imu))
         if images:
-            roles = (
-                ("left", "depth" if has_depth else "right") if has_depth or len(calibration.cameras) > 1 else ("left",)
-            )
-            if not has_depth and len(calibration.views) > 1:
-                self._rig = RigFrames(calibration)
-            further = () if self._rig is None else CAMERA_ROLES[2 : len(calibration.cameras)]
-            named = [*enumerate(zip(("left", "right", *further), (*roles, *further), strict=False))]
-            if self._rig is not None:
-                depths = zip(range(2, len(calibration.cameras)), DEPTH_ROLES[1:], strict=False)
-                named += [(n, ("depth", role)) for n, role in depths if calibration.cameras[n].has_depth]
-            for number, (side, role) in named:
+            cameras = calibration.cameras[:1] if has_depth else calibration.cameras
+            self._rig = RigFrames(replace(calibration, cameras=cameras), has_depth=has_depth)
+            roles = [*enumerate(CAMERA_ROLES[: len(cameras)]), *([(0, DEPTH_ROLES[0])] if has_depth else [])]
+            depths = zip(range(2, len(cameras)), DEPTH_ROLES[1:], strict=False)
+            roles += [(number, role) for number, role in depths if cameras[number].has_depth]
+            for number, role in roles:
                 names = transports(getattr(topics, role), role)
-                self._topics += [(name, partial(self._take_image, number, side)) for name in names]
+                self._topics += [(name, partial(self._take_image, number, role)) for name in names]
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
         handles = self.subscribe(intake)
@@ -208,33 +202,21 @@ class Ros2Source:
 
     def _handle(self, intake: Intake, take: Take, key: str, payload: bytes) -> None:
         try:
-            # A bridge's key names no type.
-            is_compressed = (self._layout.type_of(key) or key).endswith(
-                ("CompressedImage", "/compressed", "/compressedDepth")
-            )
-            take(intake, is_compressed, payload)
+            kind = self._layout.type_of(key) or key  # a bridge's key names no type
+            take(intake, kind.endswith(("CompressedImage", "/compressed", "/compressedDepth")), payload)
         except (ValueError, FleetmapError) as error:
             # An unreadable message is skipped; the health report counts them.
             intake.count_unreadable(str(error))
 
-    def _take_image(self, number: int, side: str, intake: Intake, is_compressed: bool, payload: bytes) -> None:
+    def _take_image(self, number: int, role: str, intake: Intake, is_compressed: bool, payload: bytes) -> None:
         stamp_ns, _ = messages.header_of(payload)
         decode = messages.decode_compressed_image if is_compressed else messages.decode_image
-        image = decode(payload, f"{side} at {stamp_ns}")
-        is_depth = side == "depth" or (side == "right" and self.has_depth)
+        image, is_depth = decode(payload, f"{role} at {stamp_ns}"), role in DEPTH_ROLES
         if not is_depth:
             self._grey_peak = max(self._grey_peak, grey_peak(image) if self._grey_peak < 1 << 12 else 0)
             image = replace(image, bits=grey_bits(self._grey_peak))
-        if self._rig is not None:
-            for complete in self._rig.add(number, stamp_ns, image, is_depth=is_depth):
-                intake.put_frame(complete)
-            return
-        if not self.has_depth and len(self.calibration.cameras) == 1:
-            intake.put_frame(StoredFrame(stamp_ns, image))
-            return
-        frame: StoredFrame | None = self._pairs.add(side, stamp_ns, image)
-        if frame is not None:
-            intake.put_frame(StoredFrame(frame.stamp_ns, frame.left, None, frame.right) if self.has_depth else frame)
+        for frame in self._rig.add(number, stamp_ns, image, is_depth=is_depth):
+            intake.put_frame(frame)
 
 
 def _take_imu(intake: Intake, _is_compressed: bool, payload: bytes) -> None:

@@ -2,14 +2,14 @@
 
 import logging
 import tempfile
-from collections.abc import Callable
 from pathlib import Path
 
 from fleetmap.errors import LinkError, MapFormatError, StateError, StoreError, disk_errors
 from fleetmap.mapformat.version_file import ExportReader, open_export
 from fleetmap.messages import WantedVersion
+from locclient.hooks import LinkedRobot
 from locclient.maps.map_source import addresses_of
-from locclient.maps.tile_cache import ActiveVersion, TileCache
+from locclient.maps.tile_cache import ActiveVersion
 from locclient.plugins.vda5050.version_download import Origins, TooLargeError, download
 
 _TOGETHER = 2  # space for a file, and for its extracted blobs
@@ -25,22 +25,14 @@ class DuplicateMapError(StateError):
 
 
 class FleetMaps:
-    """For the thread that owns the cache. check_admitted: raises UntrustedError for versions outside the site's signed list; None for
-    a robot without a map server, which takes what the fleet manager names with its hash.
-    """
+    """For the thread that owns the robot's cache. Without a map server it takes what the fleet manager names with its hash."""
 
-    def __init__(
-        self,
-        cache: TileCache,
-        site: str,
-        folder: Path,
-        origins: Origins,
-        check_admitted: Callable[[WantedVersion], None] | None,
-    ) -> None:
-        """folder: for files during download. Raises UsageError for invalid origins. A disk error now makes later downloads fail."""
+    def __init__(self, robot: LinkedRobot, origins: Origins) -> None:
+        """Raises UsageError for invalid origins. A disk error now makes later downloads fail."""
         origins.check()
-        self._cache, self._site, self._folder, self._origins = cache, site, folder, origins
-        self._needs_hash, self._check_admitted = check_admitted is None, check_admitted or (lambda _: None)
+        self._cache, self._site, self._folder, self._origins = robot.cache, robot.site, robot.folder, origins
+        self._needs_hash, self._check_admitted = robot.check_admitted is None, robot.check_admitted or (lambda _: None)
+        cache, site, folder = self._cache, self._site, self._folder
         active = cache.active(site)
         try:
             with disk_errors(f"{folder} cannot be used", "choose another cache"):
@@ -64,7 +56,7 @@ class FleetMaps:
 
         Raises DuplicateMapError, NoRoomError, LinkError, UntrustedError, MapFormatError, StoreError.
         """
-        if self._find(version) is not None:
+        if version in dict(self.versions()):
             raise DuplicateMapError(f"version {version} is on the robot already; delete it before another download")
         if self._needs_hash and not sha256:
             raise LinkError("without a map server no signed list admits a file; send its SHA-256 as mapHash")
@@ -118,11 +110,8 @@ class FleetMaps:
         self._cache.release(self._site, version)
 
     def _get(self, version: int) -> ActiveVersion:
-        record = self._find(version)
-        if record is None:
-            known = ", ".join(str(known) for known, _ in self.versions()) or "none"
+        records = {record.version: record for record in self._cache.kept(self._site)}
+        if version not in records:
+            known = ", ".join(map(str, records)) or "none"
             raise StateError(f"version {version} is not on the robot, which has {known}")
-        return record
-
-    def _find(self, version: int) -> ActiveVersion | None:
-        return next((record for record in self._cache.kept(self._site) if record.version == version), None)
+        return records[version]

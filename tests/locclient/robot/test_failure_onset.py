@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fleetmap import failure_definition
+from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import se3
 from fleetmap.messages import Cause, FailureKind, FailureReport, Status
 from fleetmap.odometry import OdometryStatus
@@ -77,7 +78,7 @@ def test_the_belief_is_that_of_the_beginning() -> None:
     onset = recorder.onset(BLIND, 3 * 10**9, left(50))
     assert onset.belief is not None
     assert onset.map_from_body is not None
-    assert onset.belief.radius_95_m == pytest.approx(2.796 * 0.03)
+    assert radius_95_m(onset.belief.cov_rot_trans) == pytest.approx(2.796 * 0.03)
     assert onset.map_from_body[0, 3] == pytest.approx(3.0), "carried on by odometry from 2.9 m"
 
 

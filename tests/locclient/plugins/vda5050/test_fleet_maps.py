@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -63,7 +64,8 @@ class Robot:
         self.fault: FleetmapError | None = None
         self.cache = TileCache(folder / "cache", max_bytes=max_bytes)
         self.folder = folder / "incoming"
-        self.maps = FleetMaps(self.cache, "lab", self.folder, Origins(allowed), self._check)
+        how = {"cache": self.cache, "folder": self.folder, "check_admitted": self._check}
+        self.maps = FleetMaps(SimpleNamespace(site="lab", **how), Origins(allowed))  # type: ignore[arg-type]
 
     def _check(self, wanted: WantedVersion) -> None:
         self.asked.append(wanted)
