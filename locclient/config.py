@@ -15,7 +15,7 @@ from locclient.hooks import LinkHook, link_hooks, prior_hooks
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import TileSelectionSettings
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
-from locclient.output_section import OutputSection
+from locclient.outputs import OutputSection
 from locclient.robot.robot import ImagePriors
 from locclient.robot.version_trial import TrialSettings
 

@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from fleetmap.sensors.rectification import MountedCamera
     from fleetmap.sensors.source_settings import Topics
     from fleetmap.sources.intake import Intake
-    from locclient.output_section import OutputSection
-    from locclient.publisher import Publisher
+    from locclient.outputs import OutputSection, Publisher
 
 
 @dataclass(frozen=True)

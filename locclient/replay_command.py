@@ -190,9 +190,8 @@ def _run(
     from locclient.config import image_priors_of
     from locclient.localization.priors.given import parse_prior
     from locclient.maps.connection import connected
-    from locclient.replay.replay import ReplayOptions, load_map
+    from locclient.replay.replay import ReplayOptions, load_map, spread_starts, starts
     from locclient.replay.replay import replay as play
-    from locclient.replay.starts import spread_starts, starts
 
     opening_export: AbstractContextManager[RunExport | None] = nullcontext()
     if files.mcap is not None:

@@ -36,7 +36,7 @@ from locclient.maps.connection import cache_folder, map_client, open_bus, outbox
 from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
-from locclient.publisher import Publisher
+from locclient.outputs import Publisher
 from locclient.robot.failure_report import RobotProfile
 from locclient.robot.robot import Robot
 

@@ -7,8 +7,7 @@ from fleetmap.hooks import plugins
 from fleetmap.messages import EstimateMessage, Placement, covariance_entries, encode_message, robot_key
 from locclient.hooks import OutputHook
 from locclient.localization.estimate import Estimate
-from locclient.output_section import OutputSection
-from locclient.publisher import Publisher
+from locclient.outputs import OutputSection, Publisher
 from locclient.robot.continuous_odom import PublishedPose
 
 _MAX_HYPOTHESES = 16

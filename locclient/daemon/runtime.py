@@ -30,7 +30,7 @@ from locclient.maps.building_maps import NO_GRID, BuildingMaps
 from locclient.maps.loaded_map import Cell, LoadedMap, PositionBound, PositionBoundTracker
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
-from locclient.publisher import Publisher
+from locclient.outputs import Publisher
 from locclient.robot.failure_report import RobotProfile, failure_report
 from locclient.robot.health_report import Figure, HealthFigures
 from locclient.robot.robot import FailureContext, Outcome, Robot

@@ -16,7 +16,7 @@ from fleetmap.messages import robot_key
 from locclient.config import LocclientConfig, RunSection, SourceSection
 from locclient.daemon.daemon import check_run
 from locclient.identity import GivenAddress, RobotIdentity, check_reach, identity_folder
-from locclient.output_section import OutputSection
+from locclient.outputs import OutputSection
 from mapserver.store import MapStore
 from mapserver.trust import init_here
 from mapserver.trust.enrolment import RobotRegister

@@ -33,9 +33,9 @@ from fleetmap.sources.intake import Intake
 from locclient.hooks import OutputHook
 from locclient.localization.estimate import Estimate
 from locclient.localization.place import transport_cov
-from locclient.output_section import OutputSection
+from locclient.outputs import OutputSection, Publisher
 from locclient.plugins.ros2_node.driver_odometry import DriverOdometry
-from locclient.plugins.ros2_node.graph import LATCHED, Qos, key_layout
+from locclient.plugins.ros2_node.keys import LATCHED, Qos, key_layout
 from locclient.plugins.ros2_node.navigation_messages import (
     EMPTY,
     BondStatus,
@@ -50,7 +50,6 @@ from locclient.plugins.ros2_node.navigation_messages import (
     encode_text,
 )
 from locclient.plugins.ros2_node.node import Ros2Node
-from locclient.publisher import Publisher
 from locclient.robot.continuous_odom import PublishedPose
 
 

@@ -9,8 +9,17 @@ from itertools import count
 
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import FleetmapError, RecordingError
-from locclient.plugins.ros2_node.graph import PUBLISHER, SERVICE, SUBSCRIPTION, Endpoint, KeyLayout, NodeName, Qos
-from locclient.plugins.ros2_node.keys import answer_attachment, attachment
+from locclient.plugins.ros2_node.keys import (
+    PUBLISHER,
+    SERVICE,
+    SUBSCRIPTION,
+    Endpoint,
+    KeyLayout,
+    NodeName,
+    Qos,
+    answer_attachment,
+    attachment,
+)
 
 Send = Callable[[bytes], None]
 _GID_BYTES = 16

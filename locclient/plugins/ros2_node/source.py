@@ -18,7 +18,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples
 from fleetmap.sensors.source_settings import CAMERA_ROLES, DEPTH_ROLES, SourceSection, transports
 from fleetmap.sources.intake import Intake
-from locclient.plugins.ros2_node.graph import KeyLayout, key_layout
+from locclient.plugins.ros2_node.keys import KeyLayout, key_layout
 
 _IDLE_S = 1.0
 _WAITING_IMAGES = 8  # images of each side waiting for their partner

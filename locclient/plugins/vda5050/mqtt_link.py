@@ -16,10 +16,9 @@ from locclient.hooks import LinkedRobot, RobotLink
 from locclient.plugins.vda5050.adapter import FleetAdapter
 from locclient.plugins.vda5050.dialects import dialect
 from locclient.plugins.vda5050.factsheet import read_factsheet
-from locclient.plugins.vda5050.fleet_maps import FleetMaps
+from locclient.plugins.vda5050.fleet_maps import FleetMaps, Origins
 from locclient.plugins.vda5050.messages import MAX_PAYLOAD_BYTES, timestamp
 from locclient.plugins.vda5050.settings import Broker, Vda5050Section, check_section, read_secret
-from locclient.plugins.vda5050.version_download import Origins
 
 if TYPE_CHECKING:
     from paho.mqtt.client import Client

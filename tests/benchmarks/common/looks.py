@@ -18,8 +18,7 @@ from locclient.localization.estimate import Estimate
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.connection import connected
 from locclient.maps.loaded_map import LoadedMap
-from locclient.replay.replay import load_map
-from locclient.replay.starts import starts
+from locclient.replay.replay import load_map, starts
 
 RIGHT_M, RIGHT_DEG, EVERY_S = 0.5, 5.0, 0.5
 

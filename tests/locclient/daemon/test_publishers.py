@@ -7,7 +7,7 @@ import pytest
 
 from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.messages import Cause, EstimateMessage, Status, decode_message
-from locclient.output_section import OutputSection
+from locclient.outputs import OutputSection
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import BASE_FROM_BODY, estimate, published
 

@@ -10,7 +10,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sources.intake import Intake
 from locclient.daemon.publishers import output_of
 from locclient.localization.estimate import Estimate, Hypothesis
-from locclient.output_section import OutputSection
+from locclient.outputs import OutputSection
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.recording_samples import calibration

@@ -17,7 +17,7 @@ from fleetmap.recordings.images import decode_frame
 from fleetmap.recordings.mcap.writer import copy_to_mcap
 from fleetmap.sensors.source_settings import Topics
 from fleetmap.sources.intake import Intake
-from locclient.plugins.ros2_node.graph import RmwZenohKeys
+from locclient.plugins.ros2_node.keys import RmwZenohKeys
 from locclient.plugins.ros2_node.source import Ros2Source
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.bag_samples import write_rosbag1, write_rosbag2

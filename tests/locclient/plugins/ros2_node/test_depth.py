@@ -6,7 +6,7 @@ from fleetmap.recordings import Topics
 from fleetmap.recordings.images import decode_depth, decode_frame, store_frame
 from fleetmap.recordings.ros2 import messages
 from fleetmap.sources.intake import Intake
-from locclient.plugins.ros2_node.graph import RmwZenohKeys
+from locclient.plugins.ros2_node.keys import RmwZenohKeys
 from locclient.plugins.ros2_node.source import RigFrames, Ros2Source
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.rig_samples import simulated

@@ -4,8 +4,7 @@ import pytest
 from zenoh.ext import Int64, z_deserialize
 
 from fleetmap.errors import UsageError
-from locclient.plugins.ros2_node.graph import RmwZenohKeys
-from locclient.plugins.ros2_node.keys import attachment
+from locclient.plugins.ros2_node.keys import RmwZenohKeys, attachment
 
 
 def test_keys_name_domain_topic_and_type() -> None:

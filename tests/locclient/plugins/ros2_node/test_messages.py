@@ -12,8 +12,17 @@ from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.recordings.images import grey_image, png_image
 from fleetmap.recordings.ros2 import messages
 from fleetmap.sensors.samples import PositionPrior, WheelSample
-from locclient.plugins.ros2_node.graph import LATCHED, BridgedDdsKeys, Endpoint, NodeName, Qos, RmwZenohKeys
-from locclient.plugins.ros2_node.keys import DEFINITIONS, service_definitions, type_hash
+from locclient.plugins.ros2_node.keys import (
+    DEFINITIONS,
+    LATCHED,
+    BridgedDdsKeys,
+    Endpoint,
+    NodeName,
+    Qos,
+    RmwZenohKeys,
+    service_definitions,
+    type_hash,
+)
 from locclient.plugins.ros2_node.localizer import (
     TRANSITIONS,
     LifecycleState,

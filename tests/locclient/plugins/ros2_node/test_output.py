@@ -13,8 +13,8 @@ from fleetmap.recordings.ros2.messages import decode_frame_links, decode_prior
 from fleetmap.sensors.source_settings import SourceSection, Topics
 from fleetmap.sources.source import open_source
 from locclient.daemon.publishers import output_of
-from locclient.output_section import OutputSection
-from locclient.plugins.ros2_node.graph import RmwZenohKeys
+from locclient.outputs import OutputSection
+from locclient.plugins.ros2_node.keys import RmwZenohKeys
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import BASE_FROM_BODY, estimate, inputs, published
 from support.fleet.memory_bus import MemoryBus, MemoryHub

@@ -15,8 +15,8 @@ from fleetmap.recordings.images import grey_image, png_image
 from fleetmap.recordings.ros2.messages import encode_compressed_image, encode_image
 from fleetmap.sources.intake import Intake
 from locclient.daemon.publishers import output_of
-from locclient.output_section import OutputSection
-from locclient.plugins.ros2_node.graph import BridgedDdsKeys
+from locclient.outputs import OutputSection
+from locclient.plugins.ros2_node.keys import BridgedDdsKeys
 from locclient.plugins.ros2_node.source import Ros2Source
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate

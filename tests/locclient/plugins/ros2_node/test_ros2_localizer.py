@@ -15,8 +15,8 @@ from fleetmap.messages import Status
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.sources.intake import Intake
 from locclient.localization.estimate import Estimate
-from locclient.output_section import OutputSection
-from locclient.plugins.ros2_node.graph import RmwZenohKeys
+from locclient.outputs import OutputSection
+from locclient.plugins.ros2_node.keys import RmwZenohKeys
 from locclient.plugins.ros2_node.localizer import OUTPUT, Ros2Localizer
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate

@@ -22,8 +22,7 @@ from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import open_source
-from locclient.plugins.ros2_node.graph import RmwZenohKeys
-from locclient.plugins.ros2_node.keys import attachment
+from locclient.plugins.ros2_node.keys import RmwZenohKeys, attachment
 from locclient.plugins.ros2_node.source import Ros2Source, StereoPairs
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.recording_samples import calibration

@@ -27,11 +27,10 @@ from fleetmap.sources.intake import Intake
 from locclient.config import read_config
 from locclient.daemon.publishers import output_of
 from locclient.localization.estimate import Estimate
-from locclient.output_section import OutputSection
+from locclient.outputs import OutputSection, Publisher
 from locclient.plugins.ros2_node.driver_odometry import Missing, PoseHistory
-from locclient.plugins.ros2_node.graph import RmwZenohKeys
+from locclient.plugins.ros2_node.keys import RmwZenohKeys
 from locclient.plugins.ros2_node.localizer import OUTPUT
-from locclient.publisher import Publisher
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.contracts_documents import REPOSITORY
 from support.fleet.estimates import estimate

@@ -15,8 +15,7 @@ from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StateError
 from fleetmap.messages import WantedVersion
 from locclient.maps.tile_cache import TileCache
 from locclient.plugins.vda5050 import version_download
-from locclient.plugins.vda5050.fleet_maps import DuplicateMapError, FleetMaps, NoRoomError
-from locclient.plugins.vda5050.version_download import Origins
+from locclient.plugins.vda5050.fleet_maps import DuplicateMapError, FleetMaps, NoRoomError, Origins
 from mapserver.store import MapStore
 from support.storage.map_samples import publish_samples
 
