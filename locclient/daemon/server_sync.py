@@ -149,31 +149,29 @@ class ServerSync:
                 "there, or correct [run] site"
             )
             self._refusals.warning("no version", words, wanted.site, wanted.site)
-            return
-        if chooser := next((link.chooses for link in self.links if link.chooses), ""):
-            running = None if self._running is None else self._running.version
-            self._last_ack = (running, "" if wanted == self._running else f"{chooser} chooses")
-            return self._acknowledge()
-        if sha256 in self._offered or now_s < self._not_before_s.get(sha256, 0.0):
-            if self._last_ack is None and self._running is not None:
-                self._last_ack = (self._running.version, "")
-            return self._acknowledge()  # again, for a restarted server or a lost message
+        elif chooser := next((link.chooses for link in self.links if link.chooses), ""):
+            self._acknowledge("" if wanted == self._running else f"{chooser} chooses")
+        elif sha256 in self._offered or now_s < self._not_before_s.get(sha256, 0.0):
+            # Again, for a restarted server or a lost message.
+            self._acknowledge("" if self._last_ack is None and self._running is not None else None)
+        elif self._fetches(wanted, sha256):
+            self._offered.add(sha256)
+            self.fetched.append(wanted)
+
+    def _fetches(self, wanted: WantedVersion, sha256: str) -> bool:
+        """Fetch a version and return True if it may be offered: an incomplete first one is better than none; otherwise the last good one
+        stays."""
         try:
             self.client.fetch(wanted)
+        except UnreachableError:
+            self._ask_at_s = 0.0
+            raise
         except (LinkError, MapFormatError, StoreError) as error:
-            if isinstance(error, UnreachableError):
-                self._ask_at_s = 0.0
-                raise
-            self._not_before_s[sha256] = now_s + _ASK_EVERY_S
-            self._refuse(wanted, str(error), isinstance(error, UntrustedError))
-            if isinstance(error, UntrustedError):
-                return None
-            if self._running is not None:
-                return None
-        # An incomplete first version is better than none; otherwise the last good one stays.
-        self._offered.add(sha256)
-        self.fetched.append(wanted)
-        return None
+            self._not_before_s[sha256] = self._clock_s() + _ASK_EVERY_S
+            is_untrusted = isinstance(error, UntrustedError)
+            self._refuse(wanted, str(error), is_untrusted)
+            return self._running is None and not is_untrusted
+        return True
 
     def _learn_frame(self) -> None:
         """Update the building's frame: a site may be realigned while its version stays. On an error the frame stays."""
@@ -210,24 +208,24 @@ class ServerSync:
                 link.changed_version(change)
 
     def _adopt(self, wanted: WantedVersion) -> None:
-        self._running = wanted
-        self._last_ack = (wanted.version, "")
+        self._running, fault = wanted, ""
         try:
             self.client.activate(self.client.manifest(wanted), wanted)
         except FleetmapError as error:
             # It runs from memory and from the cache, but is incomplete at the next start.
-            self._last_ack = (wanted.version, str(error))
-            _log.warning("version %s runs but is not kept: %s", wanted.version, error)
-        self._acknowledge()
+            fault = str(error)
+            _log.warning("version %s runs but is not kept: %s", wanted.version, fault)
+        self._acknowledge(fault)
 
     def _refuse(self, wanted: WantedVersion, reason: str, is_untrusted: bool = False) -> None:
         """is_untrusted: the reason begins with the kind of attack, and is reported to the server unchanged."""
         _log.warning("version %s is refused: %s", wanted.version, reason)
-        running = None if self._running is None else self._running.version
-        self._last_ack = (running, reason if is_untrusted else f"version {wanted.version}: {reason}")
-        self._acknowledge()
+        self._acknowledge(reason if is_untrusted else f"version {wanted.version}: {reason}")
 
-    def _acknowledge(self) -> None:
+    def _acknowledge(self, refused: str | None) -> None:
+        """Report the running version, and why it is not the wanted one; None: as the last time."""
+        if refused is not None:
+            self._last_ack = (None if self._running is None else self._running.version, refused)
         if self._last_ack is not None:
             try:
                 self.client.ack(self._last_ack[0], stamp_ns=self._wall_ns(), refused=self._last_ack[1])

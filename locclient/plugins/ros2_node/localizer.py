@@ -80,7 +80,14 @@ class Transition:
     goal: LifecycleState
     success_id: int
 
+    @property
+    def steps(self) -> tuple["Step", "Step"]:
+        """Return those into the transition state, and out of it."""
+        into = (self.id, self.label, self.start, self.through)
+        return into, (self.success_id, "transition_success", self.through, self.goal)
 
+
+Step = tuple[int, str, LifecycleState, LifecycleState]  # number, label, start and goal
 _S = LifecycleState
 TRANSITIONS = (
     Transition(1, "configure", _S.UNCONFIGURED, _S.CONFIGURING, _S.INACTIVE, 10),
@@ -119,10 +126,8 @@ def encode_states() -> bytes:
 
 def encode_transitions(transitions: Sequence[Transition], *, with_success: bool = False) -> bytes:
     """Encode the response of lifecycle_msgs/srv/GetAvailableTransitions; with_success: include those out of transition states."""
-    steps = [(one.id, one.label, one.start, one.through) for one in transitions]
-    if with_success:
-        steps += [(one.success_id, "transition_success", one.through, one.goal) for one in transitions]
-    steps = list(dict.fromkeys(steps))
+    both = [[one.steps[number] for one in transitions] for number in range(1 + with_success)]
+    steps = dict.fromkeys(step for listed in both for step in listed)
     writer = CdrWriter().unsigned(len(steps))
     for step in steps:
         _put_step(writer, *step)
@@ -131,13 +136,7 @@ def encode_transitions(transitions: Sequence[Transition], *, with_success: bool 
 
 def encode_events(stamp_ns: int, transition: Transition) -> list[bytes]:
     """Encode two lifecycle_msgs/TransitionEvent: into the transition state, and out of it."""
-    return [
-        _put_step(CdrWriter().long_unsigned(stamp_ns), *step).message()
-        for step in (
-            (transition.id, transition.label, transition.start, transition.through),
-            (transition.success_id, "transition_success", transition.through, transition.goal),
-        )
-    ]
+    return [_put_step(CdrWriter().long_unsigned(stamp_ns), *step).message() for step in transition.steps]
 
 
 def _put_state(writer: CdrWriter, state: LifecycleState) -> CdrWriter:

@@ -1,4 +1,4 @@
-"""Poses that the tracker carries along with the odometry."""
+"""Poses that the tracker carries along with the odometry, which places compete, and a prior against places that a robot finds later."""
 
 from typing import cast
 
@@ -11,11 +11,14 @@ from fleetmap.odometry import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.rectification import MountedCamera, StereoCamera
+from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.held_maps import HeldMaps
+from locclient.localization.hypothesis_set import HypothesisSet
 from locclient.localization.place import Place
 from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
 from locclient.localization.pose_tracker import PoseTracker
-from locclient.localization.settings import LocalizerSettings
+from locclient.localization.priors.prior import Prior
+from locclient.localization.settings import LocalizerSettings, TrackSettings
 
 STEP = se3(so3_exp(np.array([0.0, 0.0, 0.1])), np.array([0.07, 0.0, 0.0]))
 
@@ -67,3 +70,94 @@ def test_frames_of_a_single_or_depth_camera_count_beside_a_pair_by_their_bearing
             motion = se3_inverse(mounted[kept].body_from_cam) @ mounted[queried].body_from_cam
             np.testing.assert_allclose(each.cam_from_query, motion, atol=1e-12)
     assert np.isfinite(seen.pixels[0, 2])
+
+
+SETTINGS = TrackSettings()
+
+
+def hypothesis(inliers: list[int], recall: list[float]) -> PoseHypothesis:
+    """A place with a fix of so many inliers in each query; 0: a query without one."""
+    made = PoseHypothesis(0, 0, *2 * [Place(np.eye(4), np.eye(6))])
+    for count, share in zip(inliers, recall, strict=True):
+        made.decay(SETTINGS.evidence_kept_share)
+        if count:
+            made.add_fix(count, share)
+    return made
+
+
+def competitors(hypotheses: list[PoseHypothesis]) -> list[PoseHypothesis]:
+    found = HypothesisSet(SETTINGS)
+    found.hypotheses = hypotheses
+    return found.ranking()[1]
+
+
+BEST = ([161, 217, 253], [0.29, 0.35, 0.42])
+
+
+@pytest.mark.parametrize(
+    ("inliers", "recall", "competes"),
+    [
+        ([150, 200, 240], [0.3, 0.3, 0.4], True),
+        # Seen: of a robot that turns into its aisle, the map of the next one shows more at first. It was the wrong one.
+        ([86, 86, 175], [0.08, 0.06, 0.38], True),
+        ([86, 86, 86], [0.08, 0.06, 0.08], False),
+        ([40, 50, 70], [0.3, 0.36, 0.41], True),
+        ([150, 200, 0], [0.3, 0.3, 0.0], False),
+        ([0, 0, 0], [0.0, 0.0, 0.0], False),
+    ],
+)
+def test_another_place_competes_in_the_mean_or_in_the_present_query(
+    inliers: list[int], recall: list[float], competes: bool
+) -> None:
+    best, other = hypothesis(*BEST), hypothesis(inliers, recall)
+    assert competitors([other, best]) == ([other] if competes else [])
+
+
+def test_a_place_that_is_seen_competes_with_the_best_that_is_not() -> None:
+    best, other = hypothesis([161, 217, 0], [0.29, 0.35, 0.0]), hypothesis([0, 0, 60], [0.0, 0.0, 0.1])
+    assert competitors([other, best]) == [other]
+
+
+BASE_FROM_BODY = se3(so3_exp(np.array([0.0, 0.0, 1.5])), np.array([0.4, 0.0, 0.2]))
+DRIVEN = se3(so3_exp(np.array([0.0, 0.0, 0.05])), np.array([0.5, 0.0, 0.0]))
+
+
+class Ride:
+    """A robot with a prior where it was, which drives on."""
+
+    def __init__(self, sigma_m: float) -> None:
+        self.map_from_body = se3(so3_exp(np.array([0.0, 0.0, 0.7])), np.array([20.0, 8.0, 0.3]))
+        map_from_base = self.map_from_body @ np.linalg.inv(BASE_FROM_BODY)
+        covariance = np.diag([np.inf] * 3 + [sigma_m**2, sigma_m**2, np.inf])
+        self.frame, given = 0, PositionPrior(0, map_from_base, covariance)
+        self.prior = Prior.given(given, odometry(self.frame), BASE_FROM_BODY, SETTINGS)
+
+    def drive(self, steps: int) -> None:
+        for _ in range(steps):
+            self.frame += 1
+            self.map_from_body = self.map_from_body @ DRIVEN
+            for hypothesis in self.prior.tracked():
+                age = self.frame - hypothesis.frame_index
+                motion = Motion(np.linalg.matrix_power(DRIVEN, age), 1e-8 * np.eye(6), is_last=age > 5)
+                hypothesis.propagate({hypothesis.frame_index: motion}, odometry(self.frame), DRIVEN, SETTINGS)
+            self.prior.travelled_m += float(np.linalg.norm(DRIVEN[:3, 3]))
+
+    def place(self, turned_rad: float = 0.0) -> Place:
+        placed = self.map_from_body.copy()
+        placed[:3, :3] = so3_exp(np.array([0.0, 0.0, turned_rad])) @ placed[:3, :3]
+        return Place(placed, np.diag([0.002**2] * 3 + [0.01**2] * 3))
+
+
+def test_a_place_that_is_right_but_turned_round_does_not_lead_back() -> None:
+    ride = Ride(0.3)
+    ride.drive(12)
+    assert ride.prior.is_compatible(ride.place())
+    assert not ride.prior.is_compatible(ride.place(turned_rad=np.pi))
+
+
+def test_what_is_near_grows_with_the_way() -> None:
+    ride = Ride(0.5)
+    positions = ride.map_from_body[:3, 3] + np.array([[0.0, 0.0, 0.0], [0.0, 7.0, 0.0], [0.0, 30.0, 0.0]])
+    assert ride.prior.is_near(positions).tolist() == [True, False, False]
+    ride.drive(8)
+    assert ride.prior.is_near(positions).tolist() == [True, True, False]

@@ -1,4 +1,4 @@
-"""Tiles around the robot are in memory, the others on the disk; bad ones are left out with their reasons."""
+"""Tiles around the robot are in memory, the others on the disk; bad ones are left out with their reasons, and so are damaged stores."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleetmap.errors import FleetmapError
+from fleetmap.errors import FleetmapError, StoreError
 from fleetmap.mapformat import blob_path
 from fleetmap.messages import Status, WantedVersion
 from locclient.maps.loaded_map import PositionBound, PositionBoundTracker, TileSelectionSettings
@@ -120,3 +120,19 @@ def test_bad_tiles_are_left_out(row: tuple[Path, MapStore]) -> None:
     foreign = WantedVersion(site="else", version=1, manifest_sha256=wanted.manifest_sha256)
     with pytest.raises(FleetmapError, match="manifest is of row version 1"):
         TileLoader(LocalMapSource(folder, "else"), SETTINGS).load(foreign, PositionBound())
+
+
+def test_a_folder_without_sites_is_no_store(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="not a map store"):
+        LocalMapSource(tmp_path, "lab")
+
+
+def test_a_damaged_current_file_is_told(tmp_path: Path) -> None:
+    (tmp_path / "sites" / "lab").mkdir(parents=True)
+    source = LocalMapSource(tmp_path, "lab")
+    assert source.wanted().manifest_sha256 is None
+    (tmp_path / "sites" / "lab" / "current").write_bytes(b"\xff\xfe nonsense")
+    with pytest.raises(StoreError, match="repair"):
+        source.wanted()
+    with pytest.raises(StoreError, match="incomplete"):
+        source.blob("0" * 64)

@@ -1,4 +1,5 @@
-"""Every ROS 2 message that the project writes is read by rosbags, an independent library, with the values that went in."""
+"""Every ROS 2 message that the project writes is read by rosbags, an independent library, with the values that went in; keys and
+attachments are those of ROS 2's own middleware."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -6,7 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
+from zenoh.ext import Int64, z_deserialize
 
+from fleetmap.errors import UsageError
 from fleetmap.geometry import quat_wxyz_from_rotation, se3, so3_exp
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.recordings.images import grey_image, png_image
@@ -20,6 +23,7 @@ from locclient.plugins.ros2_node.keys import (
     NodeName,
     Qos,
     RmwZenohKeys,
+    attachment,
     service_definitions,
     type_hash,
 )
@@ -234,3 +238,27 @@ def test_tokens_are_those_of_rmw_zenoh_and_of_the_bridge() -> None:
     service = Endpoint("SS", "/n/get_state", "lifecycle_msgs/srv/GetState", 1)
     assert bridge.token(talker, service) == "@/8b20/@ros2_lv/SS/n§get_state/lifecycle_msgs§srv§GetState"
     assert bridge.key("/n/get_state", "lifecycle_msgs/srv/GetState") == "n/get_state"
+
+
+def test_keys_name_domain_topic_and_type() -> None:
+    key = RmwZenohKeys(3).key("/robot/imu0", "sensor_msgs/Imu")
+    assert key.startswith("3/robot/imu0/sensor_msgs::msg::dds_::Imu_/RIHS01_7d9a00ff")
+    assert RmwZenohKeys(0).type_of(key) == "sensor_msgs/Imu"
+    assert RmwZenohKeys(3).subscription("/robot/imu0") == "3/robot/imu0/*/*"
+    assert RmwZenohKeys(0).type_of("3/robot/imu0/nonsense/x") == ""
+    assert RmwZenohKeys(0).type_of("short") == ""
+
+
+@pytest.mark.parametrize("topic", ["", "/", "/a b", "a//b", "/a/*", "/0a"])
+def test_what_is_no_topic_is_refused(topic: str) -> None:
+    with pytest.raises(UsageError, match="topic"):
+        RmwZenohKeys(0).subscription(topic)
+
+
+def test_attachments_are_read_by_zenohs_own_deserializer() -> None:
+    data = attachment(7, 5_000_000_001, bytes(range(16)))
+    assert z_deserialize(tuple[Int64, Int64, bytes], __import__("zenoh").ZBytes(data)) == (
+        7,
+        5_000_000_001,
+        bytes(range(16)),
+    )
