@@ -119,7 +119,7 @@ def test_the_server_counts_what_a_robot_tells() -> None:
 def test_a_rig_says_which_of_its_views_are_in_use_and_why_others_are_not(
     views: tuple[Cause, ...], words: str | None
 ) -> None:
-    figures, seen = HealthFigures(), replace(estimate(0.0), views=views, view=len(views) - 1)
+    figures, seen = HealthFigures(), replace(estimate(0.0), view_causes=views, view=len(views) - 1)
     handle(figures, seen)
     assert taken(figures).get("views") == words
 
