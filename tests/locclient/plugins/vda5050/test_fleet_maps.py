@@ -14,7 +14,7 @@ import pytest
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StateError, UntrustedError, UsageError
 from fleetmap.messages import WantedVersion
 from locclient.maps.tile_cache import TileCache
-from locclient.plugins.vda5050 import version_download
+from locclient.plugins.vda5050 import fleet_maps
 from locclient.plugins.vda5050.fleet_maps import DuplicateMapError, FleetMaps, NoRoomError, Origins
 from mapserver.store import MapStore
 from support.storage.map_samples import publish_samples
@@ -182,7 +182,7 @@ def test_bodies_and_heads_without_end_and_servers_that_hang_up(tmp_path: Path, m
                 request.wfile.write(b"HTTP/1.1 100 Continue\r\n\r\n")
 
     with monkeypatch.context() as patch, web_server(endless_head) as http:
-        patch.setattr(version_download, "_STALL_S", 0.3)
+        patch.setattr(fleet_maps, "_STALL_S", 0.3)
         Robot(tmp_path, http).refuses(LinkError, "cannot be fetched", f"{http}/file")
     with web_server(endless) as http:
         Robot(tmp_path, http, max_bytes=1_000_000).refuses(NoRoomError, "more than 500000", f"{http}/file")
