@@ -1,6 +1,6 @@
 """Maps on the disk: content-addressed files and one database. All SQL is here."""
 
-from mapserver.store.audit import chain_faults as chain_faults
+from mapserver.store.database import chain_faults as chain_faults
 from mapserver.store.fleet_queries import CounterKey as CounterKey
 from mapserver.store.fleet_queries import FleetBatch as FleetBatch
 from mapserver.store.fleet_queries import tile_key as tile_key

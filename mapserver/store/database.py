@@ -1,5 +1,6 @@
 """The database of an open store: reading, write transactions, the log. Its SQL is the same in SQLite, here, and in those of plug-ins."""
 
+import hashlib
 import json
 import os
 import sqlite3
@@ -17,7 +18,6 @@ import sqlite_utils
 from fleetmap.errors import NewerFormatError, StoreError, UsageError
 from fleetmap.files import sync_path
 from mapserver.store import files
-from mapserver.store.audit import line_sha256
 from mapserver.store.rows import NOBODY, UNLIMITED, Actor, AuditLine
 from mapserver.store.schema import FORMAT, MIGRATIONS, TABLES, names
 
@@ -67,8 +67,52 @@ class Transaction:
         number, before = last or (0, "")
         texts = [text.replace("\0", NUL) for text in (site, kind, detail, *astuple(actor))]
         values = (number + 1, self._database.now_ns(), *texts[:3], version, *texts[3:])
-        row = dict(zip(AuditLine.__dataclass_fields__, (*values, line_sha256(before, values)), strict=True))
+        row = dict(zip(AuditLine.__dataclass_fields__, (*values, _line_sha256(before, values)), strict=True))
         self.insert("events", [row])
+
+
+def chain_faults(lines: Iterable[AuditLine]) -> list[str]:
+    """Return changed or missing lines, oldest first. A log rewritten completely from some line on shows no fault."""
+    faults: list[str] = []
+    before, number = "", 0
+    for line in lines:
+        if line.id != number + 1:
+            faults.append(f"lines {number + 1} to {line.id - 1} are missing")
+        if line.sha256 != _line_sha256(before, astuple(line)[:-1]):
+            faults.append(f"line {line.id} was changed, or follows a removed one")
+        before, number = line.sha256, line.id
+    return faults
+
+
+def _line_sha256(before: str, values: Sequence[object]) -> str:
+    """Return the hash of a line with these columns, all but the hash, after a line of hash `before` (empty for the first)."""
+    return hashlib.sha256(json.dumps([before, *values], separators=(",", ":")).encode()).hexdigest()
+
+
+class StoreFiles:
+    """Files in a store's folder that are the same for all of its servers: signed lists, enrolled robots. Here of the only server."""
+
+    def __init__(self, root: Path, database: "Database") -> None:
+        self._root, self._database = root, database
+
+    @contextmanager
+    def changing(self, folder: str) -> Iterator[Path]:
+        """Hold the lock of a folder for a change of its files below the yielded path: it is that of all servers, or of none."""
+        with self._database.locked(f"{folder}/lock"):
+            yield self._root
+
+    def share(self) -> None:
+        """Give the other servers what is here."""
+
+    def follow(self) -> None:
+        """Take what other servers changed."""
+
+    def connected(self, here: Sequence[str]) -> list[str]:
+        """Tell the other servers which certificates are connected to this one; return those of their connections.
+
+        To be called every five seconds; a server that does not is one without connections.
+        """
+        return []
 
 
 class Database(ABC):
@@ -147,6 +191,9 @@ class Database(ABC):
     def leads(self) -> bool:
         """True if this process is the one of all servers that does what one alone may do, until it ends or loses the database."""
         return True
+
+    def files(self, root: Path) -> StoreFiles:
+        return StoreFiles(root, self)
 
     def run(self, session: Any, sql: str, values: Values = ()) -> Any:
         """Return the cursor of a statement in a session."""
@@ -354,9 +401,8 @@ def _check_ours(connection: sqlite3.Connection, path: Path) -> int:
 
 
 def _migrate(connection: sqlite3.Connection) -> None:
-    MIGRATIONS.apply(
-        sqlite_utils.Database(connection, execute_plugins=False)
-    )  # the pending ones: another process may have run some
+    # The pending ones: another process may have run some
+    MIGRATIONS.apply(sqlite_utils.Database(connection, execute_plugins=False))
     connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
     connection.execute(f"PRAGMA user_version = {FORMAT}")
 

@@ -283,14 +283,9 @@ def name_failures(change: Transaction, site: str, areas: Areas) -> None:
 
 def keep_last_reports(change: Transaction, reports: LastReports) -> None:
     """Store the robots' last reports."""
-    rows = [
-        {
-            **{"site": site, "robot": robot, "version": version},
-            "last_seen_ns": ns,
-            "last_report": to_json(report).decode(),
-        }
-        for (site, robot), (version, ns, report) in reports.items()
-    ]
+    columns = ("site", "robot", "version", "last_seen_ns", "last_report")
+    values = [(*key, version, ns, to_json(report).decode()) for key, (version, ns, report) in reports.items()]
+    rows = [dict(zip(columns, row, strict=True)) for row in values]
     otherwise = """ON CONFLICT (site, robot) DO UPDATE SET version = coalesce(excluded.version, robots.version),
                    last_seen_ns = excluded.last_seen_ns, last_report = excluded.last_report"""
     change.insert("robots", rows, otherwise)

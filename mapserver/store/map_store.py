@@ -25,7 +25,6 @@ from fleetmap.errors import (
     BusyError,
     ChangedError,
     MapFormatError,
-    NewerFormatError,
     StateError,
     StoreError,
     UsageError,
@@ -63,7 +62,6 @@ from mapserver.store.queries import EXTRA_TABLES, StoreQueries
 from mapserver.store.release import Release
 from mapserver.store.rows import NOBODY, Actor, DraftContent, Retention, VerdictRow, VersionInfo
 from mapserver.store.schema import FORMAT
-from mapserver.store.shared_files import SHARED
 
 _USUAL_RETENTION = Retention()
 AREAS_BEFORE = "areas before"
@@ -113,8 +111,6 @@ class MapStore(StoreQueries):
                 make_own_file(file)
                 keep_reserve(path)
             return cls(path, clock_ns)
-        except NewerFormatError:
-            raise
         except (OSError, sqlite3.Error, StoreError) as error:
             if read_only:
                 return cls(path, clock_ns, read_only=True)
@@ -164,9 +160,7 @@ class MapStore(StoreQueries):
                 write_places(path, places)
         if places.database is not None:
             with cls.open(path, clock_ns=clock_ns) as store:
-                for folder in (folder for folder in SHARED if (path / folder).is_dir()):
-                    with store.files.changing(folder):
-                        pass
+                store.files.share()
             if file.is_file():
                 with disk_errors(f"{file} cannot be renamed", "rename it: nobody may use it any more"):
                     file.replace(path / "store-moved.sqlite3")
@@ -246,19 +240,11 @@ class MapStore(StoreQueries):
         """Insert a draft, whose bytes are on the disk but for the manifest. extras: addresses by kind in EXTRA_TABLES."""
         data = encode_manifest(manifest)
         draft = VersionInfo(
-            site=manifest.site,
-            version=manifest.version,
+            **upkeep.columns_of(manifest),
             state="draft",
-            parent=manifest.parent,
-            created=manifest.created,
             published_ns=None,
             manifest_sha256=self._blobs.put(data),
             manifest_bytes=len(data),
-            tiles=len(manifest.tiles),
-            tile_bytes=manifest.tile_bytes,
-            landmarks=manifest.landmarks,
-            vocabulary_sha256=manifest.vocabulary.sha256,
-            vocabulary_bytes=manifest.vocabulary.bytes,
             archive_sha256=archive_sha256,
             saved_ns=self.now_ns(),
             retired_ns=None,

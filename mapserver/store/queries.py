@@ -33,7 +33,6 @@ from mapserver.store.rows import (
     VerdictRow,
     VersionInfo,
 )
-from mapserver.store.shared_files import SharedFiles
 from mapserver.store.survey_pictures import SurveyPicture, pictures_of
 from mapserver.store.usage import DiskMeter, DiskSpace, StoreUsage, UsageMeter
 
@@ -55,7 +54,7 @@ class StoreQueries:
         self._blobs = Blobs(open_objects(places.content or root))
         self._database = open_database(root, places, clock_ns, create=create, read_only=read_only)
         self.fleet, self.operators = FleetQueries(self._database), OperatorQueries(self._database)
-        self.files = SharedFiles(root, self._database)
+        self.files = self._database.files(root)
         self.locked, self.leads, self.is_shared = self._database.locked, self._database.leads, self._database.is_shared
         self.audit_lines = self._database.audit_lines
         self.blob_size, self.blob_chunks, self.is_whole = self._blobs.size, self._blobs.chunks, self._blobs.is_whole

@@ -48,18 +48,8 @@ def _blobs_of_version(more: str = "") -> str:
     )
 
 
-_COMPACT = {
-    "version_blobs",
-    "grid_blobs",
-    "surfel_blobs",
-    "site_files",
-    "evidence",
-    "operators",
-    "sessions",
-    "tokens",
-    "robots",
-}
-_COMPACT |= {"tallies", "traces"}
+_COMPACT = {"version_blobs", "grid_blobs", "surfel_blobs", "site_files", "evidence", "operators", "sessions", "tokens"}
+_COMPACT |= {"robots", "tallies", "traces"}
 """Tables that lie in their key: small rows, always found by it."""
 
 TABLES = {

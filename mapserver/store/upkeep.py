@@ -3,6 +3,7 @@
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import Manifest, current_path, decode_manifest
@@ -95,6 +96,13 @@ def _planned(database: Database, rows: SiteReleases, retention: Retention) -> tu
     return surplus, sorted(version for version in gone if version not in needed)
 
 
+def columns_of(manifest: Manifest) -> dict[str, Any]:
+    """Return the columns of a version that follow from its manifest."""
+    names = ("site", "version", "parent", "created", "tile_bytes", "landmarks")
+    vocabulary = {"vocabulary_sha256": manifest.vocabulary.sha256, "vocabulary_bytes": manifest.vocabulary.bytes}
+    return {name: getattr(manifest, name) for name in names} | {"tiles": len(manifest.tiles)} | vocabulary
+
+
 def references(info: VersionInfo, manifest: Manifest) -> set[tuple[str, str]]:
     """Return kind and address of all bytes of a version."""
     found = {("manifest", info.manifest_sha256), ("vocabulary", manifest.vocabulary.sha256)}
@@ -151,10 +159,8 @@ def _version_faults(database: Database, blobs: Blobs, info: VersionInfo, sound: 
     rows = database.query(query, (info.site, info.version))
     if {(row["kind"], row["sha256"]) for row in rows} != references(info, manifest):
         faults.append(f"{name}: the database and its manifest reference different bytes")
-    names = ("site", "version", "parent", "tile_bytes", "landmarks")
-    stored = (*(getattr(info, name) for name in names), info.tiles, info.vocabulary_sha256)
-    made = (*(getattr(manifest, name) for name in names), len(manifest.tiles), manifest.vocabulary.sha256)
-    if stored != made:
+    made = columns_of(manifest)
+    if (stored := {column: getattr(info, column) for column in made}) != made:
         faults.append(f"{name}: the database says {stored}, its manifest {made}")
     wrong = [tile for tile in manifest.tiles if sound.get(tile.sha256, tile.bytes) != tile.bytes]
     return faults + [f"{name}: tile {tile.x},{tile.y} has another size than in its manifest" for tile in wrong]

@@ -22,6 +22,7 @@ from pg8000 import dbapi
 from pg8000.dbapi import DatabaseError, Error, InterfaceError
 
 from fleetmap.errors import NewerFormatError, StoreError, UnknownOutcomeError, UsageError
+from mapserver.plugins.remote_stores.shared_files import SharedFiles
 from mapserver.store.database import NUL, ROWS_AT_ONCE, Database, SqliteDatabase, Values
 from mapserver.store.files import take_lock
 from mapserver.store.schema import FORMAT, TABLES, statements
@@ -124,6 +125,9 @@ class PostgresDatabase(Database):
             self._session = self._leading = None
             for _ in range(_READERS):
                 self._readers.put(None)
+
+    def files(self, root: Path) -> SharedFiles:
+        return SharedFiles(root, self)
 
     def run(self, session: Session, sql: str, values: Values = ()) -> Any:
         cursor = session.cursor()

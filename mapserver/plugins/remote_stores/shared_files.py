@@ -16,33 +16,27 @@ from fleetmap.encoding import to_json
 from fleetmap.errors import BusyError, disk_errors
 from fleetmap.files import write_atomically
 from fleetmap.mapformat import sha256_hex
-from mapserver.store.database import Database, Transaction
+from mapserver.store.database import Database, StoreFiles, Transaction
 from mapserver.store.files import is_plain_file, make_folder
 
-SHARED = {"trust": "*.json", "keys": "robots.json"}
+_SHARED = {"trust": "*.json", "keys": "robots.json"}
 """By folder, what its files are called."""
 _LATE = ("1.root.json", "timestamp.json")  # they announce the others
 _CONNECTIONS = "connections"  # under each server's own name
 _PRESENT_NS = 12_000_000_000  # two of its turns; then the server is gone
 
 
-class SharedFiles:
-    """Files of a store's folder. With its database there, too, nothing is copied. Raises StoreError if disk or database refuse."""
+class SharedFiles(StoreFiles):
+    """Files that are copied to and from the database. Raises StoreError if disk or database refuse."""
 
     def __init__(self, root: Path, database: Database) -> None:
-        self._root, self._database = root, database
+        super().__init__(root, database)
         self._server = f"{_CONNECTIONS}/{secrets.token_hex(8)}"
 
     @contextmanager
     def changing(self, folder: str) -> Iterator[Path]:
-        """Hold the lock of a folder for a change of its files below the yielded path.
-
-        With several servers the change is that of all of them, or of none: robots see nothing of it before the database has it.
-        """
-        with self._database.locked(f"{folder}/lock"):
-            if not self._database.is_shared:
-                yield self._root
-                return
+        """As of `StoreFiles`: robots see nothing of the change before the database has it."""
+        with super().changing(folder):
             self._take(folder)
             with TemporaryDirectory() as draft:
                 make_folder(Path(draft) / folder)
@@ -57,20 +51,18 @@ class SharedFiles:
                         _keep(change, f"{folder}/{name}", (Path(draft) / folder / name).read_bytes())
             self._take(folder)
 
+    def share(self) -> None:
+        for folder in (folder for folder in _SHARED if (self._root / folder).is_dir()):
+            with self.changing(folder):
+                pass
+
     def follow(self) -> None:
-        """Take what other servers changed."""
-        for folder in SHARED if self._database.is_shared else ():
+        for folder in _SHARED:
             if self._differing(folder):
                 with suppress(BusyError), self._database.locked(f"{folder}/lock", waits=False):
                     self._take(folder)
 
     def connected(self, here: Sequence[str]) -> list[str]:
-        """Tell the other servers which certificates are connected to this one; return those of their connections.
-
-        To be called every five seconds; a server that does not is one without connections.
-        """
-        if not self._database.is_shared:
-            return []
         now_ns, found, gone = self._database.now_ns(), list[str](), list[str]()
         query = "SELECT name, data FROM shared_files WHERE name LIKE ? AND name <> ?"
         for row in self._database.query(query, (f"{_CONNECTIONS}/%", self._server)):
@@ -105,7 +97,7 @@ class SharedFiles:
 
     def _hashes(self, root: Path, folder: str) -> dict[str, str]:
         with disk_errors(f"{root / folder} cannot be read", "check the folder"):
-            paths = [path for path in (root / folder).glob(SHARED[folder]) if is_plain_file(path)]
+            paths = [path for path in (root / folder).glob(_SHARED[folder]) if is_plain_file(path)]
             return {path.name: sha256_hex(path.read_bytes()) for path in paths if not path.name.startswith(".")}
 
     def _there(self, folder: str) -> dict[str, str]:
