@@ -122,7 +122,7 @@ def settings_for(request: BuildRequest) -> SurveySettings:
     options = request.options
     if options.settings is not None:
         return options.settings
-    return survey_settings(options.config, options.use or sensor_set_of(request.recordings[0], options.reading.opening))
+    return survey_settings(options.config, options.use or sensor_set_of(request.recordings[0], options.opening))
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ from fleetmap.geometry import Array
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.calibration.estimator import Adjusted, adjust, prior_information
-from mapserver.calibration.parameters import COLUMNS, INDEX, RANGES, SHOWN, CalibrationParameter, RigAxes, corrected_rig
-from mapserver.calibration.problem import CalibrationData
+from mapserver.calibration.motion_rows import CalibrationData
+from mapserver.calibration.parameters import COLUMNS, INDEX, SHOWN, CalibrationParameter, RigAxes, corrected_rig
 
 P = CalibrationParameter
 _PAIR = {P.BASELINE, P.FOCAL_RATIO, P.PAIR_PITCH, P.PAIR_YAW, P.PAIR_ROLL, P.BASELINE_Y, P.BASELINE_Z}
@@ -38,7 +38,6 @@ class ParameterEstimate:
     name: CalibrationParameter
     estimate: float
     sigma: float
-    unit: str
     is_judged: bool
     reason: str = ""
 
@@ -87,24 +86,19 @@ def continued_from(before: Array, found: CalibrationEstimate) -> CalibrationEsti
     parameters = []
     for p in found.parameters:
         earlier = float(before[INDEX[p.name]]) if p.name in INDEX else 0.0
-        is_share = not p.unit
+        is_share = not p.name.unit
         total = (1.0 + earlier) * (1.0 + p.estimate) - 1.0 if is_share else earlier + p.estimate
         parameters.append(replace(p, estimate=total))
     return replace(found, parameters=tuple(parameters))
 
 
 def estimate_from(stretches: Sequence[CalibrationData]) -> CalibrationEstimate:
-    """Return the estimate from stretches of drives with one rig together."""
-    return combined([adjust(data) for data in stretches], stretches)
-
-
-def combined(adjusted: Sequence[Adjusted], stretches: Sequence[CalibrationData]) -> CalibrationEstimate:
-    """Return the sum of their information; the prior counts once."""
+    """Return the estimate from stretches of drives with one rig together: by the sum of their information; the prior counts once."""
+    adjusted = [adjust(data) for data in stretches]
     information = np.diag(prior_information())
     pull = np.zeros(len(COLUMNS))
     for each in adjusted:
-        own = each.information - np.diag(prior_information())
-        information += own
+        information += each.information - np.diag(prior_information())
         pull += each.information @ each.theta
     covariance: Array = np.asarray(np.linalg.inv(information), np.float64)
     theta = covariance @ pull
@@ -128,8 +122,7 @@ def combined(adjusted: Sequence[Adjusted], stretches: Sequence[CalibrationData])
 
 def _common_errors(stretches: Sequence[CalibrationData]) -> Array:
     """Return (C,) shifts of the parameters by an error common to all pixels or disparities: an angle, a share, a lever."""
-    data, errors = stretches[0], np.zeros(len(COLUMNS))
-    camera, bias_px = data.rectifier.camera, data.bias_px
+    camera, bias_px = stretches[0].rectifier.camera, stretches[0].bias_px
     disparities = np.concatenate([each.obs_pixels[:, 0] - each.obs_pixels[:, 2] for each in stretches])
     known = disparities[np.isfinite(disparities)]
     disparity_px = max(float(np.median(known)), 1.0) if len(known) else 1.0
@@ -148,8 +141,7 @@ def _common_errors(stretches: Sequence[CalibrationData]) -> Array:
         P.BASELINE_Y: bias_px / disparity_px,
         P.BASELINE_Z: bias_px / (disparity_px * beside),
     }
-    errors[[INDEX[p] for p in sizes]] = list(sizes.values())
-    return errors
+    return np.array([sizes.get(p, 0.0) for p in COLUMNS])
 
 
 def _noise(adjusted: Sequence[Adjusted]) -> list[tuple[CalibrationParameter, float, float]]:
@@ -165,7 +157,7 @@ def _noise(adjusted: Sequence[Adjusted]) -> list[tuple[CalibrationParameter, flo
             scale = float(weights @ [value for value, _ in pairs]) / total
             found.append((name, scale, scale * total**-0.5))
         else:
-            found.append((name, 1.0, RANGES[name].prior_sigma))
+            found.append((name, 1.0, name.prior_sigma))
     return found
 
 
@@ -173,31 +165,27 @@ def _judged(
     name: CalibrationParameter, estimate: float, sigma: float, keyframes: int, reason: str
 ) -> ParameterEstimate:
     """reason: the motion or sensor needed if the estimate is not accurate."""
-    limits = RANGES[name]
     is_long = keyframes >= MIN_KEYFRAMES
-    is_sharp = sigma <= min(limits.useful_sigma, _LARGEST_PRIOR_SHARE * limits.prior_sigma)
+    is_sharp = sigma <= min(name.useful_sigma, _LARGEST_PRIOR_SHARE * name.prior_sigma)
     short = f"too short: {keyframes} keyframes, {MIN_KEYFRAMES} are needed"
     lacking = [*([] if is_long else [short]), *([] if is_sharp else [reason])]
-    return ParameterEstimate(name, estimate, sigma, limits.unit, not lacking, "; ".join(lacking))
+    return ParameterEstimate(name, estimate, sigma, not lacking, "; ".join(lacking))
 
 
 def _reason(name: CalibrationParameter, *, has_pair: bool, has_imu: bool, has_wheels: bool) -> str:
-    if name in _PAIR and not has_pair:
-        return "there is one camera"
-    if name in _INERTIAL and not has_imu:
-        return "there is no IMU"
-    if name is P.WHEEL_SCALE and not has_wheels:
-        return "there is no wheel odometry"
-    if name is P.FOCAL and not has_imu:
-        return "without the turns of an IMU an error of the lens looks the same: record one"
-    if name is P.BASELINE and not (has_imu or has_wheels):
-        return "neither an IMU nor wheels measure metres: record one of them"
-    if name.startswith("camera position") and not (has_imu or has_wheels):
-        return "there is neither an IMU nor wheel odometry"
-    return _ADVICE[name]
+    has_metres = has_imu or has_wheels
+    lacks = {
+        "there is one camera": name in _PAIR and not has_pair,
+        "there is no IMU": name in _INERTIAL and not has_imu,
+        "there is no wheel odometry": name is P.WHEEL_SCALE and not has_wheels,
+        "without the turns of an IMU an error of the lens looks the same: record one": name is P.FOCAL and not has_imu,
+        "neither an IMU nor wheels measure metres: record one of them": name is P.BASELINE and not has_metres,
+        "there is neither an IMU nor wheel odometry": name.startswith("camera position") and not has_metres,
+    }
+    return next((words for words, is_lacking in lacks.items() if is_lacking), _ADVICE[name])
 
 
 def in_words(parameter: ParameterEstimate) -> tuple[str, str]:
     """A correction and its sigma, in per cent, degrees, milliseconds, millimetres or pixels."""
-    scale, unit, _ = SHOWN[parameter.unit]
+    scale, unit, _ = SHOWN[parameter.name.unit]
     return f"{parameter.estimate * scale:+.3f} {unit}", f"{parameter.sigma * scale:.3f} {unit}"

@@ -13,9 +13,8 @@ import numpy as np
 from fleetmap.geometry import Array, so3_exp
 from fleetmap.sensors.calibration import ImuNoise
 from mapserver.calibration.image_rows import Fixed, Measured, Observations, image_rows
-from mapserver.calibration.motion_rows import body_rates, inertial_edges, wheel_edges
-from mapserver.calibration.parameters import COLUMNS, INDEX, RANGES, UNKNOWNS, CalibrationParameter
-from mapserver.calibration.problem import CalibrationData, MotionState
+from mapserver.calibration.motion_rows import CalibrationData, MotionState, body_rates, inertial_edges, wheel_edges
+from mapserver.calibration.parameters import COLUMNS, INDEX, UNKNOWNS, CalibrationParameter
 from mapserver.survey.bundle.bundle_adjustment import solver_of
 from mapserver.survey.bundle.problem import (
     BundleProblem,
@@ -114,7 +113,7 @@ def adjust(data: CalibrationData) -> Adjusted:
 
 def prior_information() -> Array:
     """Return (C,) information of the calibration that came with the recording."""
-    return np.array([RANGES[p].prior_sigma ** -2 for p in COLUMNS])
+    return np.array([p.prior_sigma**-2 for p in COLUMNS])
 
 
 class Problem:
@@ -123,10 +122,8 @@ class Problem:
     def __init__(self, data: CalibrationData) -> None:
         self.data, self.seen = data, Observations.of(data)
         self.prior = np.concatenate([prior_information(), data.lens_sigmas**-2.0])
-        self.measured = (
-            np.zeros(UNKNOWNS),
-            self.seen.measured(np.zeros(UNKNOWNS)),
-        )  # the last theta, and its pixels
+        given = np.zeros(UNKNOWNS)
+        self.measured = given, self.seen.measured(given)  # the last theta, and its pixels
         self.slopes: Measured | None = None  # derivatives by the calibration
         # Weak priors fix the gauge.
         first = _FIRST_SIGMAS if data.is_inertial else 1e-3 * _FIRST_SIGMAS

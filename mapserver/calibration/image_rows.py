@@ -14,6 +14,7 @@ import numpy as np
 from fleetmap.geometry import Array, so3_exp
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import StereoCamera
+from mapserver.calibration.motion_rows import CalibrationData, MotionState
 from mapserver.calibration.parameters import (
     COLUMNS,
     DISTORTION,
@@ -24,7 +25,6 @@ from mapserver.calibration.parameters import (
     corrected_rig,
     right_camera,
 )
-from mapserver.calibration.problem import CalibrationData, MotionState
 from mapserver.survey.bundle.problem import ImageRows
 
 P = CalibrationParameter
@@ -137,10 +137,8 @@ class Observations:
     def measured_slopes(self, theta: Array) -> Measured:
         """Return derivatives of `measured` by central differences at a fixed scale of the pinholes; zero if absent."""
         pair, count = self.pair(theta), len(self.left_px)
-        slopes, left = (
-            Measured(np.zeros((count, 4, UNKNOWNS)), np.zeros((count, 2, 2, UNKNOWNS))),
-            self._left_by_raw(theta, pair),
-        )
+        slopes = Measured(np.zeros((count, 4, UNKNOWNS)), np.zeros((count, 2, 2, UNKNOWNS)))
+        left = self._left_by_raw(theta, pair)
         for column, size in _LENS_STEPS.items():
             step = size * (np.arange(UNKNOWNS) == column)
             if column in _LEFT_LENS:
@@ -201,9 +199,8 @@ def image_rows(
     view, pair, positions = _view(seen, data, state, theta), seen.pair(theta), state.map_from_body[:, :3, 3]
     is_ahead, is_seen = view.in_left[:, 2] > _MIN_DEPTH_M, np.isfinite(seen.row_sigmas)
     usable = is_ahead[:, None] & is_seen
-    off = np.where(usable, measured.rows - _predicted(view, pair), 0.0).reshape(
-        -1, 2, 2
-    )  # of the pixel, of the pair's difference
+    # of the pixel, of the pair's difference
+    off = np.where(usable, measured.rows - _predicted(view, pair), 0.0).reshape(-1, 2, 2)
     back = measured.as_given
     errors = np.einsum("mij,mkj->mki", back, off).reshape(-1, 4)
     factor = np.where(usable, 1.0 / (seen.row_sigmas * scales), 0.0)

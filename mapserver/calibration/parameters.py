@@ -6,6 +6,7 @@ that calibration: x along the baseline, y down, z ahead.
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Any, Self
 
 import numpy as np
 
@@ -15,28 +16,49 @@ from fleetmap.sensors.rectification import Rectifier
 
 
 class CalibrationParameter(StrEnum):
-    """Estimated parameters. Shares are true / given - 1."""
+    """Estimated parameters, by name. Shares are true / given - 1.
 
-    BASELINE = "baseline"
-    FOCAL = "focal length"
-    FOCAL_RATIO = "focal ratio"
-    PRINCIPAL_X = "principal point x"
-    PRINCIPAL_Y = "principal point y"
-    PAIR_PITCH = "pair pitch"
-    PAIR_YAW = "pair yaw"
-    PAIR_ROLL = "pair roll"
-    BASELINE_Y = "baseline direction y"
-    BASELINE_Z = "baseline direction z"
-    CAMERA_IMU_X = "camera to IMU x"
-    CAMERA_IMU_Y = "camera to IMU y"
-    CAMERA_IMU_Z = "camera to IMU z"
-    CAMERA_POSITION_X = "camera position x"
-    CAMERA_POSITION_Y = "camera position y"
-    CAMERA_POSITION_Z = "camera position z"
-    TIME_OFFSET = "time offset"
-    WHEEL_SCALE = "wheel scale"
-    GYRO_NOISE = "gyro noise"
-    ACCEL_NOISE = "accelerometer noise"
+    prior_sigma: of the error of a careless calibration. useful_sigma: above it an estimate is useless: the error that displaces a point at
+    3 m by about 1 cm, or the image by half a pixel. least_sigma: systematic error outside the adjustment. warn_above: error that costs
+    3 cm; fail_above: error of another rig. anew_above: a correction that changes the matches: the images are rectified and tracked again.
+    """
+
+    unit: str
+    prior_sigma: float
+    useful_sigma: float
+    least_sigma: float
+    warn_above: float
+    fail_above: float
+    anew_above: float
+
+    BASELINE = "baseline", "", 0.3, 0.01, 1.5e-3, 3e-3, 0.03, 0.02
+    FOCAL = "focal length", "", 0.3, 0.005, 7e-4, 3e-3, 0.03, 0.005
+    FOCAL_RATIO = "focal ratio", "", 0.05, 0.002, 2e-4, 1e-3, 0.03, 0.002
+    PRINCIPAL_X = "principal point x", "px", 40.0, 2.0, 1.5, 4.0, 30.0, 3.0
+    PRINCIPAL_Y = "principal point y", "px", 40.0, 2.0, 1.5, 4.0, 30.0, 3.0
+    PAIR_PITCH = "pair pitch", "rad", 0.03, 5e-4, 2.5e-4, 1e-3, 7e-3, 0.002
+    PAIR_YAW = "pair yaw", "rad", 0.03, 5e-4, 2.5e-4, 4e-4, 7e-3, 0.002
+    PAIR_ROLL = "pair roll", "rad", 0.03, 1e-3, 3e-4, 1.5e-3, 7e-3, 0.002
+    BASELINE_Y = "baseline direction y", "rad", 0.02, 5e-3, 5e-3, 0.02, 0.1
+    BASELINE_Z = "baseline direction z", "rad", 0.02, 5e-3, 5e-3, 0.02, 0.1
+    CAMERA_IMU_X = "camera to IMU x", "rad", 0.1, 3e-3, 1.5e-3, 5e-3, 0.1, 0.02
+    CAMERA_IMU_Y = "camera to IMU y", "rad", 0.1, 3e-3, 1.5e-3, 5e-3, 0.1, 0.02
+    CAMERA_IMU_Z = "camera to IMU z", "rad", 0.1, 3e-3, 1.5e-3, 5e-3, 0.1, 0.02
+    CAMERA_POSITION_X = "camera position x", "m", 0.03, 0.01, 0.01, 0.03, 0.3
+    CAMERA_POSITION_Y = "camera position y", "m", 0.03, 0.01, 0.01, 0.03, 0.3
+    CAMERA_POSITION_Z = "camera position z", "m", 0.03, 0.01, 0.01, 0.03, 0.3
+    TIME_OFFSET = "time offset", "s", 0.05, 2e-3, 5e-4, 2e-3, np.inf, 0.005
+    # Tyres wear and deform under load: half a per cent is the accuracy of a robot's odometry without calibration
+    WHEEL_SCALE = "wheel scale", "", 0.005, 0.005, 5e-3, 0.02
+    GYRO_NOISE = "gyro noise", "", 10.0, 0.5, 0.5, 20.0
+    ACCEL_NOISE = "accelerometer noise", "", 10.0, 0.5, 0.5, 20.0
+
+    def __new__(cls, name: str, *row: Any) -> Self:
+        """Make the member of a row; limits that it leaves out are infinite."""
+        member = str.__new__(cls, name)
+        member._value_ = name
+        vars(member).update(zip(cls.__annotations__, [*row, np.inf, np.inf], strict=False))
+        return member
 
 
 P = CalibrationParameter
@@ -49,20 +71,6 @@ DISTORTION = 4
 LENS_SIGMAS = np.array([1e-3, 1e-3, 5e-5, 5e-5] * 2 + [1e-3] * 2)
 UNKNOWNS = len(COLUMNS) + len(LENS_SIGMAS)
 INDEX: dict[CalibrationParameter, int] = {p: n for n, p in enumerate(COLUMNS)}
-
-
-@dataclass(frozen=True, slots=True)
-class ParameterRange:
-    """Unit; sigma of the error of a careless calibration; sigma above which an estimate is useless.
-
-    A limit is the error that displaces a point at 3 m by about 1 cm, or the image by half a pixel.
-    """
-
-    unit: str
-    prior_sigma: float
-    useful_sigma: float
-
-
 # By unit: factor to the displayed unit, and number of digits
 SHOWN = {
     "": (100.0, "%", 2),
@@ -70,29 +78,6 @@ SHOWN = {
     "s": (1e3, "ms", 1),
     "m": (1e3, "mm", 0),
     "px": (1.0, "px", 2),
-}
-RANGES: dict[CalibrationParameter, ParameterRange] = {
-    P.BASELINE: ParameterRange("", 0.3, 0.01),
-    P.FOCAL: ParameterRange("", 0.3, 0.005),
-    P.FOCAL_RATIO: ParameterRange("", 0.05, 0.002),
-    P.PRINCIPAL_X: ParameterRange("px", 40.0, 2.0),
-    P.PRINCIPAL_Y: ParameterRange("px", 40.0, 2.0),
-    P.PAIR_PITCH: ParameterRange("rad", 0.03, 5e-4),
-    P.PAIR_YAW: ParameterRange("rad", 0.03, 5e-4),
-    P.PAIR_ROLL: ParameterRange("rad", 0.03, 1e-3),
-    P.BASELINE_Y: ParameterRange("rad", 0.02, 5e-3),
-    P.BASELINE_Z: ParameterRange("rad", 0.02, 5e-3),
-    P.CAMERA_IMU_X: ParameterRange("rad", 0.1, 3e-3),
-    P.CAMERA_IMU_Y: ParameterRange("rad", 0.1, 3e-3),
-    P.CAMERA_IMU_Z: ParameterRange("rad", 0.1, 3e-3),
-    P.CAMERA_POSITION_X: ParameterRange("m", 0.03, 0.01),
-    P.CAMERA_POSITION_Y: ParameterRange("m", 0.03, 0.01),
-    P.CAMERA_POSITION_Z: ParameterRange("m", 0.03, 0.01),
-    P.TIME_OFFSET: ParameterRange("s", 0.05, 2e-3),
-    # Tyres wear and deform under load: half a per cent is the accuracy of a robot's odometry without calibration
-    P.WHEEL_SCALE: ParameterRange("", 0.005, 0.005),
-    P.GYRO_NOISE: ParameterRange("", 10.0, 0.5),
-    P.ACCEL_NOISE: ParameterRange("", 10.0, 0.5),
 }
 
 

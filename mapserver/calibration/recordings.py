@@ -17,31 +17,19 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, SensorSet, Stamps, WheelSample
 from mapserver.calibration.estimate import CalibrationEstimate, continued_from, estimate_from
-from mapserver.calibration.parameters import COLUMNS, INDEX, CalibrationParameter, RigAxes, corrected_rig
-from mapserver.calibration.problem import CalibrationData, MotionState
+from mapserver.calibration.motion_rows import CalibrationData, MotionState
+from mapserver.calibration.parameters import COLUMNS, CalibrationParameter, RigAxes, corrected_rig
 from mapserver.survey.odometry_pass import parts_between_lifts
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import begin_survey
 from mapserver.survey.state import Keyframe, SurveyState
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyInputs, SurveyTools
 
-P = CalibrationParameter
 IsEnough = Callable[[CalibrationEstimate, Sequence[CalibrationParameter]], bool]
 Follow = Callable[[Recording, RigCalibration], CalibrationData]
 LONGEST_S = 30.0  # of a recording: its stretch with the most motion
 _FEATURES = 700  # of a keyframe: a calibration needs fewer than a map
 _PASSES = 3
-# A correction above this changes the matches: the images are rectified and tracked again.
-_ANEW = {
-    P.FOCAL: 0.005,
-    P.FOCAL_RATIO: 0.002,
-    P.PRINCIPAL_X: 3.0,
-    P.PRINCIPAL_Y: 3.0,
-    P.TIME_OFFSET: 0.005,
-    P.BASELINE: 0.02,
-}
-_ANEW |= dict.fromkeys((P.PAIR_PITCH, P.PAIR_YAW, P.PAIR_ROLL), 0.002)
-_ANEW |= dict.fromkeys((P.CAMERA_IMU_X, P.CAMERA_IMU_Y, P.CAMERA_IMU_Z), 0.02)
 
 
 def estimate_calibration(
@@ -67,11 +55,8 @@ def estimate_calibration(
                 "calibration that both have with --calibration FILE"
             )
     if follow is None:
-        fewer, tools = (
-            structs.replace(settings, orb=structs.replace(settings.orb, count=_FEATURES)),
-            tools or SurveyTools(),
-        )
-        follow = partial(followed, settings=fewer, tools=tools)
+        fewer = structs.replace(settings, orb=structs.replace(settings.orb, count=_FEATURES))
+        follow = partial(followed, settings=fewer, tools=tools or SurveyTools())
     estimate, before = None, np.zeros(len(COLUMNS))
     for _ in range(_PASSES):
         axes = RigAxes.of(rig, Rectifier(rig))
@@ -79,7 +64,7 @@ def estimate_calibration(
         found = estimate_from([follow(each, current) for each in recordings])
         estimate = continued_from(before, found)
         after = estimate.corrections()
-        moved = [p for p, limit in _ANEW.items() if abs(after[INDEX[p]] - before[INDEX[p]]) > limit]
+        moved = [p for p, change in zip(COLUMNS, after - before, strict=True) if abs(change) > p.anew_above]
         if not moved or is_enough(estimate, moved):
             break
         before = after

@@ -13,7 +13,7 @@ from fleetmap.errors import BusyError, FleetmapError, UsageError, disk_errors
 from mapserver.commands.options import SurveyOptions, check_output
 
 if TYPE_CHECKING:
-    from mapserver.drafting.trajectory import OtherTrajectory
+    from mapserver.drafting.survey_recordings import StartPoses
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,11 +79,12 @@ def build(
     typer.echo(built.sentence)
 
 
-def _other_trajectory(file: Path | None, frame: str | None, scale: float | None) -> "OtherTrajectory | None":
-    from mapserver.drafting.trajectory import OtherTrajectory
+def _other_trajectory(file: Path | None, frame: str | None, scale: float | None) -> "StartPoses | None":
+    from fleetmap.hooks import plugin
 
     if file is not None:
-        return OtherTrajectory(file, frame or "camera", scale)
+        opened: StartPoses = plugin("mapserver.poses", "trajectory", "--trajectory")(file, frame or "camera", scale)
+        return opened
     for option, value in (("--trajectory-frame", frame), ("--trajectory-scale", scale)):
         if value is not None:
             raise UsageError(f"{option} describes --trajectory FILE, which is missing; add it")

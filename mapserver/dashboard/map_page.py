@@ -1,7 +1,7 @@
 """The page of maps: what runs where (versions with state, the gate's word and robots), and what another version would change."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
@@ -11,7 +11,7 @@ from mapserver.dashboard.data import EVER, MapData
 from mapserver.dashboard.map_layers import Layer, Outline, Picture, box_of, heat, squares
 from mapserver.dashboard.plan import Plan
 from mapserver.dashboard.rendering import begun, share, size
-from mapserver.drafting.area_corrections import waiting
+from mapserver.drafting.area_corrections import AreaCorrections
 from mapserver.floor_plan.alignment import Alignment
 from mapserver.floor_plan.areas import Area, Areas
 from mapserver.floor_plan.survey_requests import courses
@@ -121,10 +121,12 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     }
 
 
-def _waiting(maps: MapData, site: str) -> list[Area]:
+def _waiting(maps: MapData, site: str) -> Sequence[Area]:
     """The areas to be learned anew that the current version has not forgotten yet."""
     current = maps.current_version(site)
-    return [] if current is None else waiting(maps.store.areas(site), maps.store.manifest(site, current))
+    if current is None:
+        return []
+    return AreaCorrections.of(maps.store.areas(site), maps.store.manifest(site, current)).due
 
 
 def _used(services: Services, rows: SiteReleases) -> str:

@@ -6,6 +6,7 @@ the specific force, rotated by the images, is that change in true metres, plus g
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -58,13 +59,12 @@ def fit_accelerometer(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: floa
     windows = _windows(turns, imu, imu_minus_cam_s)
     if len(windows) < _MIN_WINDOWS:
         return []
-    runs = np.array([window.run for window in windows])
-    changes, forces, biases = (np.array([getattr(w, name) for w in windows]) for name in ("change", "force", "bias"))
+    changes, forces, biases, runs, spans_s = (np.array(column) for column in zip(*windows, strict=True))
     # metres, bias, gravity in the axes at the start of each run of frames
     design = np.zeros((len(windows), 3, 7 + 3 * int(runs.max())))
     design[:, :, 0], design[:, :, 1:4] = changes, biases
     for axis in range(3):
-        design[np.arange(len(windows)), axis, 4 + 3 * runs + axis] = [window.span_s for window in windows]
+        design[np.arange(len(windows)), axis, 4 + 3 * runs + axis] = spans_s
     held = np.zeros((3, design.shape[2]))
     held[:, 1:4] = np.eye(3) * _NOISE_MPS / _BIAS_SIGMA_MPS2
     fits: list[AxesFit] = []
@@ -113,8 +113,7 @@ def accelerometer_axes(fits: list[AxesFit], base_from_body: Array | None) -> Fin
     return Finding(NAME, Verdict.FAIL, None, limit, words)
 
 
-@dataclass(frozen=True, slots=True)
-class _Window:
+class _Window(NamedTuple):
     """One change of velocity: by the images (3,); by the specific force, (3, 3, 3) to be summed with body_from_accel over the last two;
     the effect of a bias on that (3, 3); run: number of the run of frames; span_s: factor of gravity in it."""
 
@@ -157,12 +156,8 @@ def _windows(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> lis
             weights = np.minimum((t - t0) / (t1 - t0), (t2 - t) / (t2 - t1))
             weights *= 0.5 * (t2 - t0) / weights.sum()
             number = np.clip(np.searchsorted(at_s, t) - 1, 0, end - first - 1)
-            turned = np.array(
-                [
-                    rotations[n] @ so3_exp(turns.rates_body_radps[first + n] * (s - at_s[n]))
-                    for n, s in zip(number, t, strict=True)
-                ]
-            )
+            vectors = turns.rates_body_radps[first + number] * (t - at_s[number])[:, None]
+            turned = np.array([rotations[n] @ so3_exp(vector) for n, vector in zip(number, vectors, strict=True)])
             weighted = weights[:, None, None] * turned
             force = np.einsum("iab,ic->abc", weighted, imu.accel_mps2[inside])
             change = (p2 - p1) / (t2 - t1) - (p1 - p0) / (t1 - t0)

@@ -17,7 +17,7 @@ from fleetmap.recordings import Recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate, estimate_calibration
-from mapserver.calibration.parameters import RANGES, SHOWN
+from mapserver.calibration.parameters import COLUMNS, SHOWN
 from mapserver.calibration.recordings import Follow, busiest_frames
 from mapserver.doctor.findings import Finding, Verdict, not_judged
 from mapserver.doctor.sensors import SPARSE_S, median_period_s
@@ -30,42 +30,8 @@ SURE_SIGMAS = 3.0
 _LONGER = "record a longer drive, with turns, starts and stops"
 
 
-@dataclass(frozen=True, slots=True)
-class Tolerance:
-    """Of one parameter: systematic sigma, error that costs 3 cm, error of another rig; True if a build may correct it."""
-
-    least_sigma: float
-    warn_above: float
-    fail_above: float = np.inf
-    correctable: bool = True
-
-
-_PIXELS = Tolerance(1.5, 4.0, 30.0)
-_ANGLE = Tolerance(1.5e-3, 5e-3, 0.1)
-_PLACE = Tolerance(0.01, 0.03, 0.3, correctable=False)
-_NOISE = Tolerance(0.5, 20.0, correctable=False)
-TOLERANCES = {
-    P.BASELINE: Tolerance(1.5e-3, 3e-3, 0.03),
-    P.FOCAL: Tolerance(7e-4, 3e-3, 0.03),
-    P.FOCAL_RATIO: Tolerance(2e-4, 1e-3, 0.03),
-    P.PRINCIPAL_X: _PIXELS,
-    P.PRINCIPAL_Y: _PIXELS,
-    P.PAIR_PITCH: Tolerance(2.5e-4, 1e-3, 7e-3),
-    P.PAIR_YAW: Tolerance(2.5e-4, 4e-4, 7e-3),
-    P.PAIR_ROLL: Tolerance(3e-4, 1.5e-3, 7e-3),
-    P.BASELINE_Y: Tolerance(5e-3, 0.02, 0.1),
-    P.BASELINE_Z: Tolerance(5e-3, 0.02, 0.1),
-    P.CAMERA_IMU_X: _ANGLE,
-    P.CAMERA_IMU_Y: _ANGLE,
-    P.CAMERA_IMU_Z: _ANGLE,
-    P.CAMERA_POSITION_X: _PLACE,
-    P.CAMERA_POSITION_Y: _PLACE,
-    P.CAMERA_POSITION_Z: _PLACE,
-    P.TIME_OFFSET: Tolerance(5e-4, 2e-3),
-    P.WHEEL_SCALE: Tolerance(5e-3, 0.02, correctable=False),
-    P.GYRO_NOISE: _NOISE,
-    P.ACCEL_NOISE: _NOISE,
-}
+# Those that a build does not correct: a drive shows them worse than a ruler, or they belong to no camera.
+_KEPT = {P.CAMERA_POSITION_X, P.CAMERA_POSITION_Y, P.CAMERA_POSITION_Z, P.WHEEL_SCALE, P.GYRO_NOISE, P.ACCEL_NOISE}
 # Directions in which a shift of the principal point resembles a rotation against the IMU.
 _SAME_BEARING = {P.CAMERA_IMU_X: (P.PRINCIPAL_Y, 1.0), P.CAMERA_IMU_Y: (P.PRINCIPAL_X, -1.0)}
 
@@ -80,7 +46,7 @@ class MeasuredCalibration:
     def wrong(self) -> list[CalibrationParameter]:
         """Parameters whose error certainly exceeds its tolerance and is known accurately: those a build may correct."""
         bad = {f.name for f in self.findings if f.verdict is Verdict.WARN and not f.missing}
-        return [p for p in TOLERANCES if p.value in bad and TOLERANCES[p].correctable]
+        return [p for p in P if p.value in bad and p not in _KEPT]
 
 
 def followed_frames(recording: Recording) -> int:
@@ -137,7 +103,7 @@ def corrected(
 
 def in_words(name: str, value: float) -> str:
     """Return a correction as text, such as `-4.65 %`."""
-    factor, shown, digits = SHOWN[RANGES[P(name)].unit]
+    factor, shown, digits = SHOWN[P(name).unit]
     return f"{factor * value:+.{digits}f} {shown}"
 
 
@@ -147,24 +113,24 @@ def unknown_calibration(reason: str, missing: str) -> MeasuredCalibration:
 
 
 def _finding(parameter: ParameterEstimate, estimate: CalibrationEstimate, focal_px: float) -> Finding:
-    name, tolerance = parameter.name, TOLERANCES[parameter.name]
-    factor, unit, digits = SHOWN[parameter.unit]
+    name = parameter.name
+    factor, unit, digits = SHOWN[name.unit]
     value, own_sigma = _net(parameter, estimate, focal_px)
-    sigma_all = float(np.hypot(own_sigma, tolerance.least_sigma))
+    sigma_all = float(np.hypot(own_sigma, name.least_sigma))
     sure = max(abs(value) - SURE_SIGMAS * sigma_all, 0.0)
-    is_bad, is_coarse = parameter.is_judged and sure > tolerance.warn_above, own_sigma > tolerance.warn_above
+    is_bad, is_coarse = parameter.is_judged and sure > name.warn_above, own_sigma > name.warn_above
     if not is_bad and (is_coarse or not parameter.is_judged):
         sigma = f"known to {factor * parameter.sigma:.{digits}f} {unit} only"
         return not_judged(name.value, sigma, parameter.reason or _LONGER)
-    verdict = Verdict.FAIL if sure > tolerance.fail_above else Verdict.WARN if is_bad else Verdict.OK
+    verdict = Verdict.FAIL if sure > name.fail_above else Verdict.WARN if is_bad else Verdict.OK
     words = f"{factor * value:+.{digits}f} {unit} from the calibration, sigma {factor * sigma_all:.{digits}f}"
-    if tolerance is _NOISE:
+    if name not in COLUMNS:
         words = f"{1 + value:.1f} times the data sheet, sigma {sigma_all:.1f}"
-    if not is_bad and abs(value) > tolerance.warn_above + sigma_all:  # large but uncertain: worth a warning
+    if not is_bad and abs(value) > name.warn_above + sigma_all:  # large but uncertain: worth a warning
         return replace(not_judged(name.value, f"{words}: that may be chance", _LONGER), value=value)
     if is_bad:
         words += "; calibrate again, or name the matching file with --calibration"
-    limits = f"warn {factor * tolerance.warn_above:g}, fail {factor * tolerance.fail_above:g} {unit} for sure"
+    limits = f"warn {factor * name.warn_above:g}, fail {factor * name.fail_above:g} {unit} for sure"
     return Finding(name.value, verdict, value, limits, words, _LONGER if is_bad and is_coarse else "")
 
 

@@ -62,14 +62,9 @@ def gyro_check(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> t
     fit = fit_gyro(turns, imu, imu_minus_cam_s)
     if fit.correlation < 0.6:
         words = f"the images' and the gyro's rates hardly agree (correlation {fit.correlation:.2f} at best)"
-        advice = "check that the IMU belongs to this camera and that both are stamped by one clock"
-        return (
-            [
-                Finding(AXES, Verdict.FAIL, fit.correlation, "fail below correlation 0.6", f"{words}; {advice}"),
-                *(not_judged(name, words, "check the gyro's axes first") for name in (OFFSET, SCALE)),
-            ],
-            None,
-        )
+        advice = f"{words}; check that the IMU belongs to this camera and that both are stamped by one clock"
+        axes = Finding(AXES, Verdict.FAIL, fit.correlation, "fail below correlation 0.6", advice)
+        return [axes, *(not_judged(name, words, "check the gyro's axes first") for name in (OFFSET, SCALE))], None
     return [_offset_finding(fit, imu_minus_cam_s), _scale_finding(fit), _axes_finding(fit)], fit
 
 

@@ -177,11 +177,10 @@ def _metres_finding(
         return Finding(METRES, Verdict.OK, value, _LIMIT, measured)
     shown = f"only {images.source} gives the scale: with it objects are {images.depth_m:.2g} m away in the median"
     shown += f" and the cameras move at {images.speed_mps:.2g} m/s" if images.speed_mps else ""
+    missing = "record an IMU, with starts, stops and turns, or wheel odometry"
     if has_imu:
-        return not_judged(
-            METRES, shown, "start, stop and turn more often, so that the IMU gives the scale, or record wheel odometry"
-        )
-    return not_judged(METRES, shown, "record an IMU, with starts, stops and turns, or wheel odometry")
+        missing = "start, stop and turn more often, so that the IMU gives the scale, or record wheel odometry"
+    return not_judged(METRES, shown, missing)
 
 
 _LEAST_MPS, _LEAST_RADPS = 0.1, 0.1  # below, a robot counts as at rest
@@ -194,8 +193,7 @@ def fit_wheels(
     turns: CameraTurns, wheel: Sequence[WheelSample], base_from_body: Array, imu_minus_cam_s: float
 ) -> WheelFit:
     """Fit the wheels to the images' motion in the same intervals; wheels are on the IMU's clock."""
-    seen: list[Array] = []
-    rolled: list[Array] = []
+    seen, rolled = list[Array](), list[Array]()
     stamps_s = (np.array([sample.stamp_ns for sample in wheel], np.int64) - wheel[0].stamp_ns) * 1e-9
     columns = np.array([[*sample.velocity_base_mps[:2], sample.yaw_rate_radps] for sample in wheel]).T
     spans_s = (np.stack([turns.starts_ns, turns.ends_ns], axis=1) - wheel[0].stamp_ns) * 1e-9 + imu_minus_cam_s
@@ -212,9 +210,8 @@ def fit_wheels(
     by_images, by_wheels = (np.array(each).reshape(-1, 3) for each in (seen, rolled))
     image_speeds, wheel_speeds = (each[:, 0] + 1j * each[:, 1] for each in (by_images, by_wheels))
     moving = np.fmax(np.abs(image_speeds), np.abs(wheel_speeds)) > _LEAST_MPS
-    image_mps, wheel_mps = (
-        float(np.median(np.abs(each[moving]))) if moving.any() else 0.0 for each in (image_speeds, wheel_speeds)
-    )
+    sizes = np.abs(np.stack([image_speeds, wheel_speeds]))[:, moving]
+    image_mps, wheel_mps = np.median(sizes, axis=1).tolist() if moving.any() else (0.0, 0.0)
     speed, sigma = _ratio(image_speeds, wheel_speeds, _LEAST_MPS)
     yaw, _ = _ratio(by_images[:, 2], by_wheels[:, 2], _LEAST_RADPS)
     return WheelFit(speed, sigma, None if yaw is None else yaw.real, image_mps, wheel_mps)

@@ -16,7 +16,7 @@ from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log
 from fleetmap.recordings import Recording
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from mapserver.calibration import CalibrationParameter as P
-from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES
+from mapserver.doctor.calibration import SURE_SIGMAS
 from mapserver.doctor.camera_motion import SceneError, body_motion, motion_between
 from mapserver.doctor.findings import Finding, Verdict, not_judged
 from mapserver.doctor.gyro_images import AXES, OFFSET
@@ -62,14 +62,9 @@ def _unlike_lenses(recording: Recording) -> list[Finding]:
     """Return a warning for each view whose images are not rectified to the first one's pinhole."""
     first, *others = (mounted.camera for mounted in Rectifier(recording.calibration).mounted)
     words = "its focal length is more than 1.5 times from the first view's, so that a survey leaves its images out; use a lens alike"
+    limit = f"the first view has {first.focal_px:.0f} px"
     return [
-        Finding(
-            f"field of view of {name}",
-            Verdict.WARN,
-            camera.focal_px,
-            f"the first view has {first.focal_px:.0f} px",
-            words,
-        )
+        Finding(f"field of view of {name}", Verdict.WARN, camera.focal_px, limit, words)
         for name, camera in zip(_names(recording)[1:], others, strict=True)
         if camera.focal_px != first.focal_px
     ]
@@ -136,7 +131,7 @@ def _repeated(motions: Sequence[tuple[Array, Array]], scenes: Sequence[SceneErro
 
 def judge_mounting(name: str, found: Mounting | None) -> Finding:
     """Judge an error of a mounting; to its own sigma are added what lenses leave in the motion of either view."""
-    tolerance = TOLERANCES[P.CAMERA_IMU_X]
+    tolerance = P.CAMERA_IMU_X
     if found is None:
         return not_judged(name, "too few frames of both could be followed", _DRIVE)
     variances, axes = np.linalg.eigh(found.cov)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -48,11 +49,16 @@ class CheckResults:
     metres: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
+_Moment = tuple[CameraFrame, RectifiedFrame, RectifiedFrame | None]
+
+
 class _Frames:
-    """Reads frames and records the unreadable ones."""
+    """Reads the frames of a recording and records the unreadable ones."""
 
     def __init__(self, recording: Recording, on_frame: Callable[[], None]) -> None:
-        self._recording, self._on_frame = recording, on_frame
+        self.recording, self._on_frame = recording, on_frame
+        self.rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
+        self.rig = self.rectifier.camera, self.rectifier.body_from_cam
         self.tried: set[int] = set()
         self.errors: dict[int, str] = {}
         self.repeats = 0
@@ -61,10 +67,57 @@ class _Frames:
         self.tried.add(index)
         self._on_frame()
         try:
-            return self._recording.read_frame(index)
+            return self.recording.read_frame(index)
         except RecordingError as error:
             self.errors[index] = str(error)
             return None
+
+    def _rectified(self, index: int) -> RectifiedFrame | None:
+        frame = self.read(index)
+        return None if frame is None else self.rectifier.rectify(frame)
+
+    def moments(self, count: int) -> Iterator[_Moment]:
+        """Yield frames spread over the recording, raw and rectified, and the next ones if they are near and a speed is needed."""
+        stamps_ns = self.recording.frame_stamps_ns
+        needs_speed = bool(self.recording.wheel) or not len(self.recording.imu)
+        for index in np.unique(np.linspace(0, len(stamps_ns) - 1, min(count, len(stamps_ns))).round().astype(int)):
+            frame = self.read(int(index))
+            after = int(np.searchsorted(stamps_ns, stamps_ns[index] + int(_STEP_S * 1e9)))
+            is_near = after < len(stamps_ns) and stamps_ns[after] - stamps_ns[index] < sensors.SPARSE_S * 1e9
+            later = self._rectified(after) if needs_speed and is_near else None
+            if frame is not None:
+                yield frame, self.rectifier.rectify(frame), later
+
+    def consecutive(self, count: int) -> Iterator[tuple[RectifiedFrame, RectifiedFrame]]:
+        """Yield pairs of rectified frames close in time, from the run of frames with the fastest rotation by the gyro."""
+        if len(self.recording.imu) == 0:
+            return
+        stamps_ns, first = self.recording.frame_stamps_ns, self._busiest_start(count)
+        previous: RectifiedFrame | None = None
+        is_same = False
+        for index in range(first, min(first + count, len(stamps_ns))):
+            is_close = previous is not None and stamps_ns[index] - previous.stamp_ns < sensors.SPARSE_S * 1e9
+            has_next = index + 1 < len(stamps_ns) and stamps_ns[index + 1] - stamps_ns[index] < sensors.SPARSE_S * 1e9
+            if not (is_close or has_next):
+                continue
+            current = self._rectified(index)
+            if previous is not None and current is not None and is_close:
+                is_same, was_same = np.array_equal(previous.left, current.left), is_same
+                if is_same:  # long repeats are a camera at rest; sensor noise excludes exact repeats
+                    self.repeats += not was_same
+                    continue
+                yield previous, current
+            previous = current
+
+    def _busiest_start(self, count: int) -> int:
+        stamps_ns, imu = self.recording.frame_stamps_ns, self.recording.imu
+        if len(stamps_ns) <= count:
+            return 0
+        speeds = np.linalg.norm(imu.gyro_radps - np.median(imu.gyro_radps, axis=0), axis=1)
+        total = np.concatenate([[0.0], np.cumsum(np.minimum(speeds, 3.0))])
+        starts = np.arange(0, len(stamps_ns) - count, max(1, count // 4))
+        a, b = (np.searchsorted(imu.stamps_ns, stamps_ns[edges]) for edges in (starts, starts + count))
+        return int(starts[np.argmax(total[b] - total[a])])
 
 
 def frames_to_check(recording: Recording, sampled: int = SAMPLED_FRAMES, turn_frames: int = TURN_FRAMES) -> int:
@@ -91,14 +144,12 @@ def run_checks(
     imu, has_pair = recording.imu, recording.sensor_set in _PAIRS
     shift_s = recording.calibration.cameras[0].imu_minus_cam_s
     frames = _Frames(recording, on_frame)
-    rectifier = _rectifier(recording)
-    seen = _sampled(recording, frames, rectifier, sampled, executor)
-    soon = _soon_seen(recording, rectifier, seen, frames)
+    seen = _sampled(frames, sampled, executor)
+    soon = _soon_seen(frames, seen)
 
-    rig = rectifier.camera, rectifier.body_from_cam
-    turns = CameraTurns.of(executor.map(body_motion, rig, _consecutive(recording, frames, rectifier, turn_frames)))
+    turns = CameraTurns.of(executor.map(body_motion, frames.rig, frames.consecutive(turn_frames)))
     gyro, gyro_fit = gyro_check(turns, imu, shift_s)
-    upside_down = turn_upside_down(turns, imu, shift_s, rectifier.body_from_cam)
+    upside_down = turn_upside_down(turns, imu, shift_s, frames.rectifier.body_from_cam)
     if has_pair:
         soon = [swapped_cameras(seen.pairs, upside_down=upside_down) if f.name == SWAPPED else f for f in soon]
     if upside_down:
@@ -118,16 +169,15 @@ def run_checks(
         used = replace(recording, wheel=()) if wheels.verdict is Verdict.FAIL else recording
         calibration = measure_calibration(used, on_frame, executor, follow)
 
-    findings += [*calibration.findings, images.sharpness(seen.variances)]
+    findings += [*calibration.findings, images.sharpness([look.variance for look in seen.looks])]
     findings += [images.flicker_check(recording, frames.read), _readable(frames)]
     if len(imu):
         findings.append(_repeats(frames, min(turn_frames, len(recording))))
-    known = (
-        {}
-        if seen.wheels is None or not seen.wheels.size
-        else {"the wheels": (seen.wheels.size, seen.wheels.speed_sigma)}
-    )
-    known |= {} if given is None or given.metres <= 0 else {"the accelerometer": (given.metres, given.sigma)}
+    known = {}
+    if seen.wheels is not None and seen.wheels.size:
+        known["the wheels"] = seen.wheels.size, seen.wheels.speed_sigma
+    if given is not None and given.metres > 0:
+        known["the accelerometer"] = given.metres, given.sigma
     return CheckResults(findings + sensors.other_issues(recording.issues), gyro_fit, calibration, known)
 
 
@@ -142,7 +192,7 @@ def _accelerometer(recording: Recording, turns: CameraTurns, soon: Sequence[Find
     return axes, next((fit for fit in fits if fit.is_given), None) if axes.verdict is Verdict.OK else None
 
 
-def _repeats(frames: "_Frames", count: int) -> Finding:
+def _repeats(frames: _Frames, count: int) -> Finding:
     bad = f"an image repeats the previous one {frames.repeats} times in {count} frames; record each image once, with its own stamp"
     limits = Limits(0.02, 0.1, "of the frames")
     return judge("repeated images", frames.repeats / count, limits, "every frame has an image of its own", bad)
@@ -150,86 +200,59 @@ def _repeats(frames: "_Frames", count: int) -> Finding:
 
 def run_cheap_checks(recording: Recording, sampled: int) -> list[Finding]:
     """Return the findings of `run_checks` that need only the IMU and `sampled` frames: for use before a long drive begins."""
-    rectifier, frames = _rectifier(recording), _Frames(recording, lambda: None)
-    return _soon_seen(recording, rectifier, _sampled(recording, frames, rectifier, sampled, SERIAL), frames)
+    frames = _Frames(recording, lambda: None)
+    return _soon_seen(frames, _sampled(frames, sampled, SERIAL))
 
 
-def _rectifier(recording: Recording) -> Rectifier:
-    return Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
+class _Seen(NamedTuple):
+    """Results of frames all over the recording. wheels: against the images, None without wheels; images: None for one camera."""
 
-
-@dataclass(frozen=True, slots=True)
-class _Seen:
-    """Results of frames all over the recording.
-
-    depth_shares: of pixels with a depth. wheels: against the images, None without wheels; images: None for one camera.
-    """
-
-    pairs: list[StereoMatches]
-    variances: list[float]
-    depth_shares: list[float]
-    structures: list[tuple[Array, Array]]
+    looks: list["_Look"]
     images: ImageMetres | None
     wheels: WheelFit | None
 
+    @property
+    def pairs(self) -> list[StereoMatches]:
+        return [look.pair for look in self.looks if look.pair is not None]
 
-def _soon_seen(recording: Recording, rectifier: Rectifier, seen: _Seen, frames: _Frames) -> list[Finding]:
-    imu, shift_s = recording.imu, recording.calibration.cameras[0].imu_minus_cam_s
-    overlap = sensors.camera_imu_overlap(recording.frame_stamps_ns, imu.stamps_ns, shift_s)
-    shutter = sensors.rolling_shutter(recording.calibration.cameras[0], imu)
-    findings = [overlap, sensors.gravity_magnitude(imu), *shutter, images.fixed_pattern(seen.structures)]
+
+def _soon_seen(frames: _Frames, seen: _Seen) -> list[Finding]:
+    recording, imu, camera = frames.recording, frames.recording.imu, frames.recording.calibration.cameras[0]
+    overlap = sensors.camera_imu_overlap(recording.frame_stamps_ns, imu.stamps_ns, camera.imu_minus_cam_s)
+    shutter = sensors.rolling_shutter(camera, imu)
+    findings = [
+        overlap,
+        sensors.gravity_magnitude(imu),
+        *shutter,
+        images.fixed_pattern([look.structure for look in seen.looks]),
+    ]
     if recording.sensor_set in _PAIRS:
-        findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs, rectifier.camera.focal_px)]
+        findings += [swapped_cameras(seen.pairs), epipolar_error(seen.pairs, frames.rectifier.camera.focal_px)]
     if recording.sensor_set is SensorSet.RGBD:
-        findings.append(images.measured_depth(seen.depth_shares))
+        shares = [look.depth_share for look in seen.looks if look.depth_share is not None]
+        findings.append(images.measured_depth(shares))
     return [*findings, images.lens_check(recording, frames.read)]
 
 
-def _sampled(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int, executor: Executor) -> _Seen:
-    rig = rectifier.camera, rectifier.body_from_cam
-    looks = list(executor.map(_look, rig, _moments(recording, frames, rectifier, count)))
+def _sampled(frames: _Frames, count: int, executor: Executor) -> _Seen:
+    looks, recording = list(executor.map(_look, frames.rig, frames.moments(count))), frames.recording
     depths = [look.depth_m for look in looks if np.isfinite(look.depth_m)]
     turns = CameraTurns.of(look.motion for look in looks if look.motion is not None)
-    wheels, calibration = None, recording.calibration
+    metres, wheels, calibration = None, None, recording.calibration
     if recording.wheel:
         shift_s = calibration.cameras[0].imu_minus_cam_s
         wheels = fit_wheels(turns, recording.wheel, calibration.base_from_body, shift_s)
-    metres = None
     if depths and (recording.sensor_set in _PAIRS or recording.sensor_set is SensorSet.RGBD):
         speeds = np.linalg.norm(turns.ways_m, axis=1) / ((turns.ends_ns - turns.starts_ns) * 1e-9)
         speed_mps = float(np.nanmedian(speeds)) if np.isfinite(speeds).any() else 0.0
-        baseline_m = rectifier.camera.baseline_m if recording.sensor_set in _PAIRS else None
+        baseline_m = frames.rectifier.camera.baseline_m if recording.sensor_set in _PAIRS else None
         metres = ImageMetres(baseline_m, float(np.median(depths)), speed_mps)
-    return _Seen(
-        pairs=[look.pair for look in looks if look.pair is not None],
-        variances=[look.variance for look in looks],
-        depth_shares=[look.depth_share for look in looks if look.depth_share is not None],
-        structures=[look.structure for look in looks],
-        images=metres,
-        wheels=wheels,
-    )
+    return _Seen(looks, metres, wheels)
 
 
-_Moment = tuple[CameraFrame, RectifiedFrame, RectifiedFrame | None]
-
-
-def _moments(recording: Recording, frames: _Frames, rectifier: Rectifier, count: int) -> Iterator[_Moment]:
-    """Yield frames spread over the recording, raw and rectified, and the next ones if they are near and a speed is needed."""
-    stamps_ns, needs_speed = recording.frame_stamps_ns, bool(recording.wheel) or not len(recording.imu)
-    for index in np.unique(np.linspace(0, len(recording) - 1, min(count, len(recording))).round().astype(int)):
-        frame = frames.read(int(index))
-        after = int(np.searchsorted(stamps_ns, stamps_ns[index] + int(_STEP_S * 1e9)))
-        is_near = (
-            needs_speed and after < len(recording) and stamps_ns[after] - stamps_ns[index] < sensors.SPARSE_S * 1e9
-        )
-        other = frames.read(after) if is_near else None
-        if frame is not None:
-            yield frame, rectifier.rectify(frame), None if other is None else rectifier.rectify(other)
-
-
-@dataclass(frozen=True, slots=True)
-class _Look:
-    """Results of one moment. depth_m: median, NaN if unknown. motion: as `body_motion`, None if not computed."""
+class _Look(NamedTuple):
+    """Results of one moment. depth_share: of pixels with a depth; depth_m: median, NaN if unknown. motion: as `body_motion`, None if not
+    computed."""
 
     variance: float
     pair: StereoMatches | None
@@ -255,48 +278,9 @@ def _look(rig: tuple[StereoCamera, Array], moment: _Moment) -> _Look:
     return _Look(variance, pair, share, depth_m, structure, motion)
 
 
-def _consecutive(
-    recording: Recording, frames: _Frames, rectifier: Rectifier, count: int
-) -> Iterator[tuple[RectifiedFrame, RectifiedFrame]]:
-    """Yield pairs of rectified frames close in time, from the run of frames with the fastest rotation by the gyro."""
-    if len(recording.imu) == 0:
-        return
-    stamps_ns = recording.frame_stamps_ns
-    first = _busiest_start(recording, count)
-    previous: RectifiedFrame | None = None
-    is_same = False
-    for index in range(first, min(first + count, len(recording))):
-        is_close = previous is not None and stamps_ns[index] - previous.stamp_ns < sensors.SPARSE_S * 1e9
-        has_next = index + 1 < len(recording) and stamps_ns[index + 1] - stamps_ns[index] < sensors.SPARSE_S * 1e9
-        if not (is_close or has_next):
-            continue
-        frame = frames.read(index)
-        current = None if frame is None else rectifier.rectify(frame)
-        if previous is not None and current is not None and is_close:
-            is_same, was_same = np.array_equal(previous.left, current.left), is_same
-            if is_same:  # long repeats are a camera at rest; sensor noise excludes exact repeats
-                frames.repeats += not was_same
-                continue
-            yield previous, current
-        previous = current
-
-
-def _busiest_start(recording: Recording, count: int) -> int:
-    stamps_ns, imu = recording.frame_stamps_ns, recording.imu
-    if len(stamps_ns) <= count:
-        return 0
-    speeds = np.linalg.norm(imu.gyro_radps - np.median(imu.gyro_radps, axis=0), axis=1)
-    total = np.concatenate([[0.0], np.cumsum(np.minimum(speeds, 3.0))])
-    starts = np.arange(0, len(stamps_ns) - count, max(1, count // 4))
-    a = np.searchsorted(imu.stamps_ns, stamps_ns[starts])
-    b = np.searchsorted(imu.stamps_ns, stamps_ns[starts + count])
-    return int(starts[np.argmax(total[b] - total[a])])
-
-
 def _readable(frames: _Frames) -> Finding:
-    limit = "every checked frame must be readable"
     tried, errors = len(frames.tried), list(frames.errors.values())
-    if not errors:
-        return Finding("images", Verdict.OK, 0.0, limit, f"all {tried} checked frames are readable")
-    sentence = f"{len(errors)} of {tried} cannot be read; {errors[0]}"
-    return Finding("images", Verdict.FAIL, float(len(errors)), limit, sentence)
+    verdict, sentence = Verdict.OK, f"all {tried} checked frames are readable"
+    if errors:
+        verdict, sentence = Verdict.FAIL, f"{len(errors)} of {tried} cannot be read; {errors[0]}"
+    return Finding("images", verdict, float(len(errors)), "every checked frame must be readable", sentence)

@@ -13,6 +13,7 @@ GRAVITY = "gravity magnitude"
 SPARSE_S = 0.35  # frames further apart than this are keyframes, not a video
 NO_IMU = ("there is no IMU", "record an IMU")
 _SLOWEST_CAMERA_HZ, _SLOWEST_IMU_HZ = 5.0, 90.0
+_DISORDER = "stamps not increasing"
 # Ends of issues about recordings with complete data
 _NOT_LOST = (
     "stamps uncertain",
@@ -109,32 +110,24 @@ def imu_noise(calibration: RigCalibration) -> list[Finding]:
 
 def stamp_order(issues: Sequence[DataIssue]) -> Finding:
     """Report stamps that do not increase and were dropped when the recording was opened."""
-    found = [issue for issue in issues if "stamps not increasing" in issue.what]
-    limit = "none may be out of order"
-    if not found:
-        return Finding("stamp order", Verdict.OK, 0.0, limit, "all stamps increase")
-    words = "; ".join(f"{issue.what}, {issue.detail}" for issue in found)
-    sentence = f"{words}; check for a clock that is set while recording, or for a driver that sends late"
-    return Finding("stamp order", Verdict.FAIL, float(len(found)), limit, sentence)
+    found = [f"{issue.what}, {issue.detail}" for issue in issues if _DISORDER in issue.what]
+    verdict, sentence = Verdict.OK, "all stamps increase"
+    if found:
+        advice = "check for a clock that is set while recording, or for a driver that sends late"
+        verdict, sentence = Verdict.FAIL, "; ".join([*found, advice])
+    return Finding("stamp order", verdict, float(len(found)), "none may be out of order", sentence)
 
 
 def other_issues(issues: Sequence[DataIssue]) -> list[Finding]:
     """Return a warning for each unreadable or unexpected item."""
-    odd = [issue for issue in issues if issue.what.endswith(_NOT_LOST)]
-    lost = [issue for issue in issues if issue not in odd and "stamps not increasing" not in issue.what]
-    return [
-        *(Finding(issue.what, Verdict.WARN, None, "", issue.detail) for issue in odd),
-        *(
-            Finding(
-                "lost data",
-                Verdict.WARN,
-                None,
-                "nothing lost",
-                f"{issue.what}: {issue.detail}; copy the recording again if it has more",
-            )
-            for issue in lost
-        ),
-    ]
+    odd, lost = list[Finding](), list[Finding]()
+    for issue in issues:
+        if issue.what.endswith(_NOT_LOST):
+            odd.append(Finding(issue.what, Verdict.WARN, None, "", issue.detail))
+        elif _DISORDER not in issue.what:
+            words = f"{issue.what}: {issue.detail}; copy the recording again if it has more"
+            lost.append(Finding("lost data", Verdict.WARN, None, "nothing lost", words))
+    return odd + lost
 
 
 def camera_imu_overlap(frame_stamps_ns: Stamps, imu_stamps_ns: Stamps, imu_minus_cam_s: float) -> Finding:
@@ -193,7 +186,8 @@ def rolling_shutter(camera: CameraCalibration, imu: ImuSamples) -> list[Finding]
     rate_radps = float(np.percentile(np.linalg.norm(imu.gyro_radps, axis=1), 95))
     skew_px = rate_radps * readout_s * float(camera.focal_px[0])
     words = f"{told}: at the turns of this recording (95 %: {rate_radps:.2f} rad/s) a row is shifted by {skew_px:.1f} px against the first"
-    if skew_px <= 1.0:
-        return [Finding("rolling shutter", Verdict.OK, skew_px, "warn above 1 px", words)]
-    words += "; turn more slowly, or use a camera with a global shutter"
-    return [Finding("rolling shutter", Verdict.WARN, skew_px, "warn above 1 px", words)]
+    verdict = Verdict.OK
+    if skew_px > 1.0:
+        verdict = Verdict.WARN
+        words += "; turn more slowly, or use a camera with a global shutter"
+    return [Finding("rolling shutter", verdict, skew_px, "warn above 1 px", words)]

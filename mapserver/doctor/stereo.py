@@ -38,21 +38,34 @@ _NOTHING = StereoMatches(np.zeros(0), np.zeros(0), np.zeros(0))
 
 def match_stereo(frame: RectifiedFrame) -> StereoMatches:
     """Return matches independent of the calibration. ORB both ways, refined by Lucas-Kanade, any sign of disparity, rows within 25 px."""
-    empty = _NOTHING
     if frame.right is None:
-        return empty
+        return _NOTHING
     orb = cv2.ORB.create(nfeatures=1200, nlevels=4, fastThreshold=8)
     left_points, left_words = orb.detectAndCompute(frame.left, None)
     right_points, right_words = orb.detectAndCompute(frame.right, None)
     if left_words is None or right_words is None:
-        return empty
+        return _NOTHING
     words = np.asarray(left_words, np.uint8), np.asarray(right_words, np.uint8)
     a, b = match_mutual(*words, _ALIKE, 1.0).T
     left, right = (np.asarray(cv2.KeyPoint.convert(points), np.float32) for points in (left_points, right_points))
     left, right = left[a], right[b]
     width = frame.left.shape[1]
     plausible = (np.abs(left - right) < [_LARGEST_SHARE_OF_WIDTH * width, _SEARCH_ROWS_PX]).all(axis=1)
-    return _refined(frame, left[plausible], right[plausible])
+    if not plausible.any():
+        return _NOTHING
+    corners, guess = left[plausible].reshape(-1, 1, 2), right[plausible].reshape(-1, 1, 2).copy()
+    found, status, _ = cv2.calcOpticalFlowPyrLK(
+        frame.left, frame.right, corners, guess, winSize=(15, 15), maxLevel=0, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+    )
+    found = found.reshape(-1, 2)
+    kept = (status.ravel() == 1) & (np.abs(found - right[plausible]).max(axis=1) < 3.0)
+    offsets = (left[plausible] - found)[kept].astype(np.float64)
+    columns = left[plausible][kept, 0].astype(np.float64) - 0.5 * (width - 1)
+    if len(offsets) >= 8:  # without wrong matches: they fall on any row, right ones near the median
+        off_rows = np.abs(offsets[:, 1] - np.median(offsets[:, 1]))
+        near = off_rows < max(4 * 1.4826 * np.median(off_rows), 1.0)
+        offsets, columns = offsets[near], columns[near]
+    return StereoMatches(offsets[:, 0], offsets[:, 1], columns)
 
 
 def swapped_cameras(pairs: Sequence[StereoMatches], *, upside_down: bool | None = None) -> Finding:
@@ -60,11 +73,10 @@ def swapped_cameras(pairs: Sequence[StereoMatches], *, upside_down: bool | None 
 
     upside_down: True if they turn as if rotated, None if unknown.
     """
-    name = SWAPPED
     disparities = np.concatenate([p.disparities_px for p in pairs]) if pairs else np.zeros(0)
     decided = disparities[np.abs(disparities) > 1.0]
     if len(decided) < _MIN_MATCHES:
-        return not_judged(name, f"{len(decided)} matches with a disparity above 1 px are too few", _NEAR)
+        return not_judged(SWAPPED, f"{len(decided)} matches with a disparity above 1 px are too few", _NEAR)
     wrong_share = float((decided < 0).mean())
     cause = "left and right are swapped: exchange the folders or topics"
     if upside_down is not False:
@@ -72,7 +84,7 @@ def swapped_cameras(pairs: Sequence[StereoMatches], *, upside_down: bool | None 
         cause = rotated if upside_down else f"{cause}; or {rotated}"
     bad = f"{wrong_share:.0%} of the matches have negative disparity; {cause}"
     limits = Limits(0.2, 0.5, "of the matches with negative disparity")
-    return judge(name, wrong_share, limits, "the left image is the left one", bad)
+    return judge(SWAPPED, wrong_share, limits, "the left image is the left one", bad)
 
 
 def epipolar_error(pairs: Sequence[StereoMatches], focal_px: float) -> Finding:
@@ -90,27 +102,3 @@ def epipolar_error(pairs: Sequence[StereoMatches], focal_px: float) -> Finding:
     words = f"rows differ by {median:.2f} px in the median, {p90:.2f} px at 90 %, {np.median(errors):+.2f} px with sign"
     bad = f"{words}: {angles}; calibrate the cameras again, or check their time"
     return judge(name, median, Limits(0.5, 1.2, "px (median)"), words, bad)
-
-
-def _refined(frame: RectifiedFrame, left: Array, right: Array) -> StereoMatches:
-    if len(left) == 0 or frame.right is None:
-        return _NOTHING
-    corners, guess = left.reshape(-1, 1, 2), right.reshape(-1, 1, 2).copy()
-    found, status, _ = cv2.calcOpticalFlowPyrLK(
-        frame.left, frame.right, corners, guess, winSize=(15, 15), maxLevel=0, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
-    )
-    found = found.reshape(-1, 2)
-    kept = (status.ravel() == 1) & (np.abs(found - right).max(axis=1) < 3.0)
-    offsets = (left - found)[kept].astype(np.float64)
-    columns = left[kept, 0].astype(np.float64) - 0.5 * (frame.left.shape[1] - 1)
-    return _without_strays(StereoMatches(offsets[:, 0], offsets[:, 1], columns))
-
-
-def _without_strays(matches: StereoMatches) -> StereoMatches:
-    """Remove wrong matches: they fall on any row, right ones near the median."""
-    if len(matches.row_errors_px) < 8:
-        return matches
-    centre = np.median(matches.row_errors_px)
-    spread = 1.4826 * np.median(np.abs(matches.row_errors_px - centre))
-    kept = np.abs(matches.row_errors_px - centre) < max(4 * spread, 1.0)
-    return StereoMatches(matches.disparities_px[kept], matches.row_errors_px[kept], matches.columns_px[kept])

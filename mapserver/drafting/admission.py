@@ -10,11 +10,10 @@ import numpy as np
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, format_calibration
 from fleetmap.sensors.calibration import RigCalibration
-from mapserver.calibration import CalibrationParameter
-from mapserver.calibration.parameters import RANGES
+from mapserver.calibration import CalibrationParameter as P
 from mapserver.calibration.recordings import Follow
 from mapserver.doctor import Finding, Verdict, accelerometer_images, images, run_checks
-from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES, corrected, in_words, measure_calibration
+from mapserver.doctor.calibration import SURE_SIGMAS, corrected, in_words, measure_calibration
 from mapserver.doctor.findings import grouped
 from mapserver.doctor.gyro_images import SAME_OFFSET_S
 from mapserver.doctor.metres import METRES, WHEELS
@@ -23,7 +22,6 @@ from mapserver.doctor.run_checks import CheckResults, run_cheap_checks
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.executor import SERIAL, Executor
 
-P = CalibrationParameter
 # Wrong units, axes or cameras: a survey would not fail but give a wrong map. Gaps, blur and damage are tolerated.
 DECISIVE = {"camera-imu overlap", "gravity magnitude", "left and right", "epipolar error", "depth"}
 DECISIVE |= {
@@ -34,7 +32,7 @@ DECISIVE |= {
     "repeated images",
     images.FIXED_PATTERN,
     images.LENS,
-    *(parameter.value for parameter in TOLERANCES),
+    *(parameter.value for parameter in P),
 }
 # Properties of a map that depend on the calibration only, and the checks that judge them.
 SUBJECTS = {
@@ -158,7 +156,7 @@ def _unconfirmed(checks: CheckResults, gyro_s: float | None) -> dict[str, str]:
     moved = [p for p in (P.BASELINE, P.FOCAL) if p in wrong]
     scale = float(np.prod([1 + estimate.get(p).estimate for p in moved])) if estimate is not None else 1.0
     for name, (metres, sigma) in checks.metres.items():
-        sigma_all = float(np.hypot(sigma / metres, RANGES[P.WHEEL_SCALE].prior_sigma))
+        sigma_all = float(np.hypot(sigma / metres, P.WHEEL_SCALE.prior_sigma))
         if abs(np.log(metres / scale)) > max(SURE_SIGMAS * sigma_all, abs(np.log(metres))):
             held |= dict.fromkeys(moved, f"a metre of the images is {metres:.3f} m by {name}, not {scale:.3f} m")
     return {str(parameter): reason for parameter, reason in held.items()}

@@ -34,12 +34,6 @@ def corrections_of(manifest: Manifest) -> Areas:
     return read_areas(to_json(found), None) if found else Areas()
 
 
-def waiting(areas: Areas, manifest: Manifest) -> list[Area]:
-    """Return the areas to be learned anew that wait for a recording: a version does not have them yet."""
-    done = {area.correction.since_ns for area in corrections_of(manifest).areas if area.correction}
-    return [a for a in _of(areas.areas, CorrectionKind.FORGET) if a.correction and a.correction.since_ns not in done]
-
-
 def _of(areas: Iterable[Area], kind: CorrectionKind) -> list[Area]:
     return [area for area in areas if area.correction is not None and area.correction.kind is kind]
 
@@ -54,6 +48,13 @@ class AreaCorrections:
 
     areas: Sequence[Area] = ()
     due: Sequence[Area] = ()
+
+    @classmethod
+    def of(cls, areas: Areas, manifest: Manifest) -> "AreaCorrections":
+        """Return the corrections of a site's areas for a build on a version."""
+        done = {area.correction.since_ns for area in corrections_of(manifest).areas if area.correction}
+        forget = _of(areas.areas, CorrectionKind.FORGET)
+        return cls(areas.corrections, [a for a in forget if a.correction and a.correction.since_ns not in done])
 
     def joined(
         self, base: SurveyMap | None, surveyed: Sequence[RecordingSurvey], settings: SurveySettings

@@ -1,10 +1,9 @@
 """A build: surveys recordings, merges them into the site's map, stores the draft, writes report and pictures."""
 
-import resource
 import time
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -17,12 +16,10 @@ from fleetmap.console import plain_console
 from fleetmap.encoding import to_json, to_plain
 from fleetmap.errors import RecordingError, StoreError, UsageError
 from fleetmap.mapformat import CameraEntry, Tile
-from fleetmap.recordings import OpenOptions, Topics
+from fleetmap.recordings import Topics
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
-from fleetmap.sensors.samples import SensorSet
-from mapserver.drafting.accuracy import Accuracy, accuracy, estimated_trajectory
-from mapserver.drafting.area_corrections import AreaCorrections, driven_since, waiting
+from mapserver.drafting.area_corrections import AreaCorrections, driven_since
 from mapserver.drafting.draft_evidence import Before, DraftMap, JudgedSession, examine_draft, replayed_probes
 from mapserver.drafting.extras import ChosenDraft, MappedSession, made_extras
 from mapserver.drafting.job_lock import Job, JobProgress, recorded_job
@@ -50,16 +47,13 @@ from mapserver.drafting.survey_recordings import (
     survey_all,
     survey_recording,
 )
-from mapserver.drafting.trajectory import OtherTrajectory
 from mapserver.drafting.view_check import TileChooser, asked_views
 from mapserver.drafting.worker import open_executor, single_threaded_libraries
-from mapserver.evaluation.trajectory_error import truth_from_estimate
-from mapserver.floor_plan.areas import Areas
+from mapserver.evaluation.trajectory_error import Accuracy, accuracy, truth_from_estimate
 from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged
 from mapserver.quality.probes import alias_step_m
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
-from mapserver.survey.executor import Executor
 from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.merge.multi_session import MergedMap
@@ -73,10 +67,9 @@ _NOT_FOR_ROBOTS = ("map_bytes", "sessions", "checks", "culled", "directions", "s
 
 
 @dataclass(frozen=True, slots=True)
-class BuildOptions:
-    """Options of a build. Files without a name are not written.
+class BuildOptions(RecordingOptions):
+    """Options of a build, beside those of reading. Files without a name are not written.
 
-    frames: an A:B:C slice of each recording. use: only the sensors of a smaller set. trajectory: start poses of another system.
     trajectory_out: a TUM file for the poses of all frames. replay: earlier recordings of the current version, of which frames are
     localized in the draft.
     threads, scheduler: see worker.py. settings: those of the survey; None for the preset of the first recording's sensors with the [survey]
@@ -84,16 +77,11 @@ class BuildOptions:
     look_at: called with the recordings in work.
     """
 
-    frames: str = "::"
-    calibration: Path | None = None
-    topics: Topics = field(default_factory=Topics)
     zones: Path | None = None
     report: Path | None = None
     trajectory_out: Path | None = None
     picture: Path | None = None
     frame_from_ground_truth: bool = False
-    use: SensorSet | None = None
-    trajectory: OtherTrajectory | None = None
     replay: tuple[Path, ...] = ()
     actor: Actor = NOBODY
     threads: int | None = None
@@ -102,11 +90,6 @@ class BuildOptions:
     config: Path | None = None
     settings: SurveySettings | None = None
     look_at: Callable[[Sequence[Path]], None] = lambda _: None
-
-    @property
-    def reading(self) -> RecordingOptions:
-        """Options for reading the recordings."""
-        return RecordingOptions(self.frames, OpenOptions(self.calibration, self.topics), self.use, self.trajectory)
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,16 +116,18 @@ class _Run:
     started_s: float
     images: MappedImageStore
 
-    def tools(self, executor: Executor, view: ProgressView, told: JobProgress | None = None) -> SurveyTools:
-        """Return tools with displayed and timed progress, also reported to viewers of the job."""
+    @contextmanager
+    def tools(self, scheduler: str | None = None, told: JobProgress | None = None) -> Iterator[SurveyTools]:
+        """Open tools with displayed and timed progress, also reported to viewers of the job."""
+        with ProgressView(self.console) as view, open_executor(self.request.options.threads, scheduler) as executor:
 
-        def progress(stage: str, done: int, total: int) -> None:
-            self.times(stage, done, total)
-            view(stage, done, total)
-            if told is not None:
-                told(stage, done, total)
+            def progress(stage: str, done: int, total: int) -> None:
+                self.times(stage, done, total)
+                view(stage, done, total)
+                if told is not None:
+                    told(stage, done, total)
 
-        return SurveyTools(progress, self.images, executor)
+            yield SurveyTools(progress, self.images, executor)
 
 
 @dataclass(frozen=True)
@@ -185,14 +170,10 @@ def build_draft(
     zones = read_zones(options.zones)
     times, console = StageTimes(time.perf_counter), plain_console(stderr=True)
     folder = next(each for each in (request.store, *request.store.absolute().parents) if each.is_dir())
-    with (
-        single_threaded_libraries(),
-        OpenRecordings(options.reading, folder) as reading,
-        MappedImageStore(folder) as images,
-    ):
+    with single_threaded_libraries(), OpenRecordings(options, folder) as reading, MappedImageStore(folder) as images:
         run = _Run(request, reading, settings, zones, unusable, console, times, started_s, images)
         times.begin("examination")
-        with ProgressView(console) as view, open_executor(options.threads, None) as executor:
+        with run.tools() as tools:
             admitted = admit_recordings(
                 request.recordings,
                 reading,
@@ -200,7 +181,7 @@ def build_draft(
                 needs_truth=options.frame_from_ground_truth,
                 unusable=unusable,
                 settings=settings,
-                tools=run.tools(executor, view),
+                tools=tools,
                 look_at=options.look_at,
             )
         with (
@@ -208,8 +189,10 @@ def build_draft(
             recorded_job(maps, request.site, "build") if recorded else nullcontext(Job(number=options.job)) as job,
         ):
             parent = _parent(request, maps)
-            told = JobProgress(maps, job.number)
-            built = _survey(run, admitted, parent, maps.areas(request.site) if parent is not None else Areas(), told)
+            corrections = AreaCorrections()
+            if parent is not None:
+                corrections = AreaCorrections.of(maps.areas(request.site), parent.manifest)
+            built = _survey(run, admitted, parent, corrections, JobProgress(maps, job.number))
             if parent is not None:
                 parent = built.corrections.applied(parent)
             draft = _keep(run, built, parent, maps)
@@ -238,19 +221,12 @@ def _parent(request: BuildRequest, maps: MapStore) -> Before | None:
 
 
 def _survey(
-    run: _Run, admitted: dict[Path, Admission], parent: Before | None, areas: Areas, told: JobProgress
+    run: _Run, admitted: dict[Path, Admission], parent: Before | None, corrections: AreaCorrections, told: JobProgress
 ) -> BuildResult:
     """Survey all recordings and join them to the current map, with the corrections of the site's areas."""
-    options, settings = run.request.options, run.settings
-    base, corrections = None if parent is None else parent.survey, AreaCorrections()
-    if parent is not None:
-        corrections = AreaCorrections(areas.corrections, waiting(areas, parent.manifest))
-    with (
-        ProgressView(run.console) as view,
-        open_executor(options.threads, options.scheduler) as executor,
-    ):
-        survey_options = SurveyConfig(settings, default_vocabulary(), run.zones)
-        tools = run.tools(executor, view, told)
+    options, settings, base = run.request.options, run.settings, None if parent is None else parent.survey
+    survey_options = SurveyConfig(settings, default_vocabulary(), run.zones)
+    with run.tools(options.scheduler, told) as tools:
 
         def survey_one(path: Path, pinhole: StereoCamera | None) -> list[RecordingSurvey]:
             options.look_at([path])
@@ -264,16 +240,15 @@ def _survey(
     run.times.begin("storing")
     say_left_out(run.console, run.request.site, surveyed, joined)
     truth = joined_truth(surveyed, joined)
-    found = accuracy(joined.map, truth)
+    estimate = joined.map.estimated_trajectory
+    found = accuracy(estimate, len(joined.map.trajectory), truth)
     if options.frame_from_ground_truth:
         if truth is None or found.rigid is None:
             raise RecordingError(
                 f"{run.request.recordings[0]}: too few estimated frames have a ground truth; build without "
                 "--frame-from-ground-truth"
             )
-        joined = replace(
-            joined, map=transform_map(joined.map, truth_from_estimate(estimated_trajectory(joined.map), truth))
-        )
+        joined = replace(joined, map=transform_map(joined.map, truth_from_estimate(estimate, truth)))
     return BuildResult(surveyed, joined, found, corrections, is_first=base is None)
 
 
@@ -299,40 +274,36 @@ def _keep(run: _Run, built: BuildResult, parent: Before | None, maps: MapStore) 
     run.times.begin("examining")
     evidence = msgspec.structs.replace(_evidence(run, built, judged, tiles, parent), views=views)
     run.times.begin("storing")
+    known_m = None if before is None else before.report.get("alias_step_m")
     report = make_report(
         built.surveyed,
         built.joined,
         built.accuracy,
         evidence,
-        seconds=time.perf_counter() - run.started_s,
-        peak_rss_mb=resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6,
-    )
-    known_m = None if parent is None else parent.manifest.report.get("alias_step_m")
-    report = msgspec.structs.replace(
-        report,
+        time.perf_counter() - run.started_s,
         surveyed_requests=covered_requests(maps, site, built.joined),
         removed_landmarks={} if parent is None else parent.removed(),
         alias_step_m=alias_step_m(evidence.repetition, known_m),
     )
     said = to_plain(report) | {key: to_plain(extra.report) for key, extra in extras.items()}
     details = _details(run, built, parent, evidence, said)
-    job = run.request.options.job
     content = DraftContent(
-        tiles=tiles, vocabulary=default_vocabulary_bytes(), details=details, archive=encode_archive(survey_map),
-        extras=[(extra.kind, data) for extra in extras.values() for data in extra.blobs], evidence=evidence, job=job,
-    )  # fmt: skip
+        tiles=tiles,
+        vocabulary=default_vocabulary_bytes(),
+        details=details,
+        archive=encode_archive(survey_map),
+        extras=[(extra.kind, data) for extra in extras.values() for data in extra.blobs],
+        evidence=evidence,
+        job=run.request.options.job,
+    )
     version = maps.save(site, content, actor=run.request.options.actor).version
     report = msgspec.structs.replace(report, map_bytes=maps.version(site, version).map_bytes)
     said |= {"map_bytes": report.map_bytes}
     run.times.begin("writing")
-    words = sentence(site, version, None if parent is None else parent.manifest.version, report, maps.folder)
+    words = sentence(site, version, None if before is None else before.version, report, maps.folder)
     taken, outcomes = {s.entry.sha256 for s in built.taken}, zip(built.surveyed, built.joined.outcomes, strict=True)
-    draft = Draft(
-        version,
-        maps.areas(site).name_tiles(words, TILE_SIZE_M),
-        said,
-        {s.entry.sha256: o.reason for s, o in outcomes if s.entry.sha256 not in taken},
-    )
+    left_out = {s.entry.sha256: o.reason for s, o in outcomes if s.entry.sha256 not in taken}
+    draft = Draft(version, maps.areas(site).name_tiles(words, TILE_SIZE_M), said, left_out)
     _write_files(run, built, draft)
     return draft
 
@@ -371,8 +342,8 @@ def _evidence(
     options, camera = run.request.options, built.joined.map.camera
     replayed = []
     if before is not None:
-        reading = options.frames, options.reading.opening, options.use
-        replayed = replayed_probes(options.replay, before, *reading, (camera, run.settings.orb))
+        opened = replace(options, trajectory=None).opened
+        replayed = replayed_probes(options.replay, before, opened, (camera, run.settings.orb))
     drafted = DraftMap(tiles, default_vocabulary(), camera)
     with open_executor(options.threads, None) as executor:
         evidence = examine_draft(drafted, before, sessions, replayed, executor)

@@ -1,6 +1,6 @@
 """Evidence about a draft: frames of recordings, relocalized in the tiles in their final form."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -15,8 +15,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Manifest, RecordingEntry, Tile, decode_tile, encode_tile
-from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
-from fleetmap.recordings.sensor_subset import reduced
+from fleetmap.recordings import Recording
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
@@ -81,6 +80,10 @@ class JudgedSession(NamedTuple):
         asked = {frame.number for frame in self.asked(recordings)}
         return [frame for frame in self._held_out(recordings, 0) if frame.number not in asked]
 
+    def probes(self, frames: Iterable[ProbedFrame]) -> list[Probe]:
+        """Return frames of the recording as probes."""
+        return [frame.probe(self.trajectory.frame_from_body) for frame in frames]
+
     def _held_out(self, recordings: int, first: int) -> list[ProbedFrame]:
         """Return the images of every second held-out frame of one of so many recordings."""
         numbers = list(dict.fromkeys(frame.number for frame in self.probed if frame.is_held_out))
@@ -89,11 +92,7 @@ class JudgedSession(NamedTuple):
 
 
 def probed_frames(
-    recording: Recording,
-    selected: Sequence[int],
-    rectifier: Rectifier,
-    survey: Survey,
-    orb: OrbSettings,
+    recording: Recording, selected: Sequence[int], rectifier: Rectifier, survey: Survey, orb: OrbSettings
 ) -> list[ProbedFrame]:
     """Return frames of a surveyed recording that did not become keyframes, and both ends, read again. Damaged ones are left out."""
     keyframes = [k.frame_index for k in survey.odometry.keyframes]
@@ -104,11 +103,7 @@ def probed_frames(
 
 
 def _read(
-    recording: Recording,
-    selected: Sequence[int],
-    numbers: Sequence[int],
-    rectifier: Rectifier,
-    orb: OrbSettings,
+    recording: Recording, selected: Sequence[int], numbers: Sequence[int], rectifier: Rectifier, orb: OrbSettings
 ) -> list[ProbedFrame]:
     found = []
     for number in numbers:
@@ -181,21 +176,18 @@ class Before:
 def replayed_probes(
     paths: Sequence[Path],
     before: Before,
-    frames: str,
-    opening: OpenOptions,
-    use: SensorSet | None,
+    opened: Callable[[Path], tuple[Recording, NDArray[np.int64]]],
     seen_by: tuple[StereoCamera, OrbSettings],
 ) -> list[Probe]:
     """Return frames of earlier recordings with their poses in the version built from them; none of unknown recordings.
 
-    seen_by: the camera to which they are resampled, and the survey's features.
+    opened: gives a recording and its selected frames. seen_by: the camera to which they are resampled, and the survey's features.
     """
     probes: list[Probe] = []
     pinhole, orb = seen_by
     for path in paths:
-        with open_recording(path, opening) as opened:
-            recording = reduced(opened, use)
-            recording, selected = recording.readable(FrameSelection.parse(frames).apply(recording))
+        recording, selected = opened(path)
+        with recording:
             entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(selected))
             known = before.trajectory_of(entry)
             if known is None:
@@ -228,11 +220,7 @@ def examine_draft(
     executor: Executor = SERIAL,
 ) -> Evidence:
     """Return the findings of probes in the tiles as stored; `sessions` are the map's recordings."""
-    held_out = [
-        frame.probe(session.trajectory.frame_from_body)
-        for session in sessions
-        for frame in session.judging(len(sessions))
-    ]
+    held_out = [probe for session in sessions for probe in session.probes(session.judging(len(sessions)))]
     last = [] if before is None else probes_of_map(before.survey, PROBES)
     stored = [decode_tile(encode_tile(tile)) for tile in drafted.tiles]
     drafted = drafted._replace(tiles=stored)
@@ -248,13 +236,12 @@ def examine_draft(
         recall = before.manifest.report.get("lookalike_recall") or 0.0
         for session in sessions:
             chosen = spread(np.arange(len(session.probed)), max(PROBES // len(sessions), _LEAST_PROBES))
-            frames = [session.probed[n].probe(session.trajectory.frame_from_body) for n in chosen]
+            frames = session.probes([session.probed[n] for n in chosen])
             tasks.append(partial(displaced, session.name, current, frames, recall))
     starts, repeated, evidence, *moved = executor.map(lambda _, task: task(), None, tasks)
     directions = tile_directions({(tile.tile_x, tile.tile_y): tile.map_from_cam for tile in stored})
-    found: Evidence = msgspec.structs.replace(
-        evidence, directions=directions, starts=starts, repetition=repeated, displaced=moved or None
-    )
+    more = {"directions": directions, "starts": starts, "repetition": repeated, "displaced": moved or None}
+    found: Evidence = msgspec.structs.replace(evidence, **more)
     return found
 
 
@@ -265,10 +252,9 @@ def _breaks(sessions: Sequence[JudgedSession]) -> TrajectoryBreaks | None:
         if survey.state.rig.camera.baseline_m > 0:
             guess = survey.odometry
             odometry = (guess.odom_from_body, guess.covariances, guess.tracked.astype(bool))
-            found.append(trajectory_breaks(trajectory.stamps_ns, trajectory.frame_from_body, *odometry))
-    known = [breaks for breaks in found if breaks is not None]
-    if not known:
+            breaks = trajectory_breaks(trajectory.stamps_ns, trajectory.frame_from_body, *odometry)
+            found += [] if breaks is None else [msgspec.structs.astuple(breaks)]
+    if not found:
         return None
-    return TrajectoryBreaks(
-        sum(b.stretches for b in known), sum(b.breaks for b in known), max(b.worst_m for b in known)
-    )
+    stretches, numbers, worst_m = zip(*found, strict=True)
+    return TrajectoryBreaks(sum(stretches), sum(numbers), max(worst_m))

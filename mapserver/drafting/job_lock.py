@@ -26,21 +26,21 @@ _YOUNG_S = 60.0  # a job is recorded before it holds its lock
 @contextmanager
 def held(maps: MapStore, job: int) -> Iterator[None]:
     """Mark a job as running, for the block. Raises StoreError if the lock cannot be written."""
-    with _opened(maps, job, waits=True):
+    with _locked(maps, _lock_name(job), waits=True):
         try:
             yield
         finally:
             with suppress(OSError):
-                _path(maps.folder, job).unlink()
+                (maps.folder / _lock_name(job)).unlink()
 
 
 @contextmanager
 def only_one(maps: MapStore, site: str) -> Iterator[None]:
     """Hold the site's nightly lock for the block; raises BusyError if another process holds it, StoreError on a disk error."""
+    name = f"nightly-{site}.lock"
     with ExitStack() as stack:
         try:
-            with disk_errors(f"{maps.folder} cannot be written", "check the store's rights and space"):
-                stack.enter_context(maps.locked(name := f"nightly-{site}.lock", waits=False))
+            stack.enter_context(_locked(maps, name, waits=False))
         except BusyError as error:
             raise BusyError(f"another nightly run of site {site} holds {name}; it ends by itself; try later") from error
         yield
@@ -48,26 +48,26 @@ def only_one(maps: MapStore, site: str) -> Iterator[None]:
 
 def end_interrupted(maps: MapStore, now_ns: int) -> list[int]:
     """Mark jobs as failed that are recorded as running without a process; return their numbers."""
-    ended, store = [], maps.folder
+    ended = []
     for job in maps.running_jobs():
         begun_s = datetime.fromisoformat(job.started).astimezone(UTC).timestamp()
         if 0 <= now_ns / 1e9 - begun_s < _YOUNG_S:
             continue
         try:
-            with _opened(maps, job.id, waits=False):
+            with _locked(maps, _lock_name(job.id), waits=False):
                 pass
         except FleetmapError:  # a living process holds the lock, or that is unknown
             continue
         message = "was interrupted: its process has ended; run it again, a nightly run resumes at the next start"
         maps.update_job(job.id, "failed", message, job.report | {INTERRUPTED: True})
         with suppress(OSError):
-            _path(store, job.id).unlink()
+            (maps.folder / _lock_name(job.id)).unlink()
         ended.append(job.id)
     return ended
 
 
-def _path(store: Path, job: int) -> Path:
-    return store / f"job-{job}.lock"
+def _lock_name(job: int) -> str:
+    return f"job-{job}.lock"
 
 
 @contextmanager
@@ -83,9 +83,10 @@ def logged(store: Path, job: int) -> Iterator[None]:
         for old in store.glob("job-*.log"):
             if old.stem[4:].isdecimal() and int(old.stem[4:]) <= job - _LOGS_KEPT:
                 old.unlink()
+    path = log_path(store, job)
     try:
-        log_path(store, job).touch(OWN_FILE)
-        file = log_path(store, job).open("wb", 0)
+        path.touch(OWN_FILE)
+        file = path.open("wb", 0)
     except OSError:
         yield
         return
@@ -133,10 +134,10 @@ class _LogCopy(io.TextIOBase):
 
 
 @contextmanager
-def _opened(maps: MapStore, job: int, *, waits: bool) -> Iterator[None]:
+def _locked(maps: MapStore, name: str, *, waits: bool) -> Iterator[None]:
     with ExitStack() as stack:
-        with disk_errors(f"{_path(maps.folder, job)} cannot be made", "check the store's rights and space"):
-            stack.enter_context(maps.locked(_path(maps.folder, job).name, waits=waits))
+        with disk_errors(f"{maps.folder / name} cannot be made", "check the store's rights and space"):
+            stack.enter_context(maps.locked(name, waits=waits))
         yield
 
 

@@ -10,8 +10,8 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
 from fleetmap.geometry import Array
-from mapserver.drafting.accuracy import Accuracy
 from mapserver.drafting.report import BuildReport
+from mapserver.evaluation.trajectory_error import Accuracy
 from mapserver.survey.loops.loops import Loops, LoopVerdict
 from mapserver.survey.survey_map import SurveyMap
 

@@ -1,5 +1,6 @@
 """The report of a build. Pure; the keys of `BuildReport` are stable, docs/reports.md lists their meanings."""
 
+import resource
 import shlex
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -12,8 +13,8 @@ import numpy as np
 
 from fleetmap.encoding import to_plain
 from fleetmap.errors import disk_errors
-from mapserver.drafting.accuracy import Accuracy
 from mapserver.drafting.survey_recordings import RecordingSurvey, map_trajectories
+from mapserver.evaluation.trajectory_error import Accuracy
 from mapserver.quality.directions import one_way_words
 from mapserver.quality.figures import Evidence, Starts, SurveyedViews, TileDirections
 from mapserver.quality.probes import lookalike_words
@@ -63,16 +64,14 @@ def make_report(
     joined: MergedMap,
     found: Accuracy,
     evidence: Evidence,
-    *,
     seconds: float,
-    peak_rss_mb: float,
+    **more: Any,
 ) -> BuildReport:
-    """Return the report of surveyed recordings, map_bytes still unknown. peak_rss_mb: peak memory of the build, in 10^6 bytes."""
+    """Return the report of surveyed recordings, map_bytes still unknown. more: keys that the caller knows."""
     survey_map = joined.map
     taken = [s for s, outcome in zip(recordings, joined.outcomes, strict=True) if outcome.joined]
     duration_s = sum(float(t.stamps_ns[-1] - t.stamps_ns[0]) * 1e-9 for t in joined.trajectories)
-    steps_m = [np.linalg.norm(np.diff(t.positions_m, axis=0), axis=1) for t in joined.trajectories]
-    path_m = sum(float(lengths_m.sum()) for lengths_m in steps_m)
+    path_m = sum(float(np.linalg.norm(np.diff(t.positions_m, axis=0), axis=1).sum()) for t in joined.trajectories)
     loops = [s.survey.loops.counts() for s in taken]
     culled = [asdict(s.survey.culled) for s in taken]
     return BuildReport(
@@ -90,18 +89,14 @@ def make_report(
         evaluated_share=found.evaluated_share,
         scale="metric" if survey_map.scale_known else "unknown",
         scale_error=None if found.similarity is None else 1.0 / found.similarity.scale - 1.0,
-        peak_rss_mb=round(peak_rss_mb, 1),
+        peak_rss_mb=round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e6, 1),
         culled={key: sum(count[key] for count in culled) for key in culled[0]},
         findings={s.entry.name: s.remarks() for s in recordings},
         checks={s.entry.name: s.checks for s in recordings},
         corrections={s.entry.name: s.corrections for s in taken if s.corrections},
         sessions=[
-            {
-                "recording": recordings[o.number].entry.name,
-                "joined": o.joined,
-                "verdict": o.verdict.value,
-                "reason": o.reason,
-            }
+            {"recording": recordings[o.number].entry.name, "joined": o.joined, "verdict": o.verdict.value}
+            | {"reason": o.reason}
             | ({} if o.evidence is None else {"evidence": asdict(o.evidence)})
             | ({} if o.counts is None else asdict(o.counts))
             for o in joined.outcomes
@@ -111,6 +106,7 @@ def make_report(
         starts=evidence.starts,
         views=evidence.views,
         lookalike_recall=None if evidence.starts is None else evidence.starts.lookalike_recall,
+        **more,
     )
 
 
@@ -157,16 +153,12 @@ def sentence(site: str, version: int, parent: int | None, report: BuildReport, s
     one_way = one_way_words(report.directions)
     blind = "" if report.views is None else report.views.warning
     warned = "".join(f"; {words}" for words in (one_way, lookalike_words(report.starts), blind) if words)
+    of = f"of {report.keyframes} keyframes and {report.landmarks} landmarks"
     if report.scale == "unknown":
-        return (
-            f"site {site}: draft {version} of {report.keyframes} keyframes and {report.landmarks} landmarks, {sizes}; its scale is "
-            "unknown, so it can be inspected but not published"
-        )
-    return (
-        f"site {site}: draft {version}{built_on} of {report.keyframes} keyframes and {report.landmarks} landmarks over "
-        f"{report.path_m:.1f} m, {sizes}{left_out}{warned}; make it current with "
-        f"`mapserver publish --site {site} --store {shlex.quote(str(store))}`"
-    )
+        return f"site {site}: draft {version} {of}, {sizes}; its scale is unknown, so it can be inspected but not published"
+    publish = f"`mapserver publish --site {site} --store {shlex.quote(str(store))}`"
+    whole = f"{of} over {report.path_m:.1f} m, {sizes}{left_out}{warned}"
+    return f"site {site}: draft {version}{built_on} {whole}; make it current with {publish}"
 
 
 def loop_places(taken: Sequence[RecordingSurvey], joined: MergedMap) -> list[dict[str, Any]]:
@@ -174,17 +166,14 @@ def loop_places(taken: Sequence[RecordingSurvey], joined: MergedMap) -> list[dic
 
     Each has its recording, both ends (x, y) in `map`, verdict, reason and score.
     """
-    accepted: list[dict[str, Any]] = []
-    refused: list[dict[str, Any]] = []
+    accepted, refused = list[dict[str, Any]](), list[dict[str, Any]]()
     for recording, trajectory in zip(taken, map_trajectories(joined), strict=True):
         survey = recording.survey
         frames = [keyframe.frame_index for keyframe in survey.odometry.keyframes]
         # Records have keyframe numbers from before components were left out: then their places are unknown.
         for record in survey.loops.records if all(c.kept for c in survey.components) else ():
-            start_m, end_m = (
-                [round(float(value), 3) for value in trajectory.positions_m[frames[number], :2]]
-                for number in (record.i, record.j)
-            )
+            ends = [frames[record.i], frames[record.j]]
+            start_m, end_m = trajectory.positions_m[ends, :2].round(3).tolist()
             place = {
                 "recording": recording.entry.name,
                 "from_map_m": start_m,

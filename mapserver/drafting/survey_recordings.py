@@ -6,7 +6,7 @@ from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Protocol, Self
 
 import msgspec
 import numpy as np
@@ -18,18 +18,17 @@ from fleetmap.errors import FleetmapError, RecordingError, SurveyError
 from fleetmap.geometry import Array
 from fleetmap.log_lines import printable
 from fleetmap.mapformat import RecordingEntry
-from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
+from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording
 from fleetmap.recordings.sensor_subset import reduced, with_other_views
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps, Trajectory, wheel_between
 from mapserver.calibration import CalibrationParameter
-from mapserver.calibration.problem import CalibrationData
+from mapserver.calibration.motion_rows import CalibrationData
 from mapserver.calibration.recordings import LONGEST_S, busiest_stretch
-from mapserver.doctor.calibration import SURE_SIGMAS, TOLERANCES
+from mapserver.doctor.calibration import SURE_SIGMAS
 from mapserver.doctor.findings import summary
 from mapserver.doctor.run_checks import frames_to_check
-from mapserver.drafting.accuracy import check_truth
 from mapserver.drafting.admission import (
     DECISIVE,
     SAMPLED_FRAMES,
@@ -41,8 +40,8 @@ from mapserver.drafting.admission import (
 )
 from mapserver.drafting.draft_evidence import ProbedFrame, probed_frames
 from mapserver.drafting.mapped_images import KeptFrames
-from mapserver.drafting.trajectory import GivenPoses, OtherTrajectory, given_poses, with_depths
 from mapserver.drafting.worker import read_ahead
+from mapserver.evaluation.trajectory_error import check_truth
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.bundle.stereo_yaw_check import StereoYaw
 from mapserver.survey.finish.dock_alignment import aligned_by_priors
@@ -100,8 +99,8 @@ class RecordingSurvey:
 
     def evidence(self) -> RigEvidence:
         """Evidence on its calibration: the pair is doubted if the survey's disparities contradict the angle accepted by the doctor."""
-        limit, focal_px = TOLERANCES[CalibrationParameter.PAIR_YAW], self.survey.state.rig.camera.focal_px
-        most_px = focal_px * (limit.warn_above + SURE_SIGMAS * limit.least_sigma)
+        yaw, focal_px = CalibrationParameter.PAIR_YAW, self.survey.state.rig.camera.focal_px
+        most_px = focal_px * (yaw.warn_above + SURE_SIGMAS * yaw.least_sigma)
         off = [f"{-yaw.shift_px:+.2f} px{of_view}" for of_view, yaw in self._yaws() if abs(yaw.correction_px) > most_px]
         if not off:
             return self.calibration
@@ -111,6 +110,26 @@ class RecordingSurvey:
     def _yaws(self) -> list[tuple[str, StereoYaw]]:
         """Return the error of yaw of the pair of each view, with the view's name; that of the first one is empty."""
         return [(f" of view {n}" if n else "", yaw) for n, yaw in enumerate(self.survey.stereo_yaws)]
+
+
+class GivenPoses(NamedTuple):
+    """frame_from_body of every selected frame, in metres, and text on the findings about their file."""
+
+    trajectory: Trajectory
+    words: str
+
+
+class StartPoses(Protocol):
+    """Poses of another system with which a survey begins, from a file; made by a plug-in (`mapserver.poses`)."""
+
+    @property
+    def file(self) -> Path: ...
+
+    def seen(self, recording: Recording, indices: NDArray[np.int64]) -> tuple[Recording, NDArray[np.int64]]:
+        """Return the recording with what the system measured beside poses, and which of the selected frames (F,) can be used."""
+
+    def poses(self, recording: Recording, indices: NDArray[np.int64]) -> GivenPoses:
+        """Return the poses of the selected frames (F,); an error if they do not fit the recording."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,14 +146,22 @@ class Admission:
 
 @dataclass(frozen=True, slots=True)
 class RecordingOptions:
-    """Options of reading: frames A:B:C, how recordings are opened, only the sensors of a smaller set, and the initial trajectory (None:
-    fleetmap's odometry).
+    """Options of reading.
+
+    frames: an A:B:C slice of each recording. use: only the sensors of a smaller set. trajectory: start poses of another system, None for
+    fleetmap's odometry.
     """
 
     frames: str = "::"
-    opening: OpenOptions = field(default_factory=OpenOptions)
+    calibration: Path | None = None
+    topics: Topics = field(default_factory=Topics)
     use: SensorSet | None = None
-    trajectory: OtherTrajectory | None = None
+    trajectory: StartPoses | None = None
+
+    @property
+    def opening(self) -> OpenOptions:
+        """How recordings are opened."""
+        return OpenOptions(self.calibration, self.topics)
 
     def opened(self, path: Path, keep_in: Path | None = None) -> tuple[Recording, NDArray[np.int64]]:
         """Return the recording at `path`, to be closed, and the indices of its selected frames. keep_in: a folder for KeptFrames."""
@@ -143,21 +170,15 @@ class RecordingOptions:
             recording = replace(recording, name=printable(path.name))
         try:
             recording = reduced(recording, self.use)
-            selected = FrameSelection.parse(self.frames).apply(recording)
-            recording, indices = with_depths(recording, selected, self.trajectory)
+            indices = FrameSelection.parse(self.frames).apply(recording)
+            if self.trajectory is not None:
+                recording, indices = self.trajectory.seen(recording, indices)
             if keep_in is not None:
                 recording = replace(recording, frames=KeptFrames(recording.frames, keep_in))
             return recording.readable(indices)
         except FleetmapError:
             recording.close()
             raise
-
-    @contextmanager
-    def open(self, path: Path) -> Iterator[tuple[Recording, NDArray[np.int64]]]:
-        """Open the recording at `path` for the block, and return it with the indices of its selected frames."""
-        recording, indices = self.opened(path)
-        with recording:
-            yield recording, indices
 
 
 class OpenRecordings:
@@ -167,7 +188,7 @@ class OpenRecordings:
     """
 
     def __init__(self, options: RecordingOptions, folder: Path) -> None:
-        self._options, self._folder = options, folder
+        self._options, self._folder, self.trajectory = options, folder, options.trajectory
         self._path: Path | None = None
         self._opened: tuple[Recording, NDArray[np.int64]]
 
@@ -178,10 +199,6 @@ class OpenRecordings:
         if self._path is not None:
             self._opened[0].close()
             self._path = None
-
-    @property
-    def trajectory(self) -> OtherTrajectory | None:
-        return self._options.trajectory
 
     @contextmanager
     def open(self, path: Path) -> Iterator[tuple[Recording, NDArray[np.int64]]]:
@@ -213,8 +230,7 @@ class _Frames:
 
     def __iter__(self) -> Iterator[CameraFrame]:
         with self.recording as recording:
-            for index in range(len(recording)):
-                yield recording.read_frame(index)
+            yield from map(recording.read_frame, range(len(recording)))
 
 
 def survey_inputs_of(
@@ -268,7 +284,7 @@ class BegunSurvey:
 
 def admit_recordings(
     paths: Sequence[Path],
-    options: RecordingOptions | OpenRecordings,
+    reading: OpenRecordings,
     console: Console,
     *,
     needs_truth: bool,
@@ -286,7 +302,7 @@ def admit_recordings(
     for path in paths:
         look_at([path])
         with _noting(path, unusable):
-            admitted[path] = _admission(path, options, console, needs_truth, settings, tools or SurveyTools())
+            admitted[path] = _admission(path, reading, console, needs_truth, settings, tools or SurveyTools())
     if not admitted:
         raise RecordingError(f"none of {len(paths)} recordings can be used: {'; '.join((unusable or {}).values())}")
     return admitted
@@ -312,13 +328,13 @@ def _noting(path: Path, unusable: dict[Path, str] | None) -> Iterator[None]:
 
 def _admission(
     path: Path,
-    options: RecordingOptions | OpenRecordings,
+    reading: OpenRecordings,
     console: Console,
     needs_truth: bool,
     settings: SurveySettings | None,
     tools: SurveyTools,
 ) -> Admission:
-    with options.open(path) as (recording, indices):
+    with reading.open(path) as (recording, indices):
         for issue in recording.issues:
             console.print(f"{recording.name}: issue: {issue.what}: {issue.detail}", markup=False)
         if needs_truth:
@@ -326,7 +342,7 @@ def _admission(
         first = recording.view(0)
         total, done = frames_to_check(first, SAMPLED_FRAMES, TURN_FRAMES), count(1)
         begun = None
-        if settings is not None and options.trajectory is None and BegunSurvey.suits(recording, indices):
+        if settings is not None and reading.trajectory is None and BegunSurvey.suits(recording, indices):
             begun = BegunSurvey(recording, indices, settings, tools)
         result = checked(
             first, lambda: tools.progress("examination", min(next(done), total - 1), total), tools.executor, begun
@@ -336,9 +352,9 @@ def _admission(
         tools.at("examination", total, total)
         for remark in result.remarks():
             console.print(f"{recording.name}: {remark}", markup=False)
-        if options.trajectory is None:
+        if reading.trajectory is None:
             return Admission(result, begun=None if begun is None else begun.chain_of(result.rig))
-        given = given_poses(replace(first, calibration=result.rig), indices, options.trajectory)
+        given = reading.trajectory.poses(replace(first, calibration=result.rig), indices)
         console.print(f"{recording.name}: {given.words}", markup=False)
         return Admission(result, given)
 
@@ -346,7 +362,7 @@ def _admission(
 def survey_recording(
     path: Path,
     admission: Admission,
-    reading: RecordingOptions | OpenRecordings,
+    reading: OpenRecordings,
     pinhole: StereoCamera | None,
     options: SurveyConfig,
     tools: SurveyTools,
@@ -437,10 +453,9 @@ def _between(recording: Recording, chosen: NDArray[np.int64], rectifier: Rectifi
 
 def _aligned(done: Survey, recording: Recording) -> tuple[Survey, Array | None]:
     """Return the survey, in metres if its priors give an unknown scale, and map_from_survey (4, 4) by them, None without any."""
-    priors, base_from_body = recording.priors, recording.calibration.base_from_body
     if done.map.scale_known:  # a survey with priors is in `map` already
         return done, np.eye(4) if any(prior.is_believed for prior in done.state.priors) else None
-    aligned = aligned_by_priors(done.map, priors, base_from_body)
+    aligned = aligned_by_priors(done.map, recording.priors, recording.calibration.base_from_body)
     if aligned is None:
         return done, None
     in_metres = replace(done, map=scaled(done.map, aligned.scale), state=scaled_state(done.state, aligned.scale))
@@ -469,13 +484,12 @@ def survey_all(
 
 def say_left_out(console: Console, site: str, surveyed: list[RecordingSurvey], joined: MergedMap) -> None:
     """Print the recordings that could not be joined; raises SurveyError if none could."""
-    left = [(s, o) for s, o in zip(surveyed, joined.outcomes, strict=True) if not o.joined]
-    for recording, outcome in left:
-        console.print(f"left out: {recording.entry.name}: {outcome.reason}", markup=False)
+    left = [f"{s.entry.name}: {o.reason}" for s, o in zip(surveyed, joined.outcomes, strict=True) if not o.joined]
+    for words in left:
+        console.print(f"left out: {words}", markup=False)
     if len(left) == len(surveyed):
-        reasons = "; ".join(f"{s.entry.name}: {o.reason}" for s, o in left)
         raise SurveyError(
-            f"nothing could be joined to the current version of site {site} ({reasons}); drive through places that are "
+            f"nothing could be joined to the current version of site {site} ({'; '.join(left)}); drive through places that are "
             "in the map, pass its docks, or survey the area as another --site"
         )
 

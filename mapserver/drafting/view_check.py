@@ -21,7 +21,7 @@ from mapserver.quality.probes import PRIOR_RADIUS_M, SAME_WAY_COSINE, Probe, pla
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.landmark_budget import Sighting, choose_landmarks
-from mapserver.tiles.tiling import TILE_SIZE_M, tiles_from_survey
+from mapserver.tiles.tiling import tiles_from_survey
 
 
 class AskedView(NamedTuple):
@@ -76,7 +76,7 @@ class TileChooser(NamedTuple):
         return tiles, SurveyedViews(len(views), given_more, places)
 
     def _tiles(self, sightings: Sequence[Sighting]) -> list[Tile]:
-        chosen = choose_landmarks(self.survey_map, self.settings, TILE_SIZE_M, self.published, sightings)
+        chosen = choose_landmarks(self.survey_map, self.settings, self.published, sightings)
         if self.frozen is not None and self.published is not None:
             chosen = np.where(self.frozen, np.isin(self.survey_map.landmark_ids, self.published), chosen)
         return tiles_from_survey(self.survey_map, chosen=chosen)

@@ -1,14 +1,16 @@
-"""Errors of an estimated trajectory against the truth, at the estimate's stamps. Both are of the same body. Pure."""
+"""Errors of an estimated trajectory, and of a survey, against the truth, at the estimate's stamps. Both are of the same body. Pure."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.errors import SurveyError
+from fleetmap.errors import RecordingError, SurveyError
 from fleetmap.geometry import Array, align_points, transform_points
 from fleetmap.sensors.samples import Stamps, Trajectory
 
 MAX_GAP_NS = 200_000_000
+MIN_MATCHED = 3  # stamps with ground truth needed for an alignment
 _OPEN_TURN_RAD = np.deg2rad(1.0)  # error of rotations in a motion capture system
 
 
@@ -53,10 +55,10 @@ def absolute_trajectory_error(
     Raises SurveyError if fewer than three stamps have a truth. Source: Sturm et al. 2012 (ATE), Umeyama 1991.
     """
     mine, true = paired(estimate, truth)
-    if len(mine) < 3:
+    if len(mine) < MIN_MATCHED:
         raise SurveyError(
             f"{len(mine)} of {len(estimate)} estimated stamps have ground truth within {MAX_GAP_NS / 1e6:.0f} ms gaps; "
-            "at least 3 are needed: check that both are on the same clock"
+            f"at least {MIN_MATCHED} are needed: check that both are on the same clock"
         )
     frame_from_estimate, scale = align_points(true.positions_m, mine.positions_m, with_scale=with_scale)
     errors = np.linalg.norm(transform_points(frame_from_estimate, scale * mine.positions_m) - true.positions_m, axis=1)
@@ -97,3 +99,35 @@ def truth_from_estimate(estimate: Trajectory, truth: Trajectory) -> Array:
 def rms(errors: Array) -> float:
     """Return the root mean square of errors (N,)."""
     return float(np.sqrt(np.mean(errors**2)))
+
+
+class Accuracy(NamedTuple):
+    """A survey against ground truth; all None without one, or if too few stamps have both (see MIN_MATCHED)."""
+
+    rigid: AteResult | None = None
+    similarity: AteResult | None = None
+    evaluated_share: float | None = None
+
+
+def accuracy(estimate: Trajectory, frames: int, truth: Trajectory | None) -> Accuracy:
+    """Return errors of all estimated ones of a survey's frames with a known truth."""
+    if truth is None:
+        return Accuracy()
+    matched = len(paired(estimate, truth)[0])
+    if matched < MIN_MATCHED:
+        return Accuracy(evaluated_share=matched / max(frames, 1))
+    rigid = absolute_trajectory_error(estimate, truth, frames=frames)
+    similarity = absolute_trajectory_error(estimate, truth, with_scale=True, frames=frames)
+    return Accuracy(rigid, similarity, rigid.evaluated_share)
+
+
+def check_truth(what: str, stamps_ns: Stamps, truth: Trajectory | None) -> None:
+    """Raise RecordingError unless enough of the stamps (F,) have a truth to align a survey to its frame."""
+    if truth is None:
+        raise RecordingError(f"{what} carries no ground truth; build it without --frame-from-ground-truth")
+    known = sum(truth.at(int(stamp)) is not None for stamp in stamps_ns)
+    if known < MIN_MATCHED:
+        raise RecordingError(
+            f"{what}: {known} of {len(stamps_ns)} selected frames have a ground truth, {MIN_MATCHED} are needed; "
+            "select others with --frames or build without --frame-from-ground-truth"
+        )

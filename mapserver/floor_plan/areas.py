@@ -105,10 +105,9 @@ class Area:
         """Effects on planners and maps as text, each after a comma; empty without any."""
         speed = "" if self.percent is None else f" {self.percent} %"
         masked = "" if self.mask is None else f", {self.mask.value}{speed}"
-        masked += "" if self.lift is None else f", lift {self.lift}"
-        return (
-            masked if self.correction is None else f"{masked}, {self.correction.kind.value}: {self.correction.reason}"
-        )
+        lift = "" if self.lift is None else f", lift {self.lift}"
+        corrects = "" if self.correction is None else f", {self.correction.kind.value}: {self.correction.reason}"
+        return masked + lift + corrects
 
     @property
     def rings(self) -> Rings:

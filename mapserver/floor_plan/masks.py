@@ -42,11 +42,9 @@ def mask_grid(areas: Areas, kind: MaskKind) -> OccupancyGrid:
         )
         raise UsageError(f"the site has no area with a {kind.value} mask; {words}")
     corners = np.concatenate([ring for area in chosen for ring in area.rings])
-    low, high = (
-        np.floor(corners.min(axis=0) / CELL_M).astype(int),
-        np.floor(corners.max(axis=0) / CELL_M).astype(int) + 1,
-    )
-    columns, rows = (high - low).tolist()
+    cells_of_corners = np.floor(corners / CELL_M).astype(int)
+    low = cells_of_corners.min(axis=0)
+    columns, rows = (cells_of_corners.max(axis=0) + 1 - low).tolist()
     if columns * rows > _MAX_CELLS:
         raise UsageError(
             f"the {kind.value} masks span {columns} x {rows} cells; a planner's map has at most {_MAX_CELLS}"

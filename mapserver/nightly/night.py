@@ -203,7 +203,7 @@ class _Night:
                 self._put_away(path, boxes.BAD, None, _ENDED.format(nights=ceil(self._report.ended[name])))
                 continue
             self._look_at([path])
-            recorded = boxes.identify(path, self._request.options.reading.opening)
+            recorded = boxes.identify(path, self._request.options.opening)
             if recorded is None:
                 self._wait(name, "incomplete: it changed while it was read")
             elif isinstance(recorded, str):

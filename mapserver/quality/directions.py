@@ -7,14 +7,13 @@ import numpy as np
 import scipy
 
 from fleetmap.geometry import Array
-from mapserver.quality.figures import TileDirections
+from mapserver.quality.figures import TileDirections, first_of
 
 HEADINGS = ("E", "NE", "N", "NW", "W", "SW", "S", "SE")  # E along x of `map`, N along y
 _NEAR_M = 2.0  # includes the other lane of an aisle, but not the next aisle
 _OTHER_WAY = -0.5  # cosine between the headings of two places, below which they look in opposite directions
 _UPRIGHT = 0.3  # horizontal part of an axis below which a camera looks at the ceiling or the ground
 _LEAST_M = 3.0  # one-way places within a smaller extent are a turn, not an aisle
-_NAMED = 2
 
 
 def tile_directions(places: Mapping[tuple[int, int], Array]) -> list[TileDirections]:
@@ -56,12 +55,9 @@ def tile_directions(places: Mapping[tuple[int, int], Array]) -> list[TileDirecti
 
 def one_way_words(found: Sequence[TileDirections]) -> str:
     """Return the number of one-way tiles and the missing headings in the first ones, as text; empty if none are missing."""
-    one_way = [tile for tile in found if tile.missing]
-    if not one_way:
-        return ""
-    named = "; ".join(f"tile {tile.tile[0]},{tile.tile[1]}: {missing_words(tile)}" for tile in one_way[:_NAMED])
-    more = f"; and {len(one_way) - _NAMED} more" if len(one_way) > _NAMED else ""
-    return f"{len(one_way)} of {len(found)} tiles hold places that were seen one way only ({named}{more})"
+    named = [f"tile {tile.tile[0]},{tile.tile[1]}: {missing_words(tile)}" for tile in found if tile.missing]
+    one_way = f"{len(named)} of {len(found)} tiles hold places that were seen one way only ({first_of(named, 2)})"
+    return one_way if named else ""
 
 
 def missing_words(tile: TileDirections) -> str:

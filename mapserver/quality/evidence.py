@@ -67,7 +67,6 @@ def examine(
         last_version=compare(draft, before, placed, removed_ids),
         aliasing=aliasing(draft, frames),
         aliasing_before=None if before is None else aliasing(before, frames),
-        starts=None,
         motion=motion,
     )
 
@@ -132,9 +131,7 @@ def _figures(view: MapView, probes: Sequence[Probe], fixes: Sequence[Fix | None]
         return ProbeFigures(len(probes), 0.0, 0.0, None, None, None, None)
     off = np.stack([se3_inverse(probe.map_from_cam) @ fix.map_from_cam for probe, fix in found])
     errors_m = np.linalg.norm(off[:, :3, 3], axis=1)
-    wrong = [
-        is_wrong(error_m, rotation_angle_rad(turn)) for error_m, turn in zip(errors_m, off[:, :3, :3], strict=True)
-    ]
+    wrong = [is_wrong(error_m, rotation_angle_rad(by[:3, :3])) for error_m, by in zip(errors_m, off, strict=True)]
     return ProbeFigures(
         frames=len(probes),
         localised_share=round(len(found) / len(probes), 4),
@@ -179,12 +176,10 @@ def trajectory_breaks(
     along_m = np.concatenate([[0.0], np.cumsum(steps_m)])
     follows = tracked & (np.diff(stamps_ns, prepend=stamps_ns[:1]) < _CONTINUOUS_NS)
     lost = np.concatenate([[0], np.cumsum(~follows)])
-    starts = np.arange(len(along_m))
     ends = np.searchsorted(along_m, along_m + _STRETCH_M)
-    whole = ends < len(along_m)
-    starts, ends = starts[whole], ends[whole]
-    whole = lost[ends + 1] == lost[starts + 1]
-    starts, ends = starts[whole], ends[whole]
+    starts = np.flatnonzero(ends < len(along_m))
+    starts = starts[lost[ends[starts] + 1] == lost[starts + 1]]
+    ends = ends[starts]
     if not len(starts):
         return None
     by_map = se3_inverse(map_from_body[starts]) @ map_from_body[ends]

@@ -1,6 +1,6 @@
 """Figures of the evidence about a draft's tiles; see docs/reports.md. Light imports: the store reads them."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import msgspec
@@ -15,7 +15,10 @@ EVIDENCE_KEY = "evidence"
 """Key of a manifest's report with the gate's evidence, which therefore stays with the version."""
 
 
-_NAMED = 3
+def first_of(words: Sequence[str], most: int = 3) -> str:
+    """Return the first ones as one text, with the number of the others."""
+    more = [f"and {len(words) - most} more"] if len(words) > most else []
+    return "; ".join([*words[:most], *more])
 
 
 class ProbeFigures(msgspec.Struct, frozen=True):
@@ -114,12 +117,8 @@ class SurveyedViews(msgspec.Struct, frozen=True):
         """The views without a fix, as text; empty if there are none."""
         if not self.without_fix:
             return ""
-        named = "; ".join(
-            f"({view.place[0]:g}, {view.place[1]:g}), {view.path_m:g} m into its recording"
-            for view in self.without_fix[:_NAMED]
-        )
-        more = f"; and {len(self.without_fix) - _NAMED} more" if len(self.without_fix) > _NAMED else ""
-        return f"{len(self.without_fix)} of {self.frames} frames of the surveys get no fix in the map ({named}{more})"
+        named = [f"({v.place[0]:g}, {v.place[1]:g}), {v.path_m:g} m into its recording" for v in self.without_fix]
+        return f"{len(named)} of {self.frames} frames of the surveys get no fix in the map ({first_of(named)})"
 
 
 class TrajectoryBreaks(msgspec.Struct, frozen=True):

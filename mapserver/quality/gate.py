@@ -1,6 +1,6 @@
 """Gate before publishing: reasons against a draft, by itself and compared with the robots' present version. Pure."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
@@ -10,7 +10,14 @@ from fleetmap.config import Section
 from fleetmap.encoding import to_plain
 from fleetmap.failure_definition import ERROR_LIMIT_M
 from fleetmap.mapformat import Manifest
-from mapserver.quality.figures import Aliasing, Comparison, Displacement, Evidence, trusted_calibrations
+from mapserver.quality.figures import (
+    Aliasing,
+    Comparison,
+    Displacement,
+    Evidence,
+    TrajectoryBreaks,
+    trusted_calibrations,
+)
 
 CHECKS = {
     "joining": "recordings that belong to the site",
@@ -78,70 +85,66 @@ def judge(
     site's first version, which sets the scale of all later ones: it needs a recording that judges it, or an operator's confirmation.
     """
     report: dict[str, Any] = {"landmarks": draft.landmarks, "tiles": len(draft.tiles), "tile_bytes": draft.tile_bytes}
-    examined = evidence or Evidence()
-    checked: dict[str, list[str]] = {}  # reasons by what was judged
-    strangers = _strangers(draft)
-    passed, not_judged = (["joining"] if strangers == [] else []), (["joining"] if strangers is None else [])
-    for name, compared in (
-        ("held_out_frames", examined.held_out),
-        ("yesterdays_recordings", examined.replayed),
-        ("last_versions_places", examined.last_version),
-    ):
-        if compared is None or compared.draft.frames < settings.min_frames:
-            not_judged.append(name)
-        else:
-            over = f"over {compared.draft.frames} frames"
-            checked[name] = [f"{CHECKS[name]}: {words}, {over}" for words in _frame_reasons(compared, settings)]
-    if examined.displaced is None or current is None:
-        not_judged.append("version_before")
-    else:
-        checked["version_before"] = list(_displaced_reasons(draft, current, examined.displaced, settings))
-    if not isinstance(error_m := draft.report.get("ate_rmse_m"), int | float):
-        not_judged.append("ground_truth")
-    else:
-        over = f"{CHECKS['ground_truth']}: {error_m:.3f} m are above the limit ({settings.max_truth_error_m:g})"
-        checked["ground_truth"] = [over] if error_m > settings.max_truth_error_m else []
-    if examined.aliasing is None or examined.aliasing.offered < settings.min_frames:
-        not_judged.append("aliasing_probes")
-    else:
-        checked["aliasing_probes"] = _aliasing_reasons(examined.aliasing, examined.aliasing_before, settings)
-    doubts, unjudged, unknown = _calibration_reasons(draft, examined, is_first=current is None)
-    if not unknown or doubts or unjudged:
-        checked["calibration"] = [*doubts, *unjudged]
-    not_judged += unknown
-    if examined.motion is None:
-        not_judged.append("motion")
-    else:
-        breaks, worst_m = examined.motion.breaks, examined.motion.worst_m
-        torn = f"its trajectory is torn in {breaks} places, by up to {worst_m:.2f} m against odometry; the limit is {settings.max_breaks}"
-        checked["motion"] = [torn] if breaks > settings.max_breaks else []
-    if current is None:
-        not_judged.append("size_against_last_version")
-    else:
-        shares = _shares(draft, current)
+    examined, strangers, shares = evidence or Evidence(), _strangers(draft), _shares(draft, current)
+    if current is not None:
         report |= {"compared_with": current.version, **shares}
-        checked["size_against_last_version"] = list(_size_reasons(shares, current.version, settings))
-    passed += [name for name, reasons in checked.items() if not reasons]
+    doubts, unjudged, unknown = _calibration_reasons(draft, examined, is_first=current is None)
+    checked = {  # reasons by what was judged; None for what was not
+        "held_out_frames": _frame_reasons("held_out_frames", examined.held_out, settings),
+        "yesterdays_recordings": _frame_reasons("yesterdays_recordings", examined.replayed, settings),
+        "last_versions_places": _frame_reasons("last_versions_places", examined.last_version, settings),
+        "version_before": _displaced_reasons(draft, current, examined.displaced, settings),
+        "ground_truth": _truth_reasons(draft.report.get("ate_rmse_m"), settings),
+        "aliasing_probes": _aliasing_reasons(examined.aliasing, examined.aliasing_before, settings),
+        "calibration": None if unknown and not (doubts or unjudged) else [*doubts, *unjudged],
+        "motion": _motion_reasons(examined.motion, settings),
+        "size_against_last_version": None if current is None else _size_reasons(shares, current.version, settings),
+    }
+    judged = {"joining": strangers} | checked
     if examined.views is not None and examined.views.warning:
         report["warnings"] = [examined.views.warning]
-    report |= {"evidence": to_plain(examined), "passed": passed, "not_judged": not_judged, "unjudged": unjudged}
-    reasons = tuple(words for found in checked.values() for words in found)
+    report["evidence"] = to_plain(examined)
+    report["passed"] = [name for name, reasons in judged.items() if reasons == []]
+    lacking = {name: [name] if reasons is None else [] for name, reasons in judged.items()} | {"calibration": unknown}
+    report |= {"not_judged": [words for lacks in lacking.values() for words in lacks], "unjudged": unjudged}
+    reasons = tuple(words for found in checked.values() for words in found or ())
     return GateVerdict(reasons, _hard_reasons(draft, strangers), report, tuple(unjudged))
 
 
 def _displaced_reasons(
-    draft: Manifest, current: Manifest, recordings: Iterable[Displacement], settings: GateSettings
-) -> Iterator[str]:
+    draft: Manifest, current: Manifest | None, recordings: Sequence[Displacement] | None, settings: GateSettings
+) -> list[str] | None:
+    if recordings is None or current is None:
+        return None
+    found = [
+        f"{one.elsewhere} of {one.frames} frames of {one.recording} agree in that version on a place {one.off_m:.2f} m from the draft's; "
+        "build without it"
+        for one in recordings
+        if one.elsewhere > settings.max_wrong_share * one.frames
+    ]
     if draft.parent != current.version:
-        yield f"{CHECKS['version_before']}: compared with version {draft.parent}, and {current.version} is current; build it again"
-    for one in recordings:
-        if one.elsewhere > settings.max_wrong_share * one.frames:
-            frames = f"{one.elsewhere} of {one.frames} frames of {one.recording} agree in that version"
-            yield f"{CHECKS['version_before']}: {frames} on a place {one.off_m:.2f} m from the draft's; build without it"
+        found.insert(0, f"compared with version {draft.parent}, and {current.version} is current; build it again")
+    return [f"{CHECKS['version_before']}: {words}" for words in found]
 
 
-def _frame_reasons(compared: Comparison, settings: GateSettings) -> Iterator[str]:
-    """Yield reasons from one kind of frames: figures on the wrong side of their limit; the limit itself is allowed."""
+def _truth_reasons(error_m: object, settings: GateSettings) -> list[str] | None:
+    if not isinstance(error_m, int | float):
+        return None
+    over = f"{CHECKS['ground_truth']}: {error_m:.3f} m are above the limit ({settings.max_truth_error_m:g})"
+    return [over] if error_m > settings.max_truth_error_m else []
+
+
+def _motion_reasons(motion: TrajectoryBreaks | None, settings: GateSettings) -> list[str] | None:
+    if motion is None:
+        return None
+    torn = f"its trajectory is torn in {motion.breaks} places, by up to {motion.worst_m:.2f} m against odometry; the limit is"
+    return [f"{torn} {settings.max_breaks}"] if motion.breaks > settings.max_breaks else []
+
+
+def _frame_reasons(name: str, compared: Comparison | None, settings: GateSettings) -> list[str] | None:
+    """Return reasons from one kind of frames: figures on the wrong side of their limit; the limit itself is allowed."""
+    if compared is None or compared.draft.frames < settings.min_frames:
+        return None
     draft, before = compared.draft, compared.before
     localised, error = "share of localised frames", "median error in metres"
     least = [(localised, draft.localised_share, settings.min_localised_share, "the limit")]
@@ -156,17 +159,21 @@ def _frame_reasons(compared: Comparison, settings: GateSettings) -> Iterator[str
         if before.median_error_m is not None:
             limit = before.median_error_m + settings.margin_error_m
             most.append((error, draft.median_error_m, limit, "the current version's and its margin"))
-    for sign, word, checks in ((-1, "below", least), (1, "above", most)):
-        for figure, value, limit, name in checks:
-            if value is not None and sign * (value - limit) > 0:
-                yield f"{figure}, {value:.3f}, is {word} {name} ({limit:.3f})"
-    share = compared.inliers_share
-    if before is not None and share is not None and share < settings.min_inliers_share:
-        limit = settings.min_inliers_share
-        yield f"matches per frame, {share:.3f} of the current version's, are below the limit ({limit:.3f})"
+    found = [
+        f"{figure}, {value:.3f}, is {word} {whose} ({limit:.3f})"
+        for sign, word, checks in ((-1, "below", least), (1, "above", most))
+        for figure, value, limit, whose in checks
+        if value is not None and sign * (value - limit) > 0
+    ]
+    share, limit = compared.inliers_share, settings.min_inliers_share
+    if before is not None and share is not None and share < limit:
+        found.append(f"matches per frame, {share:.3f} of the current version's, are below the limit ({limit:.3f})")
+    return [f"{CHECKS[name]}: {words}, over {draft.frames} frames" for words in found]
 
 
-def _aliasing_reasons(aliasing: Aliasing, before: Aliasing | None, settings: GateSettings) -> list[str]:
+def _aliasing_reasons(aliasing: Aliasing | None, before: Aliasing | None, settings: GateSettings) -> list[str] | None:
+    if aliasing is None or aliasing.offered < settings.min_frames:
+        return None
     usual = 0.0 if before is None else before.accepted_share
     if aliasing.accepted_share <= max(settings.max_aliased_share, usual):
         return []
@@ -198,11 +205,13 @@ def _calibration_reasons(
     return doubts, unjudged, unknown
 
 
-def _shares(draft: Manifest, current: Manifest) -> dict[str, float]:
-    """Return by tile its landmarks against before: a tile is covered with at least half as many.
+def _shares(draft: Manifest, current: Manifest | None) -> dict[str, float]:
+    """Return by tile its landmarks against before: a tile is covered with at least half as many. Empty for a first version.
 
     Those that corrections took from the draft, as its report says, do not count.
     """
+    if current is None:
+        return {}
     found = draft.report.get("removed_landmarks") if draft.parent == current.version else None
     removed = found if isinstance(found, dict) else {}
     before = {(tile.x, tile.y): tile.landmarks - removed.get(f"{tile.x},{tile.y}", 0) for tile in current.tiles}
@@ -215,16 +224,16 @@ def _shares(draft: Manifest, current: Manifest) -> dict[str, float]:
     }
 
 
-def _size_reasons(shares: dict[str, float], version: int, settings: GateSettings) -> Iterator[str]:
-    for name, words, limit in (
-        ("landmarks_share", "the number of landmarks", settings.min_landmarks_share),
-        ("coverage_share", "the covered area", settings.min_coverage_share),
-    ):
-        if shares[name] < limit:
-            yield f"{words} is {shares[name]:.2f} of version {version}'s, below the limit of {limit:g}"
-    if shares["bytes_share"] > settings.max_bytes_share:
-        limit = settings.max_bytes_share
-        yield f"the size in bytes is {shares['bytes_share']:.2f} of version {version}'s, above the limit of {limit:g}"
+def _size_reasons(shares: dict[str, float], version: int, settings: GateSettings) -> list[str]:
+    return [
+        f"{words} is {shares[name]:.2f} of version {version}'s, {side} the limit of {limit:g}"
+        for sign, side, name, words, limit in (
+            (-1, "below", "landmarks_share", "the number of landmarks", settings.min_landmarks_share),
+            (-1, "below", "coverage_share", "the covered area", settings.min_coverage_share),
+            (1, "above", "bytes_share", "the size in bytes", settings.max_bytes_share),
+        )
+        if sign * (shares[name] - limit) > 0
+    ]
 
 
 def _strangers(draft: Manifest) -> list[str] | None:

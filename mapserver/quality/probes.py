@@ -18,7 +18,7 @@ from fleetmap.relocalization.relocalizer import SAME_PLACE_M, Fix, Relocalizer, 
 from fleetmap.relocalization.settings import RelocalizerSettings
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.time_sliced import finished
-from mapserver.quality.figures import LookAlike, Repetition, Starts
+from mapserver.quality.figures import LookAlike, Repetition, Starts, first_of
 from mapserver.survey.survey_map import SurveyMap
 
 PRIOR_RADIUS_M = 3.0
@@ -99,9 +99,6 @@ def probes_of_map(survey_map: SurveyMap, count: int) -> list[Probe]:
     return probes
 
 
-_NAMED = 3
-
-
 def starts_without_prior(view: MapView, probes: Sequence[Probe]) -> Starts | None:
     """Use each probe as a start without a prior at an unmapped place; None if all of the map lies around each.
 
@@ -176,12 +173,9 @@ def lookalike_words(starts: Starts | None) -> str:
     if starts is None or starts.lookalike_recall == 0.0:
         return ""
     worst = sorted(starts.lookalikes, key=lambda alike: -alike.recall)
-    named = "; ".join(
-        f"({a.place[0]:g}, {a.place[1]:g}) looks like ({a.taken_for[0]:g}, {a.taken_for[1]:g})" for a in worst[:_NAMED]
-    )
-    more = f"; and {len(worst) - _NAMED} more" if len(worst) > _NAMED else ""
+    named = [f"({a.place[0]:g}, {a.place[1]:g}) looks like ({a.taken_for[0]:g}, {a.taken_for[1]:g})" for a in worst]
     return (
-        f"{len(worst)} of {starts.frames} frames look like another place of the map ({named}{more}): a robot without a coarse position "
+        f"{len(named)} of {starts.frames} frames look like another place of the map ({first_of(named)}): a robot without a coarse position "
         f"stays AMBIGUOUS unless it sees more than {100 * starts.lookalike_recall:.0f} % of what it should see"
     )
 

@@ -58,6 +58,12 @@ class SurveyMap:
     history: History | None = None
     scale_known: bool = True
 
+    @property
+    def estimated_trajectory(self) -> Trajectory:
+        """The selected frames whose poses are measured in the map."""
+        chosen = self.trajectory_estimated
+        return Trajectory(self.trajectory.stamps_ns[chosen], self.trajectory.frame_from_body[chosen])
+
 
 def history_of(survey_map: SurveyMap) -> History:
     """Return its history; for a survey without one, that of a map without later surveys."""

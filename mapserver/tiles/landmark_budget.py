@@ -18,6 +18,7 @@ from fleetmap.geometry import Array, se3_inverse
 from mapserver.survey.merge.landmark_persistence import PRIOR_COUNT
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap, history_of
+from mapserver.tiles.tiling import cells_of
 
 # An object differs from its identical copy by about 30 bits, two objects by 128; copies have the same height above the ground.
 _ALIKE_BITS, _HEIGHT_M = 60, 0.15
@@ -58,7 +59,6 @@ class Sighting(NamedTuple):
 def choose_landmarks(
     survey: SurveyMap,
     settings: BudgetSettings,
-    tile_size_m: float,
     published: NDArray[np.uint32] | None = None,
     sightings: Sequence[Sighting] = (),
 ) -> NDArray[np.bool_]:
@@ -72,7 +72,8 @@ def choose_landmarks(
     """
     limit = max(settings.min_landmarks, int(settings.landmarks_per_m * covered_path_m(survey)))
     starts, bins, weights = _views(survey, sightings)
-    cells, room = _cells(survey, tile_size_m, settings.tile_landmarks)
+    squares, cells = np.unique(cells_of(survey.points_map), axis=0, return_inverse=True)
+    cells, room = cells.reshape(-1).astype(np.int64), np.full(len(squares), settings.tile_landmarks, np.int64)
     counts = np.zeros(int(bins.max(initial=-1)) + 1, np.int64)
     chosen = np.zeros(len(survey.landmark_ids), bool)
     seen = np.diff(starts) > 0
@@ -165,10 +166,3 @@ def _weights(survey: SurveyMap, map_from_cam: Array) -> Array:
     again = history.landmark_seen + PRIOR_COUNT * rate * seen / (seen + 1.0)
     found = again / (history.landmark_expected + PRIOR_COUNT)
     return np.asarray(found * (1.0 + np.minimum(2 * spread / _WIDE_RAD, 1.0)) / (1.0 + sigma_px**2))
-
-
-def _cells(survey: SurveyMap, size_m: float, limit: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return (N,) the tile of each landmark, numbered, and the limit of landmarks in each tile."""
-    squares = np.floor(survey.points_map[:, :2] / size_m)
-    names, cells = np.unique(squares, axis=0, return_inverse=True)
-    return cells.reshape(-1).astype(np.int64), np.full(len(names), limit, np.int64)

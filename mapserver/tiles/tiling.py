@@ -16,16 +16,11 @@ MAX_PLACE_LANDMARKS = 300
 _Ids = NDArray[np.uint32]
 
 
-def tiles_from_survey(
-    survey: SurveyMap,
-    tile_size_m: float = TILE_SIZE_M,
-    max_place_landmarks: int = MAX_PLACE_LANDMARKS,
-    chosen: NDArray[np.bool_] | None = None,
-) -> list[Tile]:
-    """Return the survey divided into squares of `tile_size_m`, ordered by x, then y.
+def tiles_from_survey(survey: SurveyMap, chosen: NDArray[np.bool_] | None = None) -> list[Tile]:
+    """Return the survey divided into squares of TILE_SIZE_M, ordered by x, then y.
 
     Landmarks lie in the tile of their position, places (keyframes offered as such, under their ids) in that
-    of their camera's centre. A place lists at most `max_place_landmarks` of the landmarks seen there, those with most
+    of their camera's centre. A place lists at most MAX_PLACE_LANDMARKS of the landmarks seen there, those with most
     observations in the survey. Landmarks without observations are left out: their viewing directions are unknown.
     chosen (N,): the landmarks for robots, all if None.
     Raises SurveyError for a survey with values that are not finite.
@@ -42,9 +37,8 @@ def tiles_from_survey(
     chosen = np.ones(len(survey.landmark_ids), bool) if chosen is None else chosen
     kept = np.flatnonzero((counts > 0) & chosen)
     kept = kept[np.argsort(survey.landmark_ids[kept], kind="stable")]
-    landmark_cells = _cells(survey.points_map[kept], tile_size_m)
-    place_cells = _cells(map_from_cam[:, :3, 3], tile_size_m)
-    references = _place_landmarks(survey, counts, max_place_landmarks, chosen)
+    landmark_cells, place_cells = cells_of(survey.points_map[kept]), cells_of(map_from_cam[:, :3, 3])
+    references = _place_landmarks(survey, counts, chosen)
     history = history_of(survey)
     tiles = []
     for cell in sorted({(int(x), int(y)) for x, y in np.concatenate([landmark_cells, place_cells[history.is_place]])}):
@@ -55,7 +49,7 @@ def tiles_from_survey(
             Tile(
                 tile_x=cell[0],
                 tile_y=cell[1],
-                size_m=tile_size_m,
+                size_m=TILE_SIZE_M,
                 landmark_ids=survey.landmark_ids[rows],
                 points_map=survey.points_map[rows],
                 descriptors=survey.descriptors[rows],
@@ -71,11 +65,12 @@ def tiles_from_survey(
     return tiles
 
 
-def _cells(points_map: Array, size_m: float) -> NDArray[np.int64]:
-    return np.asarray(np.floor(points_map[:, :2] / size_m), np.int64)
+def cells_of(points_map: Array) -> NDArray[np.int64]:
+    """Return (N, 2) x and y of the tiles in which points (N, 2 or 3) lie."""
+    return np.asarray(np.floor(points_map[:, :2] / TILE_SIZE_M), np.int64)
 
 
-def _place_landmarks(survey: SurveyMap, counts: NDArray[np.intp], limit: int, chosen: NDArray[np.bool_]) -> list[_Ids]:
+def _place_landmarks(survey: SurveyMap, counts: NDArray[np.intp], chosen: NDArray[np.bool_]) -> list[_Ids]:
     """Return for each keyframe the sorted ids of the best observed chosen landmarks seen in it."""
     ids = survey.landmark_ids
     order = np.lexsort((ids[survey.obs_landmark], -counts[survey.obs_landmark], survey.obs_keyframe))
@@ -85,5 +80,5 @@ def _place_landmarks(survey: SurveyMap, counts: NDArray[np.intp], limit: int, ch
     for start, end in pairwise(bounds):
         seen = ids[survey.obs_landmark[order[start:end]]]
         _, first = np.unique(seen, return_index=True)
-        lists.append(np.unique(seen[np.sort(first)[:limit]]))
+        lists.append(np.unique(seen[np.sort(first)[:MAX_PLACE_LANDMARKS]]))
     return lists

@@ -12,7 +12,8 @@ from fleetmap.errors import RecordingError, UsageError
 from mapserver.commands.options import Calibration, SiteOptions, open_store, topics_of, version_named, write_output
 
 if TYPE_CHECKING:
-    from mapserver.config import MapserverConfig
+    from collections.abc import Callable
+
     from mapserver.plugins.acceptance.figures import Report
     from mapserver.store import MapStore
 
@@ -56,20 +57,20 @@ def accept(
     The first line is the verdict. Status 1 if the site is not accepted.
     """
     from fleetmap.encoding import to_json
-    from mapserver.plugins.acceptance.document import sections
-    from mapserver.plugins.acceptance.html_page import html_page
+    from mapserver.plugins.acceptance.document import html_page, sections
     from mapserver.plugins.acceptance.pdf import pdf
     from mapserver.plugins.acceptance.verdict import compared
     from mapserver.trust.documents import sign
 
     if not options.out.is_dir():
         raise UsageError(f"--out {options.out}: the folder does not exist; make it first")
-    settings = settings_of(context)
     with open_store(options.store, read_only=True) as maps:
-        before = None if options.before is None else _before(context, maps, recordings, options, settings)
-        report, picture = _report(
-            context, maps, version_named(maps, options.site, options.version), recordings, options, settings
-        )
+
+        def report_of(version: int) -> "tuple[Report, bytes]":
+            return _report(context, maps, version, recordings, options)
+
+        before = None if options.before is None else _before(options.before, options.site, report_of)
+        report, picture = report_of(version_named(maps, options.site, options.version))
         if before is not None:
             report = compared(report, before)
         shown = sections(report)
@@ -98,12 +99,7 @@ def accept(
 
 
 def _report(
-    context: typer.Context,
-    maps: "MapStore",
-    version: int,
-    recordings: list[Path],
-    options: AcceptOptions,
-    settings: "MapserverConfig",
+    context: typer.Context, maps: "MapStore", version: int, recordings: list[Path], options: AcceptOptions
 ) -> "tuple[Report, bytes]":
     from fleetmap.recordings import OpenOptions
     from mapserver.fleet.resurvey_list import resurvey_list
@@ -111,9 +107,8 @@ def _report(
     from mapserver.plugins.acceptance.examine import PICTURES, STARTS, examine
     from mapserver.plugins.acceptance.verdict import KNOWN_STARTS, ONE_WAY, judged
 
-    opening = OpenOptions(options.calibration, topics_of(context, options.topic))
-    counts = (-(-number // len(recordings)) for number in (STARTS, PICTURES))
-    starts, pictures = counts
+    opening, settings = OpenOptions(options.calibration, topics_of(context, options.topic)), settings_of(context)
+    starts, pictures = (-(-number // len(recordings)) for number in (STARTS, PICTURES))
     drives = [DriveRequest(path, options.frames, opening, starts, pictures) for path in recordings]
     promises = [words for words, given in ((ONE_WAY, options.one_way), (KNOWN_STARTS, options.known_starts)) if given]
     report, picture = examine(maps, options.site, version, drives, promises)
@@ -124,32 +119,25 @@ def _report(
     return judged(report, settings.gate, maps.evidence(options.site, version), fleet), picture
 
 
-def _before(
-    context: typer.Context,
-    maps: "MapStore",
-    recordings: list[Path],
-    options: AcceptOptions,
-    settings: "MapserverConfig",
-) -> "Report":
+def _before(named: str, site: str, report_of: "Callable[[int], tuple[Report, bytes]]") -> "Report":
     """Return the earlier report: that of a file, or of the same drives in an earlier version."""
     import msgspec
 
     from fleetmap.errors import disk_errors
     from mapserver.plugins.acceptance.figures import FORMAT, Report
 
-    assert options.before is not None
-    if options.before.isdecimal():
-        return _report(context, maps, int(options.before), recordings, options, settings)[0]
-    with disk_errors(f"{options.before} cannot be read", "name a version or a report", UsageError):
-        data = Path(options.before).read_bytes()
+    if named.isdecimal():
+        return report_of(int(named))[0]
+    with disk_errors(f"{named} cannot be read", "name a version or a report", UsageError):
+        data = Path(named).read_bytes()
     try:
         found = msgspec.json.decode(data, type=Report)
     except msgspec.MsgspecError as error:
-        raise RecordingError(f"{options.before} is no acceptance report ({error}); name its acceptance.json") from error
+        raise RecordingError(f"{named} is no acceptance report ({error}); name its acceptance.json") from error
     if found.format != FORMAT:
         raise UsageError(
-            f"{options.before} has format {found.format}, this program writes {FORMAT}; compare by the version's number"
+            f"{named} has format {found.format}, this program writes {FORMAT}; compare by the version's number"
         )
-    if found.site != options.site:
-        raise UsageError(f"{options.before} is a report of site {found.site}; name one of site {options.site}")
+    if found.site != site:
+        raise UsageError(f"{named} is a report of site {found.site}; name one of site {site}")
     return found

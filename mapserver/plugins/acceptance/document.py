@@ -1,13 +1,18 @@
-"""The report as text and tables, for the page and the PDF."""
+"""The report as text and tables, and as a page; `pdf.py` prints the same."""
 
 import io
+from base64 import b64encode
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
+import msgspec
 import numpy as np
+from markupsafe import Markup
 from matplotlib.figure import Figure
 
 from fleetmap.geometry import Array
+from mapserver.dashboard import rendering
 from mapserver.fleet_statistics.kpis import figure
 from mapserver.plugins.acceptance.figures import ALL, UNKNOWN_PLACE, AreaFigures, Count, Report, percentile
 
@@ -74,6 +79,14 @@ def drawn(places_m: Array, starts: Sequence[tuple[Array, str]]) -> bytes:
     return data.getvalue()
 
 
+def html_page(report: Report, shown: Sequence[Section], picture: bytes) -> str:
+    """Return the report as one HTML file without links, light or dark as the screen is. picture: PNG."""
+    template = rendering.TEMPLATES.from_string((Path(__file__).parent / "acceptance.html").read_text("utf-8"))
+    style = (Path(rendering.__file__).parent / "static" / "style.css").read_text("utf-8")
+    encoded = b64encode(picture).decode()
+    return template.render(report=report, sections=shown, picture=encoded, style=Markup(style))
+
+
 def _coverage(areas: Sequence[AreaFigures]) -> Section:
     rows = []
     for a in areas:
@@ -85,27 +98,16 @@ def _coverage(areas: Sequence[AreaFigures]) -> Section:
 
 
 def _errors(report: Report, areas: Sequence[AreaFigures]) -> Section:
-    rows = [
-        (a.name, a.frames.text, str(a.wrong), _mm(percentile(a.errors_mm, 50)), _mm(percentile(a.errors_mm, 99)))
-        for a in areas
-        if a.frames.tries
-    ]
+    rows = [(a.name, a.frames.text, str(a.wrong), *_quantiles_mm(a.errors_mm)) for a in areas if a.frames.tries]
     for drive in report.drives:
         errors = drive.errors_mm or {}
-        share = f"{100 * drive.localised_share:.1f} % of {drive.frames}"
-        rows.append(
-            (f"drive {drive.name}", share, str(drive.silent), _mm(errors.get("median")), _mm(errors.get("p99")))
+        share, quantiles = (
+            f"{100 * drive.localised_share:.1f} % of {drive.frames}",
+            (errors.get("median"), errors.get("p99")),
         )
+        rows.append((f"drive {drive.name}", share, str(drive.silent), _mm(quantiles[0]), _mm(quantiles[1])))
         if drive.docks_mm:
-            rows.append(
-                (
-                    f"docks of {drive.name}",
-                    str(len(drive.docks_mm)),
-                    "",
-                    _mm(percentile(drive.docks_mm, 50)),
-                    _mm(percentile(drive.docks_mm, 99)),
-                )
-            )
+            rows.append((f"docks of {drive.name}", str(len(drive.docks_mm)), "", *_quantiles_mm(drive.docks_mm)))
     references = [f"{drive.name}: against {drive.reference}." for drive in report.drives]
     words = [
         "Held-out frames one at a time in the tiles, from a prior at their own place; drives as a robot localises them, with odometry; "
@@ -116,19 +118,11 @@ def _errors(report: Report, areas: Sequence[AreaFigures]) -> Section:
 
 
 def _starts(areas: Sequence[AreaFigures]) -> Section:
-    rows = [
-        (
-            a.name,
-            str(a.starts.found_of_all.tries),
-            *(str(n) for n in (a.starts.found, a.starts.ambiguous, a.starts.lost, a.starts.silent)),
-        )
-        for a in areas
-        if a.starts.found_of_all.tries
-    ]
+    counted = [(a.name, a.starts.found_of_all.tries, *msgspec.structs.astuple(a.starts)) for a in areas]
+    rows = [[str(cell) for cell in row] for row in counted if row[1]]
     words = ["A robot is switched on along the drives, knows nothing, and looks around for 3 s while it drives on."]
-    return Section(
-        "Starts without a guess", words, header=("area", "starts", "found", "AMBIGUOUS", "lost", "silent"), rows=rows
-    )
+    header = ("area", "starts", "found", "AMBIGUOUS", "lost", "silent")
+    return Section("Starts without a guess", words, header=header, rows=rows)
 
 
 def _ladder(
@@ -147,12 +141,9 @@ def _similar(report: Report) -> Section:
     if not report.similar:
         return Section("Similar places", [f"None of {report.similar_of} frames fits another place of the map."])
     rows = [(s.area, s.other, f"{s.frames} of {report.similar_of}", f"{100 * s.recall:.0f} %") for s in report.similar]
-    words = [
-        "Frames that robots would accept at another place, too: a robot without a coarse position stays AMBIGUOUS there."
-    ]
-    return Section(
-        "Similar places", words, header=("area", "looks like", "frames", "of its landmarks, at most"), rows=rows
-    )
+    words = "Frames that robots would accept at another place, too: a robot without a coarse position stays AMBIGUOUS there."
+    header = ("area", "looks like", "frames", "of its landmarks, at most")
+    return Section("Similar places", [words], header=header, rows=rows)
 
 
 def _calibrations(report: Report) -> Section:
@@ -174,6 +165,11 @@ def _incidents(report: Report) -> Section:
     if found.fleet is not None:
         words.append(f"The fleet itself reported {found.fleet} failures a robot-day in this version.")
     return Section("Expected incidents", [*words, "Assumed:"], found.assumptions)
+
+
+def _quantiles_mm(values: list[float]) -> tuple[str, str]:
+    """Return median and 99 % quantile."""
+    return _mm(percentile(values, 50)), _mm(percentile(values, 99))
 
 
 def _mm(value: float | None) -> str:

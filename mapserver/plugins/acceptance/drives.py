@@ -27,7 +27,7 @@ from fleetmap.sensors.samples import CameraFrame, SensorSet, Trajectory
 from mapserver.doctor import Finding, Verdict, run_checks
 from mapserver.drafting.admission import fingerprint, rig_evidence
 from mapserver.drafting.draft_evidence import Before
-from mapserver.plugins.acceptance.figures import DriveFigures, percentile
+from mapserver.plugins.acceptance.figures import DriveFigures
 from mapserver.plugins.acceptance.ladders import ladders
 from mapserver.quality.probes import Probe, probe_features, relocalized, spread
 from mapserver.store import MapStore
@@ -76,9 +76,8 @@ class MapUnderTest:
         tiles = [decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles]
         view = MapView(tiles, decode_vocabulary(maps.blob(manifest.vocabulary.sha256)), manifest.camera.focal_px)
         built = None if archive is None else Before.of(maps, manifest, decode_archive(archive))
-        return cls(
-            maps.folder, manifest, tiles, view, built, bool(manifest.configuration.get("frame_from_ground_truth"))
-        )
+        truth_in_map = bool(manifest.configuration.get("frame_from_ground_truth"))
+        return cls(maps.folder, manifest, tiles, view, built, truth_in_map)
 
 
 @dataclass(frozen=True)
@@ -172,13 +171,17 @@ def examined(
         numbers = spread(np.flatnonzero(known & reference.free), request.pictures)
         pictures = list(_pictures(recording, [(int(selected[n]), truths[n]) for n in numbers], version.view))
         starts = [_start(frames, reference.trajectory) for frames in report.starts]
-        stamped = zip(localised.stamps_ns.tolist(), localised.frame_from_body, strict=True)
-        compared = [
-            (map_from_body, reference.trajectory.at(stamp))
-            for stamp, map_from_body in stamped
-            if reference.trajectory is not localised
-        ]
-        errors_m = [_off(map_from_body, truth)[0] for map_from_body, truth in compared if truth is not None]
+        off = {
+            stamp: _off(map_from_body, truth)
+            for stamp, map_from_body in zip(localised.stamps_ns.tolist(), localised.frame_from_body, strict=True)
+            if (truth := reference.trajectory.at(stamp)) is not None
+        }
+        errors_mm = None
+        if off and reference.trajectory is not localised:
+            errors_m = [error_m for error_m, _ in off.values()]
+            quantiles = np.percentile(errors_m, [50, 95, 99, 100])
+            named_m = zip(("median", "p95", "p99", "max"), quantiles.tolist(), strict=True)
+            errors_mm = {name: round(1e3 * error_m, 2) for name, error_m in named_m}
         docks_mm = [
             1e3 * float(np.linalg.norm((there @ se3_inverse(recording.calibration.base_from_body) - prior.map_from_base)[:2, 3]))
             for prior in recording.priors
@@ -195,13 +198,8 @@ def examined(
             is_surveyed=is_surveyed,
             localised_share=round(report.localised_share_of_all or 0.0, 4),
             failures=report.position_failures,
-            silent=_silent(localised, reference.trajectory),
-            errors_mm={
-                name: round(1e3 * (percentile(errors_m, at) or 0.0), 2)
-                for name, at in (("median", 50), ("p95", 95), ("p99", 99), ("max", 100))
-            }
-            if errors_m
-            else None,
+            silent=_silent_runs((stamp, is_wrong(*error)) for stamp, error in off.items()),
+            errors_mm=errors_mm,
             docks_mm=[round(off, 1) for off in docks_mm],
             calibration=rig_evidence(fingerprint(recording.calibration), findings),
             remarks=[f"{f.name}: {f.sentence}" for f in findings if f.verdict in (Verdict.WARN, Verdict.FAIL)],
@@ -217,30 +215,19 @@ def _reference(
     entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(selected))
     known = None if version.built is None else version.built.trajectory_of(entry)
     free = np.ones(len(selected), bool) if known is None else known[1]
-    stamps_ns = recording.frame_stamps_ns[selected]
-    is_surveyed = any(entry.sha256 == each.sha256 for each in version.manifest.recordings)
+    source, trajectory = "its own replay", localised
     if version.truth_in_map and recording.ground_truth is not None:
-        return Reference("ground truth", recording.ground_truth, free), is_surveyed
-    if known is not None:
-        return Reference(
-            f"the survey of version {version.manifest.version}", Trajectory(stamps_ns, known[0]), free
-        ), is_surveyed
-    return Reference("its own replay", localised, free), is_surveyed
+        source, trajectory = "ground truth", recording.ground_truth
+    elif known is not None:
+        source = f"the survey of version {version.manifest.version}"
+        trajectory = Trajectory(recording.frame_stamps_ns[selected], known[0])
+    is_surveyed = any(entry.sha256 == each.sha256 for each in version.manifest.recordings)
+    return Reference(source, trajectory, free), is_surveyed
 
 
 def _off(map_from_body: Array, truth: Array) -> tuple[float, float]:
     off = se3_inverse(truth) @ map_from_body
     return float(np.linalg.norm(off[:3, 3])), rotation_angle_rad(off[:3, :3])
-
-
-def _silent(localised: Trajectory, reference: Trajectory) -> int:
-    """Return the number of silent failures among localized frames."""
-    pairs = zip(localised.stamps_ns.tolist(), localised.frame_from_body, strict=True)
-    return _silent_runs(
-        (stamp, is_wrong(*_off(map_from_body, truth)))
-        for stamp, map_from_body in pairs
-        if (truth := reference.at(stamp)) is not None
-    )
 
 
 def _silent_runs(frames: Iterable[tuple[int, bool]]) -> int:

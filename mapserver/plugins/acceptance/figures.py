@@ -20,6 +20,9 @@ class Count(msgspec.Struct):
         self.hits += hit
         self.tries += 1
 
+    def __add__(self, other: "Count") -> "Count":
+        return Count(self.hits + other.hits, self.tries + other.tries)
+
     @property
     def share(self) -> Share:
         """With its exact 95 % interval."""
@@ -145,14 +148,12 @@ class Report(msgspec.Struct, kw_only=True):
         for area in self.areas:
             sums.places += area.places
             sums.wrong += area.wrong
-            sums.frames = Count(sums.frames.hits + area.frames.hits, sums.frames.tries + area.frames.tries)
+            sums.frames += area.frames
             sums.errors_mm = [*sums.errors_mm, *area.errors_mm]
             for name in StartCounts.__struct_fields__:
                 setattr(sums.starts, name, getattr(sums.starts, name) + getattr(area.starts, name))
             for mine, other in ((sums.darkness, area.darkness), (sums.blur, area.blur)):
-                for level, count in other.items():
-                    known = mine.get(level, Count())
-                    mine[level] = Count(known.hits + count.hits, known.tries + count.tries)
+                mine.update({level: mine.get(level, Count()) + count for level, count in other.items()})
         return sums
 
 

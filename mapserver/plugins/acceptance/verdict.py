@@ -1,6 +1,7 @@
 """Verdict on a site, the list to survey again, and the comparison with an earlier report, from the figures of a report. Pure."""
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -8,7 +9,7 @@ import scipy
 
 from mapserver.plugins.acceptance.figures import ALL, UNKNOWN_PLACE, AreaFigures, Count, Report, percentile
 from mapserver.quality.directions import missing_words
-from mapserver.quality.figures import Evidence, TileDirections
+from mapserver.quality.figures import Evidence, TileDirections, first_of
 from mapserver.quality.gate import GateSettings
 
 ONE_WAY = "robots drive every aisle as it was surveyed"
@@ -18,6 +19,13 @@ _NAMED = 3
 _QUIET_H = 48.0  # 3.0 robot-days, the rule of three: so much driving without an incident shows at most one a day
 
 
+class Reason(NamedTuple):
+    """A reason against a site, and the survey that would end it, empty for none."""
+
+    words: str
+    again: str = ""
+
+
 def judged(report: Report, settings: GateSettings, evidence: Evidence | None, fleet: Sequence[str]) -> Report:
     """Return the report with verdict, reasons, what was not judged and what to survey again.
 
@@ -25,14 +33,12 @@ def judged(report: Report, settings: GateSettings, evidence: Evidence | None, fl
     failures put on the list, as text.
     """
     found = [*_of_areas(report, settings), *_of_site(report, settings)]
-    reasons = [reason for reason, _ in found]
-    again = [words for _, words in found if words]
+    reasons, again = [reason.words for reason in found], [reason.again for reason in found if reason.again]
     if evidence is not None and evidence.views is not None and evidence.views.warning:
         again.append(evidence.views.warning)
     whole, sentence = report.whole, f"{report.site}, version {report.version}"
     if reasons:
-        more = f"; and {len(reasons) - _NAMED} more" if len(reasons) > _NAMED else ""
-        verdict = f"NOT ACCEPTED: {sentence}: {'; '.join(reasons[:_NAMED])}{more}."
+        verdict = f"NOT ACCEPTED: {sentence}: {first_of(reasons)}."
     else:
         median, p99 = percentile(whole.errors_mm, 50), percentile(whole.errors_mm, 99)
         promised = f", if {' and '.join(report.promises)}" if report.promises else ""
@@ -50,76 +56,65 @@ def judged(report: Report, settings: GateSettings, evidence: Evidence | None, fl
     )
 
 
-def _of_areas(report: Report, settings: GateSettings) -> Iterator[tuple[str, str]]:
-    """Yield reasons against areas, each with the survey that would end it ("" for none)."""
+def _of_areas(report: Report, settings: GateSettings) -> Iterator[Reason]:
     for area in report.areas:
         if area.starts.silent:
-            yield f"{area.name}: {area.starts.silent} starts without a guess are silently wrong", ""
+            yield Reason(f"{area.name}: {area.starts.silent} starts without a guess are silently wrong")
         if area.name == UNKNOWN_PLACE:
             continue
         dark = report.darkest_grey is not None and area.grey is not None and area.grey <= report.darkest_grey
         if _is_below(area.frames, settings):
             why = f"too dark (grey level {area.grey:.0f} of 255)" if dark else "not localized"
             light = " with more light" if dark else ""
-            yield f"{area.name} is {why}: {area.frames.text} frames get a fix", f"{area.name}: survey it{light}"
+            yield Reason(f"{area.name} is {why}: {area.frames.text} frames get a fix", f"{area.name}: survey it{light}")
         elif _is_below(area.darkness.get("1", Count()), settings):
-            yield (
-                f"{area.name} is nearly too dark: with half its light {area.darkness['1'].text} frames get a fix",
-                f"{area.name}: survey it with more light",
-            )
+            half = f"with half its light {area.darkness['1'].text} frames get a fix"
+            yield Reason(f"{area.name} is nearly too dark: {half}", f"{area.name}: survey it with more light")
         if not area.places and not _is_below(area.frames, settings):
-            yield f"{area.name} was driven through, and is not in the map", f"{area.name}: survey it"
+            yield Reason(f"{area.name} was driven through, and is not in the map", f"{area.name}: survey it")
         if area.missing and ONE_WAY not in report.promises:
             ways = ", ".join(area.missing)
             words = missing_words(TileDirections((0, 0), area.seen, area.missing))
-            yield (
-                f"{area.name} was surveyed in one direction only, nobody drove it facing {ways}",
-                f"{area.name}: drive it facing {ways} ({words})",
-            )
+            one_way = f"{area.name} was surveyed in one direction only, nobody drove it facing {ways}"
+            yield Reason(one_way, f"{area.name}: drive it facing {ways} ({words})")
         starts = area.starts.found_of_all
         if KNOWN_STARTS not in report.promises and _is_below(starts, settings):
             alike = ", ".join([alike.other for alike in report.similar if alike.area == area.name][:_NAMED])
             if area.starts.ambiguous > area.starts.lost:
-                yield (
-                    f"{area.name} looks like {alike or 'another place'}: {area.starts.ambiguous} of {starts.tries} starts stay AMBIGUOUS",
-                    "",
-                )
+                stay = f"{area.starts.ambiguous} of {starts.tries} starts stay AMBIGUOUS"
+                yield Reason(f"{area.name} looks like {alike or 'another place'}: {stay}")
             else:
-                yield (
-                    f"{area.name}: {area.starts.lost} of {starts.tries} starts without a guess stay lost",
-                    f"{area.name}: survey it",
-                )
+                stay = f"{area.starts.lost} of {starts.tries} starts without a guess stay lost"
+                yield Reason(f"{area.name}: {stay}", f"{area.name}: survey it")
 
 
-def _of_site(report: Report, settings: GateSettings) -> Iterator[tuple[str, str]]:
+def _of_site(report: Report, settings: GateSettings) -> Iterator[Reason]:
     whole = report.whole
     median = percentile(whole.errors_mm, 50)
     if silent := sum(drive.silent for drive in report.drives):
-        yield f"{silent} silent failures while driving", ""
+        yield Reason(f"{silent} silent failures while driving")
     # Of areas with few tries each, which judge none of them, all together may be below.
     if _is_below(whole.frames, settings) and not any(_is_below(area.frames, settings) for area in report.areas):
-        yield f"only {whole.frames.text} frames get a fix", "all areas: survey them"
+        yield Reason(f"only {whole.frames.text} frames get a fix", "all areas: survey them")
     if KNOWN_STARTS not in report.promises:
         starts = whole.starts.found_of_all
         if not starts.tries:
-            yield "no start without a guess was tried: record a longer drive", ""
+            yield Reason("no start without a guess was tried: record a longer drive")
         elif _is_below(starts, settings) and not any(_is_below(a.starts.found_of_all, settings) for a in report.areas):
-            yield f"only {starts.text} starts without a guess found their place", "all areas: survey them"
+            yield Reason(f"only {starts.text} starts without a guess found their place", "all areas: survey them")
     if whole.frames.tries and whole.wrong / whole.frames.tries > settings.max_wrong_share:
-        yield f"{whole.wrong} of {whole.frames.tries} frames are localized at a wrong place", ""
+        yield Reason(f"{whole.wrong} of {whole.frames.tries} frames are localized at a wrong place")
     if median is not None and median > 1e3 * settings.max_median_error_m:
-        yield f"the median error is {median:.0f} mm, the limit is {1e3 * settings.max_median_error_m:.0f} mm", ""
+        yield Reason(f"the median error is {median:.0f} mm, the limit is {1e3 * settings.max_median_error_m:.0f} mm")
     for drive in report.drives:
         if drive.localised_share < settings.min_localised_share:
-            yield f"{100 * drive.localised_share:.0f} % of drive {drive.name} is localized", ""
+            yield Reason(f"{100 * drive.localised_share:.0f} % of drive {drive.name} is localized")
     for rig in report.calibrations:
         for subject, words in rig.doubted.items():
-            yield f"the calibration {rig.rig} is in doubt: {subject}: {words}", ""
+            yield Reason(f"the calibration {rig.rig} is in doubt: {subject}: {words}")
     if whole.frames.tries < settings.min_frames:
-        yield (
-            f"only {whole.frames.tries} frames at a known place judge it, {settings.min_frames} are needed: record a longer drive",
-            "",
-        )
+        needed = f"{settings.min_frames} are needed: record a longer drive"
+        yield Reason(f"only {whole.frames.tries} frames at a known place judge it, {needed}")
 
 
 def _is_below(count: Count, settings: GateSettings) -> bool:
@@ -145,9 +140,8 @@ def _not_judged(report: Report) -> Iterator[str]:
         for subject, missing in rig.unknown().items():
             yield f"{subject} of calibration {rig.rig}: {missing}"
     if hours < _QUIET_H:
-        yield (
-            f"the rate of incidents, by {hours:.2f} h of driving: {_QUIET_H:g} h without one show that there is at most one a robot-day"
-        )
+        quiet = f"{_QUIET_H:g} h without one show that there is at most one a robot-day"
+        yield f"the rate of incidents, by {hours:.2f} h of driving: {quiet}"
 
 
 def compared(report: Report, before: Report) -> Report:
@@ -181,11 +175,8 @@ def _tests(now: AreaFigures, old: AreaFigures) -> Iterator[tuple[str, float, boo
         if mine.tries and other.tries:
             table = np.array([[count.hits, count.tries - count.hits] for count in (mine, other)])
             p = float(scipy.stats.fisher_exact(table).pvalue)
-            yield (
-                f"{now.name}: {mine.text} {name}, {other.text} before",
-                p,
-                mine.hits * other.tries > other.hits * mine.tries,
-            )
+            is_better = mine.hits * other.tries > other.hits * mine.tries
+            yield f"{now.name}: {mine.text} {name}, {other.text} before", p, is_better
     medians = percentile(now.errors_mm, 50), percentile(old.errors_mm, 50)
     if medians[0] is not None and medians[1] is not None:
         p = float(scipy.stats.mannwhitneyu(now.errors_mm, old.errors_mm).pvalue)

@@ -122,9 +122,7 @@ class _Voxels(NamedTuple):
 
 def _plan(places_m: NDArray[np.float32]) -> tuple[Array, tuple[int, int]]:
     """Return the corner of a plan that contains places (N, 2), and its rows and columns."""
-    low, high = (
-        np.floor(extreme / CELL_M).astype(np.int64) for extreme in (places_m.min(axis=0), places_m.max(axis=0))
-    )
+    low, high = np.floor(np.stack([places_m.min(axis=0), places_m.max(axis=0)]) / CELL_M).astype(np.int64)
     columns, rows = (high - low + 1).tolist()
     if rows * columns > _MOST_CELLS:
         raise UsageError(f"a plan of {columns} x {rows} cells; the limit is {_MOST_CELLS}")

@@ -16,8 +16,7 @@ from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import SensorSet
 from mapserver.plugins.dense_maps.expected_view import brightness, pinhole, resized
 from mapserver.plugins.dense_maps.exposure import lens_factor
-from mapserver.plugins.dense_maps.splat_file import Splats
-from mapserver.plugins.dense_maps.splat_renderer import Renderer, bounds, draw, parameters_of, with_parameters
+from mapserver.plugins.dense_maps.splats import Renderer, Splats, bounds, draw, parameters_of, with_parameters
 from mapserver.plugins.dense_maps.surfel_map import Surfels
 from mapserver.survey.survey_map import SurveyMap
 

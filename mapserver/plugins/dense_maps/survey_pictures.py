@@ -21,9 +21,7 @@ def nearest_pictures(
     pictures: Sequence[SurveyPicture], place_map_m: Array, looks_map: Array | None = None
 ) -> list[tuple[SurveyPicture, float]]:
     """Return the pictures with their distances in metres, the nearest first, those that look more than 45 degrees elsewhere last."""
-    places, axes = (
-        np.array([getattr(one, name) for one in pictures]).reshape(-1, 3) for name in ("place_map_m", "looks_map")
-    )
+    places, axes = _looks(pictures)
     off_m = np.linalg.norm(places - place_map_m, axis=1)
     elsewhere = np.zeros(len(pictures), bool) if looks_map is None else axes @ looks_map < _SAME_COSINE
     return [(pictures[i], float(off_m[i])) for i in np.lexsort([off_m, elsewhere]).tolist()]
@@ -68,11 +66,14 @@ def kept_pictures(
     return blobs, report
 
 
+def _looks(pictures: Sequence[SurveyPicture]) -> Array:
+    """Return (2, K, 3) places and viewing directions."""
+    return np.array([(one.place_map_m, one.looks_map) for one in pictures]).reshape(-1, 2, 3).transpose(1, 0, 2)
+
+
 def _is_among(place: Sequence[float] | Array, looks: Sequence[float] | Array, taken: Sequence[SurveyPicture]) -> bool:
     """Return True if one of these was taken near the place and looks the same way."""
-    places, axes = (
-        np.array([getattr(one, name) for one in taken]).reshape(-1, 3) for name in ("place_map_m", "looks_map")
-    )
+    places, axes = _looks(taken)
     return bool(((np.linalg.norm(places - place, axis=1) < _SAME_M) & (axes @ looks > _SAME_COSINE)).any())
 
 

@@ -38,11 +38,8 @@ _BLOCK_M = 4.0  # surfels are judged by the images near their block
 _HALO_M = 0.32  # around a tile, where finer surfels may replace its coarse ones: two of the coarsest voxels
 _OWN_LIGHT_M = 2.0
 _DARK, _MIN_ALIKE = 5, 50  # grey levels; common voxels needed to compare the exposure of two drives
-_SATURATED, _SAMPLE_STEP, _MOST_SAMPLED = (
-    250,
-    24,
-    10_000,
-)  # grey level; every so many kept disparities a point is used for exposure
+_SATURATED = 250  # grey level
+_SAMPLE_STEP, _MOST_SAMPLED = 24, 10_000  # every so many kept disparities a point is used for exposure
 _LOGS_STEP = 16  # one common voxel of this many is used to compare drives
 _MIN_FINER = 2  # voxels of the next finer level that replace a coarse one
 _Place = tuple[int, int]

@@ -99,7 +99,8 @@ def _played(recording: Path, build: "BuildOptions", speed: float) -> "Iterator[t
     from mapserver.config import survey_settings
     from mapserver.plugins.live_surveys.drives import RecordedDrive
 
-    with build.reading.open(recording) as (opened, indices):
+    opened, indices = build.opened(recording)
+    with opened:
         settings = survey_settings(build.config, opened.sensor_set)
         yield RecordedDrive(recording, opened, indices, build.frames, speed), settings
 

@@ -80,14 +80,12 @@ def scale_by(measured: MarkerList, known: MarkerList) -> float:
     """Return true metres per metre of the map, by the distances between markers of both lists; RecordingError with fewer than two."""
     ours, theirs = measured.by_id, known.by_id
     pairs = list(combinations(sorted(ours.keys() & theirs.keys()), 2))
-    lengths = np.array([[_distance_m(listed[a], listed[b]) for listed in (ours, theirs)] for a, b in pairs]).reshape(
-        -1, 2
-    )
-    if not len(lengths):
+    if not pairs:
         raise RecordingError(
             f"the scale needs two of the known markers; the survey saw {sorted(ours)} of {sorted(theirs)}"
         )
-    return float(lengths[:, 0] @ lengths[:, 1] / (lengths[:, 0] @ lengths[:, 0]))
+    mine, true = (np.array([_distance_m(listed[a], listed[b]) for a, b in pairs]) for listed in (ours, theirs))
+    return float(mine @ true / (mine @ mine))
 
 
 def _distance_m(one: Marker, other: Marker) -> float:

@@ -65,13 +65,8 @@ class GuessedCalibration:
 def first_rig(width_px: int, height_px: int, baseline_m: float) -> RigCalibration:
     """Return two parallel pinholes at this baseline, with a focal length of the image's width, and no IMU."""
     lens = np.array([width_px, width_px, 0.5 * (width_px - 1), 0.5 * (height_px - 1)], np.float64)
-    places = (np.zeros(3), np.array([baseline_m, 0.0, 0.0]))
-    return RigCalibration(
-        tuple(
-            CameraCalibration("radial-tangential", width_px, height_px, lens, np.zeros(4), se3(np.eye(3), place))
-            for place in places
-        )
-    )
+    left = CameraCalibration("radial-tangential", width_px, height_px, lens, np.zeros(4), np.eye(4))
+    return RigCalibration((left, replace(left, body_from_cam=se3(np.eye(3), np.array([baseline_m, 0.0, 0.0])))))
 
 
 def calibration_from_guess(
@@ -210,8 +205,7 @@ class _EpipolarProblem:
     """Sampson distances of all matches, in pixels, as a function of the rig and of each motion."""
 
     def __init__(self, camera: CameraCalibration, matches: RawMatches) -> None:
-        self.width, self.matches = camera.width_px, matches
-        self.middle = np.array([0.5 * (camera.width_px - 1), 0.5 * (camera.height_px - 1)])
+        self.width, self.middle, self.matches = camera.width_px, _middle(camera), matches
 
     def fit(self, share: float) -> tuple[float, float, Array]:
         """Return the cost of the best fit near a focal length in widths, relative sigma of the focal length, the unknowns."""
@@ -251,9 +245,7 @@ class _EpipolarProblem:
     def _rays(self, pixels: Array, rig: _Unknowns, number: int) -> Array:
         """Return (N, 3) rays with z = 1; radial terms use the distorted position, so no inversion is needed."""
         places = (pixels - self.middle) / self.width - number * rig.centre
-        squared = (places**2).sum(axis=1)
-        straight = places * (1.0 + rig.distortion[0] * squared + rig.distortion[1] * squared**2)[:, None] / rig.focal
-        return np.column_stack([straight, np.ones(len(pixels))])
+        return np.column_stack([_straight(places, rig.distortion) / rig.focal, np.ones(len(pixels))])
 
     def _motion(self, match: Array, focal_px: float) -> Array:
         """(6,) rotation vector and direction of a motion, under a focal length."""
@@ -290,16 +282,22 @@ def _sampson(first: Array, second: Array, rotation: Array, direction: Array) -> 
     return np.asarray((first * line).sum(axis=1) / np.maximum(scale, 1e-12))
 
 
+def _middle(camera: CameraCalibration) -> Array:
+    return np.array([0.5 * (camera.width_px - 1), 0.5 * (camera.height_px - 1)])
+
+
+def _straight(places: Array, terms: Array) -> Array:
+    """Return (N, 2) positions without distortion, by two radial terms of the distorted ones (N, 2), both in widths."""
+    squared = (places**2).sum(axis=1)
+    return np.asarray(places * (1.0 + terms[0] * squared + terms[1] * squared**2)[:, None])
+
+
 def _distorted(camera: CameraCalibration, focal_px: float, terms: Array) -> CameraCalibration:
     """Return the radial-tangential lens with the rays of the guess, by least squares over the image."""
-    columns, rows = np.meshgrid(
-        np.linspace(0, camera.width_px - 1, _GRID[0]), np.linspace(0, camera.height_px - 1, _GRID[1])
-    )
-    pixels = np.column_stack([columns.ravel(), rows.ravel()])
-    middle = np.array([0.5 * (camera.width_px - 1), 0.5 * (camera.height_px - 1)])
-    places = (pixels - middle) / camera.width_px
-    squared = (places**2).sum(axis=1)
-    straight = places * (1.0 + terms[0] * squared + terms[1] * squared**2)[:, None] * (camera.width_px / focal_px)
+    sides_px, middle = (camera.width_px - 1, camera.height_px - 1), _middle(camera)
+    grid = np.meshgrid(*(np.linspace(0, side_px, count) for side_px, count in zip(sides_px, _GRID, strict=True)))
+    pixels = np.stack(grid, axis=-1).reshape(-1, 2)
+    straight = _straight((pixels - middle) / camera.width_px, terms) * (camera.width_px / focal_px)
     around = (straight**2).sum(axis=1)[:, None]
     design = np.column_stack([(straight * around).ravel(), (straight * around**2).ravel()])
     found = np.linalg.lstsq(design, ((pixels - middle) / focal_px - straight).ravel(), rcond=None)[0]
@@ -323,7 +321,5 @@ def guessed_in_words(found: GuessedCalibration) -> list[str]:
 
 def guessed_file(found: GuessedCalibration, name: str) -> str:
     """Return the text of a camchain of the result."""
-    lines = [f"# Found by `mapserver calibrate` from {name}, beginning with focal length = image width."]
-    return (
-        "\n".join([*lines, *(f"# {line}" for line in guessed_in_words(found))]) + "\n" + format_calibration(found.rig)
-    )
+    first = f"Found by `mapserver calibrate` from {name}, beginning with focal length = image width."
+    return "".join(f"# {line}\n" for line in (first, *guessed_in_words(found))) + format_calibration(found.rig)

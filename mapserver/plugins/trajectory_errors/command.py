@@ -27,8 +27,7 @@ def evaluate(
     """Print the errors of a trajectory: aligned rigidly, aligned with scale, unaligned, between stamps, and its drift."""
     from fleetmap.recordings.ordering import ReadLog
     from fleetmap.recordings.tum import read_truth, read_tum
-    from mapserver.plugins.trajectory_errors.covariances import read_covariances
-    from mapserver.plugins.trajectory_errors.errors import summary
+    from mapserver.plugins.trajectory_errors.errors import read_covariances, summary
 
     log = ReadLog()
     trajectories = read_tum(estimate), read_truth(ground_truth, log)

@@ -31,7 +31,13 @@ from fleetsim.recorder import Order
 from fleetsim.scenarios import SCENARIOS, Run, Scenario
 from fleetsim.scene.layout import Layout
 from mapserver.config import survey_settings
-from mapserver.drafting.survey_recordings import RecordingOptions, RecordingSurvey, admit_recordings, survey_recording
+from mapserver.drafting.survey_recordings import (
+    OpenRecordings,
+    RecordingOptions,
+    RecordingSurvey,
+    admit_recordings,
+    survey_recording,
+)
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.survey.merge import pipeline
 from mapserver.survey.merge.base_map import BaseMap
@@ -72,7 +78,7 @@ def recorded(seed: int, n: int, work: Path) -> Path:
 
 def surveyed(path: Path, frames: str, pinhole: StereoCamera | None) -> RecordingSurvey:
     """The survey of a recording's frames, without a store."""
-    reading = RecordingOptions(frames)
+    reading = OpenRecordings(RecordingOptions(frames), path.parent)
     admitted = admit_recordings([path], reading, Console(quiet=True), needs_truth=True)
     with reading.open(path) as (recording, _):
         settings = survey_settings(None, recording.sensor_set)

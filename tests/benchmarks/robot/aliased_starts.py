@@ -22,7 +22,6 @@ from mapserver.quality.probes import Probe, starts_without_prior
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.landmark_budget import choose_landmarks
-from mapserver.tiles.tiling import TILE_SIZE_M
 from support.estimator.landmarks import LandmarkField
 from support.estimator.simulated_run import EstimatorSession, Found, Ids, Sighting, Smudge
 
@@ -250,7 +249,7 @@ def within_budget(tile: Tile, camera: StereoCamera, body_from_cam: Array) -> Til
         np.zeros(len(keyframe), np.int8), np.ones((len(keyframe), 2)), Trajectory(stamps_ns, map_from_body), np.ones(len(counts), bool),
         np.zeros((len(tile.landmark_ids), 1, 1), np.uint8),
     )  # fmt: skip
-    return part_of(tile, choose_landmarks(survey, BudgetSettings(), TILE_SIZE_M), np.ones(len(counts), bool))
+    return part_of(tile, choose_landmarks(survey, BudgetSettings()), np.ones(len(counts), bool))
 
 
 def with_aisles(site: Site, aisles: tuple[int, ...]) -> Site:

@@ -22,7 +22,8 @@ from mapserver.plugins.live_surveys.live_survey import LiveRequest, run_live
 
 def bench(path: Path) -> dict[str, Any]:
     """Figures of a recording, played at its own speed."""
-    with tempfile.TemporaryDirectory() as folder, RecordingOptions().open(path) as (opened, indices):
+    opened, indices = RecordingOptions().opened(path)
+    with tempfile.TemporaryDirectory() as folder, opened:
         settings = survey_settings(None, opened.sensor_set)
         drive = RecordedDrive(path, opened, indices, "::", 1.0)
         request = LiveRequest("live", Path(folder) / "store", settings, BuildOptions())

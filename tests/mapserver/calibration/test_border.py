@@ -7,8 +7,8 @@ from msgspec import structs
 from fleetmap.geometry import Array, so3_exp, so3_log
 from fleetsim.recorder import Order
 from mapserver.calibration.estimator import SETTINGS, ErrorScales, Problem
-from mapserver.calibration.parameters import RANGES, UNKNOWNS
-from mapserver.calibration.problem import MotionState
+from mapserver.calibration.motion_rows import MotionState
+from mapserver.calibration.parameters import COLUMNS, UNKNOWNS
 from mapserver.survey.bundle.bundle_adjustment import solver_of
 from mapserver.survey.settings import BundleSettings
 from support.worlds.calibration_scene import make_stretch, measured
@@ -23,9 +23,7 @@ class Scene:
         stretch = make_stretch(Order("small-loop", seed=1), 6.0, 1.0, step_s=0.2, per_frame=10)
         rng = np.random.default_rng(1)
         self.problem = problem = Problem(measured(stretch, stretch.session.true, 1))
-        self.theta = np.concatenate(
-            [0.001 * rng.normal(size=18) * [r.prior_sigma for r in list(RANGES.values())[:18]], np.zeros(10)]
-        )
+        self.theta = np.concatenate([0.001 * rng.normal(size=18) * [p.prior_sigma for p in COLUMNS], np.zeros(10)])
         start = problem.data.start
         self.state = MotionState(
             start.map_from_body, start.motions + 1e-3 * rng.normal(size=start.motions.shape), start.points_map

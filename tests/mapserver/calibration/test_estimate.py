@@ -53,11 +53,13 @@ def test_errors_are_found_within_their_sigma(loop: Stretch, errors: dict[P, floa
     found = estimated(loop, errors)
     for p in found.parameters[: len(COLUMNS)]:
         error = errors.get(p.name, 0.0)
-        true = error if p.unit else 1.0 / (1.0 - error) - 1.0
+        true = error if p.name.unit else 1.0 / (1.0 - error) - 1.0
         if p.name is P.WHEEL_SCALE:  # the simulated robot has an error of its own
             continue
         # angles and shifts of several errors add to first order only
-        assert abs(p.estimate - true) < 4.0 * p.sigma + 0.01 * abs(true) + 0.0002 * len(errors) * (p.unit == "rad"), p
+        assert abs(p.estimate - true) < 4.0 * p.sigma + 0.01 * abs(true) + 0.0002 * len(errors) * (
+            p.name.unit == "rad"
+        ), p
         if error:
             assert p.is_judged, p
             assert abs(true) > 10.0 * p.sigma, p

@@ -11,11 +11,10 @@ from fleetmap.errors import FleetmapError, StoreError, SurveyError
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate, recordings
-from mapserver.calibration.parameters import COLUMNS, RANGES
-from mapserver.calibration.problem import CalibrationData
+from mapserver.calibration.motion_rows import CalibrationData
+from mapserver.calibration.parameters import COLUMNS
 from mapserver.doctor import Verdict
 from mapserver.doctor.calibration import (
-    TOLERANCES,
     MeasuredCalibration,
     corrected,
     findings_of,
@@ -34,12 +33,10 @@ FOCAL_PX = 420.0
 
 def estimate(*, unknown: dict[P, str] | None = None, **off: float) -> CalibrationEstimate:
     """All parameters right to a tenth of their limit, but for those that are off, by name of the member, and those that nothing shows."""
-    sigmas = np.array([0.1 * TOLERANCES[p].warn_above for p in COLUMNS])
+    sigmas = np.array([0.1 * p.warn_above for p in COLUMNS])
     values = {P[name.upper()]: value for name, value in off.items()}
     parameters = [
-        ParameterEstimate(
-            p, values.get(p, 0.0), float(s), RANGES[p].unit, p not in (unknown or {}), (unknown or {}).get(p, "")
-        )
+        ParameterEstimate(p, values.get(p, 0.0), float(s), p not in (unknown or {}), (unknown or {}).get(p, ""))
         for p, s in zip(COLUMNS, sigmas, strict=True)
     ]
     return CalibrationEstimate(tuple(parameters), np.diag(sigmas**2), 40, 4000)
@@ -53,29 +50,26 @@ def verdicts(found: CalibrationEstimate) -> dict[str, Verdict]:
     return {f.name: f.verdict for f in findings_of(found, FOCAL_PX) if f.verdict is not Verdict.OK}
 
 
-@pytest.mark.parametrize("parameter", [p for p in COLUMNS if np.isfinite(TOLERANCES[p].fail_above)])
+@pytest.mark.parametrize("parameter", [p for p in COLUMNS if np.isfinite(p.fail_above)])
 def test_an_error_that_costs_3_cm_warns_and_that_of_another_rig_fails(parameter: P) -> None:
     """Three sigmas come off first: what is not sure is no fault."""
-    limit = TOLERANCES[parameter]
-    slack = (
-        3.0 * float(np.hypot(0.1 * limit.warn_above, limit.least_sigma))
-        + 3.0 * (RANGES[parameter].unit == "rad") * 0.4 / FOCAL_PX
-    )
+    beside = 0.4 / FOCAL_PX if parameter.unit == "rad" else 0.0
+    slack = 3.0 * float(np.hypot(0.1 * parameter.warn_above, parameter.least_sigma)) + 3.0 * beside
     name = parameter.name.lower()
-    assert parameter.value not in verdicts(estimate(**{name: 0.99 * limit.warn_above}))
-    assert verdicts(estimate(**{name: -1.01 * limit.warn_above - slack}))[parameter.value] is Verdict.WARN
-    assert verdicts(estimate(**{name: 1.01 * limit.fail_above + slack}))[parameter.value] is Verdict.FAIL
+    assert parameter.value not in verdicts(estimate(**{name: 0.99 * parameter.warn_above}))
+    assert verdicts(estimate(**{name: -1.01 * parameter.warn_above - slack}))[parameter.value] is Verdict.WARN
+    assert verdicts(estimate(**{name: 1.01 * parameter.fail_above + slack}))[parameter.value] is Verdict.FAIL
 
 
 def test_noise_is_told_in_multiples_of_the_data_sheet() -> None:
-    noise = ParameterEstimate(P.GYRO_NOISE, 3.3, 0.1, "", True, "")
+    noise = ParameterEstimate(P.GYRO_NOISE, 3.3, 0.1, True)
     (told,) = findings_of(replace(estimate(), parameters=(noise,)), FOCAL_PX)
     assert told.sentence.startswith("4.3 times the data sheet")
 
 
 def test_a_dear_error_that_may_be_chance_is_neither_ok_nor_a_fault() -> None:
     """One percent of baseline, 10 cm of 10 m, two and a half sigmas from nothing."""
-    sigma = np.hypot(0.1 * 0.003, TOLERANCES[P.BASELINE].least_sigma)
+    sigma = np.hypot(0.1 * 0.003, P.BASELINE.least_sigma)
     (finding,) = [f for f in findings_of(estimate(baseline=-0.003 - 2.5 * sigma), FOCAL_PX) if f.name == "baseline"]
     assert finding.verdict is Verdict.NOT_JUDGED
     assert "that may be chance" in finding.sentence

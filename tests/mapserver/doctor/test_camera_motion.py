@@ -25,6 +25,5 @@ def test_one_camera_that_hardly_moves_does_not_turn_round(way_m: float) -> None:
         ]
         before, after = (RectifiedFrame(stamp, picture, None, None) for stamp, picture in enumerate(pictures))
         found, _ = motion_between(before, after, SINGLE)
-        assert found is not None
         expected = turn if way_m else np.eye(3)
         assert np.linalg.norm(so3_log(expected.T @ found[:3, :3])) < 0.02

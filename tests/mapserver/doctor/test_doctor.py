@@ -14,7 +14,6 @@ from fleetmap.errors import CalibrationError
 from fleetmap.geometry import so3_exp
 from fleetmap.recordings import Recording, format_calibration, open_recording, read_calibration
 from fleetmap.recordings.sensor_subset import reduced
-from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet, Stamps
 from mapserver.calibration import CalibrationParameter
 from mapserver.commands.recordings import doctor
@@ -24,7 +23,7 @@ from mapserver.doctor.findings import grouped, not_judged, summary
 from mapserver.doctor.gyro_images import fit_gyro, gyro_check
 from mapserver.doctor.images import flicker_check, sharpness
 from mapserver.doctor.metres import ImageMetres, judge_metres
-from mapserver.doctor.run_checks import TURN_FRAMES, _consecutive, _Frames
+from mapserver.doctor.run_checks import TURN_FRAMES, _Frames
 from mapserver.doctor.sensors import (
     camera_checks,
     camera_imu_overlap,
@@ -66,9 +65,8 @@ def found(recording: Recording) -> dict[str, Finding]:
 @pytest.fixture(scope="module")
 def turns(good: Recording) -> CameraTurns:
     """What the pictures of the good recording say about its turns."""
-    rectifier = Rectifier(good.calibration)
-    pairs = _consecutive(good, _Frames(good, lambda: None), rectifier, TURN_FRAMES)
-    return CameraTurns.of(body_motion((rectifier.camera, rectifier.body_from_cam), pair) for pair in pairs)
+    frames = _Frames(good, lambda: None)
+    return CameraTurns.of(body_motion(frames.rig, pair) for pair in frames.consecutive(TURN_FRAMES))
 
 
 def gyro_found(turns: CameraTurns, imu: ImuSamples) -> dict[str, Finding]:
@@ -86,7 +84,6 @@ def swapped(frame: CameraFrame) -> CameraFrame:
 
 
 def rotated(frame: CameraFrame) -> CameraFrame:
-    assert frame.right is not None
     return replace(frame, left=frame.left[::-1, ::-1].copy(), right=frame.right[::-1, ::-1].copy())
 
 

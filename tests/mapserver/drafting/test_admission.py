@@ -11,7 +11,7 @@ import pytest
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, open_recording
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate
-from mapserver.calibration.parameters import COLUMNS, RANGES
+from mapserver.calibration.parameters import COLUMNS
 from mapserver.doctor import Finding, Verdict, sensors
 from mapserver.doctor.calibration import MeasuredCalibration, findings_of
 from mapserver.doctor.findings import not_judged
@@ -30,9 +30,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 def measured(parameter: P, value: float) -> MeasuredCalibration:
     """Everything known to a hundredth of its useful sigma, one parameter off."""
-    sigmas = np.array([0.01 * RANGES[p].useful_sigma for p in COLUMNS])
+    sigmas = np.array([0.01 * p.useful_sigma for p in COLUMNS])
     parameters = tuple(
-        ParameterEstimate(p, value if p is parameter else 0.0, float(s), RANGES[p].unit, True)
+        ParameterEstimate(p, value if p is parameter else 0.0, float(s), True)
         for p, s in zip(COLUMNS, sigmas, strict=True)
     )
     found = CalibrationEstimate(parameters, np.diag(sigmas**2), 40, 4000)

@@ -9,7 +9,7 @@ import pytest
 
 from fleetmap.geometry import inside_any
 from fleetmap.sensors.samples import Trajectory
-from mapserver.drafting.area_corrections import AreaCorrections, corrections_of, waiting
+from mapserver.drafting.area_corrections import AreaCorrections, corrections_of
 from mapserver.floor_plan.areas import Area, Areas, Correction, CorrectionKind
 from mapserver.quality.gate import GateSettings, judge
 from mapserver.survey.merge import multi_session
@@ -106,13 +106,13 @@ def test_an_area_is_forgotten_once_a_later_recording_covers_it(
 
 def test_a_version_knows_its_corrections() -> None:
     areas = Areas.of([area(FORGET, (0, 0), (1, 1)), area(FREEZE, (5, 5), (6, 6))])
-    assert [one.name for one in waiting(areas, manifest())] == ["forget (0, 0)"]
+    assert [one.name for one in AreaCorrections.of(areas, manifest()).due] == ["forget (0, 0)"]
     configuration = AreaCorrections(areas.areas).configuration("lab")
     kept_areas = corrections_of(manifest(**configuration))
     assert kept_areas.geojson("lab") == areas.geojson("lab")
-    assert waiting(areas, manifest(**configuration)) == []
+    assert AreaCorrections.of(areas, manifest(**configuration)).due == []
     again = Areas.of([area(FORGET, (0, 0), (1, 1), NOW_NS + 1)])
-    assert waiting(again, manifest(**configuration)) == list(again.areas)
+    assert AreaCorrections.of(again, manifest(**configuration)).due == list(again.areas)
 
 
 def test_the_gate_does_not_count_what_corrections_removed() -> None:

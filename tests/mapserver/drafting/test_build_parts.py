@@ -11,9 +11,9 @@ from rich.console import Console
 from fleetmap.errors import RecordingError, UsageError
 from fleetmap.geometry import se3_exp, se3_inverse, transform_points
 from fleetmap.sensors.samples import Trajectory
-from mapserver.drafting.accuracy import accuracy, check_truth
 from mapserver.drafting.draft import read_zones
 from mapserver.drafting.progress import ProgressView, StageTimes
+from mapserver.evaluation.trajectory_error import accuracy, check_truth
 from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.survey_map import SurveyMap
 from support.storage.map_samples import random_survey
@@ -49,13 +49,12 @@ def test_accuracy_is_over_all_estimated_frames_that_have_a_truth() -> None:
     estimated = np.ones(frames, bool)
     estimated[[3, 7]] = False
     survey = replace(random_survey(rng), trajectory=Trajectory(stamps, estimate), trajectory_estimated=estimated)
-    found = accuracy(survey, Trajectory(stamps[:-1], true[:-1]))
-    assert found.rigid is not None
+    found = accuracy(survey.estimated_trajectory, frames, Trajectory(stamps[:-1], true[:-1]))
     assert found.rigid.rmse_m < 1e-9
     assert found.evaluated_share == pytest.approx(0.7)
     np.testing.assert_allclose(found.rigid.frame_from_estimate, se3_inverse(NEW_FROM_MAP), atol=1e-9)
-    assert accuracy(survey, None).evaluated_share is None
-    few = accuracy(survey, Trajectory(stamps[:2], true[:2]))
+    assert accuracy(survey.estimated_trajectory, frames, None).evaluated_share is None
+    few = accuracy(survey.estimated_trajectory, frames, Trajectory(stamps[:2], true[:2]))
     assert (few.rigid, few.evaluated_share) == (None, pytest.approx(0.2))
 
 

@@ -142,7 +142,6 @@ def test_the_map_lies_in_the_frame_of_the_truth(done: Path) -> None:
 
 def test_the_picture_shows_the_map_on_the_left_and_its_errors_on_the_right(done: Path) -> None:
     picture = cv2.imread(str(done / "p.png"))
-    assert picture is not None
     half = picture.shape[1] // 2
 
     def count(hexadecimal: str, part: NDArray[np.uint8]) -> int:

@@ -11,7 +11,7 @@ import numpy as np
 from mapserver.store import DraftContent, MapStore
 from mapserver.survey.settings import BudgetSettings
 from mapserver.tiles.landmark_budget import choose_landmarks
-from mapserver.tiles.tiling import TILE_SIZE_M, tiles_from_survey
+from mapserver.tiles.tiling import tiles_from_survey
 from support.storage.map_samples import draft_details, random_survey
 
 GOLDEN = Path(__file__).parents[2] / "golden"
@@ -20,7 +20,7 @@ GOLDEN = Path(__file__).parents[2] / "golden"
 def test_the_draft_of_a_fixed_survey_is_the_golden_one(tmp_path: Path) -> None:
     survey = random_survey(np.random.default_rng(11), keyframes=6, landmarks=80)
     budget = BudgetSettings(min_landmarks=60, landmarks_per_m=0.1, view_landmarks=20, view_distinctive_landmarks=10)
-    chosen = choose_landmarks(survey, budget, TILE_SIZE_M)
+    chosen = choose_landmarks(survey, budget)
     tiles = tiles_from_survey(survey, chosen=chosen)
     with MapStore.open(tmp_path, create=True) as store:
         store.save("lab", DraftContent(tiles=tiles, vocabulary=b"words" * 50, details=draft_details(path_m=12.5)))

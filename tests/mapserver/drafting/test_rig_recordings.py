@@ -44,8 +44,8 @@ def test_frames_keep_all_views_when_they_are_read_again(recorded: Path, tmp_path
                 assert len(recording.view(0).calibration.cameras) == 2
 
 
-def test_a_smaller_set_of_sensors_is_that_of_the_first_view(recorded: Path) -> None:
-    with RecordingOptions(use=SensorSet.MONO).open(recorded) as (recording, _):
+def test_a_smaller_set_of_sensors_is_that_of_the_first_view(recorded: Path, tmp_path: Path) -> None:
+    with OpenRecordings(RecordingOptions(use=SensorSet.MONO), tmp_path).open(recorded) as (recording, _):
         assert len(recording.calibration.cameras) == 1
         assert len(images_of(recording.read_frame(0))) == 1
 

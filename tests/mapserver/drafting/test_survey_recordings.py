@@ -138,7 +138,9 @@ def test_a_recording_ends_where_its_robot_is_lifted(
     assert [(part.start, part.stop) for part in parts_between_lifts(estimates)] == parts
 
 
-def test_nobody_holds_what_was_begun_once_its_loops_are_closed(drive: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nobody_holds_what_was_begun_once_its_loops_are_closed(
+    drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its landmarks are as large as those that are made anew then."""
 
     @dataclass
@@ -164,7 +166,9 @@ def test_nobody_holds_what_was_begun_once_its_loops_are_closed(drive: Path, monk
     monkeypatch.setattr(stages, "match_again", adjust)
     config = SurveyConfig(SurveySettings(), default_vocabulary())
     with pytest.raises(SurveyError, match="let go of"):
-        survey_recording(drive, admitted.pop(), RecordingOptions(), None, config, SurveyTools())
+        survey_recording(
+            drive, admitted.pop(), OpenRecordings(RecordingOptions(), tmp_path), None, config, SurveyTools()
+        )
 
 
 def test_the_turn_within_each_pair_of_a_rig_is_told_and_judged() -> None:

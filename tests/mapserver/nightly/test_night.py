@@ -36,7 +36,7 @@ from fleetmap.sensors.samples import SensorSet
 from mapserver import releases
 from mapserver.config import survey_settings
 from mapserver.drafting.draft import BuildOptions, BuildRequest, Draft
-from mapserver.drafting.survey_recordings import RecordingOptions, admit_recordings, survey_all
+from mapserver.drafting.survey_recordings import OpenRecordings, RecordingOptions, admit_recordings, survey_all
 from mapserver.nightly import inbox as boxes
 from mapserver.nightly import night, reading
 from mapserver.nightly.inbox import arrivals
@@ -195,7 +195,11 @@ def test_a_recording_that_the_doctor_refuses_does_not_stop_the_others(hall: Path
 
     def admit(*paths: Path, unusable: dict[Path, str] | None) -> list[Path]:
         console = Console(file=io.StringIO())
-        return list(admit_recordings(paths, RecordingOptions(), console, needs_truth=False, unusable=unusable))
+        return list(
+            admit_recordings(
+                paths, OpenRecordings(RecordingOptions(), hall), console, needs_truth=False, unusable=unusable
+            )
+        )
 
     assert admit(swapped, sound, unusable=unusable) == [sound]
     assert "left and right" in unusable[swapped]

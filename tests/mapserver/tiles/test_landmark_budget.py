@@ -88,7 +88,7 @@ def with_a_lonely_view(own: np.ndarray) -> SurveyMap:
 def test_a_lonely_view_is_served_before_crowded_ones_get_more() -> None:
     own = np.arange(375, 400)
     survey = with_a_lonely_view(own)
-    chosen = choose_landmarks(survey, exactly(120), 16.0)
+    chosen = choose_landmarks(survey, exactly(120))
     # All others are seen several times: by how often they are seen alone, none of these would be kept.
     assert np.bincount(survey.obs_landmark)[np.isin(np.arange(400), own)].max() == 1
     assert seen_per_view(survey, chosen)[9] >= 5
@@ -97,8 +97,8 @@ def test_a_lonely_view_is_served_before_crowded_ones_get_more() -> None:
 def test_a_view_at_the_end_of_a_drive_keeps_what_it_needs() -> None:
     """Its own landmarks are seen from nowhere else, so that any other one helps many views at once."""
     survey = with_a_lonely_view(np.arange(300, 400))
-    served = choose_landmarks(survey, msgspec.structs.replace(exactly(160), view_landmarks=40), 16.0)
-    unserved = choose_landmarks(survey, msgspec.structs.replace(exactly(160), view_landmarks=0), 16.0)
+    served = choose_landmarks(survey, msgspec.structs.replace(exactly(160), view_landmarks=40))
+    unserved = choose_landmarks(survey, msgspec.structs.replace(exactly(160), view_landmarks=0))
     assert served.sum() == unserved.sum() == 160
     assert seen_per_view(survey, served)[9] >= 40 > seen_per_view(survey, unserved)[9]
     assert seen_per_view(survey, served).min() >= 40
@@ -120,12 +120,12 @@ def test_every_view_gets_what_tells_it_from_its_twins_first() -> None:
         obs_pixels=survey.obs_pixels[once], obs_octave=survey.obs_octave[once], obs_sigma_px=survey.obs_sigma_px[once],
     )  # fmt: skip
     wanted = seen_per_view(survey, is_alone)
-    told = choose_landmarks(survey, msgspec.structs.replace(exactly(200), view_distinctive_landmarks=60), 16.0)
-    untold = choose_landmarks(survey, exactly(200), 16.0)
+    told = choose_landmarks(survey, msgspec.structs.replace(exactly(200), view_distinctive_landmarks=60))
+    untold = choose_landmarks(survey, exactly(200))
     assert told.sum() == untold.sum() == 200
     np.testing.assert_array_equal(seen_per_view(survey, told & is_alone), wanted)
     assert (seen_per_view(survey, untold & is_alone) < wanted).mean() > 0.5
-    some = choose_landmarks(survey, msgspec.structs.replace(exactly(200), view_distinctive_landmarks=1), 16.0)
+    some = choose_landmarks(survey, msgspec.structs.replace(exactly(200), view_distinctive_landmarks=1))
     assert (some & is_alone).sum() < is_alone.sum()
 
 
@@ -134,7 +134,7 @@ def test_the_path_sets_the_budget_and_breaks_do_not_count() -> None:
     whole_m = np.linalg.norm(np.diff((survey.map_from_body @ survey.body_from_cam)[:, :3, 3], axis=0), axis=1).sum()
     assert covered_path_m(survey) == pytest.approx(whole_m)
     settings = BudgetSettings(landmarks_per_m=2.0, min_landmarks=10)
-    assert choose_landmarks(survey, settings, 16.0).sum() == int(2.0 * whole_m)
+    assert choose_landmarks(survey, settings).sum() == int(2.0 * whole_m)
     broken = survey.map_from_body.copy()
     broken[25:, 0, 3] += 1000.0
     assert whole_m - 5 < covered_path_m(replace(survey, map_from_body=broken)) < whole_m
@@ -154,36 +154,36 @@ def test_the_same_way_again_adds_no_budget_and_the_way_back_does() -> None:
 def test_what_later_surveys_found_again_comes_before_what_they_missed() -> None:
     """The nights looked twenty times for every landmark, and found every second one seldom."""
     survey = random_survey(np.random.default_rng(8), keyframes=20, landmarks=600)
-    first = choose_landmarks(survey, exactly(150), 16.0)
+    first = choose_landmarks(survey, exactly(150))
     is_often = np.arange(600) % 2 == 0
     looks = np.full(600, 20, np.uint32)
     seen = np.where(is_often, 16, 1).astype(np.uint32)
     known = replace(history_of(survey), landmark_expected=looks, landmark_seen=seen)
-    later = choose_landmarks(replace(survey, history=known), exactly(150), 16.0)
+    later = choose_landmarks(replace(survey, history=known), exactly(150))
     assert first.sum() == later.sum() == 150
     assert (first & is_often).sum() < 90
     assert (later & is_often).sum() > 110
     alike = replace(known, landmark_seen=looks // 2)  # says nothing of one against another
-    assert (choose_landmarks(replace(survey, history=alike), exactly(150), 16.0) & first).sum() > 100
+    assert (choose_landmarks(replace(survey, history=alike), exactly(150)) & first).sum() > 100
 
 
 def test_what_is_published_is_kept_first() -> None:
     survey = random_survey(np.random.default_rng(4), keyframes=20, landmarks=600)
     ids = survey.landmark_ids
-    worst = ids[~choose_landmarks(survey, exactly(500), 16.0)][:60]
-    again = choose_landmarks(survey, exactly(100), 16.0, published=worst)
+    worst = ids[~choose_landmarks(survey, exactly(500))][:60]
+    again = choose_landmarks(survey, exactly(100), published=worst)
     seen = ids[np.unique(survey.obs_landmark)]
     assert set(ids[again]) >= set(worst) & set(seen)
     assert again.sum() == 100
     # Nothing else changed, so nothing changes.
-    once_more = choose_landmarks(survey, exactly(100), 16.0, published=ids[again])
+    once_more = choose_landmarks(survey, exactly(100), published=ids[again])
     np.testing.assert_array_equal(once_more, again)
 
 
 def test_tiles_stay_below_their_limit() -> None:
     survey = random_survey(np.random.default_rng(5), keyframes=10, landmarks=900)
-    chosen = choose_landmarks(survey, exactly(800, tile_landmarks=70), 16.0)
-    assert max(len(tile) for tile in tiles_from_survey(survey, 16.0, chosen=chosen)) == 70
+    chosen = choose_landmarks(survey, exactly(800, tile_landmarks=70))
+    assert max(len(tile) for tile in tiles_from_survey(survey, chosen=chosen)) == 70
 
 
 def test_a_full_tile_of_the_default_budget_fits_in_256_kb() -> None:
@@ -199,8 +199,8 @@ def test_a_full_tile_of_the_default_budget_fits_in_256_kb() -> None:
         landmark_ids=np.sort(rng.choice(1 << 20, len(survey.landmark_ids), replace=False)).astype(np.uint32),
         map_from_body=map_from_body,
     )
-    chosen = choose_landmarks(survey, exactly(10_000, settings.tile_landmarks), 16.0)
-    largest = max(tiles_from_survey(survey, 16.0, chosen=chosen), key=len)
+    chosen = choose_landmarks(survey, exactly(10_000, settings.tile_landmarks))
+    largest = max(tiles_from_survey(survey, chosen=chosen), key=len)
     assert len(largest) == settings.tile_landmarks
     assert len(encode_tile(largest)) <= 256_000
 
@@ -215,4 +215,4 @@ def test_nothing_comes_of_nothing() -> None:
         obs_octave=survey.obs_octave[:0],
         obs_sigma_px=survey.obs_sigma_px[:0],
     )
-    assert not choose_landmarks(nobody, BudgetSettings(), 16.0).any()
+    assert not choose_landmarks(nobody, BudgetSettings()).any()

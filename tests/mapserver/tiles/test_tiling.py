@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import SurveyError
+from mapserver.tiles import tiling
 from mapserver.tiles.tiling import tiles_from_survey
 from support.storage.map_samples import random_survey
 
 
 def test_tiles_hold_what_a_plain_loop_finds() -> None:
     survey = random_survey(np.random.default_rng(4))
-    tiles = tiles_from_survey(survey, 16.0)
+    tiles = tiles_from_survey(survey)
     cells = [(tile.tile_x, tile.tile_y) for tile in tiles]
     assert cells == sorted(set(cells))
     centres = [(frame @ survey.body_from_cam)[:3, 3] for frame in survey.map_from_body]
@@ -43,10 +44,11 @@ def test_tiles_hold_what_a_plain_loop_finds() -> None:
     assert 5 in unseen
 
 
-def test_places_list_the_best_observed_landmarks() -> None:
+def test_places_list_the_best_observed_landmarks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tiling, "MAX_PLACE_LANDMARKS", 10)
     survey = random_survey(np.random.default_rng(5))
     counts = np.bincount(survey.obs_landmark, minlength=len(survey.landmark_ids))
-    tiles = tiles_from_survey(survey, 16.0, max_place_landmarks=10)
+    tiles = tiles_from_survey(survey)
     listed = {}
     for tile in tiles:
         for place, map_from_cam, ids in zip(tile.place_ids, tile.map_from_cam, tile.place_landmark_ids, strict=True):

@@ -63,7 +63,8 @@ def played(
     recording: Path, frames: str = "::", speed: float = 1.0, use: SensorSet | None = None
 ) -> Iterator[RecordedDrive]:
     """A recording, or the sensors `use` of it, as a drive."""
-    with RecordingOptions(frames, use=use).open(recording) as (opened, indices):
+    opened, indices = RecordingOptions(frames, use=use).opened(recording)
+    with opened:
         yield RecordedDrive(recording, opened, indices, frames, speed)
 
 

@@ -9,8 +9,8 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import ImuSamples
 from fleetsim.recorder import Order, Session, prepare
+from mapserver.calibration.motion_rows import CalibrationData, MotionState
 from mapserver.calibration.parameters import COLUMNS, RigAxes, corrected_rig
-from mapserver.calibration.problem import CalibrationData, MotionState
 from support.estimator.simulated_run import EstimatorSession
 
 SIGMAS_PX = np.array([0.25, 0.12, 0.15])  # of the left pixel, the disparity, the row difference

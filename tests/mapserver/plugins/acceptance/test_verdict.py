@@ -2,7 +2,6 @@
 
 import copy
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -13,7 +12,7 @@ from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, se3, so3_exp
 from mapserver.floor_plan.areas import Area, Areas
 from mapserver.plugins.acceptance.command import _before
-from mapserver.plugins.acceptance.document import drawn, sections
+from mapserver.plugins.acceptance.document import drawn, html_page, sections
 from mapserver.plugins.acceptance.drives import Drive, Picture, Start
 from mapserver.plugins.acceptance.examine import area_name, areas_of, similar
 from mapserver.plugins.acceptance.figures import (
@@ -25,7 +24,6 @@ from mapserver.plugins.acceptance.figures import (
     Report,
     StartCounts,
 )
-from mapserver.plugins.acceptance.html_page import html_page
 from mapserver.plugins.acceptance.ladders import BLUR_PX, STOPS
 from mapserver.plugins.acceptance.pdf import pdf
 from mapserver.plugins.acceptance.verdict import KNOWN_STARTS, ONE_WAY, compared, judged
@@ -251,9 +249,7 @@ def test_names_from_outside_break_no_document(good: Report, name: str) -> None:
 
 def test_a_report_is_compared_with_one_of_its_site(good: Report, tmp_path: Path) -> None:
     (tmp_path / "acceptance.json").write_bytes(msgspec.json.encode(good))
-    options: Any = SimpleNamespace(before=str(tmp_path / "acceptance.json"), site="hall")
     nothing: Any = None
-    assert _before(nothing, nothing, [], options, nothing) == good
-    options.site = "yard"
+    assert _before(str(tmp_path / "acceptance.json"), "hall", nothing) == good
     with pytest.raises(UsageError, match="of site hall"):
-        _before(nothing, nothing, [], options, nothing)
+        _before(str(tmp_path / "acceptance.json"), "yard", nothing)

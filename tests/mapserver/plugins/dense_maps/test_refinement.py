@@ -7,8 +7,7 @@ import numpy as np
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.sensors.calibration import CameraCalibration
 from mapserver.plugins.dense_maps.refinement import Look, Views, refine
-from mapserver.plugins.dense_maps.splat_file import THICKNESS, Splats
-from mapserver.plugins.dense_maps.splat_renderer import BLUR_PX2, draw, parameters_of, with_parameters
+from mapserver.plugins.dense_maps.splats import BLUR_PX2, THICKNESS, Splats, draw, parameters_of, with_parameters
 from support.storage.dense_samples import wall
 
 CAMERA = CameraCalibration("radial-tangential", 24, 18, np.array([22.0, 22.0, 11.5, 8.5]), np.zeros(0), np.eye(4))

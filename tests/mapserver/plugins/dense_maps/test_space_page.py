@@ -15,7 +15,7 @@ from fleetmap.geometry import Array, se3
 from fleetmap.mapformat import Tile
 from fleetmap.messages import CameraNote, FailureAck, Placement, decode_message, encode_message, robot_key
 from mapserver.plugins.dense_maps import space_points as points
-from mapserver.plugins.dense_maps.space_page import robot_views
+from mapserver.plugins.dense_maps.pages import robot_views
 from mapserver.plugins.dense_maps.space_points import space_bytes
 from mapserver.store import MapStore
 from support.fleet.dashboard_scene import ROBOTS, SITE, Served, failure, opened, serving, talking, wait_until

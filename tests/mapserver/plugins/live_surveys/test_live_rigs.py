@@ -238,7 +238,8 @@ def test_sensors_by_the_same_file_are_built_with_their_topics(site: Site, tmp_pa
         "::",
         survey_settings(file, SensorSet.RGBD),
     )
-    with options.reading.open(record) as (kept, indices):
+    kept, indices = options.opened(record)
+    with kept:
         assert (kept.sensor_set, len(indices)) == (SensorSet.RGBD, len(robot_world.cycle().stamps_ns))
     for option, value in (("--use", "stereo"), ("--calibration", file), ("--topic", "imu=/a")):
         refused = run("live", "--config", file, option, value)

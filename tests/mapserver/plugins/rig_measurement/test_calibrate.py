@@ -11,7 +11,7 @@ from fleetmap.geometry import se3, se3_inverse
 from fleetmap.recordings import open_recording, read_calibration
 from fleetmap.sensors.samples import CameraFrame
 from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate
-from mapserver.calibration.parameters import COLUMNS, RANGES
+from mapserver.calibration.parameters import COLUMNS
 from mapserver.cli import app
 from support.command_line import status
 from support.recordings.recording_samples import calibration, make_sample, write_euroc
@@ -40,10 +40,7 @@ def test_the_other_cameras_of_a_rig_are_kept(tmp_path: Path, monkeypatch: pytest
     frames = [replace(frame, others=(frame,)) for frame in shown]
     drive = write_kitti_raw(tmp_path / "drive", replace(front, cameras=(*front.cameras, *rear)), frames)
     is_wrong = [p is CalibrationParameter.BASELINE for p in COLUMNS]
-    parameters = [
-        ParameterEstimate(p, 0.01 * wrong, 1e-4, RANGES[p].unit, wrong)
-        for p, wrong in zip(COLUMNS, is_wrong, strict=True)
-    ]
+    parameters = [ParameterEstimate(p, 0.01 * wrong, 1e-4, wrong) for p, wrong in zip(COLUMNS, is_wrong, strict=True)]
     found = CalibrationEstimate(tuple(parameters), 1e-8 * np.eye(len(COLUMNS)), 9, 99)
     monkeypatch.setattr("mapserver.calibration.estimate_calibration", lambda *_: found)
     done = CliRunner().invoke(app, ["calibrate", str(drive), "--out", str(tmp_path / "cams.yaml")])

@@ -16,11 +16,12 @@ from fleetmap.recordings.sensor_subset import reduced
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from mapserver import BuildOptions, build_map
-from mapserver.drafting.trajectory import GivenPoses, OtherTrajectory, given_poses
-from mapserver.drafting.trajectory import given as given_module
-from mapserver.drafting.trajectory.formats import WrittenPoses
-from mapserver.drafting.trajectory.given import OwnMotion, fitted_scale, stamps_on_clock
+from mapserver.drafting.survey_recordings import GivenPoses
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
+from mapserver.plugins.given_trajectories import given as given_module
+from mapserver.plugins.given_trajectories.depths import GivenTrajectory
+from mapserver.plugins.given_trajectories.formats import WrittenPoses
+from mapserver.plugins.given_trajectories.given import OwnMotion, fitted_scale, stamps_on_clock
 from mapserver.survey.given_poses import poses_as_odometry
 from mapserver.survey.state import OdometryPass
 from support.recordings.recording_samples import BODY_FROM_CAM0, START_NS, Sample, write_mcap
@@ -88,9 +89,9 @@ def in_seconds(sample: Sample) -> list[str]:
     return [f"{stamp / 10**9:.6f}" for stamp in sample.stamps_ns.tolist()]
 
 
-def given(recording: Path, other: OtherTrajectory, use: SensorSet | None = None, frames: int = FRAMES) -> GivenPoses:
+def given(recording: Path, other: GivenTrajectory, use: SensorSet | None = None, frames: int = FRAMES) -> GivenPoses:
     with open_recording(recording) as opened:
-        return given_poses(reduced(opened, use), np.arange(frames), other)
+        return other.poses(reduced(opened, use), np.arange(frames))
 
 
 def off_m(found: GivenPoses, sample: Sample) -> float:
@@ -124,9 +125,9 @@ def test_a_wrong_convention_is_refused_with_the_one_that_fits(
     file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample), **convention)
     if instead:
         with pytest.raises(RecordingError, match=f"does not fit ride as poses of the {frame}: .*; {instead}$"):
-            given(recording, OtherTrajectory(file, frame), use)
+            given(recording, GivenTrajectory(file, frame), use)
     else:
-        found = given(recording, OtherTrajectory(file, frame), use)
+        found = given(recording, GivenTrajectory(file, frame), use)
         assert f"trajectory p.tum (TUM): poses of the {frame}, scale 1:" in found.words
         assert off_m(found, sample) < 0.02
 
@@ -140,7 +141,7 @@ def test_stamps_of_mast3r_and_dpv_slam_are_read(sample: Sample, recording: Path,
     """Seconds since the first frame, and numbers of frames."""
     stamps = [stamp(ns) for ns in sample.stamps_ns.tolist()]
     file = written(tmp_path / "p.txt", drifted(sample), stamps, camera=True)
-    assert off_m(given(recording, OtherTrajectory(file)), sample) < 0.02
+    assert off_m(given(recording, GivenTrajectory(file)), sample) < 0.02
 
 
 @pytest.mark.parametrize("stamps", [False, True], ids=["rows", "numbers"])
@@ -152,14 +153,14 @@ def test_frames_that_are_damaged_count(sample: Sample, recording: Path, tmp_path
     with open_recording(recording) as opened:
         kept = np.delete(np.arange(count), 7)
         sound = replace(opened.part(kept), damaged_ns=opened.frame_stamps_ns[[7]])
-        found = stamps_on_clock(rows, sound, np.arange(count - 1), OtherTrajectory(tmp_path / "p.txt"))
+        found = stamps_on_clock(rows, sound, np.arange(count - 1), GivenTrajectory(tmp_path / "p.txt"))
         np.testing.assert_array_equal(found, opened.frame_stamps_ns)
 
 
 @pytest.mark.parametrize("scale", [1000.0, 0.3])
 def test_the_scale_is_found(sample: Sample, recording: Path, tmp_path: Path, scale: float) -> None:
     file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample), camera=True, scale=scale)
-    found = given(recording, OtherTrajectory(file))
+    found = given(recording, GivenTrajectory(file))
     said = float(found.words.partition("scale ")[2].partition(":")[0])
     assert said * scale == pytest.approx(1.0, rel=0.02)
     assert off_m(found, sample) < 0.03
@@ -182,14 +183,14 @@ def test_noise_of_neither_side_passes_for_another_scale(noise_m: float, own_nois
 def test_kitti_and_droid_are_read(sample: Sample, recording: Path, tmp_path: Path) -> None:
     map_from_cam = drifted(sample) @ BODY_FROM_CAM0
     np.savetxt(tmp_path / "p.txt", map_from_cam[:, :3].reshape(-1, 12))
-    assert off_m(given(recording, OtherTrajectory(tmp_path / "p.txt")), sample) < 0.02
+    assert off_m(given(recording, GivenTrajectory(tmp_path / "p.txt")), sample) < 0.02
     rows = []
     for cam_from_map in se3_inverse(map_from_cam):
         w, x, y, z = quat_wxyz_from_rotation(cam_from_map[:3, :3])
         rows.append([*cam_from_map[:3, 3], x, y, z, w])
     np.save(tmp_path / "poses.npy", np.array(rows, np.float32)[::2])
     np.save(tmp_path / "tstamps.npy", np.arange(0, FRAMES, 2, np.float64))
-    found = given(recording, OtherTrajectory(tmp_path))
+    found = given(recording, GivenTrajectory(tmp_path))
     assert "(DROID): poses of the camera" in found.words
     assert off_m(found, sample) < 0.02
 
@@ -201,7 +202,7 @@ def test_missing_poses_are_bridged_by_our_odometry(
     """Every third one, a second in the middle, and both ends."""
     kept = [k for k in range(3, FRAMES - 4) if k % 3 and not 25 <= k < 36]
     stamps = np.array(in_seconds(sample))[kept].tolist()
-    found = given(recording, OtherTrajectory(written(tmp_path / "p.tum", drifted(sample)[kept], stamps), "body"), use)
+    found = given(recording, GivenTrajectory(written(tmp_path / "p.tum", drifted(sample)[kept], stamps), "body"), use)
     assert "21 of 61 frames without a pose are bridged by our own odometry" in found.words
     assert len(found.trajectory) == FRAMES
     assert off_m(found, sample) < 0.03
@@ -212,8 +213,8 @@ def test_standing_still_shows_no_metres(tmp_path: Path) -> None:
     folder = write_mcap(tmp_path / "still", still)
     file = written(tmp_path / "p.tum", np.array(still.world_from_body), in_seconds(still))
     with pytest.raises(UsageError, match="set its metres with --trajectory-scale METRES"):
-        given(folder, OtherTrajectory(file, "body"), frames=20)
-    assert "as stated" in given(folder, OtherTrajectory(file, "body", scale=1.0), frames=20).words
+        given(folder, GivenTrajectory(file, "body"), frames=20)
+    assert "as stated" in given(folder, GivenTrajectory(file, "body", scale=1.0), frames=20).words
 
 
 @pytest.mark.parametrize("use", [None, SensorSet.STEREO])
@@ -223,10 +224,10 @@ def test_poses_of_another_recording_are_refused(
     other = ride_sample(out_and_back(3.5, yaw_rad=0.3), FRAMES, 0.1, begin_s=0.4)
     file = written(tmp_path / "p.tum", np.array(other.world_from_body), in_seconds(sample))
     with pytest.raises(RecordingError, match=r"another recording: .* off by \d+ % of"):
-        given(recording, OtherTrajectory(file, "body"), use)
+        given(recording, GivenTrajectory(file, "body"), use)
     late = [f"{stamp / 10**9 + 3600:.6f}" for stamp in sample.stamps_ns.tolist()]
     with pytest.raises(RecordingError, match="another recording: of its 61 poses"):
-        given(recording, OtherTrajectory(written(tmp_path / "q.tum", drifted(sample), late), "body"), use)
+        given(recording, GivenTrajectory(written(tmp_path / "q.tum", drifted(sample), late), "body"), use)
 
 
 @pytest.mark.parametrize("use", [None, SensorSet.STEREO])
@@ -242,7 +243,7 @@ def test_a_build_from_poses_makes_a_map_of_them(
 
     monkeypatch.setattr("mapserver.survey.stages.poses_as_odometry", begun)
     file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample), camera=True, scale=0.1)
-    options = BuildOptions(use=use, trajectory=OtherTrajectory(file), threads=1)
+    options = BuildOptions(use=use, trajectory=GivenTrajectory(file), threads=1)
     done = build_map(recording, tmp_path / "maps", "hall", options)
     assert done.report["ate_rmse_m"] < 0.02
     assert done.report["keyframes"] > 5
@@ -259,7 +260,7 @@ def test_frames_between_keyframes_lose_the_noise_of_the_file(sample: Sample, rec
     rng = np.random.default_rng(4)
     noisy = [drift @ se3_exp(rng.normal(0, [3e-3] * 3 + [0.04] * 3)) for drift in drifted(sample)]
     file = written(tmp_path / "p.tum", np.array(noisy), in_seconds(sample))
-    options = BuildOptions(use=SensorSet.STEREO, trajectory=OtherTrajectory(file, "body"), threads=1)
+    options = BuildOptions(use=SensorSet.STEREO, trajectory=GivenTrajectory(file, "body"), threads=1)
     done = build_map(recording, tmp_path / "maps", "hall", options)
     assert done.report["keyframes"] < FRAMES / 2
     assert done.report["ate_rmse_m"] < 0.02
@@ -268,8 +269,8 @@ def test_frames_between_keyframes_lose_the_noise_of_the_file(sample: Sample, rec
 def test_half_of_the_way_is_refused_by_name(sample: Sample, recording: Path, tmp_path: Path) -> None:
     write_tum(tmp_path / "half.tum", Trajectory(sample.stamps_ns[:28], drifted(sample)[:28]))
     with pytest.raises(UsageError, match=r"no pose for 33 of 61 frames of ride: \d+\.\d{9}, .* --frames"):
-        given(recording, OtherTrajectory(tmp_path / "half.tum", "body"))
-    assert len(given(recording, OtherTrajectory(tmp_path / "half.tum", "body"), frames=28).trajectory) == 28
+        given(recording, GivenTrajectory(tmp_path / "half.tum", "body"))
+    assert len(given(recording, GivenTrajectory(tmp_path / "half.tum", "body"), frames=28).trajectory) == 28
 
 
 @pytest.mark.parametrize(
@@ -288,7 +289,7 @@ def test_half_of_the_way_is_refused_by_name(sample: Sample, recording: Path, tmp
 def test_files_that_are_no_poses_are_refused(recording: Path, tmp_path: Path, content: str, said: str) -> None:
     (tmp_path / "p.txt").write_bytes(content.encode("utf-8", "surrogateescape"))
     with pytest.raises(RecordingError, match=said):
-        given(recording, OtherTrajectory(tmp_path / "p.txt"))
+        given(recording, GivenTrajectory(tmp_path / "p.txt"))
 
 
 def test_arrays_that_are_no_poses_are_refused(recording: Path, tmp_path: Path) -> None:
@@ -303,12 +304,12 @@ def test_arrays_that_are_no_poses_are_refused(recording: Path, tmp_path: Path) -
     ):
         np.save(file, array, allow_pickle=True)
         with pytest.raises(RecordingError, match=r"poses\.npy"):
-            given(recording, OtherTrajectory(file))
+            given(recording, GivenTrajectory(file))
     header = b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000, 7), }".ljust(117) + b"\n"
     for content in (b"", b"\x93NUMPY", b"\x93NUMPY\x01\x00v\x00" + header, b"\x93NUMPY\x01\x00v\x00" + b"(" * 118):
         file.write_bytes(content)
         with pytest.raises(RecordingError, match="file of numbers"):
-            given(recording, OtherTrajectory(file))
+            given(recording, GivenTrajectory(file))
 
 
 @pytest.mark.parametrize(
@@ -325,11 +326,11 @@ def test_what_does_not_fit_is_refused(
 ) -> None:
     file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample))
     with pytest.raises(FleetmapError, match=said):
-        given(recording, OtherTrajectory(**{"file": file} | change), use)  # type: ignore[arg-type]
+        given(recording, GivenTrajectory(**{"file": file} | change), use)  # type: ignore[arg-type]
 
 
 def test_one_file_belongs_to_one_recording(sample: Sample, recording: Path, tmp_path: Path) -> None:
     file = written(tmp_path / "p.tum", drifted(sample), in_seconds(sample))
-    options = BuildOptions(trajectory=OtherTrajectory(file, "body"))
+    options = BuildOptions(trajectory=GivenTrajectory(file, "body"))
     with pytest.raises(UsageError, match="is for one recording, 2 are named"):
         build_map([recording, recording], tmp_path / "maps", "hall", options)

@@ -12,9 +12,8 @@ from fleetmap.geometry import quat_wxyz_from_rotation, se3, se3_inverse, so3_exp
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from mapserver import BuildOptions, build_map
-from mapserver.drafting.survey_recordings import RecordingOptions
-from mapserver.drafting.trajectory import OtherTrajectory
-from mapserver.drafting.trajectory.depths import DepthFrames
+from mapserver.drafting.survey_recordings import OpenRecordings, RecordingOptions
+from mapserver.plugins.given_trajectories.depths import DepthFrames, GivenTrajectory
 from support.recordings.recording_samples import BODY_FROM_CAM0, HEIGHT, WIDTH, Sample, write_mcap
 from support.worlds.box_room import out_and_back, points_seen, ride_sample
 
@@ -53,8 +52,8 @@ def run(sample: Sample, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def options(run: Path, scale: float | None = METRES, use: SensorSet = SensorSet.MONO) -> RecordingOptions:
-    return RecordingOptions(use=use, trajectory=OtherTrajectory(run, scale=scale))
+def options(run: Path, scale: float | None = METRES, use: SensorSet = SensorSet.MONO) -> OpenRecordings:
+    return OpenRecordings(RecordingOptions(use=use, trajectory=GivenTrajectory(run, scale=scale)), run)
 
 
 @pytest.mark.parametrize("use", [SensorSet.MONO, SensorSet.MONO_INERTIAL])
@@ -73,10 +72,9 @@ def test_depths_are_those_of_the_recorded_pixels(
         part_m = opened.part(indices[10:12]).read_frame(0).depth_m
         digest = opened.content_hash()
     assert depth_m is not None
-    assert without is not None
     assert not without.any()
     np.testing.assert_array_equal(part_m, depth_m)
-    with RecordingOptions(use=use).open(recording) as (plain, _):
+    with OpenRecordings(RecordingOptions(use=use), run).open(recording) as (plain, _):
         assert digest == plain.content_hash()
     v, u = np.nonzero(depth_m)
     assert len(v) > 0.85 * WIDTH * HEIGHT
@@ -94,7 +92,6 @@ def test_between_two_surfaces_no_depth_is_made_up(recording: Path, run: Path) ->
     np.save(run / "disps.npy", inverse)
     with options(run).open(recording) as (opened, _):
         depth_m = opened.read_frame(0).depth_m
-    assert depth_m is not None
     np.testing.assert_allclose(np.unique(depth_m), [0.0, METRES, 2 * METRES], rtol=1e-5)
     assert not depth_m[28, 28]
 
@@ -119,7 +116,7 @@ def test_a_lens_bends_the_recorded_pixels_alone(tmp_path: Path, width: int, heig
 
 
 def test_a_single_camera_is_surveyed_with_them_in_metres(sample: Sample, recording: Path, run: Path) -> None:
-    chosen = BuildOptions(use=SensorSet.MONO, trajectory=OtherTrajectory(run, scale=METRES), threads=1)
+    chosen = BuildOptions(use=SensorSet.MONO, trajectory=GivenTrajectory(run, scale=METRES), threads=1)
     done = build_map(recording, run / "maps", "hall", chosen)
     assert done.report["ate_rmse_m"] < 0.03
     assert done.report["keyframes"] > 5
@@ -134,7 +131,7 @@ def test_a_single_camera_is_surveyed_with_them_in_metres(sample: Sample, recordi
 
 def test_depths_of_another_unit_than_the_poses_are_refused(recording: Path, run: Path) -> None:
     np.save(run / "disps.npy", np.load(run / "disps.npy") / 4)
-    chosen = BuildOptions(use=SensorSet.MONO, trajectory=OtherTrajectory(run, scale=METRES), threads=1)
+    chosen = BuildOptions(use=SensorSet.MONO, trajectory=GivenTrajectory(run, scale=METRES), threads=1)
     with pytest.raises(RecordingError, match="another recording"):
         build_map(recording, run / "maps", "hall", chosen)
 

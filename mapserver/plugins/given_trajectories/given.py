@@ -26,7 +26,8 @@ from fleetmap.recordings import Recording
 from fleetmap.recordings.tum import format_stamp
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import SensorSet, Stamps, Trajectory
-from mapserver.drafting.trajectory.formats import WrittenPoses, read_poses
+from mapserver.drafting.survey_recordings import GivenPoses
+from mapserver.plugins.given_trajectories.formats import WrittenPoses, read_poses
 from mapserver.survey.odometry_pass import OdometryRun, SampleFeed
 from mapserver.survey.settings import SurveySettings
 
@@ -46,7 +47,7 @@ _LEAST_SPAN = 0.5  # of the frames' time
 _MARGIN_NS = 1_000_000_000
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class OtherTrajectory:
     """A file of another system's poses: TUM or KITTI text, DROID-SLAM's `poses.npy` or its folder.
 
@@ -65,6 +66,42 @@ class OtherTrajectory:
             raise UsageError(
                 f"--trajectory-scale {self.scale}: invalid; give the metres in the file's unit of length, above 0"
             )
+
+    def poses(self, recording: Recording, indices: NDArray[np.int64]) -> GivenPoses:
+        """Return the poses of the selected frames (F,).
+
+        Frames without poses get them from fleetmap's odometry between those with poses. UsageError for a single camera with unknown
+        scale, and if too few frames have poses; RecordingError for a file that cannot be read, is of another convention (naming the one
+        that fits) or of another recording.
+        """
+        if recording.sensor_set in (SensorSet.MONO, SensorSet.MONO_INERTIAL):
+            raise UsageError(
+                f"{recording.path} is {recording.sensor_set}; --trajectory needs stereo or depth, such as DROID's disps.npy beside "
+                "its poses"
+            )
+        written = read_poses(self.file)
+        stamps_ns = recording.frame_stamps_ns[indices]
+        other_trajectory = Trajectory(stamps_on_clock(written, recording, indices, self), written.map_from_it)
+        known = covered(other_trajectory.stamps_ns, stamps_ns)
+        if known.sum() <= LEAST_STRETCHES:
+            raise _foreign_stamps(written, recording, self)
+        check_span(stamps_ns, known, recording, self)
+        is_sparse = known.sum() < 2 or np.median(np.diff(stamps_ns[known])) > GAP_NS
+        whole = is_sparse or len(stamps_ns) <= _WINDOWS * _WINDOW_FRAMES
+        followed = _followed(recording, indices, whole=whole)
+        shown = Reference(followed, stretches(followed, known), recording.calibration.cameras[0].body_from_cam)
+        found, words = _judged(other_trajectory, f"{self.file.name} ({written.kind})", shown, recording, self)
+        at_frames = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
+        at_frames[known] = [pose_at(other_trajectory, int(stamp)) for stamp in stamps_ns[known]]
+        at_frames[:, :3, 3] *= found.in_metres
+        at_frames = at_frames @ se3_inverse(shown.body_from(found.reading))
+        if not known.all():
+            if not whole:
+                followed = _followed(recording, indices, whole=True)
+            at_frames = _bridged(at_frames, known, followed, self)
+            gaps = f"{int((~known).sum())} of {len(stamps_ns)} frames without a pose"
+            words += f"; {gaps} are bridged by our own odometry"
+        return GivenPoses(Trajectory(stamps_ns, at_frames), words)
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,15 +245,13 @@ def judge(as_read: Trajectory, reading: PoseReading, shown: Reference, scale: fl
     return Judgement(reading, scale, within, 0.5 * (turn_errors + way_errors), *medians)
 
 
-def undecided(best: Judgement, others: list[Judgement]) -> list[Judgement]:
-    """Return those indistinguishable from the best one: their errors exceed its errors by less than the noise of the difference."""
-    found = []
-    for other in others:
-        worse = other.errors - best.errors
-        noise = float(worse.std(ddof=1)) / np.sqrt(len(worse)) if len(worse) > 1 else np.inf
-        if len(worse) < LEAST_STRETCHES or worse.mean() <= _STANDARD_ERRORS * noise or worse.mean() < 1e-6:
-            found.append(other)
-    return found
+def is_undecided(best: Judgement, other: Judgement) -> bool:
+    """True if another one is indistinguishable from the best: its errors are larger by less than the noise of the difference."""
+    worse = other.errors - best.errors
+    if len(worse) < LEAST_STRETCHES:
+        return True
+    noise = float(worse.std(ddof=1)) / np.sqrt(len(worse))
+    return bool(worse.mean() <= max(_STANDARD_ERRORS * noise, 1e-6))
 
 
 def fitted_scale(moved: Array, seen: Array) -> tuple[float, float]:
@@ -248,49 +283,6 @@ def _angles(rotations: Array) -> Array:
     return np.asarray(2.0 * np.arcsin(np.minimum(chord, 1.0)))
 
 
-@dataclass(frozen=True, slots=True)
-class GivenPoses:
-    """frame_from_body of every selected frame, in metres, and text on the findings about the file."""
-
-    trajectory: Trajectory
-    words: str
-
-
-def given_poses(recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory) -> GivenPoses:
-    """Return the poses of the selected frames (F,).
-
-    Frames without poses get them from fleetmap's odometry between those with poses. UsageError for a single camera with unknown
-    scale, and if too few frames have poses; RecordingError for a file that cannot be read, is of another convention (naming the one
-    that fits) or of another recording.
-    """
-    if recording.sensor_set in (SensorSet.MONO, SensorSet.MONO_INERTIAL):
-        raise UsageError(
-            f"{recording.path} is {recording.sensor_set}; --trajectory needs stereo or depth, such as DROID's disps.npy beside its poses"
-        )
-    written = read_poses(other.file)
-    stamps_ns = recording.frame_stamps_ns[indices]
-    other_trajectory = Trajectory(stamps_on_clock(written, recording, indices, other), written.map_from_it)
-    known = covered(other_trajectory.stamps_ns, stamps_ns)
-    if known.sum() <= LEAST_STRETCHES:
-        raise _foreign_stamps(written, recording, other)
-    check_span(stamps_ns, known, recording, other)
-    is_sparse = known.sum() < 2 or np.median(np.diff(stamps_ns[known])) > GAP_NS
-    whole = is_sparse or len(stamps_ns) <= _WINDOWS * _WINDOW_FRAMES
-    followed = _followed(recording, indices, whole=whole)
-    shown = Reference(followed, stretches(followed, known), recording.calibration.cameras[0].body_from_cam)
-    found, words = _judged(other_trajectory, f"{other.file.name} ({written.kind})", shown, recording, other)
-    at_frames = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
-    at_frames[known] = [pose_at(other_trajectory, int(stamp)) for stamp in stamps_ns[known]]
-    at_frames[:, :3, 3] *= found.in_metres
-    at_frames = at_frames @ se3_inverse(shown.body_from(found.reading))
-    if not known.all():
-        if not whole:
-            followed = _followed(recording, indices, whole=True)
-        at_frames = _bridged(at_frames, known, followed, other)
-        words += f"; {int((~known).sum())} of {len(stamps_ns)} frames without a pose are bridged by our own odometry"
-    return GivenPoses(Trajectory(stamps_ns, at_frames), words)
-
-
 def stamps_on_clock(
     rows: WrittenPoses, recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory
 ) -> Stamps:
@@ -304,10 +296,8 @@ def stamps_on_clock(
     frames, damaged = recording.frame_stamps_ns, recording.damaged_ns
     clock, chosen = np.union1d(frames, damaged), frames[indices]
     inner = np.union1d(chosen, damaged[(damaged > chosen[0]) & (damaged < chosen[-1])])
-    before_ns, after_ns = (
-        frames[frames < chosen[0]].max(initial=-(2**62)),
-        frames[frames > chosen[-1]].min(initial=2**62),
-    )
+    before_ns = frames[frames < chosen[0]].max(initial=-(2**62))
+    after_ns = frames[frames > chosen[-1]].min(initial=2**62)
     chosen = np.union1d(chosen, damaged[(damaged > before_ns) & (damaged < after_ns)])
     count = len(rows.map_from_it)
     if rows.stamps_ns is None:
@@ -352,10 +342,8 @@ def _followed(recording: Recording, indices: NDArray[np.int64], *, whole: bool) 
     rectifier = Rectifier(rig, has_depth=recording.sensor_set is SensorSet.RGBD)
     frame_from_body, piece, pieces = np.tile(np.eye(4), (count, 1, 1)), np.full(count, -1), 0
     for first, end in spans:
-        run, feed = (
-            OdometryRun(rig, rectifier, settings),
-            SampleFeed(recording.imu, recording.wheel, rectifier.imu_minus_cam_s),
-        )
+        run = OdometryRun(rig, rectifier, settings)
+        feed = SampleFeed(recording.imu, recording.wheel, rectifier.imu_minus_cam_s)
         for number in range(first, end):
             frame = rectifier.rectify(recording.read_frame(int(indices[number])))
             estimate = run.handle(frame, *feed.until(frame.stamp_ns)).estimate
@@ -386,7 +374,7 @@ def _judged(
             f"{other.file} belongs to another recording: read as {best.reading}, which fits {recording.name} best, it is off by "
             f"{best.figures} in the median of {count} stretches, {100 * FITS_WITHIN:.0f} % is the most; pass the poses of this recording"
         )
-    if found is not best and not any(each is found for each in undecided(best, every)):
+    if found is not best and not is_undecided(best, found):
         raise RecordingError(
             f"{other.file} does not fit {recording.name} as {said}: off by {found.figures} in the median of {count} stretches, and by "
             f"{best.figures} as {best.reading}; {best.reading.instead(other.frame)}"
