@@ -44,14 +44,9 @@ def export(
     write_grid(file, grid)
     if heights is not None:
         (lowest, highest), where = height_map(tiles)
-        arrays = {
-            "lowest_m": lowest,
-            "highest_m": highest,
-            "corner_map_m": where.map_from_grid[:2, 3],
-            "cell_m": CELL_M,
-        }
+        corner_map_m = where.map_from_grid[:2, 3]
         with disk_errors(f"{heights} cannot be written", "choose another place"), heights.open("wb") as stream:
-            np.savez_compressed(stream, **arrays)
+            np.savez_compressed(stream, lowest_m=lowest, highest_m=highest, corner_map_m=corner_map_m, cell_m=CELL_M)
     rows, columns = grid.cells.shape
     typer.echo(
         f"site {site}: grid of version {version} is in {file}: {columns} x {rows} cells of {grid.resolution_m} m, "

@@ -98,20 +98,8 @@ def _drawn(
         low, high = -_RIM * camera.width_px, np.array([camera.width_px, camera.height_px]) + _RIM * camera.width_px
         inside = ((pixels > low) & (pixels < high)).all(axis=1)
         numbers, points, pixels = numbers[inside], points[inside], pixels[inside]
-    drawn = core.draw_discs(
-        numbers,
-        points,
-        pixels,
-        cam_from_map,
-        surfels.normals,
-        surfels.levels,
-        surfels.greys,
-        far_m,
-        RADIUS_EDGES,
-        rays,
-        pixels_per_rad,
-    )
-    return rays, *drawn
+    discs = numbers, points, pixels, cam_from_map, surfels.normals, surfels.levels, surfels.greys
+    return rays, *core.draw_discs(*discs, far_m, RADIUS_EDGES, rays, pixels_per_rad)
 
 
 def filled(picture: NDArray[np.float32], unknown: NDArray[np.bool_]) -> NDArray[np.float32]:

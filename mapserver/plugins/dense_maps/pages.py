@@ -105,7 +105,7 @@ def _space_page(services: Services, context: PageContext) -> dict[str, object]:
         },
         "plan": scene_of(services, context, version, [Layer("Where you stand")]),
         "lacks": lacks,
-        "_lacks_pictures": no_pictures,
+        "lacks_pictures": no_pictures,
         "own": len(cameras),
         "absent": {"loops", "refused loops", "surfels"}
         - {"loops" if loop.is_accepted else "refused loops" for loop in loops}

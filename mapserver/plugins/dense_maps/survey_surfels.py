@@ -123,10 +123,9 @@ class SurfelGrower:
                 column, row = np.clip(pixels[seen].round().astype(np.int64), 0, last).T
                 greys = self._looks[number].picture[row, column].astype(np.float64)
                 fit = (greys < _SATURATED) & (greys >= 1)
-                tangents = squared_tangent(pixels[seen[fit]], self._camera)
-                samples.append(
-                    Sample(rows.start + seen[fit], np.full(int(fit.sum()), number), tangents, np.log(greys[fit]))
-                )
+                seen, greys = seen[fit], greys[fit]
+                tangents = squared_tangent(pixels[seen], self._camera)
+                samples.append(Sample(rows.start + seen, np.full(len(seen), number), tangents, np.log(greys)))
             self._images.release()
         return estimate_exposure(samples, len(self._looks))
 
