@@ -58,14 +58,12 @@ def poses_as_odometry(
                 cov_rot_trans=covariances[number],
                 velocity_odom_mps=velocities[number],
                 gyro_bias_radps=gyro_bias,
-                accel_bias_mps2=np.zeros(3),
                 status=OdometryStatus.TRACKING,
                 track_ids=tracked.ids,
                 scene_depth_m=_scene_depth_m(tracked.pixels, rectifier.camera),
                 inlier_share=tracked.inlier_share,
                 after_gap=tracked.by_descriptors,
                 inertial=inertial,
-                new_odom_from_old_odom=None,
                 track_pixels=tracked.pixels,
             )
             seen.append(FrameTracks.of_frame(estimate))

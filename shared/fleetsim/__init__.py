@@ -13,8 +13,7 @@ from fleetmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from fleetmap.version import __version__
-    from fleetsim.commands import record_order
-    from fleetsim.recorder import Order, Session, prepare
+    from fleetsim.recorder import Order, Session, prepare, record_order
     from fleetsim.scenarios import SCENARIOS
 
 __all__ = ["SCENARIOS", "Order", "Session", "__version__", "prepare", "record_order"]
@@ -22,8 +21,7 @@ __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "fleetmap.version": "__version__",
-        "fleetsim.commands": "record_order",
-        "fleetsim.recorder": "Order Session prepare",
+        "fleetsim.recorder": "Order Session prepare record_order",
         "fleetsim.scenarios": "SCENARIOS",
     },
 )

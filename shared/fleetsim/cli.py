@@ -70,7 +70,7 @@ def record(
     """Record one robot's run: images, IMU, wheels, position priors, exact ground truth."""
     if out.exists() and not (force and out.is_file()):
         raise UsageError(f"{out} exists already; choose another name{' or pass --force' if out.is_file() else ''}")
-    from fleetsim.recorder import Order
+    from fleetsim.recorder import Order, record_order
     from fleetsim.sensors.faults import parse_fault
     from fleetsim.sensors.robots import HiddenErrors
 
@@ -78,8 +78,6 @@ def record(
         scenario, seed, day, light, robot, lens, frames, tuple(parse_fault(text) for text in fault or []), _size_px(size),
         HiddenErrors(camera_delay_ms * 1e-3, math.radians(camera_turn_deg), camera_shift_mm * 1e-3), camera_pipeline, rig,
     )  # fmt: skip
-    from fleetsim.commands import record_order
-
     typer.echo(record_order(order, out))
 
 

@@ -62,16 +62,16 @@ def _loop(layout: Layout, first: int, last: int, *, shift_m: float = 0.0) -> Rou
     return Route(((left, y0), (right, y0), (right, y1), (left, y1), (left, y0), (left + _OVERLAP_M, y0)))
 
 
-def _snake(layout: Layout, aisles: range) -> Route:
-    """Route through every aisle in turn, back along the ends, and into the first one again."""
-    left, right = _END_M, layout.length_m - _END_M
-    points: list[tuple[float, float]] = []
-    for number, aisle in enumerate(aisles):
-        ends = (left, right) if number % 2 == 0 else (right, left)
-        points += [(end, layout.aisle_y_m(aisle)) for end in ends]
-    if len(aisles) % 2:
-        raise UsageError("a snake that comes home needs an even number of aisles")
-    return Route((*points, points[0], (left + _OVERLAP_M, points[0][1])))
+def _zigzag(layout: Layout, left: float) -> list[tuple[float, float]]:
+    """Way points through every aisle in turn, from `left` to the right end and back along the next one."""
+    ends = left, layout.length_m - _END_M
+    return [(end, layout.aisle_y_m(aisle)) for aisle in range(layout.aisles) for end in ends[:: -1 if aisle % 2 else 1]]
+
+
+def _snake(layout: Layout) -> Route:
+    """Route through every aisle, of an even number, and into the first one again."""
+    points = _zigzag(layout, _END_M)
+    return Route((*points, points[0], (_END_M + _OVERLAP_M, points[0][1])))
 
 
 def _both_ways(layout: Layout) -> Route:
@@ -136,7 +136,7 @@ def _busy() -> Scenario:
     )
     passing = Route(((_END_M, y[0]), (right, y[0]), (right, y[1]), (_END_M, y[1])), stops=((1, 2.0),))
     runs = {
-        "survey": Run("surveyor", (_snake(layout, range(4)),), is_sharp=True),
+        "survey": Run("surveyor", (_snake(layout),), is_sharp=True),
         "tote-1": Run("tote", (passing,), zone_period_s=15.0),
         "pallet-1": Run("pallet-mover", (_loop(layout, 2, 3),), zone_period_s=15.0),
     }
@@ -146,7 +146,7 @@ def _busy() -> Scenario:
 def _identical() -> Scenario:
     layout = Layout(aisles=6, bays=8, has_landmarks=False, are_aisles_identical=True)
     runs = {
-        "survey": Run("surveyor", (_snake(layout, range(6)),), is_sharp=True, zone_period_s=20.0),
+        "survey": Run("surveyor", (_snake(layout),), is_sharp=True, zone_period_s=20.0),
         "survey-both-ways": Run("surveyor", (_both_ways(layout),), is_sharp=True, zone_period_s=20.0),
         "tote-1": Run("tote", (_loop(layout, 1, 2),), zone_period_s=20.0),
         "runner-1": Run("runner", (_loop(layout, 2, 1),), zone_period_s=20.0),
@@ -190,14 +190,11 @@ def _faulty() -> Scenario:
 
 def _fulfilment_centre() -> Scenario:
     layout = Layout(aisles=30, bays=33, aisle_width_m=2.3, dock_m=46.2, cross_bays=(11, 22), are_aisles_identical=True)
-    left, right = layout.dock_m + _END_M, layout.length_m - _END_M
+    left = layout.dock_m + _END_M
     across = layout.bay_x_m(layout.cross_bays[0]) + layout.bay_m / 2
     y = [layout.aisle_y_m(aisle) for aisle in range(layout.aisles)]
     # Along the ends on the docks' side and back through a cross aisle, which ties the aisles together, then every aisle once.
-    points = [(left, y[0]), (left, y[-1]), (across, y[-1]), (across, y[1]), (left, y[1]), (left, y[0])]
-    for number, aisle in enumerate(range(layout.aisles)):
-        ends = (left, right) if number % 2 == 0 else (right, left)
-        points += [(end, y[aisle]) for end in ends if points[-1] != (end, y[aisle])]
+    points = [(left, y[0]), (left, y[-1]), (across, y[-1]), (across, y[1]), (left, y[1]), *_zigzag(layout, left)]
     runs = {
         "survey": Run("surveyor", (Route(tuple(points)),), is_sharp=True, zone_period_s=20.0),
         "tote-1": Run("tote", (_loop(layout, 13, 16, shift_m=0.2),), zone_period_s=20.0),

@@ -15,9 +15,8 @@ from rich.console import Console
 from benchmarks.common.recorded_runs import SITE, played, tool
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import Array, align_points, transform_points
-from fleetsim.commands import record_order
 from fleetsim.motion.routes import Route
-from fleetsim.recorder import Order
+from fleetsim.recorder import Order, record_order
 from fleetsim.scenarios import SCENARIOS, Run, Scenario
 from fleetsim.scene.layout import Layout
 from fleetsim.sensors.faults import Fault

@@ -1,6 +1,6 @@
 """Result of odometry for one frame, and a coordinate frame in which results are continuous."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
@@ -22,7 +22,7 @@ class OdometryStatus(StrEnum):
 class OdometryEstimate:
     """Estimated state of the body at one frame.
 
-    odom_from_body (4, 4); cov_rot_trans (6, 6) in odom axes; velocity, biases (3,). track_ids (N,) of the observed points and
+    odom_from_body (4, 4); cov_rot_trans (6, 6) in odom axes; velocity, biases (3,), zero if unknown. track_ids (N,) of the observed points,
     track_pixels (N, 3), u_left v u_right (None for an odometry without tracks);
     after_gap: they were matched by descriptors; inertial: gravity is known. new_odom_from_old_odom is
     given when the frame `odom` was redefined (gravity found): earlier estimates must be multiplied by it from the left.
@@ -38,16 +38,16 @@ class OdometryEstimate:
     frame_index: int
     odom_from_body: Array
     cov_rot_trans: Array
-    velocity_odom_mps: Array
-    gyro_bias_radps: Array
-    accel_bias_mps2: Array
     status: OdometryStatus
-    track_ids: NDArray[np.int64]
-    scene_depth_m: float
-    inlier_share: float
-    after_gap: bool
-    inertial: bool
-    new_odom_from_old_odom: Array | None
+    velocity_odom_mps: Array = field(default_factory=lambda: np.zeros(3))
+    gyro_bias_radps: Array = field(default_factory=lambda: np.zeros(3))
+    accel_bias_mps2: Array = field(default_factory=lambda: np.zeros(3))
+    track_ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    scene_depth_m: float = 5.0
+    inlier_share: float = 1.0
+    after_gap: bool = False
+    inertial: bool = False
+    new_odom_from_old_odom: Array | None = None
     scale_known: bool = True
     revised: tuple[tuple[int, Array], ...] = ()
     imu_minus_cam_s: float = 0.0

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,7 +74,7 @@ class Step(NamedTuple):
     """
 
     mode: "Mode"
-    used: NDArray[np.int8]
+    used: NDArray[np.int8] = np.zeros(0, np.int8)
     new_odom_from_old_odom: Array | None = None
     revised: tuple[tuple[int, Array], ...] = ()
     is_lost: bool = False
@@ -121,8 +121,21 @@ class Mode(ABC):
         """As `Odometry.will_forget`."""
 
     @abstractmethod
+    def state(self, frame_index: int, tracked: Tracked, step: Step) -> dict[str, Any]:
+        """Return the fields of the estimate at a frame that the mode knows by itself; `step` is the result of `process`."""
+
     def estimate(self, stamp_ns: int, frame_index: int, tracked: Tracked, step: Step) -> OdometryEstimate:
-        """Return the estimate at a frame, stamped on the camera's clock; `step` is the result of `process`."""
+        """Return the estimate at a frame, stamped on the camera's clock."""
+        fields: dict[str, Any] = {
+            "track_ids": tracked.ids,
+            "track_pixels": tracked.pixels,
+            "inlier_share": tracked.inlier_share,
+            "after_gap": tracked.by_descriptors,
+            "new_odom_from_old_odom": step.new_odom_from_old_odom,
+            "revised": step.revised,
+            "is_lifted": step.is_lifted,
+        }
+        return OdometryEstimate(stamp_ns, frame_index, **fields | self.state(frame_index, tracked, step))
 
 
 class WindowMode(Mode):
@@ -159,36 +172,27 @@ class WindowMode(Mode):
             imu.accelerometer.handle(stamp_ns, moved, samples.imu, on_wheels=samples.on_wheels)
         return imu.has_fault
 
-    def estimate(self, stamp_ns: int, frame_index: int, tracked: Tracked, step: Step) -> OdometryEstimate:
+    def state(self, frame_index: int, tracked: Tracked, step: Step) -> dict[str, Any]:
         window_filter, used = self.window.filter, step.used
         state = window_filter.state
         status = OdometryStatus.INITIALISING if self.waits_for_gravity else OdometryStatus.TRACKING
         if frame_index > 0 and (tracked.lost or step.is_lost or self.window.contradicts_images):
             status = OdometryStatus.DEGRADED
-        offset_s = self._rig.imu_minus_cam_s + window_filter.imu_minus_cam_s if self.inertial else 0.0
-        return OdometryEstimate(
-            stamp_ns=stamp_ns,
-            frame_index=frame_index,
-            odom_from_body=state.odom_from_body,
-            cov_rot_trans=window_filter.body_covariance(),
-            velocity_odom_mps=state.velocity_mps,
-            gyro_bias_radps=state.gyro_bias_radps,
-            accel_bias_mps2=state.accel_bias_mps2,
-            status=status,
-            track_ids=tracked.ids,
-            scene_depth_m=self.window.scene_depth_m,
-            inlier_share=int((used == 1).sum()) / len(used) if len(used) else tracked.inlier_share,
-            after_gap=tracked.by_descriptors,
-            inertial=self.inertial,
-            new_odom_from_old_odom=step.new_odom_from_old_odom,
-            revised=step.revised,
-            imu_minus_cam_s=offset_s,
-            imu_minus_cam_sigma_s=window_filter.offset_sigma_s if self.inertial else np.inf,
-            track_pixels=tracked.pixels,
-            previous_from_body=self.window.body_since(frame_index - 1) if frame_index else None,
-            is_lifted=step.is_lifted,
-            is_bridged=self.is_bridged,
-        )
+        return {
+            "odom_from_body": state.odom_from_body,
+            "cov_rot_trans": window_filter.body_covariance(),
+            "velocity_odom_mps": state.velocity_mps,
+            "gyro_bias_radps": state.gyro_bias_radps,
+            "accel_bias_mps2": state.accel_bias_mps2,
+            "status": status,
+            "scene_depth_m": self.window.scene_depth_m,
+            "inlier_share": int((used == 1).sum()) / len(used) if len(used) else tracked.inlier_share,
+            "inertial": self.inertial,
+            "imu_minus_cam_s": self._rig.imu_minus_cam_s + window_filter.imu_minus_cam_s if self.inertial else 0.0,
+            "imu_minus_cam_sigma_s": window_filter.offset_sigma_s if self.inertial else np.inf,
+            "previous_from_body": self.window.body_since(frame_index - 1) if frame_index else None,
+            "is_bridged": self.is_bridged,
+        }
 
     def _body_from_next(self, cam_from_previous: Array) -> Array:
         """Return the body's motion (4, 4) for one of the camera."""
@@ -505,7 +509,7 @@ class InertialMode(WindowMode):
         """See Mode; abandons a gyro or accelerometer that contradicts the images, restarts a diverged filter."""
         window, monitor = self.window, self._imu.monitor
         if self._is_pause:
-            return Step(self._begin_again(frame_index, tracked), np.zeros(0, np.int8), np.eye(4))
+            return self._begin_again(frame_index, tracked)
         tracked = self._without_lookalikes(tracked)
         self._seen = seen = tracked.cam_from_previous
         if self._guess is not None:
@@ -515,7 +519,7 @@ class InertialMode(WindowMode):
             window.filter.return_to_clone(frame_index - 1)  # vision moves the state from there, not once more
             return VisualMode(window, seen).process(frame_index, tracked)
         if self._show(self._imu, self._frame_ns, tracked):
-            return Step(self._begin_again(frame_index, tracked), np.zeros(0, np.int8), np.eye(4))
+            return self._begin_again(frame_index, tracked)
         matched = window.matched_body(tracked)
         if matched is not None:
             window.filter.inflate(matched[0], matched[1], window.seconds_since(matched[0]))
@@ -533,13 +537,13 @@ class InertialMode(WindowMode):
             # Images give a start in motion to who did not rest, if they are near enough to each other.
             is_start = len(window.filter.clone_ids) == 1 and self._step_s <= self._rig.settings.start.moving_gap_s
             if wheel is None and is_start and length(lacking_mps) > _NEAR_REST_MPS:
-                return Step(self._begin_again(frame_index, tracked), np.zeros(0, np.int8), np.eye(4))
+                return self._begin_again(frame_index, tracked)
             self._take_speed(lacking_mps, tracked)
         effort = (settings.chunk_frames_without_imu, 4) if self.is_bridged else (settings.chunk_frames, 1)
         used = window.update(frame_index, tracked, *effort)
         off_mps = 0.0 if seen is None else self._off_mps(frame_index - 1, seen)
         if monitor.is_wrong_start(window.filter.imu_minus_cam_s, off_mps):
-            return Step(self._begin_again(frame_index, tracked), used, np.eye(4))
+            return self._begin_again(frame_index, tracked)._replace(used=used)
         moved = (
             window.filter.odom_from_body(),
             None if self.is_bridged else window.body_since(frame_index - 1),
@@ -639,7 +643,7 @@ class InertialMode(WindowMode):
         if self.window.filter.correct_by_rest(mean_radps, float(sigma_radps), _GATE_6) <= _GATE_6:
             self._measured_ns = now_ns
 
-    def _begin_again(self, frame_index: int, tracked: Tracked) -> Mode:
+    def _begin_again(self, frame_index: int, tracked: Tracked) -> Step:
         """Continue from the last frame without the accelerometer, until gravity is known again.
 
         The frame `odom` continues, but earlier estimates are less accurate than reported.
@@ -652,5 +656,7 @@ class InertialMode(WindowMode):
         window.seed(frame_index, tracked)
         self._imu.monitor.begin_again()
         if self._imu.has_fault:
-            return _without_fault(window, self._imu, motion)
-        return StartingMode(window, self._imu, self._frame_ns, motion)
+            mode: Mode = _without_fault(window, self._imu, motion)
+        else:
+            mode = StartingMode(window, self._imu, self._frame_ns, motion)
+        return Step(mode, new_odom_from_old_odom=np.eye(4))

@@ -3,7 +3,7 @@
 Never touches a file, a socket or a clock.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from fleetmap.odometry.modes import ImuInputs, Mode, StartingMode, VisualMode
 from fleetmap.odometry.odometry_checks import MAX_OFFSET_SIGMAS
 from fleetmap.odometry.sensor_buffer import SensorBuffer
 from fleetmap.odometry.settings import OdometrySettings
-from fleetmap.odometry.tracking.tracker import Tracker
+from fleetmap.odometry.tracking.tracker import Ids, Tracker
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import ImuSamples, WheelSample
@@ -29,6 +29,8 @@ _IMU_MEMORY_INERTIAL_S = 4.0  # with a state to continue from, no start is searc
 
 class Odometry:
     """Stereo-inertial, or stereo alone if the rig has no IMU. Frames go to the current mode, see `modes`."""
+
+    _points_in_camera: Callable[[Ids], Array] | None = None  # see Tracker
 
     def __init__(
         self,
@@ -73,9 +75,14 @@ class Odometry:
         self._tracker = self._new_tracker(first_frame, self._tracker.next_id)
 
     def _new_tracker(self, first_frame: int, first_id: int) -> Tracker:
-        settings = self._rig.settings.tracker
-        numbers = {"first_frame": first_frame, "first_id": first_id}
-        return Tracker(self._rig.camera, settings, self._stereo_settings, **numbers)
+        return Tracker(
+            self._rig.camera,
+            self._rig.settings.tracker,
+            self._stereo_settings,
+            first_frame=first_frame,
+            first_id=first_id,
+            points_in_camera=self._points_in_camera,
+        )
 
     def handle_stereo(self, frame: RectifiedFrame) -> OdometryEstimate:
         """Return the estimate at `frame`, of the followed view, which must be newer than any before.

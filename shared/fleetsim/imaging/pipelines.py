@@ -1,6 +1,6 @@
 """Registry of image pipelines: named combinations of the stages, in the order in which light passes them."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -17,6 +17,8 @@ _TINT_EXPONENTS = {"red": 0.9, "green": 1.0, "blue": 1.15}
 # Share of white light that a sensor's dyes transmit; the white balance divides by it, which amplifies noise.
 _DYE_SHARE = {"red": 0.6, "green": 1.0, "blue": 0.5}
 _LUMA = {"red": 0.299, "green": 0.587, "blue": 0.114}
+_FLICKER_HZ = 100.0  # lamps on 50 Hz mains
+_READOUT_S = 0.015  # from the first row to the last
 
 
 def lens_blur(picture: Grey, sigma_px: float) -> Grey:
@@ -32,9 +34,10 @@ def vignette(picture: Grey, corner_loss: float) -> Grey:
     return np.asarray(picture * (np.float32(1.0) - np.float32(corner_loss) * squared), np.float32)
 
 
-def rolling_exposure(picture: Grey, amplitude: float, periods: float, phase_rad: float) -> Grey:
-    """Rows are exposed one after the other under lamps that flicker: `periods` of them from the first row to the last."""
-    rows = np.linspace(0.0, 2 * np.pi * periods, picture.shape[0], dtype=np.float32)[:, None]
+def flicker(picture: Grey, amplitude: float, stamp_ns: int) -> Grey:
+    """Rows are exposed one after the other under lamps that flicker."""
+    phase_rad = 2 * np.pi * ((stamp_ns * 1e-9 * _FLICKER_HZ) % 1.0)
+    rows = np.linspace(0.0, 2 * np.pi * (_READOUT_S * _FLICKER_HZ), picture.shape[0], dtype=np.float32)[:, None]
     factor = np.float32(1.0) + np.float32(amplitude) * np.sin(rows + np.float32(phase_rad))
     return np.asarray(picture * factor, np.float32)
 
@@ -98,77 +101,41 @@ def quantise(picture: Grey) -> Image:
     return np.clip(np.rint(picture), 0.0, _WHITE).astype(np.uint8)
 
 
-_FLICKER_HZ = 100.0  # lamps on 50 Hz mains
-_READOUT_S = 0.015  # from the first row to the last
+Pipeline = Callable[[Grey, int, np.random.Generator], Image]
+"""From a sharp picture, its stamp and a generator of noise to the image; in the order in which light passes the stages."""
 
 
-@dataclass(frozen=True, slots=True)
-class ImagePipeline:
-    """Strengths of the stages; a stage whose strength is None, or no stage at all, leaves the image unchanged.
-
-    blur_px: standard deviation of the lens' point spread. corner_loss: share of light lost in the corners. flicker:
-    amplitude of the lamps' flicker, which rows see one after the other. gain: of the sensor, 1 is the renderer's by day.
-    sharpening: amount and radius in pixels of the unsharp mask. rescaling: size at which the picture was made.
-    """
-
-    blur_px: float | None = None
-    corner_loss: float | None = None
-    flicker: float | None = None
-    gain: float | None = None
-    has_bayer: bool = False
-    gamma: float | None = None
-    sharpening: tuple[float, float] | None = None
-    rescaling: float | None = None
-    jpeg_quality: int | None = None
+def _soft(picture: Grey, _: int, rng: np.random.Generator) -> Image:
+    return quantise(sensor_noise(vignette(lens_blur(picture, 1.5), 0.4), 1.0, rng))
 
 
-IMAGE_PIPELINES = {
-    "clean": ImagePipeline(),
-    "soft": ImagePipeline(blur_px=1.5, corner_loss=0.4, gain=1.0),
-    "phone": ImagePipeline(
-        blur_px=1.0, corner_loss=0.3, flicker=0.08, gain=4.0, has_bayer=True, gamma=2.2, sharpening=(1.2, 1.5),
-        rescaling=1.25, jpeg_quality=80,
-    ),
-    "night-gain": ImagePipeline(blur_px=0.8, corner_loss=0.3, flicker=0.15, gain=16.0),
-}  # fmt: skip
+def _phone(picture: Grey, stamp_ns: int, rng: np.random.Generator) -> Image:
+    lit = flicker(vignette(lens_blur(picture, 1.0), 0.3), 0.08, stamp_ns)
+    shown = sharpen(gamma(bayer(lit, 4.0, rng), 2.2), 1.2, 1.5)
+    return jpeg(quantise(rescale(shown, 1.25)), 80)
 
 
-def process_frame(frame: CameraFrame, pipeline: ImagePipeline, seed: int, first_camera: int = 0) -> CameraFrame:
+def _night_gain(picture: Grey, stamp_ns: int, rng: np.random.Generator) -> Image:
+    lit = flicker(vignette(lens_blur(picture, 0.8), 0.3), 0.15, stamp_ns)
+    return quantise(sensor_noise(lit, 16.0, rng))
+
+
+IMAGE_PIPELINES: dict[str, Pipeline | None] = {"clean": None, "soft": _soft, "phone": _phone, "night-gain": _night_gain}
+
+
+def process_frame(frame: CameraFrame, pipeline: Pipeline | None, seed: int, first_camera: int = 0) -> CameraFrame:
     """Apply a pipeline to a frame; noise depends on seed, stamp and camera alone."""
-    if pipeline == ImagePipeline():
+    if pipeline is None:
         return frame
-    pictures = [
+    left, right = (
         None
         if picture is None
-        else _process(picture, pipeline, frame.stamp_ns, np.random.default_rng([seed, frame.stamp_ns, n]))
+        else pipeline(picture.astype(np.float32), frame.stamp_ns, np.random.default_rng([seed, frame.stamp_ns, n]))
         for n, picture in enumerate((frame.left, frame.right), first_camera)
-    ]
-    assert pictures[0] is not None
+    )
+    assert left is not None
     others = (
         None if other is None else process_frame(other, pipeline, seed, first_camera + 2 * n)
         for n, other in enumerate(frame.others, 1)
     )
-    return CameraFrame(frame.stamp_ns, pictures[0], pictures[1], frame.depth_m, tuple(others))
-
-
-def _process(picture: Image, pipeline: ImagePipeline, stamp_ns: int, rng: np.random.Generator) -> Image:
-    grey = picture.astype(np.float32)
-    if pipeline.blur_px is not None:
-        grey = lens_blur(grey, pipeline.blur_px)
-    if pipeline.corner_loss is not None:
-        grey = vignette(grey, pipeline.corner_loss)
-    if pipeline.flicker is not None:
-        phase = 2 * np.pi * ((stamp_ns * 1e-9 * _FLICKER_HZ) % 1.0)
-        grey = rolling_exposure(grey, pipeline.flicker, _READOUT_S * _FLICKER_HZ, phase)
-    if pipeline.has_bayer:
-        grey = bayer(grey, pipeline.gain or 0.0, rng)
-    elif pipeline.gain is not None:
-        grey = sensor_noise(grey, pipeline.gain, rng)
-    if pipeline.gamma is not None:
-        grey = gamma(grey, pipeline.gamma)
-    if pipeline.sharpening is not None:
-        grey = sharpen(grey, *pipeline.sharpening)
-    if pipeline.rescaling is not None:
-        grey = rescale(grey, pipeline.rescaling)
-    image = quantise(grey)
-    return image if pipeline.jpeg_quality is None else jpeg(image, pipeline.jpeg_quality)
+    return CameraFrame(frame.stamp_ns, left, right, frame.depth_m, tuple(others))

@@ -104,7 +104,6 @@ class RouteMotion:
         self._spline = UniformSpline(-6 * KNOT_S, KNOT_S, _control_points(path, height_m, shake, rng))
 
     def map_from_body(self, times_s: Array) -> Array:
-        """(N, 4, 4) at times (N,)."""
         values = self._spline.at(times_s)
         stacked = np.zeros((len(values), 4, 4))
         stacked[:, :3, :3] = rotation_from_yaw_pitch_roll(values[:, 3:])
@@ -130,7 +129,6 @@ class RouteMotion:
         return gyro, np.einsum("nji,nj->ni", rotation, force_map)
 
     def velocity_body(self, times_s: Array) -> Array:
-        """(N, 3) m/s in body axes."""
         rotation = rotation_from_yaw_pitch_roll(self._spline.at(times_s)[:, 3:])
         return np.asarray(np.einsum("nji,nj->ni", rotation, self._spline.at(times_s, 1)[:, :3]))
 

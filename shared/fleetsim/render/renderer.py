@@ -71,11 +71,7 @@ class StereoRenderer:
     def path(self, camera: int) -> Callable[[float], Array]:
         """t_s -> map_from_cam."""
         body_from_cam = self._rig.cameras[camera].body_from_cam
-
-        def map_from_cam(t_s: float) -> Array:
-            return np.asarray(self._motion.map_from_body(np.array([t_s]))[0] @ body_from_cam)
-
-        return map_from_cam
+        return lambda t_s: np.asarray(self._motion.map_from_body(np.array([t_s]))[0] @ body_from_cam)
 
     def exposure(self, t_s: float) -> Exposure:
         """Exposure chosen by the automatic control."""

@@ -1,6 +1,6 @@
 """The hall of one chunk: ground with markings, walls, roof, lamps, columns, docks, signs."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +18,7 @@ _TAG_HALL, _TAG_POSTER = 41, 42
 _DOCK_HEIGHT_M, _DOCK_HALF_WIDTH_M = 3.2, 1.2
 
 
-@dataclass(frozen=True, slots=True)
-class Lamp:
+class Lamp(NamedTuple):
     """A light source for baking: place in map, power, lamp group."""
 
     x_m: float
@@ -99,15 +98,13 @@ class HallMaker:
         layout, (x_min, y_min, x_max, y_max) = self._layout, self.rectangle(column, row)
         columns, rows = layout.chunk_counts
         top = layout.ceiling_m
-        spans = []
-        if row == 0:
-            spans.append(((x_max, 0.0), (x_min - x_max, 0.0)))
-        if row == rows - 1:
-            spans.append(((x_min, layout.width_m), (x_max - x_min, 0.0)))
-        if column == 0:
-            spans.append(((0.0, y_min), (0.0, y_max - y_min)))
-        if column == columns - 1:
-            spans.append(((layout.length_m, y_max), (0.0, y_min - y_max)))
+        walls = (
+            (row == 0, (x_max, 0.0), (x_min - x_max, 0.0)),
+            (row == rows - 1, (x_min, layout.width_m), (x_max - x_min, 0.0)),
+            (column == 0, (0.0, y_min), (0.0, y_max - y_min)),
+            (column == columns - 1, (layout.length_m, y_max), (0.0, y_min - y_max)),
+        )
+        spans = [(start, along) for is_outer, start, along in walls if is_outer]
         for number, ((x, y), (along_x, along_y)) in enumerate(spans):
             surface = Surface(self._textures.wall, 0.9, self._scramble(column, row, number))
             builder.add_quad((x, y, top), (along_x, along_y, 0), (0, 0, -top), surface)
@@ -171,20 +168,19 @@ class HallMaker:
         columns, rows = layout.chunk_counts
         for number in range(8):
             bits = mix(self._seed, _TAG_POSTER, column, row, number)
-            along, up = (bits & 0xFFFF) / 0xFFFF, 1.3 + 1.9 * ((bits >> 16) & 0xFFFF) / 0xFFFF
+            share, up = (bits & 0xFFFF) / 0xFFFF, 1.3 + 1.9 * ((bits >> 16) & 0xFFFF) / 0xFFFF
             side = 0.5 + 0.12 * ((bits >> 32) & 0xFF) / 0xFF
-            x = x_min + 0.4 + along * (x_max - x_min - side - 0.8)
-            y = y_min + 0.4 + along * (y_max - y_min - side - 0.8)
+            x = x_min + 0.4 + share * (x_max - x_min - side - 0.8)
+            y = y_min + 0.4 + share * (y_max - y_min - side - 0.8)
             texture = self._textures.posters[(bits >> 40) % len(self._textures.posters)]
-            poster, down = Surface(texture, scramble=bits >> 44), (0.0, 0.0, -side)
-            if number % 4 == 0 and row == 0:
-                builder.add_quad((x + side, 0.015, up), (-side, 0, 0), down, poster)
-            elif number % 4 == 1 and row == rows - 1:
-                builder.add_quad((x, layout.width_m - 0.015, up), (side, 0, 0), down, poster)
-            elif number % 4 == 2 and column == columns - 1:
-                builder.add_quad((layout.length_m - 0.015, y + side, up), (0, -side, 0), down, poster)
-            elif number % 4 == 3 and column == 0 and not self._has_dock(column, row):
-                builder.add_quad((0.015, y, up), (0, side, 0), down, poster)
+            is_there, place, along = (
+                (row == 0, (x + side, 0.015), (-side, 0)),
+                (row == rows - 1, (x, layout.width_m - 0.015), (side, 0)),
+                (column == columns - 1, (layout.length_m - 0.015, y + side), (0, -side)),
+                (column == 0 and not self._has_dock(column, row), (0.015, y), (0, side)),
+            )[number % 4]
+            if is_there:
+                builder.add_quad((*place, up), (*along, 0), (0.0, 0.0, -side), Surface(texture, scramble=bits >> 44))
 
     def _add_columns(self, builder: FaceBuilder, column: int, row: int) -> None:
         layout, textures = self._layout, self._textures

@@ -83,10 +83,7 @@ class FaceBuilder:
     texture_sizes: NDArray[np.int32]
     stretched: frozenset[int]
     _boxes: list[tuple[float, ...]] = field(default_factory=list)
-    _box_numbers: list[tuple[int, ...]] = field(default_factory=list)
     _quads: list[tuple[float, ...]] = field(default_factory=list)
-    _quad_values: list[tuple[float, ...]] = field(default_factory=list)
-    _quad_numbers: list[tuple[int, ...]] = field(default_factory=list)
 
     def add_box(
         self,
@@ -103,26 +100,26 @@ class FaceBuilder:
         textures = [texture] * 6 if isinstance(texture, int) else [texture.get(name, 0) for name in FACE_NAMES]
         mask = sum(1 << FACE_NAMES.index(name) for name in sides)
         turn = (1.0, 0.0) if yaw_rad == 0.0 else (float(np.cos(yaw_rad)), float(np.sin(yaw_rad)))
-        self._boxes.append((*centre_map, *half_m, *turn, tint, emission))
-        self._box_numbers.append((*textures, mask, material, group, scramble, int(is_solid)))
+        numbers = *textures, mask, material, group, scramble, int(is_solid)
+        self._boxes.append((*centre_map, *half_m, *turn, tint, emission, *numbers))
 
     def add_quad(self, origin_map: Vector, edge_u: Vector, edge_v: Vector, surface: Surface) -> None:
         """A single face."""
         texture, tint, scramble, material, emission, group, offset_texels = surface
         assert isinstance(texture, int)
-        self._quads.append((*origin_map, *edge_u, *edge_v))
-        self._quad_values.append((tint, emission, *offset_texels))
-        self._quad_numbers.append((texture, material, group, scramble))
+        look = tint, emission, *offset_texels, texture, material, group, scramble
+        self._quads.append((*origin_map, *edge_u, *edge_v, *look))
 
     def finish(self) -> Faces:
         """All faces: those of the boxes by side, then the single ones."""
-        boxes = np.array(self._boxes, np.float64).reshape(-1, 10)
-        numbers = np.array(self._box_numbers, np.int64).reshape(-1, 11)
+        boxes = np.array(self._boxes, np.float64).reshape(-1, 21)
+        numbers = boxes[:, 10:].astype(np.int64)
         box_of, side_of = np.nonzero((numbers[:, 6:7] >> np.arange(6)) & 1)
         from_boxes = _quads_of_boxes(boxes, box_of, side_of)
-        singles = np.array(self._quads, np.float64).reshape(-1, 9)
-        single_values = np.array(self._quad_values, np.float64).reshape(-1, 4)
-        single_numbers = np.array(self._quad_numbers, np.int64).reshape(-1, 4)
+        singles, single_values, single_numbers = np.split(
+            np.array(self._quads, np.float64).reshape(-1, 17), [9, 13], axis=1
+        )
+        single_numbers = single_numbers.astype(np.int64)
         quads = np.concatenate([from_boxes, singles])
         texture = np.concatenate([numbers[box_of, side_of], single_numbers[:, 0]])
         material = np.concatenate([numbers[box_of, 7], single_numbers[:, 1]])

@@ -27,9 +27,8 @@ class LampField:
     """All lamps of a site, to compute the light at a place without tracing rays."""
 
     def __init__(self, lamps: list[Lamp], floor_area_m2: float) -> None:
-        self._places = np.array([(lamp.x_m, lamp.y_m, lamp.z_m) for lamp in lamps]).reshape(-1, 3)
-        self._powers = np.array([lamp.power for lamp in lamps])
-        self._groups = np.array([lamp.group for lamp in lamps], np.int64)
+        table = np.array(lamps, np.float64).reshape(-1, 5)
+        self._places, self._powers, self._groups = table[:, :3], table[:, 3], table[:, 4].astype(np.int64)
         self._ambient = np.zeros(3)
         for lamp in lamps:
             self._ambient[lamp.group] += _AMBIENT_SHARE * lamp.power * _floor_integral(lamp.z_m) / floor_area_m2

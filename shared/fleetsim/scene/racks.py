@@ -81,8 +81,7 @@ class RackMaker:
                 if y + sku.width_m > y_m + 0.8:
                     break
                 half = (0.15, sku.width_m / 2, sku.height_m / 2)
-                sides = {"x": sku.front, "X": sku.front, "y": sku.side, "Y": sku.side, "z": sku.top, "Z": sku.top}
-                surface = Surface(sides, rng.uniform(0.8, 1.2), int(rng.integers(0, 1 << 24)))
+                surface = Surface(sku.sides("xX"), rng.uniform(0.8, 1.2), int(rng.integers(0, 1 << 24)))
                 centre = (x_m - 0.2, y + half[1], base_m + half[2])
                 builder.add_box(centre, half, surface, yaw_rad=rng.normal(0, 0.03))
                 y += sku.width_m + rng.uniform(0.05, 0.4)
@@ -94,14 +93,13 @@ class RackMaker:
         pallet = Surface(textures.wood, scramble=int(rng.integers(0, 1 << 24)))
         builder.add_box((x_m, y_m, 0.07), (0.4, 0.6, 0.07), pallet)
         sku = textures.skus[int(rng.integers(0, len(textures.skus)))]
-        sides = {"x": sku.front, "X": sku.front, "y": sku.side, "Y": sku.side, "z": sku.top, "Z": sku.top}
         for layer in range(int(rng.integers(1, 5))):
             z = 0.14 + (layer + 0.5) * sku.height_m + 0.002 * layer
             for side in (-1, 1):
                 centre = (x_m + rng.uniform(-0.03, 0.03), y_m + side * (sku.width_m / 2 + 0.01), z)
                 half = (0.36, sku.width_m / 2, sku.height_m / 2)
                 yaw, scramble = rng.normal(0, 0.015), int(rng.integers(0, 1 << 24))
-                surface = Surface(sides, rng.uniform(0.8, 1.2), scramble)
+                surface = Surface(sku.sides("xX"), rng.uniform(0.8, 1.2), scramble)
                 builder.add_box(centre, half, surface, yaw_rad=yaw)
 
     def _scramble(self, tag: int, row: int, *rest: int) -> int:
@@ -176,10 +174,9 @@ class RackMaker:
         half_depth = max(sku.depth_m, 0.5) / 2
         centre_x = x + sku.width_m / 2 + jitter
         centre_y = y + toward_aisle * (self._layout.rack_depth_m / 2 - setback - half_depth)
-        front, back = ("Y", "y") if row % 2 else ("y", "Y")
-        textures = {front: sku.front, back: sku.side, "x": sku.side, "X": sku.side, "z": sku.top, "Z": sku.top}
         centre, half = (centre_x, centre_y, bottom + sku.height_m / 2), (sku.width_m / 2, half_depth, sku.height_m / 2)
-        surface = Surface(textures, rng.uniform(0.8, 1.2), int(rng.integers(0, 1 << 24)))
+        sides = sku.sides("Y" if row % 2 else "y")
+        surface = Surface(sides, rng.uniform(0.8, 1.2), int(rng.integers(0, 1 << 24)))
         builder.add_box(centre, half, surface, yaw_rad=yaw)
         if rng.random() < 0.5:
             side, reach = 0.12, half_depth + 0.003

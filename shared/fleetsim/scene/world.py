@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.geometry import Array
-from fleetsim.scene.building import HallMaker, Lamp
+from fleetsim.scene.building import HallMaker
 from fleetsim.scene.faces import FaceBuilder, Faces
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.light import LAMP_REACH_M, LampField
@@ -112,16 +112,13 @@ class World:
         add = self._racks.add_plain_bay if is_plain else self._racks.add_bay
         middles_m = [layout.bay_x_m(bay) + layout.bay_m / 2 for bay in range(layout.bays)]
         own = {bay for bay, x_m in enumerate(middles_m) if layout.chunk_at(x_m, 0.0)[0] == column}
-        runs = [
-            (first, behind, [bay for bay in range(first, behind) if bay in own]) for first, behind in layout.rack_runs
-        ]
         for rack_row in (2 * row, 2 * row + 1):
-            for first, behind, bays in runs:
-                for bay in bays:
+            for first, behind in layout.rack_runs:
+                for bay in sorted(own & set(range(first, behind))):
                     add(builder, rack_row, bay)
-                if first in bays:
+                if first in own:
                     self._racks.add_end_guards(builder, rack_row, first, is_far_end=False)
-                if behind - 1 in bays:
+                if behind - 1 in own:
                     self._racks.add_end_guards(builder, rack_row, behind, is_far_end=True)
         for number, (x, y) in enumerate(layout.parked_pallets_m()):
             if layout.chunk_at(x, y) == key:
@@ -147,8 +144,8 @@ class World:
         high = np.array([rectangles[:, 2].max(), rectangles[:, 3].max(), self.layout.ceiling_m]) + 0.5
         grid = core.BoxGrid(boxes, low, high, _CELL_M)
         light = np.zeros((LAMP_GROUPS, faces.light_samples), np.float32)
-        near: list[Lamp] = [lamp for other in self._neighbours(key, 1, 1) for lamp in self._lamps[other]]
-        lamps = np.array([(lamp.x_m, lamp.y_m, lamp.z_m, lamp.power, lamp.group) for lamp in near]).reshape(-1, 5)
+        near = [lamp for other in self._neighbours(key, 1, 1) for lamp in self._lamps[other]]
+        lamps = np.array(near, np.float64).reshape(-1, 5)
 
         def bake(first: int, last: int) -> None:
             columns = (faces.quads[first:last], faces.numbers[first:last], faces.owners[first:last])

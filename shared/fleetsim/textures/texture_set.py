@@ -15,7 +15,7 @@ _DECALS = (("scuffs", 6), ("stains", 3), ("cracks", 4), ("sticker", 6), ("repair
 
 @dataclass(frozen=True, slots=True)
 class Sku:
-    """One kind of carton: width, depth, height in metres and its textures."""
+    """One kind of carton: width, depth, height in metres and its textures, by the names of a box' sides."""
 
     width_m: float
     depth_m: float
@@ -23,6 +23,10 @@ class Sku:
     front: int
     side: int
     top: int
+
+    def sides(self, fronts: str) -> dict[str, int]:
+        """The textures by the names of a box' sides, of which `fronts` show the front."""
+        return {name: self.front if name in fronts else self.top if name in "zZ" else self.side for name in "xXyYzZ"}
 
 
 class Textures:
@@ -64,17 +68,8 @@ class Textures:
             self.signs = tuple(add(painting.aisle_sign(rng, f"A{aisle + 1}")) for aisle in range(aisles))
             self.rack_labels = tuple(add(painting.rack_label(rng, f"{slot:04d}")) for slot in range(RACK_LABELS))
         self.markers = {number: add(painting.april_tag(number)) for number in markers}
-        self.stretched = frozenset(
-            (
-                *self.markers.values(),
-                *self.posters,
-                *self.signs,
-                *self.labels,
-                *self.rack_labels,
-                self.vest,
-                *self.cloth,
-            )
-        )
+        printed = *self.markers.values(), *self.posters, *self.signs, *self.labels, *self.rack_labels
+        self.stretched = frozenset((*printed, self.vest, *self.cloth))
         self.atlas = atlas
 
 

@@ -25,9 +25,8 @@ from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
-from fleetsim.commands import record_order
 from fleetsim.motion.routes import Route
-from fleetsim.recorder import Order
+from fleetsim.recorder import Order, record_order
 from fleetsim.scenarios import SCENARIOS, Run, Scenario
 from fleetsim.scene.layout import Layout
 from mapserver.config import survey_settings

@@ -30,9 +30,8 @@ from fleetmap.mapformat import decode_tile
 from fleetmap.recordings import open_recording
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
-from fleetsim.commands import record_order
 from fleetsim.motion.routes import Route
-from fleetsim.recorder import Order, Session
+from fleetsim.recorder import Order, Session, record_order
 from fleetsim.scenarios import SCENARIOS, Run
 from fleetsim.sensors.faults import Fault
 from fleetsim.sensors.robots import HiddenErrors

@@ -24,11 +24,8 @@ STEP = se3(so3_exp(np.array([0.0, 0.0, 0.1])), np.array([0.07, 0.0, 0.0]))
 
 
 def odometry(frame: int) -> OdometryEstimate:
-    odom_from_body = np.linalg.matrix_power(STEP, frame)
-    return OdometryEstimate(
-        frame, frame, odom_from_body, 1e-8 * np.eye(6), np.zeros(3), np.zeros(3), np.zeros(3), OdometryStatus.TRACKING,
-        np.arange(50), 5.0, 1.0, False, True, None, previous_from_body=STEP,
-    )  # fmt: skip
+    pose = np.linalg.matrix_power(STEP, frame), 1e-8 * np.eye(6)
+    return OdometryEstimate(frame, frame, *pose, OdometryStatus.TRACKING, inertial=True, previous_from_body=STEP)
 
 
 def test_the_frame_of_a_long_search_moves_once_with_each_frame() -> None:

@@ -26,8 +26,8 @@ def estimate(
     """At x_m in `map`, 10 m further in `odom`; known: whether there is a place at all."""
     stamp_ns = round(stamp_s * 1e9)
     odometry = OdometryEstimate(
-        stamp_ns, 0, se3(np.eye(3), np.array([10.0 + x_m, 0, 0])), 1e-6 * np.eye(6), np.array([1.0, 0, 0]), np.zeros(3),
-        np.zeros(3), OdometryStatus.TRACKING, np.arange(50), 5.0, 1.0, False, True, change,
+        stamp_ns, 0, se3(np.eye(3), np.array([10.0 + x_m, 0, 0])), 1e-6 * np.eye(6), OdometryStatus.TRACKING,
+        np.array([1.0, 0, 0]), track_ids=np.arange(50), inertial=True, new_odom_from_old_odom=change,
     )  # fmt: skip
     place = se3(np.eye(3), np.array([x_m, 0.0, 0.0])) if known else None
     covariance = np.diag([1e-4] * 3 + [sigma_m**2] * 3) if known else None

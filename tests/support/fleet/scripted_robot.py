@@ -54,9 +54,8 @@ class ScriptedOdometry:
         last = self.odom_from_body[-1] if self.odom_from_body else np.eye(4)
         self.odom_from_body.append(last @ self.next_motion)
         return OdometryEstimate(
-            frame.stamp_ns, len(self.odom_from_body) - 1, self.odom_from_body[-1], 1e-6 * np.eye(6), np.zeros(3),
-            np.zeros(3), np.zeros(3), status, np.arange(50), 5.0, 1.0, False, True, change, is_lifted=is_lifted,
-            is_bridged=self.lacks_imu,
+            frame.stamp_ns, len(self.odom_from_body) - 1, self.odom_from_body[-1], 1e-6 * np.eye(6), status, inertial=True,
+            track_ids=np.arange(50), new_odom_from_old_odom=change, is_lifted=is_lifted, is_bridged=self.lacks_imu,
         )  # fmt: skip
 
     def will_forget(self, frame_index: int) -> bool:

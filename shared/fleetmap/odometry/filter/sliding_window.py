@@ -141,11 +141,10 @@ class SlidingWindow:
         self._observe(frame_index, tracked)
         due = (frame_index + tracked.ids) % chunk_frames == 0
         chosen = tracked.ids, due | tracked.by_descriptors, self._first_depth_m
-        seen = self.matched_body(tracked)
-        if seen is None:
-            used = self.filter.update(*chosen, iterations)
-        else:
-            used = self.filter.update(*chosen, 4, seen[1], self.rig.settings.filter.descriptor_sigma_scale)
+        seen, scale = self.matched_body(tracked), self.rig.settings.filter.descriptor_sigma_scale
+        used = (
+            self.filter.update(*chosen, iterations) if seen is None else self.filter.update(*chosen, 4, seen[1], scale)
+        )
         if (used == 1).any():
             self._refused_frames = 0
         elif self._refused_frames or (used == -1).any():
@@ -154,9 +153,8 @@ class SlidingWindow:
         judged = np.concatenate(self._judged)
         is_clear = len(self._judged) == _JUDGED_UPDATES and len(judged) >= _JUDGED_TRACKS
         takes_few = is_clear and (judged == 1).mean() < _LEAST_TAKEN
-        self.contradicts_images = bool(
-            takes_few or self._refused_frames >= chunk_frames
-        )  # or each of few tracks was due once
+        # Or each of few tracks was due once.
+        self.contradicts_images = bool(takes_few or self._refused_frames >= chunk_frames)
         self._prune()
         return used
 

@@ -34,11 +34,6 @@ class VisualMotion:
     sigma_mps: float
     gravity_weights: tuple[float, float]
 
-    @property
-    def unknowns(self) -> int:
-        """Number of unknowns before the velocities, in this order: gravity's direction (2), accelerometer bias (3), scale if unknown."""
-        return 5 if self.unscaled is None else 6
-
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
@@ -133,26 +128,41 @@ def _gyro_bias_step(motion: VisualMotion, imu: ImuSamples, noise: ImuNoise, gyro
 
 
 def _free_gravity(motion: VisualMotion, terms: list[Preintegrated]) -> Array | None:
-    """Gravity (3,) with its size free, by linear least squares over all velocities, and the scale if unknown.
-
-    For each interval, p and v of the body: p' - p - R dp = 0.5 dt^2 g + dt v and -R dv = dt g + v - v'.
-    """
-    count, first = len(motion.rotations), motion.unknowns - 2
-    rows, right = np.zeros((6 * (count - 1), first + 3 * count)), np.zeros(6 * (count - 1))
-    for k, term in enumerate(terms):
-        dt, rotation, at, v = term.dt_s, motion.rotations[k], 6 * k, first + 3 * k
-        rows[at : at + 3, 0:3] = 0.5 * dt * dt * np.eye(3)
-        if motion.unscaled is not None:
-            rows[at : at + 3, 3] = -(motion.unscaled[k + 1] - motion.unscaled[k])
-        rows[at : at + 3, v : v + 3] = dt * np.eye(3)
-        right[at : at + 3] = motion.positions_m[k + 1] - motion.positions_m[k] - rotation @ term.delta_position_m
-        rows[at + 3 : at + 6, 0:3] = dt * np.eye(3)
-        rows[at + 3 : at + 6, v : v + 3] = np.eye(3)
-        rows[at + 3 : at + 6, v + 3 : v + 6] = -np.eye(3)
-        right[at + 3 : at + 6] = -rotation @ term.delta_velocity_mps
-    weights = np.tile(np.repeat(motion.gravity_weights, 3), count - 1)
+    """Gravity (3,) with its size free, by linear least squares over all velocities, and the scale if unknown."""
+    parts = [_equations(motion, k, term, 1.0, np.eye(3), np.zeros(3), None) for k, term in enumerate(terms)]
+    rows, right = (np.concatenate(sides) for sides in zip(*parts, strict=True))
+    weights = np.tile(np.repeat(motion.gravity_weights, 3), len(terms))
     solution, _, rank, _ = np.linalg.lstsq(rows * weights[:, None], right * weights, rcond=None)
     return np.asarray(solution[:3]) if rank == rows.shape[1] else None
+
+
+def _equations(
+    motion: VisualMotion,
+    k: int,
+    term: Preintegrated,
+    size_mps2: float,
+    directions: Array,
+    gravity: Array,
+    accel_bias: Array | None,
+) -> tuple[Array, Array]:
+    """Rows (6, n) and right side (6,) of an interval, for corrections of `gravity` along directions (3, g), in units of size_mps2, of the
+    accelerometer's bias unless that is None, for the scale if unknown, and all velocities.
+
+    For p and v of the body: p' - p - R dp = 0.5 dt^2 g + dt v and -R dv = dt g + v - v'.
+    """
+    dt, rotation = term.dt_s, motion.rotations[k]
+    moved, gained = term.delta_position_m, term.delta_velocity_mps
+    columns = [np.vstack([0.5 * dt * dt * size_mps2 * directions, dt * size_mps2 * directions])]
+    if accel_bias is not None:
+        moved, gained = moved + term.d_position_d_accel @ accel_bias, gained + term.d_velocity_d_accel @ accel_bias
+        columns.append(np.vstack([rotation @ term.d_position_d_accel, rotation @ term.d_velocity_d_accel]))
+    if motion.unscaled is not None:
+        columns.append(np.append(motion.unscaled[k] - motion.unscaled[k + 1], np.zeros(3))[:, None])
+    velocities = np.zeros((6, 3 * len(motion.rotations)))
+    velocities[:3, 3 * k : 3 * k + 3] = dt * np.eye(3)
+    velocities[3:, 3 * k : 3 * k + 6] = np.hstack([np.eye(3), -np.eye(3)])
+    shift = motion.positions_m[k + 1] - motion.positions_m[k] - 0.5 * dt * dt * gravity - rotation @ moved
+    return np.hstack([*columns, velocities]), np.concatenate([shift, -dt * gravity - rotation @ gained])
 
 
 def _sphere_step(
@@ -162,26 +172,12 @@ def _sphere_step(
 
     If the scale is unknown, residuals beyond the sigmas widen the covariance.
     """
-    count, first = len(motion.rotations), motion.unknowns
-    size = first + 3 * count
+    count = len(motion.rotations)
+    size = (5 if motion.unscaled is None else 6) + 3 * count
     hessian, gradient, squares = np.zeros((size, size)), np.zeros(size), 0.0
     weights = np.repeat([motion.sigma_m**-2, motion.sigma_mps**-2], 3)
     for k, term in enumerate(terms):
-        dt, rotation, v = term.dt_s, motion.rotations[k], first + 3 * k
-        rows = np.zeros((6, size))
-        rows[0:3, 0:2] = 0.5 * dt * dt * GRAVITY_MPS2 * basis
-        rows[0:3, 2:5] = rotation @ term.d_position_d_accel
-        if motion.unscaled is not None:
-            rows[0:3, 5] = -(motion.unscaled[k + 1] - motion.unscaled[k])
-        rows[0:3, v : v + 3] = dt * np.eye(3)
-        rows[3:6, 0:2] = dt * GRAVITY_MPS2 * basis
-        rows[3:6, 2:5] = rotation @ term.d_velocity_d_accel
-        rows[3:6, v : v + 3] = np.eye(3)
-        rows[3:6, v + 3 : v + 6] = -np.eye(3)
-        moved = term.delta_position_m + term.d_position_d_accel @ accel_bias
-        gained = term.delta_velocity_mps + term.d_velocity_d_accel @ accel_bias
-        shift = motion.positions_m[k + 1] - motion.positions_m[k] - 0.5 * dt * dt * gravity - rotation @ moved
-        right = np.concatenate([shift, -dt * gravity - rotation @ gained])
+        rows, right = _equations(motion, k, term, GRAVITY_MPS2, basis, gravity, accel_bias)
         hessian += rows.T @ (weights[:, None] * rows)
         gradient += rows.T @ (weights * right)
         squares += float(right @ (weights * right))

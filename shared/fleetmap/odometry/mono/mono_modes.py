@@ -1,9 +1,9 @@
 """Odometry with one camera: metric once the IMU has determined the scale; before that, or without an IMU, up to scale and marked so."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,8 @@ from fleetmap.odometry.mono.mono_vo import VisualEstimate, VisualOdometry
 from fleetmap.odometry.mono.wheel_mode import SeenWay, WheelMode
 from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.odometry_checks import is_image_still
-from fleetmap.odometry.settings import OdometrySettings, TrackerSettings
-from fleetmap.odometry.tracking.tracker import MotionSince, Tracked, Tracker
+from fleetmap.odometry.settings import OdometrySettings
+from fleetmap.odometry.tracking.tracker import Tracked
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Trajectory
@@ -34,7 +34,6 @@ _STILL_SIGMA_MPS = 0.02
 _FAR_M = 200.0  # points beyond it lie on almost parallel rays and carry no information on the scene's depth
 _UNSCALED_FRAMES = 2400  # kept for new poses once the IMU has determined the scale
 _SIGHTINGS = 12  # of one track that are kept to place its point
-_NONE_USED = np.zeros(0, np.int8)
 Ids = NDArray[np.int64]
 
 
@@ -52,8 +51,7 @@ class MonocularWindow(SlidingWindow):
         out = np.full((len(ids), 3), np.nan)
         if not held:
             return out
-        camera, settings = self.rig.camera, self.rig.settings
-        lens = camera.lens
+        lens, settings = self.rig.camera.lens, self.rig.settings
         odom_from_cam = np.array([self.filter.odom_from_clone(c) for c in held]) @ self.rig.body_from_cam
         lenses = np.tile(lens, (len(held), 1))
         rotations, positions = odom_from_cam[:, :3, :3], odom_from_cam[:, :3, 3]
@@ -88,10 +86,11 @@ class MonocularWindow(SlidingWindow):
     def _first_depth_m(self) -> float:
         return self.scene_depth_m
 
+    def _depth_of(self, pixels: Array) -> float:
+        return self.scene_depth_m
+
     def _observe(self, frame_index: int, tracked: Tracked) -> None:
-        depth_m = self.scene_depth_m
         super()._observe(frame_index, tracked)
-        self.scene_depth_m = depth_m
         alive = set(tracked.ids.tolist())
         self._sightings = {i: seen[-_SIGHTINGS:] for i, seen in self._sightings.items() if i in alive}
         for track_id, pixel in zip(tracked.ids.tolist(), tracked.pixels, strict=True):
@@ -109,11 +108,13 @@ class _UnscaledFrame(NamedTuple):
 class MonocularMode(Mode):
     """One camera alone, up to scale, until an IMU determines the scale and the direction of gravity."""
 
+    stamp_ns = 0
+
     def __init__(self, rig: OdometryRig, imu: ImuInputs | None) -> None:
         self._rig, self.imu = rig, imu
         self.is_in_map = False  # a robot's, whose motion counts in metres
-        self._stamp_ns, self._stamps_ns = 0, deque[int](maxlen=_UNSCALED_FRAMES)  # of the present frame; of all
-        self._visual_odometry = VisualOdometry(rig.camera, rig.settings.monocular)
+        self._stamps_ns = deque[int](maxlen=_UNSCALED_FRAMES)  # of all frames
+        self.visual_odometry = VisualOdometry(rig.camera, rig.settings.monocular)
         self._visual = VisualEstimate(None, np.zeros((6, 6)))
         self._unscaled: list[_UnscaledFrame] = []
         self._newest_pixels: tuple[Ids, Array] = (np.zeros(0, np.int64), np.zeros((0, 3)))
@@ -122,16 +123,12 @@ class MonocularMode(Mode):
         self._tried_ns = 0
         self._not_before_ns = -(2**62)
 
-    @property
-    def stamp_ns(self) -> int:
-        return self._stamp_ns
-
     def resume(self, mode: Mode) -> None:
         """Continue after the filter was abandoned; vision restarts without scale.
 
         Without the IMU if that was abandoned, else by those of its samples that caused no wrong start.
         """
-        self._stamp_ns, self._still_since_ns = mode.stamp_ns, None
+        self.stamp_ns, self._still_since_ns = mode.stamp_ns, None
         self._stamps_ns.clear()
         self._unscaled.clear()
         if isinstance(mode, StartingMode):
@@ -139,17 +136,13 @@ class MonocularMode(Mode):
         elif isinstance(mode, VisualMode):
             self.imu = None
 
-    def points_in_camera(self, ids: Ids) -> Array:
-        """(N, 3) tracked points in the newest frame's camera, NaN where unknown."""
-        return self._visual_odometry.points_in_camera(ids)
-
     def predict(self, stamp_ns: int) -> None:
-        self._stamp_ns = stamp_ns
+        self.stamp_ns = stamp_ns
         self._stamps_ns.append(stamp_ns)
 
     def cam_from_earlier(self, frame_index: int) -> Array | None:
         """See Mode: repeats the last motion, for the frame before."""
-        return self._visual_odometry.motion_guess()
+        return self.visual_odometry.motion_guess()
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """See Mode: none while the image stands still, of any scale. Else the gyro's turn, and a way of unknown direction and speed."""
@@ -161,8 +154,8 @@ class MonocularMode(Mode):
         if self.imu is None or not self.is_in_map or -number > len(self._stamps_ns):
             return None
         since_ns, settings = self._stamps_ns[number], self._rig.settings
-        duration_s = (self._stamp_ns - since_ns) * 1e-9
-        turned = self.imu.samples.rotation_between(since_ns, self._stamp_ns, self.imu.noise)
+        duration_s = (self.stamp_ns - since_ns) * 1e-9
+        turned = self.imu.samples.rotation_between(since_ns, self.stamp_ns, self.imu.noise)
         sigma_rad = np.pi if turned is None else settings.start.steady_gyro_mean_radps * duration_s
         sigma_m = settings.filter.initial_velocity_sigma_mps * duration_s
         covariance = np.diag(np.square(np.repeat([min(sigma_rad, np.pi), sigma_m], 3)))
@@ -175,43 +168,29 @@ class MonocularMode(Mode):
     def process(self, frame_index: int, tracked: Tracked) -> Step:
         """See Mode; switches to the filter once the scale is known, and revises earlier frames then."""
         self._detect_standstill(frame_index, tracked)
-        visual = self._visual = self._visual_odometry.add(frame_index, tracked.ids, tracked.pixels[:, :2])
+        visual = self._visual = self.visual_odometry.add(frame_index, tracked.ids, tracked.pixels[:, :2])
         if self.imu is not None:
             self._keep_unscaled(frame_index, visual)
             found = self._metric_start(self.imu, visual)
             if found is not None:
-                return self._go_metric(
-                    frame_index, tracked, InertialMode(self._metric_window(*found), self.imu), found[1]
-                )
-        return Step(self, _NONE_USED, revised=tuple((number, self._body(there)) for number, there in visual.revised))
+                return self._go_metric(frame_index, tracked, self.imu, *found)
+        return Step(self, revised=tuple((number, self._body(there)) for number, there in visual.revised))
 
-    def estimate(self, stamp_ns: int, frame_index: int, tracked: Tracked, step: Step) -> OdometryEstimate:
-        """See Mode; velocity and biases are unknown, reported as zero."""
+    def state(self, frame_index: int, tracked: Tracked, step: Step) -> dict[str, Any]:
+        """See Mode; velocity and biases are unknown."""
         visual = self._visual
         there = np.eye(4) if visual.vision_from_cam is None else visual.vision_from_cam
         turn = np.kron(np.eye(2), self._rig.body_from_cam[:3, :3])
         status = OdometryStatus.TRACKING
         if visual.vision_from_cam is None and self._still_since_ns is None:
             status = OdometryStatus.DEGRADED if visual.lost else OdometryStatus.INITIALISING
-        return OdometryEstimate(
-            stamp_ns=stamp_ns,
-            frame_index=frame_index,
-            odom_from_body=self._body(there),
-            cov_rot_trans=turn @ visual.cov_rot_trans @ turn.T + 1e-12 * np.eye(6),
-            velocity_odom_mps=np.zeros(3),
-            gyro_bias_radps=np.zeros(3),
-            accel_bias_mps2=np.zeros(3),
-            status=status,
-            track_ids=tracked.ids,
-            scene_depth_m=visual.depth,
-            inlier_share=tracked.inlier_share,
-            after_gap=tracked.by_descriptors,
-            inertial=False,
-            new_odom_from_old_odom=None,
-            scale_known=False,
-            revised=step.revised,
-            track_pixels=tracked.pixels,
-        )
+        return {
+            "odom_from_body": self._body(there),
+            "cov_rot_trans": turn @ visual.cov_rot_trans @ turn.T + 1e-12 * np.eye(6),
+            "status": status,
+            "scene_depth_m": visual.depth,
+            "scale_known": False,
+        }
 
     def _body(self, vision_from_cam: Array) -> Array:
         return np.asarray(self._rig.body_from_cam @ vision_from_cam @ self._rig.cam_from_body)
@@ -221,7 +200,7 @@ class MonocularMode(Mode):
             self._unscaled.clear()
         revised = dict(visual.revised)
         kept = [f._replace(vision_from_cam=revised.get(f.frame_index, f.vision_from_cam)) for f in self._unscaled]
-        kept.append(_UnscaledFrame(frame_index, self._stamp_ns, visual.vision_from_cam))
+        kept.append(_UnscaledFrame(frame_index, self.stamp_ns, visual.vision_from_cam))
         self._unscaled = kept[-_UNSCALED_FRAMES:]
 
     def _detect_standstill(self, frame_index: int, tracked: Tracked) -> None:
@@ -232,12 +211,12 @@ class MonocularMode(Mode):
         if not still:
             self._still_since_ns, self._still_from = None, frame_index
         elif self._still_since_ns is None:
-            self._still_since_ns = self._stamp_ns
+            self._still_since_ns = self.stamp_ns
         self._newest_pixels = (tracked.ids, tracked.pixels)
 
     def _metric_start(self, imu: ImuInputs, visual: VisualEstimate) -> tuple[InitialState, float | None] | None:
         """Start by rest, if image and IMU agree on it, else by motion; with the metres per unit of vision, unknown after rest."""
-        stamp_ns, settings = self._stamp_ns, self._rig.settings
+        stamp_ns, settings = self.stamp_ns, self._rig.settings
         if self._still_since_ns is not None and (stamp_ns - self._still_since_ns) * 1e-9 > _STILL_S:
             since = imu.samples.imu.between(self._not_before_ns, stamp_ns + 1)
             resting = static_initialization(since, stamp_ns, settings)
@@ -245,7 +224,7 @@ class MonocularMode(Mode):
                 covariance = resting.covariance
                 covariance[3:6, 3:6] = _STILL_SIGMA_MPS**2 * np.eye(3)
                 return replace(resting, covariance=covariance), None
-        if not self._visual_odometry.started or visual.vision_from_cam is None:
+        if not self.visual_odometry.started or visual.vision_from_cam is None:
             return None
         if stamp_ns - self._tried_ns < settings.monocular.sample_interval_s * 1e9:
             return None
@@ -274,19 +253,19 @@ class MonocularMode(Mode):
             vision_from_cams.append(there)
         return Trajectory(np.array(stamps[::-1], np.int64), np.array(vision_from_cams[::-1]).reshape(-1, 4, 4))
 
-    def _metric_window(self, start: InitialState, metres_per_unit: float | None) -> MonocularWindow:
-        window = MonocularWindow(self._rig, start.state, start.covariance, start.stamp_ns)
-        window.scene_depth_m = self._visual.depth * (1.0 if metres_per_unit is None else metres_per_unit)
-        return window
-
-    def _go_metric(self, frame_index: int, tracked: Tracked, mode: InertialMode, metres_per_unit: float | None) -> Step:
+    def _go_metric(
+        self, frame_index: int, tracked: Tracked, imu: ImuInputs, start: InitialState, metres_per_unit: float | None
+    ) -> Step:
         """Switch to the filter and revise earlier frames: in metres, in a gravity-aligned frame.
 
         After motion: all frames since vision began; after rest: those since the image stands still.
         """
-        mode.predict(self._stamp_ns)
-        mode.window.seed(frame_index, tracked)
-        here, newest = mode.window.filter.odom_from_body(), self._unscaled[-1].vision_from_cam
+        window = MonocularWindow(self._rig, start.state, start.covariance, start.stamp_ns)
+        window.scene_depth_m = self._visual.depth * (1.0 if metres_per_unit is None else metres_per_unit)
+        mode = InertialMode(window, imu)
+        mode.predict(self.stamp_ns)
+        window.seed(frame_index, tracked)
+        here, newest = window.filter.odom_from_body(), self._unscaled[-1].vision_from_cam
         revised: list[tuple[int, Array]] = []
         for number, seen_ns, there in self._unscaled[:-1]:
             if metres_per_unit is None:
@@ -297,7 +276,7 @@ class MonocularMode(Mode):
                 newest_from_there[:3, 3] *= metres_per_unit
                 revised.append((number, here @ self._body(newest_from_there)))
         self._unscaled.clear()
-        return Step(mode, _NONE_USED, revised=tuple(revised))
+        return Step(mode, revised=tuple(revised))
 
 
 def make_odometry(
@@ -320,33 +299,6 @@ def make_odometry(
     if isinstance(made, MonocularOdometry):
         made.vision.is_in_map = by_wheels
     return made
-
-
-class MonocularTracker(Tracker):
-    """A tracker whose point depths are triangulated from several frames, for lack of a second camera."""
-
-    def __init__(
-        self, camera: StereoCamera, settings: TrackerSettings, points_in_camera: Callable[[NDArray[np.int64]], Array]
-    ) -> None:
-        super().__init__(camera, settings)
-        self._points_in_camera = points_in_camera
-
-    def track(
-        self, frame: RectifiedFrame, motion_since: MotionSince, rotation_sigma_rad: float | None = None
-    ) -> Tracked:
-        """As Tracker's; tracked points suffice to continue, since without parallax none of them can be triangulated."""
-        before = self._points.ids
-        tracked = super().track(frame, motion_since, rotation_sigma_rad)
-        followed = int(np.isin(tracked.ids, before).sum())
-        if tracked.cam_from_previous is None and followed >= self._settings.min_inliers and not tracked.by_descriptors:
-            guess = motion_since(self._frame_index - 1)
-            return replace(tracked, cam_from_previous=np.eye(4) if guess is None else guess)
-        return tracked
-
-    def _points_cam(self) -> Array:
-        points = self._points_in_camera(self._points.ids)
-        points[~(points[:, 2] > 0.0)] = np.nan
-        return points
 
 
 class MonocularOdometry(Odometry):
@@ -400,7 +352,6 @@ class MonocularOdometry(Odometry):
 
     def _first_mode(self) -> Mode:
         rig = self._rig
-        self._tracker = MonocularTracker(rig.camera, rig.settings.tracker, self._points_in_camera)
         imu = None if rig.imu is None else ImuInputs(rig, rig.imu, self._samples, self._clock)
         self.vision = MonocularMode(rig, imu)
         self._by_map = None if imu is None else MapStart(rig, imu)
@@ -411,22 +362,21 @@ class MonocularOdometry(Odometry):
         window = self._mode.window if isinstance(self._mode, WindowMode) else None
         return window if isinstance(window, MonocularWindow) and window.is_blind else None
 
-    def _points_in_camera(self, ids: NDArray[np.int64]) -> Array:
-        """(N, 3) tracked points in the camera of the frame before, NaN where unknown."""
+    def _points_in_camera(self, ids: Ids) -> Array:
         if isinstance(self._mode, WindowMode) and isinstance(self._mode.window, MonocularWindow):
             return self._mode.window.points_in_camera(ids)
-        return self.vision.points_in_camera(ids)
+        return self.vision.visual_odometry.points_in_camera(ids)
 
 
 class WheelOdometry(Odometry):
     """The class `Odometry` for one camera and wheels, see `WheelMode`."""
 
     def _first_mode(self) -> Mode:
-        rig = self._rig
-        unknown = np.full(3, np.nan)
-        self._tracker = MonocularTracker(rig.camera, rig.settings.tracker, lambda ids: np.tile(unknown, (len(ids), 1)))
-        self._wheels = WheelMode(rig, self._samples)
+        self._wheels = WheelMode(self._rig, self._samples)
         return self._wheels
+
+    def _points_in_camera(self, ids: Ids) -> Array:
+        return np.full((len(ids), 3), np.nan)
 
     @property
     def seen_way(self) -> SeenWay | None:

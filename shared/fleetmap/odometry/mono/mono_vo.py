@@ -1,6 +1,8 @@
 """Visual odometry of one camera, up to scale: initialized from two keyframes, refined over a window of keyframes."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,14 +22,13 @@ _CORRELATION = 3.0
 _LONGEST_WAIT = 60  # frames without a first pair before the search starts again from a later one
 
 
-@dataclass(frozen=True, slots=True)
-class Keyframe:
-    """One camera of the window: vision_from_cam (4, 4), its observed ids (N,) and their pixels (N, 2)."""
+class Frame(NamedTuple):
+    """One image: its observed ids (N,), their pixels (N, 2), and vision_from_cam (4, 4), a guess until it is located."""
 
     frame_index: int
-    vision_from_cam: Array
     ids: Ids
     pixels: Array
+    vision_from_cam: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +50,7 @@ class VisualEstimate:
 class _LocalMap:
     """The window's keyframes and their points, by track id; for tracks without a point, their vision_from_cam and pixels."""
 
-    keyframes: list[Keyframe] = field(default_factory=list)
+    keyframes: list[Frame] = field(default_factory=list)
     points: dict[int, Array] = field(default_factory=dict)
     first_seen: dict[int, tuple[Array, Array]] = field(default_factory=dict)
 
@@ -59,9 +60,8 @@ class VisualOdometry:
 
     def __init__(self, camera: StereoCamera, settings: MonocularSettings) -> None:
         self._camera, self._settings = camera, settings
-        self._lens = camera.lens
-        self._local_map = _LocalMap()
-        self._waiting: list[tuple[int, Ids, Array]] = []
+        self._map = _LocalMap()
+        self._waiting: list[Frame] = []
         self._last = np.eye(4)  # vision_from_cam of the frame before
         self._step = np.eye(4)  # previous camera from this one
         self._covariance = np.zeros((6, 6))
@@ -70,11 +70,11 @@ class VisualOdometry:
     @property
     def started(self) -> bool:
         """True if there are points to locate frames by."""
-        return bool(self._local_map.keyframes)
+        return bool(self._map.keyframes)
 
     def points_in_camera(self, ids: Ids) -> Array:
         """(N, 3) points of these tracks in the last frame's camera, NaN where unknown."""
-        known = np.array([self._local_map.points.get(i, _NOWHERE) for i in ids.tolist()]).reshape(-1, 3)
+        known = np.array([self._map.points.get(i, _NOWHERE) for i in ids.tolist()]).reshape(-1, 3)
         return transform_points(se3_inverse(self._last), known)
 
     def motion_guess(self) -> Array:
@@ -83,23 +83,23 @@ class VisualOdometry:
 
     def add(self, frame_index: int, ids: Ids, pixels: Array) -> VisualEstimate:
         """Return the estimate at one frame from the ids (N,) and pixels (N, 2) of its tracks."""
+        frame = Frame(frame_index, ids, pixels, self._last @ self._step)
         if not self.started:
-            return self._first_views(frame_index, ids, pixels)
-        located = self._locate(ids, pixels, self._last @ self._step)
+            return self._first_frames(frame)
+        located = self._locate(frame)
         if located is None:
-            self._local_map, self._waiting = _LocalMap(), [(frame_index, ids, pixels)]
-            self._step = np.eye(4)
+            self._map, self._waiting, self._step = _LocalMap(), [frame], np.eye(4)
             return VisualEstimate(None, self._covariance, lost=True, depth=self.depth)
-        keyframe = Keyframe(frame_index, located[0], ids, pixels)
-        self._place_new(keyframe)
-        if self._is_new(keyframe):
-            self._local_map.keyframes.append(keyframe)
+        frame, cov = located
+        self._place_new(frame)
+        if self._is_new(frame):
+            self._map.keyframes.append(frame)
             self._grow()
-            keyframe = self._local_map.keyframes[-1]
-        self._advance(keyframe.vision_from_cam, located[1])
-        return VisualEstimate(keyframe.vision_from_cam, self._covariance.copy(), depth=self.depth)
+            frame = self._map.keyframes[-1]
+        return self._advance(frame, cov)
 
-    def _advance(self, vision_from_cam: Array, cov: Array) -> None:
+    def _advance(self, frame: Frame, cov: Array, revised: Iterable[Frame] = ()) -> VisualEstimate:
+        vision_from_cam = frame.vision_from_cam
         self._step = se3_inverse(self._last) @ vision_from_cam
         length = float(np.linalg.norm(self._step[:3, 3]))
         rotation = np.kron(np.eye(2), vision_from_cam[:3, :3])
@@ -107,31 +107,27 @@ class VisualOdometry:
         grown = np.diag([1e-7] * 3 + [(share * length) ** 2 + 1e-9] * 3)
         self._covariance = self._covariance + grown + 0.1 * rotation @ (_CORRELATION**2 * cov) @ rotation.T
         self._last = vision_from_cam
-        depths = [p[2] for p in self._seen_points(vision_from_cam)]
-        if depths:
-            self.depth = float(np.median(depths))
-
-    def _seen_points(self, vision_from_cam: Array) -> Array:
-        newest = self._local_map.keyframes[-1]
-        known = [self._local_map.points[i] for i in newest.ids.tolist() if i in self._local_map.points]
-        points = transform_points(se3_inverse(vision_from_cam), np.array(known).reshape(-1, 3))
-        return points[points[:, 2] > 0]
+        known = [self._map.points[i] for i in self._map.keyframes[-1].ids.tolist() if i in self._map.points]
+        depths = transform_points(se3_inverse(vision_from_cam), np.array(known).reshape(-1, 3))[:, 2]
+        if (depths > 0).any():
+            self.depth = float(np.median(depths[depths > 0]))
+        earlier = tuple((frame.frame_index, frame.vision_from_cam) for frame in revised)
+        return VisualEstimate(vision_from_cam, self._covariance.copy(), earlier, depth=self.depth)
 
     # --- the first pair ---
 
-    def _first_views(self, frame_index: int, ids: Ids, pixels: Array) -> VisualEstimate:
-        s = self._settings
-        self._waiting.append((frame_index, ids, pixels))
+    def _first_frames(self, frame: Frame) -> VisualEstimate:
+        self._waiting.append(frame)
         nothing = VisualEstimate(None, self._covariance, depth=self.depth)
         while len(self._waiting) > 1:
             first = self._waiting[0]
-            _, a, b = np.intersect1d(first[1], ids, return_indices=True)
-            if len(a) < s.first_min_points or len(self._waiting) > _LONGEST_WAIT:
+            _, a, b = np.intersect1d(first.ids, frame.ids, return_indices=True)
+            if len(a) < self._settings.first_min_points or len(self._waiting) > _LONGEST_WAIT:
                 self._waiting.pop(0)  # too few tracks of the oldest frame are left: begin later
-                continue
-            if np.median(np.linalg.norm(first[2][a] - pixels[b], axis=1)) < s.first_parallax_px:
+            elif np.median(np.linalg.norm(first.pixels[a] - frame.pixels[b], axis=1)) < self._settings.first_parallax_px:
                 return nothing
-            return self._begin(first[1][a], first[2][a], pixels[b]) or nothing
+            else:
+                return self._begin(first.ids[a], first.pixels[a], frame.pixels[b]) or nothing
         return nothing
 
     def _begin(self, ids: Ids, before: Array, now: Array) -> VisualEstimate | None:
@@ -144,37 +140,24 @@ class VisualOdometry:
         ):
             return None
         unit = self.depth / float(np.median(found.points_a[found.inliers, 2]))
-        first, last = self._waiting[0], self._waiting[-1]
-        vision_from_first = self._last
         now_from_first = se3(found.b_from_a[:3, :3], unit * found.b_from_a[:3, 3])
-        points = transform_points(vision_from_first, unit * found.points_a[found.inliers])
-        self._local_map = _LocalMap(
-            [
-                Keyframe(first[0], vision_from_first, first[1], first[2]),
-                Keyframe(last[0], vision_from_first @ se3_inverse(now_from_first), last[1], last[2]),
-            ],
-            dict(zip(ids[found.inliers].tolist(), points, strict=True)),
-        )
+        points = transform_points(self._last, unit * found.points_a[found.inliers])
+        first = self._waiting[0]._replace(vision_from_cam=self._last)
+        last = self._waiting[-1]._replace(vision_from_cam=self._last @ se3_inverse(now_from_first))
+        self._map = _LocalMap([first, last], dict(zip(ids[found.inliers].tolist(), points, strict=True)))
         self._adjust(held=1)
         placed = self._place_between()
-        if placed is None or len(self._local_map.points) < s.first_min_points // 2:
-            self._local_map = _LocalMap()
+        if placed is None or len(self._map.points) < s.first_min_points // 2:
+            self._map = _LocalMap()
             return None
-        self._normalise(vision_from_first, placed)
+        placed = self._normalised(first.vision_from_cam, placed)
         self._waiting = []
-        located = self._locate(last[1], last[2], self._local_map.keyframes[-1].vision_from_cam)
-        self._last = placed[-2][1] if len(placed) > 1 else vision_from_first
-        self._advance(
-            self._local_map.keyframes[-1].vision_from_cam, np.eye(6) * 1e-6 if located is None else located[1]
-        )
-        return VisualEstimate(
-            self._local_map.keyframes[-1].vision_from_cam,
-            self._covariance.copy(),
-            revised=tuple(placed[:-1]),
-            depth=self.depth,
-        )
+        last = self._map.keyframes[-1]
+        located = self._locate(last)
+        self._last = placed[-2].vision_from_cam
+        return self._advance(last, np.eye(6) * 1e-6 if located is None else located[1], placed[:-1])
 
-    def _place_between(self) -> list[tuple[int, Array]] | None:
+    def _place_between(self) -> list[Frame] | None:
         """Locate all waiting frames by the points of the first and the last; None if one fails. Some become keyframes.
 
         Twice, with an adjustment between: two keyframes of a flat scene alone can leave the rotation between them off by many degrees.
@@ -183,91 +166,83 @@ class VisualOdometry:
         if between is None:
             return None
         stride = max(1, -(-len(between) // (self._settings.window_views - 3)))
-        self._local_map.keyframes[1:1] = between[stride // 2 :: stride]
+        self._map.keyframes[1:1] = between[stride // 2 :: stride]
         self._adjust(held=1)
-        first, last = self._local_map.keyframes[0], self._local_map.keyframes[-1]
         between = self._located_between()
-        if between is None:
-            return None
-        return [(v.frame_index, v.vision_from_cam) for v in (first, *between, last)]
+        return None if between is None else [self._map.keyframes[0], *between, self._map.keyframes[-1]]
 
-    def _located_between(self) -> list[Keyframe] | None:
-        guess = self._local_map.keyframes[0].vision_from_cam
-        found = []
-        for frame_index, ids, pixels in self._waiting[1:-1]:
-            located = self._locate(ids, pixels, guess)
+    def _located_between(self) -> list[Frame] | None:
+        found = self._map.keyframes[:1]
+        for waiting in self._waiting[1:-1]:
+            located = self._locate(waiting._replace(vision_from_cam=found[-1].vision_from_cam))
             if located is None:
                 return None
-            guess = located[0]
-            found.append(Keyframe(frame_index, guess, ids, pixels))
-        return found
+            found.append(located[0])
+        return found[1:]
 
-    def _normalise(self, vision_from_first: Array, placed: list[tuple[int, Array]]) -> None:
-        """Scale the new map so that the median depth of its points is the unit."""
-        points = transform_points(se3_inverse(vision_from_first), np.array(list(self._local_map.points.values())))
-        unit = self.depth / float(np.median(points[:, 2]))
+    def _normalised(self, vision_from_first: Array, placed: list[Frame]) -> list[Frame]:
+        """Scale the new map so that the median depth of its points is the unit, and the placed frames with it."""
+        points = transform_points(se3_inverse(vision_from_first), np.array(list(self._map.points.values())))
+        unit, origin = self.depth / float(np.median(points[:, 2])), vision_from_first[:3, 3]
 
-        def scaled(vision_from_cam: Array) -> Array:
-            out = vision_from_cam.copy()
-            out[:3, 3] = vision_from_first[:3, 3] + unit * (out[:3, 3] - vision_from_first[:3, 3])
-            return out
+        def scaled(frame: Frame) -> Frame:
+            vision_from_cam = frame.vision_from_cam.copy()
+            vision_from_cam[:3, 3] = origin + unit * (vision_from_cam[:3, 3] - origin)
+            return frame._replace(vision_from_cam=vision_from_cam)
 
-        origin = vision_from_first[:3, 3]
-        self._local_map.points = {i: origin + unit * (p - origin) for i, p in self._local_map.points.items()}
-        self._local_map.keyframes = [
-            Keyframe(v.frame_index, scaled(v.vision_from_cam), v.ids, v.pixels) for v in self._local_map.keyframes
-        ]
-        placed[:] = [(number, scaled(there)) for number, there in placed]
+        self._map.points = {i: origin + unit * (p - origin) for i, p in self._map.points.items()}
+        self._map.keyframes = list(map(scaled, self._map.keyframes))
+        return list(map(scaled, placed))
 
     # --- one frame, and the window ---
 
-    def _locate(self, ids: Ids, pixels: Array, guess: Array) -> tuple[Array, Array] | None:
-        """vision_from_cam and covariance (6, 6, camera axes) by known points; None if too few agree."""
+    def _locate(self, frame: Frame) -> tuple[Frame, Array] | None:
+        """Return the frame as located by known points, and the covariance (6, 6, camera axes); None if too few agree."""
         s = self._settings
-        rows = [n for n, i in enumerate(ids.tolist()) if i in self._local_map.points]
+        rows = [n for n, i in enumerate(frame.ids.tolist()) if i in self._map.points]
         if len(rows) < s.min_points:
             return None
-        points = np.array([self._local_map.points[i] for i in ids[rows].tolist()])
-        measured = np.column_stack([pixels[rows], np.full(len(rows), np.nan)])
+        points = np.array([self._map.points[i] for i in frame.ids[rows].tolist()])
+        measured = np.column_stack([frame.pixels[rows], np.full(len(rows), np.nan)])
         sigmas = np.full((len(rows), 2), s.sigma_px)
         matches = Correspondences(self._camera, points, measured, sigmas)
-        found = refine_pnp(matches, se3_inverse(guess))
+        found = refine_pnp(matches, se3_inverse(frame.vision_from_cam))
         if found is None or found.inliers.sum() < max(s.min_points, 0.6 * len(rows)):
             again = ransac_pnp(matches, threshold_px=s.max_error_px, min_inliers=s.min_points, seed=len(rows))
             found = again if again is not None and again.inliers.sum() >= 0.4 * len(rows) else None
-        return None if found is None else (_orthonormal(se3_inverse(found.cam_from_source)), found.cov_rot_trans)
+        return None if found is None else (_at(frame, se3_inverse(found.cam_from_source)), found.cov_rot_trans)
 
-    def _is_new(self, keyframe: Keyframe) -> bool:
-        s, last = self._settings, self._local_map.keyframes[-1]
-        shared, a, b = np.intersect1d(last.ids, keyframe.ids, return_indices=True)
+    def _is_new(self, frame: Frame) -> bool:
+        s, last = self._settings, self._map.keyframes[-1]
+        shared, a, b = np.intersect1d(last.ids, frame.ids, return_indices=True)
         if len(shared) < s.view_overlap * len(last.ids):
             return True
-        known = sum(i in self._local_map.points for i in keyframe.ids.tolist())
-        wanted_px = s.view_parallax_px * (0.4 if known < 0.5 * len(keyframe.ids) else 1.0)
-        return bool(np.median(np.linalg.norm(last.pixels[a] - keyframe.pixels[b], axis=1)) > wanted_px)
+        known = sum(i in self._map.points for i in frame.ids.tolist())
+        wanted_px = s.view_parallax_px * (0.4 if known < 0.5 * len(frame.ids) else 1.0)
+        return bool(np.median(np.linalg.norm(last.pixels[a] - frame.pixels[b], axis=1)) > wanted_px)
 
     def _grow(self) -> None:
         """Adjust the window and forget keyframes and points that left it."""
         self._adjust(held=2)
-        self._local_map.keyframes = self._local_map.keyframes[-self._settings.window_views :]
-        seen = {i for v in self._local_map.keyframes for i in v.ids.tolist()}
-        self._local_map.points = {i: p for i, p in self._local_map.points.items() if i in seen}
+        self._map.keyframes = self._map.keyframes[-self._settings.window_views :]
+        seen = {i for v in self._map.keyframes for i in v.ids.tolist()}
+        self._map.points = {i: p for i, p in self._map.points.items() if i in seen}
 
-    def _place_new(self, keyframe: Keyframe) -> None:
+    def _place_new(self, frame: Frame) -> None:
         """Triangulate every track whose parallax since its first observation is large enough."""
-        points, first_seen = self._local_map.points, self._local_map.first_seen
-        wanted = np.array([i not in points for i in keyframe.ids.tolist()], bool)
-        for track_id, pixel in zip(keyframe.ids[wanted].tolist(), keyframe.pixels[wanted], strict=True):
-            first_seen.setdefault(track_id, (keyframe.vision_from_cam, pixel))
-        alive = set(keyframe.ids.tolist())
+        points, first_seen = self._map.points, self._map.first_seen
+        wanted = np.array([i not in points for i in frame.ids.tolist()], bool)
+        for track_id, pixel in zip(frame.ids[wanted].tolist(), frame.pixels[wanted], strict=True):
+            first_seen.setdefault(track_id, (frame.vision_from_cam, pixel))
+        alive = set(frame.ids.tolist())
         for gone in [i for i in first_seen if i not in alive]:
             del first_seen[gone]
         if not wanted.any():
             return
-        ids, now = keyframe.ids[wanted], keyframe.pixels[wanted]
+        ids, now = frame.ids[wanted], frame.pixels[wanted]
         first = np.array([first_seen[i][0] for i in ids.tolist()])
         before = np.array([first_seen[i][1] for i in ids.tolist()])
-        found = self._between(first, before, keyframe.vision_from_cam, now)
+        found = self._between(first, before, frame.vision_from_cam, now)
         for track_id, point in zip(ids.tolist(), found, strict=True):
             if np.isfinite(point[0]):
                 points[track_id] = point
@@ -293,7 +268,7 @@ class VisualOdometry:
 
     def _adjust(self, held: int) -> None:
         """Bundle adjustment of the window; its `held` oldest keyframes stay, points that do not fit go."""
-        keyframes, points = self._local_map.keyframes, self._local_map.points
+        keyframes, points = self._map.keyframes, self._map.points
         rows = [{i: n for n, i in enumerate(v.ids.tolist())} for v in keyframes]
         numbers: list[int] = []
         starts, obs_views = [0], list[int]()
@@ -312,7 +287,7 @@ class VisualOdometry:
         observed = bounds, np.array(obs_views, np.int64), np.array(pixels)
         limits = self._settings.sigma_px, _HUBER_SIGMAS, _ITERATIONS
         values = np.array([points[i] for i in numbers])
-        placed, values, squared, _ = core.adjust_window(placed, held, values, *observed, self._lens, *limits)
+        placed, values, squared, _ = core.adjust_window(placed, held, values, *observed, self._camera.lens, *limits)
         worst = np.maximum.reduceat(squared, bounds[:-1])
         limit = (self._settings.max_error_px / self._settings.sigma_px) ** 2
         for track_id, value, off in zip(numbers, values, worst.tolist(), strict=True):
@@ -320,15 +295,13 @@ class VisualOdometry:
                 points[track_id] = value
             else:
                 del points[track_id]
-        self._local_map.keyframes = [
-            Keyframe(v.frame_index, _orthonormal(placed[k]), v.ids, v.pixels) for k, v in enumerate(keyframes)
-        ]
+        self._map.keyframes = [_at(frame, vision_from_cam) for frame, vision_from_cam in zip(keyframes, placed, strict=True)]
 
 
 _NOWHERE = np.full(3, np.nan)
 
 
-def _orthonormal(vision_from_cam: Array) -> Array:
-    """The nearest rigid transform: guesses are products of earlier results, in which rounding errors triple with every frame."""
+def _at(frame: Frame, vision_from_cam: Array) -> Frame:
+    """The frame at the nearest rigid transform: guesses are products of earlier results, whose rounding errors triple with every frame."""
     u, _, vt = np.linalg.svd(vision_from_cam[:3, :3])
-    return se3(u @ vt, vision_from_cam[:3, 3])
+    return frame._replace(vision_from_cam=se3(u @ vt, vision_from_cam[:3, 3]))

@@ -36,20 +36,13 @@ def two_view_motion(
     """
     if len(pixels_a) < 8:
         return None
-    best: TwoView | None = None
-    scored: list[TwoView] = []
-    for b_from_a in _candidates(camera, pixels_a, pixels_b, threshold_px, seed):
-        found = _scored(camera, b_from_a, pixels_a, pixels_b)
-        scored.append(found)
-        if best is None or found.inliers.sum() > best.inliers.sum():
-            best = found
+    candidates = _candidates(camera, pixels_a, pixels_b, threshold_px, seed)
+    scored = [_scored(camera, b_from_a, pixels_a, pixels_b) for b_from_a in candidates]
+    best = max(scored, key=lambda found: int(found.inliers.sum()), default=None)
     if best is None or not best.inliers.any():
         return None
-    for rival in scored:
-        apart = rival.b_from_a[:3, 3] @ best.b_from_a[:3, 3] < 0.9
-        if apart and rival.inliers.sum() > _RIVAL_SHARE * best.inliers.sum():
-            return None
-    return best
+    rivals = [rival for rival in scored if rival.b_from_a[:3, 3] @ best.b_from_a[:3, 3] < 0.9]
+    return None if any(rival.inliers.sum() > _RIVAL_SHARE * best.inliers.sum() for rival in rivals) else best
 
 
 def _candidates(camera: StereoCamera, pixels_a: Array, pixels_b: Array, threshold_px: float, seed: int) -> list[Array]:
@@ -59,11 +52,11 @@ def _candidates(camera: StereoCamera, pixels_a: Array, pixels_b: Array, threshol
     essential, _ = cv2.findEssentialMat(a, b, camera.matrix, cv2.RANSAC, 0.999, threshold_px)
     if essential is not None and essential.shape == (3, 3):
         first, second, direction = cv2.decomposeEssentialMat(essential)
-        found.extend(
+        found += [
             se3(np.asarray(rotation, np.float64), np.asarray(sign * direction.ravel(), np.float64))
             for rotation in (first, second)
             for sign in (1.0, -1.0)
-        )
+        ]
     homography, _ = cv2.findHomography(a, b, cv2.RANSAC, 1.5 * threshold_px)
     if homography is not None:
         _, rotations, directions, _ = cv2.decomposeHomographyMat(homography, camera.matrix)

@@ -1,12 +1,12 @@
 """Odometry of one camera without an IMU, by wheels: its images measure no length, and correct the motion in a map alone."""
 
 from collections import deque
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from fleetmap.geometry import Array, length, rotation_angle_rad, se3_exp, se3_inverse
-from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.odometry.filter.sliding_window import OdometryRig
 from fleetmap.odometry.modes import Mode, Step
 from fleetmap.odometry.mono.two_view import two_view_motion
@@ -46,24 +46,22 @@ class SeenWay(NamedTuple):
 class WheelMode(Mode):
     """Dead reckoning. The errors of samples stay alike from one to the next, so that sigmas add up and variances do not."""
 
+    stamp_ns = 0
+
     def __init__(self, rig: OdometryRig, samples: SensorBuffer) -> None:
         self._rig, self._samples = rig, samples
         self._frames = deque[_Frame](maxlen=_KEPT_FRAMES)
         self._newest: WheelSample | None = None
-        self._stamp_ns, self._velocity_mps = 0, np.zeros(3)
+        self._velocity_mps = np.zeros(3)
         self._is_silent = True
         self.seen_way: SeenWay | None = None  # until this frame
         self._way_begins: tuple[int, Tracked, float] | None = None  # and the motion in the image that it needs, pixels
 
-    @property
-    def stamp_ns(self) -> int:
-        return self._stamp_ns
-
     def predict(self, stamp_ns: int) -> None:
         """See Mode: a sample counts until its stamp, the newest one also after it."""
-        at_ns = since_ns = self._stamp_ns or stamp_ns
+        at_ns = since_ns = self.stamp_ns or stamp_ns
         samples = self._samples.wheel_between(at_ns + 1, stamp_ns)
-        self._newest, self._stamp_ns = samples[-1] if samples else self._newest, stamp_ns
+        self._newest, self.stamp_ns = samples[-1] if samples else self._newest, stamp_ns
         self._is_silent = self._newest is None or stamp_ns - self._newest.stamp_ns > _SILENT_NS
         parts = [(sample.stamp_ns, sample) for sample in samples]
         if self._newest is not None and not self._is_silent:
@@ -90,12 +88,12 @@ class WheelMode(Mode):
     def process(self, frame_index: int, tracked: Tracked) -> Step:
         """See Mode: nothing corrects it, but images that show another direction."""
         self.seen_way = way = self._see_way(tracked)
-        return Step(self, np.zeros(0, np.int8), is_lost=self._is_silent or tracked.lost or self._contradicts(way))
+        return Step(self, is_lost=self._is_silent or tracked.lost or self._contradicts(way))
 
     def _see_way(self, tracked: Tracked) -> SeenWay | None:
         """Return the way since an earlier frame as soon as its points have moved enough in the image."""
         s = self._rig.settings.monocular
-        anew = self._stamp_ns, tracked, _WAY_SIGMAS * s.sigma_px
+        anew = self.stamp_ns, tracked, _WAY_SIGMAS * s.sigma_px
         since_ns, before, wanted_px = self._way_begins or anew
         _, a, b = np.intersect1d(before.ids, tracked.ids, return_indices=True)
         pixels_a, pixels_b = before.pixels[a, :2], tracked.pixels[b, :2]
@@ -133,35 +131,22 @@ class WheelMode(Mode):
     def _covariance(self, rolled: _Rolled) -> Array:
         settings = self._rig.settings.filter
         sigma_rad = rolled.sigma_rad + settings.wheel_yaw_scale_sigma * rolled.turn_rad
-        sigma_m = (
-            rolled.sigma_m + settings.wheel_speed_scale_sigma * rolled.way_m + settings.wheel_slip_mps * rolled.moving_s
-        )
-        tilt_rad = (
-            settings.initial_tilt_sigma_rad if rolled.moving_s else 0.0
-        )  # by the ground, which wheels do not show
+        slipped_m = settings.wheel_slip_mps * rolled.moving_s
+        sigma_m = rolled.sigma_m + settings.wheel_speed_scale_sigma * rolled.way_m + slipped_m
+        # By the ground, which wheels do not show.
+        tilt_rad = settings.initial_tilt_sigma_rad if rolled.moving_s else 0.0
         turns = [sigma_rad + tilt_rad, sigma_rad + tilt_rad, sigma_rad]
         return np.diag(np.square([*turns, *[sigma_m + turns[0] * rolled.way_m] * 3]))
 
     def will_forget(self, frame_index: int) -> bool:
         return frame_index <= self._frames[0].frame_index
 
-    def estimate(self, stamp_ns: int, frame_index: int, tracked: Tracked, step: Step) -> OdometryEstimate:
-        """See Mode; biases are unknown, reported as zero."""
+    def state(self, frame_index: int, tracked: Tracked, step: Step) -> dict[str, Any]:
+        """See Mode; biases are unknown."""
         _, odom_from_body, rolled, _ = self._frames[-1]
-        return OdometryEstimate(
-            stamp_ns=stamp_ns,
-            frame_index=frame_index,
-            odom_from_body=odom_from_body,
-            cov_rot_trans=self._covariance(rolled) + 1e-12 * np.eye(6),
-            velocity_odom_mps=self._velocity_mps,
-            gyro_bias_radps=np.zeros(3),
-            accel_bias_mps2=np.zeros(3),
-            status=OdometryStatus.DEGRADED if frame_index and step.is_lost else OdometryStatus.TRACKING,
-            track_ids=tracked.ids,
-            scene_depth_m=5.0,
-            inlier_share=tracked.inlier_share,
-            after_gap=tracked.by_descriptors,
-            inertial=False,
-            new_odom_from_old_odom=None,
-            track_pixels=tracked.pixels,
-        )
+        return {
+            "odom_from_body": odom_from_body,
+            "cov_rot_trans": self._covariance(rolled) + 1e-12 * np.eye(6),
+            "velocity_odom_mps": self._velocity_mps,
+            "status": OdometryStatus.DEGRADED if frame_index and step.is_lost else OdometryStatus.TRACKING,
+        }

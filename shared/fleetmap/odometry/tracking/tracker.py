@@ -85,10 +85,11 @@ class Tracker:
         *,
         first_frame: int = 0,
         first_id: int = 0,
+        points_in_camera: Callable[[Ids], Array] | None = None,
     ) -> None:
-        """first_frame: number of the frame that comes first; first_id: of its first point."""
-        self._camera = camera
-        self._settings = settings
+        """first_frame: number of the frame that comes first; first_id: of its first point. points_in_camera: for lack of a second camera,
+        the points (N, 3) of tracks in the camera of the frame before, as known from several frames, NaN where unknown."""
+        self._camera, self._settings, self._points_in_camera = camera, settings, points_in_camera
         self._stereo = stereo_settings or StereoSettings()
         self._orb = OrbSettings(count=settings.match_features)
         most_px = stereo.max_disparity_px(camera, self._stereo)
@@ -121,8 +122,15 @@ class Tracker:
             return Tracked(self._ids(), self._points.pixels, (), None, 1.0, by_descriptors=False)
         guess = motion_since(self._frame_index - 1)
         is_predicted = guess is not None and rotation_sigma_rad is not None
-        found, share = self._step(frame, np.eye(4) if guess is None else guess, is_predicted, self._points_cam())
+        guess, before, points_cam = np.eye(4) if guess is None else guess, self._points.ids, None
+        if self._points_in_camera is not None:
+            points_cam = self._points_in_camera(before)
+            points_cam[~(points_cam[:, 2] > 0.0)] = np.nan
+        found, share = self._step(frame, guess, is_predicted, points_cam)
         motion, information = found or (None, None)
+        if motion is None and points_cam is not None:
+            # Without parallax none of the tracked points can be triangulated: they suffice to continue.
+            motion = guess if np.isin(self._points.ids, before).sum() >= self._settings.min_inliers else None
         pixels = self._points.pixels
         return Tracked(self._ids(), pixels, (), motion, share, by_descriptors=False, information=information)
 
@@ -145,10 +153,6 @@ class Tracker:
         guess = None if cam_from_previous is None else np.ascontiguousarray(cam_from_previous)
         images = frame.left, pair, frame.disparity_px
         return self._points.track(*images, guess, is_predicted, points_cam, self._camera.clearance_px)
-
-    def _points_cam(self) -> Array | None:
-        """(N, 3) the points in the camera of the frame before; None if their disparities give the depth."""
-        return None
 
     def _rematch(
         self,

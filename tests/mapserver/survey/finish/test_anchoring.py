@@ -80,10 +80,8 @@ def test_a_scaled_map_is_seen_by_its_cameras_as_before() -> None:
 
 
 def estimate(k: int, status: OdometryStatus, *, scale_known: bool) -> OdometryEstimate:
-    return OdometryEstimate(
-        k, k, se3(np.eye(3), np.array([float(k), 0, 0])), np.eye(6), np.zeros(3), np.zeros(3), np.zeros(3), status,
-        np.zeros(0, np.int64), 5.0, 1.0, False, scale_known, None, scale_known,
-    )  # fmt: skip
+    place = se3(np.eye(3), np.array([float(k), 0, 0]))
+    return OdometryEstimate(k, k, place, np.eye(6), status, inertial=scale_known, scale_known=scale_known)
 
 
 def guess_of(marks: str, *, scale_known: bool) -> OdometryPass:

@@ -31,11 +31,8 @@ def estimate(
     status: OdometryStatus = OdometryStatus.TRACKING,
 ) -> Any:
     """An odometry's estimate at x_m; its covariance is the unit matrix times `variance`."""
-    unknown = np.zeros(3), np.zeros(3), np.zeros(3)
-    place = se3(np.eye(3), np.array([x_m, 0.0, 0.0]))
-    return OdometryEstimate(
-        0, 0, place, variance * np.eye(6), *unknown, status, np.zeros(0, np.int64), 5.0, 1.0, False, inertial, change
-    )
+    pose = se3(np.eye(3), np.array([x_m, 0.0, 0.0])), variance * np.eye(6)
+    return OdometryEstimate(0, 0, *pose, status, inertial=inertial, new_odom_from_old_odom=change)
 
 
 def test_only_what_touches_the_dark_hangs_on_odometry_as_odometry_measured_it() -> None:
