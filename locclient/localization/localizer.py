@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
-from fleetmap.bow import Vocabulary
+from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.mapformat.building import Floor

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.bow import decode_vocabulary
+from fleetmap.bow.vocabulary import decode_vocabulary
 from fleetmap.errors import FleetmapError, MapFormatError, StateError, UnreachableError
 from fleetmap.mapformat.building import (
     ALIGNMENT,

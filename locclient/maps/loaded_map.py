@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from fleetmap.bow import Vocabulary
+from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.config import Section
 from fleetmap.geometry import Array
 from fleetmap.mapformat import Manifest, Tile

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field
 
-from fleetmap.bow import Vocabulary, decode_vocabulary
+from fleetmap.bow.vocabulary import Vocabulary, decode_vocabulary
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat import Manifest, Tile
 from fleetmap.messages import WantedVersion

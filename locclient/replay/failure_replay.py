@@ -13,7 +13,7 @@ from math import dist, pi, remainder
 
 import numpy as np
 
-from fleetmap.bow import decode_vocabulary
+from fleetmap.bow.vocabulary import decode_vocabulary
 from fleetmap.errors import LinkError, UsageError
 from fleetmap.failure_definition import BLIND_S, is_blind
 from fleetmap.failure_summary import FailureSummary, Moment

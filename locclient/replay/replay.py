@@ -11,7 +11,7 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from fleetmap.bow import decode_vocabulary
+from fleetmap.bow.vocabulary import decode_vocabulary
 from fleetmap.errors import LinkError, RecordingError
 from fleetmap.free_memory import gc_frozen, give_back_free_memory
 from fleetmap.geometry import Array, rotation_angle_rad

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import Vocabulary
+from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.errors import RecordingError
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array

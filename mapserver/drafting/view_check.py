@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import Vocabulary
+from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.failure_definition import is_wrong
 from fleetmap.geometry import rotation_angle_rad, se3_inverse
 from fleetmap.mapformat import Tile, decode_tile, encode_tile

@@ -22,7 +22,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import Vocabulary
+from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3_inverse
 from mapserver.survey.bundle.bundle_rounds import bundle_rounds, local_windows

@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import decode_vocabulary
+from fleetmap.bow.vocabulary import decode_vocabulary
 from fleetmap.errors import FleetmapError, RecordingError, StateError
 from fleetmap.failure_definition import SILENT_S, is_wrong
 from fleetmap.features.settings import OrbSettings

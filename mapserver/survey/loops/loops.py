@@ -7,7 +7,8 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import BowVector, PlaceIndex
+from fleetmap.bow.place_index import PlaceIndex
+from fleetmap.bow.vocabulary import BowVector
 from fleetmap.geometry import Array, se3_inverse, se3_log, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fleetmap.bow import Vocabulary
+from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.relocalization.landmark_visibility import Rows, VisibleLandmarks, visible_landmarks

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import Vocabulary
+from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.features import patch_align
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array, se3_inverse, transform_points

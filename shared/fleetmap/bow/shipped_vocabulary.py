@@ -6,7 +6,7 @@ Trained on simulated warehouses by `tests/benchmarks/survey/default_vocabulary.p
 from functools import lru_cache
 from importlib import resources
 
-from fleetmap.bow import Vocabulary, decode_vocabulary
+from fleetmap.bow.vocabulary import Vocabulary, decode_vocabulary
 
 DEFAULT_VOCABULARY_SHA256 = "be3518d36889c1d59cb5bf33b41e573d064585376a11c75990fa0accfa1e8a47"
 _FILE = "vocabulary.fmvb"

@@ -1,14 +1,36 @@
-"""A tree of binary words: a descriptor descends to the nearest child until it reaches a leaf, which is its word."""
+"""A tree of binary words: a descriptor descends to the nearest child until it reaches a leaf, which is its word. As bytes:
 
+    offset  type     content
+    0       4 s      magic FMVB
+    4       u16      format number
+    6       u16      0
+    8       u32      M nodes
+    12      u32      W words
+    16      u32      CRC-32 of everything behind it
+    20      M   u8   number of children of each node, breadth first
+            32 M u8  centre of each node
+            4 W f32  idf of each word
+
+Little-endian. Not compressed: centres are close to random bits. The index of a node's first child follows from the counts.
+"""
+
+import struct
+import zlib
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
+from fleetmap.errors import MapFormatError, NewerFormatError
 from fleetmap.features.matching import Descriptors, Packed, packed
 
 WordIds = NDArray[np.int32]
+VOCABULARY_FORMAT = 1
+MAX_NODES = 1 << 20
+MAX_LEVELS = 16
+_MAGIC = b"FMVB"
+_HEADER = struct.Struct("<4sHHIII")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -58,3 +80,69 @@ class Vocabulary:
         used = products > 0.0
         weights = products[used] / max(float(products.sum()), 1e-300)
         return BowVector(word_ids[used].astype(np.int32), weights.astype(np.float32))
+
+
+def encode_vocabulary(vocabulary: Vocabulary) -> bytes:
+    """Encode a vocabulary; equal vocabularies give equal bytes on every machine."""
+    nodes = len(vocabulary.child_count)
+    assert nodes <= MAX_NODES
+    body = (
+        vocabulary.child_count.astype(np.uint8).tobytes()
+        + np.ascontiguousarray(vocabulary.centres, "<u8").tobytes()
+        + np.ascontiguousarray(vocabulary.idf, "<f4").tobytes()
+    )
+    return _HEADER.pack(_MAGIC, VOCABULARY_FORMAT, 0, nodes, vocabulary.word_count, zlib.crc32(body)) + body
+
+
+def decode_vocabulary(data: bytes) -> Vocabulary:
+    """Decode the vocabulary in `data`.
+
+    Raises NewerFormatError for a newer format, MapFormatError for anything that is not a whole, undamaged vocabulary.
+    Allocates no more than a small multiple of len(data).
+    """
+    nodes, words = _checked_header(data)
+    body = memoryview(data)[_HEADER.size :]
+    child_count = np.frombuffer(body, np.uint8, nodes).astype(np.int32)
+    centres = np.frombuffer(body, "<u8", 4 * nodes, nodes).reshape(nodes, 4).astype(np.uint64)
+    idf = np.frombuffer(body, "<f4", words, 33 * nodes).astype(np.float32)
+    first_child = _first_children(child_count, words)
+    if not np.isfinite(idf).all() or (idf < 0.0).any():
+        raise MapFormatError("vocabulary: a word's weight is negative or not finite; fetch the vocabulary again")
+    return Vocabulary(centres, first_child, child_count, idf)
+
+
+def _checked_header(data: bytes) -> tuple[int, int]:
+    """Check the header and the checksum; return the numbers of nodes and words."""
+    if len(data) < _HEADER.size or data[:4] != _MAGIC:
+        raise MapFormatError(
+            f"vocabulary: {len(data)} bytes beginning {data[:4]!r}, not {_MAGIC!r}; another kind of file"
+        )
+    _, number, reserved, nodes, words, checksum = _HEADER.unpack_from(data)
+    if number > VOCABULARY_FORMAT:
+        raise NewerFormatError(
+            f"vocabulary has format {number}, this fleetmap reads up to {VOCABULARY_FORMAT}; update fleetmap to read it"
+        )
+    if number < 1 or reserved != 0 or not 1 <= words <= nodes <= MAX_NODES:
+        raise MapFormatError(
+            f"vocabulary: format {number}, {nodes} nodes, {words} words (at most {MAX_NODES}): damaged, fetch it again"
+        )
+    if len(data) != _HEADER.size + 33 * nodes + 4 * words:
+        raise MapFormatError(f"vocabulary: {len(data)} bytes for {nodes} nodes and {words} words; fetch it again")
+    found = zlib.crc32(memoryview(data)[_HEADER.size :])
+    if found != checksum:
+        raise MapFormatError(f"vocabulary: CRC-32 {found:08x} instead of {checksum:08x}; damaged, fetch it again")
+    return nodes, words
+
+
+def _first_children(child_count: NDArray[np.int32], words: int) -> NDArray[np.int32]:
+    """Index of each node's first child; MapFormatError unless the counts make one tree with that many leaves."""
+    nodes = len(child_count)
+    begin, end = 0, 1
+    for _ in range(MAX_LEVELS):  # downwards, one level at a time
+        begin, end = end, end + int(child_count[begin:end].sum())
+        if begin == end or end > nodes:
+            break
+    if not begin == end == nodes or (child_count == 1).any() or int((child_count == 0).sum()) != words:
+        raise MapFormatError(f"vocabulary: {nodes} nodes and {words} words do not make a tree; fetch it again")
+    first_child = 1 + np.cumsum(child_count, dtype=np.int64) - child_count
+    return np.where(child_count > 0, first_child, 0).astype(np.int32)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.bow import Vocabulary
+from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.features.matching import Descriptors, packed
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import Vocabulary
+from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.features import orb
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
 from fleetmap.mapformat import Tile

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow import encode_vocabulary
+from fleetmap.bow.vocabulary import encode_vocabulary
 from fleetmap.features.orb import detect
 from fleetmap.features.settings import OrbSettings
 from fleetmap.mapformat import sha256_hex

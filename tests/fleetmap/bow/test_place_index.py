@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from fleetmap.bow import BowVector, PlaceIndex
+from fleetmap.bow.place_index import PlaceIndex
+from fleetmap.bow.vocabulary import BowVector
 from support.worlds.vocabulary_training import train_vocabulary
 
 WORDS = 300

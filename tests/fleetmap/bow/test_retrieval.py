@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from fleetmap.bow import PlaceIndex
+from fleetmap.bow.place_index import PlaceIndex
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.features.orb import detect
 from fleetmap.features.settings import OrbSettings

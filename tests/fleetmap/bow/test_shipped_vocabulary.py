@@ -4,13 +4,13 @@ from hashlib import sha256
 
 import numpy as np
 
-from fleetmap.bow import encode_vocabulary
 from fleetmap.bow.shipped_vocabulary import (
     DEFAULT_VOCABULARY_SHA256,
     default_vocabulary,
     default_vocabulary_bytes,
     shipped_vocabulary,
 )
+from fleetmap.bow.vocabulary import encode_vocabulary
 
 
 def test_it_is_what_its_hash_says() -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleetmap.bow import Vocabulary, decode_vocabulary, encode_vocabulary
+from fleetmap.bow.vocabulary import Vocabulary, decode_vocabulary, encode_vocabulary
 from fleetmap.errors import MapFormatError, NewerFormatError
 from support.worlds.vocabulary_training import train_vocabulary
 

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.bow import Vocabulary
+from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.features.matching import packed
 from fleetmap.relocalization.map_view import DescriptorIndex
 from support.worlds.vocabulary_training import train_vocabulary

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleetmap.bow import Vocabulary
+from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.messages import Status
 from fleetmap.odometry import OdometryEstimate, OdometryStatus

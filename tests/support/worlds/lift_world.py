@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleetmap.bow import Vocabulary
+from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import Array, Rings, se3, se3_inverse, so3_exp
 from fleetmap.mapformat.building import BuildingFrame, Floor, FloorEntry
 from fleetmap.messages import Status

@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from fleetmap.bow import decode_vocabulary, encode_vocabulary
+from fleetmap.bow.vocabulary import decode_vocabulary, encode_vocabulary
 from fleetmap.features import orb
 from fleetmap.geometry import Array
 from fleetmap.mapformat import CameraEntry, Tile

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.bow import Vocabulary
+from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.features.matching import FAR, Descriptors, packed
 from fleetmap.geometry import Array
 

@@ -7,8 +7,7 @@ import numpy as np
 
 from fleetmap import core
 from fleetmap.geometry import Array
-from fleetmap.inertial import GRAVITY_MPS2
-from fleetmap.inertial.preintegration import densities
+from fleetmap.inertial import GRAVITY_MPS2, densities
 from fleetmap.odometry.filter.nav_state import NavState
 from fleetmap.odometry.settings import FilterSettings
 from fleetmap.sensors.calibration import ImuNoise

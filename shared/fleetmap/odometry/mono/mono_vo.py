@@ -124,7 +124,9 @@ class VisualOdometry:
             _, a, b = np.intersect1d(first.ids, frame.ids, return_indices=True)
             if len(a) < self._settings.first_min_points or len(self._waiting) > _LONGEST_WAIT:
                 self._waiting.pop(0)  # too few tracks of the oldest frame are left: begin later
-            elif np.median(np.linalg.norm(first.pixels[a] - frame.pixels[b], axis=1)) < self._settings.first_parallax_px:
+            elif (
+                np.median(np.linalg.norm(first.pixels[a] - frame.pixels[b], axis=1)) < self._settings.first_parallax_px
+            ):
                 return nothing
             else:
                 return self._begin(first.ids[a], first.pixels[a], frame.pixels[b]) or nothing
@@ -295,7 +297,9 @@ class VisualOdometry:
                 points[track_id] = value
             else:
                 del points[track_id]
-        self._map.keyframes = [_at(frame, vision_from_cam) for frame, vision_from_cam in zip(keyframes, placed, strict=True)]
+        self._map.keyframes = [
+            _at(frame, vision_from_cam) for frame, vision_from_cam in zip(keyframes, placed, strict=True)
+        ]
 
 
 _NOWHERE = np.full(3, np.nan)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from fleetmap.bow import Vocabulary
+from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import Array, se3_exp, se3_inverse, se3_log, transform_points
 from fleetmap.pnp.pnp import Correspondences, refine_pnp
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
