@@ -8,7 +8,7 @@ import numpy as np
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.messages import Cause, Status
-from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.relocalizer import Fix
 from locclient.localization.calibration.parameters import NOT_JUDGED, CalibrationState
 from locclient.localization.image_quality import GOOD_IMAGE, ImageQuality

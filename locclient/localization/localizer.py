@@ -8,7 +8,7 @@ from fleetmap.geometry import se3_inverse
 from fleetmap.mapformat import Tile
 from fleetmap.mapformat.building import Floor
 from fleetmap.messages import Cause, Status
-from fleetmap.odometry import is_away
+from fleetmap.odometry.estimate import is_away
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.rectification import MountedRig, RectifiedFrame

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fleetmap.errors import RecordingError
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, interpolate_se3, se3_inverse
-from fleetmap.odometry import OdometryEstimate
+from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, Relocalizer
 from fleetmap.sensors.rectification import RectifiedFrame

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from fleetmap.messages import Cause
-from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.frame_features import FrameFeatures
 from locclient.localization.calibration.parameters import NOT_JUDGED, CalibrationState
 from locclient.localization.image_quality import ImageQuality

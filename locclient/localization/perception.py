@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from fleetmap.messages import Cause
-from fleetmap.odometry import make_odometry
+from fleetmap.odometry.mono.mono_modes import make_odometry
 from fleetmap.sensors.rectification import MountedRig, RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, WheelSample
 from locclient.localization.image_quality import UNUSABLE, ImageQuality, ImageQualityMonitor

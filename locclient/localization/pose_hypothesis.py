@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fleetmap.geometry import Array, length
-from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from locclient.localization.alias_disambiguation import ObservationHistory
 from locclient.localization.place import ORIGIN, Place, bounded_turn, boxminus
 from locclient.localization.settings import TrackSettings

@@ -9,7 +9,7 @@ import numpy as np
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.inertial import GRAVITY_MPS2
-from fleetmap.odometry import OdometryEstimate
+from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, is_reliable

@@ -2,7 +2,7 @@
 
 from fleetmap.config import Section
 from fleetmap.features.settings import OrbSettings, StereoSettings
-from fleetmap.odometry import OdometrySettings
+from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.relocalization.settings import STRONG_INLIERS, FixSettings, RelocalizerSettings
 from locclient.localization.image_quality import ImageQualitySettings
 

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.odometry import ContinuousFrame
+from fleetmap.odometry.estimate import ContinuousFrame
 from locclient.localization.estimate import Estimate
 from locclient.localization.place import transport_cov
 

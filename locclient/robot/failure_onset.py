@@ -10,7 +10,7 @@ import numpy as np
 from fleetmap.failure_definition import ERROR_LIMIT_M, radius_95_m
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.messages import Cause, FailureKind
-from fleetmap.odometry import OdometryStatus
+from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import Image
 from locclient.localization.estimate import Estimate

@@ -10,8 +10,9 @@ import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse, so3_exp, so3_log
 from fleetmap.messages import Flag, Status
-from fleetmap.odometry import OdometryEstimate, OdometryStatus, SeenWay
 from fleetmap.odometry.accelerometer_check import AccelerometerCheck
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.mono.wheel_mode import SeenWay
 from fleetmap.sensors.axes import speed_in_words
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import MountedCamera

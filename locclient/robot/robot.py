@@ -9,7 +9,7 @@ from fleetmap.geometry import Array
 from fleetmap.mapformat.building import BuildingFrame, Floor
 from fleetmap.mapformat.manifest import building_frame
 from fleetmap.messages import Cause, Flag, PoseMessage, Status
-from fleetmap.odometry import WheelOdometry
+from fleetmap.odometry.mono.mono_modes import WheelOdometry
 from fleetmap.recordings.images import StoredFrame, decode_frame
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import PositionPrior, WheelSample

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse, so3_log
-from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.tracking.tracker import MotionSince, Tracker
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Trajectory

@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse
-from fleetmap.odometry import ContinuousFrame, OdometryEstimate, OdometryStatus, is_away, make_odometry
+from fleetmap.odometry.estimate import ContinuousFrame, OdometryEstimate, OdometryStatus, is_away
 from fleetmap.odometry.lift_check import WINDOW_NS
+from fleetmap.odometry.mono.mono_modes import make_odometry
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample, wheel_between

@@ -5,7 +5,7 @@ from typing import Literal
 
 from fleetmap.config import Section
 from fleetmap.features.settings import AlignSettings, OrbSettings, StereoSettings
-from fleetmap.odometry import OdometrySettings
+from fleetmap.odometry.settings import OdometrySettings
 
 MIN_SEEN = 8  # least landmarks of a keyframe that is not blind
 

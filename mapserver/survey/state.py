@@ -13,7 +13,7 @@ from fleetmap import core
 from fleetmap.features import orb, patch_align
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import AnyArray, Array
-from fleetmap.odometry import OdometryEstimate
+from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples

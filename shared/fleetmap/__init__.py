@@ -17,7 +17,8 @@ from fleetmap.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from fleetmap.errors import CalibrationError, FleetmapError, MapFormatError, RecordingError
-    from fleetmap.odometry import OdometrySettings, make_odometry
+    from fleetmap.odometry.mono.mono_modes import make_odometry
+    from fleetmap.odometry.settings import OdometrySettings
     from fleetmap.recordings import (
         RECORDING_FORMATS,
         FrameSelection,
@@ -56,7 +57,8 @@ __getattr__, __dir__ = lazy_names(
     __name__,
     {
         "fleetmap.errors": "CalibrationError FleetmapError MapFormatError RecordingError",
-        "fleetmap.odometry": "OdometrySettings make_odometry",
+        "fleetmap.odometry.mono.mono_modes": "make_odometry",
+        "fleetmap.odometry.settings": "OdometrySettings",
         "fleetmap.recordings": "FrameSelection OpenOptions Recording RecordingFormat RECORDING_FORMATS Topics open_recording "
         "read_calibration",
         "fleetmap.recordings.tum": "read_tum write_tum",

@@ -19,7 +19,8 @@ class Refuse:
 sys.meta_path.insert(0, Refuse())
 import numpy as np
 from fleetmap.sensors.calibration import ImuNoise
-from fleetmap.odometry import Odometry, OdometrySettings
+from fleetmap.odometry.odometry import Odometry
+from fleetmap.odometry.settings import OdometrySettings
 from support.worlds.inertial_motion import sample_motion
 from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, rig, stereo_frame
 

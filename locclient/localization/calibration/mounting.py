@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse, so3_log
-from fleetmap.odometry import OdometryEstimate
+from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.samples import WheelSample
 

@@ -9,7 +9,7 @@ import numpy as np
 from fleetmap.features import stereo
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
-from fleetmap.odometry import OdometryEstimate
+from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.pnp.pnp import Correspondences
 from fleetmap.sensors.samples import WheelSample
 from locclient.localization.calibration import mounting

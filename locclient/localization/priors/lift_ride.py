@@ -7,7 +7,7 @@ import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat.building import Floor
-from fleetmap.odometry import OdometryEstimate
+from fleetmap.odometry.estimate import OdometryEstimate
 from locclient.localization.percept import Percept
 from locclient.localization.place import Place
 from locclient.localization.pose_hypothesis import PoseHypothesis

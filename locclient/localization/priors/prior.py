@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse, so3_log, transform_points
-from fleetmap.odometry import OdometryEstimate
+from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.hypothesis_set import HypothesisSet, Observations

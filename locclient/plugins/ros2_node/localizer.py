@@ -18,7 +18,7 @@ from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse, so3_log
 from fleetmap.messages import Status
 from fleetmap.occupancy_grid import OccupancyGrid
-from fleetmap.odometry import OdometryStatus
+from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.recordings.ros2.cdr import CdrReader, CdrWriter
 from fleetmap.recordings.ros2.messages import (
     FrameLink,

@@ -21,7 +21,7 @@ from fleetmap.geometry import (
     se3_inverse,
     se3_log,
 )
-from fleetmap.odometry import OdometryStatus
+from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.recordings import Recording
 from fleetmap.recordings.tum import format_stamp
 from fleetmap.sensors.rectification import Rectifier

@@ -6,7 +6,8 @@ import numpy as np
 
 from benchmarks.common import estimator_loop
 from fleetmap.geometry import Array, se3_inverse, so3_log
-from fleetmap.odometry import OdometryEstimate, OdometrySettings
+from fleetmap.odometry.estimate import OdometryEstimate
+from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples
 from fleetsim.motion.body_motion import RouteMotion

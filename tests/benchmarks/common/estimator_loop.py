@@ -13,8 +13,9 @@ from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.features import orb
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
 from fleetmap.mapformat import Tile
-from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
-from fleetmap.odometry.settings import TrackerSettings
+from fleetmap.odometry.estimate import OdometryEstimate
+from fleetmap.odometry.odometry import Odometry
+from fleetmap.odometry.settings import OdometrySettings, TrackerSettings
 from fleetmap.odometry.tracking.tracker import MotionSince, Tracked, Tracker
 from fleetmap.pnp.pnp import Correspondences, PnpResult, ransac_pnp, refine_pnp
 from fleetmap.relocalization.frame_features import FrameFeatures

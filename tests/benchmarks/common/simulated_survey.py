@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from benchmarks.common.estimator_loop import EstimatorTracker, blank
 from fleetmap.features import orb, patch_align
 from fleetmap.geometry import AnyArray, Array
-from fleetmap.odometry import OdometryStatus
+from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import wheel_between
 from fleetsim import recorder

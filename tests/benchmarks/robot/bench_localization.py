@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.common.recorded_runs import parsed, played, recorded, resident_mb, surveyed, write_results
 from benchmarks.common.yardstick import at_reference, mean_of, slowness
 from fleetmap.free_memory import give_back_free_memory
-from fleetmap.odometry import Odometry
+from fleetmap.odometry.odometry import Odometry
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.replay_source import ReplaySource

@@ -5,9 +5,10 @@ import pytest
 
 from benchmarks.common import consistency, estimator_loop
 from fleetmap.geometry import se3, se3_inverse
-from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
+from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.odometry.modes import InertialMode
-from fleetmap.odometry.settings import FilterSettings
+from fleetmap.odometry.odometry import Odometry
+from fleetmap.odometry.settings import FilterSettings, OdometrySettings
 from fleetsim.sensors.faults import Fault
 from support.estimator.simulated_run import EstimatorSession
 

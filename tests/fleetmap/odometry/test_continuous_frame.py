@@ -7,7 +7,7 @@ import pytest
 
 from benchmarks.common import consistency, estimator_loop
 from fleetmap.geometry import Array, se3_exp, se3_inverse
-from fleetmap.odometry import ContinuousFrame, OdometryEstimate
+from fleetmap.odometry.estimate import ContinuousFrame, OdometryEstimate
 
 STEP = se3_exp(np.array([0.0, 0.0, 0.02, 1.0, 0.0, 0.0]))
 

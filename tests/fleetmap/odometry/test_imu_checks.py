@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
-from fleetmap.odometry import Odometry, OdometrySettings
 from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.odometry.gyro_clock import GyroClock
+from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.odometry_checks import DivergenceMonitor, ZeroVelocityDetector
+from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples
 from support.worlds.inertial_motion import analytic_motion

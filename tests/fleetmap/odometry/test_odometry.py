@@ -10,13 +10,15 @@ import pytest
 
 from fleetmap.geometry import Array, se3, se3_inverse, se3_log, so3_exp, transform_points
 from fleetmap.inertial import GRAVITY_MPS2
-from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings, OdometryStatus, is_away, modes
+from fleetmap.odometry import modes
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus, is_away
 from fleetmap.odometry.filter.nav_state import InitialState
 from fleetmap.odometry.filter.sliding_window import SlidingWindow
 from fleetmap.odometry.init.imu_alignment import dynamic_initialization
 from fleetmap.odometry.modes import InertialMode
+from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.odometry_checks import DivergenceMonitor
-from fleetmap.odometry.settings import FilterSettings, TrackerSettings
+from fleetmap.odometry.settings import FilterSettings, OdometrySettings, TrackerSettings
 from fleetmap.odometry.tracking.tracker import Earlier, Tracked, Tracker
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame

@@ -14,7 +14,7 @@ from fleetmap.errors import CalibrationError
 from fleetmap.features.extraction import extract
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.features.settings import OrbSettings, StereoSettings
-from fleetmap.odometry import make_odometry
+from fleetmap.odometry.mono.mono_modes import make_odometry
 from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.pnp.pnp import REFINEMENT
 from fleetmap.recordings.calibration_files import format_calibration, parse_calibration, read_calibration

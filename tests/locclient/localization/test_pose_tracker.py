@@ -7,7 +7,7 @@ import pytest
 
 from fleetmap.features import orb
 from fleetmap.geometry import se3, se3_inverse, so3_exp
-from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.rectification import MountedCamera, StereoCamera

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.common import estimator_loop
 from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.messages import Cause, Status
-from fleetmap.odometry import OdometryStatus
+from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier

@@ -11,7 +11,7 @@ from fleetmap import failure_definition
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import se3
 from fleetmap.messages import Cause, FailureKind, FailureReport, Status
-from fleetmap.odometry import OdometryStatus
+from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.estimate import Estimate, Hypothesis

@@ -8,7 +8,7 @@ import pytest
 
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Status
-from fleetmap.odometry import OdometryStatus
+from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.sensors.samples import PositionPrior, WheelSample
 from locclient.localization.estimate import Estimate
 from locclient.robot.motion_checks import DockCheck, SpeedGauge

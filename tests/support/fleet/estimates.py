@@ -4,7 +4,7 @@ import numpy as np
 
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Status
-from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sources.intake import Intake

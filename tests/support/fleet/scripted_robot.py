@@ -11,7 +11,7 @@ import pytest
 from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.messages import Status
-from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration

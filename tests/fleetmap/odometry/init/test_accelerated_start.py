@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, rotation_angle_rad, se3, so3_exp
-from fleetmap.odometry import Odometry, OdometryEstimate, OdometrySettings
+from fleetmap.odometry.estimate import OdometryEstimate
+from fleetmap.odometry.odometry import Odometry
+from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, WheelSample

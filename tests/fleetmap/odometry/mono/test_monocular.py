@@ -7,18 +7,14 @@ import pytest
 
 from fleetmap.geometry import Array, align_points, transform_points
 from fleetmap.inertial import GRAVITY_MPS2
-from fleetmap.odometry import (
-    MonocularOdometry,
-    Odometry,
-    OdometryEstimate,
-    OdometrySettings,
-    OdometryStatus,
-    make_odometry,
-)
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter.nav_state import InitialState
 from fleetmap.odometry.init.imu_alignment import mono_inertial_initialization
 from fleetmap.odometry.mono import mono_modes
+from fleetmap.odometry.mono.mono_modes import MonocularOdometry, make_odometry
+from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.odometry_checks import DivergenceMonitor
+from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, Trajectory

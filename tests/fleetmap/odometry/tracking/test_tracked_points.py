@@ -8,8 +8,8 @@ import pytest
 from fleetmap import core
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import transform_points
-from fleetmap.odometry import Odometry, OdometrySettings
-from fleetmap.odometry.settings import TrackerSettings
+from fleetmap.odometry.odometry import Odometry
+from fleetmap.odometry.settings import OdometrySettings, TrackerSettings
 from fleetmap.pnp.pnp import REFINEMENT
 from fleetmap.sensors.calibration import ImuNoise
 from support.worlds.point_world import noisy_imu

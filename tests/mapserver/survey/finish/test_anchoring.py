@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp, transform_points
-from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.samples import PositionPrior, Trajectory
 from mapserver.survey.finish.dock_alignment import aligned_by_priors
 from mapserver.survey.finish.map_transform import scaled, transform_map

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, skew
-from fleetmap.odometry import OdometryEstimate, OdometryStatus
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.survey.bundle.bundle_rounds import bundle_problem
