@@ -19,7 +19,7 @@ from fleetmap.bus import Bus, TlsFiles, check_endpoint, handshake_fault, has_tls
 from fleetmap.encoding import to_json
 from fleetmap.errors import LinkError, StateError, UsageError, disk_errors
 from fleetmap.files import write_atomically
-from fleetmap.mapformat import check_name
+from fleetmap.mapformat.names import check_name
 from fleetmap.messages import decode_message, robot_key
 
 if TYPE_CHECKING:

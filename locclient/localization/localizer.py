@@ -5,8 +5,8 @@ from dataclasses import replace
 
 from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import se3_inverse
-from fleetmap.mapformat import Tile
 from fleetmap.mapformat.building import Floor
+from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import Cause, Status
 from fleetmap.odometry.estimate import is_away
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes, MapView

@@ -7,7 +7,8 @@ import numpy as np
 from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.config import Section
 from fleetmap.geometry import Array
-from fleetmap.mapformat import Manifest, Tile
+from fleetmap.mapformat.manifest import Manifest
+from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import Status, WantedVersion
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes
 from locclient.localization.estimate import Estimate

@@ -9,15 +9,9 @@ import msgspec
 
 from fleetmap.bus import Bus, Handle
 from fleetmap.errors import LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
-from fleetmap.mapformat import (
-    MAX_MANIFEST_BYTES,
-    Manifest,
-    TileEntry,
-    check_name,
-    sha256_hex,
-    verified,
-)
 from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame, aligned_frame
+from fleetmap.mapformat.manifest import MAX_MANIFEST_BYTES, Manifest, TileEntry
+from fleetmap.mapformat.names import check_name, sha256_hex, verified
 from fleetmap.messages import (
     PART_BYTES,
     ChunkRequest,

@@ -12,18 +12,10 @@ from typing import Any
 
 from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UsageError, disk_errors
-from fleetmap.mapformat import (
-    Manifest,
-    Tile,
-    TileEntry,
-    blob_path,
-    check_name,
-    check_sha256,
-    current_path,
-    decode_manifest,
-    decode_tile,
-    verified,
-)
+from fleetmap.mapformat.manifest import Manifest, TileEntry, decode_manifest
+from fleetmap.mapformat.names import blob_path, check_name, check_sha256, current_path, verified
+from fleetmap.mapformat.tile import Tile
+from fleetmap.mapformat.tile_codec import decode_tile
 from fleetmap.messages import WantedVersion
 from locclient.maps.tile_cache import TileCache
 

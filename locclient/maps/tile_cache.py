@@ -12,7 +12,7 @@ import msgspec
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, StoreError, disk_errors
 from fleetmap.files import sync_path, write_atomically
-from fleetmap.mapformat import blob_path, check_name, check_sha256, verified
+from fleetmap.mapformat.names import blob_path, check_name, check_sha256, verified
 from fleetmap.messages import WantedVersion
 
 DEFAULT_MAX_BYTES = 2_000_000_000

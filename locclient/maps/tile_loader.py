@@ -4,7 +4,8 @@ from dataclasses import dataclass, field
 
 from fleetmap.bow.vocabulary import Vocabulary, decode_vocabulary
 from fleetmap.errors import FleetmapError
-from fleetmap.mapformat import Manifest, Tile
+from fleetmap.mapformat.manifest import Manifest
+from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import WantedVersion
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.version_grid import grid_of, occupancy

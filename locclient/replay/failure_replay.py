@@ -17,7 +17,8 @@ from fleetmap.bow.vocabulary import decode_vocabulary
 from fleetmap.errors import LinkError, UsageError
 from fleetmap.failure_definition import BLIND_S, is_blind
 from fleetmap.failure_summary import FailureSummary, Moment
-from fleetmap.mapformat import check_sha256, decode_manifest
+from fleetmap.mapformat.manifest import decode_manifest
+from fleetmap.mapformat.names import check_sha256
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import MountedCamera, MountedRig

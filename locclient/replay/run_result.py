@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from fleetmap.geometry import Array, align_points, transform_points
-from fleetmap.mapformat import Manifest
+from fleetmap.mapformat.manifest import Manifest
 from fleetmap.messages import Status
 from fleetmap.sensors.samples import Stamps, Trajectory
 from locclient.localization.estimate import Estimate

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fleetmap.failure_definition import known_radius_m
 from fleetmap.features.extraction import extract
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.mapformat import Tile
+from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import MAX_THUMBNAIL_BYTES, CameraNote, Cause, FailureReport, Placement, Thumbnail
 from fleetmap.relocalization.landmark_visibility import cones_of_tiles, match_visible, visible_landmarks
 from fleetmap.sensors.rectification import MountedRig, StereoCamera

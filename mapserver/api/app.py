@@ -15,7 +15,8 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 import fleetmap
 from fleetmap.bus import Bus
 from fleetmap.encoding import to_json
-from fleetmap.mapformat import MANIFEST_FORMAT, TILE_FORMAT
+from fleetmap.mapformat.manifest import MANIFEST_FORMAT
+from fleetmap.mapformat.tile_codec import TILE_FORMAT
 from mapserver.api import building_routes, describe, fleet_routes, inbox_routes, problems, views
 from mapserver.api import parameters as p
 from mapserver.api.bytes_response import bytes_response

@@ -6,7 +6,7 @@ from typing import Annotated, Any, NamedTuple, cast
 from fastapi import APIRouter, Depends, Query, Request, Response
 
 from fleetmap.encoding import to_plain
-from fleetmap.mapformat import sha256_hex
+from fleetmap.mapformat.names import sha256_hex
 from fleetmap.messages import InitialPoseMessage
 from mapserver.api import parameters as p
 from mapserver.api import views

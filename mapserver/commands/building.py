@@ -249,8 +249,8 @@ def list_buildings(*, store: StoreFolder, json: Json = False) -> None:
 
 
 def _entry(text: str) -> "FloorEntry":
-    from fleetmap.mapformat import check_name
     from fleetmap.mapformat.building import FloorEntry
+    from fleetmap.mapformat.names import check_name
 
     site, _, rest = text.partition("=")
     level, _, height = rest.rpartition("@")

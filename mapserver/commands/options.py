@@ -83,7 +83,7 @@ class SurveyOptions(SiteOptions):
 
     def check(self) -> None:
         """Raise UsageError for a report that cannot be written and for an invalid name of the site."""
-        from fleetmap.mapformat import check_name
+        from fleetmap.mapformat.names import check_name
 
         check_output("--report", self.report)
         check_name(self.site, "site")

@@ -22,7 +22,7 @@ from mapserver.commands.options import (
 )
 
 if TYPE_CHECKING:
-    from fleetmap.mapformat import Manifest
+    from fleetmap.mapformat.manifest import Manifest
     from mapserver.releases import Difference
     from mapserver.store import Event, MapStore, VerdictRow, VersionInfo
 

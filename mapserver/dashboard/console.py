@@ -20,7 +20,7 @@ from markupsafe import Markup
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, StoreError, UsageError
-from fleetmap.mapformat import sha256_hex
+from fleetmap.mapformat.names import sha256_hex
 from mapserver.api.guard import SIGN_IN, SIGN_OUT
 from mapserver.api.moments import moment_text, read_moment, read_range, written, zone_of
 from mapserver.api.version_routes import ApiSettings

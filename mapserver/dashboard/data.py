@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from fleetmap.errors import FleetmapError, UsageError
-from fleetmap.mapformat import decode_tile
 from fleetmap.mapformat.building import ALIGNMENT
+from fleetmap.mapformat.tile_codec import decode_tile
 from fleetmap.version_grid import known_grid, occupancy
 from mapserver import releases
 from mapserver.dashboard.map_layers import Box, Layer, Picture, box_of

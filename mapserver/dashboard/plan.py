@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
-from fleetmap.mapformat import Manifest, Tile, TileEntry
+from fleetmap.mapformat.manifest import Manifest, TileEntry
+from fleetmap.mapformat.tile import Tile
 from mapserver.quality.directions import tile_directions
 from mapserver.quality.figures import TileDirections
 

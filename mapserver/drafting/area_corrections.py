@@ -13,7 +13,7 @@ import numpy as np
 
 from fleetmap.encoding import to_json
 from fleetmap.geometry import AnyArray, Array, Rings, inside_any
-from fleetmap.mapformat import Manifest
+from fleetmap.mapformat.manifest import Manifest
 from mapserver.drafting.draft_evidence import Before
 from mapserver.drafting.survey_recordings import RecordingSurvey, map_trajectories
 from mapserver.floor_plan.areas import Area, Areas, CorrectionKind, read_areas

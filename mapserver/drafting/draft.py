@@ -15,7 +15,8 @@ from fleetmap.bow.shipped_vocabulary import default_vocabulary, default_vocabula
 from fleetmap.console import plain_console
 from fleetmap.encoding import to_json, to_plain
 from fleetmap.errors import RecordingError, StoreError, UsageError
-from fleetmap.mapformat import CameraEntry, Tile
+from fleetmap.mapformat.manifest import CameraEntry
+from fleetmap.mapformat.tile import Tile
 from fleetmap.recordings import Topics
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera

@@ -14,7 +14,9 @@ from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.errors import RecordingError
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array
-from fleetmap.mapformat import Manifest, RecordingEntry, Tile, decode_tile, encode_tile
+from fleetmap.mapformat.manifest import Manifest, RecordingEntry
+from fleetmap.mapformat.tile import Tile
+from fleetmap.mapformat.tile_codec import decode_tile, encode_tile
 from fleetmap.recordings import Recording
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import MapView

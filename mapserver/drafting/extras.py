@@ -7,7 +7,7 @@ from typing import NamedTuple
 import msgspec
 
 from fleetmap.geometry import Array
-from fleetmap.mapformat import Manifest
+from fleetmap.mapformat.manifest import Manifest
 from mapserver.drafting.area_corrections import AreaCorrections
 from mapserver.hooks import stage_hooks
 from mapserver.store import MapStore

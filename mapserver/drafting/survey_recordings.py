@@ -17,7 +17,7 @@ from fleetmap.config import Section, load_toml
 from fleetmap.errors import FleetmapError, RecordingError, SurveyError
 from fleetmap.geometry import Array
 from fleetmap.log_lines import printable
-from fleetmap.mapformat import RecordingEntry
+from fleetmap.mapformat.manifest import RecordingEntry
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording
 from fleetmap.recordings.sensor_subset import reduced, with_other_views
 from fleetmap.sensors.calibration import RigCalibration

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.failure_definition import is_wrong
 from fleetmap.geometry import rotation_angle_rad, se3_inverse
-from fleetmap.mapformat import Tile, decode_tile, encode_tile
+from fleetmap.mapformat.tile import Tile
+from fleetmap.mapformat.tile_codec import decode_tile, encode_tile
 from fleetmap.relocalization.landmark_visibility import places_around
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Fix, is_reliable

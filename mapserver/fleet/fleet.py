@@ -11,7 +11,7 @@ from typing import Any
 
 from fleetmap.encoding import to_plain
 from fleetmap.errors import LinkError, StoreError, UsageError
-from fleetmap.mapformat import check_name
+from fleetmap.mapformat.names import check_name
 from fleetmap.messages import (
     MAX_THUMBNAIL_BYTES,
     FailureAck,

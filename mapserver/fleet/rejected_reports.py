@@ -7,8 +7,8 @@ import msgspec
 
 from fleetmap.errors import LinkError, StoreError, UsageError
 from fleetmap.files import write_atomically
-from fleetmap.mapformat import check_name
 from fleetmap.mapformat.manifest import Name
+from fleetmap.mapformat.names import check_name
 from fleetmap.messages import FailureAck
 from mapserver.store.files import check_no_link, make_folder
 

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 
 from fleetmap.errors import FleetmapError
-from fleetmap.mapformat import TileEntry, decode_tile
+from fleetmap.mapformat.manifest import TileEntry
+from fleetmap.mapformat.tile_codec import decode_tile
 from mapserver.fleet_statistics.kpis import Counters, hour_of
 from mapserver.fleet_statistics.resurvey_decision import (
     ResurveySettings,

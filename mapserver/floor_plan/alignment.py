@@ -8,8 +8,8 @@ import numpy as np
 from fleetmap.encoding import to_json
 from fleetmap.errors import StoreError
 from fleetmap.geometry import Array, transform_points
-from fleetmap.mapformat import Manifest
 from fleetmap.mapformat.building import BuildingFrame
+from fleetmap.mapformat.manifest import Manifest
 
 PLAN = "plan"
 """Kind of a site's file in the store that is not sent to robots."""

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 
 import msgspec
 
-from fleetmap.mapformat import Manifest
-from fleetmap.mapformat.manifest import manifest_entry
+from fleetmap.mapformat.manifest import Manifest, manifest_entry
 
 TRUSTED_KEY = "trusted_calibrations"
 """Key of a manifest's configuration with the calibrations trusted by an operator."""

@@ -9,7 +9,7 @@ import msgspec
 from fleetmap.config import Section
 from fleetmap.encoding import to_plain
 from fleetmap.failure_definition import ERROR_LIMIT_M
-from fleetmap.mapformat import Manifest
+from fleetmap.mapformat.manifest import Manifest
 from mapserver.quality.figures import (
     Aliasing,
     Comparison,

@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from fleetmap.mapformat import Manifest, Tile, TileEntry
+from fleetmap.mapformat.manifest import Manifest, TileEntry
+from fleetmap.mapformat.tile import Tile
 
 TileReader = Callable[[str], Tile]
 

@@ -10,7 +10,7 @@ from fleetmap.bus import Bus, Handle
 from fleetmap.errors import FleetmapError, LinkError
 from fleetmap.failure_summary import ReplayPart
 from fleetmap.log_lines import LogLimit
-from fleetmap.mapformat import check_name
+from fleetmap.mapformat.names import check_name
 from fleetmap.messages import (
     FailureAck,
     PoseMessage,

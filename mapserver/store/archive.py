@@ -15,7 +15,7 @@ import numpy as np
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError
 from fleetmap.geometry import AnyArray
-from fleetmap.mapformat import pack, unpack
+from fleetmap.mapformat.container import pack, unpack
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.survey_map import History, SurveyMap, history_of

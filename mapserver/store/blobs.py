@@ -10,7 +10,7 @@ from typing import ClassVar
 
 from fleetmap.errors import MapFormatError, StoreError, disk_errors
 from fleetmap.files import sync_path, write_atomically
-from fleetmap.mapformat import sha256_hex, verified
+from fleetmap.mapformat.names import sha256_hex, verified
 from mapserver.store.files import check_no_link, is_plain_file, make_folder, read_chunks
 
 Listed = tuple[str, int, int]

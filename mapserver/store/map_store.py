@@ -31,17 +31,10 @@ from fleetmap.errors import (
     disk_errors,
 )
 from fleetmap.files import sync_path, write_atomically
-from fleetmap.mapformat import (
-    BlobEntry,
-    Manifest,
-    TileEntry,
-    check_name,
-    current_path,
-    decode_manifest,
-    encode_manifest,
-    encode_tile,
-)
 from fleetmap.mapformat.building import AREAS, BUILDING_KEY
+from fleetmap.mapformat.manifest import BlobEntry, Manifest, TileEntry, decode_manifest, encode_manifest
+from fleetmap.mapformat.names import check_name, current_path
+from fleetmap.mapformat.tile_codec import encode_tile
 from fleetmap.mapformat.version_file import ExportBlob, ExportHead, open_export
 from mapserver.quality.figures import carried_evidence, trusted_calibrations
 from mapserver.store import upkeep

@@ -10,8 +10,9 @@ import msgspec
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, StateError, StoreError, UsageError
-from fleetmap.mapformat import Manifest, check_name, check_sha256, decode_manifest, sha256_hex
 from fleetmap.mapformat.building import ALIGNMENT, AREAS, FLOORS, FOR_ROBOTS, Building, read_building
+from fleetmap.mapformat.manifest import Manifest, decode_manifest
+from fleetmap.mapformat.names import check_name, check_sha256, sha256_hex
 from mapserver.floor_plan.alignment import Alignment, decode_alignment
 from mapserver.floor_plan.areas import Areas, read_areas
 from mapserver.floor_plan.survey_requests import KIND, SurveyRequest, read_request

@@ -6,7 +6,8 @@ from typing import Any
 
 import msgspec
 
-from fleetmap.mapformat import CameraEntry, RecordingEntry, Tile
+from fleetmap.mapformat.manifest import CameraEntry, RecordingEntry
+from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import FailureReport
 from mapserver.quality.figures import Evidence
 

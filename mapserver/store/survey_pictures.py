@@ -6,8 +6,7 @@ from typing import Annotated
 import msgspec
 
 from fleetmap.errors import MapFormatError, NewerFormatError, StateError
-from fleetmap.mapformat import Manifest
-from fleetmap.mapformat.manifest import Positive, Sha256
+from fleetmap.mapformat.manifest import Manifest, Positive, Sha256
 
 PICTURES_KEY = "pictures"
 """Key in `report` of a manifest with the index; older readers ignore it."""

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from fleetmap.errors import FleetmapError
-from fleetmap.mapformat import Manifest, current_path, decode_manifest
+from fleetmap.mapformat.manifest import Manifest, decode_manifest
+from fleetmap.mapformat.names import current_path
 from mapserver.store.blobs import Blobs
 from mapserver.store.database import Database
 from mapserver.store.files import is_plain_file

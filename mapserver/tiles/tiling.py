@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array
-from fleetmap.mapformat import Tile
+from fleetmap.mapformat.tile import Tile
 from mapserver.survey.finish.landmark_visibility import viewing_cones
 from mapserver.survey.survey_map import SurveyMap, history_of
 

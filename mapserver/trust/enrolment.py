@@ -18,7 +18,7 @@ from fleetmap.bus import TlsFiles
 from fleetmap.encoding import to_json
 from fleetmap.errors import LinkError, StateError, StoreError, disk_errors
 from fleetmap.files import write_atomically
-from fleetmap.mapformat import check_name
+from fleetmap.mapformat.names import check_name
 from fleetmap.messages import encode_message
 from fleetmap.trust.enrolment import Bundle, RenewalAnswer, certificate_info, check_request, key_fingerprint
 from mapserver.store import NOBODY, Actor, MapStore

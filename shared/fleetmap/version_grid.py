@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, NewerFormatError, StateError, UsageError
 from fleetmap.geometry import se3
-from fleetmap.mapformat import Manifest, sha256_hex
 from fleetmap.mapformat.grid_tile import (
     CELL_M,
     GRID_FORMAT,
@@ -22,7 +21,8 @@ from fleetmap.mapformat.grid_tile import (
     decode_grid_tile,
     encode_grid_tile,
 )
-from fleetmap.mapformat.manifest import Positive, Sha256, TileEntry, manifest_entry
+from fleetmap.mapformat.manifest import Manifest, Positive, Sha256, TileEntry, manifest_entry
+from fleetmap.mapformat.names import sha256_hex
 from fleetmap.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 
 FLOOR_M, SLICE_M, SLICES = 0.10, 0.25, 8  # the ground's unevenness, and the noise of its points

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import LinkError
-from fleetmap.mapformat import blob_path
+from fleetmap.mapformat.names import blob_path
 from locclient.cli import app as locclient_app
 from mapserver.cli import app as mapserver_app
 from mapserver.store import MapStore

@@ -17,7 +17,7 @@ import pytest
 import uvicorn
 
 from fleetmap.bus import Bus
-from fleetmap.mapformat import sha256_hex
+from fleetmap.mapformat.names import sha256_hex
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
 from mapserver.fleet.fleet import Fleet

@@ -18,7 +18,9 @@ from fleetmap.errors import FleetmapError, RecordingError, StateError
 from fleetmap.failure_definition import SILENT_S, is_wrong
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
-from fleetmap.mapformat import Manifest, RecordingEntry, Tile, decode_tile
+from fleetmap.mapformat.manifest import Manifest, RecordingEntry
+from fleetmap.mapformat.tile import Tile
+from fleetmap.mapformat.tile_codec import decode_tile
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
 from fleetmap.recordings.tum import read_tum
 from fleetmap.relocalization.map_view import MapView

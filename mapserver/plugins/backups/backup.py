@@ -17,7 +17,7 @@ from pathlib import Path
 import pyrage
 
 from fleetmap.errors import StateError, UsageError, disk_errors
-from fleetmap.mapformat import sha256_hex
+from fleetmap.mapformat.names import sha256_hex
 from mapserver.plugins.backups.snapshots import LEFT_OUT, NAMED, PIECE_BYTES, BackupTarget, Snapshot
 from mapserver.store import MapStore
 from mapserver.store.database import format_of

@@ -16,7 +16,7 @@ import msgspec
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, MapFormatError, NewerFormatError, StoreError, UsageError
-from fleetmap.mapformat import check_sha256
+from fleetmap.mapformat.names import check_sha256
 from mapserver.store.blobs import Blobs
 from mapserver.store.places import open_objects
 

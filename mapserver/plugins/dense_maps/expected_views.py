@@ -6,7 +6,7 @@ import numpy as np
 
 from fleetmap.errors import StateError, UsageError
 from fleetmap.geometry import Array, se3, so3_exp
-from fleetmap.mapformat import CameraEntry
+from fleetmap.mapformat.manifest import CameraEntry
 from fleetmap.messages import CameraNote, FailureReport
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.rectification import StereoCamera

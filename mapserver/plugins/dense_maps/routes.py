@@ -10,7 +10,7 @@ from fastapi import FastAPI, Query, Request, Response
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
-from fleetmap.mapformat import sha256_hex
+from fleetmap.mapformat.names import sha256_hex
 from fleetmap.occupancy_grid import map_server_files
 from fleetmap.version_grid import FLOOR_M, TOP_M, grid_of, occupancy
 from mapserver.api.bytes_response import bytes_response

@@ -23,7 +23,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fleetmap.mapformat import Tile
+from fleetmap.mapformat.tile import Tile
 from mapserver.plugins.dense_maps.surfel_map import EDGE_M, LEVELS, Surfels
 
 FINEST_M, COARSEST_M = 0.002, 0.2

@@ -14,9 +14,9 @@ from fleetmap import core
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, StateError
 from fleetmap.geometry import AnyArray, Array
-from fleetmap.mapformat import Manifest, sha256_hex
 from fleetmap.mapformat.container import pack, unpack
-from fleetmap.mapformat.manifest import Positive, Sha256, TileEntry, manifest_entry
+from fleetmap.mapformat.manifest import Manifest, Positive, Sha256, TileEntry, manifest_entry
+from fleetmap.mapformat.names import sha256_hex
 from fleetmap.version_grid import decode_index
 from mapserver.plugins.dense_maps.exposure import FALLOFF
 

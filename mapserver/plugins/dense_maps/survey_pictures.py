@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fleetmap.encoding import to_json
 from fleetmap.geometry import Array
-from fleetmap.mapformat import sha256_hex
+from fleetmap.mapformat.names import sha256_hex
 from mapserver.drafting.extras import MappedSession
 from mapserver.store.survey_pictures import MOST, PictureIndex, PicturesReport, SurveyPicture
 

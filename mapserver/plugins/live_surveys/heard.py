@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 from fleetmap.errors import LinkError
-from fleetmap.mapformat import check_name
+from fleetmap.mapformat.names import check_name
 from fleetmap.messages import decode_message, split_key
 from mapserver.plugins.live_surveys.message import LiveSurveyState
 

@@ -15,7 +15,7 @@ import msgspec
 from fleetmap.encoding import to_json
 from fleetmap.errors import BusyError, disk_errors
 from fleetmap.files import write_atomically
-from fleetmap.mapformat import sha256_hex
+from fleetmap.mapformat.names import sha256_hex
 from mapserver.store.database import Database, StoreFiles, Transaction
 from mapserver.store.files import is_plain_file, make_folder
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.mapformat import Tile
+from fleetmap.mapformat.tile import Tile
 from fleetmap.relocalization.landmark_visibility import Rows, VisibleLandmarks, visible_landmarks
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import StereoCamera

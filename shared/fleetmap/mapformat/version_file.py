@@ -26,8 +26,9 @@ import msgspec
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, NewerFormatError, StoreError, disk_errors
-from fleetmap.mapformat import Manifest, check_name, decode_manifest, decode_tile, verified
-from fleetmap.mapformat.manifest import MAX_MANIFEST_BYTES, Name, Positive, Sha256
+from fleetmap.mapformat.manifest import MAX_MANIFEST_BYTES, Manifest, Name, Positive, Sha256, decode_manifest
+from fleetmap.mapformat.names import check_name, verified
+from fleetmap.mapformat.tile_codec import decode_tile
 
 EXPORT_MAGIC = b"FMEX"
 EXPORT_FORMAT = 3

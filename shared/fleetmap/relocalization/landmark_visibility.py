@@ -14,7 +14,7 @@ from fleetmap import core
 from fleetmap.features.matching import Projected, match_by_projection
 from fleetmap.features.orb import SCALE_FACTOR, Features
 from fleetmap.geometry import AnyArray, Array
-from fleetmap.mapformat import Tile
+from fleetmap.mapformat.tile import Tile
 from fleetmap.relocalization.settings import FixSettings
 from fleetmap.sensors.rectification import StereoCamera
 

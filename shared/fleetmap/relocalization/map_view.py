@@ -13,7 +13,7 @@ from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.features.matching import Descriptors, packed
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array
-from fleetmap.mapformat import Tile
+from fleetmap.mapformat.tile import Tile
 from fleetmap.pnp.pnp import REFINEMENT
 from fleetmap.relocalization.landmark_visibility import (
     Rows,

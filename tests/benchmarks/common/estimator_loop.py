@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.features import orb
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transform_points
-from fleetmap.mapformat import Tile
+from fleetmap.mapformat.tile import Tile
 from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.settings import OdometrySettings, TrackerSettings

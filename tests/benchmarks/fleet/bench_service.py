@@ -22,7 +22,10 @@ import numpy as np
 from benchmarks.common.recorded_runs import parsed, write_results
 from benchmarks.fleet.server_process import SITE, measured
 from fleetmap.bus import Bus
-from fleetmap.mapformat import Manifest, Tile, decode_manifest, decode_tile, verified
+from fleetmap.mapformat.manifest import Manifest, decode_manifest
+from fleetmap.mapformat.names import verified
+from fleetmap.mapformat.tile import Tile
+from fleetmap.mapformat.tile_codec import decode_tile
 from fleetmap.messages import WantedVersion, decode_message, robot_key
 from locclient.maps.map_client import ChunkReader
 from mapserver import releases

@@ -26,7 +26,7 @@ from rich.console import Console
 from benchmarks.common.recorded_runs import parsed, played, write_results
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import se3_inverse
-from fleetmap.mapformat import decode_tile
+from fleetmap.mapformat.tile_codec import decode_tile
 from fleetmap.recordings import open_recording
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame

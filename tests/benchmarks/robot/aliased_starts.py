@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from benchmarks.common import estimator_loop
 from benchmarks.robot.standing_robot import standing
 from fleetmap.geometry import Array, se3_inverse
-from fleetmap.mapformat import Tile
+from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import Status
 from fleetmap.relocalization.map_view import LookAlikes, MapView
 from fleetmap.sensors.rectification import StereoCamera

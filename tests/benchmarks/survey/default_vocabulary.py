@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from fleetmap.bow.vocabulary import encode_vocabulary
 from fleetmap.features.orb import detect
 from fleetmap.features.settings import OrbSettings
-from fleetmap.mapformat import sha256_hex
+from fleetmap.mapformat.names import sha256_hex
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
 from fleetsim.recorder import Order, prepare

@@ -7,7 +7,8 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from fleetmap.mapformat import MAX_TILE_PLACES, decode_tile, pack
+from fleetmap.mapformat.container import pack
+from fleetmap.mapformat.tile_codec import MAX_TILE_PLACES, decode_tile
 
 _LIMIT = 16 << 20
 

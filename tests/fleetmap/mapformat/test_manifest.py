@@ -9,23 +9,25 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fleetmap.errors import MapFormatError, UsageError
-from fleetmap.mapformat import (
+from fleetmap.mapformat.manifest import (
     BlobEntry,
     CameraEntry,
     Manifest,
+    Name,
     RecordingEntry,
     TileEntry,
+    decode_manifest,
+    encode_manifest,
+)
+from fleetmap.mapformat.names import (
+    NAME_PATTERN,
     blob_path,
     check_name,
     check_sha256,
     current_path,
-    decode_manifest,
-    encode_manifest,
     sha256_hex,
     verified,
 )
-from fleetmap.mapformat.manifest import Name
-from fleetmap.mapformat.names import NAME_PATTERN
 from fleetmap.mapformat.version_file import ExportHead
 from support.fleet.contracts_documents import REPOSITORY
 

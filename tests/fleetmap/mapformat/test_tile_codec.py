@@ -13,15 +13,9 @@ from hypothesis import strategies as st
 
 from fleetmap.errors import MapFormatError
 from fleetmap.geometry import rotation_angle_rad, se3
-from fleetmap.mapformat import (
-    LANDMARK_BYTES,
-    MAX_TILE_PLACES,
-    Tile,
-    decode_tile,
-    encode_tile,
-    pack,
-    unpack,
-)
+from fleetmap.mapformat.container import pack, unpack
+from fleetmap.mapformat.tile import Tile
+from fleetmap.mapformat.tile_codec import LANDMARK_BYTES, MAX_TILE_PLACES, decode_tile, encode_tile
 from support.storage.map_samples import random_tile
 
 LIMIT = 64 << 20

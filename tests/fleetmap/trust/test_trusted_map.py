@@ -23,7 +23,7 @@ from tuf.api.metadata import (
 )
 
 from fleetmap.errors import FleetmapError, LinkError, UnreachableError, UntrustedError
-from fleetmap.mapformat import sha256_hex
+from fleetmap.mapformat.names import sha256_hex
 from fleetmap.messages import Part, WantedVersion, encode_message, robot_key
 from fleetmap.trust import Ask, TrustedMap, ask_over, manifest_target, site_role, tuf_client
 from support.fleet.memory_bus import MemoryBus, MemoryHub

@@ -10,7 +10,7 @@ import pytest
 
 from fleetmap.errors import LinkError, StoreError
 from fleetmap.failure_summary import ReplayPart
-from fleetmap.mapformat import blob_path
+from fleetmap.mapformat.names import blob_path
 from fleetmap.messages import (
     PART_BYTES,
     FailureAck,

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from fleetmap.encoding import to_json
-from fleetmap.mapformat import current_path
 from fleetmap.mapformat.building import FLOORS, Building, FloorEntry
+from fleetmap.mapformat.names import current_path
 from fleetmap.trust import TrustedMap, ask_over
 from locclient.maps.building_maps import BuildingMaps
 from locclient.maps.map_client import MapClient

@@ -11,8 +11,8 @@ import pytest
 from tuf.api.metadata import MetaFile, Snapshot, Timestamp
 
 from fleetmap.errors import FleetmapError, LinkError, UntrustedError
-from fleetmap.mapformat import blob_path
 from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame
+from fleetmap.mapformat.names import blob_path
 from fleetmap.messages import (
     PART_BYTES,
     RobotAck,

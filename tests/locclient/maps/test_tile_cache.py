@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fleetmap.errors import MapFormatError, StoreError
-from fleetmap.mapformat import blob_path, sha256_hex
+from fleetmap.mapformat.names import blob_path, sha256_hex
 from locclient.maps.tile_cache import ActiveVersion, TileCache
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import FleetmapError, StoreError
-from fleetmap.mapformat import blob_path
+from fleetmap.mapformat.names import blob_path
 from fleetmap.messages import Status, WantedVersion
 from locclient.maps.loaded_map import PositionBound, PositionBoundTracker, TileSelectionSettings
 from locclient.maps.map_source import LocalMapSource

@@ -9,7 +9,9 @@ import psutil
 import pytest
 
 from fleetmap.errors import StoreError
-from fleetmap.mapformat import TILE_FORMAT, blob_path, decode_manifest, decode_tile, sha256_hex
+from fleetmap.mapformat.manifest import decode_manifest
+from fleetmap.mapformat.names import blob_path, sha256_hex
+from fleetmap.mapformat.tile_codec import TILE_FORMAT, decode_tile
 from fleetmap.messages import RobotAck, RobotHealth, Thumbnail
 from mapserver.api import app as app_module
 from mapserver.quality.figures import Evidence, RigEvidence

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from fleetmap.mapformat import decode_manifest, encode_manifest
-from fleetmap.mapformat.manifest import building_frame
+from fleetmap.mapformat.manifest import building_frame, decode_manifest, encode_manifest
 from fleetmap.messages import FailureReport, Placement
 from mapserver import releases
 from mapserver.api.metrics import Metrics

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fleetmap.mapformat import blob_path
+from fleetmap.mapformat.names import blob_path
 from mapserver.store import MapStore
 from support.storage.map_samples import publish_samples, save_sample_draft
 

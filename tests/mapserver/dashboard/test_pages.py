@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Locator, Page, expect
 
 from fleetmap.bus import Bus
-from fleetmap.mapformat import blob_path
+from fleetmap.mapformat.names import blob_path
 from fleetmap.messages import FailureAck, decode_message, encode_message, robot_key
 from mapserver.store import MapStore
 from support.fleet.dashboard_scene import (

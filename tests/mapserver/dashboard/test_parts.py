@@ -14,8 +14,8 @@ import pytest
 from PIL import Image
 
 from fleetmap.geometry import se3, se3_inverse
-from fleetmap.mapformat import Manifest
 from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame
+from fleetmap.mapformat.manifest import Manifest
 from fleetmap.occupancy_grid import OccupancyGrid
 from mapserver import releases
 from mapserver.dashboard import fleet_parts, map_layers

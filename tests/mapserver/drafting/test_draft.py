@@ -14,7 +14,7 @@ from fleetmap.bow.shipped_vocabulary import DEFAULT_VOCABULARY_SHA256
 from fleetmap.bow.vocabulary import decode_vocabulary
 from fleetmap.errors import FleetmapError, RecordingError, StoreError, UsageError
 from fleetmap.geometry import Array
-from fleetmap.mapformat import decode_tile
+from fleetmap.mapformat.tile_codec import decode_tile
 from mapserver.cli import app
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive

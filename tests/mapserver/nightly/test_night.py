@@ -30,7 +30,7 @@ from fleetmap.errors import (
     SurveyError,
     UsageError,
 )
-from fleetmap.mapformat import RecordingEntry
+from fleetmap.mapformat.manifest import RecordingEntry
 from fleetmap.recordings import OpenOptions, open_recording
 from fleetmap.sensors.samples import SensorSet
 from mapserver import releases

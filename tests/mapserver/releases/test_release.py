@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import GateRefusedError, MapFormatError, StateError, StoreError, UsageError
-from fleetmap.mapformat import blob_path, current_path
+from fleetmap.mapformat.names import blob_path, current_path
 from mapserver import releases
 from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, RigEvidence, TrustedCalibration
 from mapserver.quality.gate import GateSettings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import LinkError, MapFormatError, UnreachableError
-from fleetmap.mapformat import blob_path, sha256_hex
+from fleetmap.mapformat.names import blob_path, sha256_hex
 from fleetmap.messages import (
     FailureAck,
     PoseMessage,

@@ -18,7 +18,7 @@ import pytest
 
 from fleetmap.bus import Bus
 from fleetmap.errors import LinkError
-from fleetmap.mapformat import sha256_hex
+from fleetmap.mapformat.names import sha256_hex
 from fleetmap.messages import (
     FailureAck,
     Part,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import MapFormatError
-from fleetmap.mapformat import pack
+from fleetmap.mapformat.container import pack
 from mapserver.store.archive import decode_archive, encode_archive
 from support.storage.map_samples import random_survey
 

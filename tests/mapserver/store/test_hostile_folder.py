@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from fleetmap.errors import StoreError
-from fleetmap.mapformat import blob_path, current_path
+from fleetmap.mapformat.names import blob_path, current_path
 from mapserver.store import MapStore, Retention
 from mapserver.store.files import keep_reserve, locked
 from support.command_line import status

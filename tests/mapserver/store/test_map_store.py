@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import GateRefusedError, MapFormatError, StoreError
-from fleetmap.mapformat import current_path, decode_tile, sha256_hex
+from fleetmap.mapformat.names import current_path, sha256_hex
+from fleetmap.mapformat.tile_codec import decode_tile
 from mapserver import releases
 from mapserver.store import Actor, DraftContent, MapStore, chain_faults, queries, schema
 from mapserver.store.places import read_places

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from fleetmap.errors import FleetmapError, MapFormatError, StateError, StoreError
-from fleetmap.mapformat import current_path
+from fleetmap.mapformat.names import current_path
 from mapserver import releases
 from mapserver.store import Actor, MapStore, Retention, chain_faults
 from mapserver.store.places import read_places

@@ -16,7 +16,7 @@ from playwright.sync_api import Page, expect
 
 from fleetmap.bus import Bus
 from fleetmap.geometry import se3
-from fleetmap.mapformat import Tile
+from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import (
     FailureReport,
     FixNote,

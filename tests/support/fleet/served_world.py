@@ -5,7 +5,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from fleetmap.mapformat import Tile, decode_tile
+from fleetmap.mapformat.tile import Tile
+from fleetmap.mapformat.tile_codec import decode_tile
 from fleetmap.messages import (
     WantedVersion,
 )

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from fleetmap.mapformat import blob_path
+from fleetmap.mapformat.names import blob_path
 from mapserver.store import MapStore
 from mapserver.store.places import open_objects, read_places
 

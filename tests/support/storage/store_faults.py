@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fleetmap.mapformat import current_path
+from fleetmap.mapformat.names import current_path
 from mapserver import releases
 from mapserver.store import Actor, DraftContent, MapStore, Retention
 from support.storage.faulty_disk import Disk, in_child

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.features.orb import SCALE_FACTOR, Features
 from fleetmap.geometry import Array, se3, se3_inverse, transform_points
-from fleetmap.mapformat import Tile
+from fleetmap.mapformat.tile import Tile
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Relocalizer

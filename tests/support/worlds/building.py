@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fleetmap.mapformat import Tile
 from fleetmap.mapformat.building import Building, BuildingFrame, FloorEntry
+from fleetmap.mapformat.tile import Tile
 from mapserver.fleet.floors import keep_building
 from mapserver.floor_plan.alignment import Alignment, encode_alignment
 from mapserver.store import NOBODY, MapStore

@@ -11,8 +11,9 @@ import numpy as np
 from fleetmap.bow.vocabulary import decode_vocabulary, encode_vocabulary
 from fleetmap.features import orb
 from fleetmap.geometry import Array
-from fleetmap.mapformat import CameraEntry, Tile
 from fleetmap.mapformat.grid_tile import TILE_CELLS
+from fleetmap.mapformat.manifest import CameraEntry
+from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples

@@ -14,7 +14,7 @@ import pytest
 
 from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, MapFormatError, StoreError, UsageError
-from fleetmap.mapformat import blob_path, sha256_hex
+from fleetmap.mapformat.names import blob_path, sha256_hex
 from fleetmap.messages import WantedVersion
 from fleetmap.trust import TrustedMap
 from mapserver.plugins.backups.backup import back_up, recipient_of

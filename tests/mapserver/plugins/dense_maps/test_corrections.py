@@ -3,7 +3,7 @@
 import numpy as np
 
 from fleetmap.geometry import Array
-from fleetmap.mapformat import sha256_hex
+from fleetmap.mapformat.names import sha256_hex
 from mapserver.drafting.area_corrections import AreaCorrections
 from mapserver.floor_plan.areas import Area, Correction, CorrectionKind
 from mapserver.plugins.dense_maps.stage import Corrected

@@ -12,7 +12,7 @@ from playwright.sync_api import Page, expect
 
 from fleetmap.bus import Bus
 from fleetmap.geometry import Array, se3
-from fleetmap.mapformat import Tile
+from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import CameraNote, FailureAck, Placement, decode_message, encode_message, robot_key
 from mapserver.plugins.dense_maps import space_points as points
 from mapserver.plugins.dense_maps.pages import robot_views

@@ -6,7 +6,7 @@ import pytest
 
 from fleetmap.errors import MapFormatError, NewerFormatError, StateError
 from fleetmap.geometry import se3, so3_exp
-from fleetmap.mapformat import sha256_hex
+from fleetmap.mapformat.names import sha256_hex
 from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.plugins.dense_maps.survey_pictures import (
     kept_pictures,
