@@ -16,8 +16,10 @@ from typing import Any
 from fleetmap.errors import UsageError
 from fleetmap.recordings.ros2 import definitions
 
-# The definitions of the messages and services of the node, and of those in recordings, field by field as ROS 2 fixes them.
-DEFINITIONS = definitions.DEFINITIONS | {
+# The definitions of the messages and services of the node, and of those in recordings, field by field as ROS 2 fixes them: those by which
+# messages are packed and unpacked.
+DEFINITIONS = definitions.DEFINITIONS
+DEFINITIONS |= {
     "std_msgs/String": "string data",
     "nav_msgs/MapMetaData": (
         "builtin_interfaces/Time map_load_time\nfloat32 resolution\nuint32 width\nuint32 height\ngeometry_msgs/Pose origin"

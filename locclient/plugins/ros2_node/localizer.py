@@ -19,13 +19,8 @@ from fleetmap.geometry import Array, se3_inverse, so3_log
 from fleetmap.messages import Status
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.odometry.estimate import OdometryStatus
-from fleetmap.recordings.ros2.cdr import CdrReader, CdrWriter
-from fleetmap.recordings.ros2.messages import (
-    FrameLink,
-    decode_frame_links,
-    encode_frame_links,
-    encode_prior,
-)
+from fleetmap.recordings.ros2.cdr import pack, unpack
+from fleetmap.recordings.ros2.messages import FrameLink, decode_frame_links, encode_frame_links, encode_prior
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import PositionPrior
 from fleetmap.sensors.source_settings import Topics
@@ -105,46 +100,40 @@ def requested(request: bytes, state: LifecycleState) -> Transition | None:
 
     None for a transition that does not begin at this state. ValueError for an invalid request.
     """
-    reader = CdrReader(request)
-    number, label = reader.byte(), reader.text()
+    number, label = unpack("lifecycle_msgs/srv/ChangeState_Request", request)
     here = [transition for transition in TRANSITIONS if transition.start is state]
     return next((one for one in here if (one.label == label if label else one.id == number)), None)
 
 
 def encode_state(state: LifecycleState) -> bytes:
     """Encode the response of lifecycle_msgs/srv/GetState."""
-    return _put_state(CdrWriter(), state).message()
+    return pack("lifecycle_msgs/srv/GetState_Response", *_named(state))
 
 
 def encode_states() -> bytes:
     """Encode the response of lifecycle_msgs/srv/GetAvailableStates."""
-    writer = CdrWriter().unsigned(len(LifecycleState))
-    for state in LifecycleState:
-        _put_state(writer, state)
-    return writer.message()
+    return pack("lifecycle_msgs/srv/GetAvailableStates_Response", [_named(state) for state in LifecycleState])
 
 
 def encode_transitions(transitions: Sequence[Transition], *, with_success: bool = False) -> bytes:
     """Encode the response of lifecycle_msgs/srv/GetAvailableTransitions; with_success: include those out of transition states."""
     both = [[one.steps[number] for one in transitions] for number in range(1 + with_success)]
-    steps = dict.fromkeys(step for listed in both for step in listed)
-    writer = CdrWriter().unsigned(len(steps))
-    for step in steps:
-        _put_step(writer, *step)
-    return writer.message()
+    steps = dict.fromkeys(_values(step) for listed in both for step in listed)
+    return pack("lifecycle_msgs/srv/GetAvailableTransitions_Response", steps)
 
 
 def encode_events(stamp_ns: int, transition: Transition) -> list[bytes]:
     """Encode two lifecycle_msgs/TransitionEvent: into the transition state, and out of it."""
-    return [_put_step(CdrWriter().long_unsigned(stamp_ns), *step).message() for step in transition.steps]
+    return [pack("lifecycle_msgs/TransitionEvent", stamp_ns, *_values(step)) for step in transition.steps]
 
 
-def _put_state(writer: CdrWriter, state: LifecycleState) -> CdrWriter:
-    return writer.byte(state.value).text(state.name.lower())
+def _named(state: LifecycleState) -> tuple[int, str]:
+    return state.value, state.name.lower()
 
 
-def _put_step(writer: CdrWriter, number: int, label: str, start: LifecycleState, goal: LifecycleState) -> CdrWriter:
-    return _put_state(_put_state(writer.byte(number).text(label), start), goal)
+def _values(step: Step) -> tuple[int | str, ...]:
+    number, label, start, goal = step
+    return number, label, *_named(start), *_named(goal)
 
 
 _BOND_PERIOD_S, _BOND_TIMEOUT_S = 0.1, 4.0  # as in nav2
@@ -358,7 +347,7 @@ class Ros2Localizer(Publisher):
             transition = requested(request, self._state)
             if transition is None:
                 _log.warning("a requested transition does not begin at %s", self._state.name.lower())
-                return CdrWriter().byte(0).message()
+                return pack("lifecycle_msgs/srv/ChangeState_Response", False)
             if transition.start is LifecycleState.ACTIVE:
                 self._break_bond()
             self._state = transition.goal
@@ -368,7 +357,7 @@ class Ros2Localizer(Publisher):
         for event in encode_events(time.time_ns(), transition):
             self._send_event(event)
         _log.info("the node is %s", transition.goal.name.lower())
-        return CdrWriter().byte(1).message()
+        return pack("lifecycle_msgs/srv/ChangeState_Response", True)
 
     def _take_initial_pose(self, message: bytes) -> bytes:
         try:

@@ -11,11 +11,12 @@ import numpy as np
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array
 from fleetmap.occupancy_grid import OccupancyGrid
-from fleetmap.recordings.ros2.cdr import CdrReader, CdrWriter
-from fleetmap.recordings.ros2.messages import HALVES_SWAPPED, decode_prior, header_of, position_quat_xyzw
+from fleetmap.recordings.ros2 import messages
+from fleetmap.recordings.ros2.cdr import pack, unpack
 from fleetmap.sensors.samples import UNSAID_SIGMAS, PositionPrior
+from locclient.plugins.ros2_node import keys  # noqa: F401 -- has the definitions of the messages here
 
-EMPTY = CdrWriter().byte(0).message()  # a message without fields
+EMPTY = pack("std_srvs/srv/Empty_Response", 0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +57,11 @@ def decode_initial_pose(data: bytes, map_frame: str) -> PositionPrior:
 
     RecordingError for another frame, a pose or covariance that is not finite, and an invalid covariance.
     """
-    _, frame_id = header_of(data)
+    _, frame_id = messages.header_of(data)
     if frame_id.lstrip("/") != map_frame:
         raise RecordingError(f"an initial pose in the frame {frame_id!r} is not used; give it in {map_frame!r}")
     try:
-        prior = decode_prior(data)
+        prior = messages.decode_prior(data)
     except ValueError as error:
         raise RecordingError(f"an initial pose is not used: {error}; give a finite pose and a quaternion") from error
     cov = prior.cov_rot_trans
@@ -81,47 +82,35 @@ def decode_initial_pose(data: bytes, map_frame: str) -> PositionPrior:
 
 def encode_text(text: str) -> bytes:
     """std_msgs/String."""
-    return CdrWriter().text(text).message()
+    return pack("std_msgs/String", text)
 
 
 def encode_motion(stamp_ns: int, frame_id: str, child_frame_id: str, motion: Motion) -> bytes:
     """nav_msgs/Odometry."""
-    writer = CdrWriter().header(stamp_ns, frame_id).text(child_frame_id)
-    writer.doubles(position_quat_xyzw(motion.odom_from_base)).doubles(motion.cov_rot_trans[HALVES_SWAPPED])
-    return writer.doubles(motion.twist_base).doubles(motion.twist_cov).message()
+    placed = motion.odom_from_base, motion.cov_rot_trans[messages.HALVES_SWAPPED]
+    return messages.encode_motion(stamp_ns, frame_id, child_frame_id, *placed, motion.twist_base, motion.twist_cov)
 
 
 def encode_diagnostics(stamp_ns: int, diagnoses: Sequence[Diagnosis]) -> bytes:
     """diagnostic_msgs/DiagnosticArray."""
-    writer = CdrWriter().header(stamp_ns, "").unsigned(len(diagnoses))
-    for one in diagnoses:
-        writer.byte(one.level).text(one.name).text(one.message).text(one.hardware_id).unsigned(len(one.values))
-        for key, value in one.values.items():
-            writer.text(key).text(value)
-    return writer.message()
+    rows = [(one.level, one.name, one.message, one.hardware_id, one.values.items()) for one in diagnoses]
+    return pack("diagnostic_msgs/DiagnosticArray", stamp_ns, "", rows)
 
 
 def encode_bond(stamp_ns: int, status: BondStatus, timeout_s: float, period_s: float) -> bytes:
     """bond/Status."""
-    writer = CdrWriter().header(stamp_ns, "").text(status.bond).text(status.instance).byte(status.is_active)
-    return writer.single(timeout_s).single(period_s).message()
+    return pack("bond/Status", stamp_ns, "", status.bond, status.instance, status.is_active, timeout_s, period_s)
 
 
 def decode_bond(data: bytes) -> BondStatus:
     """bond/Status."""
-    reader = CdrReader(data)
-    reader.stamp_ns(), reader.text()
-    return BondStatus(reader.text(), reader.text(), bool(reader.byte()))
+    _, _, bond, instance, is_active, *_ = unpack("bond/Status", data)
+    return BondStatus(bond, instance, bool(is_active))
 
 
 def encode_grid(stamp_ns: int, frame_id: str, grid: OccupancyGrid) -> bytes:
     """nav_msgs/OccupancyGrid."""
     height, width = grid.cells.shape
-    writer = (
-        CdrWriter().header(stamp_ns, frame_id).time(stamp_ns).single(grid.resolution_m).unsigned(width).unsigned(height)
-    )
-    return (
-        writer.doubles(position_quat_xyzw(grid.map_from_grid))
-        .blob(np.ascontiguousarray(grid.cells, np.int8).tobytes())
-        .message()
-    )
+    place, cells = messages.position_quat_xyzw(grid.map_from_grid), np.ascontiguousarray(grid.cells, np.int8).tobytes()
+    size = grid.resolution_m, width, height
+    return pack("nav_msgs/OccupancyGrid", stamp_ns, frame_id, stamp_ns, *size, place, cells)

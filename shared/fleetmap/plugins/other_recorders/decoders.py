@@ -18,7 +18,7 @@ from fleetmap.geometry import Array
 from fleetmap.recordings.images import StoredImage
 from fleetmap.recordings.mcap.container import Channel, Container
 from fleetmap.recordings.ros2 import messages as ros
-from fleetmap.recordings.ros2.cdr import CdrReader
+from fleetmap.recordings.ros2.cdr import unpack
 from fleetmap.sensors.samples import Stamps
 
 ENCODINGS = ("cdr", "ros1", "protobuf")
@@ -44,6 +44,11 @@ class CameraInfo:
     binning: tuple[int, int] = (1, 1)
     roi: tuple[int, int, int, int] = (0, 0, 0, 0)
     stamp_ns: int = 0
+
+    @property
+    def frame(self) -> str:
+        """Name of the camera's frame in the transforms."""
+        return self.frame_id.lstrip("/")
 
 
 class AnyEncoding(Container):
@@ -155,16 +160,12 @@ def _camera_info(m: Any) -> CameraInfo:
 
 def decode_camera_info(data: bytes) -> CameraInfo:
     """sensor_msgs/CameraInfo."""
-    reader = CdrReader(data)
-    stamp_ns, frame_id = reader.stamp_ns(), reader.text()
-    height, width, lens = reader.unsigned(), reader.unsigned(), reader.text()
-    distortion = reader.doubles(reader.unsigned())
-    matrix, rect, projection = reader.doubles(9), reader.doubles(9), reader.doubles(12)
-    binning = reader.unsigned() or 1, reader.unsigned() or 1
-    x, y, roi_height, roi_width = (reader.unsigned() for _ in range(4))
-    matrices = matrix.reshape(3, 3), rect.reshape(3, 3), projection.reshape(3, 4)
-    roi = x, y, roi_width, roi_height
-    return CameraInfo(frame_id, width, height, lens, distortion, *matrices, binning, roi, stamp_ns)
+    stamp_ns, frame_id, height, width, lens, distortion, matrices, bin_x, bin_y, x, y, roi_height, roi_width, _ = (
+        unpack("sensor_msgs/CameraInfo", data)
+    )
+    matrix, rect, projection = (each.reshape(3, -1) for each in np.split(matrices, [9, 18]))
+    binning, roi = (bin_x or 1, bin_y or 1), (x, y, roi_width, roi_height)
+    return CameraInfo(frame_id, width, height, lens, distortion, matrix, rect, projection, binning, roi, stamp_ns)
 
 
 def _links(items: Sequence[Any]) -> list[ros.FrameLink]:

@@ -8,7 +8,7 @@ from typing import Any
 from fleetmap.geometry import Array
 from fleetmap.recordings.limits import KeptBytes
 from fleetmap.recordings.ros2 import messages as ros
-from fleetmap.recordings.ros2.cdr import CdrReader
+from fleetmap.recordings.ros2.cdr import unpack
 from fleetmap.sensors.samples import DataIssue, Stamps
 
 CALIBRATION_ATTACHMENT = "calibration.yaml"
@@ -60,7 +60,8 @@ class Container(KeptBytes):
 
     def stamp_of(self, channel: Channel, data: bytes) -> int:
         """Stamp of a message with a header, 0 where the sender set none; UNDECODABLE without one."""
-        return CdrReader(data[:16]).stamp_ns()
+        seconds, nanoseconds = unpack("builtin_interfaces/Time", data)
+        return int(seconds * 1_000_000_000 + nanoseconds)
 
     def close(self) -> None:
         """Close the files."""

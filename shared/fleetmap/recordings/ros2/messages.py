@@ -13,7 +13,7 @@ import numpy as np
 
 from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
 from fleetmap.recordings.images import INVERSE_DEPTH, StoredImage, file_kind
-from fleetmap.recordings.ros2.cdr import CdrReader, CdrWriter
+from fleetmap.recordings.ros2.cdr import byte_order, pack, unpack
 from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import PositionPrior, Stamps, WheelSample
 
@@ -45,31 +45,26 @@ class FrameLink:
 
 def header_of(data: bytes) -> tuple[int, str]:
     """Stamp in ns and frame_id of a message that begins with a header."""
-    reader = CdrReader(data)
-    return reader.stamp_ns(), reader.text()
+    stamp_ns, frame_id = unpack("std_msgs/Header", data)
+    return stamp_ns, frame_id
 
 
 def decode_image(data: bytes, where: str) -> StoredImage:
     """sensor_msgs/Image."""
-    reader = CdrReader(data)
-    reader.stamp_ns(), reader.text()
-    height, width, encoding = reader.unsigned(), reader.unsigned(), reader.text()
-    big_endian, step = bool(reader.byte()), reader.unsigned()
-    return StoredImage(encoding, reader.blob(), where, width, height, step, big_endian)
+    _, _, height, width, encoding, big_endian, step, pixels = unpack("sensor_msgs/Image", data)
+    return StoredImage(encoding, pixels, where, width, height, step, bool(big_endian))
 
 
 def encode_image(stamp_ns: int, frame_id: str, image: StoredImage) -> bytes:
     """sensor_msgs/Image of an image stored in rows."""
-    writer = CdrWriter().header(stamp_ns, frame_id).unsigned(image.height_px).unsigned(image.width_px)
-    writer.text(image.encoding).byte(image.big_endian).unsigned(image.step_bytes)
-    return writer.blob(image.data).message()
+    size = image.height_px, image.width_px
+    form = image.encoding, image.big_endian, image.step_bytes
+    return pack("sensor_msgs/Image", stamp_ns, frame_id, *size, *form, image.data)
 
 
 def decode_compressed_image(data: bytes, where: str) -> StoredImage:
     """sensor_msgs/CompressedImage: an image file's bytes, after a 12-byte header if packed by compressed_depth_image_transport."""
-    reader = CdrReader(data)
-    reader.stamp_ns(), reader.text()
-    form, content = reader.text(), reader.blob()
+    _, _, form, content = unpack("sensor_msgs/CompressedImage", data)
     if "compressedDepth" in form and form.strip().startswith("32FC1"):
         return StoredImage(INVERSE_DEPTH, content, where, form=form)
     if "compressedDepth" in form and file_kind(content[12:]) == "png":
@@ -79,11 +74,11 @@ def decode_compressed_image(data: bytes, where: str) -> StoredImage:
 
 def encode_compressed_image(stamp_ns: int, frame_id: str, image: StoredImage, form: str) -> bytes:
     """sensor_msgs/CompressedImage of an image file's bytes."""
-    return CdrWriter().header(stamp_ns, frame_id).text(form).blob(image.data).message()
+    return pack("sensor_msgs/CompressedImage", stamp_ns, frame_id, form, image.data)
 
 
 def encode_camera_info(stamp_ns: int, frame_id: str, camera: CameraCalibration) -> bytes:
-    """sensor_msgs/CameraInfo of an unrectified camera: its projection is that of the camera itself."""
+    """sensor_msgs/CameraInfo of an unrectified camera: its projection is that of the camera itself, without binning, of the whole image."""
     fx, fy, cx, cy = camera.intrinsics_px
     matrix = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
     name, distortion = camera.model, camera.distortion
@@ -91,12 +86,9 @@ def encode_camera_info(stamp_ns: int, frame_id: str, camera: CameraCalibration) 
         name, distortion = "plumb_bob", np.pad(distortion, (0, 5 - len(distortion)))
     elif name == "radial-tangential":
         name = "rational_polynomial"
-    writer = CdrWriter().header(stamp_ns, frame_id).unsigned(camera.height_px).unsigned(camera.width_px)
-    writer.text(name).unsigned(len(distortion)).doubles(distortion)
-    writer.doubles(matrix).doubles(np.eye(3)).doubles(np.hstack([matrix, np.zeros((3, 1))]))
-    for _ in range(6):  # binning_x binning_y and the region of interest: all zero means the whole image
-        writer.unsigned(0)
-    return writer.byte(0).message()
+    matrices = np.concatenate([each.ravel() for each in (matrix, np.eye(3), np.pad(matrix, ((0, 0), (0, 1))))])
+    values = camera.height_px, camera.width_px, name, distortion, matrices
+    return pack("sensor_msgs/CameraInfo", stamp_ns, frame_id, *values, *[0] * 7)
 
 
 def decode_imu(messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
@@ -109,17 +101,15 @@ def decode_imu(messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
         *columns, frame_ids = zip(*(decode_imu([data]) for data in messages), strict=True)
         stamps_ns, gyro, accel = (np.concatenate(column) for column in columns)
         return stamps_ns, gyro, accel, frame_ids[0]
-    reader = CdrReader(messages[0])
-    _, frame_id = header_of(messages[0])
-    name_bytes = int(np.frombuffer(messages[0][12:16], reader.endian + "u4")[0])
+    _, frame_id, _ = unpack("sensor_msgs/Imu", messages[0])  # ValueError if it is too short
+    order = byte_order(messages[0])
+    name_bytes = int(np.frombuffer(messages[0][12:16], order + "u4")[0])
     start = 16 + name_bytes + (-(12 + name_bytes) % 8)
-    if len(messages[0]) < start + 8 * _IMU_DOUBLES:
-        raise ValueError(f"an Imu message of {len(messages[0])} bytes is too short")
     table = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)
-    seconds = np.ascontiguousarray(table[:, 4:8]).view(reader.endian + "i4")[:, 0].astype(np.int64)
-    nanoseconds = np.ascontiguousarray(table[:, 8:12]).view(reader.endian + "u4")[:, 0].astype(np.int64)
+    seconds = np.ascontiguousarray(table[:, 4:8]).view(order + "i4")[:, 0].astype(np.int64)
+    nanoseconds = np.ascontiguousarray(table[:, 8:12]).view(order + "u4")[:, 0].astype(np.int64)
     doubles = np.ascontiguousarray(table[:, start : start + 8 * _IMU_DOUBLES])
-    values = doubles.view(reader.endian + "f8").astype(np.float64)
+    values = doubles.view(order + "f8").astype(np.float64)
     return seconds * 1_000_000_000 + nanoseconds, values[:, 13:16].copy(), values[:, 25:28].copy(), frame_id
 
 
@@ -128,7 +118,7 @@ def encode_imu(stamp_ns: int, frame_id: str, gyro_radps: Array, accel_mps2: Arra
     values = np.zeros(_IMU_DOUBLES)
     values[3], values[4] = 1.0, -1.0
     values[13:16], values[25:28] = gyro_radps, accel_mps2
-    return CdrWriter().header(stamp_ns, frame_id).doubles(values).message()
+    return pack("sensor_msgs/Imu", stamp_ns, frame_id, values)
 
 
 def decode_odometry(data: bytes) -> WheelSample:
@@ -136,10 +126,7 @@ def decode_odometry(data: bytes) -> WheelSample:
 
     A variance that is not positive is unknown.
     """
-    reader = CdrReader(data)
-    stamp_ns, _ = reader.stamp_ns(), reader.text()
-    reader.text()
-    values = reader.doubles(7 + 36 + 6 + 36)
+    stamp_ns, _, _, values = unpack("nav_msgs/Odometry", data)
     twist, variances = values[43:49], np.diag(values[49:].reshape(6, 6))
     sigma_mps = float(np.sqrt(variances[0])) if variances[0] > 0 else UNKNOWN_WHEEL_SIGMA_MPS
     sigma_radps = float(np.sqrt(variances[5])) if variances[5] > 0 else UNKNOWN_WHEEL_SIGMA_RADPS
@@ -152,50 +139,51 @@ def encode_odometry(sample: WheelSample, frame_id: str, child_frame_id: str) -> 
     """nav_msgs/Odometry that carries the twist; its pose stays at the origin with an infinite variance."""
     twist = np.concatenate([sample.velocity_base_mps, [0.0, 0.0, sample.yaw_rate_radps]])
     variances = np.diag([sample.sigma_mps**2] * 3 + [sample.sigma_radps**2] * 3)
-    writer = CdrWriter().header(sample.stamp_ns, frame_id).text(child_frame_id)
-    writer.doubles(position_quat_xyzw(np.eye(4))).doubles(np.diag(np.full(6, np.inf))).doubles(twist)
-    return writer.doubles(variances).message()
+    return encode_motion(sample.stamp_ns, frame_id, child_frame_id, np.eye(4), np.diag([np.inf] * 6), twist, variances)
+
+
+def encode_motion(
+    stamp_ns: int, frame_id: str, child_id: str, frame_from_child: Array, cov: Array, twist: Array, twist_cov: Array
+) -> bytes:
+    """nav_msgs/Odometry; covariances (6, 6) in ROS's order, translation first."""
+    values = [each.ravel() for each in (position_quat_xyzw(frame_from_child), cov, twist, twist_cov)]
+    return pack("nav_msgs/Odometry", stamp_ns, frame_id, child_id, np.concatenate(values))
 
 
 def decode_prior(data: bytes) -> PositionPrior:
     """geometry_msgs/PoseWithCovarianceStamped as map_from_base."""
-    reader = CdrReader(data)
-    stamp_ns, _ = reader.stamp_ns(), reader.text()
-    position_quat_xyzw = reader.doubles(7)
-    norm = float(np.linalg.norm(position_quat_xyzw[3:]))
-    if not np.isfinite(position_quat_xyzw).all() or abs(norm - 1) > 0.01:
-        raise ValueError(f"the quaternion {position_quat_xyzw[3:].tolist()} is not of unit length")
-    map_from_base = se3(rotation_from_quat_wxyz(position_quat_xyzw[[6, 3, 4, 5]]), position_quat_xyzw[:3])
-    return PositionPrior(stamp_ns, map_from_base, reader.doubles(36).reshape(6, 6)[HALVES_SWAPPED])
+    stamp_ns, _, values = unpack("geometry_msgs/PoseWithCovarianceStamped", data)
+    position_m, quat_xyzw, cov = np.split(values, [3, 7])
+    if not np.isfinite(values[:7]).all() or abs(float(np.linalg.norm(quat_xyzw)) - 1) > 0.01:
+        raise ValueError(f"the quaternion {quat_xyzw.tolist()} is not of unit length")
+    map_from_base = se3(rotation_from_quat_wxyz(quat_xyzw[[3, 0, 1, 2]]), position_m)
+    return PositionPrior(stamp_ns, map_from_base, cov.reshape(6, 6)[HALVES_SWAPPED])
 
 
 def encode_prior(prior: PositionPrior, frame_id: str) -> bytes:
     """geometry_msgs/PoseWithCovarianceStamped."""
-    writer = CdrWriter().header(prior.stamp_ns, frame_id).doubles(position_quat_xyzw(prior.map_from_base))
-    return writer.doubles(prior.cov_rot_trans[HALVES_SWAPPED]).message()
+    values = np.append(position_quat_xyzw(prior.map_from_base), prior.cov_rot_trans[HALVES_SWAPPED])
+    return pack("geometry_msgs/PoseWithCovarianceStamped", prior.stamp_ns, frame_id, values)
 
 
 def decode_pose(data: bytes) -> tuple[int, Array]:
     """geometry_msgs/PoseStamped: stamp and x y z qw qx qy qz (7,), not checked."""
-    reader = CdrReader(data)
-    stamp_ns, _ = reader.stamp_ns(), reader.text()
-    return stamp_ns, reader.doubles(7)[[0, 1, 2, 6, 3, 4, 5]]
+    stamp_ns, _, values = unpack("geometry_msgs/PoseStamped", data)
+    return stamp_ns, values[[0, 1, 2, 6, 3, 4, 5]]
 
 
 def encode_pose(stamp_ns: int, frame_id: str, frame_from_body: Array) -> bytes:
     """geometry_msgs/PoseStamped."""
-    return CdrWriter().header(stamp_ns, frame_id).doubles(position_quat_xyzw(frame_from_body)).message()
+    return pack("geometry_msgs/PoseStamped", stamp_ns, frame_id, position_quat_xyzw(frame_from_body))
 
 
 def decode_frame_links(data: bytes) -> list[FrameLink]:
     """tf2_msgs/TFMessage."""
-    reader = CdrReader(data)
-    links = []
-    for _ in range(reader.unsigned()):
-        stamp_ns, parent, child = reader.stamp_ns(), reader.text(), reader.text()
-        values = reader.doubles(7)
-        links.append(replace(frame_link(parent, child, values[:3], values[[6, 3, 4, 5]]), stamp_ns=stamp_ns))
-    return links
+    (links,) = unpack("tf2_msgs/TFMessage", data)
+    return [
+        replace(frame_link(parent, child, values[:3], values[[6, 3, 4, 5]]), stamp_ns=stamp_ns)
+        for stamp_ns, parent, child, values in links
+    ]
 
 
 def frame_link(parent: str, child: str, translation: Array, quat_wxyz: Array) -> FrameLink:
@@ -215,10 +203,8 @@ def frame_link(parent: str, child: str, translation: Array, quat_wxyz: Array) ->
 
 def encode_frame_links(stamp_ns: int, links: Sequence[FrameLink]) -> bytes:
     """tf2_msgs/TFMessage."""
-    writer = CdrWriter().unsigned(len(links))
-    for link in links:
-        writer.header(stamp_ns, link.parent).text(link.child).doubles(position_quat_xyzw(link.parent_from_child))
-    return writer.message()
+    values = [(stamp_ns, k.parent, k.child, position_quat_xyzw(k.parent_from_child)) for k in links]
+    return pack("tf2_msgs/TFMessage", values)
 
 
 def position_quat_xyzw(target_from_source: Array) -> Array:

@@ -8,7 +8,7 @@ import pytest
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.messages import Status
-from fleetmap.recordings.ros2.cdr import CdrReader
+from fleetmap.recordings.ros2.cdr import unpack
 from fleetmap.recordings.ros2.messages import decode_frame_links, decode_prior
 from fleetmap.sensors.source_settings import SourceSection, Topics
 from fleetmap.sources.source import open_source
@@ -43,7 +43,7 @@ def test_ros_topics_hold_the_same() -> None:
     assert [(link.parent, link.child) for link in links] == [("map", "odom"), *[("odom", "base_link")] * 2]
     np.testing.assert_allclose(links[0].parent_from_child @ links[1].parent_from_child, expected, atol=1e-12)
     states = told[RmwZenohKeys(3).key("/localization/status", "std_msgs/String")]
-    assert [CdrReader(state).text() for state in states] == ["TRACKING", "LOST"]
+    assert [unpack("std_msgs/String", state) for state in states] == [["TRACKING"], ["LOST"]]
 
 
 def test_the_building_is_told_once_the_map_says_it() -> None:
