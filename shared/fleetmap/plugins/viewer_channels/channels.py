@@ -9,37 +9,7 @@ from typing import Any, BinaryIO, NamedTuple, Self
 
 import numpy as np
 from foxglove import Schema
-from foxglove.messages import (
-    ArrowPrimitive,
-    CameraCalibration,
-    Color,
-    CompressedImage,
-    FrameTransform,
-    FrameTransforms,
-    ImageAnnotations,
-    LinePrimitive,
-    LinePrimitiveLineType,
-    Log,
-    LogLevel,
-    PackedElementField,
-    PackedElementFieldNumericType,
-    Point2,
-    Point3,
-    PointCloud,
-    PointsAnnotation,
-    PointsAnnotationType,
-    Pose,
-    PoseInFrame,
-    PosesInFrame,
-    Quaternion,
-    SceneEntity,
-    SceneEntityDeletion,
-    SceneEntityDeletionType,
-    SceneUpdate,
-    TextPrimitive,
-    Timestamp,
-    Vector3,
-)
+from foxglove import messages as fox
 from mcap.writer import CompressionType, Writer
 
 from fleetmap.encoding import to_json, to_plain
@@ -55,25 +25,27 @@ _MAX_PATH = 2000
 _QUALITY = 80
 _LAST_S = (1 << 32) - 1
 REPORT = Schema(name="fleetmap.FailureReport", encoding="jsonschema", data=b"")
-CHANNELS: dict[str, Schema] = {
-    "/map": PointCloud.get_schema(),
-    "/path": PosesInFrame.get_schema(),
-    "/tf": FrameTransforms.get_schema(),
-    "/robots": SceneUpdate.get_schema(),
-    "/fixes": PoseInFrame.get_schema(),
-    "/camera": CompressedImage.get_schema(),
-    "/camera/calibration": CameraCalibration.get_schema(),
-    "/camera/matches": ImageAnnotations.get_schema(),
-    "/log": Log.get_schema(),
-    "/survey/landmarks": PointCloud.get_schema(),
-    "/survey/path": PosesInFrame.get_schema(),
-    "/survey/revisits": SceneUpdate.get_schema(),
-    "/survey/robot": SceneUpdate.get_schema(),
-    "/failures/log": Log.get_schema(),
-    "/failures/place": PoseInFrame.get_schema(),
-    "/failures/frame": CompressedImage.get_schema(),
-    "/failures/matches": CompressedImage.get_schema(),
-    "/failures/report": REPORT,
+_KINDS: dict[str, Any] = {
+    "/map": fox.PointCloud,
+    "/path": fox.PosesInFrame,
+    "/tf": fox.FrameTransforms,
+    "/robots": fox.SceneUpdate,
+    "/fixes": fox.PoseInFrame,
+    "/camera": fox.CompressedImage,
+    "/camera/calibration": fox.CameraCalibration,
+    "/camera/matches": fox.ImageAnnotations,
+    "/log": fox.Log,
+    "/survey/landmarks": fox.PointCloud,
+    "/survey/path": fox.PosesInFrame,
+    "/survey/revisits": fox.SceneUpdate,
+    "/survey/robot": fox.SceneUpdate,
+    "/failures/log": fox.Log,
+    "/failures/place": fox.PoseInFrame,
+    "/failures/frame": fox.CompressedImage,
+    "/failures/matches": fox.CompressedImage,
+}
+CHANNELS: dict[str, Schema] = {topic: kind.get_schema() for topic, kind in _KINDS.items()} | {
+    "/failures/report": REPORT
 }
 
 _GOOD, _WARN, _BAD = (0.15, 0.65, 0.35), (0.95, 0.65, 0.1), (0.85, 0.2, 0.2)
@@ -84,10 +56,10 @@ _COLOURS: dict[str, tuple[float, float, float]] = {
     Status.AMBIGUOUS: _BAD,
     Status.LOST: _BAD,
 }
-_LEVELS: dict[str, LogLevel] = {
-    Status.TRACKING: LogLevel.Info,
-    Status.INITIALISING: LogLevel.Info,
-    Status.DEGRADED: LogLevel.Warning,
+_LEVELS: dict[str, fox.LogLevel] = {
+    Status.TRACKING: fox.LogLevel.Info,
+    Status.INITIALISING: fox.LogLevel.Info,
+    Status.DEGRADED: fox.LogLevel.Warning,
 }
 
 
@@ -155,24 +127,20 @@ class ChannelWriter:
 def points(stamp_ns: int, points_map: Array, topic: str = "/map", frame: str = MAP) -> ChannelMessage:
     """Landmarks (N, 3), thinned evenly if there are too many."""
     kept = points_map[:: max(1, math.ceil(len(points_map) / MAX_POINTS))]
-    kind = PackedElementFieldNumericType.Float32
-    fields = [PackedElementField(name=name, offset=4 * n, type=kind) for n, name in enumerate("xyz")]
+    kind = fox.PackedElementFieldNumericType.Float32
+    fields = [fox.PackedElementField(name=name, offset=4 * n, type=kind) for n, name in enumerate("xyz")]
     data = np.ascontiguousarray(kept, "<f4").tobytes()
-    cloud = PointCloud(
-        timestamp=_stamp(stamp_ns), frame_id=frame, pose=_located(np.eye(4)), point_stride=12, fields=fields, data=data
-    )
-    return ChannelMessage(topic, stamp_ns, cloud.encode())
+    placed = {"frame_id": frame, "pose": _located(np.eye(4))}
+    return _stamped(topic, stamp_ns, **placed, point_stride=12, fields=fields, data=data)
 
 
 def path(stamp_ns: int, positions_m: Array, topic: str = "/path", frame: str = MAP) -> ChannelMessage:
     """Positions (N, 3) of a path, thinned evenly; the last one is among them."""
     step = max(1, math.ceil(len(positions_m) / _MAX_PATH))
-    level = Quaternion(w=1.0)
+    level = fox.Quaternion(w=1.0)
     kept = positions_m[::-1][::step][::-1].tolist()
-    found = [Pose(position=Vector3(x=x, y=y, z=z), orientation=level) for x, y, z in kept]
-    return ChannelMessage(
-        topic, stamp_ns, PosesInFrame(timestamp=_stamp(stamp_ns), frame_id=frame, poses=found).encode()
-    )
+    poses = [fox.Pose(position=fox.Vector3(x=x, y=y, z=z), orientation=level) for x, y, z in kept]
+    return _stamped(topic, stamp_ns, frame_id=frame, poses=poses)
 
 
 def links(stamp_ns: int, given: Iterable[tuple[str, str, Array]]) -> ChannelMessage:
@@ -180,44 +148,28 @@ def links(stamp_ns: int, given: Iterable[tuple[str, str, Array]]) -> ChannelMess
     found = []
     for parent, child, parent_from_child in given:
         translation, rotation = _parts(parent_from_child)
-        found.append(
-            FrameTransform(
-                timestamp=_stamp(stamp_ns),
-                parent_frame_id=parent,
-                child_frame_id=child,
-                translation=translation,
-                rotation=rotation,
-            )
-        )
-    return ChannelMessage("/tf", stamp_ns, FrameTransforms(transforms=found).encode())
+        frames: dict[str, Any] = {"timestamp": _stamp(stamp_ns), "parent_frame_id": parent, "child_frame_id": child}
+        found.append(fox.FrameTransform(**frames, translation=translation, rotation=rotation))
+    return ChannelMessage("/tf", stamp_ns, fox.FrameTransforms(transforms=found).encode())
 
 
 def robots(stamp_ns: int, marks: Sequence[RobotMark], topic: str = "/robots", frame: str = MAP) -> ChannelMessage:
     """All robots as arrows with labels; replaces those shown before."""
     entities = []
     for mark in marks:
-        colour, above = _COLOURS.get(mark.status, _QUIET), mark.map_from_base.copy()
+        colour, above = _colour(_COLOURS.get(mark.status, _QUIET)), mark.map_from_base.copy()
         above[2, 3] += 0.6
-        arrow = ArrowPrimitive(
-            pose=_located(mark.map_from_base),
-            shaft_length=0.5,
-            shaft_diameter=0.15,
-            head_length=0.3,
-            head_diameter=0.35,
-            color=_colour(colour),
-        )
-        words = f"{mark.name}: {mark.status}"
-        text = TextPrimitive(
-            pose=_located(above), billboard=True, font_size=14, scale_invariant=True, color=_colour(colour), text=words
-        )
+        sizes = {"shaft_length": 0.5, "shaft_diameter": 0.15, "head_length": 0.3, "head_diameter": 0.35}
+        arrow = fox.ArrowPrimitive(pose=_located(mark.map_from_base), color=colour, **sizes)
+        shown: dict[str, Any] = {"text": f"{mark.name}: {mark.status}", "font_size": 14, "color": colour}
+        text = fox.TextPrimitive(pose=_located(above), billboard=True, scale_invariant=True, **shown)
         entities.append(_entity(stamp_ns, frame, mark.name, arrows=[arrow], texts=[text]))
-    return ChannelMessage(topic, stamp_ns, _scene(stamp_ns, entities))
+    return _scene(topic, stamp_ns, entities)
 
 
 def place(topic: str, stamp_ns: int, map_from_base: Array) -> ChannelMessage:
     """A place (4, 4) in `map`: a fix, or the start of a failure."""
-    found = PoseInFrame(timestamp=_stamp(stamp_ns), frame_id=MAP, pose=_located(map_from_base))
-    return ChannelMessage(topic, stamp_ns, found.encode())
+    return _stamped(topic, stamp_ns, frame_id=MAP, pose=_located(map_from_base))
 
 
 def picture(stamp_ns: int, left: Image) -> ChannelMessage:
@@ -227,56 +179,45 @@ def picture(stamp_ns: int, left: Image) -> ChannelMessage:
 
 def jpeg(topic: str, stamp_ns: int, data: bytes) -> ChannelMessage:
     """A JPEG of the left camera."""
-    image = CompressedImage(timestamp=_stamp(stamp_ns), frame_id=CAMERA, data=data, format="jpeg")
-    return ChannelMessage(topic, stamp_ns, image.encode())
+    return _stamped(topic, stamp_ns, frame_id=CAMERA, data=data, format="jpeg")
 
 
 def lens(stamp_ns: int, camera: StereoCamera) -> ChannelMessage:
     """The rectified left camera, with which a viewer projects the map into its images."""
-    matrix = camera.matrix
-    calibration = CameraCalibration(
-        timestamp=_stamp(stamp_ns),
-        frame_id=CAMERA,
-        width=camera.width_px,
-        height=camera.height_px,
-        distortion_model="plumb_bob",
-        D=[0.0] * 5,
-        K=matrix.ravel().tolist(),
-        R=np.eye(3).ravel().tolist(),
-        P=np.pad(matrix, ((0, 0), (0, 1))).ravel().tolist(),
-    )
-    return ChannelMessage("/camera/calibration", stamp_ns, calibration.encode())
+    matrices = {"K": camera.matrix, "R": np.eye(3), "P": np.pad(camera.matrix, ((0, 0), (0, 1)))}
+    rows = {name: matrix.ravel().tolist() for name, matrix in matrices.items()}
+    size = {"width": camera.width_px, "height": camera.height_px}
+    undistorted = {"distortion_model": "plumb_bob", "D": [0.0] * 5}
+    return _stamped("/camera/calibration", stamp_ns, frame_id=CAMERA, **size, **undistorted, **rows)
 
 
 def matches(stamp_ns: int, pixels: Array, expected: Array | None = None) -> ChannelMessage:
     """Observed pixels (N, 2) of landmarks; expected (N, 2): pixels predicted by the map, joined by lines."""
-    colour = _colour(_GOOD)
-    drawn = [_annotation(stamp_ns, pixels, PointsAnnotationType.Points, colour)]
+    drawn = [_annotation(stamp_ns, pixels, fox.PointsAnnotationType.Points, _colour(_GOOD))]
     if expected is not None:
         ends = np.column_stack([pixels, expected]).reshape(-1, 2)
-        drawn.append(_annotation(stamp_ns, ends, PointsAnnotationType.LineList, _colour(_WARN)))
-    found = ImageAnnotations(timestamp=_stamp(stamp_ns), points=drawn)
-    return ChannelMessage("/camera/matches", stamp_ns, found.encode())
+        drawn.append(_annotation(stamp_ns, ends, fox.PointsAnnotationType.LineList, _colour(_WARN)))
+    return _stamped("/camera/matches", stamp_ns, points=drawn)
 
 
 def status_log(stamp_ns: int, robot: str, status: str, cause: str) -> ChannelMessage:
     """A log line with a robot's status."""
     words = f"{status}: {cause}" if cause else status
-    return _log("/log", stamp_ns, words, robot, _LEVELS.get(status, LogLevel.Error))
+    return _stamped("/log", stamp_ns, level=_LEVELS.get(status, fox.LogLevel.Error), message=words, name=robot)
 
 
 def lines(stamp_ns: int, ends_m: Array, topic: str, frame: str) -> ChannelMessage:
     """Lines between two places (L, 2, 2) on the ground of a frame."""
-    corners = [Point3(x=x, y=y) for x, y in ends_m.reshape(-1, 2).tolist()]
-    line = LinePrimitive(
-        type=LinePrimitiveLineType.LineList,
+    corners = [fox.Point3(x=x, y=y) for x, y in ends_m.reshape(-1, 2).tolist()]
+    line = fox.LinePrimitive(
+        type=fox.LinePrimitiveLineType.LineList,
         pose=_located(np.eye(4)),
         thickness=2.0,
         scale_invariant=True,
         points=corners,
         color=_colour(_WARN),
     )
-    return ChannelMessage(topic, stamp_ns, _scene(stamp_ns, [_entity(stamp_ns, frame, topic, lines=[line])]))
+    return _scene(topic, stamp_ns, [_entity(stamp_ns, frame, topic, lines=[line])])
 
 
 def failure(
@@ -286,8 +227,8 @@ def failure(
     if where is None:
         where = "nowhere" if report.tile is None else "tile {},{}".format(*report.tile)
     words = f"{report.kind}: {report.cause}, {report.duration_s:.1f} s, version {report.version}, {where}"
-    level = LogLevel.Warning if report.kind == FailureKind.SUSPECTED else LogLevel.Error
-    found = [_log("/failures/log", stamp_ns, words, report.robot, level)]
+    level = fox.LogLevel.Warning if report.kind == FailureKind.SUSPECTED else fox.LogLevel.Error
+    found = [_stamped("/failures/log", stamp_ns, level=level, message=words, name=report.robot)]
     if report.map_from_base is not None:
         placed = report.map_from_base
         if np.isfinite([*placed.position_m, *placed.quat_wxyz]).all():
@@ -300,45 +241,43 @@ def failure(
     return found
 
 
-def _log(topic: str, stamp_ns: int, words: str, name: str, level: LogLevel) -> ChannelMessage:
-    return ChannelMessage(
-        topic, stamp_ns, Log(timestamp=_stamp(stamp_ns), level=level, message=words, name=name).encode()
-    )
+def _stamped(topic: str, stamp_ns: int, **fields: Any) -> ChannelMessage:
+    return ChannelMessage(topic, stamp_ns, _KINDS[topic](timestamp=_stamp(stamp_ns), **fields).encode())
 
 
-def _scene(stamp_ns: int, entities: list[SceneEntity]) -> bytes:
-    gone = SceneEntityDeletion(timestamp=_stamp(stamp_ns), type=SceneEntityDeletionType.All)
-    return SceneUpdate(deletions=[gone], entities=entities).encode()
+def _scene(topic: str, stamp_ns: int, entities: list[fox.SceneEntity]) -> ChannelMessage:
+    gone = fox.SceneEntityDeletion(timestamp=_stamp(stamp_ns), type=fox.SceneEntityDeletionType.All)
+    return ChannelMessage(topic, stamp_ns, fox.SceneUpdate(deletions=[gone], entities=entities).encode())
 
 
-def _entity(stamp_ns: int, frame: str, name: str, **drawn: Any) -> SceneEntity:
-    return SceneEntity(timestamp=_stamp(stamp_ns), frame_id=frame, id=name, frame_locked=True, **drawn)
+def _entity(stamp_ns: int, frame: str, name: str, **drawn: Any) -> fox.SceneEntity:
+    return fox.SceneEntity(timestamp=_stamp(stamp_ns), frame_id=frame, id=name, frame_locked=True, **drawn)
 
 
-def _annotation(stamp_ns: int, pixels: Array, kind: PointsAnnotationType, colour: Color) -> PointsAnnotation:
-    corners = [Point2(x=u, y=v) for u, v in pixels.tolist()]
-    return PointsAnnotation(
+def _annotation(
+    stamp_ns: int, pixels: Array, kind: fox.PointsAnnotationType, colour: fox.Color
+) -> fox.PointsAnnotation:
+    corners = [fox.Point2(x=u, y=v) for u, v in pixels.tolist()]
+    return fox.PointsAnnotation(
         timestamp=_stamp(stamp_ns), type=kind, points=corners, outline_color=colour, fill_color=colour, thickness=2.0
     )
 
 
-def _stamp(stamp_ns: int) -> Timestamp:
+def _stamp(stamp_ns: int) -> fox.Timestamp:
     """Clamp a time to 1970 to 2106."""
-    return Timestamp(sec=min(max(0, stamp_ns) // 10**9, _LAST_S), nsec=max(0, stamp_ns) % 10**9)
+    return fox.Timestamp(sec=min(max(0, stamp_ns) // 10**9, _LAST_S), nsec=max(0, stamp_ns) % 10**9)
 
 
-def _parts(target_from_source: Array) -> tuple[Vector3, Quaternion]:
-    (x, y, z), (qw, qx, qy, qz) = (
-        target_from_source[:3, 3].tolist(),
-        quat_wxyz_from_rotation(target_from_source[:3, :3]).tolist(),
-    )
-    return Vector3(x=x, y=y, z=z), Quaternion(x=qx, y=qy, z=qz, w=qw)
+def _parts(target_from_source: Array) -> tuple[fox.Vector3, fox.Quaternion]:
+    x, y, z = target_from_source[:3, 3].tolist()
+    qw, qx, qy, qz = quat_wxyz_from_rotation(target_from_source[:3, :3]).tolist()
+    return fox.Vector3(x=x, y=y, z=z), fox.Quaternion(x=qx, y=qy, z=qz, w=qw)
 
 
-def _located(target_from_source: Array) -> Pose:
+def _located(target_from_source: Array) -> fox.Pose:
     position, orientation = _parts(target_from_source)
-    return Pose(position=position, orientation=orientation)
+    return fox.Pose(position=position, orientation=orientation)
 
 
-def _colour(rgb: tuple[float, float, float]) -> Color:
-    return Color(r=rgb[0], g=rgb[1], b=rgb[2], a=1.0)
+def _colour(rgb: tuple[float, float, float]) -> fox.Color:
+    return fox.Color(r=rgb[0], g=rgb[1], b=rgb[2], a=1.0)
