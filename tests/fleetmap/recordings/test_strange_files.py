@@ -13,7 +13,6 @@ from contracts.test_recordings import WITHOUT_CALIBRATION, WRITERS
 from fleetmap.errors import FleetmapError, RecordingError
 from fleetmap.recordings import OpenOptions, open_recording
 from fleetmap.recordings.ros2 import messages as ros_messages
-from fleetmap.recordings.tum import parse_tum, read_tum
 from support.command_line import status
 from support.recordings.bag_samples import write_rosbag1
 from support.recordings.mcap_samples import SAMPLE, foreign_messages, write_foreign
@@ -93,36 +92,6 @@ def test_zip_files_are_to_be_unpacked(tmp_path: Path, name: str) -> None:
         archive.writestr("mav0/cam0/data.csv", "")
     with pytest.raises(RecordingError, match=f"{name} is a zip file; `unzip` it"):
         open_recording(tmp_path / name)
-
-
-LINES = ["1.0 0 0 0 0 0 0 1", "1.1 1 0 0 0 0 0 1"]
-
-
-@pytest.mark.parametrize(
-    ("lines", "says"),
-    [
-        (["1400000000000000000 0 0 0 0 0 0 1"], "it looks like ns; write seconds"),
-        (["1400000000000 0 0 0 0 0 0 1"], "it looks like ms; write seconds"),
-        (["1400000000000000 0 0 0 0 0 0 1"], "it looks like us; write seconds"),
-        (["1 0 0 0 0 1 0 0 0 0 1 0"], "KITTI's twelve numbers of a matrix and no stamp"),
-        ([LINES[0], "1.1 nan 0 0 0 0 0 1"], "line 2: .* holds NaN or infinity"),
-        (
-            ["1.4e9 0 0 0 0 0 0 1", "1.4e9 1 0 0 0 0 0 1"],
-            "line 2: stamp 1.4e9 does not rise, it is that of the line before; .*nine decimals",
-        ),
-        (LINES[::-1], "stamp 1.0 does not rise, sort the lines by time"),
-        ([LINES[0], "1.1 x 0 0 0 0 0 1"], "not all numbers, 'x' is not a number"),
-    ],
-)
-def test_trajectories_that_are_no_tum(lines: list[str], says: str) -> None:
-    with pytest.raises(RecordingError, match=says):
-        parse_tum("\n".join(lines))
-
-
-def test_a_header_and_windows_line_ends_are_no_lines_of_a_trajectory(tmp_path: Path) -> None:
-    file = tmp_path / "a.tum"
-    file.write_bytes(b"\xef\xbb\xbf" + "\r\n".join(["timestamp tx ty tz qx qy qz qw", *LINES]).encode())
-    assert len(read_tum(file)) == 2
 
 
 def rewritten(file: Path, change: Callable[[list[list[str]]], list[list[str]]], joint: str = ",") -> None:
