@@ -1,21 +1,5 @@
 """Errors caused by external input: files, network, users.
 
-FleetmapError                      exit status 3
-├── UsageError                     exit status 2: an invalid command line or setting
-│   └── StateError                 a request that does not fit the current state
-│       └── ChangedError           a change of what somebody else changed since it was looked at
-├── RecordingError                 a recording that cannot be read or contradicts itself
-│   └── CalibrationError           missing or impossible calibration
-├── SurveyError                    a recording from which no correct map can be made
-├── MapFormatError                 invalid tile, manifest or vocabulary bytes
-│   └── NewerFormatError           made by a newer fleetmap; names the required version
-├── StoreError                     a store that cannot be opened, read or written
-├── LinkError                      the other side cannot be reached, refuses or sends an invalid reply
-│   ├── UnreachableError           no reply in time; a later retry may help
-│   └── UntrustedError             refused by signed lists; begins with rollback:, freeze:, signature: or size:
-├── GateRefusedError               exit status 4: the draft is not good enough to publish
-└── BusyError                      exit status 5: another process does the same work
-
 The message holds the offending value and the next step. Caught only in the commands' `main` and the HTTP API.
 "I do not know where I am" is a value with a status, never one of these.
 """

@@ -64,12 +64,11 @@ def may_be_mapped(x_m: float, y_m: float, radius_95_m: float, cells: Iterable[tu
 
     From farther away, the survey did not observe the tile's landmarks. An infinite radius admits every place.
     """
-    reach_m = radius_95_m + size_m
-    return any(
-        hypot(max(x * size_m - x_m, 0.0, x_m - (x + 1) * size_m), max(y * size_m - y_m, 0.0, y_m - (y + 1) * size_m))
-        <= reach_m
-        for x, y in cells
-    )
+
+    def away_m(at_m: float, cell: int) -> float:
+        return max(cell * size_m - at_m, 0.0, at_m - (cell + 1) * size_m)
+
+    return any(hypot(away_m(x_m, x), away_m(y_m, y)) <= radius_95_m + size_m for x, y in cells)
 
 
 class SearchClock:

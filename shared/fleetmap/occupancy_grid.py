@@ -40,7 +40,7 @@ def map_server_files(grid: OccupancyGrid, image_name: str) -> tuple[bytes, bytes
     if trinary:
         shades = np.select([values == value for value in _SHADES], list(_SHADES.values())).astype(np.uint8)
     height, width = shades.shape
-    x, y, _ = (float(v) for v in grid.map_from_grid[:3, 3])
+    x, y, _ = grid.map_from_grid[:3, 3].tolist()
     entries = {
         "image": image_name,
         "mode": "trinary" if trinary else "raw",

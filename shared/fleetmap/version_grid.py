@@ -126,8 +126,7 @@ def grid_blobs(manifest: Manifest, blob: Callable[[str, int], bytes]) -> list[Ti
 
 def known_grid(manifest: Manifest, blob: Callable[[str], bytes]) -> Tiles:
     """As `grid_of`; no tiles for a version without a grid."""
-    report = report_of(manifest)
-    return {} if report is None or report.sha256 is None else grid_of(manifest, blob)
+    return {} if grid_index(manifest) is None else grid_of(manifest, blob)
 
 
 def report_of(manifest: Manifest) -> GridReport | None:

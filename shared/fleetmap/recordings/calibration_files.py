@@ -205,10 +205,10 @@ def parse_calibration(text: str, where: str, folder: Path | None = None) -> Cali
     told = {"imu": noise or not has_imu, "base_from_body": "base_from_body" in file}
     base = file.matrix("base_from_body") if told["base_from_body"] else np.eye(4)
     imu = (noise or ImuNoise()) if has_imu else None
-    named = (*sections, *([file.section("imu0")] if isinstance(file.get("imu0"), dict) else []))
-    topics = dict(zip((*names, "imu0"), (str(section.get("rostopic", "")) for section in named), strict=False))
+    noted = {name: file[name].get("rostopic") for name in (*names, "imu0") if isinstance(file.get(name), dict)}
     assumed = tuple(name for name, is_told in told.items() if not is_told)
-    return CalibrationFile(RigCalibration(tuple(cameras), imu, base, assumed), {k: v for k, v in topics.items() if v})
+    topics = {name: str(topic) for name, topic in noted.items() if topic}
+    return CalibrationFile(RigCalibration(tuple(cameras), imu, base, assumed), topics)
 
 
 def format_calibration(calibration: RigCalibration) -> str:
@@ -336,63 +336,54 @@ def camera_of(values: Section, distortion_key: str, body_from_cam: Array | None 
     if not isinstance(has_depth, bool):
         raise values.error(f"has_depth is {_brief(has_depth)}; write true or false")
     size_px = int(width), int(height)
-    mounting = np.eye(4) if body_from_cam is None else body_from_cam
-    mask = _mask(values, size_px)
-    lens = model, *size_px, intrinsics, distortion, mounting
-    return CameraCalibration(*lens, line_delay_s=delay_s, mask=mask, has_depth=has_depth)
+    lens = model, *size_px, intrinsics, distortion, np.eye(4) if body_from_cam is None else body_from_cam
+    return CameraCalibration(*lens, line_delay_s=delay_s, mask=_mask(values, size_px), has_depth=has_depth)
 
 
 def _mask(values: Section, size_px: tuple[int, int]) -> tuple[Polygon, ...]:
-    value, where = values.get("mask", []), f"{values.where}: mask"
+    value = values.get("mask", [])
     if isinstance(value, str):
-        polygons = _outlines(value, size_px, where, values.folder)
+        polygons = _outlines(values, value, size_px)
     else:
         try:
             polygons = tuple(tuple((float(u), float(v)) for u, v in polygon) for polygon in value)
         except (TypeError, ValueError):
             form = "write polygons [[[u, v], [u, v], [u, v]]] in pixels, or the name of a PNG"
-            raise CalibrationError(f"{where} is {_brief(value)}; {form}") from None
+            raise values.error(f"mask is {_brief(value)}; {form}") from None
     corners = np.array([corner for polygon in polygons for corner in polygon]).reshape(-1, 2)
     if len(corners) > _MOST_CORNERS:
-        limit = f"the limit is {_MOST_CORNERS}, simplify its outline"
-        raise CalibrationError(f"{where} has {len(corners)} corners; {limit}")
+        raise values.error(f"mask has {len(corners)} corners; the limit is {_MOST_CORNERS}, simplify its outline")
     if any(len(polygon) < 3 for polygon in polygons) or not (np.abs(corners) <= _LARGEST_PX).all():
-        raise CalibrationError(f"{where} is {_brief(value)}; a polygon has three corners or more, near the image")
+        raise values.error(f"mask is {_brief(value)}; a polygon has three corners or more, near the image")
     for polygon in polygons:
         low, high = np.min(polygon, axis=0), np.max(polygon, axis=0)
         if (high < 0).any() or (low > np.array(size_px) - 1).any():
-            raise CalibrationError(
-                f"{where}: the polygon from {low.tolist()} to {high.tolist()} lies outside of the {size_px[0]}x{size_px[1]} image; is it "
-                "for another resolution?"
-            )
+            where = f"the polygon from {low.tolist()} to {high.tolist()} lies outside of the {size_px[0]}x{size_px[1]} image"
+            raise values.error(f"mask: {where}; is it for another resolution?")
     if hidden_pixels(polygons, size_px).all():
-        raise CalibrationError(f"{where} hides the whole image; of an image as mask, 0 is what may be used")
+        raise values.error("mask hides the whole image; of an image as mask, 0 is what may be used")
     return polygons
 
 
-def _outlines(name: str, size_px: tuple[int, int], where: str, folder: Path | None) -> tuple[Polygon, ...]:
+def _outlines(values: Section, name: str, size_px: tuple[int, int]) -> tuple[Polygon, ...]:
     """The polygons around the pixels of an image that are not 0, to one pixel."""
-    if folder is None or Path(name).is_absolute() or ".." in Path(name).parts:
-        raise CalibrationError(
-            f"{where}: {name[:80]!r} is not a file beside the calibration; write its polygons instead"
-        )
+    if values.folder is None or Path(name).is_absolute() or ".." in Path(name).parts:
+        raise values.error(f"mask: {name[:80]!r} is not a file beside the calibration; write its polygons instead")
+    file = values.folder / name
     try:
-        if not (folder / name).is_file() or (folder / name).stat().st_size > MAX_IMAGE_BYTES:
-            raise CalibrationError(f"{where}: {name} is not there, no file or too large for an image")
-        stored = StoredImage("file", (folder / name).read_bytes(), str(folder / name))
-        size_of_image_px = decode_grey(stored).shape[::-1]  # within the limits of images
+        if not file.is_file() or file.stat().st_size > MAX_IMAGE_BYTES:
+            raise values.error(f"mask: {name} is not there, no file or too large for an image")
+        stored = StoredImage("file", file.read_bytes(), str(file))
+        width, height = decode_grey(stored).shape[::-1]  # within the limits of images
     except (OSError, RecordingError) as error:
-        raise CalibrationError(f"{where}: {name} cannot be read: {error}") from error
-    if size_of_image_px != size_px:
-        width, height = size_px
-        raise CalibrationError(
-            f"{where}: {name} is {size_of_image_px[0]}x{size_of_image_px[1]}, the camera's images are {width}x{height}"
-        )
+        raise values.error(f"mask: {name} cannot be read: {error}") from error
+    if (width, height) != size_px:
+        raise values.error(f"mask: {name} is {width}x{height}, the camera's images are {size_px[0]}x{size_px[1]}")
     image = cv2.imdecode(np.frombuffer(stored.data, np.uint8), cv2.IMREAD_UNCHANGED)
     shown = np.atleast_3d(np.asarray(image))[:, :, :3].any(axis=2)
     areas = sum(cv2.connectedComponents(np.asarray(side, np.uint8))[0] for side in (shown, ~shown))
     if 3 * areas > _MOST_CORNERS:  # before their outlines are made: noise has millions
-        raise CalibrationError(f"{where}: {name} has {areas} areas; the limit is {_MOST_CORNERS // 3}, simplify it")
+        raise values.error(f"mask: {name} has {areas} areas; the limit is {_MOST_CORNERS // 3}, simplify it")
     contours, _ = cv2.findContours(np.asarray(shown, np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_SIMPLE)
     outlines = [_simplified(np.asarray(contour, np.int32).reshape(-1, 2)) for contour in contours]
     return tuple(tuple((float(u), float(v)) for u, v in outline) for outline in outlines)
@@ -413,30 +404,24 @@ def imu_noise(file: Section) -> ImuNoise | None:
     given = Section(inner, file.where)
     used = {name: given.number(key, 0.0) for name, key in _NOISE_KEYS.items() if key in given}
     unused = {key: (inner[key], neutral) for key, neutral in _IMU_INTRINSICS.items() if key in inner}
-    unused |= {
-        f"{key}: M": (inner[key].get("M"), np.eye(3))
-        for key in ("gyroscopes", "accelerometers")
-        if isinstance(inner.get(key), dict)
-    }
-    for key, (value, neutral) in unused.items():
+    scaled = [key for key in ("gyroscopes", "accelerometers") if isinstance(inner.get(key), dict)]
+    for key, (value, neutral) in (unused | {f"{key}: M": (inner[key].get("M"), np.eye(3)) for key in scaled}).items():
         if not _is_near(value, neutral):
             raise given.error(
                 f"{key} of the IMU is {_brief(value)}, which is not supported; correct the samples by it, and write "
                 f"{np.asarray(neutral).tolist()}, or calibrate with --imu-models calibrated"
             )
-    for name, value in used.items():
-        if not 0 < value < 10:
-            fault = f"{_NOISE_KEYS[name]} is {value}; noise densities in SI units are small and positive"
-            raise given.error(fault)
+    for name in (name for name, value in used.items() if not 0 < value < 10):
+        raise given.error(f"{_NOISE_KEYS[name]} is {used[name]}; noise densities in SI units are small and positive")
     return ImuNoise(**used)
 
 
 def _is_near(value: object, wanted: Any) -> bool:
     try:
         found = np.array(value, np.float64)
+        return found.shape == np.shape(wanted) and bool(np.allclose(found, wanted, atol=1e-3))
     except (TypeError, ValueError):
         return False
-    return found.shape == np.shape(wanted) and bool(np.allclose(found, np.asarray(wanted), atol=1e-3))
 
 
 class _RepeatedKeyError(ValueError):
@@ -477,10 +462,9 @@ def _parse_yaml(text: str, where: str) -> dict[str, Any]:
         raise CalibrationError(f"{where} has the key {error} twice; keep the one that is right") from error
     # The loader's own constructors raise ValueError for 2026-02-30.
     except (yaml.YAMLError, ValueError) as error:
-        mark = getattr(error, "problem_mark", None)
-        line = (
-            "" if mark is None else f" from line {mark.line + 1} on: {''.join(lines[mark.line : mark.line + 1])[:60]!r}"
-        )
+        mark, line = getattr(error, "problem_mark", None), ""
+        if mark is not None:
+            line = f" from line {mark.line + 1} on: {''.join(lines[mark.line : mark.line + 1])[:60]!r}"
         raise CalibrationError(f"{where} is not YAML{line}; is it cut off? Correct it, or copy it again") from error
     if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
         raise CalibrationError(f"{where} holds {_brief(values)}; a calibration is a mapping of names to values")

@@ -4,6 +4,7 @@ It is an ordinary recording with reduced images and two additional attachments: 
 initial pose with its perceptions since, which only a robot's client reads (locclient.delivery.failure_file).
 """
 
+from contextlib import closing
 from pathlib import Path
 
 from fleetmap.errors import RecordingError
@@ -40,10 +41,7 @@ def attachments_of(path: Path) -> dict[str, bytes]:
 
 
 def _scanned(path: Path) -> McapFile:
-    file = McapFile(path)
-    try:
+    with closing(McapFile(path)) as file:
         for _ in file.messages():
             pass
-    finally:
-        file.close()
     return file

@@ -1,14 +1,17 @@
 """Images of each camera by stamp, paired to frames and read one frame at a time."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.errors import RecordingError
+from fleetmap.recordings.files import hash_file
 from fleetmap.recordings.images import StoredFrame, StoredImage, decode_frame
 from fleetmap.recordings.ordering import (
     DEPTH_TOLERANCE_NS,
@@ -50,20 +53,34 @@ class ImageSeries:
         return self.take(largest)
 
 
-class ImageReader(Protocol):
-    """Reads the images of a recording from their storage."""
+class ImageReader:
+    """Reads the images of a recording from their storage. read_files: those that the content's hash covers, the recording first."""
+
+    def __init__(self, read_files: Sequence[Path]) -> None:
+        self.read_files, self._is_closed = read_files, False
 
     def read(self, source: Any, stamp_ns: int) -> StoredImage:
         """Read one image, still encoded; RecordingError if its bytes are gone."""
+        raise NotImplementedError
 
     def apart(self) -> "ImageReader":
         """Create another reader of the same images, used and closed independently, also in other threads and processes."""
+        raise NotImplementedError
 
     def hash_into(self, digest: "hashlib._Hash", images: list[Any]) -> None:
         """Feed the recording's content, including images, to `digest`."""
+        for path in self.read_files:
+            hash_file(path, digest)
 
     def close(self) -> None:
         """Close open files."""
+        self._is_closed = True
+
+    def check_open(self, where: str) -> None:
+        """RecordingError for an image, named for messages, that is read after `close`."""
+        if self._is_closed:
+            closed = "was asked for after the recording was closed; keep it open while frames are read"
+            raise RecordingError(f"{where} {closed}")
 
 
 @dataclass(frozen=True)

@@ -118,6 +118,7 @@ _DEPTH_HEAD = struct.Struct("<iff")
 # Words in the `format` of a message, and the first bytes, of unsupported image formats
 _VIDEO = "; one picture of a video cannot be read alone: record JPEG (`ros2 run image_transport republish ffmpeg compressed`) or raw images"
 _OTHER_IMAGE = "; record JPEG, PNG or raw images"
+_REMOVE_IT = "remove it from the recording"
 _UNREAD_FORMS = {
     "rvl": "depths packed as RVL; set the publisher's parameter compressedDepth.format to png, or record raw depth images",
     **dict.fromkeys(("h264", "h.264", "avc"), "H.264 video" + _VIDEO),
@@ -160,6 +161,10 @@ class StoredImage:
     big_endian: bool = False
     form: str = ""
     bits: int = 16
+
+    def error(self, fault: str) -> RecordingError:
+        """An error of this image."""
+        return RecordingError(f"{self.where}: {fault}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,15 +215,15 @@ def decode_grey(stored: StoredImage) -> Image:
     if pixels.dtype == np.uint16:
         return np.asarray(np.minimum(pixels >> (stored.bits - 8), 255), np.uint8)
     if pixels.dtype != np.uint8:
-        raise RecordingError(f"{stored.where}: {pixels.dtype} pixels are not a camera image; known are 8 and 16 bits")
+        raise stored.error(f"{pixels.dtype} pixels are not a camera image; known are 8 and 16 bits")
     return np.ascontiguousarray(pixels, np.uint8)
 
 
 def is_wide(stored: StoredImage) -> bool:
     """True for a 16-bit image, by its encoding or the header of a PNG file."""
-    dtype, _ = RAW_ENCODINGS.get(stored.encoding, (None, 0))
-    is_wide_png = stored.data[24:25] == b"\x10" and file_kind(stored.data) == "png"
-    return dtype == np.uint16 if dtype is not None else is_wide_png
+    if stored.encoding in RAW_ENCODINGS:
+        return RAW_ENCODINGS[stored.encoding][0] == np.uint16
+    return stored.data[24:25] == b"\x10" and file_kind(stored.data) == "png"
 
 
 def grey_peak(stored: StoredImage) -> int:
@@ -250,9 +255,7 @@ def decode_depth(stored: StoredImage) -> NDArray[np.float32]:
         return np.where(pixels == 65535, 0, pixels).astype(np.float32) / np.float32(1000.0)
     if pixels.ndim == 2 and pixels.dtype == np.float32:
         return np.where(np.isfinite(pixels) & (pixels > 0), pixels, np.float32(0))
-    raise RecordingError(
-        f"{stored.where}: {pixels.dtype} pixels of shape {pixels.shape} are not a depth image; use 16UC1 or 32FC1"
-    )
+    raise stored.error(f"{pixels.dtype} pixels of shape {pixels.shape} are not a depth image; use 16UC1 or 32FC1")
 
 
 def grey_image(image: Image, where: str = "") -> StoredImage:
@@ -347,20 +350,18 @@ def _decode(stored: StoredImage) -> AnyArray:
 def _check_rows(stored: StoredImage) -> int:
     """Bytes from one row to the next; RecordingError if the data does not fit encoding and size."""
     if stored.encoding not in RAW_ENCODINGS:
-        raise RecordingError(
-            f"{stored.where}: image encoding {stored.encoding!r}; known are {', '.join(RAW_ENCODINGS)}, jpeg, png"
-        )
+        raise stored.error(f"image encoding {stored.encoding!r}; known are {', '.join(RAW_ENCODINGS)}, jpeg, png")
     dtype, channels = RAW_ENCODINGS[stored.encoding]
     row_bytes = stored.width_px * channels * np.dtype(dtype).itemsize
     step = stored.step_bytes or row_bytes
     colour_rows, luma_rows = _COLOUR_ROWS.get(stored.encoding, (0, 1))
     needed = step * (stored.height_px - 1) + row_bytes + step * (stored.height_px * colour_rows // luma_rows)
     if step < row_bytes or len(stored.data) < needed or 0 in (row_bytes, stored.height_px):
-        raise RecordingError(
-            f"{stored.where}: {len(stored.data)} bytes for {stored.width_px}x{stored.height_px} {stored.encoding} in "
-            f"rows of {step} bytes; the message is damaged, or its encoding is another"
+        raise stored.error(
+            f"{len(stored.data)} bytes for {stored.width_px}x{stored.height_px} {stored.encoding} in rows of {step} bytes; "
+            "the message is damaged, or its encoding is another"
         )
-    _check_size(stored.width_px, stored.height_px, stored.where)
+    _check_size(stored, stored.width_px, stored.height_px)
     return step if stored.height_px > 1 else row_bytes  # the length of a single row is not defined
 
 
@@ -369,10 +370,8 @@ def _decode_inverse_depth(stored: StoredImage) -> NDArray[np.float32]:
     a, b = _inverse_depth_scale(stored)
     quantized = _decode_file(replace(stored, data=stored.data[_DEPTH_HEAD.size :]))
     if quantized.dtype != np.uint16 or quantized.ndim != 2:
-        raise RecordingError(
-            f"{stored.where}: {stored.form!r} with {quantized.dtype} pixels of shape {quantized.shape}; "
-            "16 bits and one channel are expected"
-        )
+        found = f"{stored.form!r} with {quantized.dtype} pixels of shape {quantized.shape}"
+        raise stored.error(f"{found}; 16 bits and one channel are expected")
     with np.errstate(divide="ignore"):
         depth_m = np.float32(a) / (quantized.astype(np.float32) - np.float32(b))
     return np.where(quantized == 0, np.float32(np.nan), depth_m)
@@ -381,13 +380,11 @@ def _decode_inverse_depth(stored: StoredImage) -> NDArray[np.float32]:
 def _inverse_depth_scale(stored: StoredImage) -> tuple[float, float]:
     """a and b of `_decode_inverse_depth`; RecordingError if the header lacks them."""
     if len(stored.data) < _DEPTH_HEAD.size:
-        raise RecordingError(f"{stored.where}: a depth image of {len(stored.data)} bytes; remove it from the recording")
+        raise stored.error(f"a depth image of {len(stored.data)} bytes; {_REMOVE_IT}")
     _, a, b = _DEPTH_HEAD.unpack_from(stored.data)
     if not (np.isfinite([a, b]).all() and a > 0):
-        raise RecordingError(
-            f"{stored.where}: {stored.form!r} needs two numbers that say what its values mean, there are {a:g} and {b:g}; "
-            "record raw depth images, or 16UC1"
-        )
+        needs = f"{stored.form!r} needs two numbers that say what its values mean, there are {a:g} and {b:g}"
+        raise stored.error(f"{needs}; record raw depth images, or 16UC1")
     return a, b
 
 
@@ -399,10 +396,8 @@ def _decode_file(stored: StoredImage) -> AnyArray:
         pixels, said = None, ""
     kind = file_kind(stored.data)
     if kind != "other" and (pixels is None or _DAMAGED.search(said)):
-        raise RecordingError(
-            f"{stored.where}: the {kind} image of {len(stored.data)} bytes is damaged inside; copy the recording again, or "
-            "remove the image"
-        )
+        damaged = f"the {kind} image of {len(stored.data)} bytes is damaged inside"
+        raise stored.error(f"{damaged}; copy the recording again, or remove the image")
     if pixels is None:
         raise _not_an_image(stored)
     return np.asarray(pixels)
@@ -412,29 +407,24 @@ def _check_file(stored: StoredImage) -> tuple[int, int]:
     """Width and height in pixels from the file's header; RecordingError if it is truncated or not a supported image."""
     data = stored.data
     if not data:
-        raise RecordingError(f"{stored.where}: the image has no bytes; remove it from the recording")
-    unread = what_instead(data) or _unread(data, stored.form)
-    if unread:
-        raise RecordingError(f"{stored.where}: {unread}")
+        raise stored.error(f"the image has no bytes; {_REMOVE_IT}")
+    if unread := what_instead(data) or _unread(data, stored.form):
+        raise stored.error(unread)
     if is_cut(data, data):
-        raise RecordingError(
-            f"{stored.where}: the {file_kind(data)} image is cut off after {len(data)} bytes; remove it from the recording"
-        )
+        raise stored.error(f"the {file_kind(data)} image is cut off after {len(data)} bytes; {_REMOVE_IT}")
     if is_damaged_png(data):
-        raise RecordingError(f"{stored.where}: the png image is damaged; remove it from the recording")
+        raise stored.error(f"the png image is damaged; {_REMOVE_IT}")
     size = image_size(data)
     if size is None:
         raise _not_an_image(stored)
-    _check_size(*size, stored.where)
+    _check_size(stored, *size)
     return size
 
 
 def _not_an_image(stored: StoredImage) -> RecordingError:
     form = f", their format is {stored.form[:80]!r}" if stored.form else ""
     known = "an image (JPEG, PNG, TIFF, BMP, PNM)"
-    return RecordingError(
-        f"{stored.where}: {len(stored.data)} bytes that cannot be read as {known}{form}; remove it from the recording"
-    )
+    return stored.error(f"{len(stored.data)} bytes that cannot be read as {known}{form}; {_REMOVE_IT}")
 
 
 def _unread(data: bytes, form: str) -> str:
@@ -445,9 +435,7 @@ def _unread(data: bytes, form: str) -> str:
     return said or next((what for start, what in _UNREAD_STARTS if start.match(data)), "")
 
 
-def _check_size(width_px: int, height_px: int, where: str) -> None:
+def _check_size(stored: StoredImage, width_px: int, height_px: int) -> None:
     if width_px * height_px > MAX_PIXELS:
-        raise RecordingError(
-            f"{where}: an image of {width_px}x{height_px}; the limit is {MAX_PIXELS // 1_000_000} megapixels, "
-            "remove it from the recording"
-        )
+        limit = f"the limit is {MAX_PIXELS // 1_000_000} megapixels"
+        raise stored.error(f"an image of {width_px}x{height_px}; {limit}, {_REMOVE_IT}")

@@ -8,9 +8,8 @@ import zstandard
 
 from fleetmap.errors import RecordingError
 
-MAX_MESSAGE_BYTES = (
-    64 << 20
-)  # of a message, a chunk, an attachment: one raw image of 64 megapixels; recorders write chunks of 1 to 4 MiB
+# Of a message, a chunk, an attachment: one raw image of 64 megapixels; recorders write chunks of 1 to 4 MiB
+MAX_MESSAGE_BYTES = 64 << 20
 MAX_PIXELS = 64_000_000  # the largest machine-vision sensors have 150, those of robots 5
 MAX_IMAGE_BYTES = 8 * MAX_PIXELS
 MAX_TABLE_BYTES = 1 << 30  # 13 hours of an IMU at 200 Hz
@@ -35,8 +34,7 @@ class KeptBytes:
 
     def unpack(self, compression: str, packed: bytes | memoryview, most_bytes: int = MAX_MESSAGE_BYTES) -> bytes:
         """See `unpack`; RecordingError if the file unpacks to more than a real recording can. Damaged bytes count as `most_bytes`."""
-        if self._unpacked > (most := _UNPACKED_BYTES + _UNPACKED_PER_FILE_BYTE * self.size):
-            raise RecordingError(f"{self.path}: {self.size} bytes unpack to more than {most} bytes; leave the file out")
+        self._limit(self._unpacked, _UNPACKED_BYTES + _UNPACKED_PER_FILE_BYTE * self.size, "bytes;")
         self._unpacked += most_bytes
         unpacked = unpack(compression, packed, most_bytes)
         self._unpacked -= most_bytes - len(unpacked)
@@ -45,19 +43,18 @@ class KeptBytes:
     def pass_record(self) -> None:
         """Count a record that is read, kept or not; RecordingError if the file unpacks to more than a real recording can."""
         self._passed += 1
-        if self._passed > (most := _PASSED_RECORDS + self.size // _LEAST_RECORD_BYTES):
-            raise RecordingError(
-                f"{self.path}: {self.size} bytes unpack to more than {most} records; leave the file out"
-            )
+        self._limit(self._passed, _PASSED_RECORDS + self.size // _LEAST_RECORD_BYTES, "records;")
 
     def keep(self, size: int) -> None:
         """Count a record of `size` bytes kept in memory; RecordingError if the file unpacks to more than a real recording can."""
         self._kept += size + _KEPT_RECORD_BYTES
-        limit = _KEPT_BYTES + _KEPT_PER_FILE_BYTE * self.size
-        if self._kept > limit:
+        most = _KEPT_BYTES + _KEPT_PER_FILE_BYTE * self.size
+        self._limit(self._kept, most, "bytes beside the images; no recorder writes that,")
+
+    def _limit(self, count: int, most: int, words: str) -> None:
+        if count > most:
             raise RecordingError(
-                f"{self.path}: {self.size} bytes unpack to more than {limit} bytes beside the images; no recorder writes "
-                "that, leave the file out"
+                f"{self.path}: {self.size} bytes unpack to more than {most} {words} leave the file out"
             )
 
 

@@ -5,7 +5,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,7 +29,6 @@ _FEWEST = 10  # values needed to recognise a unit by their steps
 # Of a part of a stream with a pause on either side: a part shorter than the second that an odometry needs to start is useless, so
 # an interrupted recording loses nothing by it. Sparse streams, of keyframes or of single photographs, have longer steps.
 _SHORTEST_PART_NS, _PAUSE_STEPS, _STRAY_SHARE = 1_000_000_000, 10, 0.05
-V = TypeVar("V")
 
 
 @dataclass(slots=True)
@@ -94,7 +92,10 @@ def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_
         steps, share = np.diff(stamps_ns), f"{dropped} of {len(kept)}"
         if (steps >= 0).all():
             first_ns = stamps_ns[np.flatnonzero(steps == 0)[0]]
-            what_is_wrong = "stamps repeated", f"are that of the one before and left out; the first is {first_ns}"
+            what_is_wrong, detail = (
+                "stamps repeated",
+                f"are that of the one before and left out; the first is {first_ns}",
+            )
             fault = (
                 f"{share} stamps repeat the one before, the first is {first_ns}; the driver stamps several alike, or rounds: "
                 "let it stamp each one when it is measured"
@@ -102,9 +103,9 @@ def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_
         else:
             back = int(np.flatnonzero(steps < 0)[0])
             from_to = f"{steps[back] * 1e-9:.3f} s, from {stamps_ns[back]} to {stamps_ns[back + 1]}"
-            what_is_wrong = "stamps not increasing", f"left out; the first step back is {from_to}"
+            what_is_wrong, detail = "stamps not increasing", f"left out; the first step back is {from_to}"
             fault = f"stamps go backwards, {share} do not fit; the sensor's clock is broken, record again"
-        log.note(f"{what}: {what_is_wrong[0]}", f"{share} {what_is_wrong[1]}")
+        log.note(f"{what}: {what_is_wrong}", f"{share} {detail}")
         if dropped > len(kept) // 2:
             raise RecordingError(f"{what}: {fault}")
     if what not in ("position priors", "ground truth"):  # which arrive irregularly
@@ -115,10 +116,9 @@ def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_
 
 def _strays(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
     """(N,) mask of the few isolated increasing stamps, a pause away from all others; noted in `log`."""
-    none, steps = np.zeros(len(stamps_ns), np.bool_), np.diff(stamps_ns)
+    strays, steps = np.zeros(len(stamps_ns), np.bool_), np.diff(stamps_ns)
     if len(steps) == 0:
-        return none
-    strays = none.copy()
+        return strays
     pause_ns = max(PAUSE_NS, _PAUSE_STEPS * int(np.median(steps)))
     parts = np.split(np.arange(len(stamps_ns)), np.flatnonzero(steps > pause_ns) + 1)
     largest = max(parts, key=len)
@@ -126,7 +126,7 @@ def _strays(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_]:
         strays[part] = part is not largest and stamps_ns[part[-1]] - stamps_ns[part[0]] < _SHORTEST_PART_NS
     count = int(strays.sum())
     if not 0 < count <= max(1, _STRAY_SHARE * len(stamps_ns)):
-        return none
+        return np.zeros_like(strays)
     first_ns, others = stamps_ns[strays][:3], stamps_ns[~strays]
     away_s = (first_ns - others[nearest(others, first_ns)]) * 1e-9
     named = ", ".join(f"{stamp} ({seconds:+.1f} s)" for stamp, seconds in zip(first_ns, away_s, strict=True))
@@ -209,12 +209,6 @@ def _overlap(stamps_ns: Stamps, factor: int, others_ns: Stamps) -> bool:
     return 2 * (min(last, end) - max(first, begin)) >= min(last - first, end - begin)
 
 
-def values_forward(values: Sequence[V], stamps_ns: Sequence[int], what: str, log: ReadLog) -> tuple[V, ...]:
-    """Values with increasing stamps, as `forward_only`."""
-    kept = forward_only(np.array(stamps_ns, np.int64), what, log)
-    return tuple(value for value, keep in zip(values, kept, strict=True) if keep)
-
-
 def clean_imu(stamps_ns: Stamps, gyro_radps: Array, accel_mps2: Array, log: ReadLog) -> ImuSamples:
     """Samples with plausible values and increasing stamps; the others are noted in `log`."""
     possible = np.asarray((np.abs(np.hstack([gyro_radps, accel_mps2])) < _MAX_IMU_VALUE).all(axis=1))
@@ -251,10 +245,8 @@ def pair_stamps(
     if len(left_ns) == 0 or len(right_ns) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)
     right_of_left, left_of_right = nearest(right_ns, left_ns), nearest(left_ns, right_ns)
-    lefts = np.arange(len(left_ns))
-    is_mutual = left_of_right[right_of_left] == lefts
-    is_close = np.abs(right_ns[right_of_left] - left_ns) <= tolerance_ns
-    chosen = lefts[is_mutual & is_close]
+    is_mutual = left_of_right[right_of_left] == np.arange(len(left_ns))
+    chosen = np.flatnonzero(is_mutual & (np.abs(right_ns[right_of_left] - left_ns) <= tolerance_ns))
     return chosen, right_of_left[chosen]
 
 

@@ -23,6 +23,7 @@ _GOOD_PX2, FITS_PX2 = 0.25, 2.0  # mean squared errors: of a perfect fit; of an 
 DOUBTFUL_RATIO = 1.7  # of squared errors: with a right calibration other lenses reach 1.5, on straight drives
 _PAIRS, _APART_S, _TOO_FAR_S = 8, 0.2, 0.6
 _MORE_OFTEN = 0.75  # of the pairs of frames
+Points = NDArray[np.float32]
 _FACTORS = (0.5, 0.6, 0.7, 0.77, 0.85, 1.18, 1.3, 1.43, 1.67, 2.0)
 
 
@@ -99,12 +100,8 @@ def follow_points(frame: CameraFrame, later: CameraFrame, mask: tuple[Polygon, .
         is_good &= np.nan_to_num(depth_m) > 0
     if is_good.sum() < _LEAST_POINTS:
         return None
-    return FollowedPoints(
-        left[is_good].astype(np.float64),
-        None if right is None else right[is_good],
-        None if depth_m is None else depth_m[is_good],
-        found[is_good],
-    )
+    right, depth_m = (None if values is None else values[is_good] for values in (right, depth_m))
+    return FollowedPoints(left[is_good].astype(np.float64), right, depth_m, found[is_good])
 
 
 def fit_lens(rig: RigCalibration, pairs: Sequence[FollowedPoints]) -> LensFit | None:
@@ -114,7 +111,7 @@ def fit_lens(rig: RigCalibration, pairs: Sequence[FollowedPoints]) -> LensFit | 
     motions_px = np.concatenate([np.linalg.norm(points.later - points.left, axis=1) for points in pairs])
     if np.median(motions_px) < _LEAST_MOTION_PX:
         return None
-    given = _errors_px2(rig, pairs)
+    given = np.array([_error_px2(rig, points) for points in pairs])
     best, words = given, ""
     if given.mean() > _GOOD_PX2:
         for lens, other in _other_lenses(rig):
@@ -126,12 +123,10 @@ def fit_lens(rig: RigCalibration, pairs: Sequence[FollowedPoints]) -> LensFit | 
     return LensFit(float(given.mean()), float(best.mean()), words)
 
 
-def _followed(image: Image, other: Image, corners: NDArray[np.float32]) -> tuple[Array, NDArray[np.bool_]]:
+def _followed(image: Image, other: Image, corners: Points) -> tuple[Array, NDArray[np.bool_]]:
     """Pixels (N, 2) in the other image, and a mask of those that pass the backward check."""
 
-    def follow(
-        first: Image, second: Image, points: NDArray[np.float32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    def follow(first: Image, second: Image, points: Points) -> tuple[Points, NDArray[np.bool_]]:
         guess = np.empty(0, np.float32)
         found, status, _ = cv2.calcOpticalFlowPyrLK(first, second, points, guess, winSize=(15, 15), maxLevel=4)
         return np.asarray(found, np.float32), np.asarray(status.ravel() == 1)
@@ -153,12 +148,11 @@ def _other_lenses(rig: RigCalibration) -> Iterator[tuple[str, RigCalibration]]:
         words = f"this camera matrix times {factor:g}: it is of images of {size} the size"
         if all(_is_possible(camera) for camera in other.cameras[:2]):
             yield words, other
-    model, name = ("radial-tangential", "plumb_bob (radtan)")
-    if first.model == model:
-        model, name = ("equidistant", "equidistant (fisheye)")
     zeros = np.zeros(4)
-    if first.model not in LENSES:
-        yield f"an {name} lens" if model == "equidistant" else f"a {name} lens", _with_lens(rig, model, None)
+    if first.model == "radial-tangential":
+        yield "an equidistant (fisheye) lens", _with_lens(rig, "equidistant", None)
+    elif first.model not in LENSES:
+        yield "a plumb_bob (radtan) lens", _with_lens(rig, "radial-tangential", None)
     yield "an equidistant lens without coefficients", _with_lens(rig, "equidistant", zeros)
     yield "a lens without distortion", _with_lens(rig, "radial-tangential", zeros)
 
@@ -184,13 +178,8 @@ def _is_possible(camera: CameraCalibration) -> bool:
     return bool((camera.intrinsics_px[2:] < [camera.width_px, camera.height_px]).all())
 
 
-def _errors_px2(rig: RigCalibration, pairs: Sequence[FollowedPoints]) -> Array:
-    """(K,) mean squared error of each pair of frames: pixels of the first frame's points in the later one, and in their own."""
-    return np.array([_error_px2(rig, points) for points in pairs])
-
-
 def _smaller_errors_px2(rig: RigCalibration, pairs: Sequence[FollowedPoints], given: Array) -> Array | None:
-    """(K,) as `_errors_px2`; None as soon as too few of them can be smaller than `given`."""
+    """(K,) errors of all pairs; None as soon as too few of them can be smaller than `given`."""
     errors = np.zeros(len(pairs))
     for number, points in enumerate(pairs, 1):
         errors[number - 1] = _error_px2(rig, points)
@@ -201,6 +190,7 @@ def _smaller_errors_px2(rig: RigCalibration, pairs: Sequence[FollowedPoints], gi
 
 
 def _error_px2(rig: RigCalibration, points: FollowedPoints) -> float:
+    """Mean squared error of a pair of frames: pixels of the first frame's points in the later one, and in their own."""
     camera = rig.cameras[0]
     rays, later = camera.ray_from_pixel(points.left), camera.ray_from_pixel(points.later)
     with np.errstate(divide="ignore", invalid="ignore"):

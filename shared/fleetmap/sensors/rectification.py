@@ -67,10 +67,8 @@ class StereoCamera:
         """(N, 3) points in `cam0` of left pixels (N, 2) with disparities (N,); not finite if the disparity is 0."""
         with np.errstate(divide="ignore", invalid="ignore"):
             z = self.focal_px * self.baseline_m / disparities_px
-            return np.stack(
-                [(pixels[:, 0] - self.cx_px) * z / self.focal_px, (pixels[:, 1] - self.cy_px) * z / self.focal_px, z],
-                axis=1,
-            )
+            ahead = (pixels - [self.cx_px, self.cy_px]) * z[:, None] / self.focal_px
+            return np.column_stack([ahead, z])
 
 
 class MountedCamera(NamedTuple):
@@ -165,13 +163,10 @@ class Rectifier:
         self._numbers = numbers or view
         self._sizes = [(c.height_px, c.width_px) for c in cameras]
         self.has_depth = has_depth or cameras[0].has_depth
-        if self.has_depth or len(cameras) == 1:
-            cam0_from_rect = np.eye(3)
-            baseline = RGBD_BASELINE_M if self.has_depth else 0.0
-            used = cameras[:1]
-        else:
-            cam0_from_rect, baseline = _rectifying_rotation(cameras[0], cameras[1], self._numbers)
-            used = cameras
+        used = cameras[:1] if self.has_depth else cameras
+        cam0_from_rect, baseline = np.eye(3), RGBD_BASELINE_M if self.has_depth else 0.0
+        if len(used) == 2:
+            cam0_from_rect, baseline = _rectifying_rotation(*used, self._numbers)
         cx, cy = np.mean([c.intrinsics_px[2:] for c in used], axis=0)
         focal_px = float(np.mean([c.focal_px.mean() for c in used]))
         self.camera = StereoCamera(focal_px, float(cx), float(cy), baseline, used[0].width_px, used[0].height_px)
@@ -187,13 +182,10 @@ class Rectifier:
         self.others = tuple(self._of_view(calibration, numbers) for numbers in others)
         self._maps, hidden = [], []
         for camera in used:
-            body_from_rect = self.body_from_cam[:3, :3]
-            cam_from_rect = camera.body_from_cam[:3, :3].T @ body_from_rect
-            values = camera.intrinsics_px, camera.distortion, cam_from_rect.ravel()
-            size = camera.width_px, camera.height_px
-            tables, shows_robot = _remap_tables(
-                self.camera, camera.model, size, *(tuple(each.tolist()) for each in values), camera.mask
-            )
+            cam_from_rect = camera.body_from_cam[:3, :3].T @ self.body_from_cam[:3, :3]
+            lens = (tuple(each.ravel().tolist()) for each in (camera.intrinsics_px, camera.distortion, cam_from_rect))
+            size_px = camera.width_px, camera.height_px
+            tables, shows_robot = _remap_tables(self.camera, camera.model, size_px, *lens, camera.mask)
             self._maps.append(tables)
             hidden.append(shows_robot)
         self.camera = replace(self.camera, clearance_px=_clearance_px(hidden[0]))
@@ -241,15 +233,13 @@ class Rectifier:
 
     def _remap(self, image: Image, index: int, stamp_ns: int) -> Image:
         if image.shape != self._sizes[index]:
-            height, width = self._sizes[index]
+            (height, width), (rows, columns) = self._sizes[index], image.shape
             raise RecordingError(
-                f"cam{self._numbers[index]} image at {stamp_ns} is {image.shape[1]}x{image.shape[0]}, "
-                f"the calibration says {width}x{height}; pass the matching one with --calibration FILE"
+                f"cam{self._numbers[index]} image at {stamp_ns} is {columns}x{rows}, the calibration says {width}x{height}; "
+                "pass the matching one with --calibration FILE"
             )
         tables = self._maps[index]
-        if tables is None:
-            return image
-        return np.asarray(cv2.remap(image, tables[0], tables[1], cv2.INTER_LINEAR), np.uint8)
+        return image if tables is None else np.asarray(cv2.remap(image, *tables, cv2.INTER_LINEAR), np.uint8)
 
 
 def _rectifying_rotation(
@@ -275,9 +265,8 @@ def _rectifying_rotation(
     return np.stack([x_axis, y_axis, np.cross(x_axis, y_axis)], axis=1), baseline_m
 
 
-@lru_cache(
-    maxsize=16
-)  # tables of some rigs: a build creates the rectifier of a recording for its checks, and again for its survey
+# Tables of some rigs: a build creates the rectifier of a recording for its checks, and again for its survey
+@lru_cache(maxsize=16)
 def _remap_tables(
     rectified: StereoCamera,
     model: str,
@@ -288,13 +277,9 @@ def _remap_tables(
     mask: tuple[Polygon, ...],
 ) -> tuple[tuple[NDArray[np.int16], NDArray[np.uint16]] | None, NDArray[np.bool_] | None]:
     """Fixed-point look-up tables for cv2.remap, or None if the image is already rectified (as KITTI's are); and the rectified mask."""
-    u, v = np.meshgrid(
-        np.arange(rectified.width_px, dtype=np.float64), np.arange(rectified.height_px, dtype=np.float64)
-    )
-    rays = np.stack(
-        [(u - rectified.cx_px) / rectified.focal_px, (v - rectified.cy_px) / rectified.focal_px, np.ones_like(u)], -1
-    )
-    rays = rays.reshape(-1, 3) @ np.array(cam_from_rect).reshape(3, 3).T
+    v, u = np.indices((rectified.height_px, rectified.width_px), np.float64)
+    x, y = (u - rectified.cx_px) / rectified.focal_px, (v - rectified.cy_px) / rectified.focal_px
+    rays = np.stack([x, y, np.ones_like(u)], -1).reshape(-1, 3) @ np.array(cam_from_rect).reshape(3, 3).T
     lens = np.array(intrinsics_px), np.array(distortion)
     pixels = CAMERA_MODELS[model].pixel_from_ray(*lens, rays).reshape(*u.shape, 2)
     hidden = None

@@ -27,6 +27,7 @@ _STEP_NS = 100_000_000  # between values, until their own steps are known
 _STEPS = 9  # whose median is the usual one
 _IMU = "the IMU is left out"
 V = TypeVar("V")
+S = TypeVar("S", WheelSample, PositionPrior)
 
 
 @dataclass
@@ -140,8 +141,8 @@ class Intake:
         """
         with self._changed:
             stream = self._imu_stream
-            if len(samples):
-                _check_unit("imu", int(samples.stamps_ns[-1]), self._frame_stream.newest_ns)
+            for last_ns in samples.stamps_ns[-1:].tolist():
+                _check_unit("imu", last_ns, self._frame_stream.newest_ns)
             values = np.hstack([samples.gyro_radps, samples.accel_mps2])
             possible = np.asarray((np.abs(values) < _ABSURD).all(axis=1))
             for stamp_ns, row, good in zip(samples.stamps_ns.tolist(), values.tolist(), possible.tolist(), strict=True):
@@ -210,7 +211,8 @@ class Intake:
             self._changed.wait_for(lambda: self._frames or self._finished or images.set_back, timeout_s)
             if images.set_back:
                 raise RecordingError(f"{images.set_back}; start again, which begins a new run with the new clock")
-            self._use_first()
+            if images.last_ns == _NEVER_NS:  # a first frame that no second one has confirmed in time
+                self._queue(images.release())
             if not self._frames:
                 return SensorBundle()
             if self._has_imu and not self._changed.wait_for(self._imu_is_there, self._imu_wait_s):
@@ -218,10 +220,8 @@ class Intake:
             frame = self._frames.popleft()
             body_ns = frame.stamp_ns + self._offset_ns
             imu = _take_until(self._imu, body_ns + _IMU_LEAD_NS)
-            wheel = [sample for sample in self._wheel if sample.stamp_ns <= body_ns]
-            priors = [prior for prior in self._priors if prior.stamp_ns <= frame.stamp_ns]
-            self._wheel = [sample for sample in self._wheel if sample.stamp_ns > body_ns]
-            self._priors = [prior for prior in self._priors if prior.stamp_ns > frame.stamp_ns]
+            wheel, self._wheel = _split(self._wheel, body_ns)
+            priors, self._priors = _split(self._priors, frame.stamp_ns)
             forget, self._forget = self._forget, False
             dropped, self._dropped = self._dropped, 0
             self._changed.notify_all()
@@ -238,22 +238,19 @@ class Intake:
             self._dropped += 1
         self._changed.notify_all()
 
-    def _use_first(self) -> None:
-        """Queue a first frame that no second one has confirmed in time."""
-        if self._frame_stream.last_ns == _NEVER_NS:
-            self._queue(self._frame_stream.release())
-
     def _left_out(self) -> dict[Flag, str]:
-        set_back = {
-            Flag.IMU_REFUSED: self._imu_stream.set_back,
-            Flag.WHEELS_REFUSED: self._wheel_stream.set_back,
-        }
-        return {flag: f"{words}; stamp all sensors by one clock" for flag, words in set_back.items() if words}
+        faults = {Flag.IMU_REFUSED: self._imu_stream.set_back, Flag.WHEELS_REFUSED: self._wheel_stream.set_back}
+        return {flag: f"{words}; stamp all sensors by one clock" for flag, words in faults.items() if words}
 
     def _imu_is_there(self) -> bool:
         """True if the IMU samples reach the oldest frame, which may have changed since the wait began, or will not."""
         is_awaited = not (self._finished or self._imu_stream.set_back)
         return not is_awaited or self._imu_stream.last_ns >= self._frames[0].stamp_ns + self._offset_ns
+
+
+def _split(samples: list[S], last_ns: int) -> tuple[list[S], list[S]]:
+    """Samples up to a stamp, and later ones."""
+    return [each for each in samples if each.stamp_ns <= last_ns], [each for each in samples if each.stamp_ns > last_ns]
 
 
 def _take_until(imu: list[tuple[int, list[float]]], until_ns: int) -> ImuSamples:

@@ -12,6 +12,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample, wheel_between
 
 _IMU_LEAD_NS = 10_000_000  # a frame is handled once IMU samples slightly past it have arrived
+_NEVER_NS = -(2**62)
 
 
 @dataclass(frozen=True)
@@ -58,32 +59,28 @@ class ReplaySource:
         return replace(frame, stamp_ns=self.played_stamp_ns(frame.stamp_ns), others=others)
 
     def imu_before_each(self) -> Iterator[ImuSamples]:
-        """For each frame of the playback, the IMU samples that arrive before it is handled."""
-        fed_ns = -(2**62)
-        offset_ns = int(self.recording.calibration.cameras[0].imu_minus_cam_s * 1e9)
+        """For each frame of the playback, the IMU samples that arrive before it is handled; none backwards."""
         for number in range(len(self)):
-            if self.reverse:
-                yield ImuSamples.empty()
-                continue
-            until_ns = self.recorded_stamp_ns(number) + offset_ns + _IMU_LEAD_NS
-            yield self.recording.imu.between(fed_ns, until_ns)
-            fed_ns = until_ns
+            since_ns, until_ns = (self._body_ns(each) + _IMU_LEAD_NS for each in (number - 1, number))
+            yield ImuSamples.empty() if self.reverse else self.recording.imu.between(since_ns, until_ns)
 
     def priors_before(self, number: int) -> list[PositionPrior]:
         """Coarse poses in the recording between the frame before and frame `number`; none backwards."""
         if self.reverse:
             return []
-        since = self.recorded_stamp_ns(number - 1) if number else -(2**62)
+        since = self.recorded_stamp_ns(number - 1) if number else _NEVER_NS
         return [p for p in self.recording.priors if since < p.stamp_ns <= self.recorded_stamp_ns(number)]
 
     def wheel_before(self, number: int) -> Sequence[WheelSample]:
         """Wheel odometry between the frame before and frame `number`; none backwards."""
         if self.reverse:
             return []
+        return wheel_between(self.recording.wheel, self._body_ns(number - 1) + 1, self._body_ns(number) + 1)
+
+    def _body_ns(self, number: int) -> int:
+        """Stamp of a frame on the clock of the IMU and the wheels; -1 for before all frames."""
         offset_ns = int(self.recording.calibration.cameras[0].imu_minus_cam_s * 1e9)
-        since = self.recorded_stamp_ns(number - 1) + offset_ns if number else -(2**62)
-        until = self.recorded_stamp_ns(number) + offset_ns
-        return wheel_between(self.recording.wheel, since + 1, until + 1)
+        return _NEVER_NS if number < 0 else self.recorded_stamp_ns(number) + offset_ns
 
     def truth_map_from_body(self, number: int) -> Array | None:
         """The recording's ground truth at frame `number`, None if absent."""

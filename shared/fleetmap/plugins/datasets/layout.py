@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.recordings.files import hash_file, lines_of, read_text, what_instead
-from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, rig_views
+from fleetmap.recordings.image_series import ImageReader, ImageSeries, SeriesFrames, rig_views
 from fleetmap.recordings.images import (
     StoredFrame,
     StoredImage,
@@ -43,12 +43,12 @@ _IMU_NAMES = {
 }
 
 
-@dataclass(frozen=True)
-class FileReader:
-    """An ImageReader of image files below `root`. read_files: all other files that were read, for the content's hash."""
+class FileReader(ImageReader):
+    """Reads image files below `root`; read_files: all other files that were read."""
 
-    root: Path
-    read_files: Sequence[Path]
+    def __init__(self, root: Path, read_files: Sequence[Path]) -> None:
+        super().__init__(read_files)
+        self._root = root
 
     def read(self, source: Path, stamp_ns: int) -> StoredImage:
         return read_image(source)
@@ -63,11 +63,8 @@ class FileReader:
             digest.update(f"{name}\0{named[name].stat().st_size}\0".encode())
             hash_file(named[name], digest)
 
-    def close(self) -> None:
-        """Do nothing: no file stays open."""
-
     def _portable_name(self, path: Path) -> str:
-        return path.relative_to(self.root).as_posix() if path.is_relative_to(self.root) else f"outside/{path.name}"
+        return path.relative_to(self._root).as_posix() if path.is_relative_to(self._root) else f"outside/{path.name}"
 
 
 def rig_frames(

@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -25,16 +24,9 @@ _UPRIGHT = 0.9  # the cosine of 26 degrees
 _BASE_FRAMES = ("base", "base_link", "base_footprint")
 
 
-class InfoCamera(NamedTuple):
-    """A camera described by its CameraInfo; `is_rectified`: its images are rectified already."""
-
-    info: CameraInfo
-    is_rectified: bool
-
-    @property
-    def frame(self) -> str:
-        """Name of its frame in the transforms."""
-        return self.info.frame_id.lstrip("/")
+def rectified(info: CameraInfo) -> CameraInfo:
+    """The CameraInfo of the rectified images of a camera."""
+    return replace(info, matrix=info.projection[:, :3], lens="", distortion=np.zeros(0), rect_from_cam=np.eye(3))
 
 
 def same_lens(one: CameraInfo, other: CameraInfo) -> bool:
@@ -61,8 +53,8 @@ def info_of_images(info: CameraInfo, size_px: tuple[int, int], where: str) -> Ca
     """
     (x, y, width, height), (bin_x, bin_y) = info.roi, info.binning
     width, height = width or info.width_px - x, height or info.height_px - y
-    whole = info.width_px, info.height_px
-    if size_px == whole or (x, y, width, height, bin_x, bin_y) == (0, 0, *whole, 1, 1):
+    full_px = info.width_px, info.height_px
+    if size_px == full_px or (x, y, width, height, bin_x, bin_y) == (0, 0, *full_px, 1, 1):
         return info
     if not (0 <= width - size_px[0] * bin_x < bin_x and 0 <= height - size_px[1] * bin_y < bin_y):
         raise CalibrationError(
@@ -72,19 +64,13 @@ def info_of_images(info: CameraInfo, size_px: tuple[int, int], where: str) -> Ca
     image_from_whole = np.array(
         [[1 / bin_x, 0, (0.5 - x) / bin_x - 0.5], [0, 1 / bin_y, (0.5 - y) / bin_y - 0.5], [0, 0, 1]]
     )
-    return replace(
-        info,
-        width_px=size_px[0],
-        height_px=size_px[1],
-        matrix=image_from_whole @ info.matrix,
-        projection=image_from_whole @ info.projection,
-        binning=(1, 1),
-        roi=(0, 0, 0, 0),
-    )
+    matrix, projection = image_from_whole @ info.matrix, image_from_whole @ info.projection
+    whole = replace(info, width_px=size_px[0], height_px=size_px[1], binning=(1, 1), roi=(0, 0, 0, 0))
+    return replace(whole, matrix=matrix, projection=projection)
 
 
 def calibration_of_messages(
-    cameras: Sequence[InfoCamera],
+    cameras: Sequence[CameraInfo],
     cam0_from_cams: Sequence[Array | None],
     links: Sequence[FrameLink],
     imu_frame: str | None,
@@ -97,14 +83,8 @@ def calibration_of_messages(
     body_from_cam0 = _target_from_source(links, imu_frame, cameras[0].frame) if imu_frame else None
     has_imu = body_from_cam0 is not None
     body_from_first = np.eye(4) if body_from_cam0 is None else body_from_cam0
-    placed = [
-        check_camera(
-            replace(_lens(camera, where), body_from_cam=body_from_first @ cam0_from_cam),
-            f"{where}: {camera.info.frame_id}",
-        )
-        for camera, cam0_from_cam in zip(cameras, cam0_from_cams, strict=True)
-        if cam0_from_cam is not None
-    ]
+    posed = zip(cameras, cam0_from_cams, strict=True)
+    placed = [_camera(info, body_from_first @ pose, where) for info, pose in posed if pose is not None]
     body_frame = imu_frame if has_imu and imu_frame else cameras[0].frame
     bases = (_target_from_source(links, name, body_frame) for name in _BASE_FRAMES)
     base_from_body = next((base for base in bases if base is not None), None)
@@ -113,7 +93,7 @@ def calibration_of_messages(
     return RigCalibration(tuple(placed), ImuNoise() if has_imu else None, base, assumed)
 
 
-def camera_poses(cameras: Sequence[InfoCamera], links: Sequence[FrameLink], where: str) -> list[Array | None]:
+def camera_poses(cameras: Sequence[CameraInfo], links: Sequence[FrameLink], where: str) -> list[Array | None]:
     """cam0_from_cam (4, 4) of every camera: by transforms, or in the frame of an earlier camera by the baseline in the projection.
 
     None for an unknown one, CalibrationError for that of the second camera.
@@ -122,7 +102,7 @@ def camera_poses(cameras: Sequence[InfoCamera], links: Sequence[FrameLink], wher
     for number, camera in list(enumerate(cameras))[1:]:
         first = frames.index(camera.frame)
         cam0_from_left = cam0_from_cams[first % number]  # of camera 0 for the second camera, whatever its frame
-        if cam0_from_left is not None and (number == 1 or (first < number and camera.info.projection[0, 3] < 0)):
+        if cam0_from_left is not None and (number == 1 or (first < number and camera.projection[0, 3] < 0)):
             cam0_from_cams.append(cam0_from_left @ _left_from_right((cameras[first % number], camera), links, where))
         else:
             cam0_from_cams.append(_target_from_source(links, frames[0], frames[number]) if first == number else None)
@@ -133,13 +113,12 @@ def last_links(links: Sequence[FrameLink]) -> tuple[list[FrameLink], list[str]]:
     """The last usable transform of each child frame, as tf2 keeps it, and those that cannot be used; also words on children with several
     values."""
     sound = [link for link in links if link.is_usable and link.parent != link.child]
-    last = {link.child: link for link in sound}
-    others = {
-        link.child: link
-        for link in sound
-        if (now := last[link.child]).parent != link.parent
-        or not np.allclose(now.parent_from_child, link.parent_from_child, atol=1e-6)  # drivers round
-    }
+    last, others = {link.child: link for link in sound}, {}
+    for link in sound:
+        now = last[link.child]
+        is_alike = np.allclose(now.parent_from_child, link.parent_from_child, atol=1e-6)  # drivers round
+        if now.parent != link.parent or not is_alike:
+            others[link.child] = link
     words = [f"{_in_words(link)}, and later {_in_words(last[child])}" for child, link in others.items()]
     return [*(link for link in links if not link.is_usable), *last.values()], words
 
@@ -149,7 +128,7 @@ def _in_words(link: FrameLink) -> str:
     return f"{link.parent} -> {link.child} at {place_m.round(4).tolist()} m, turned by {turn_deg.round(2).tolist()} degrees"
 
 
-def frames_not_optical(cameras: Sequence[InfoCamera], links: Sequence[FrameLink]) -> list[str]:
+def frames_not_optical(cameras: Sequence[CameraInfo], links: Sequence[FrameLink]) -> list[str]:
     """Warning on cameras whose frame has the axes of the robot (x forward, z up); images need one with z forward and y down."""
     found = []
     for frame in dict.fromkeys(camera.frame for camera in cameras if "optical" not in camera.frame):
@@ -163,22 +142,20 @@ def frames_not_optical(cameras: Sequence[InfoCamera], links: Sequence[FrameLink]
     return found
 
 
-def _lens(camera: InfoCamera, where: str) -> CameraCalibration:
-    info = camera.info
-    matrix = info.projection[:, :3] if camera.is_rectified else info.matrix
-    name, coefficients = ("", np.zeros(0)) if camera.is_rectified else (info.lens, info.distortion)
-    model, distortion = lens_of(name, coefficients, f"{where}: CameraInfo of {info.frame_id}")
-    return CameraCalibration(model, info.width_px, info.height_px, intrinsics_of(matrix), distortion, np.eye(4))
+def _camera(info: CameraInfo, body_from_cam: Array, where: str) -> CameraCalibration:
+    model, distortion = lens_of(info.lens, info.distortion, f"{where}: CameraInfo of {info.frame_id}")
+    lens = model, info.width_px, info.height_px, intrinsics_of(info.matrix), distortion
+    return check_camera(CameraCalibration(*lens, body_from_cam), f"{where}: {info.frame_id}")
 
 
-def _left_from_right(cameras: Sequence[InfoCamera], links: Sequence[FrameLink], where: str) -> Array:
+def _left_from_right(cameras: Sequence[CameraInfo], links: Sequence[FrameLink], where: str) -> Array:
     """(4, 4) cam0_from_cam1 by the transforms, else by the right camera's projection.
 
     There, K, R and P are those of ROS's stereo calibration: P[0, 3] = -fx * baseline. Drivers without a calibration send transforms of
     length 0, which are right only for cameras that look different ways.
     """
-    left, right = cameras[0].info, cameras[1].info
-    cam0_from_cam1 = _target_from_source(links, cameras[0].frame, cameras[1].frame)
+    left, right = cameras
+    cam0_from_cam1 = _target_from_source(links, left.frame, right.frame)
     if cam0_from_cam1 is not None and np.linalg.norm(cam0_from_cam1[:3, 3]) > LEAST_BASELINE_M:
         return cam0_from_cam1
     fx = right.projection[0, 0]
@@ -193,10 +170,8 @@ def _left_from_right(cameras: Sequence[InfoCamera], links: Sequence[FrameLink], 
             "with --calibration FILE"
         )
     rect_from_rect = se3(np.eye(3), np.array([baseline_m, 0.0, 0.0]))
-    left_rotation, right_rotation = (
-        np.eye(3) if camera.is_rectified else camera.info.rect_from_cam for camera in cameras
-    )
-    return se3_inverse(se3(left_rotation, np.zeros(3))) @ rect_from_rect @ se3(right_rotation, np.zeros(3))
+    rect_from_left, rect_from_right = (se3(camera.rect_from_cam, np.zeros(3)) for camera in cameras)
+    return se3_inverse(rect_from_left) @ rect_from_rect @ rect_from_right
 
 
 def _target_from_source(links: Sequence[FrameLink], target: str, source: str) -> Array | None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from functools import cache, partial
 from io import BufferedReader, FileIO
 from itertools import islice
-from pathlib import Path
+from pathlib import Path, PosixPath
 from typing import Any, BinaryIO
 
 from fleetmap.errors import RecordingError
@@ -102,20 +102,11 @@ class _BoundedFile(BufferedReader):
         return super().readline(100)  # only its first line is read this way
 
 
-class _BagPath:
-    """The subset of Path's interface that rosbags uses."""
+class _BagPath(PosixPath):
+    """A path that opens a file with that limit."""
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def exists(self) -> bool:
-        return True
-
-    def open(self, _: str) -> BinaryIO:
-        return _BoundedFile(FileIO(self._path))
-
-    def __str__(self) -> str:
-        return str(self._path)
+    def open(self, *_: object) -> BinaryIO:  # type: ignore[override]
+        return _BoundedFile(FileIO(self))
 
 
 @cache

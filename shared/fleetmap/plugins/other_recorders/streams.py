@@ -13,12 +13,12 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.plugins.other_recorders.calibration import (
-    InfoCamera,
     calibration_of_messages,
     camera_poses,
     frames_not_optical,
     info_of_images,
     last_links,
+    rectified,
     same_lens,
     setting_of,
 )
@@ -51,9 +51,8 @@ from fleetmap.sensors.source_settings import CAMERA_ROLES, Topics, transports
 
 _SAME_LENS = 0.02  # of the focal length
 _MOST_LENSES = 20  # of one camera in a recording
-_HEADER_BYTES = (
-    12  # CDR's head and a stamp, or ROS 1's sequence number and stamp: the difference between messages of equal content
-)
+# CDR's head and a stamp, or ROS 1's sequence number and stamp: the difference between messages of equal content
+_HEADER_BYTES = 12
 _RECTIFIED = re.compile(r"(?<![a-z])(rect(?![a-z])|rectified)")  # image_rect, rect/image; not direct, image_unrect
 
 
@@ -143,10 +142,9 @@ def _stream_of(container: Container, topics: Topics, channel: Channel) -> Stream
     is_known = channel.encoding in ENCODINGS and channel.type_name in KNOWN_TYPES
     if not is_known or (channel.type_name in TF_TYPES and channel.topic != topics.tf_static):
         return None
-    kind = (
-        _InfoStream if channel.type_name in INFO_TYPES else ImageStream if channel.type_name in IMAGE_TYPES else Stream
-    )
-    return kind(container, channel)
+    if channel.type_name in INFO_TYPES:
+        return _InfoStream(container, channel)
+    return (ImageStream if channel.type_name in IMAGE_TYPES else Stream)(container, channel)
 
 
 def _with_hints(topics: Topics, given: CalibrationFile | None, present: set[str]) -> Topics:
@@ -191,20 +189,14 @@ def _usable(what: str, lenses: _Lenses, log: ReadLog) -> NDArray[np.bool_]:
 
 def _lenses(images: Sequence[ImageStream], streams: Sequence[Stream]) -> _Lenses:
     """CalibrationError if the number of lenses keeps growing, as with autofocus."""
-    told: list[tuple[int, CameraInfo]] = [
-        (info.stamp_ns or log_time_ns, info)
-        for stream in streams
-        for log_time_ns, info in stream.values
-        if info.matrix[0, 0] > 0
-    ]
+    values: list[tuple[int, CameraInfo]] = [value for stream in streams for value in stream.values]
+    told = [(info.stamp_ns or log_time_ns, info) for log_time_ns, info in values if info.matrix[0, 0] > 0]
     told.sort(key=lambda each: each[0])
-    infos: list[CameraInfo] = []
-    numbers: list[int] = []
+    infos, numbers = list[CameraInfo](), list[int]()
     for _, info in told:
         number = next((n for n, lens in enumerate(infos) if same_lens(lens, info)), len(infos))
         numbers.append(number)
-        if number == len(infos):
-            infos.append(info)
+        infos += [info] if number == len(infos) else []
         if len(infos) > _MOST_LENSES:
             raise CalibrationError(
                 f"{streams[0].channel.topic} describes more than {_MOST_LENSES} lenses, from {setting_of(infos[0])} to "
@@ -225,7 +217,7 @@ def _note_unregistered(streams: Iterable[Stream], roles: Roles, camera: CameraCa
     infos = [info for stream in beside for _, info in stream.values]
     if not infos or not infos[0].matrix.any():
         return
-    own = np.array([infos[0].matrix[0, 0], infos[0].matrix[0, 2], infos[0].matrix[1, 2]])
+    own = infos[0].matrix[[0, 0, 1], [0, 2, 2]]
     if np.abs(own - [fx, cx, cy]).max() > _SAME_LENS * fx:
         log.note(
             "depth not registered",
@@ -243,11 +235,10 @@ def _calibration(
         image_topic = roles[side][0].channel.topic
         if not told.infos:
             has_messages = any(len(stream.messages) > stream.damaged for stream in roles.get(f"{side}_info", ()))
-            fault = (
-                f"every CameraInfo beside {image_topic} holds zeros, as drivers without a calibration send it; calibrate the camera, or"
-                if has_messages
-                else f"no CameraInfo beside {image_topic} describes its lens;"
-            )
+            fault = f"no CameraInfo beside {image_topic} describes its lens;"
+            if has_messages:
+                zeros = "holds zeros, as drivers without a calibration send it; calibrate the camera, or"
+                fault = f"every CameraInfo beside {image_topic} {zeros}"
             raise CalibrationError(f"{container.path}: {fault} pass a calibration with --calibration FILE")
         sizes_px = [size for stream in roles[side] for size in stream.sizes_px]
         of_usual = [size for size, n in zip(sizes_px, told.numbers, strict=True) if n == told.usual]
@@ -256,7 +247,7 @@ def _calibration(
         if info.binning != (1, 1) or info.roi[:2] != (0, 0):
             setting = f"{setting_of(info)}, of images of just that size; the calibration is used as it is"
             log.note("binning or roi not used", f"the CameraInfo beside {image_topic} says {setting}")
-        cameras.append(InfoCamera(info, bool(_RECTIFIED.search(image_topic.lower()))))
+        cameras.append(rectified(info) if _RECTIFIED.search(image_topic.lower()) else info)
     said = [value for stream in roles.get("tf_static", ()) for value in stream.values]
     said.sort(key=lambda value: value[0])
     links, changes = last_links([link for _, found in said for link in found])
@@ -271,9 +262,7 @@ def _calibration(
             log.note("camera not mounted", f"{side}: {what}; its images are not used")
     for words in frames_not_optical(cameras, links):
         log.note("camera frame not optical", words)
-    mounted = tuple(
-        side for side, cam0_from_cam in zip(sides, cam0_from_cams, strict=True) if cam0_from_cam is not None
-    )
+    mounted = tuple(side for side, pose in zip(sides, cam0_from_cams, strict=True) if pose is not None)
     calibration = calibration_of_messages(cameras, cam0_from_cams, links, imu_frame, str(container.path))
     if len(mounted) > 1:
         marked = zip(calibration.cameras, mounted, strict=True)

@@ -1,5 +1,6 @@
 """Roles of the topics in a recording of messages: by the conventional name, else by type and name if the choice is unique."""
 
+import re
 from collections.abc import Iterable
 
 from fleetmap.errors import RecordingError
@@ -118,9 +119,7 @@ def _of_one_camera(topics: list[str]) -> str | None:
 
 
 def _unpacked(topic: str) -> str:
-    for suffix in PACKED:
-        topic = topic.removesuffix(suffix)
-    return topic
+    return re.sub(rf"({'|'.join(PACKED)})$", "", topic)
 
 
 def _camera(topic: str) -> str:

@@ -6,7 +6,6 @@ image sizes have the general limit.
 """
 
 import bisect
-import hashlib
 import re
 import struct
 from collections.abc import Iterator, Sequence
@@ -18,9 +17,9 @@ import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
-from fleetmap.recordings.files import file_head, hash_file
+from fleetmap.recordings.files import file_head
 from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
-from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, paired
+from fleetmap.recordings.image_series import ImageReader, ImageSeries, SeriesFrames, paired
 from fleetmap.recordings.images import StoredImage, grey_image
 from fleetmap.recordings.limits import MAX_PIXELS, MAX_VIDEO_TABLE_BYTES
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS, ReadLog
@@ -59,16 +58,16 @@ def open_video(path: Path, options: OpenOptions) -> Recording:
         raise
 
 
-class VideoReader:
-    """An ImageReader that decodes forward, and seeks to the last key frame before any other requested frame.
+class VideoReader(ImageReader):
+    """Decodes forward, and seeks to the last key frame before any other requested frame.
 
-    Frames are identified by their presentation time in the video's own unit. read_files: the video first; keys: times of all key frames.
+    Frames are identified by their presentation time in the video's own unit. keys: times of all key frames.
     """
 
     def __init__(self, read_files: Sequence[Path], keys: Sequence[int]) -> None:
-        self._read_files, self._keys = read_files, keys
+        super().__init__(read_files)
+        self._keys, self._files = keys, ExitStack()
         self._open: tuple[Any, Any] | None = None  # container and stream
-        self._files, self._is_closed = ExitStack(), False
         self._decoded: Iterator[Any] = iter(())
         self._last: Any = None
 
@@ -78,25 +77,19 @@ class VideoReader:
 
     def read(self, source: int, stamp_ns: int) -> StoredImage:
         """Read a frame, decoded: its encoded form depends on other frames."""
-        return grey_image(_luma(self._at(source, stamp_ns)), f"{self._read_files[0]} at {stamp_ns}")
+        return grey_image(_luma(self._at(source, stamp_ns)), f"{self.read_files[0]} at {stamp_ns}")
 
     def apart(self) -> "VideoReader":
-        return VideoReader(self._read_files, self._keys)
-
-    def hash_into(self, digest: "hashlib._Hash", images: list[int]) -> None:
-        """Hash the bytes of the video, then those of the calibration file."""
-        for path in self._read_files:
-            hash_file(path, digest)
+        return VideoReader(self.read_files, self._keys)
 
     def close(self) -> None:
+        super().close()
         self._files.close()
-        self._open, self._last, self._is_closed = None, None, True
+        self._open, self._last = None, None
 
     def _at(self, wanted: int, stamp_ns: int) -> Any:
-        where = f"{self._read_files[0]}: the frame at {stamp_ns}"
-        if self._is_closed:
-            closed = "was asked for after the recording was closed; keep it open while frames are read"
-            raise RecordingError(f"{where} {closed}")
+        where = f"{self.read_files[0]}: the frame at {stamp_ns}"
+        self.check_open(where)
         if self._last is None or self._last.pts != wanted:
             try:
                 self._last = self._decode(wanted)
@@ -110,7 +103,7 @@ class VideoReader:
     def _decode(self, wanted: int) -> Any:
         """Decode the frame of that time; None if absent."""
         if self._open is None:
-            self._open = _opened(self._read_files[0], self._files)
+            self._open = _opened(self.read_files[0], self._files)
         container, stream = self._open
         last = -1 if self._last is None else self._last.pts
         if not (last < wanted and bisect.bisect(self._keys, last) == bisect.bisect(self._keys, wanted) > 0):
@@ -137,12 +130,12 @@ def _opened(path: Path, files: ExitStack) -> tuple[Any, Any]:
         stream = next(iter(container.streams.video), None)
         codec = stream.codec_context if stream else None
         problem = "its codec is not known" if stream else "it holds no pictures"
-        if codec is not None and codec.width * codec.height > MAX_PIXELS:
-            problem = f"pictures of {codec.width}x{codec.height} are larger than the limit of {MAX_PIXELS} pixels"
-        elif codec is not None:
+        if codec is not None and codec.width * codec.height <= MAX_PIXELS:
             codec.options = {"max_pixels": str(MAX_PIXELS)}
             files.push(opened.pop_all())
             return container, stream
+        if codec is not None:
+            problem = f"pictures of {codec.width}x{codec.height} are larger than the limit of {MAX_PIXELS} pixels"
         raise RecordingError(f"{path} cannot be read as a video: {problem}; {_conversion(path)}")
 
 

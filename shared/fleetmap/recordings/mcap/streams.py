@@ -1,6 +1,5 @@
 """A recording from the messages in a container: orders stamps, leaves images in the file."""
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -15,9 +14,8 @@ from numpy.typing import NDArray
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array
 from fleetmap.recordings.calibration_files import CalibrationFile, parse_calibration
-from fleetmap.recordings.files import hash_file
 from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize, image_parts
-from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, ViewImages, paired, rig_views
+from fleetmap.recordings.image_series import ImageReader, ImageSeries, SeriesFrames, ViewImages, paired, rig_views
 from fleetmap.recordings.images import StoredImage, check_image
 from fleetmap.recordings.mcap.container import CALIBRATION_ATTACHMENT, UNDECODABLE, Channel, Container, Place
 from fleetmap.recordings.ordering import (
@@ -25,9 +23,9 @@ from fleetmap.recordings.ordering import (
     ReadLog,
     as_logged,
     clean_imu,
+    forward_only,
     trajectory_of_rows,
     usual_size,
-    values_forward,
 )
 from fleetmap.recordings.recording import OpenOptions, Recording
 from fleetmap.sensors.calibration import RigCalibration
@@ -104,14 +102,19 @@ class ImageStream(Stream):
 
 Roles = Mapping[str, Sequence[Any]]
 """Streams by their role, ImageStreams for roles of images."""
-PartsOf = Callable[[Container, CalibrationFile | None, ReadLog], RecordingParts]
-"""Builds the parts of a recording, by the calibration that the caller chose or the container's."""
 
 
 def open_container(
-    path: Path, file_format: str, opener: Callable[[], Container], options: OpenOptions, parts_of: PartsOf
+    path: Path,
+    file_format: str,
+    opener: Callable[[], Container],
+    options: OpenOptions,
+    parts_of: Callable[[Container, CalibrationFile | None, ReadLog], RecordingParts],
 ) -> Recording:
-    """Open the recording at `path` through the container that `opener` opens; its issues list unreadable messages."""
+    """Open the recording at `path` through the container that `opener` opens; its issues list unreadable messages.
+
+    parts_of: builds its parts, by the calibration that the caller chose, if any.
+    """
     log = ReadLog()
     given = calibration_of_options(options, log)
     container = opener()
@@ -269,8 +272,8 @@ def _samples(streams: Sequence[Stream], what: str, log: ReadLog) -> tuple[Any, .
     """The samples whose stamps increase as they arrived."""
     samples = [value for stream in streams for value in stream.values]
     stamps_ns, order = as_logged([sample.stamp_ns for _, sample in samples], [at for at, _ in samples], what, log)
-    stamped = [replace(samples[k][1], stamp_ns=int(stamps_ns[k])) for k in order.tolist()]
-    return values_forward(stamped, [sample.stamp_ns for sample in stamped], what, log)
+    kept = order[forward_only(stamps_ns[order], what, log)].tolist()
+    return tuple(replace(samples[k][1], stamp_ns=int(stamps_ns[k])) for k in kept)
 
 
 def _imu(streams: Sequence[Stream], log: ReadLog) -> tuple[ImuSamples, str | None]:
@@ -299,25 +302,19 @@ def _ground_truth(streams: Sequence[Stream], log: ReadLog) -> Trajectory | None:
     return trajectory_of_rows(stamps_ns[order], rows[order], log)
 
 
-class MessageReader:
-    """An ImageReader of the image messages of a container, which the first read opens if necessary.
-
-    read_files: files covered by the content's hash, the recording first.
-    """
+class MessageReader(ImageReader):
+    """Reads the image messages of a container, which the first read opens if necessary."""
 
     def __init__(
         self, opener: Callable[[], Container], container: Container | None, read_files: Sequence[Path]
     ) -> None:
-        self._opener, self._container, self._read_files = opener, container, read_files
-        self._is_closed = False
+        super().__init__(read_files)
+        self._opener, self._container = opener, container
 
     def read(self, source: Source, stamp_ns: int) -> StoredImage:
         channel, place = source
-        where = f"{self._read_files[0]}: {channel.topic} at {stamp_ns}"
-        if self._is_closed:
-            raise RecordingError(
-                f"{where} was asked for after the recording was closed; keep it open while frames are read"
-            )
+        where = f"{self.read_files[0]}: {channel.topic} at {stamp_ns}"
+        self.check_open(where)
         try:
             if self._container is None:
                 self._container = self._opener()
@@ -333,14 +330,10 @@ class MessageReader:
             ) from error
 
     def apart(self) -> "MessageReader":
-        return MessageReader(self._opener, None, self._read_files)
-
-    def hash_into(self, digest: "hashlib._Hash", images: list[Source]) -> None:
-        """Hash the bytes of the recording's files, then those of the calibration file if one was given."""
-        for path in self._read_files:
-            hash_file(path, digest)
+        return MessageReader(self._opener, None, self.read_files)
 
     def close(self) -> None:
+        super().close()
         if self._container is not None:
             self._container.close()
-        self._container, self._is_closed = None, True
+        self._container = None

@@ -14,18 +14,9 @@ from pathlib import Path
 from mcap.writer import CompressionType, Writer
 
 from fleetmap.errors import RecordingError, disk_errors
+from fleetmap.recordings import images
 from fleetmap.recordings.calibration_files import format_calibration
-from fleetmap.recordings.images import (
-    INVERSE_DEPTH,
-    StoredFrame,
-    StoredImage,
-    decode_depth,
-    decode_grey,
-    depth_image,
-    file_kind,
-    grey_image,
-    store_frame,
-)
+from fleetmap.recordings.images import INVERSE_DEPTH, StoredFrame, StoredImage
 from fleetmap.recordings.mcap.container import CALIBRATION_ATTACHMENT
 from fleetmap.recordings.ordering import UNCERTAIN_STAMPS
 from fleetmap.recordings.recording import Recording
@@ -86,7 +77,7 @@ class McapRecordingWriter:
 
         Images that are JPEG or PNG already as CompressedImage, all others as Image.
         """
-        stored = frame if isinstance(frame, StoredFrame) else store_frame(frame)
+        stored = frame if isinstance(frame, StoredFrame) else images.store_frame(frame)
         topics = self._topics
         infos = {0: topics.left_info, 1: topics.right_info}
         for numbers, view in zip(self._calibration.views, (stored, *stored.others), strict=False):
@@ -105,10 +96,8 @@ class McapRecordingWriter:
                 self._write_image(topic, view.stamp_ns, f"cam{numbers[0]}", view.depth, is_depth=True)
 
     def write_imu(self, samples: ImuSamples) -> None:
-        for stamp_ns, gyro, accel in zip(
-            samples.stamps_ns.tolist(), samples.gyro_radps, samples.accel_mps2, strict=True
-        ):
-            data = messages.encode_imu(stamp_ns, BODY_FRAME, gyro, accel)
+        for stamp_ns, *values in zip(samples.stamps_ns.tolist(), samples.gyro_radps, samples.accel_mps2, strict=True):
+            data = messages.encode_imu(stamp_ns, BODY_FRAME, *values)
             self._write(self._topics.imu, "sensor_msgs/Imu", stamp_ns, data)
 
     def write_wheel(self, samples: WheelSample | Iterable[WheelSample]) -> None:
@@ -162,19 +151,19 @@ class McapRecordingWriter:
     def _write_image(
         self, topic: str, stamp_ns: int, frame_id: str, image: StoredImage, *, is_depth: bool = False
     ) -> None:
-        if image.encoding == INVERSE_DEPTH:
-            data = messages.encode_compressed_image(stamp_ns, frame_id, image, image.form)
-            self._write(f"{topic}/compressedDepth", "sensor_msgs/CompressedImage", stamp_ns, data)
-            return
-        kind = file_kind(image.data) if image.encoding == "file" else "rows"
-        if kind in ("jpeg", "png"):
-            form = f"16UC1; {kind} compressed" if is_depth else image.form or kind
+        kind = images.file_kind(image.data) if image.encoding == "file" else image.encoding
+        if kind in ("jpeg", "png", INVERSE_DEPTH):
+            is_png_depth = is_depth and kind != INVERSE_DEPTH
+            form = f"16UC1; {kind} compressed" if is_png_depth else image.form or kind
             data = messages.encode_compressed_image(stamp_ns, frame_id, image, form)
-            self._write(f"{topic}/compressed", "sensor_msgs/CompressedImage", stamp_ns, data)
+            transport = "compressedDepth" if kind == INVERSE_DEPTH else "compressed"
+            self._write(f"{topic}/{transport}", "sensor_msgs/CompressedImage", stamp_ns, data)
             return
         rows = image
-        if kind != "rows":
-            rows = depth_image(decode_depth(image)) if is_depth else grey_image(decode_grey(image))
+        if kind == "other" and is_depth:
+            rows = images.depth_image(images.decode_depth(image))
+        elif kind == "other":
+            rows = images.grey_image(images.decode_grey(image))
         if rows.step_bytes == 0:
             raise RecordingError(f"{image.where or topic} at {stamp_ns}: an image in rows needs its step_bytes")
         self._write(topic, "sensor_msgs/Image", stamp_ns, messages.encode_image(stamp_ns, frame_id, rows))
@@ -182,26 +171,19 @@ class McapRecordingWriter:
     def _write(self, topic: str, type_name: str, stamp_ns: int, data: bytes) -> None:
         if not self._links_are_written:
             self._links_are_written = True
-            links = [
-                messages.FrameLink(BODY_FRAME, f"cam{i}", camera.body_from_cam)
-                for i, camera in enumerate(self._calibration.cameras)
-            ]
+            mounted = [(f"cam{i}", camera.body_from_cam) for i, camera in enumerate(self._calibration.cameras)]
+            links = [messages.FrameLink(BODY_FRAME, name, body_from_cam) for name, body_from_cam in mounted]
             links.append(messages.FrameLink(BASE_FRAME, BODY_FRAME, self._calibration.base_from_body))
             tf_data = messages.encode_frame_links(stamp_ns, links)
             self._write(self._topics.tf_static, "tf2_msgs/TFMessage", stamp_ns, tf_data)
-        channel = self._channel(topic, type_name)
-        with self._disk_errors():
-            self._writer.add_message(channel, stamp_ns, data, stamp_ns, self._counts[topic])
-        self._counts[topic] += 1
-
-    def _channel(self, topic: str, type_name: str) -> int:
+        if type_name not in self._schemas:
+            names = type_name.replace("/", "/msg/"), "ros2msg"
+            self._schemas[type_name] = self._writer.register_schema(*names, ros2msg(type_name).encode())
         if topic not in self._channels:
-            ros_name = type_name.replace("/", "/msg/")
-            if type_name not in self._schemas:
-                definition = ros2msg(type_name).encode()
-                self._schemas[type_name] = self._writer.register_schema(ros_name, "ros2msg", definition)
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schemas[type_name])
-        return self._channels[topic]
+        with self._disk_errors():
+            self._writer.add_message(self._channels[topic], stamp_ns, data, stamp_ns, self._counts[topic])
+        self._counts[topic] += 1
 
 
 def copy_to_mcap(recording: Recording, path: Path, on_frame: Callable[[], None] = lambda: None) -> None:
@@ -210,10 +192,8 @@ def copy_to_mcap(recording: Recording, path: Path, on_frame: Callable[[], None] 
     Samples precede the frame that follows them, so that the file is ordered in time to within one frame. The
     file appears at `path` only when it is complete.
     """
-    is_uncertain = UNCERTAIN_STAMPS in recording.issues
-    with McapRecordingWriter(
-        path, recording.calibration, name=recording.name, has_uncertain_stamps=is_uncertain
-    ) as writer:
+    is_uncertain, rig = UNCERTAIN_STAMPS in recording.issues, recording.calibration
+    with McapRecordingWriter(path, rig, name=recording.name, has_uncertain_stamps=is_uncertain) as writer:
         since_ns = -(1 << 62)
         for index, stamp_ns in enumerate(recording.frame_stamps_ns.tolist()):
             _write_between(recording, writer, since_ns, stamp_ns)
