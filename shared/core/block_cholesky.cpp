@@ -1,4 +1,5 @@
 #include "block_cholesky.h"
+#include "bindings/arrays.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
@@ -8,17 +9,17 @@
 namespace fleetmap {
 namespace {
 
-using Indices = std::vector<int32_t>;
+using NodeList = std::vector<int32_t>;
 
 // A row of numbers for each node.
 struct Lists {
   std::vector<int64_t> starts;
-  Indices entries;
+  NodeList entries;
 };
 
 // For each position in the order of elimination the coupled ones before it, or after it.
-Lists neighbours(const std::vector<std::pair<int64_t, int64_t>>& pairs, const Indices& position, bool after) {
-  Lists lists{std::vector<int64_t>(position.size() + 1), Indices(pairs.size())};
+Lists neighbours(const std::vector<std::pair<int64_t, int64_t>>& pairs, const NodeList& position, bool after) {
+  Lists lists{std::vector<int64_t>(position.size() + 1), NodeList(pairs.size())};
   auto ends = [&](const std::pair<int64_t, int64_t>& pair) {
     const auto [early, late] = std::minmax({position[size_t(pair.first)], position[size_t(pair.second)]});
     return after ? std::pair(early, late) : std::pair(late, early);
@@ -30,16 +31,16 @@ Lists neighbours(const std::vector<std::pair<int64_t, int64_t>>& pairs, const In
   return lists;
 }
 
-Indices positions_of(const std::vector<int64_t>& order) {
-  Indices position(order.size());
+NodeList positions_of(const std::vector<int64_t>& order) {
+  NodeList position(order.size());
   for (size_t n = 0; n < order.size(); ++n) position[size_t(order[n])] = int32_t(n);
   return position;
 }
 
 // The parent of each node, -1 for roots. Source: Davis 2006, section 4.1.
-Indices elimination_tree(const Lists& before) {
+NodeList elimination_tree(const Lists& before) {
   const int32_t count = int32_t(before.starts.size()) - 1;
-  Indices parent(size_t(count), -1), ancestor(size_t(count), -1);
+  NodeList parent(size_t(count), -1), ancestor(size_t(count), -1);
   for (int32_t n = 0; n < count; ++n)
     for (int64_t entry = before.starts[n]; entry < before.starts[n + 1]; ++entry)
       for (int32_t m = before.entries[entry]; m != -1 && m < n;) {
@@ -52,9 +53,9 @@ Indices elimination_tree(const Lists& before) {
 }
 
 // Nodes so that every subtree is in one piece, its root last; children in the order that they had.
-Indices postorder(const Indices& parent) {
+NodeList postorder(const NodeList& parent) {
   const int32_t count = int32_t(parent.size());
-  Indices head(size_t(count), -1), following(size_t(count), -1), order, stack;
+  NodeList head(size_t(count), -1), following(size_t(count), -1), order, stack;
   for (int32_t n = count - 1; n >= 0; --n)
     if (parent[n] >= 0) following[n] = std::exchange(head[parent[n]], n);
   for (int32_t root = 0; root < count; ++root) {
@@ -75,9 +76,9 @@ Indices postorder(const Indices& parent) {
 }
 
 // The rows of each column of the factor below its diagonal, ascending: those of its own matrix, and of its children in the tree.
-Lists column_structures(const Lists& after, const Indices& parent) {
+Lists column_structures(const Lists& after, const NodeList& parent) {
   const int32_t count = int32_t(parent.size());
-  Indices head(size_t(count), -1), following(size_t(count), -1), marked(size_t(count), -1);
+  NodeList head(size_t(count), -1), following(size_t(count), -1), marked(size_t(count), -1);
   Lists columns{{0}, {}};
   for (int32_t n = 0; n < count; ++n) {
     auto take = [&](int32_t row) {
@@ -103,8 +104,8 @@ double allowed_zeros(double columns) { return columns <= 24 ? 0.8 : columns <= 9
 // The first node of each run of columns that are kept as one dense front, and N at the end. below: unknowns below each column of
 // nodes; unknowns (N + 1,): where those of each node begin. Source: Ashcraft and Grimes 1989, The influence of relaxed supernode
 // partitions on the multifrontal method.
-Indices supernodes(const Indices& parent, const std::vector<int64_t>& below, const std::vector<int64_t>& unknowns) {
-  Indices firsts;
+NodeList supernodes(const NodeList& parent, const std::vector<int64_t>& below, const std::vector<int64_t>& unknowns) {
+  NodeList firsts;
   std::vector<double> exact;  // numbers of each front that are not zero for certain
   for (int32_t n = 0; n < int32_t(parent.size()); ++n) {
     auto numbers = [&](double columns) { return columns * (columns + 1.0) / 2.0 + columns * double(below[n]); };
@@ -126,7 +127,7 @@ Indices supernodes(const Indices& parent, const std::vector<int64_t>& below, con
 }
 
 // Adds a child's update (m, m), of which the lower triangle counts, to its parent's front at rows (m,).
-void add_child(const std::vector<double>& child, const Indices& rows, double* diagonal, int own, double* lower, double* rest, int below) {
+void add_child(const std::vector<double>& child, const NodeList& rows, double* diagonal, int own, double* lower, double* rest, int below) {
   const size_t m = rows.size();
   for (size_t c = 0; c < m; ++c) {
     const int32_t col = rows[c];
@@ -153,10 +154,10 @@ BlockCholesky::BlockCholesky(const std::vector<int64_t>& sizes, const std::vecto
     : position_(positions_of(order)) {
   const size_t count = sizes.size();
   const std::vector<int64_t> given = order;
-  const Indices after_order = postorder(elimination_tree(neighbours(pairs, position_, false)));
+  const NodeList after_order = postorder(elimination_tree(neighbours(pairs, position_, false)));
   for (size_t n = 0; n < count; ++n) order[n] = given[size_t(after_order[n])];
   position_ = positions_of(order);
-  const Indices parent = elimination_tree(neighbours(pairs, position_, false));
+  const NodeList parent = elimination_tree(neighbours(pairs, position_, false));
   const Lists columns = column_structures(neighbours(pairs, position_, true), parent);
 
   std::vector<int64_t> begins(count + 1), unknowns(count + 1), below(count);  // of nodes, and by position
@@ -167,7 +168,7 @@ BlockCholesky::BlockCholesky(const std::vector<int64_t>& sizes, const std::vecto
     for (int64_t entry = columns.starts[n]; entry < columns.starts[n + 1]; ++entry) below[n] += size_at(columns.entries[size_t(entry)]);
   }
 
-  const Indices firsts = supernodes(parent, below, unknowns);
+  const NodeList firsts = supernodes(parent, below, unknowns);
   front_.resize(count), offset_.resize(count);
   for (size_t s = 0; s + 1 < firsts.size(); ++s) {
     const size_t first = size_t(firsts[s]), end = size_t(firsts[s + 1]);
@@ -268,6 +269,97 @@ void BlockCholesky::solve(const double* values, double* b) const {
     lapack.dtrsv("L", "T", "N", &front.own, diagonal, &front.own, here, &kOne);
   }
   for (size_t n = 0; n < x.size(); ++n) b[order_[n]] = x[n];
+}
+
+void check_order(std::span<const int64_t> order, size_t count) {
+  std::vector<bool> seen(count, false);
+  for (const int64_t node : order) {
+    if (node < 0 || size_t(node) >= count || seen[size_t(node)]) throw nb::value_error("order: each node once");
+    seen[size_t(node)] = true;
+  }
+  if (order.size() != count) throw nb::value_error("order: each node once");
+}
+
+Lapack lapack;
+
+// scipy hands out its LAPACK as capsules, for Cython, of Fortran's interface with 32-bit integers.
+void find_lapack() {
+  if (lapack.dpotrf) return;
+  auto found = [](const char* library, const char* name, auto& function) {
+    const nb::object capsule = nb::module_::import_(library).attr("__pyx_capi__")[name];
+    void* address = PyCapsule_GetPointer(capsule.ptr(), PyCapsule_GetName(capsule.ptr()));
+    if (!address) throw nb::python_error();
+    function = reinterpret_cast<std::remove_reference_t<decltype(function)>>(address);
+  };
+  found("scipy.linalg.cython_blas", "dtrsm", lapack.dtrsm);
+  found("scipy.linalg.cython_blas", "dsyrk", lapack.dsyrk);
+  found("scipy.linalg.cython_blas", "dtrsv", lapack.dtrsv);
+  found("scipy.linalg.cython_blas", "dgemv", lapack.dgemv);
+  found("scipy.linalg.cython_lapack", "dpotrs", lapack.dpotrs);
+  found("scipy.linalg.cython_lapack", "dpotrf", lapack.dpotrf);
+}
+
+namespace {
+
+void make(BlockCholesky* self, const Indices& sizes, const Array<int64_t, -1, 2>& pairs, const Indices& order) {
+  constexpr int64_t kMostEach = 1 << 12, kMost = 1 << 24;
+  const int64_t count = int64_t(sizes.shape(0));
+  find_lapack();
+  const nb::gil_scoped_release others_run;
+  int64_t total = 0;
+  for (const int64_t size : sizes)
+    if (size < 1 || size > kMostEach || (total += size) > kMost) throw nb::value_error("sizes: 1 to 4096, at most 2^24 in all");
+  std::vector<std::pair<int64_t, int64_t>> coupled;
+  for (size_t n = 0; n < pairs.shape(0); ++n) {
+    const int64_t a = pairs(n, 0), b = pairs(n, 1);
+    if (a < 0 || b < 0 || a >= count || b >= count) throw nb::value_error("pairs: of nodes");
+    coupled.emplace_back(a, b);
+  }
+  check_order({order.begin(), order.end()}, size_t(count));
+  new (self) BlockCholesky({sizes.begin(), sizes.end()}, coupled, {order.begin(), order.end()});
+}
+
+auto places_of(const BlockCholesky& pattern, const Indices& rows, const Indices& cols) {
+  const size_t count = rows.shape(0);
+  const int64_t nodes = int64_t(pattern.nodes());
+  if (cols.shape(0) != count) throw nb::value_error("cols: one for each row");
+  std::vector<BlockPlace> places;
+  unlocked([&] {
+    for (size_t n = 0; n < count; ++n) {
+      if (rows(n) < 0 || cols(n) < 0 || rows(n) >= nodes || cols(n) >= nodes) throw nb::value_error("rows, cols: nodes");
+      places.push_back(pattern.place(rows(n), cols(n)));
+      if (places.back().first < 0) throw nb::value_error("rows, cols: nodes that are coupled");
+    }
+  });
+  return as_numpy<int64_t>(std::move(places));
+}
+
+bool factorise(const BlockCholesky& pattern, const MutableArray<double, -1>& values) {
+  if (values.size() != pattern.size()) throw nb::value_error("values: as many as size says");
+  return unlocked([&] { return pattern.factorise(values.data()); });
+}
+
+auto solve(const BlockCholesky& pattern, const Reals& values, const Reals& rhs) {
+  if (values.size() != pattern.size()) throw nb::value_error("values: as many as size says");
+  if (rhs.size() != pattern.unknowns()) throw nb::value_error("rhs: one for each unknown");
+  std::vector<double> x;
+  unlocked([&] {
+    x.assign(rhs.begin(), rhs.end());
+    pattern.solve(values.data(), x.data());
+  });
+  return as_numpy<double>(std::move(x));
+}
+
+}  // namespace
+
+void bind_block_cholesky(nb::module_& module) {
+  nb::class_<BlockCholesky>(module, "BlockCholesky")
+      .def("__init__", &make, "sizes"_a, "pairs"_a, "order"_a)
+      .def_prop_ro("size", &BlockCholesky::size)
+      .def("order", [](const BlockCholesky& pattern) { return as_numpy<int64_t>(unlocked([&] { return std::vector(pattern.order()); })); })
+      .def("places", &places_of, "rows"_a, "cols"_a)
+      .def("factorise", &factorise, "values"_a)
+      .def("solve", &solve, "values"_a, "rhs"_a);
 }
 
 }  // namespace fleetmap

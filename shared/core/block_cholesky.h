@@ -7,6 +7,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <span>
 #include <utility>
 #include <vector>
 
@@ -61,5 +62,8 @@ class BlockCholesky {
   std::vector<int32_t> front_, offset_;  // by position: front of a node, and where its unknowns begin there
   size_t size_ = 0;
 };
+
+// Refuses what is not an order of so many nodes.
+void check_order(std::span<const int64_t> order, size_t count);
 
 }  // namespace fleetmap

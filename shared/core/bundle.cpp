@@ -137,7 +137,7 @@ void BundleSolver::sort_observations() {
     const auto& each = given[n];
     const size_t to = next[size_t(each.landmark)]++;
     const double disparity = each.pixels[0] - each.pixels[2];
-    const bool has_right = std::isfinite(disparity) && problem_.focal_baseline_px_m > 0.0;
+    const bool has_right = std::isfinite(disparity) && problem_.lens.focal_baseline > 0.0;
     const double weight = 1.0 / each.sigma_px[0];
     order_[to] = n;
     seen_[to] = {each.keyframe,
@@ -210,9 +210,9 @@ bool BundleSolver::residual(const Seen& seen, Vec3 q, Residual& out) const {
   out = {x,
          y,
          z,
-         {(problem_.focal_px * x + problem_.cx_px - seen.pixels[0]) * seen.weights[0],
-          (problem_.focal_px * y + problem_.cy_px - seen.pixels[1]) * seen.weights[1],
-          (problem_.focal_baseline_px_m / z - seen.pixels[2]) * seen.weights[2]}};
+         {(problem_.lens.focal * x + problem_.lens.cx - seen.pixels[0]) * seen.weights[0],
+          (problem_.lens.focal * y + problem_.lens.cy - seen.pixels[1]) * seen.weights[1],
+          (problem_.lens.focal_baseline / z - seen.pixels[2]) * seen.weights[2]}};
   return true;
 }
 
@@ -279,8 +279,8 @@ bool BundleSolver::linearise(const Seen& seen, Vec3 q, Symmetric& info, Vec3& sl
   if (!residual(seen, q, at)) return false;
   const double weight = robust_weight(norm(at.off), huber_, cutoff_);
   if (weight == 0.0) return false;
-  const double scale = problem_.focal_px / at.z * seen.weights[0];
-  const double scale_d = -problem_.focal_baseline_px_m / (at.z * at.z) * seen.weights[2];
+  const double scale = problem_.lens.focal / at.z * seen.weights[0];
+  const double scale_d = -problem_.lens.focal_baseline / (at.z * at.z) * seen.weights[2];
   const Vec3 forward = vec3(rot[2]);  // rows of J: of u, v and disparity
   const Vec3 row_u = scale * (vec3(rot[0]) - at.x * forward), row_v = scale * (vec3(rot[1]) - at.y * forward);
   const Vec3 row_d = scale_d * forward;

@@ -27,6 +27,7 @@
 #include <vector>
 
 #include "block_cholesky.h"
+#include "camera.h"
 #include "factors.h"
 
 namespace fleetmap {
@@ -69,7 +70,7 @@ struct BundleProblem {
     std::vector<double> increments, information;  // (67,) and (15, 15)
   };
 
-  double focal_px, cx_px, cy_px, focal_baseline_px_m;
+  StereoLens lens;
   std::vector<SE3> body_from_cams;  // of all cameras of a rig, with the same lens
   int unknowns;                     // of each keyframe: 6, or 15 with motion
   std::vector<uint8_t> free;        // (K, unknowns)

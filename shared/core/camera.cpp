@@ -1,9 +1,8 @@
-#include "camera.h"
+// Lenses: points that a lens maps to a place, and depth images seen through another camera's lens.
+#include "bindings/arrays.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
-#include <tuple>
-#include <utility>
 
 namespace fleetmap {
 namespace {
@@ -11,6 +10,24 @@ namespace {
 constexpr int kIterations = 12;
 constexpr double kStep = 1e-6;
 constexpr double kNearest = 1e-9;
+
+// Radial-tangential distortion k1 k2 p1 p2 k3 k4 k5 k6. Sources: Brown 1966; OpenCV's order and its rational model.
+struct RadialTangential {
+  double k1, k2, p1, p2, k3, k4, k5, k6;
+  explicit RadialTangential(const double* k) : k1(k[0]), k2(k[1]), p1(k[2]), p2(k[3]), k3(k[4]), k4(k[5]), k5(k[6]), k6(k[7]) {}
+};
+
+// Equidistant fisheye k1 k2 k3 k4. Source: Kannala and Brandt 2006.
+struct Equidistant {
+  double k1, k2, k3, k4;
+};
+
+// Fisheye by spheres (unified, extended unified, double sphere): a ray is moved along the axis by xi of its length, projected with the
+// weights a and b of sphere and plane, and distorted. Sources: Mei and Rives 2007, Khomutenko et al. 2016, Usenko et al. 2018.
+struct Sphere {
+  RadialTangential plane;
+  double xi, beta, a, b;
+};
 
 std::pair<double, double> distorted(const RadialTangential& lens, double x, double y) {
   const auto& [k1, k2, p1, p2, k3, k4, k5, k6] = lens;
@@ -44,30 +61,45 @@ bool is_seen(const Sphere& lens, double reach, Vec3 point, double* image) {
   return grows && is_seen(lens.plane, reach, Vec3{point[0], point[1], lens.a * d2 + lens.b * w}, image);
 }
 
-}  // namespace
-
-void undistort(const RadialTangential& lens, const double* goal_x, const double* goal_y, size_t count, double* found_x, double* found_y) {
-  for (size_t n = 0; n < count; ++n) {
-    double x = goal_x[n], y = goal_y[n];
-    for (int iteration = 0; iteration < kIterations; ++iteration) {
-      const auto [dx, dy] = distorted(lens, x, y);
-      const auto [dx_x, dy_x] = distorted(lens, x + kStep, y);
-      const auto [dx_y, dy_y] = distorted(lens, x, y + kStep);
-      const double a = (dx_x - dx) / kStep, b = (dx_y - dx) / kStep, c = (dy_x - dy) / kStep, d = (dy_y - dy) / kStep;
-      const double determinant = a * d - b * c, before_x = x, before_y = y;
-      x = x + (d * (goal_x[n] - dx) - b * (goal_y[n] - dy)) / determinant;
-      y = y + (a * (goal_y[n] - dy) - c * (goal_x[n] - dx)) / determinant;
-      if (x == before_x && y == before_y) break;  // a further step would be the same
+// The points (x, y) of the plane z = 1 that the lens maps to the goals: Newton's method with a numeric Jacobian, not checked.
+auto undistort(const Array<double, 8>& coefficients, const Reals& goals_x, const Reals& goals_y) {
+  const size_t count = goals_x.shape(0);
+  if (goals_y.shape(0) != count) throw nb::value_error("goals_y: as many as goals_x");
+  auto found_x = zeros<double>(count), found_y = zeros<double>(count);
+  const RadialTangential lens(coefficients.data());
+  unlocked([&] {
+    for (size_t n = 0; n < count; ++n) {
+      double x = goals_x(n), y = goals_y(n);
+      for (int iteration = 0; iteration < kIterations; ++iteration) {
+        const auto [dx, dy] = distorted(lens, x, y);
+        const auto [dx_x, dy_x] = distorted(lens, x + kStep, y);
+        const auto [dx_y, dy_y] = distorted(lens, x, y + kStep);
+        const double a = (dx_x - dx) / kStep, b = (dx_y - dx) / kStep, c = (dy_x - dy) / kStep, d = (dy_y - dy) / kStep;
+        const double determinant = a * d - b * c, before_x = x, before_y = y;
+        x = x + (d * (goals_x(n) - dx) - b * (goals_y(n) - dy)) / determinant;
+        y = y + (a * (goals_y(n) - dy) - c * (goals_x(n) - dx)) / determinant;
+        if (x == before_x && y == before_y) break;  // a further step would be the same
+      }
+      found_x[n] = x, found_y[n] = y;
     }
-    found_x[n] = x, found_y[n] = y;
-  }
+  });
+  return std::tuple(as_numpy<double>(std::move(found_x)), as_numpy<double>(std::move(found_y)));
 }
 
+// Camera with a lens: u = fx x' + cx, v = fy y' + cy of the distorted x', y'. reach: largest x^2 + y^2 at which the image of
+// radial-tangential distortion does not fold back yet.
+struct LensCamera {
+  double fx, fy, cx, cy, reach;
+  ptrdiff_t width, height;
+};
+
+// Fills colour, an image of the camera that comes as zeros, with the depth of the nearest point at each of its pixels. The points are
+// depth (count) along rays (count, 3), which have z = 1 and are NaN for pixels without one. All four pixels around a point take it: with
+// the nearest alone the background would shine through the foreground.
 template <typename Lens>
-void register_depth(const float* depth, const double* rays, size_t count, const SE3& colour_from_depth, const LensCamera& camera,
-                    const Lens& lens, float* colour) {
+void fill_nearest(const float* depth, const double* rays, size_t count, const SE3& colour_from_depth, const LensCamera& camera,
+                  const Lens& lens, float* colour) {
   const auto [fx, fy, cx, cy, reach, width, height] = camera;
-  std::fill_n(colour, height * width, 0.0f);
   for (size_t n = 0; n < count; ++n) {
     if (!(depth[n] > 0.0f)) continue;
     const Vec3 point = colour_from_depth * (double(depth[n]) * vec3(rays + 3 * n));
@@ -85,8 +117,35 @@ void register_depth(const float* depth, const double* rays, size_t count, const 
   }
 }
 
-template void register_depth(const float*, const double*, size_t, const SE3&, const LensCamera&, const RadialTangential&, float*);
-template void register_depth(const float*, const double*, size_t, const SE3&, const LensCamera&, const Equidistant&, float*);
-template void register_depth(const float*, const double*, size_t, const SE3&, const LensCamera&, const Sphere&, float*);
+auto register_depth(const Array<float, -1, -1>& depth, const Points& rays, const SE3& colour_from_depth, const Array<double, 4>& intrinsics,
+                    const Reals& lens, double reach, int width, int height) {
+  constexpr int64_t kMostPixels = 1 << 26;
+  const size_t count = depth.size(), size = lens.shape(0);
+  if (rays.shape(0) != count) throw nb::value_error("rays: one for each pixel of depth");
+  if (size != 8 && size != 4 && size != 12)
+    throw nb::value_error("lens: 8 coefficients, radial-tangential, 4, equidistant, or 12, a sphere's");
+  if (width < 0 || height < 0 || int64_t(width) * height > kMostPixels) throw nb::value_error("width, height: up to 2^26 pixels");
+  const LensCamera camera{intrinsics(0), intrinsics(1), intrinsics(2), intrinsics(3), reach, width, height};
+  auto colour = zeros<float>(size_t(width) * size_t(height));
+  const auto fill = [&](const auto& coefficients) {
+    unlocked([&] { fill_nearest(depth.data(), rays.data(), count, colour_from_depth, camera, coefficients, colour.data()); });
+  };
+  if (size == 8)
+    fill(RadialTangential(lens.data()));
+  else if (size == 12)
+    fill(Sphere{RadialTangential(lens.data()), lens(8), lens(9), lens(10), lens(11)});
+  else
+    fill(Equidistant{lens(0), lens(1), lens(2), lens(3)});
+  return as_numpy<float, 2>(std::move(colour), {size_t(height), size_t(width)});
+}
+
+}  // namespace
+
+void bind_camera(nb::module_& module) {
+  const auto lens = "lens"_a;
+  module.def("undistort", &undistort, lens, "goals_x"_a, "goals_y"_a);
+  module.def("register_depth", &register_depth, "depth"_a, "rays"_a, "colour_from_depth"_a, "intrinsics"_a, lens, "reach"_a, "width"_a,
+             "height"_a);
+}
 
 }  // namespace fleetmap

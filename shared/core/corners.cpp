@@ -1,4 +1,5 @@
 #include "corners.h"
+#include "bindings/images.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <bit>
@@ -116,7 +117,7 @@ void min_eigenvalues(GreyImage image, const Pixel* pixels, size_t count, double*
 }
 
 // Sets pixels nearer than radius to one of taken to 0, a ring of up to 1.5 px at the edge left out.
-void clear_discs(Grey<uint8_t> free, const Pixel* taken, size_t count, double radius) {
+void clear_discs(Picture<uint8_t> free, const Pixel* taken, size_t count, double radius) {
   const double reach = std::min(radius, double(free.width + free.height)) - 0.75;  // from the nearest whole pixel
   const ptrdiff_t size = ptrdiff_t(reach);
   for (size_t n = 0; n < count; ++n) {
@@ -248,37 +249,93 @@ void CornerFinder::find(GreyImage image, size_t count, const CornerLimits& limit
   }
 }
 
-void centroid_angles(GreyImage image, const Pixel* pixels, size_t count, int radius, float* degrees) {
-  std::vector<ptrdiff_t> reach(size_t(radius) + 1);
-  for (int v = 0; v <= radius; ++v) reach[size_t(v)] = ptrdiff_t(std::sqrt(double(radius * radius - v * v)));
-  for (size_t n = 0; n < count; ++n) {
-    const ptrdiff_t x = whole(pixels[n].x + 0.5), y = whole(pixels[n].y + 0.5);
-    const bool is_inside = x >= radius && y >= radius && x < image.width - radius && y < image.height - radius;
-    int64_t moment_x = 0, moment_y = 0;
-    for (ptrdiff_t v = -radius; v <= radius; ++v) {
-      const uint8_t* row = image.row(std::clamp<ptrdiff_t>(y + v, 0, image.height - 1));
-      const ptrdiff_t r = reach[size_t(std::abs(v))];
-      int32_t along = 0, total = 0;
-      if (is_inside) {
-        for (ptrdiff_t u = 0; u <= 2 * r; ++u) {
-          const int32_t value = row[x - r + u];
-          along += int32_t(u) * value;
-          total += value;
+namespace {
+
+using Pixels = Array<float, -1, 2>;
+
+const Pixel* first(const Pixels& pixels) { return reinterpret_cast<const Pixel*>(pixels.data()); }
+
+auto spread_corners(const Image& image, int count, double distance_px, int threshold, int border_px, const Pixels& taken,
+                    const std::optional<Image>& clearance_px, double scale, double clear_px) {
+  if (count < 0) throw nb::value_error("count: not negative");
+  if (threshold < 0 || threshold > 255) throw nb::value_error("threshold: a difference of grey values, 0 to 255");
+  if (border_px < 3) throw nb::value_error("border_px: at least the circle's radius, 3");
+  check_corners(distance_px, double(image.shape(1)), double(image.shape(0)));
+  if (!(scale >= 1.0)) throw nb::value_error("scale: at least 1");
+  const CornerLimits limits{threshold, border_px, distance_px, clearance(clearance_px), scale, clear_px};
+  CornerFinder found;
+  unlocked([&] { found.find(image, size_t(count), limits, first(taken), taken.shape(0)); });
+  return std::tuple(as_numpy<float>(std::move(found.corners)), as_numpy<double>(std::move(found.scores)));
+}
+
+auto select_spread(const Pixels& pixels, const Indices& order, const Pixels& taken, double distance_px, int count, int width, int height) {
+  if (width < 0 || height < 0 || count < 0) throw nb::value_error("width, height, count: not negative");
+  check_corners(distance_px, width, height);
+  const int64_t known = int64_t(pixels.shape(0));
+  for (const int64_t n : order)
+    if (n < 0 || n >= known) throw nb::value_error("order: indices of pixels");
+  for (int64_t n = 0; n < known; ++n)
+    if (!(pixels(n, 0) >= 0.0f && pixels(n, 0) <= float(width) && pixels(n, 1) >= 0.0f && pixels(n, 1) <= float(height)))
+      throw nb::value_error("pixels: of the image");
+  std::vector<int64_t> chosen = unlocked([&] {
+    return Suppression()(first(pixels), order.data(), order.shape(0), first(taken), taken.shape(0), distance_px, size_t(count), width,
+                         height);
+  });
+  return as_numpy<int64_t>(std::move(chosen));
+}
+
+// The direction in degrees, 0 to 360, from each pixel to the intensity centroid of the disc around it; beyond the image's edge
+// its outermost pixels go on. Source: Rosin 1999, as ORB uses it.
+auto centroid_angles_deg(const Image& grey, const Pixels& pixels, int radius) {
+  if (radius < 0 || radius > 255) throw nb::value_error("radius: 0 to 255");
+  const size_t count = pixels.shape(0);
+  if (count && grey.size() == 0) throw nb::value_error("image: not empty");
+  std::vector<float> degrees(count);
+  const GreyImage image = grey;
+  const Pixel* const places = first(pixels);
+  unlocked([&] {
+    std::vector<ptrdiff_t> reach(size_t(radius) + 1);
+    for (int v = 0; v <= radius; ++v) reach[size_t(v)] = ptrdiff_t(std::sqrt(double(radius * radius - v * v)));
+    for (size_t n = 0; n < count; ++n) {
+      const ptrdiff_t x = whole(places[n].x + 0.5), y = whole(places[n].y + 0.5);
+      const bool is_inside = x >= radius && y >= radius && x < image.width - radius && y < image.height - radius;
+      int64_t moment_x = 0, moment_y = 0;
+      for (ptrdiff_t v = -radius; v <= radius; ++v) {
+        const uint8_t* row = image.row(std::clamp<ptrdiff_t>(y + v, 0, image.height - 1));
+        const ptrdiff_t r = reach[size_t(std::abs(v))];
+        int32_t along = 0, total = 0;
+        if (is_inside) {
+          for (ptrdiff_t u = 0; u <= 2 * r; ++u) {
+            const int32_t value = row[x - r + u];
+            along += int32_t(u) * value;
+            total += value;
+          }
+          along -= int32_t(r) * total;
+        } else {
+          for (ptrdiff_t u = -r; u <= r; ++u) {
+            const int32_t value = row[std::clamp<ptrdiff_t>(x + u, 0, image.width - 1)];
+            along += int32_t(u) * value;
+            total += value;
+          }
         }
-        along -= int32_t(r) * total;
-      } else {
-        for (ptrdiff_t u = -r; u <= r; ++u) {
-          const int32_t value = row[std::clamp<ptrdiff_t>(x + u, 0, image.width - 1)];
-          along += int32_t(u) * value;
-          total += value;
-        }
+        moment_x += along;
+        moment_y += v * total;
       }
-      moment_x += along;
-      moment_y += v * total;
+      const double angle = std::fmod(std::atan2(double(moment_y), double(moment_x)) * (180.0 / std::numbers::pi), 360.0);
+      degrees[n] = float(angle < 0.0 ? angle + 360.0 : angle);
     }
-    const double angle = std::fmod(std::atan2(double(moment_y), double(moment_x)) * (180.0 / std::numbers::pi), 360.0);
-    degrees[n] = float(angle < 0.0 ? angle + 360.0 : angle);
-  }
+  });
+  return as_numpy<float>(std::move(degrees));
+}
+
+}  // namespace
+
+void bind_corners(nb::module_& module) {
+  const auto image = "image"_a, pixels = "pixels"_a, count = "count"_a, distance_px = "distance_px"_a, taken = "taken"_a;
+  module.def("spread_corners", &spread_corners, image, count, distance_px, "threshold"_a, "border_px"_a, taken,
+             "clearance_px"_a = nb::none(), "scale"_a = 1.0, "clear_px"_a = 0.0);
+  module.def("select_spread", &select_spread, pixels, "order"_a, taken, distance_px, count, "width"_a, "height"_a);
+  module.def("centroid_angles_deg", &centroid_angles_deg, image, pixels, "radius"_a);
 }
 
 }  // namespace fleetmap

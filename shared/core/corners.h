@@ -62,8 +62,4 @@ class CornerFinder {
   Suppression suppress_;
 };
 
-// Fills the direction in degrees, 0 to 360, from each pixel to the intensity centroid of the disc around it; beyond the image's edge
-// its outermost pixels go on. Source: Rosin 1999, as ORB uses it.
-void centroid_angles(GreyImage image, const Pixel* pixels, size_t count, int radius, float* degrees);
-
 }  // namespace fleetmap

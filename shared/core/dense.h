@@ -48,6 +48,16 @@ inline void multiply(const Matrix& a, const Matrix& b, Matrix& out) {
   multiply(a.values.data(), b.values.data(), out.values.data(), a.rows, a.columns, b.columns);
 }
 
+// out (n, n) = a p a^T, for a (n, k) and p (k, k).
+template <size_t n, size_t k>
+void carry(const double* a, const double* p, double* out) {
+  double turned[k * n], part[n * k];
+  for (size_t i = 0; i < k; ++i)
+    for (size_t j = 0; j < n; ++j) turned[i * n + j] = a[j * k + i];
+  multiply(a, p, part, n, k, k);
+  multiply(part, turned, out, n, k, n);
+}
+
 inline void transpose(const Matrix& a, Matrix& out) {
   out.resize(a.columns, a.rows);
   for (size_t i = 0; i < a.rows; ++i)

@@ -590,28 +590,23 @@ void Filter::inflate_velocity(double sigma_mps) {
 void Filter::motion_covariance(size_t index, double* out) const {
   const Matrix& c = true_error_cov;
   const size_t at = clone_errors(kConsidered, index).rotation, end = clone_errors(kConsidered, clones_.size() - 1).rotation;
-  double difference[6][6], carry[36] = {}, carry_turned[36], part[36];
+  double difference[6][6], adjoint[36] = {};
   for (size_t a = 0; a < 6; ++a)
     for (size_t b = 0; b < 6; ++b) difference[a][b] = c[end + a][end + b] + c[at + a][at + b] - c[end + a][at + b] - c[at + a][end + b];
-  const SE3 earlier_from_odom = inverse(clones_[index]);  // and its adjoint
-  store(earlier_from_odom.rotation, carry, 6);
-  store(earlier_from_odom.rotation, carry + 21, 6);
-  store(skew(earlier_from_odom.translation) * earlier_from_odom.rotation, carry + 18, 6);
-  multiply(carry, difference[0], part, 6, 6, 6);
-  for (size_t k = 0; k < 36; ++k) carry_turned[k] = carry[k % 6 * 6 + k / 6];
-  multiply(part, carry_turned, out, 6, 6, 6);
+  const SE3 earlier_from_odom = inverse(clones_[index]);
+  store(earlier_from_odom.rotation, adjoint, 6);
+  store(earlier_from_odom.rotation, adjoint + 21, 6);
+  store(skew(earlier_from_odom.translation) * earlier_from_odom.rotation, adjoint + 18, 6);
+  carry<6, 6>(adjoint, difference[0], out);
 }
 
 void Filter::body_covariance(double* out) const {
-  double own[9][9], jacobian[6][9] = {}, jacobian_turned[9][6], part[6 * 9];
+  double own[9][9], jacobian[6][9] = {};
   for (size_t a = 0; a < 9; ++a) std::copy_n(true_error_cov[kConsidered + a] + kConsidered, 9, own[a]);
   store(kIdentity, jacobian[0], 9);
   store(kIdentity, jacobian[3] + kPosition, 9);
   store(-1.0 * skew(state.position), jacobian[3], 9);
-  multiply(jacobian[0], own[0], part, 6, 9, 9);
-  for (size_t a = 0; a < 9; ++a)
-    for (size_t b = 0; b < 6; ++b) jacobian_turned[a][b] = jacobian[b][a];
-  multiply(part, jacobian_turned[0], out, 6, 9, 6);
+  carry<6, 9>(jacobian[0], own[0], out);
 }
 
 }  // namespace fleetmap

@@ -1,4 +1,8 @@
-#include "grid.h"
+// The grid of a site: rays of one view through the cells of a window, and sums of views over a session.
+//
+// A cell is a square column of the map: below the floor margin it is floor, above it stand kSlices voxels. Within one view a voxel is
+// hit, passed or not seen, so that a view counts once, however many of its pixels fall into a voxel.
+#include "bindings/arrays.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
@@ -7,10 +11,25 @@
 namespace fleetmap {
 namespace {
 
+constexpr double kCellM = 0.05, kFloorM = 0.10, kSliceM = 0.25;  // as of the map's format, with what follows
+constexpr int kSlices = 8;
+constexpr double kHeightStepM = 0.01, kLowestM = -0.16;
+constexpr ptrdiff_t kHitStride = 2, kRayStride = 4;  // pixels
+constexpr double kClearSigmas = 3.0;                 // and a cell: so far before a point its ray no longer proves a voxel free
+constexpr uint8_t kPassed = 1, kBehind = 2;
 constexpr double kBelowM = 0.15;        // deeper points are mirror images in the floor, or wrong disparities
 constexpr double kMaxHitSigmaM = 0.08;  // of the depth: beyond, points only prove free space before them
 constexpr uint16_t kMinPoints = 6;      // of a view in a voxel that it hits
 constexpr uint8_t kMost = 255;
+
+// Evidence of one view on a window of cells (rows, columns): pixels in each voxel (R, C, kSlices); looks (R, C, kSlices), kPassed where a
+// ray went through, up to a clear distance before its point, and to the floor itself, kBehind behind points where nothing was before;
+// heights (R, C, 2), codes of the lowest and the highest of the points in voxels that are hit and on the floor, 0 for none.
+struct Window {
+  ptrdiff_t rows, columns;
+  uint16_t* points;
+  uint8_t *looks, *heights;
+};
 
 // The voxel at a height over the floor margin, kSlices above the top.
 inline int level_at(double height) {
@@ -48,10 +67,14 @@ void walk(Vec3 camera, Vec3 end, double first, double until, uint8_t mark, const
   }
 }
 
-}  // namespace
+using Image32 = Array<float, -1, -1>;
 
-void cast_view(Picture<const float> disparity, Picture<const float> nearest, double sigma_px, StereoLens lens, const Mat3& map_from_cam,
-               Vec3 camera, const uint8_t* was_free, Window window) {
+// Fills a window, which comes as zeros, from disparities in px, NaN unknown, of standard deviation sigma_px; nearest: the largest around
+// each pixel, beyond whose depth nothing is proved free. camera: its x and y in cells of the window, its height over the floor in
+// metres. was_free (R, C): bits of the voxels that were free before this recording, and all around them. Cells of a ray: Amanatides and
+// Woo 1987; a voxel is that of the ray's height in the middle of its way through a cell.
+void fill_window(Picture<const float> disparity, Picture<const float> nearest, double sigma_px, StereoLens lens, const Mat3& map_from_cam,
+                 Vec3 camera, const uint8_t* was_free, Window window) {
   // Calls visit(u, v, depth, its standard deviation, the point as `camera`, its cell or -1) for each pixel that has a point, but those
   // below the floor.
   const auto for_each_point = [&](const auto& visit) {
@@ -94,32 +117,73 @@ void cast_view(Picture<const float> disparity, Picture<const float> nearest, dou
   });
 }
 
-void add_view(Window window, ptrdiff_t first_row, ptrdiff_t first_column, GridTile tile) {
-  const auto count = [](uint8_t& views) { views = uint8_t(views + (views < kMost)); };
-  for (ptrdiff_t row = std::max<ptrdiff_t>(0, -first_row); row < std::min(tile.size, window.rows - first_row); ++row)
-    for (ptrdiff_t column = std::max<ptrdiff_t>(0, -first_column); column < std::min(tile.size, window.columns - first_column); ++column) {
-      const ptrdiff_t from = (row + first_row) * window.columns + column + first_column, to = row * tile.size + column;
+auto cast_view(const Image32& disparity_px, const Image32& nearest_px, double sigma_px, const StereoLens& lens, const Mat3& map_from_cam,
+               const Vec3& camera, const Image& was_free) {
+  if (nearest_px.shape(0) != disparity_px.shape(0) || nearest_px.shape(1) != disparity_px.shape(1))
+    throw nb::value_error("nearest_px: of the size of disparity_px");
+  const size_t rows = was_free.shape(0), columns = was_free.shape(1), slices = kSlices;
+  auto points = zeros<uint16_t>(rows * columns * slices);
+  auto looks = zeros<uint8_t>(rows * columns * slices), heights = zeros<uint8_t>(2 * rows * columns);
+  unlocked([&] {
+    fill_window(disparity_px, nearest_px, sigma_px, lens, map_from_cam, camera, was_free.data(),
+                {ptrdiff_t(rows), ptrdiff_t(columns), points.data(), looks.data(), heights.data()});
+  });
+  return std::tuple(as_numpy<uint16_t, 3>(std::move(points), {rows, columns, slices}),
+                    as_numpy<uint8_t, 3>(std::move(looks), {rows, columns, slices}),
+                    as_numpy<uint8_t, 3>(std::move(heights), {rows, columns, 2}));
+}
+
+using Voxels = MutableArray<uint8_t, -1, -1, kSlices>;
+
+// Adds a window to a tile whose cell (0, 0) is the window's cell (row, column). A tile of N cells each way: views that hit, pass and would
+// pass each voxel (N, N, kSlices), which stop at 255, and (N, N, 4) the two lowest and the two highest codes of all views; the second of
+// each is used, as one view may err.
+void add_view(const MutableArray<uint16_t, -1, -1, kSlices>& points, const Voxels& looks, const MutableArray<uint8_t, -1, -1, 2>& heights,
+              int at_row, int at_column, const Voxels& hits, const Voxels& passes, const Voxels& hidden,
+              const MutableArray<uint8_t, -1, -1, 4>& tile_heights) {
+  const ptrdiff_t first_row = at_row, first_column = at_column;
+  const ptrdiff_t rows = ptrdiff_t(points.shape(0)), columns = ptrdiff_t(points.shape(1)), size = ptrdiff_t(hits.shape(0));
+  const auto is_of = [](const auto& array, ptrdiff_t height, ptrdiff_t width) {
+    return array.shape(0) == size_t(height) && array.shape(1) == size_t(width);
+  };
+  if (!is_of(looks, rows, columns) || !is_of(heights, rows, columns)) throw nb::value_error("looks, heights: of the size of points");
+  if (!is_of(hits, size, size) || !is_of(passes, size, size) || !is_of(hidden, size, size))
+    throw nb::value_error("hits, passes, hidden: of one square tile");
+  if (!is_of(tile_heights, size, size)) throw nb::value_error("tile_heights: of the tile's size");
+  const Window window{rows, columns, points.data(), looks.data(), heights.data()};
+  uint8_t *const views[] = {hits.data(), passes.data(), hidden.data()}, *const codes = tile_heights.data();
+  const auto count = [](uint8_t& seen) { seen = uint8_t(seen + (seen < kMost)); };
+  const nb::gil_scoped_release others_run;
+  for (ptrdiff_t row = std::max<ptrdiff_t>(0, -first_row); row < std::min(size, rows - first_row); ++row)
+    for (ptrdiff_t column = std::max<ptrdiff_t>(0, -first_column); column < std::min(size, columns - first_column); ++column) {
+      const ptrdiff_t from = (row + first_row) * columns + column + first_column, to = row * size + column;
       for (int level = 0; level < kSlices; ++level) {
-        const uint8_t looks = window.looks[from * kSlices + level];
-        if (window.points[from * kSlices + level] >= kMinPoints)
-          count(tile.hits[to * kSlices + level]);
-        else if (looks & kPassed)
-          count(tile.passes[to * kSlices + level]);
-        else if (looks & kBehind)
-          count(tile.hidden[to * kSlices + level]);
+        const uint8_t looked = window.looks[from * kSlices + level];
+        const bool is_hit = window.points[from * kSlices + level] >= kMinPoints;
+        if (is_hit || looked & (kPassed | kBehind)) count(views[is_hit ? 0 : looked & kPassed ? 1 : 2][to * kSlices + level]);
       }
       const uint8_t low = window.heights[2 * from], high = window.heights[2 * from + 1];
       if (low == 0) continue;
-      uint8_t* known = tile.heights + 4 * to;
+      uint8_t* const known = codes + 4 * to;
       if (known[0] == 0 || low < known[0])
-        known[1] = known[0], known[0] = low;
+        known[1] = std::exchange(known[0], low);
       else if (known[1] == 0 || low < known[1])
         known[1] = low;
       if (high > known[2])
-        known[3] = known[2], known[2] = high;
+        known[3] = std::exchange(known[2], high);
       else if (high > known[3])
         known[3] = high;
     }
+}
+
+}  // namespace
+
+void bind_grid(nb::module_& module) {
+  module.attr("GRID_RAY_STRIDE_PX") = kRayStride;
+  module.attr("GRID_CLEAR_SIGMAS") = kClearSigmas;
+  module.def("cast_view", &cast_view, "disparity_px"_a, "nearest_px"_a, "sigma_px"_a, "lens"_a, "map_from_cam"_a, "camera"_a, "was_free"_a);
+  module.def("add_view", &add_view, "points"_a, "looks"_a, "heights"_a, "row"_a, "column"_a, "hits"_a, "passes"_a, "hidden"_a,
+             "tile_heights"_a);
 }
 
 }  // namespace fleetmap

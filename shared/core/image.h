@@ -1,4 +1,4 @@
-// Grey images, and wide registers for their loops.
+// Pictures in memory, and wide registers for their loops.
 #pragma once
 
 #include <algorithm>
@@ -8,14 +8,14 @@
 
 namespace fleetmap {
 
-// A grey image without gaps between its rows.
-template <typename Byte>
-struct Grey {
-  Byte* at;
+// A picture without gaps between its rows.
+template <typename Number>
+struct Picture {
+  Number* at;
   ptrdiff_t height, width;
-  Byte* row(ptrdiff_t y) const { return at + y * width; }
+  Number* row(ptrdiff_t y) const { return at + y * width; }
 };
-using GreyImage = Grey<const uint8_t>;
+using GreyImage = Picture<const uint8_t>;
 
 // Distance of a camera's pixels from those that show the robot itself, in whole pixels, 255 at most; empty where it shows nothing of it.
 struct Clearance {
@@ -29,8 +29,8 @@ struct Clearance {
   }
 };
 
-// The whole pixel towards zero; far outside for what is not finite.
-inline ptrdiff_t whole(double coordinate) { return std::abs(coordinate) < 1e9 ? ptrdiff_t(coordinate) : -1'000'000'000; }
+// A whole number towards zero, far outside of any picture if it is large or not a number.
+inline ptrdiff_t whole(double number) { return std::abs(number) < 1e9 ? ptrdiff_t(number) : number > 0.0 ? 1'000'000'000 : -1'000'000'000; }
 
 // Eight numbers in one wide register, by the compilers' vector types: loops over bytes come out half as fast.
 template <typename Number>

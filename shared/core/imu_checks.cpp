@@ -1,12 +1,10 @@
-#include "imu_checks.h"
+// Checks of inertial samples before their use: spikes, gaps, steadiness of the body.
+#include "bindings/imu_samples.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
 
-#include "lie.h"
-
 namespace fleetmap {
-
 namespace {
 
 // No body that carries cameras changes so much between two samples and back.
@@ -20,27 +18,36 @@ bool jumps(const double* values, size_t before, double limit) {
 // Absurd stamps wrap around.
 int64_t difference(int64_t after_ns, int64_t before_ns) { return int64_t(uint64_t(after_ns) - uint64_t(before_ns)); }
 
-}  // namespace
-
-size_t drop_spikes(int64_t* stamps_ns, double* gyro, double* accel, size_t known, size_t end) {
+// Removes spikes, samples far from both neighbours, in place from the rows after the known ones; returns the new end. Rows up
+// to known came earlier. The last sample is compared with one neighbour alone; the very first one has none and stays.
+size_t drop_spikes(const MutableArray<int64_t, -1>& stamps_ns, const MutableArray<double, -1, 3>& gyro_radps,
+                   const MutableArray<double, -1, 3>& accel_mps2, size_t known) {
+  const size_t end = stamps_ns.shape(0);
+  if (gyro_radps.shape(0) != end || accel_mps2.shape(0) != end)
+    throw nb::value_error("gyro_radps, accel_mps2: a row for each of stamps_ns");
+  if (known > end) throw nb::value_error("known: at most as many as stamps_ns");
+  double *const gyro = gyro_radps.data(), *const accel = accel_mps2.data();
   const auto stands_out = [&](const double* values, size_t n, double limit) {
     return jumps(values, n - 1, limit) && (n == end - 1 || jumps(values, n, limit));
   };
-  size_t to = known;
-  for (size_t n = known; n < end; ++n) {  // its neighbours are still in place: kept samples move to n at most
-    if (n > 0 && (stands_out(gyro, n, kSpikeGyro) || stands_out(accel, n, kSpikeAccel))) continue;
-    stamps_ns[to] = stamps_ns[n];
-    store(vec3(gyro + 3 * n), gyro + 3 * to);
-    store(vec3(accel + 3 * n), accel + 3 * to);
-    ++to;
-  }
-  return to;
+  return unlocked([&] {
+    size_t to = known;
+    for (size_t n = known; n < end; ++n) {  // its neighbours are still in place: kept samples move to n at most
+      if (n > 0 && (stands_out(gyro, n, kSpikeGyro) || stands_out(accel, n, kSpikeAccel))) continue;
+      stamps_ns.data()[to] = stamps_ns.data()[n];
+      store(vec3(gyro + 3 * n), gyro + 3 * to);
+      store(vec3(accel + 3 * n), accel + 3 * to);
+      ++to;
+    }
+    return to;
+  });
 }
 
-int64_t longest_gap_ns(const int64_t* stamps_ns, size_t count, int64_t start_ns, int64_t end_ns) {
-  const int64_t *const stop = stamps_ns + count, *const first = std::upper_bound(stamps_ns, stop, start_ns);
-  const int64_t* const after = std::lower_bound(stamps_ns, stop, end_ns);
-  int64_t before_ns = first > stamps_ns ? first[-1] : start_ns, longest_ns = 0;
+// The longest time between start and end, both included, without a sample.
+int64_t longest_gap_ns(const Indices& stamps_ns, int64_t start_ns, int64_t end_ns) {
+  const int64_t *const stamps = stamps_ns.begin(), *const stop = stamps_ns.end();
+  const int64_t *const first = std::upper_bound(stamps, stop, start_ns), *const after = std::lower_bound(stamps, stop, end_ns);
+  int64_t before_ns = first > stamps ? first[-1] : start_ns, longest_ns = 0;
   for (const int64_t* stamp = first; stamp < after; ++stamp) {
     longest_ns = std::max(longest_ns, difference(*stamp, before_ns));
     before_ns = *stamp;
@@ -48,7 +55,14 @@ int64_t longest_gap_ns(const int64_t* stamps_ns, size_t count, int64_t start_ns,
   return std::max(longest_ns, difference(after < stop ? *after : end_ns, before_ns));
 }
 
-bool is_steady(const double* gyro, const double* accel, size_t count, const SteadyLimits& limits) {
+// Largest standard deviation of the means of a window's parts, largest mean of the rate, size of gravity and its tolerance.
+struct SteadyLimits {
+  double gyro_sigma, accel_sigma, gyro_mean, gravity, gravity_error;
+};
+using Limits = std::tuple<double, double, double, double, double>;
+
+// True if the means of the parts of a window, gyro and accel (N, 3), agree, and are those of a body at rest or at constant speed.
+bool is_steady_window(const double* gyro, const double* accel, size_t count, const SteadyLimits& limits) {
   double means[kParts][6]{}, total[6]{}, spread[6]{};
   const double length = double(count) / double(kParts);
   for (size_t part = 0; part < kParts; ++part) {
@@ -70,15 +84,45 @@ bool is_steady(const double* gyro, const double* accel, size_t count, const Stea
   return norm(vec3(total)) < limits.gyro_mean && std::abs(norm(vec3(total + 3)) - limits.gravity) < limits.gravity_error;
 }
 
-int64_t latest_steady(const int64_t* stamps_ns, const double* gyro, const double* accel, size_t count, int64_t first_ns, int64_t until_ns,
-                      int64_t window_ns, const SteadyLimits& limits) {
-  const int64_t* const stop = stamps_ns + count;
-  for (int64_t end_ns = until_ns; end_ns - window_ns >= first_ns; end_ns -= window_ns / 4) {
-    const size_t begin = size_t(std::lower_bound(stamps_ns, stop, end_ns - window_ns) - stamps_ns);
-    const size_t end = size_t(std::lower_bound(stamps_ns, stop, end_ns) - stamps_ns);
-    if (end >= begin + 2 * kParts && is_steady(gyro + 3 * begin, accel + 3 * begin, end - begin, limits)) return end_ns;
-  }
-  return first_ns - 1;
+bool is_steady(const Points& gyro_radps, const Points& accel_mps2, const Limits& limits) {
+  const size_t count = gyro_radps.shape(0);
+  if (accel_mps2.shape(0) != count) throw nb::value_error("accel_mps2: a row for each of gyro_radps");
+  return unlocked(
+      [&] { return is_steady_window(gyro_radps.data(), accel_mps2.data(), count, std::make_from_tuple<SteadyLimits>(limits)); });
+}
+
+// End of the latest steady window, by quarters of a window, at least 4 ns, back from until_ns, none of which begins before first_ns.
+// A stamp before first_ns if there is none.
+int64_t latest_steady(const Indices& stamps_ns, const Points& gyro_radps, const Points& accel_mps2, int64_t first_ns, int64_t until_ns,
+                      int64_t window_ns, const Limits& limits) {
+  constexpr int64_t kFarthest = int64_t(1) << 61, kMostWindows = 100'000;
+  const ImuSamples imu = imu_samples(stamps_ns, gyro_radps, accel_mps2);
+  if (first_ns < -kFarthest || first_ns > kFarthest || until_ns < -kFarthest || until_ns > kFarthest)
+    throw nb::value_error("first_ns, until_ns: within 2^61");
+  if (window_ns < 4 || window_ns > kFarthest || (until_ns - first_ns) / window_ns > kMostWindows)
+    throw nb::value_error("window_ns: at least 4, and a hundred-thousandth of the time");
+  return unlocked([&] {
+    const auto row = [&](int64_t stamp_ns) {
+      return size_t(std::lower_bound(imu.stamps_ns, imu.stamps_ns + imu.count, stamp_ns) - imu.stamps_ns);
+    };
+    for (int64_t end_ns = until_ns; end_ns - window_ns >= first_ns; end_ns -= window_ns / 4) {
+      const size_t begin = row(end_ns - window_ns), count = row(end_ns) - begin;
+      if (count >= 2 * kParts &&
+          is_steady_window(imu.gyro + 3 * begin, imu.accel + 3 * begin, count, std::make_from_tuple<SteadyLimits>(limits)))
+        return end_ns;
+    }
+    return first_ns - 1;
+  });
+}
+
+}  // namespace
+
+void bind_imu_checks(nb::module_& module) {
+  const auto stamps_ns = "stamps_ns"_a, gyro_radps = "gyro_radps"_a, accel_mps2 = "accel_mps2"_a;
+  module.def("drop_spikes", &drop_spikes, stamps_ns, gyro_radps, accel_mps2, "known"_a);
+  module.def("longest_gap_ns", &longest_gap_ns, stamps_ns, "start_ns"_a, "end_ns"_a);
+  module.def("is_steady", &is_steady, gyro_radps, accel_mps2, "limits"_a);
+  module.def("latest_steady", &latest_steady, stamps_ns, gyro_radps, accel_mps2, "first_ns"_a, "until_ns"_a, "window_ns"_a, "limits"_a);
 }
 
 }  // namespace fleetmap

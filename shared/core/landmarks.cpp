@@ -1,157 +1,270 @@
-#include "landmarks.h"
+// Reduction of a finished survey: redundant keyframes, duplicate landmarks, landmarks chosen for robots.
+#include "bindings/arrays.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
 #include <functional>
 #include <numeric>
 #include <queue>
+#include <ranges>
 
 namespace fleetmap {
 namespace {
 
-// How many visits besides its own see the track of a member, whose scale is not finer than theirs.
-int64_t other_visits(size_t member, const TrackMembers& members, int64_t gap, const uint8_t* spare) {
-  const int64_t track = members.track[member];
-  int64_t visits = 0, last = -1;
-  for (int64_t n = members.tracks.starts[track]; n < members.tracks.starts[track + 1]; ++n) {
-    const int64_t k = members.keyframe[n];
-    if (spare[k] || std::abs(k - members.keyframe[member]) <= gap || members.octave[n] > members.octave[member] + 1) continue;
-    visits += last < 0 || k - last > gap;
-    last = k;
+// Lists one after the other: list n is values[starts[n]] to values[starts[n + 1]].
+struct Lists {
+  const int64_t* starts;
+  size_t count;
+
+  Lists(const Indices& of, size_t values, const char* refusal) : starts(of.data()), count(of.shape(0) - 1) {
+    if (of.shape(0) < 1 || starts[0] < 0 || starts[count] > int64_t(values) ||
+        !unlocked([&] { return std::is_sorted(of.begin(), of.end()); }))
+      throw nb::value_error(refusal);
   }
-  return visits;
+  size_t size(size_t n) const { return size_t(starts[n + 1] - starts[n]); }
+  auto operator[](size_t n) const { return std::views::iota(starts[n], starts[n + 1]); }
+};
+
+template <typename Column>
+void check_indices(const Column& column, size_t size, const char* refusal) {
+  const auto is_inside = [&](auto index) { return index >= 0 && size_t(index) < size; };
+  if (!unlocked([&] { return std::all_of(column.begin(), column.end(), is_inside); })) throw nb::value_error(refusal);
 }
 
-bool are_seen_together(const Observations& seen, int64_t a, int64_t b) {
-  const int64_t* starts = seen.landmarks.starts;
-  const int32_t *first = seen.keyframe + starts[b], *last = seen.keyframe + starts[b + 1];
-  return std::any_of(seen.keyframe + starts[a], seen.keyframe + starts[a + 1],
-                     [&](int32_t keyframe) { return std::find(first, last, keyframe) != last; });
+void check_size(size_t size, size_t wanted, const char* refusal) {
+  if (size != wanted) throw nb::value_error(refusal);
 }
 
-double gain(int64_t n, const BinnedLandmarks& seen, const Budget& budget) {
-  double total = 0.0;
-  for (int64_t i = seen.landmarks.starts[n]; i < seen.landmarks.starts[n + 1]; ++i)
-    if (budget.needs[seen.bins[i] / seen.bins_per_view] > 0) total += 1.0 / (1.0 + double(budget.counts[seen.bins[i]]));
-  const double worth = seen.weights[n] * total;
-  return worth > 0.0 ? worth : 0.0;
+// Marks keyframes that are spare, checked from the last to the second: a share of their tracks, and at least `least`, are seen equally
+// finely on enough other visits. Members of tracks more than `gap` keyframes apart are of different visits. rows: the members of each
+// keyframe; starts: those of each track, by rising keyframe.
+auto spare_keyframes(const Indices& rows, const Indices& row_starts, const Indices& tracks, const Indices& starts, const Indices& keyframes,
+                     const Array<int8_t, -1>& octaves, int64_t gap, int64_t visits, double share, int64_t least) {
+  const size_t members = tracks.shape(0);
+  check_size(keyframes.shape(0), members, "keyframes: one for each member");
+  check_size(octaves.shape(0), members, "octaves: one for each member");
+  const Lists by_keyframe(row_starts, rows.shape(0), "row_starts: rising, of rows");
+  const Lists by_track(starts, members, "starts: rising, of members");
+  check_indices(rows, members, "rows: of members");
+  check_indices(tracks, by_track.count, "tracks: of starts");
+  check_indices(keyframes, by_keyframe.count, "keyframes: of row_starts");
+  std::vector<uint8_t> spare(by_keyframe.count);
+  const int64_t *const row_of = rows.data(), *const track_of = tracks.data(), *const keyframe_of = keyframes.data();
+  const int8_t* const octave_of = octaves.data();
+  // How many visits besides its own see the track of a member, whose scale is not finer than theirs.
+  const auto other_visits = [&](int64_t member) {
+    int64_t found = 0, last = -1;
+    for (const int64_t n : by_track[size_t(track_of[member])]) {
+      const int64_t k = keyframe_of[n];
+      if (spare[size_t(k)] || std::abs(k - keyframe_of[member]) <= gap || octave_of[n] > octave_of[member] + 1) continue;
+      found += last < 0 || k - last > gap;
+      last = k;
+    }
+    return found;
+  };
+  unlocked([&] {
+    for (size_t k = by_keyframe.count; k-- > 1;) {
+      int64_t repeated = 0;
+      for (const int64_t at : by_keyframe[k]) repeated += other_visits(row_of[at]) >= visits;
+      spare[k] = repeated >= least && double(repeated) >= share * double(by_keyframe.size(k));
+    }
+  });
+  return as_numpy<bool>(std::move(spare));
 }
 
-bool are_twins(size_t i, size_t j, Descriptors descriptors, const double* points_map, const TwinLimits& limits) {
-  const double *a = points_map + 3 * i, *b = points_map + 3 * j, off_x = a[0] - b[0], off_y = a[1] - b[1];
-  if (off_x * off_x + off_y * off_y <= limits.own_m * limits.own_m || std::abs(a[2] - b[2]) > limits.height_m) return false;
-  return hamming(descriptors[i], descriptors[j]) <= limits.max_bits;
+// Marks the less observed landmark of every near pair, in their order, that could be one landmark: by their places and sigmas, by their
+// first descriptors, and because no keyframe sees both.
+auto duplicate_landmarks(const Array<int64_t, -1, 2>& near, const Points& points_map, const Reals& sigmas_m, const Indices& starts,
+                         const Numbers& obs_keyframe, const Packed& packed, int most_bits) {
+  const size_t count = points_map.shape(0);
+  check_size(sigmas_m.shape(0), count, "sigmas_m: one for each landmark");
+  check_size(packed.shape(0), count, "descriptors: one for each landmark");
+  const Lists landmarks(starts, obs_keyframe.shape(0), "starts: rising, of obs_keyframe");
+  check_size(landmarks.count, count, "starts: one more than landmarks");
+  check_indices(near, count, "near: of landmarks");
+  auto duplicate = zeros<uint8_t>(count);
+  const Descriptors descriptors = packed;
+  const double *const points = points_map.data(), *const sigmas = sigmas_m.data();
+  const auto are_seen_together = [=, keyframe_of = obs_keyframe.data()](size_t a, size_t b) {
+    const int32_t *first = keyframe_of + landmarks.starts[b], *last = keyframe_of + landmarks.starts[b + 1];
+    return std::ranges::any_of(landmarks[a], [&](int64_t n) { return std::find(first, last, keyframe_of[n]) != last; });
+  };
+  unlocked([&, marks = duplicate.data(), first = near.begin(), last = near.end()] {
+    for (const int64_t* pair = first; pair < last; pair += 2) {
+      const size_t a = size_t(pair[0]), b = size_t(pair[1]);
+      if (marks[a] || marks[b]) continue;
+      const Vec3 off = vec3(points + 3 * a) - vec3(points + 3 * b);
+      if (dot(off, off) > 9.0 * (sigmas[a] * sigmas[a] + sigmas[b] * sigmas[b])) continue;
+      if (hamming(descriptors[a], descriptors[b]) > most_bits || are_seen_together(a, b)) continue;
+      marks[landmarks.size(a) >= landmarks.size(b) ? b : a] = 1;
+    }
+  });
+  return as_numpy<bool>(std::move(duplicate));
+}
+
+// Marks keyframes, checked in `order`, of whose observations a share is repeated by enough remaining keyframes, at the same or a
+// finer scale. rows: the observations of each keyframe that count; starts: those of each landmark. Source: Mur-Artal and Tardos 2015.
+auto redundant_keyframes(const Indices& order, const Indices& rows, const Indices& row_starts, const Numbers& obs_landmark,
+                         const Numbers& obs_keyframe, const Indices& octaves, const Indices& starts, int observers, double share) {
+  const size_t observed = obs_landmark.shape(0);
+  check_size(obs_keyframe.shape(0), observed, "obs_keyframe: one for each observation");
+  check_size(octaves.shape(0), observed, "octaves: one for each observation");
+  const Lists keyframes(row_starts, rows.shape(0), "row_starts: rising, of rows");
+  const Lists landmarks(starts, observed, "starts: rising, of observations");
+  check_indices(order, keyframes.count, "order: of keyframes");
+  check_indices(rows, observed, "rows: of observations");
+  check_indices(obs_landmark, landmarks.count, "obs_landmark: of starts");
+  check_indices(obs_keyframe, keyframes.count, "obs_keyframe: of row_starts");
+  std::vector<uint8_t> gone(keyframes.count);
+  const int32_t *const landmark_of = obs_landmark.data(), *const keyframe_of = obs_keyframe.data();
+  const int64_t *const octave_of = octaves.data(), *const row_of = rows.data();
+  unlocked([&] {
+    for (const int64_t k : order) {
+      int64_t repeated = 0;
+      for (const int64_t at : keyframes[size_t(k)]) {
+        const int64_t row = row_of[at];
+        int64_t others = -1;  // itself does not count
+        for (const int64_t m : landmarks[size_t(landmark_of[row])])
+          others += (octave_of[m] <= octave_of[row] || octave_of[m] - 1 == octave_of[row]) && !gone[size_t(keyframe_of[m])];
+        repeated += others >= observers;
+      }
+      gone[size_t(k)] = double(repeated) >= share * double(keyframes.size(size_t(k)));
+    }
+  });
+  return as_numpy<bool>(std::move(gone));
+}
+
+// The row of descriptors nearest to all others of its landmark, ties to the first; 0 for one without any.
+auto medoids(const Packed& packed, const Indices& starts) {
+  const Lists landmarks(starts, packed.shape(0), "starts: rising, of descriptors");
+  auto chosen = zeros<int64_t>(landmarks.count);
+  const Descriptors descriptors = packed;
+  unlocked([&] {
+    for (size_t n = 0; n < landmarks.count; ++n) {
+      int64_t best = -1;
+      for (const int64_t i : landmarks[n]) {
+        int64_t total = 0;
+        for (const int64_t j : landmarks[n]) total += hamming(descriptors[size_t(i)], descriptors[size_t(j)]);
+        if (best < 0 || total < best) best = total, chosen[n] = i;
+      }
+    }
+  });
+  return as_numpy<int64_t>(std::move(chosen));
+}
+
+using Counts = MutableArray<int64_t, -1>;
+
+// Number of candidates chosen, at most `limit`; marks them. A landmark is worth its weight times the sum, over its bins in views that need
+// more, of 1 / (1 + how many were chosen there): the gain of a sum of harmonic numbers, which is submodular, so that a value that was
+// computed earlier is an upper bound and only the best one has to be computed again. Worthless ones are not chosen. Equal values: the
+// smaller row first. A fixed number of bins makes a view. Carried on: chosen landmarks per bin, remaining room of cells, remaining needs
+// of views. Source: Minoux 1978.
+size_t choose_landmarks(const Indices& candidates, const Indices& starts, const Indices& bins, const Reals& weights, const Indices& cells,
+                        const Counts& room, int64_t limit, const Counts& counts, const Flags& chosen, const Counts& needs,
+                        int64_t bins_per_view) {
+  const Lists landmarks(starts, bins.shape(0), "starts: rising, of bins");
+  check_size(weights.shape(0), landmarks.count, "weights: one for each landmark");
+  check_size(cells.shape(0), landmarks.count, "cells: one for each landmark");
+  check_size(chosen.shape(0), landmarks.count, "chosen: one for each landmark");
+  if (limit < 0 || bins_per_view < 1) throw nb::value_error("limit: not negative; bins_per_view: at least 1");
+  constexpr int64_t kFarthest = int64_t(1) << 62;
+  const auto is_far = [](int64_t number) { return number < -kFarthest || number > kFarthest; };
+  for (const Counts* each : {&counts, &needs})
+    if (unlocked([&] { return std::any_of(each->begin(), each->end(), is_far); })) throw nb::value_error("counts, needs: within 2^62");
+  check_indices(candidates, landmarks.count, "candidates: of landmarks");
+  check_indices(cells, room.shape(0), "cells: of room");
+  check_indices(bins, std::min(counts.shape(0), needs.shape(0) * size_t(bins_per_view)), "bins: of counts and needs");
+  const int64_t* const bin_of = bins.data();
+  int64_t *const count_of = counts.data(), *const need_of = needs.data();
+  const auto gain = [&](int64_t n) {
+    double total = 0.0;
+    for (const int64_t i : landmarks[size_t(n)])
+      if (need_of[bin_of[i] / bins_per_view] > 0) total += 1.0 / (1.0 + double(count_of[bin_of[i]]));
+    const double worth = weights.data()[n] * total;
+    return worth > 0.0 ? worth : 0.0;
+  };
+  return unlocked([&] {
+    using Bid = std::pair<double, int64_t>;  // less the gain, and the row: the least is the best
+    std::vector<Bid> bids;
+    bids.reserve(candidates.size());
+    for (const int64_t candidate : candidates) bids.emplace_back(-gain(candidate), candidate);
+    std::priority_queue<Bid, std::vector<Bid>, std::greater<>> queue(std::greater<>(), std::move(bids));
+    size_t taken = 0;
+    while (!queue.empty() && taken < size_t(limit)) {
+      const int64_t n = queue.top().second;
+      queue.pop();
+      int64_t& left = room.data()[cells.data()[n]];
+      if (left <= 0) continue;
+      const Bid now(-gain(n), n);
+      if (!queue.empty() && queue.top() < now) {
+        queue.push(now);
+        continue;
+      }
+      if (now.first >= 0.0) break;
+      chosen.data()[n] = true;
+      ++taken;
+      --left;
+      for (const int64_t i : landmarks[size_t(n)]) {
+        ++count_of[bin_of[i]];
+        --need_of[bin_of[i] / bins_per_view];
+      }
+    }
+    return taken;
+  });
+}
+
+// Marks which landmarks at points_map (count, 3) by rising z have a twin: within max_bits and height_m of it, and farther away than own_m,
+// beyond one object mapped twice. Twins mostly agree in some two bytes, and stand at most `reach` from each other where all are sorted by
+// those; the others are compared with at most about `most` that stand equally high.
+auto twins(const Packed& packed, const Points& points_map, int reach, int most, int max_bits, double height_m, double own_m) {
+  const size_t count = packed.shape(0);
+  check_size(points_map.shape(0), count, "points_map: one for each descriptor");
+  if (reach < 0 || most < 1) throw nb::value_error("reach: not negative; most: at least 1");
+  auto repeated = zeros<uint8_t>(count);
+  const Descriptors descriptors = packed;
+  const double* const points = points_map.data();
+  unlocked([&] {
+    const auto compare = [=, marks = repeated.data()](size_t i, size_t j) {  // by value: marks could be any of them
+      const double *a = points + 3 * i, *b = points + 3 * j, off_x = a[0] - b[0], off_y = a[1] - b[1];
+      if (off_x * off_x + off_y * off_y <= own_m * own_m || std::abs(a[2] - b[2]) > height_m) return;
+      if (hamming(descriptors[i], descriptors[j]) <= max_bits) marks[i] = marks[j] = 1;
+    };
+    std::vector<size_t> order(count);
+    for (int pair = 0; pair < 16; ++pair) {
+      const auto two_bytes = [&](size_t n) { return uint16_t(descriptors[n][pair / 4] >> (16 * (pair % 4))); };
+      std::iota(order.begin(), order.end(), size_t(0));
+      std::stable_sort(order.begin(), order.end(), [&](size_t i, size_t j) { return two_bytes(i) < two_bytes(j); });
+      for (size_t a = 0; a < count; ++a)
+        for (size_t b = a + 1; b < count && b - a <= size_t(reach); ++b)
+          if (const size_t i = order[a], j = order[b]; !(repeated[i] && repeated[j])) compare(i, j);
+    }
+    const auto z = [&](size_t n) { return points[3 * n + 2]; };
+    size_t low = 0, high = 0;
+    for (size_t i = 0; i < count; ++i) {
+      while (low < count && z(low) < z(i) - height_m) ++low;
+      while (high < count && z(high) <= z(i) + height_m) ++high;
+      const size_t step = high > low ? std::max<size_t>(1, (high - low) / size_t(most)) : 1;
+      for (size_t j = low + i % step; j < high && !repeated[i]; j += step) compare(i, j);
+    }
+  });
+  return as_numpy<bool>(std::move(repeated));
 }
 
 }  // namespace
 
-void mark_spare(const int64_t* rows, const Lists& keyframes, const TrackMembers& members, const RevisitLimits& limits, uint8_t* spare) {
-  std::fill_n(spare, keyframes.count, uint8_t(0));
-  for (size_t k = keyframes.count; k-- > 1;) {
-    int64_t repeated = 0;
-    for (int64_t at = keyframes.starts[k]; at < keyframes.starts[k + 1]; ++at)
-      repeated += other_visits(size_t(rows[at]), members, limits.gap, spare) >= limits.visits;
-    spare[k] = repeated >= limits.least && double(repeated) >= limits.share * double(keyframes.size(k));
-  }
-}
-
-void mark_duplicates(const std::pair<int64_t, int64_t>* near, size_t near_count, const double* points_map, const double* sigmas_m,
-                     const Observations& seen, Descriptors descriptors, int most_bits, uint8_t* duplicate) {
-  for (size_t n = 0; n < near_count; ++n) {
-    const auto [a, b] = near[n];
-    if (duplicate[a] || duplicate[b]) continue;
-    double squared = 0.0;
-    for (int k = 0; k < 3; ++k) {
-      const double off = points_map[3 * a + k] - points_map[3 * b + k];
-      squared += off * off;
-    }
-    if (squared > 9.0 * (sigmas_m[a] * sigmas_m[a] + sigmas_m[b] * sigmas_m[b])) continue;
-    if (hamming(descriptors[size_t(a)], descriptors[size_t(b)]) > most_bits || are_seen_together(seen, a, b)) continue;
-    duplicate[seen.landmarks.size(size_t(a)) >= seen.landmarks.size(size_t(b)) ? b : a] = 1;
-  }
-}
-
-void mark_redundant(const int64_t* order, size_t order_count, const int64_t* rows, const Lists& keyframes, const Observations& seen,
-                    const int32_t* landmark, const int64_t* octave, int observers, double share, uint8_t* gone) {
-  const int64_t* starts = seen.landmarks.starts;
-  for (size_t n = 0; n < order_count; ++n) {
-    const int64_t k = order[n];
-    int64_t repeated = 0;
-    for (int64_t at = keyframes.starts[k]; at < keyframes.starts[k + 1]; ++at) {
-      const int64_t row = rows[at];
-      int64_t others = -1;  // itself does not count
-      for (int64_t m = starts[landmark[row]]; m < starts[landmark[row] + 1]; ++m)
-        others += (octave[m] <= octave[row] || octave[m] - 1 == octave[row]) && !gone[seen.keyframe[m]];
-      repeated += others >= observers;
-    }
-    gone[k] = double(repeated) >= share * double(keyframes.size(size_t(k)));
-  }
-}
-
-void medoids(Descriptors descriptors, const Lists& landmarks, int64_t* chosen) {
-  for (size_t n = 0; n < landmarks.count; ++n) {
-    int64_t best = -1;
-    chosen[n] = 0;
-    for (int64_t i = landmarks.starts[n]; i < landmarks.starts[n + 1]; ++i) {
-      int64_t total = 0;
-      for (int64_t j = landmarks.starts[n]; j < landmarks.starts[n + 1]; ++j)
-        total += hamming(descriptors[size_t(i)], descriptors[size_t(j)]);
-      if (best < 0 || total < best) best = total, chosen[n] = i;
-    }
-  }
-}
-
-size_t choose_landmarks(const int64_t* candidates, size_t candidate_count, const BinnedLandmarks& seen, size_t limit, const Budget& budget,
-                        uint8_t* chosen) {
-  using Bid = std::pair<double, int64_t>;  // less the gain, and the row: the least is the best
-  std::vector<Bid> bids(candidate_count);
-  for (size_t k = 0; k < candidate_count; ++k) bids[k] = {-gain(candidates[k], seen, budget), candidates[k]};
-  std::priority_queue<Bid, std::vector<Bid>, std::greater<>> queue(std::greater<>(), std::move(bids));
-  size_t taken = 0;
-  while (!queue.empty() && taken < limit) {
-    const int64_t n = queue.top().second;
-    queue.pop();
-    int64_t& room = budget.room[seen.cells[n]];
-    if (room <= 0) continue;
-    const Bid now(-gain(n, seen, budget), n);
-    if (!queue.empty() && queue.top() < now) {
-      queue.push(now);
-      continue;
-    }
-    if (now.first >= 0.0) break;
-    chosen[n] = 1;
-    ++taken;
-    --room;
-    for (int64_t i = seen.landmarks.starts[n]; i < seen.landmarks.starts[n + 1]; ++i) {
-      ++budget.counts[seen.bins[i]];
-      --budget.needs[seen.bins[i] / seen.bins_per_view];
-    }
-  }
-  return taken;
-}
-
-void mark_twins(Descriptors descriptors, const double* points_map, size_t reach, size_t most, const TwinLimits& limits, uint8_t* repeated) {
-  const size_t count = descriptors.count;
-  std::vector<size_t> order(count);
-  for (int pair = 0; pair < 16; ++pair) {
-    const auto two_bytes = [&](size_t n) { return uint16_t(descriptors[n][pair / 4] >> (16 * (pair % 4))); };
-    std::iota(order.begin(), order.end(), size_t(0));
-    std::stable_sort(order.begin(), order.end(), [&](size_t i, size_t j) { return two_bytes(i) < two_bytes(j); });
-    for (size_t a = 0; a < count; ++a)
-      for (size_t b = a + 1; b < count && b - a <= reach; ++b) {
-        const size_t i = order[a], j = order[b];
-        if (!(repeated[i] && repeated[j]) && are_twins(i, j, descriptors, points_map, limits)) repeated[i] = repeated[j] = 1;
-      }
-  }
-  const auto z = [&](size_t n) { return points_map[3 * n + 2]; };
-  size_t low = 0, high = 0;
-  for (size_t i = 0; i < count; ++i) {
-    while (low < count && z(low) < z(i) - limits.height_m) ++low;
-    while (high < count && z(high) <= z(i) + limits.height_m) ++high;
-    const size_t step = high > low ? std::max<size_t>(1, (high - low) / most) : 1;
-    for (size_t j = low + i % step; j < high && !repeated[i]; j += step)
-      if (are_twins(i, j, descriptors, points_map, limits)) repeated[i] = repeated[j] = 1;
-  }
+void bind_landmarks(nb::module_& module) {
+  const auto rows = "rows"_a, row_starts = "row_starts"_a, starts = "starts"_a, obs_keyframe = "obs_keyframe"_a, octaves = "octaves"_a;
+  const auto descriptors = "descriptors"_a, points_map = "points_map"_a, share = "share"_a;
+  module.def("spare_keyframes", &spare_keyframes, rows, row_starts, "tracks"_a, starts, "keyframes"_a, octaves, "gap"_a, "visits"_a, share,
+             "least"_a);
+  module.def("duplicate_landmarks", &duplicate_landmarks, "near"_a, points_map, "sigmas_m"_a, starts, obs_keyframe, descriptors,
+             "most_bits"_a);
+  module.def("redundant_keyframes", &redundant_keyframes, "order"_a, rows, row_starts, "obs_landmark"_a, obs_keyframe, octaves, starts,
+             "observers"_a, share);
+  module.def("medoids", &medoids, descriptors, starts);
+  module.def("choose_landmarks", &choose_landmarks, "candidates"_a, starts, "bins"_a, "weights"_a, "cells"_a, "room"_a, "limit"_a,
+             "counts"_a, "chosen"_a, "needs"_a, "bins_per_view"_a);
+  module.def("twins", &twins, descriptors, points_map, "reach"_a, "most"_a, "max_bits"_a, "height_m"_a, "own_m"_a);
 }
 
 }  // namespace fleetmap

@@ -1,5 +1,4 @@
-// Dense factorisation by LAPACK and BLAS, of the library that scipy carries: bindings/lapack.cpp fetches them when they are first needed.
-// Matrices are column by column, as in Fortran.
+// Dense factorisation by LAPACK and BLAS, of the library that scipy carries. Matrices are column by column, as in Fortran.
 #pragma once
 
 #include <algorithm>
@@ -19,6 +18,9 @@ struct Lapack {
                 const int* incx, const double* beta, double* y, const int* incy);
 };
 extern Lapack lapack;
+
+// Fetches LAPACK from scipy, the first time that it is called.
+void find_lapack();
 
 // a (n, n) becomes its factor, in the half that uplo, "L" or "U", names; false where it is not positive definite.
 inline bool dense_cholesky(const char* uplo, int n, double* a) {

@@ -31,38 +31,34 @@ struct Mat3 {
 
 constexpr Mat3 kIdentity = {{{1, 0, 0}, {0, 1, 0}, {0, 0, 1}}};
 
-inline Mat3 operator*(const Mat3& a, const Mat3& b) {
+// The matrix whose number (i, j) is of(i, j).
+template <typename Number>
+inline Mat3 filled(const Number& of) {
   Mat3 out;
   for (int i = 0; i < 3; ++i)
-    for (int j = 0; j < 3; ++j) out[i][j] = a[i][0] * b[0][j] + a[i][1] * b[1][j] + a[i][2] * b[2][j];
+    for (int j = 0; j < 3; ++j) out[i][j] = of(i, j);
   return out;
+}
+
+inline Mat3 operator*(const Mat3& a, const Mat3& b) {
+  return filled([&](int i, int j) { return a[i][0] * b[0][j] + a[i][1] * b[1][j] + a[i][2] * b[2][j]; });
 }
 inline Vec3 operator*(const Mat3& a, Vec3 v) { return {dot(vec3(a[0]), v), dot(vec3(a[1]), v), dot(vec3(a[2]), v)}; }
 inline Mat3 operator+(const Mat3& a, const Mat3& b) {
-  Mat3 out;
-  for (int i = 0; i < 3; ++i)
-    for (int j = 0; j < 3; ++j) out[i][j] = a[i][j] + b[i][j];
-  return out;
-}
-inline Mat3 operator*(double s, const Mat3& a) {
-  Mat3 out;
-  for (int i = 0; i < 3; ++i)
-    for (int j = 0; j < 3; ++j) out[i][j] = s * a[i][j];
-  return out;
+  return filled([&](int i, int j) { return a[i][j] + b[i][j]; });
 }
 inline Mat3 operator-(const Mat3& a, const Mat3& b) {
-  Mat3 out;
-  for (int i = 0; i < 3; ++i)
-    for (int j = 0; j < 3; ++j) out[i][j] = a[i][j] - b[i][j];
-  return out;
+  return filled([&](int i, int j) { return a[i][j] - b[i][j]; });
+}
+inline Mat3 operator*(double s, const Mat3& a) {
+  return filled([&](int i, int j) { return s * a[i][j]; });
 }
 inline Mat3 operator/(const Mat3& a, double s) {
-  Mat3 out;
-  for (int i = 0; i < 3; ++i)
-    for (int j = 0; j < 3; ++j) out[i][j] = a[i][j] / s;
-  return out;
+  return filled([&](int i, int j) { return a[i][j] / s; });
 }
-inline Mat3 transposed(const Mat3& a) { return {{{a[0][0], a[1][0], a[2][0]}, {a[0][1], a[1][1], a[2][1]}, {a[0][2], a[1][2], a[2][2]}}}; }
+inline Mat3 transposed(const Mat3& a) {
+  return filled([&](int i, int j) { return a[j][i]; });
+}
 inline double trace(const Mat3& a) { return a[0][0] + a[1][1] + a[2][2]; }
 
 // The inverse of a symmetric matrix, by its cofactors.
@@ -75,12 +71,10 @@ inline Mat3 inverse_symmetric(const Mat3& m) {
 }
 
 // The upper left corner of a matrix in memory whose rows are `stride` numbers apart.
-inline Mat3 mat3(const double* from, int stride = 3) {
-  Mat3 out;
-  for (int i = 0; i < 3; ++i)
-    for (int j = 0; j < 3; ++j) out[i][j] = from[stride * i + j];
-  return out;
+inline Mat3 mat3(const double* from, int stride) {
+  return filled([&](int i, int j) { return from[stride * i + j]; });
 }
+inline Mat3 mat3(const double* from) { return mat3(from, 3); }
 inline void store(const Mat3& a, double* to, int stride = 3) {
   for (int i = 0; i < 3; ++i)
     for (int j = 0; j < 3; ++j) to[stride * i + j] = a[i][j];

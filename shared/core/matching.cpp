@@ -1,4 +1,5 @@
-#include "matching.h"
+// Nearest neighbours of descriptors by their Hamming distances.
+#include "bindings/arrays.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <numeric>
@@ -73,29 +74,34 @@ Pairs returned(const std::vector<int64_t>& choice, const Claims& claims) {
   return pairs;
 }
 
-}  // namespace
-
-void nearest_two(Descriptors a, Descriptors b, int64_t* index, int32_t* first, int32_t* second) {
-  for (size_t i = 0; i < a.count; ++i) {
-    int best = kFar, runner_up = kFar;
-    int64_t found = -1;
-    for (size_t j = 0; j < b.count; ++j) {
-      const int distance = hamming(a[i], b[j]);
-      if (distance < best) {
-        runner_up = best;
-        best = distance;
-        found = int64_t(j);
-      } else if (distance < runner_up) {
-        runner_up = distance;
+// For every descriptor of a, the nearest of b (-1 none), its distance and the second smallest one (kFar none).
+// Ties go to the lower index.
+auto nearest_two(const Packed& packed_a, const Packed& packed_b) {
+  const Descriptors a = packed_a, b = packed_b;
+  auto index = zeros<int64_t>(a.count);
+  auto first = zeros<int32_t>(a.count), second = zeros<int32_t>(a.count);
+  unlocked([&] {
+    for (size_t i = 0; i < a.count; ++i) {
+      int best = kFar, runner_up = kFar;
+      int64_t found = -1;
+      for (size_t j = 0; j < b.count; ++j) {
+        const int distance = hamming(a[i], b[j]);
+        if (distance < best) {
+          runner_up = std::exchange(best, distance);
+          found = int64_t(j);
+        } else if (distance < runner_up) {
+          runner_up = distance;
+        }
       }
+      index[i] = found, first[i] = best, second[i] = runner_up;
     }
-    index[i] = found;
-    first[i] = best;
-    second[i] = runner_up;
-  }
+  });
+  return std::tuple(as_numpy<int64_t>(std::move(index)), as_numpy<int32_t>(std::move(first)), as_numpy<int32_t>(std::move(second)));
 }
 
-Pairs mutual(Descriptors a, Descriptors b, int max_distance, double ratio) {
+// Pairs that are each other's nearest, by rising index in a: at most max_distance apart, and below ratio times the distance of
+// a's second nearest. Ties go to the lower index. Source: Lowe 2004.
+Pairs mutual_pairs(Descriptors a, Descriptors b, int max_distance, double ratio) {
   const Columns columns(b);
   Claims claims(b.count);
   std::vector<int32_t> scratch(b.count);
@@ -110,7 +116,13 @@ Pairs mutual(Descriptors a, Descriptors b, int max_distance, double ratio) {
   return returned(choice, claims);
 }
 
-Pairs mutual_within(Descriptors a, const int32_t* nodes_a, Descriptors b, const int32_t* nodes_b, int max_distance, double ratio) {
+auto mutual(const Packed& a, const Packed& b, int max_distance, double ratio) {
+  return as_numpy<int64_t>(unlocked([&] { return mutual_pairs(a, b, max_distance, ratio); }));
+}
+
+// As mutual, of each of a with those of b whose node is one of its two: nodes_a holds two numbers for each of a, nodes_b one
+// for each of b, none negative. Source: direct index, Galvez-Lopez and Tardos 2012, section III-B.
+Pairs mutual_pairs_within(Descriptors a, const int32_t* nodes_a, Descriptors b, const int32_t* nodes_b, int max_distance, double ratio) {
   if (a.count == 0 || b.count == 0) return {};
   // b sorted by node: those of node n are the columns starts[n]..starts[n + 1].
   std::vector<int64_t> order(b.count);
@@ -141,6 +153,25 @@ Pairs mutual_within(Descriptors a, const int32_t* nodes_a, Descriptors b, const 
   Pairs pairs = returned(choice, claims);
   for (auto& [i, j] : pairs) j = order[size_t(j)];
   return pairs;
+}
+
+auto mutual_within(const Packed& a, const Array<int32_t, -1, 2>& nodes_a, const Packed& b, const Numbers& nodes_b, int max_distance,
+                   double ratio) {
+  constexpr int32_t kMostNodes = 1 << 20;
+  if (nodes_a.shape(0) != a.shape(0) || nodes_b.shape(0) != b.shape(0)) throw nb::value_error("a node for each descriptor is needed");
+  const auto is_node = [](int32_t node) { return node >= 0 && node < kMostNodes; };
+  if (!std::all_of(nodes_a.begin(), nodes_a.end(), is_node) || !std::all_of(nodes_b.begin(), nodes_b.end(), is_node))
+    throw nb::value_error("nodes are numbers from 0 to 2^20");
+  return as_numpy<int64_t>(unlocked([&] { return mutual_pairs_within(a, nodes_a.data(), b, nodes_b.data(), max_distance, ratio); }));
+}
+
+}  // namespace
+
+void bind_matching(nb::module_& module) {
+  const auto a = "a"_a, b = "b"_a, max_distance = "max_distance"_a, ratio = "ratio"_a;
+  module.def("nearest_two", &nearest_two, a, b);
+  module.def("mutual", &mutual, a, b, max_distance, ratio);
+  module.def("mutual_within", &mutual_within, a, "nodes_a"_a, b, "nodes_b"_a, max_distance, ratio);
 }
 
 }  // namespace fleetmap

@@ -1,4 +1,4 @@
-// Hamming distances of 256-bit descriptors, and nearest neighbours by them.
+// Hamming distances of 256-bit descriptors, and matching by them near a predicted pixel.
 #pragma once
 
 #include <bit>
@@ -24,16 +24,22 @@ inline int hamming(const uint64_t* a, const uint64_t* b) {
 
 using Pairs = std::vector<std::pair<int64_t, int64_t>>;
 
-// Fills, for every descriptor of a, the nearest of b (-1 none), its distance and the second smallest one (kFar none).
-// Ties go to the lower index.
-void nearest_two(Descriptors a, Descriptors b, int64_t* index, int32_t* first, int32_t* second);
+// Predicted pixels and appearance of landmarks or features in an image; NaN excludes one from matching.
+struct Projections {
+  const double *pixels, *radius_px;  // (A, 2), (A,)
+  const int64_t* octave_range;       // (A, 2) lowest and highest octave, both included
+  Descriptors descriptors;           // of A
+};
 
-// Pairs that are each other's nearest, by rising index in a: at most max_distance apart, and below ratio times the distance of
-// a's second nearest. Ties go to the lower index. Source: Lowe 2004.
-Pairs mutual(Descriptors a, Descriptors b, int max_distance, double ratio);
+struct SeenFeatures {
+  const double* pixels;  // (B, 2)
+  const int8_t* octaves;
+  Descriptors descriptors;  // of B
+};
 
-// As mutual, of each of a with those of b whose node is one of its two: nodes_a holds two numbers for each of a, nodes_b one
-// for each of b, none negative. Source: direct index, Galvez-Lopez and Tardos 2012, section III-B.
-Pairs mutual_within(Descriptors a, const int32_t* nodes_a, Descriptors b, const int32_t* nodes_b, int max_distance, double ratio);
+// Fills index (A,) of the matching feature of each, -1 none, and their distance (A,), kFar none. The distance is at most max_distance and
+// below ratio times that of its nearest rival of the same octave: a corner found again on the next octave is no rival. Each feature goes
+// to the nearest candidate that chose it, the others stay unmatched; ties to the lower index.
+void match_projected(const Projections& a, const SeenFeatures& b, int max_distance, double ratio, int64_t* index, int32_t* distances);
 
 }  // namespace fleetmap

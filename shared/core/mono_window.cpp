@@ -1,4 +1,5 @@
-#include "mono_window.h"
+// Bundle adjustment of a small window of one camera's views: dense, for about ten views and a few hundred points.
+#include "bindings/arrays.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
@@ -6,10 +7,21 @@
 #include "dense.h"
 
 namespace fleetmap {
-
 namespace {
 
 constexpr double kNearest = 1e-3;
+
+// Views are map_from_cam. Observations of point n are those from starts[n] to starts[n + 1]: the view, and the pixel (u, v).
+struct MonoWindow {
+  std::vector<SE3> views;
+  std::vector<int64_t> slots;  // of each view among the free ones, -1 for one that stays
+  std::vector<Vec3> points;
+  const int64_t* starts;
+  const int64_t* observers;
+  const double* pixels;
+  StereoLens lens;
+  double sigma_px, huber_sigmas;
+};
 
 // A point in a view, and the derivatives of its pixel by the view and by the point.
 struct Projection {
@@ -22,10 +34,10 @@ bool project(const MonoWindow& window, const SE3& view, Vec3 point, Projection& 
   const Mat3& rotation = view.rotation;
   const Vec3 away = point - view.translation, y = transposed(rotation) * away;
   if (y[2] < kNearest) return false;
-  const double inverse = 1.0 / y[2], centre[2] = {window.cx, window.cy};
+  const double inverse = 1.0 / y[2], centre[2] = {window.lens.cx, window.lens.cy};
   for (int row = 0; row < 2; ++row) {
-    out.pixel[row] = window.focal * y[row] * inverse + centre[row];
-    for (int b = 0; b < 3; ++b) out.by_point[row][b] = window.focal * inverse * (rotation[b][row] - y[row] * inverse * rotation[b][2]);
+    out.pixel[row] = window.lens.focal * y[row] * inverse + centre[row];
+    for (int b = 0; b < 3; ++b) out.by_point[row][b] = window.lens.focal * inverse * (rotation[b][row] - y[row] * inverse * rotation[b][2]);
     store(cross(out.by_point[row], away), out.by_view[row]);
     store(-out.by_point[row], out.by_view[row] + 3);
   }
@@ -55,7 +67,6 @@ struct Cross {
 
 // Normal equations of points and free views, and memory for their solution.
 struct NormalSystem {
-  std::vector<int64_t> slots;  // of each view among the free ones, -1 for a fixed one
   Matrix hessian, reduced;
   std::vector<double> gradient, step;
   std::vector<Mat3> point_hessian;
@@ -78,7 +89,7 @@ void linearise(const MonoWindow& window, const double* squared, NormalSystem& sy
       const double off = std::sqrt(squared[m]);
       double weight = 1.0 / (window.sigma_px * window.sigma_px);
       if (off > window.huber_sigmas) weight *= window.huber_sigmas / off;
-      const int64_t slot = system.slots[view];
+      const int64_t slot = window.slots[view];
       for (int row = 0; row < 2; ++row) {
         const double residual = window.pixels[2 * m + row] - seen.pixel[row];
         const Vec3 by_point = seen.by_point[row];
@@ -117,14 +128,14 @@ bool solve(const MonoWindow& window, double damping, NormalSystem& system) {
   for (size_t n = 0; n < window.points.size(); ++n) {
     const Mat3 inverse = damped_inverse(system.point_hessian[n], damping);
     for (int64_t m = window.starts[n]; m < window.starts[n + 1]; ++m) {
-      const int64_t slot = system.slots[size_t(window.observers[m])];
+      const int64_t slot = window.slots[size_t(window.observers[m])];
       if (slot < 0) continue;
       Cross carried;
       multiply(system.cross[size_t(m)].at[0], inverse[0], carried.at[0], 6, 3, 3);
       for (size_t a = 0; a < 6; ++a)
         for (int b = 0; b < 3; ++b) system.step[6 * size_t(slot) + a] -= carried.at[a][b] * system.point_gradient[n][b];
       for (int64_t other = window.starts[n]; other < window.starts[n + 1]; ++other) {
-        const int64_t other_slot = system.slots[size_t(window.observers[other])];
+        const int64_t other_slot = window.slots[size_t(window.observers[other])];
         if (other_slot < 0) continue;
         const Cross& by = system.cross[size_t(other)];
         for (size_t a = 0; a < 6; ++a) {
@@ -139,7 +150,7 @@ bool solve(const MonoWindow& window, double damping, NormalSystem& system) {
   for (size_t n = 0; n < window.points.size(); ++n) {
     Vec3 pull = system.point_gradient[n];
     for (int64_t m = window.starts[n]; m < window.starts[n + 1]; ++m) {
-      const int64_t slot = system.slots[size_t(window.observers[m])];
+      const int64_t slot = window.slots[size_t(window.observers[m])];
       if (slot < 0) continue;
       for (int b = 0; b < 3; ++b)
         for (size_t a = 0; a < 6; ++a) pull[b] -= system.cross[size_t(m)].at[a][b] * system.step[6 * size_t(slot) + a];
@@ -152,21 +163,20 @@ bool solve(const MonoWindow& window, double damping, NormalSystem& system) {
 MonoWindow moved(const MonoWindow& window, const NormalSystem& system) {
   MonoWindow out = window;
   for (size_t k = 0; k < out.views.size(); ++k) {
-    if (system.slots[k] < 0) continue;
-    const double* const step = system.step.data() + 6 * system.slots[k];
+    if (window.slots[k] < 0) continue;
+    const double* const step = system.step.data() + 6 * window.slots[k];
     out.views[k] = {so3_exp(vec3(step)) * out.views[k].rotation, out.views[k].translation + vec3(step + 3)};
   }
   for (size_t n = 0; n < out.points.size(); ++n) out.points[n] = out.points[n] + system.shifts[n];
   return out;
 }
 
-}  // namespace
-
-double adjust_window(MonoWindow& window, int iterations, double* squared) {
+// Moves views and points to the nearest optimum by Levenberg-Marquardt; half the robust sum of squares there. squared: of each
+// observation, in sigmas, a million behind a camera. Views are perturbed as R <- Exp(rotation) R, p <- p + translation, both in map axes.
+// The Schur complement over the points is solved dense. Source: Triggs et al. 2000.
+double adjusted(MonoWindow& window, size_t free_views, int iterations, double* squared) {
   NormalSystem system;
-  size_t count = 0;
-  for (const bool is_held : window.held) system.slots.push_back(is_held ? -1 : int64_t(count++));
-  system.gradient.resize(6 * count);
+  system.gradient.resize(6 * free_views);
   system.point_hessian.resize(window.points.size());
   system.point_gradient.resize(window.points.size());
   system.shifts.resize(window.points.size());
@@ -192,6 +202,38 @@ double adjust_window(MonoWindow& window, int iterations, double* squared) {
     if (is_small) break;
   }
   return cost_of(window, squared);
+}
+
+auto adjust_window(const Array<double, -1, 4, 4>& map_from_cam, size_t held, const Points& points, const Indices& starts,
+                   const Indices& views, const Places& pixels, const StereoLens& lens, double sigma_px, double huber_sigmas,
+                   int iterations) {
+  const size_t view_count = map_from_cam.shape(0), count = points.shape(0), seen = views.shape(0);
+  if (view_count > 500) throw nb::value_error("map_from_cam: at most 500 views");
+  if (starts.shape(0) != count + 1) throw nb::value_error("starts: one more than points");
+  if (pixels.shape(0) != seen) throw nb::value_error("pixels: one for each of views");
+  if (starts(0) != 0 || starts(count) != int64_t(seen) || !std::is_sorted(starts.begin(), starts.end()))
+    throw nb::value_error("starts: rows of views");
+  if (std::any_of(views.begin(), views.end(), [&](int64_t view) { return view < 0 || view >= int64_t(view_count); }))
+    throw nb::value_error("views: numbers of map_from_cam");
+  if (iterations < 0 || iterations > 1000) throw nb::value_error("iterations: 0 to 1000");
+  MonoWindow window{{}, {}, {}, starts.data(), views.data(), pixels.data(), lens, sigma_px, huber_sigmas};
+  for (size_t k = 0; k < view_count; ++k) {
+    window.views.push_back(se3(map_from_cam.data() + 16 * k));
+    window.slots.push_back(k < held ? -1 : int64_t(k - held));
+  }
+  for (size_t n = 0; n < count; ++n) window.points.push_back(vec3(&points(n, 0)));
+  std::vector<double> squared(seen), moved(16 * view_count);
+  const double cost = unlocked([&] { return adjusted(window, view_count - std::min(held, view_count), iterations, squared.data()); });
+  for (size_t k = 0; k < view_count; ++k) store(window.views[k], moved.data() + 16 * k);
+  return std::tuple(as_numpy<double, 3>(std::move(moved), {view_count, 4, 4}), as_numpy<double>(std::move(window.points)),
+                    as_numpy<double>(std::move(squared)), cost);
+}
+
+}  // namespace
+
+void bind_mono_window(nb::module_& module) {
+  module.def("adjust_window", &adjust_window, "map_from_cam"_a, "held"_a, "points"_a, "starts"_a, "views"_a, "pixels"_a, "lens"_a,
+             "sigma_px"_a, "huber_sigmas"_a, "iterations"_a);
 }
 
 }  // namespace fleetmap

@@ -1,11 +1,9 @@
-#include "pair_matching.h"
+// Matching of two keyframes near a motion: prediction of one's features in the other, and the motion that fits them.
+#include "bindings/refinement.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
 #include <limits>
-#include <optional>
-
-#include "projection.h"
 
 namespace fleetmap {
 namespace {
@@ -15,15 +13,58 @@ constexpr double kRatio = 0.95;  // of the nearest descriptor to its rival near 
 constexpr double kScale = 1.2;   // from octave to octave
 constexpr double kNearM = 1e-6;
 
+using Size = std::tuple<double, double>;  // width and height
+// pixels (N, 2), octaves (N,), descriptors (N, 4), disparities (N, 2), points_cam (N, 3), true if the disparities are measured
+using Features = std::tuple<Places, Array<int8_t, -1>, Packed, Places, Points, bool>;
+
+// Features of a keyframe.
+struct KeyframeFeatures {
+  const double* pixels;  // (N, 2)
+  const int8_t* octaves;
+  Descriptors descriptors;
+  const double* disparities;  // (N, 2) with their standard deviations, NaN unknown
+  const double* points_cam;   // (N, 3), by the disparities
+  bool is_measured;           // true if the keyframe measured the disparities itself
+
+  explicit KeyframeFeatures(const Features& features)
+      : pixels(std::get<0>(features).data()),
+        octaves(std::get<1>(features).data()),
+        descriptors(std::get<2>(features)),
+        disparities(std::get<3>(features).data()),
+        points_cam(std::get<4>(features).data()),
+        is_measured(std::get<5>(features)) {
+    if (std::get<0>(features).shape(0) != count() || std::get<1>(features).shape(0) != count() ||
+        std::get<3>(features).shape(0) != count() || std::get<4>(features).shape(0) != count())
+      throw nb::value_error("a, b: as many pixels, octaves, disparities and points as descriptors");
+  }
+  size_t count() const { return descriptors.count; }
+};
+
+struct PairGuidance {
+  StereoLens lens;
+  Size size_px;
+  double sigma_px;  // of features; it grows with their octaves
+  Refinement refinement;
+  int max_distance;
+};
+
+struct GuidedPair {
+  int good = 0;                               // number of successful radii
+  std::vector<std::array<int32_t, 2>> pairs;  // if all succeeded
+  SE3 b_from_a;
+  double hessian[36] = {};
+};
+
 // By which pixels of an octave are coarser than the image's.
 double coarseness(double octave) { return std::pow(kScale, std::min(std::max(octave, 0.0), 4.0)); }
 
 // Pixel of a point of camera b's frame, none outside of its image.
-std::optional<std::pair<double, double>> seen_by(Vec3 point, const StereoLens& lens, double width_px, double height_px) {
+std::optional<std::array<double, 2>> seen_by(Vec3 point, const StereoLens& lens, const Size& size_px) {
+  const auto [width_px, height_px] = size_px;
   if (!(point[2] > kNearM)) return {};
   const double u = lens.focal * point[0] / point[2] + lens.cx, v = lens.focal * point[1] / point[2] + lens.cy;
   if (!(0.0 < u && u < width_px && 0.0 < v && v < height_px)) return {};
-  return std::pair(u, v);
+  return {{u, v}};
 }
 
 // Matches of a's features with depth into b. Nearer, a feature appears larger and so on a higher octave; there pixels are coarser and the
@@ -36,11 +77,11 @@ Pairs project_matches(const KeyframeFeatures& a, const KeyframeFeatures& b, cons
   for (size_t n = 0; n < count; ++n) {
     if (!std::isfinite(a.disparities[2 * n])) continue;
     const Vec3 point = vec3(a.points_cam + 3 * n), in_b = b_from_a * point;
-    const auto seen = seen_by(in_b, guidance.lens, guidance.width_px, guidance.height_px);
+    const auto seen = seen_by(in_b, guidance.lens, guidance.size_px);
     if (!seen) continue;
     const double nearer = std::min(std::max(point[2] / std::max(in_b[2], 0.05), 0.1), 10.0);
     const double octave = a.octaves[n] + std::log(nearer) / std::log(kScale);
-    predicted[2 * n] = seen->first, predicted[2 * n + 1] = seen->second;
+    std::copy(seen->begin(), seen->end(), &predicted[2 * n]);
     span[2 * n] = int64_t(std::floor(octave)) - 2, span[2 * n + 1] = int64_t(std::ceil(octave)) + 2;
     radius[n] = radius_px * coarseness(octave);
   }
@@ -78,47 +119,71 @@ void match_both_ways(const KeyframeFeatures& a, const KeyframeFeatures& b, const
                      const Pairs& forward, GuidedPair& found) {
   std::vector<char> taken_a(a.count(), false), taken_b(b.count(), false);
   for (const auto& [i, j] : forward) {
-    found.pairs.emplace_back(int32_t(i), int32_t(j));
+    found.pairs.push_back({int32_t(i), int32_t(j)});
     taken_a[size_t(i)] = taken_b[size_t(j)] = true;
   }
   for (const auto& [j, i] : project_matches(b, a, guidance, inverse(found.b_from_a), radius_px))
-    if (!taken_a[size_t(i)] && !taken_b[size_t(j)]) found.pairs.emplace_back(int32_t(i), int32_t(j));
+    if (!taken_a[size_t(i)] && !taken_b[size_t(j)]) found.pairs.push_back({int32_t(i), int32_t(j)});
 }
 
-}  // namespace
-
-GuidedPair match_guided(const KeyframeFeatures& a, const KeyframeFeatures& b, const PairGuidance& guidance, const SE3& b_from_a,
-                        const PairStart& start) {
+// Matches a's features into b by projection and finds the motion from them in turn, once for each radius: with so many inliers each time,
+// and the first time with that share of the matches. At the end b's features are matched into a too, to those whose features are still
+// free.
+GuidedPair guided(const KeyframeFeatures& a, const KeyframeFeatures& b, const PairGuidance& guidance, const SE3& b_from_a,
+                  const std::vector<double>& radii_px, int least_inliers, double least_share) {
   GuidedPair found;
   found.b_from_a = b_from_a;
   Pairs pairs;
   std::vector<double> squared;
-  for (const double radius_px : start.radii_px) {
+  for (const double radius_px : radii_px) {
     pairs = project_matches(a, b, guidance, found.b_from_a, radius_px);
-    if (pairs.size() < size_t(start.least_inliers) || !refine(a, b, guidance, pairs, found, squared)) return found;
-    const double wanted = found.good == 0 ? start.least_share * double(pairs.size()) : 0.0;
+    if (pairs.size() < size_t(least_inliers) || !refine(a, b, guidance, pairs, found, squared)) return found;
+    const double wanted = found.good == 0 ? least_share * double(pairs.size()) : 0.0;
     size_t inliers = 0;
     for (size_t n = 0; n < pairs.size(); ++n)
       if (squared[n] < guidance.refinement.gate_squared) pairs[inliers++] = pairs[n];
-    if (double(inliers) < std::max(double(start.least_inliers), wanted)) return found;
+    if (double(inliers) < std::max(double(least_inliers), wanted)) return found;
     pairs.resize(inliers);
     ++found.good;
   }
-  if (!start.radii_px.empty()) match_both_ways(a, b, guidance, start.radii_px.back(), pairs, found);
+  if (!radii_px.empty()) match_both_ways(a, b, guidance, radii_px.back(), pairs, found);
   return found;
 }
 
-double share_in_view(const SE3& b_from_a, const double* points_a, const double* disparities_a, size_t count, const StereoLens& lens,
-                     double width_px, double height_px) {
-  size_t known = 0, seen = 0;
-  for (size_t n = 0; n < count; ++n) {
-    if (!std::isfinite(disparities_a[2 * n])) continue;
-    ++known;
-    const Vec3 point = vec3(points_a + 3 * n), in_b = b_from_a * point;
-    const double farther = in_b[2] / point[2];
-    seen += 0.4 < farther && farther < 2.5 && seen_by(in_b, lens, width_px, height_px);
-  }
-  return known ? double(seen) / double(known) : 0.0;
+auto match_guided(const Features& a, const Features& b, const SE3& b_from_a, const StereoLens& lens, const Size& size_px, double sigma_px,
+                  const Limits& refinement, int max_distance, const Reals& radii_px, int least_inliers, double least_share) {
+  if (least_inliers < 0) throw nb::value_error("least_inliers: not negative");
+  const PairGuidance guidance{lens, size_px, sigma_px, refinement_of(refinement), max_distance};
+  const KeyframeFeatures ours(a), theirs(b);
+  GuidedPair found =
+      unlocked([&] { return guided(ours, theirs, guidance, b_from_a, {radii_px.begin(), radii_px.end()}, least_inliers, least_share); });
+  return std::tuple(found.good, as_numpy<int32_t>(std::move(found.pairs)), found.b_from_a, copied<2>(found.hessian, {6, 6}));
+}
+
+// Share of a's points with a disparity in view of b, at a similar distance.
+double share_in_view(const SE3& b_from_a, const Points& points_a, const Places& disparities_a, const StereoLens& lens,
+                     const Size& size_px) {
+  if (points_a.shape(0) != disparities_a.shape(0)) throw nb::value_error("disparities_a: one for each point");
+  return unlocked([&] {
+    size_t known = 0, seen = 0;
+    for (size_t n = 0; n < points_a.shape(0); ++n) {
+      if (!std::isfinite(disparities_a(n, 0))) continue;
+      ++known;
+      const Vec3 point = vec3(&points_a(n, 0)), in_b = b_from_a * point;
+      const double farther = in_b[2] / point[2];
+      seen += 0.4 < farther && farther < 2.5 && seen_by(in_b, lens, size_px);
+    }
+    return known ? double(seen) / double(known) : 0.0;
+  });
+}
+
+}  // namespace
+
+void bind_pair_matching(nb::module_& module) {
+  const auto b_from_a = "b_from_a"_a, lens = "lens"_a, size_px = "size_px"_a;
+  module.def("match_guided", &match_guided, "a"_a, "b"_a, b_from_a, lens, size_px, "sigma_px"_a, "refinement"_a, "max_distance"_a,
+             "radii_px"_a, "least_inliers"_a, "least_share"_a);
+  module.def("share_in_view", &share_in_view, b_from_a, "points_a"_a, "disparities_a"_a, lens, size_px);
 }
 
 }  // namespace fleetmap

@@ -1,8 +1,10 @@
-#include "patch_align.h"
+// Alignment of patches: a small window of one image in another, to a fraction of a pixel.
+#include "bindings/arrays.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
 #include <cstring>
+#include <limits>
 #include <numbers>
 
 #include "dense.h"
@@ -10,11 +12,35 @@
 namespace fleetmap {
 namespace {
 
+constexpr double kNaN = std::numeric_limits<double>::quiet_NaN();
+constexpr int kMostPatchHalf = 15;
 constexpr int kMostSide = 2 * kMostPatchHalf + 1, kMostCount = kMostSide * kMostSide;
 constexpr int kMostIterations = 30;
 constexpr double kScale = 1.2;  // from octave to octave
 constexpr double kNearM = 1e-6;
 constexpr double kSlantSigma = 3.0;  // see align_patch
+
+// Position of the patch in the current image: its standard deviation comes from the residual and the window's gradients in the weaker
+// direction. All NaN where alignment fails.
+struct Alignment {
+  double x = kNaN, y = kNaN, sigma_px = kNaN, correlation = kNaN;
+};
+
+struct PatchLimits {
+  int half;  // patches have 2 half + 1 pixels
+  double max_shift_px, min_correlation;
+  PatchLimits(int half, double max_shift_px, double min_correlation)
+      : half(half), max_shift_px(max_shift_px), min_correlation(min_correlation) {
+    if (half < 1 || half > kMostPatchHalf) throw nb::value_error("half: 1 to 15");
+  }
+};
+
+// Offsets in the reference image of offsets in the current one, on a surface that faces the camera. On one whose inverse depth changes
+// along the current offset (u, v), relative to itself by s and t in a unit of normalised coordinates, a pixel lies (s u + t v) (slant_x,
+// slant_y) aside of that; these are 0 where the motion is not known.
+struct Warp {
+  double xx, xy, slant_x, yx, yy, slant_y;
+};
 
 // The level of the pyramid nearest to the scale of an octave.
 int halvings(int octave) { return int(std::clamp(std::nearbyint(octave * std::log2(kScale)), 0.0, 2.0)); }
@@ -86,8 +112,16 @@ struct Template {
   }
 };
 
-}  // namespace
-
+// Moves (x, y) of the current image, and the slants s and t of the surface, until the reference's window around (rx, ry), warped, lies on
+// it.
+//
+// With T the warped window less its mean, I the current one less its own, T' = slant_x Tx + slant_y Ty, and J = (Tx, Ty, T' u, T' v) less
+// what an offset and T explain of it, each step solves
+//   (sum J^T J + diag(0, 0, p, p)) d = sum J^T (g I - T) + p (0, 0, s, t),   g = sum I T / sum I I,   p = (sum (g I - T)^2 / A + 4) / 3^2
+// and goes to (x, y, s, t) - d. p holds the slants near 0: their standard deviation 3 is the cotangent of the 18 degrees at which a
+// surface is seen, A the number of pixels, and 4 the variance of two pixels' own noise. A wall along the motion, taken to face the
+// camera, would draw (x, y) towards its place in the reference.
+// Inverse compositional, with free offset and gain. Sources: Baker and Matthews 2004; Shi and Tomasi 1994 for windows that deform.
 Alignment align_patch(GreyImage reference, GreyImage current, double rx, double ry, double x, double y, const Warp& warp,
                       const PatchLimits& limits) {
   const int half = limits.half, count = (2 * half + 1) * (2 * half + 1);
@@ -134,11 +168,28 @@ Alignment align_patch(GreyImage reference, GreyImage current, double rx, double 
   return {};
 }
 
+using Pyramid = std::tuple<Image, Image, Image>;
+using Octaves = Array<int8_t, -1>;
+
+// Features of an image, whole, halved and quartered; pixels (M, 2) in the whole one, where the scale of octave k is 1.2^k.
+struct PatchFeatures {
+  GreyImage pyramid[3];
+  const double* pixels;
+  const int8_t* octaves;
+
+  PatchFeatures(const Pyramid& images, const Places& places, const Octaves& of)
+      : pyramid{std::get<0>(images), std::get<1>(images), std::get<2>(images)}, pixels(places.data()), octaves(of.data()) {
+    if (of.shape(0) != places.shape(0)) throw nb::value_error("octaves: one for each pixel");
+  }
+};
+
+// align_patch of feature i of the reference and feature j of the current image, each on the halving nearest to its scale. The warp and
+// the result are for the whole images; NaN below min_correlation.
 Alignment align_feature(const PatchFeatures& reference, int64_t i, const PatchFeatures& current, int64_t j, Warp warp,
                         const PatchLimits& limits) {
   const int level = halvings(reference.octaves[i]), current_level = halvings(current.octaves[j]);
   const double size = 1 << level, current_size = 1 << current_level, ratio = current_size / size;
-  warp = {ratio * warp.xx, ratio * warp.xy, ratio * warp.yx, ratio * warp.yy, warp.slant_x, warp.slant_y};
+  warp = {ratio * warp.xx, ratio * warp.xy, warp.slant_x, ratio * warp.yx, ratio * warp.yy, warp.slant_y};
   const double *a = reference.pixels + 2 * i, *b = current.pixels + 2 * j;
   const Alignment found = align_patch(reference.pyramid[level], current.pyramid[current_level], a[0] / size, a[1] / size,
                                       b[0] / current_size, b[1] / current_size, warp, limits);
@@ -146,6 +197,7 @@ Alignment align_feature(const PatchFeatures& reference, int64_t i, const PatchFe
   return {found.x * current_size, found.y * current_size, found.sigma_px * current_size, found.correlation};
 }
 
+// The warp around a point of the reference camera; none where it is degenerate.
 std::optional<Warp> warp_from_motion(Vec3 point, const SE3& current_from_reference) {
   if (!(point[2] > kNearM)) return {};
   constexpr double kStep = 0.01;  // of the depth, to the right and below
@@ -165,14 +217,87 @@ std::optional<Warp> warp_from_motion(Vec3 point, const SE3& current_from_referen
   const double c = (seen[1][1] - seen[0][1]) / kStep, d = (seen[2][1] - seen[0][1]) / kStep;
   const double determinant = a * d - b * c;
   if (!(0.02 < std::abs(determinant) && std::abs(determinant) < 50.0)) return {};
-  return Warp{d / determinant, -b / determinant, -c / determinant, a / determinant, slant_x, slant_y};
+  return Warp{d / determinant, -b / determinant, slant_x, -c / determinant, a / determinant, slant_y};
 }
 
+// The warp between two features, by octaves and orientations.
 Warp warp_from_features(int octave_reference, double angle_reference_deg, int octave_current, double angle_current_deg) {
   const double scale = std::pow(kScale, double(octave_reference - octave_current));
   const double angle = (angle_reference_deg - angle_current_deg) * (std::numbers::pi / 180.0);
   const double cosine = scale * std::cos(angle), sine = scale * std::sin(angle);
-  return {cosine, -sine, sine, cosine};
+  return {cosine, -sine, 0.0, sine, cosine, 0.0};
+}
+
+// Places (N, 3) x, y, sigma_px of aligned features.
+using Aligned = std::vector<std::array<double, 3>>;
+
+auto align_patches(const Pyramid& reference, const Places& reference_pixels, const Octaves& reference_octaves, const Pyramid& current,
+                   const Places& pixels, const Octaves& octaves, const Array<double, -1, 2, 3>& warps, int half, double max_shift_px,
+                   double min_correlation) {
+  const PatchLimits limits(half, max_shift_px, min_correlation);
+  const PatchFeatures a(reference, reference_pixels, reference_octaves), b(current, pixels, octaves);
+  const size_t count = pixels.shape(0);
+  if (reference_pixels.shape(0) != count || warps.shape(0) != count) throw nb::value_error("reference_pixels, warps: one for each pixel");
+  Aligned found(count);
+  unlocked([&] {
+    const Warp* const warp_of = reinterpret_cast<const Warp*>(warps.data());
+    for (size_t n = 0; n < count; ++n) {
+      const Alignment at = align_feature(a, int64_t(n), b, int64_t(n), warp_of[n], limits);
+      found[n] = {at.x, at.y, at.sigma_px};
+    }
+  });
+  return as_numpy<double>(std::move(found));
+}
+
+// Those of an image: pyramid, pixels (M, 2), octaves (M,), angles in degrees (M,), and the chosen ones (N,).
+using Features = std::tuple<Pyramid, Places, Octaves, Array<float, -1>, Indices>;
+
+auto align_observations(const Features& reference, const Features& own, const Points& points_reference, const SE3& own_from_reference,
+                        int half, double max_shift_px, double min_correlation) {
+  const PatchLimits limits(half, max_shift_px, min_correlation);
+  const auto& [pyramid_a, pixels_a, octaves_a, angles_a, chosen_a] = reference;
+  const auto& [pyramid_b, pixels_b, octaves_b, angles_b, chosen_b] = own;
+  const PatchFeatures a(pyramid_a, pixels_a, octaves_a), b(pyramid_b, pixels_b, octaves_b);
+  const size_t count = chosen_b.shape(0);
+  if (angles_a.shape(0) != pixels_a.shape(0) || angles_b.shape(0) != pixels_b.shape(0)) throw nb::value_error("angles: one for each pixel");
+  if (chosen_a.shape(0) != count || points_reference.shape(0) != count) throw nb::value_error("points_reference: one for each chosen");
+  for (size_t n = 0; n < count; ++n)
+    if (size_t(chosen_a(n)) >= pixels_a.shape(0) || size_t(chosen_b(n)) >= pixels_b.shape(0))
+      throw nb::value_error("chosen: indices of pixels");
+  Aligned found(count);
+  unlocked([&] {
+    for (size_t n = 0; n < count; ++n) {
+      const int64_t i = chosen_a(n), j = chosen_b(n);
+      // finer than octaves and angles
+      const auto by_motion = warp_from_motion(vec3(&points_reference(n, 0)), own_from_reference);
+      const Warp warp =
+          by_motion ? *by_motion : warp_from_features(octaves_a(size_t(i)), angles_a(size_t(i)), octaves_b(size_t(j)), angles_b(size_t(j)));
+      const Alignment at = align_feature(a, i, b, j, warp, limits);
+      found[n] = {at.x, at.y, at.sigma_px};
+    }
+  });
+  return as_numpy<double>(std::move(found));
+}
+
+auto warps_from_motion(const Points& points_reference, const SE3& current_from_reference) {
+  const size_t count = points_reference.shape(0);
+  std::vector<Warp> warps(count, {kNaN, kNaN, kNaN, kNaN, kNaN, kNaN});
+  unlocked([&] {
+    for (size_t n = 0; n < count; ++n)
+      if (const auto warp = warp_from_motion(vec3(&points_reference(n, 0)), current_from_reference)) warps[n] = *warp;
+  });
+  return as_numpy<double, 3>(std::move(warps), {count, 2, 3});
+}
+
+}  // namespace
+
+void bind_patch_align(nb::module_& module) {
+  const auto reference = "reference"_a, half = "half"_a, max_shift_px = "max_shift_px"_a, min_correlation = "min_correlation"_a;
+  module.def("align_patches", &align_patches, reference, "reference_pixels"_a, "reference_octaves"_a, "current"_a, "pixels"_a, "octaves"_a,
+             "warps"_a, half, max_shift_px, min_correlation);
+  module.def("align_observations", &align_observations, reference, "own"_a, "points_reference"_a, "own_from_reference"_a, half,
+             max_shift_px, min_correlation);
+  module.def("warps_from_motion", &warps_from_motion, "points_reference"_a, "current_from_reference"_a);
 }
 
 }  // namespace fleetmap

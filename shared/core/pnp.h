@@ -67,4 +67,17 @@ struct Resection {
 std::optional<Resection> refine_pnp(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const double* prior,
                                     const SE3& start);
 
+// A proposed camera must see a minimum of points within a limit in pixels of their measurements, and keep as many inliers
+// after its refinement, by those points and then by all.
+struct Agreement {
+  double threshold_px;
+  size_t min_inliers;
+};
+
+// The camera that most points agree with, of those that three of them allow: draws (count, 3) in [0, 1) say which three propose. Fewer
+// are tried once the best camera is the best of all with that confidence.
+// Source: Fischler and Bolles 1981; Grunert 1841, as in Haralick et al. 1994, for the three points.
+std::optional<Resection> ransac_pnp(const Sightings& seen, const StereoLens& lens, const Refinement& refinement, const Agreement& agreement,
+                                    const double* draws, size_t draw_count, double confidence);
+
 }  // namespace fleetmap

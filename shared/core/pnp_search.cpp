@@ -1,4 +1,4 @@
-#include "pnp_search.h"
+#include "bindings/refinement.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
@@ -201,8 +201,12 @@ std::optional<Resection> ransac_pnp(const Sightings& seen, const StereoLens& len
   return refine_from(best_camera, seen, lens, refinement, nullptr, agreement);
 }
 
-std::optional<Resection> pnp_with_rotation(const Sightings& seen, const StereoLens& lens, const Refinement& refinement,
-                                           const Agreement& agreement, const Mat3& rotation, double rotation_sigma_rad) {
+namespace {
+
+// As ransac_pnp where the rotation is nearly known: each point whose depth the camera's stereo measured proposes a translation. Finds the
+// camera among far more wrong matches than three points can.
+std::optional<Resection> with_rotation(const Sightings& seen, const StereoLens& lens, const Refinement& refinement,
+                                       const Agreement& agreement, const Mat3& rotation, double rotation_sigma_rad) {
   if (seen.count < agreement.min_inliers) return {};
   Columns columns(seen);  // of the points turned into the camera's axes
   for (size_t n = 0; n < seen.count; ++n) {
@@ -223,6 +227,58 @@ std::optional<Resection> pnp_with_rotation(const Sightings& seen, const StereoLe
   double prior[36] = {};
   for (int a = 0; a < 3; ++a) prior[7 * a] = 1.0 / (rotation_sigma_rad * rotation_sigma_rad);
   return refine_from(best_camera, seen, lens, refinement, prior, agreement);
+}
+
+Sightings sightings_of(const Points& points, const Points& pixels, const Places& weights) {
+  if (pixels.shape(0) != points.shape(0) || weights.shape(0) != points.shape(0))
+    throw nb::value_error("pixels and weights: one row for each point");
+  return {points.data(), pixels.data(), weights.data(), points.shape(0)};
+}
+
+Agreement agreement_of(double threshold_px, int min_inliers) { return {threshold_px, size_t(std::max(min_inliers, 0))}; }
+
+using Result = std::optional<std::tuple<SE3, nb::ndarray<nb::numpy, double, nb::ndim<2>>, nb::ndarray<nb::numpy, double, nb::ndim<1>>>>;
+
+Result result_of(std::optional<Resection>&& found) {
+  if (!found) return {};
+  return {{found->cam_from_source, copied<2>(found->information, {6, 6}), as_numpy<double>(std::move(found->squared))}};
+}
+
+Result refine_pnp_of(const Points& points, const Points& pixels, const Places& weights, const StereoLens& lens, const Limits& refinement,
+                     const SE3& cam_from_source, const std::optional<Array<double, 6, 6>>& prior) {
+  const Sightings seen = sightings_of(points, pixels, weights);
+  const Refinement limits = refinement_of(refinement);
+  return result_of(unlocked([&] { return refine_pnp(seen, lens, limits, prior ? prior->data() : nullptr, cam_from_source); }));
+}
+
+Result ransac_pnp_of(const Points& points, const Points& pixels, const Places& weights, const StereoLens& lens, const Limits& refinement,
+                     double threshold_px, int min_inliers, const Points& draws, double confidence) {
+  const Sightings seen = sightings_of(points, pixels, weights);
+  if (!std::all_of(draws.begin(), draws.end(), [](double draw) { return draw >= 0.0 && draw < 1.0; }))
+    throw nb::value_error("draws: from 0 to below 1");
+  const Refinement limits = refinement_of(refinement);
+  return result_of(unlocked(
+      [&] { return ransac_pnp(seen, lens, limits, agreement_of(threshold_px, min_inliers), draws.data(), draws.shape(0), confidence); }));
+}
+
+Result pnp_with_rotation_of(const Points& points, const Points& pixels, const Places& weights, const StereoLens& lens,
+                            const Limits& refinement, double threshold_px, int min_inliers, const Mat3& rotation,
+                            double rotation_sigma_rad) {
+  const Sightings seen = sightings_of(points, pixels, weights);
+  const Refinement limits = refinement_of(refinement);
+  return result_of(
+      unlocked([&] { return with_rotation(seen, lens, limits, agreement_of(threshold_px, min_inliers), rotation, rotation_sigma_rad); }));
+}
+
+}  // namespace
+
+void bind_pnp(nb::module_& module) {
+  const auto points = "points"_a, pixels = "pixels"_a, weights = "weights"_a, lens = "lens"_a, refinement = "refinement"_a,
+             threshold_px = "threshold_px"_a, min_inliers = "min_inliers"_a;
+  module.def("refine_pnp", &refine_pnp_of, points, pixels, weights, lens, refinement, "cam_from_source"_a, "prior"_a);
+  module.def("ransac_pnp", &ransac_pnp_of, points, pixels, weights, lens, refinement, threshold_px, min_inliers, "draws"_a, "confidence"_a);
+  module.def("pnp_with_rotation", &pnp_with_rotation_of, points, pixels, weights, lens, refinement, threshold_px, min_inliers, "rotation"_a,
+             "rotation_sigma_rad"_a);
 }
 
 }  // namespace fleetmap

@@ -1,11 +1,10 @@
-#include "preintegration.h"
+#include "bindings/imu_samples.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
 #include <limits>
 
 namespace fleetmap {
-
 namespace {
 
 constexpr double kGapPeriods = 3.0;                   // a longer distance between samples counts as missing data
@@ -142,6 +141,9 @@ void propagate_covariance(double (&p)[15][15], const Transition& t, const StepVa
     }
 }
 
+// Where a bias enters an increment: Jacobians of this order.
+enum BiasJacobian { kRotationByGyro, kVelocityByGyro, kVelocityByAccel, kPositionByGyro, kPositionByAccel, kBiasJacobians };
+
 void advance_bias_jacobians(Mat3 (&by_bias)[kBiasJacobians], const Step& s) {
   const double dt = s.dt;
   const Mat3 before = by_bias[kRotationByGyro];
@@ -186,8 +188,23 @@ void imu_intervals(const ImuSamples& imu, int64_t start_ns, int64_t end_ns, std:
   }
 }
 
-Preintegrated preintegrate(const ImuSamples& imu, int64_t start_ns, int64_t end_ns, Vec3 gyro_bias, Vec3 accel_bias,
-                           const ImuNoise& noise) {
+namespace {
+
+// Increments in the axes of the body at the start, without gravity and initial velocity. Order of the errors: rotation (on the
+// right), velocity, position, and the biases' walks since the start.
+struct Preintegrated {
+  Mat3 rotation = kIdentity;
+  Vec3 velocity{}, position{};
+  Mat3 by_bias[kBiasJacobians]{};
+  double covariance[15][15]{};
+  double max_gap_s = 0.0;  // the longest time without a sample
+};
+
+// The biases are taken as constant. If samples are missing the covariance grows by the largest plausible motion. Rate and specific
+// force change linearly between samples; rotation is right to fourth order of the step, velocity and position to second.
+// Source: Forster et al. 2017, with the exact derivatives of this rule in place of Euler's.
+Preintegrated preintegrated(const ImuSamples& imu, int64_t start_ns, int64_t end_ns, Vec3 gyro_bias, Vec3 accel_bias,
+                            const ImuNoise& noise) {
   const Cut cut = cut_samples(imu, start_ns, end_ns, gyro_bias, accel_bias);
   const bool is_blind = imu.count == 0;
   const double longest_s = kGapPeriods * (std::isnan(cut.period_s) ? kDefaultPeriod : cut.period_s);
@@ -212,6 +229,35 @@ Preintegrated preintegrate(const ImuSamples& imu, int64_t start_ns, int64_t end_
     sum.max_gap_s = std::max(sum.max_gap_s, cut.holes_s[n]);
   }
   return sum;
+}
+
+auto imu_intervals_of(const Indices& stamps_ns, const Points& gyro_radps, const Points& accel_mps2, int64_t start_ns, int64_t end_ns) {
+  const ImuSamples imu = imu_samples(stamps_ns, gyro_radps, accel_mps2);
+  std::vector<ImuInterval> intervals;
+  unlocked([&] { imu_intervals(imu, start_ns, end_ns, intervals); });
+  std::vector<double> durations_s;
+  std::vector<Vec3> gyro, accel;
+  for (const ImuInterval& each : intervals) durations_s.push_back(each.duration_s), gyro.push_back(each.gyro), accel.push_back(each.accel);
+  return std::tuple(as_numpy<double>(std::move(durations_s)), as_numpy<double>(std::move(gyro)), as_numpy<double>(std::move(accel)));
+}
+
+auto preintegrate(const Indices& stamps_ns, const Points& gyro_radps, const Points& accel_mps2, int64_t start_ns, int64_t end_ns,
+                  const Vec3& gyro_bias, const Vec3& accel_bias, const std::tuple<double, double, double, double>& noise) {
+  const ImuSamples imu = imu_samples(stamps_ns, gyro_radps, accel_mps2);
+  if (end_ns < start_ns) throw nb::value_error("end_ns: not before start_ns");
+  const Preintegrated sum =
+      unlocked([&] { return preintegrated(imu, start_ns, end_ns, gyro_bias, accel_bias, std::make_from_tuple<ImuNoise>(noise)); });
+  return std::tuple(sum.rotation, sum.velocity, sum.position, copied<3>(sum.by_bias[0][0], {kBiasJacobians, 3, 3}),
+                    copied<2>(sum.covariance[0], {15, 15}), sum.max_gap_s);
+}
+
+}  // namespace
+
+void bind_preintegration(nb::module_& module) {
+  const auto stamps_ns = "stamps_ns"_a, gyro_radps = "gyro_radps"_a, accel_mps2 = "accel_mps2"_a, start_ns = "start_ns"_a,
+             end_ns = "end_ns"_a;
+  module.def("imu_intervals", &imu_intervals_of, stamps_ns, gyro_radps, accel_mps2, start_ns, end_ns);
+  module.def("preintegrate", &preintegrate, stamps_ns, gyro_radps, accel_mps2, start_ns, end_ns, "gyro_bias"_a, "accel_bias"_a, "noise"_a);
 }
 
 }  // namespace fleetmap

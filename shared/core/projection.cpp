@@ -1,4 +1,4 @@
-#include "projection.h"
+#include "bindings/arrays.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
@@ -117,6 +117,27 @@ void match_projected(const Projections& a, const SeenFeatures& b, int max_distan
     if (holder >= 0) index[holder] = -1, distances[holder] = kFar;
     owner[size_t(found)] = int64_t(i), index[i] = found, distances[i] = best;
   }
+}
+
+static auto match_projected_of(const Places& predicted, const Reals& radius_px, const Packed& a, const Array<int64_t, -1, 2>& octave_range,
+                               const Places& pixels, const Array<int8_t, -1>& octaves, const Packed& b, int max_distance, double ratio) {
+  const size_t count = a.shape(0);
+  if (predicted.shape(0) != count || radius_px.shape(0) != count || octave_range.shape(0) != count)
+    throw nb::value_error("predicted, radius_px, octave_range: one for each descriptor of a");
+  if (pixels.shape(0) != b.shape(0) || octaves.shape(0) != b.shape(0))
+    throw nb::value_error("pixels, octaves: one for each descriptor of b");
+  auto index = zeros<int64_t>(count);
+  auto distances = zeros<int32_t>(count);
+  unlocked([&] {
+    match_projected({predicted.data(), radius_px.data(), octave_range.data(), a}, {pixels.data(), octaves.data(), b}, max_distance, ratio,
+                    index.data(), distances.data());
+  });
+  return std::tuple(as_numpy<int64_t>(std::move(index)), as_numpy<int32_t>(std::move(distances)));
+}
+
+void bind_projection(nb::module_& module) {
+  module.def("match_projected", &match_projected_of, "predicted"_a, "radius_px"_a, "a"_a, "octave_range"_a, "pixels"_a, "octaves"_a, "b"_a,
+             "max_distance"_a, "ratio"_a);
 }
 
 }  // namespace fleetmap

@@ -9,7 +9,6 @@
 #include "lie.h"
 #include "matching.h"
 #include "pnp.h"
-#include "projection.h"
 #include "stereo.h"
 
 namespace fleetmap {

@@ -1,6 +1,11 @@
-#include "render.h"
+// The simulator's pictures: faces projected, painted by a 1/z test and shaded, and radiance developed to grey levels.
+//
+// Nothing here calls the maths library (square roots apart) or reorders sums, so that the same bits come out on every machine.
+#include "bindings/in_turn.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
+#include <array>
+#include <bit>
 #include <cmath>
 
 namespace fleetmap {
@@ -13,6 +18,149 @@ constexpr double kMostTexels = 1e15;  // farther out than this a surface is blac
 constexpr double kGloss = 9.0;        // footprint area of a reflection: the polish is not perfect
 constexpr double kJointM = 4.4, kTexelM = 0.0025;
 constexpr int kMostSamples = 16;  // of a pixel
+
+// An undistorted image plane in pixels.
+struct Plane {
+  double fx, fy, cx, cy;
+  ptrdiff_t width, height;
+
+  explicit Plane(const Array<double, 6>& plane)
+      : fx(plane(0)), fy(plane(1)), cx(plane(2)), cy(plane(3)), width(whole(plane(4))), height(whole(plane(5))) {
+    constexpr double kMostPx = 8192;
+    if (!(plane(4) >= 1 && plane(4) <= kMostPx && plane(5) >= 1 && plane(5) <= kMostPx))
+      throw nb::value_error("plane: 1 to 8192 px each way");
+  }
+};
+
+// Parallelograms, in columns of F rows: quads (F, 9), origin, edge U and edge V in map, metres, whose outward normal is V x U; values
+// (F, 6), texels along U and V, tint, offset of the dirt (of a floor: of the concrete) in texels, emission; numbers (F, 6), material,
+// texture, lamp group, first light sample, light samples along U and V. light: of each sample at this moment; groups: strengths of lamps.
+// Chunks: ranges (C, 2) of faces, and bounds (C, 6), the least and largest x, y, z of their corners.
+struct Surfaces {
+  const double *quads, *values;
+  const int32_t* numbers;
+  const float* light;
+  const double* groups;
+  const int32_t* ranges;
+  const double* bounds;
+  size_t chunks;
+};
+constexpr int32_t kPlain = 0, kFloor = 1, kLamp = 2;  // materials
+
+// Textures with all their coarser levels, one after the other. table (T, columns): logarithms of width and height, where each level
+// begins. decals: texture * 4 + quarter turns for each cell of the floor, -1 for none. The last two: the textures of concrete and dirt.
+struct Textures {
+  const uint8_t* texels;
+  const int32_t* table;
+  ptrdiff_t columns;
+  const int32_t* decals;
+  ptrdiff_t decal_rows, decal_columns;
+  int32_t concrete, dirt;
+};
+constexpr int kMostLevels = 12;  // that are read
+
+// One instant of an exposure: samples per pixel side, shift of the samples in pixels, weight in the picture, most taps of a texture's
+// filter, reflectance of the floor seen from above, whether depth and faces are filled. Shadows (M, 3): x, y, 1 / radius^2 of soft
+// contact shadows on the floor.
+struct Instant {
+  int samples;
+  double shift_x, shift_y, weight;
+  int most_taps;
+  double reflectance;
+  bool wants_truth;
+  const double* shadows;
+  size_t shadow_count;
+};
+
+// A picture in the making (H, W): radiance, depth along the optical axis, 0 for nothing, face of each pixel, -1 for nothing.
+struct Canvas {
+  Picture<double> radiance;
+  float* depth_m;
+  int32_t* faces;
+};
+
+using Lit = std::tuple<Array<double, -1, 9>, Array<double, -1, 6>, Array<int32_t, -1, 6>, Array<float, -1>, Reals>;
+using Chunks = std::tuple<Array<int32_t, -1, 2>, Array<double, -1, 6>>;
+using Atlas = std::tuple<Array<uint8_t, -1>, Array<int32_t, -1, -1>, Array<int32_t, -1, -1>, Array<int32_t, 2>>;
+
+Textures textures_of(const Atlas& atlas) {
+  const auto& [texels, table, decals, floor] = atlas;
+  const int64_t count = int64_t(table.shape(0)), bytes = int64_t(texels.shape(0));
+  if (table.shape(1) < 2 + kMostLevels) throw nb::value_error("textures: a row for each, of two sizes and where 12 levels begin");
+  for (size_t t = 0; t < table.shape(0); ++t)
+    for (int level = 0; level < kMostLevels; ++level) {
+      const int32_t width = table(t, 0), height = table(t, 1), first = table(t, size_t(2 + level));
+      if (width < 0 || width > 15 || height < 0 || height > 15) throw nb::value_error("textures: sides of 1 to 2^15 texels");
+      const int64_t size = int64_t(1) << (std::max(width - level, 0) + std::max(height - level, 0));
+      if (first < 0 || first + size > bytes) throw nb::value_error("textures: levels of the texels");
+    }
+  if (decals.size() == 0 || std::any_of(decals.data(), decals.data() + decals.size(), [&](int32_t decal) { return decal >> 2 >= count; }))
+    throw nb::value_error("textures: decals are textures, on at least one cell");
+  if (floor(0) < 0 || floor(0) >= count || floor(1) < 0 || floor(1) >= count || table(size_t(floor(0)), 2) + (1 << 18) > bytes)
+    throw nb::value_error("textures: those of the floor, of which the first has 512 x 512 texels");
+  return {texels.data(), table.data(), ptrdiff_t(table.shape(1)), decals.data(), ptrdiff_t(decals.shape(0)), ptrdiff_t(decals.shape(1)),
+          floor(0),      floor(1)};
+}
+
+Surfaces surfaces_of(const Lit& lit, const Chunks& chunks, int64_t textures) {
+  const auto& [quads, values, numbers, light, groups] = lit;
+  const auto& [ranges, bounds] = chunks;
+  const size_t count = quads.shape(0);
+  const int64_t samples = int64_t(light.shape(0));
+  if (values.shape(0) != count || numbers.shape(0) != count) throw nb::value_error("faces: columns of one length");
+  for (size_t f = 0; f < count; ++f) {
+    if (numbers(f, 2) < 0 || size_t(numbers(f, 2)) >= groups.shape(0)) throw nb::value_error("faces: lamp groups that have a strength");
+    if (numbers(f, 0) == kLamp) continue;
+    if (numbers(f, 1) < 0 || numbers(f, 1) >= textures) throw nb::value_error("faces: textures of the table");
+    const int64_t first = numbers(f, 3), columns = numbers(f, 4), rows = numbers(f, 5);
+    if (first < 0 || columns < 2 || rows < 2 || first + columns * rows > samples)
+      throw nb::value_error("faces: 2 x 2 light samples or more");
+  }
+  if (bounds.shape(0) != ranges.shape(0)) throw nb::value_error("chunks: a range and bounds of each");
+  for (size_t c = 0; c < ranges.shape(0); ++c)
+    if (ranges(c, 0) < 0 || ranges(c, 1) > int64_t(count)) throw nb::value_error("chunks: ranges of faces");
+  return {quads.data(), values.data(), numbers.data(), light.data(), groups.data(), ranges.data(), bounds.data(), ranges.shape(0)};
+}
+
+// Paints the image of one camera. Holds that camera's buffers.
+class ScenePainter {
+ public:
+  // rays (H, W, 4): a lens' x/z, y/z and their change per pixel, whose samples are looked up in the plane; no rows for a pinhole.
+  ScenePainter(const Array<double, 6>& plane, const Array<float, -1, -1, 4>& rays);
+  // Adds an instant's weighted picture to the canvas, which is of the rays' size, or of the plane's. cam_from_map: rotation.
+  void add(const Lit& lit, const Chunks& chunks, const Atlas& atlas, const Mat3& cam_from_map, const Vec3& centre_map, int samples,
+           std::tuple<double, double> shift, double weight, int most_taps, double reflectance, const Points& shadows, bool wants_truth,
+           const MutableArray<double, -1, -1>& radiance, const MutableArray<float, -1, -1>& depth_m,
+           const MutableArray<int32_t, -1, -1>& faces);
+
+ private:
+  struct Polygon {  // of a visible face: (u', v', 1/z) = h (x/z, y/z, 1), u = u' z; its outline in pixels, clipped
+    double h[9], corners[8][2];
+    int corner_count;
+    int32_t face;
+  };
+  struct View {
+    std::vector<Polygon> polygons;
+    std::vector<float> nearness;  // 1/z and visible polygon of each sample
+    std::vector<int32_t> owner;
+  };
+
+  void project(const Surfaces& surfaces, const Mat3& cam_from_map, Vec3 centre_map, bool is_mirrored, std::vector<Polygon>& polygons) const;
+  int clip_near(const Vec3* corners, bool needs_clipping, Polygon& polygon) const;
+  void paint(View& view, int samples, double shift_x, double shift_y, ptrdiff_t first_row);
+  ptrdiff_t first_floor_row(const Surfaces& surfaces, int samples) const;
+  const int32_t* through_lens(int samples);
+  void shade_image(const Surfaces& surfaces, const Textures& textures, const int32_t* owner, double height_m, const Instant& instant,
+                   const Canvas& canvas) const;
+
+  Plane plane_;
+  std::vector<std::array<float, 4>> rays_;
+  ptrdiff_t rows_, columns_;  // of the picture
+  View direct_, mirrored_;
+  std::vector<double> low_, high_;               // ends of a polygon in each row
+  std::array<std::vector<int32_t>, 5> indices_;  // of each sample in the plane, -1 outside, by samples
+  std::vector<int32_t> seen_;
+};
 
 // Bounds of x/z and y/z in a plane.
 struct Limits {
@@ -42,13 +190,12 @@ bool is_box_outside(const double* bounds, double sign_z, const Mat3& cam_from_ma
   return outside.wholly();
 }
 
-}  // namespace
-
-ScenePainter::ScenePainter(Plane plane, Picture<const float> rays) : plane_(plane), rows_(plane.height), columns_(plane.width) {
-  if (rays.height == 0 || rays.width == 0) return;
-  rows_ = rays.height, columns_ = rays.width;
+ScenePainter::ScenePainter(const Array<double, 6>& plane, const Array<float, -1, -1, 4>& rays)
+    : plane_(plane), rows_(plane_.height), columns_(plane_.width) {
+  if (rays.size() == 0) return;
+  rows_ = ptrdiff_t(rays.shape(0)), columns_ = ptrdiff_t(rays.shape(1));
   rays_.resize(size_t(rows_ * columns_));
-  for (size_t i = 0; i < rays_.size(); ++i) std::copy_n(rays.at + 4 * i, 4, rays_[i].begin());
+  for (size_t i = 0; i < rays_.size(); ++i) std::copy_n(rays.data() + 4 * i, 4, rays_[i].begin());
 }
 
 // The faces that may be seen; is_mirrored: of the world reflected in the floor, z -> -z.
@@ -125,16 +272,16 @@ void ScenePainter::paint(View& view, int samples, double shift_x, double shift_y
       const double y = (polygon.corners[i][1] - start_y) * samples;
       y_min = std::min(y_min, y), y_max = std::max(y_max, y);
     }
-    const ptrdiff_t top = std::max(first_row, whole_or_outside(std::ceil(std::max(y_min, -1.0))));
-    const ptrdiff_t bottom = std::min(height - 1, whole_or_outside(std::floor(std::min(y_max, double(height) + 1.0))));
+    const ptrdiff_t top = std::max(first_row, whole(std::ceil(std::max(y_min, -1.0))));
+    const ptrdiff_t bottom = std::min(height - 1, whole(std::floor(std::min(y_max, double(height) + 1.0))));
     for (ptrdiff_t row = top; row <= bottom; ++row) low[row] = kNever, high[row] = -kNever;
     for (int i = 0; top <= bottom && i < polygon.corner_count; ++i) {
       const int j = i + 1 < polygon.corner_count ? i + 1 : 0;
       double px = (polygon.corners[i][0] - start_x) * samples, py = (polygon.corners[i][1] - start_y) * samples;
       double qx = (polygon.corners[j][0] - start_x) * samples, qy = (polygon.corners[j][1] - start_y) * samples;
       if (py > qy) std::swap(px, qx), std::swap(py, qy);
-      const ptrdiff_t first = std::max(top, whole_or_outside(std::ceil(std::max(py, -1.0))));
-      const ptrdiff_t last = std::min(bottom, whole_or_outside(std::floor(std::min(qy, double(height) + 1.0))));
+      const ptrdiff_t first = std::max(top, whole(std::ceil(std::max(py, -1.0))));
+      const ptrdiff_t last = std::min(bottom, whole(std::floor(std::min(qy, double(height) + 1.0))));
       if (first > last) continue;
       if (qy <= py) {  // a level edge on a row of samples
         low[first] = std::min(std::min(low[first], px), qx), high[first] = std::max(std::max(high[first], px), qx);
@@ -152,8 +299,8 @@ void ScenePainter::paint(View& view, int samples, double shift_x, double shift_y
     w_0 += h[1] * (start_y - plane_.cy) / plane_.fy;
     for (ptrdiff_t row = top; row <= bottom; ++row) {
       if (high[row] < -0.5 || low[row] > double(width)) continue;
-      const int32_t first = int32_t(std::max<ptrdiff_t>(0, whole_or_outside(std::ceil(low[row]))));
-      const int32_t last = int32_t(std::min(width - 1, whole_or_outside(std::floor(std::min(high[row], double(width) + 1.0)))) + 1);
+      const int32_t first = int32_t(std::max<ptrdiff_t>(0, whole(std::ceil(low[row]))));
+      const int32_t last = int32_t(std::min(width - 1, whole(std::floor(std::min(high[row], double(width) + 1.0)))) + 1);
       const float start = float(w_0 + w_y * double(row)), slope = float(w_x);  // of 32 bits, so that the loop is one over wide registers
       float* __restrict nearness = view.nearness.data() + row * width;
       int32_t* __restrict owner = view.owner.data() + row * width;
@@ -199,8 +346,6 @@ const int32_t* ScenePainter::through_lens(int samples) {
   for (size_t i = 0; i < indices.size(); ++i) seen_[i] = indices[i] >= 0 ? direct_.owner[size_t(indices[i])] : -1;
   return seen_.data();
 }
-
-namespace {
 
 // A pixel's footprint on a texture: shift in texels per pixel to the right and down.
 struct Footprint {
@@ -343,8 +488,6 @@ Shade shade(const Surfaces& surfaces, const Textures& textures, const double* h,
   return {grey * (1.0 / 255.0) * values[2] * received, u, v, w};
 }
 
-}  // namespace
-
 // Samples of one polygon in a pixel are shaded once, at their mean place; owner: that of each sample.
 void ScenePainter::shade_image(const Surfaces& surfaces, const Textures& textures, const int32_t* owner, double height_m,
                                const Instant& instant, const Canvas& canvas) const {
@@ -405,8 +548,8 @@ void ScenePainter::shade_image(const Surfaces& surfaces, const Textures& texture
             const double slope_x = bilinear(waves, 9, 9, x_map * 25.0, y_map * 25.0) - 128.0;
             const double slope_y = bilinear(waves, 9, 9, y_map * 25.0 + 77.0, x_map * 25.0) - 128.0;
             const double px = xn * plane_.fx + plane_.cx + 0.03 * slope_x, py = yn * plane_.fy + plane_.cy + 0.10 * slope_y;
-            const ptrdiff_t row = std::clamp<ptrdiff_t>(whole_or_outside(std::floor(py + 0.5)), 0, plane_.height - 1);
-            const ptrdiff_t column = std::clamp<ptrdiff_t>(whole_or_outside(std::floor(px + 0.5)), 0, plane_.width - 1);
+            const ptrdiff_t row = std::clamp<ptrdiff_t>(whole(std::floor(py + 0.5)), 0, plane_.height - 1);
+            const ptrdiff_t column = std::clamp<ptrdiff_t>(whole(std::floor(px + 0.5)), 0, plane_.width - 1);
             const int32_t m = mirrored_.owner[size_t(row * plane_.width + column)];
             if (m >= 0) {
               const Polygon& mirrored = mirrored_.polygons[size_t(m)];
@@ -427,33 +570,66 @@ void ScenePainter::shade_image(const Surfaces& surfaces, const Textures& texture
     }
 }
 
-void ScenePainter::add(const Surfaces& surfaces, const Textures& textures, const Mat3& cam_from_map, Vec3 centre_map,
-                       const Instant& instant, const Canvas& canvas) {
+void ScenePainter::add(const Lit& lit, const Chunks& chunks, const Atlas& atlas, const Mat3& cam_from_map, const Vec3& centre_map,
+                       int samples, std::tuple<double, double> shift, double weight, int most_taps, double reflectance,
+                       const Points& shadows, bool wants_truth, const MutableArray<double, -1, -1>& radiance,
+                       const MutableArray<float, -1, -1>& depth_m, const MutableArray<int32_t, -1, -1>& faces) {
+  if (samples < 1 || samples > 4) throw nb::value_error("samples: 1 to 4");
+  const auto is_picture = [&](const auto& array) { return array.shape(0) == size_t(rows_) && array.shape(1) == size_t(columns_); };
+  if (!is_picture(radiance) || !is_picture(depth_m) || !is_picture(faces))
+    throw nb::value_error("radiance, depth_m, faces: of the picture's size");
+  const Textures textures = textures_of(atlas);
+  const Surfaces surfaces = surfaces_of(lit, chunks, int64_t(std::get<1>(atlas).shape(0)));
+  const auto [shift_x, shift_y] = shift;
+  const Instant instant{samples, shift_x, shift_y, weight, most_taps, reflectance, wants_truth, shadows.data(), shadows.shape(0)};
   project(surfaces, cam_from_map, centre_map, false, direct_.polygons);
-  paint(direct_, instant.samples, instant.shift_x, instant.shift_y, 0);
-  const ptrdiff_t first_row = first_floor_row(surfaces, instant.samples);
+  paint(direct_, samples, shift_x, shift_y, 0);
+  const ptrdiff_t first_row = first_floor_row(surfaces, samples);
   mirrored_.polygons.clear();
-  if (instant.reflectance > 0.0 && first_row < plane_.height) project(surfaces, cam_from_map, centre_map, true, mirrored_.polygons);
+  if (reflectance > 0.0 && first_row < plane_.height) project(surfaces, cam_from_map, centre_map, true, mirrored_.polygons);
   paint(mirrored_, 1, 0.0, 0.0, std::max<ptrdiff_t>(0, first_row - 6));  // all of one sample per pixel
-  shade_image(surfaces, textures, through_lens(instant.samples), centre_map[2], instant, canvas);
+  shade_image(surfaces, textures, through_lens(samples), centre_map[2], instant, {radiance, depth_m.data(), faces.data()});
 }
 
-void develop(Picture<const double> radiance, double gain, double shot, double read, const float* normals, size_t normal_count, uint64_t key,
-             const float* vignetting, uint8_t* image) {
-  const uint64_t mask = normal_count - 1;
-  uint64_t state = key * 0x9E3779B97F4A7C15 + 0x1234567;
-  for (ptrdiff_t y = 0; y < radiance.height; ++y) {
-    state = (state ^ (state >> 30)) * 0xBF58476D1CE4E5B9;
-    state = (state ^ (state >> 27)) * 0x94D049BB133111EB;
-    state = (state ^ (state >> 31)) + 0x9E3779B97F4A7C15;
-    const uint64_t start = state >> 40;
-    for (ptrdiff_t x = 0; x < radiance.width; ++x) {
-      const ptrdiff_t at = y * radiance.width + x;
-      double value = radiance.at[at] * gain * vignetting[at];
-      value += normals[(start + uint64_t(x)) & mask] * std::sqrt(read * read + shot * value);
-      image[at] = uint8_t(std::min(std::max(0.0, value + 0.5), 255.0));
+// An image (H, W) of gain * vignetting * radiance plus noise, clipped: shot noise of variance `shot` * value, read noise of this
+// standard deviation, from a table of standard normals, as long as a power of two, of which each row begins at a place mixed from key.
+// Source of the mixing: splitmix64.
+auto develop(const Array<double, -1, -1>& radiance, double gain, double shot, double read, const Array<float, -1>& normals, int64_t key,
+             const Array<float, -1, -1>& vignetting) {
+  const size_t rows = radiance.shape(0), columns = radiance.shape(1);
+  if (!std::has_single_bit(normals.shape(0))) throw nb::value_error("normals: as many as a power of two");
+  if (vignetting.shape(0) != rows || vignetting.shape(1) != columns) throw nb::value_error("vignetting: of the picture's size");
+  auto image = zeros<uint8_t>(rows * columns);
+  const double* const radiance_of = radiance.data();
+  const float *const normal_of = normals.data(), *const vignetting_of = vignetting.data();
+  unlocked([&] {
+    const uint64_t mask = normals.shape(0) - 1;
+    uint64_t state = uint64_t(key) * 0x9E3779B97F4A7C15 + 0x1234567;
+    for (size_t y = 0; y < rows; ++y) {
+      state = (state ^ (state >> 30)) * 0xBF58476D1CE4E5B9;
+      state = (state ^ (state >> 27)) * 0x94D049BB133111EB;
+      state = (state ^ (state >> 31)) + 0x9E3779B97F4A7C15;
+      const uint64_t start = state >> 40;
+      for (size_t x = 0; x < columns; ++x) {
+        const size_t at = y * columns + x;
+        double value = radiance_of[at] * gain * vignetting_of[at];
+        value += normal_of[(start + x) & mask] * std::sqrt(read * read + shot * value);
+        image[at] = uint8_t(std::min(std::max(0.0, value + 0.5), 255.0));
+      }
     }
-  }
+  });
+  return as_numpy<uint8_t, 2>(std::move(image), {rows, columns});
+}
+
+}  // namespace
+
+void bind_render(nb::module_& module) {
+  nb::class_<Shared<ScenePainter>>(module, "ScenePainter")
+      .def(nb::init<const Array<double, 6>&, const Array<float, -1, -1, 4>&>(), "plane"_a, "rays"_a)
+      .def("add", in_turn<PythonLock::kReleased>(&ScenePainter::add), "faces"_a, "chunks"_a, "textures"_a, "cam_from_map"_a, "centre_map"_a,
+           "samples"_a, "shift_px"_a, "weight"_a, "most_taps"_a, "reflectance"_a, "shadows"_a, "wants_truth"_a, "radiance"_a, "depth_m"_a,
+           "face_of"_a);
+  module.def("develop", &develop, "radiance"_a, "gain"_a, "shot"_a, "read"_a, "normals"_a, "key"_a, "vignetting"_a);
 }
 
 }  // namespace fleetmap

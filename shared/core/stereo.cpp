@@ -1,4 +1,4 @@
-#include "stereo.h"
+#include "bindings/images.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
@@ -220,7 +220,7 @@ void StereoMatcher::match_rows(const StereoPair& whole, const StereoPair& halved
   }
 }
 
-void match_depth(const Grey<const float>& disparity_px, const double* pixels, size_t count, double sigma_px, double* out) {
+void match_depth(const Picture<const float>& disparity_px, const double* pixels, size_t count, double sigma_px, double* out) {
   for (size_t n = 0; n < count; ++n) {
     out[2 * n] = out[2 * n + 1] = kUnknown;
     const double x = std::nearbyint(pixels[2 * n]), y = std::nearbyint(pixels[2 * n + 1]);
@@ -232,6 +232,38 @@ void match_depth(const Grey<const float>& disparity_px, const double* pixels, si
     if (!(patch[8] - patch[0] < 0.08f * patch[4] + 0.5f)) continue;
     out[2 * n] = patch[4], out[2 * n + 1] = sigma_px;
   }
+}
+
+namespace {
+
+auto match_rows(const Image& left, const Image& right, const Image& left_half, const Image& right_half, const Places& pixels,
+                const Reals& prior_px, double max_disparity_px, double min_correlation, double uniqueness, int wide_half, int narrow_half,
+                double agreement_px) {
+  if (!same_size(left, right) || !same_size(left_half, right_half)) throw nb::value_error("right: of the left image's size");
+  if (prior_px.shape(0) != pixels.shape(0)) throw nb::value_error("prior_px: one for each pixel");
+  const size_t count = pixels.shape(0);
+  std::vector<double> found(2 * count);
+  const StereoLimits limits = checked({max_disparity_px, min_correlation, uniqueness, wide_half, narrow_half, agreement_px});
+  unlocked([&] {
+    StereoMatcher().match_rows({left, right}, {left_half, right_half}, pixels.data(), prior_px.data(), count, limits, found.data());
+  });
+  return as_numpy<double, 2>(std::move(found), {count, 2});
+}
+
+auto match_depth_of(const Array<float, -1, -1>& disparity_px, const Places& pixels, double sigma_px) {
+  const size_t count = pixels.shape(0);
+  std::vector<double> found(2 * count);
+  unlocked([&] { match_depth(disparity_px, pixels.data(), count, sigma_px, found.data()); });
+  return as_numpy<double, 2>(std::move(found), {count, 2});
+}
+
+}  // namespace
+
+void bind_stereo(nb::module_& module) {
+  const auto pixels = "pixels"_a;
+  module.def("match_rows", &match_rows, "left"_a, "right"_a, "left_half"_a, "right_half"_a, pixels, "prior_px"_a, "max_disparity_px"_a,
+             "min_correlation"_a, "uniqueness"_a, "wide_half"_a, "narrow_half"_a, "agreement_px"_a);
+  module.def("match_depth", &match_depth_of, "disparity_px"_a, pixels, "sigma_px"_a);
 }
 
 }  // namespace fleetmap

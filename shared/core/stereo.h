@@ -48,6 +48,6 @@ class StereoMatcher {
 
 // The same of a depth sensor, as the disparities of a pair: the median of 3x3 pixels; NaN at its edges, where colour and depth cannot be
 // registered well enough.
-void match_depth(const Grey<const float>& disparity_px, const double* pixels, size_t count, double sigma_px, double* out);
+void match_depth(const Picture<const float>& disparity_px, const double* pixels, size_t count, double sigma_px, double* out);
 
 }  // namespace fleetmap

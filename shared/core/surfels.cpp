@@ -1,11 +1,24 @@
-#include "surfels.h"
+// Surfels: points of views merged in voxels, checks of voxels against free space in views, discs drawn into a picture for any lens, and
+// Gaussians blended into one. Lengths are metres; pictures row by row.
+#include "bindings/in_turn.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
+#include <array>
 #include <cmath>
 #include <limits>
 
 namespace fleetmap {
 namespace {
+
+using FloatPoints = Array<float, -1, 3>;
+using Levels = Array<uint8_t, -1>;
+using Image32 = Array<float, -1, -1>;
+using Image64 = Array<double, -1, -1>;
+
+// A voxel's edge is a power of two times kEdgeM, as fine as the pixel that falls into it: distant points are kept coarsely.
+constexpr double kEdgeM = 0.01;
+constexpr int kLevels = 5;
+constexpr double kMinRangeM = 0.3, kMaxRangeM = 12.0;
 
 constexpr double kMaxSigmaShare = 0.06;  // standard deviation of a depth, as a share of it
 constexpr double kFootprintShare = 1.5;  // least edge of a voxel, in steps from pixel to pixel that merge in it
@@ -27,6 +40,13 @@ constexpr ptrdiff_t kBlockPx = 8;     // squares of pixels whose farthest surfac
 constexpr size_t kLooks = 24;         // and largest number of probes
 
 constexpr double kHidden = 1e-4;  // share of the light at which a pixel is full
+
+// One of so many pixels in a row or column is merged, so that a surface at a metre has voxels of kEdgeM: finer ones cost as the square.
+int stride_px(double focal) {
+  int stride = 2;
+  while (stride < 4 && kEdgeM * focal / kFootprintShare >= stride + 0.5) ++stride;
+  return stride;
+}
 
 inline double edge_of(int level) { return kEdgeM * double(1 << level); }
 
@@ -78,14 +98,7 @@ bool fit_normal(const float* corner, ptrdiff_t row_step, int stride, ptrdiff_t r
   return true;
 }
 
-}  // namespace
-
-int stride_px(double focal) {
-  int stride = 2;
-  while (stride < 4 && kEdgeM * focal / kFootprintShare >= stride + 0.5) ++stride;
-  return stride;
-}
-
+// The voxel of a point at a level, in 63 bits: 5 km each way at the finest level. Points farther out are clamped to that border.
 int64_t voxel_key(double x, double y, double z, int level) {
   const double edge = edge_of(level);
   uint64_t key = uint64_t(level);
@@ -95,6 +108,54 @@ int64_t voxel_key(double x, double y, double z, int level) {
   }
   return int64_t(key);
 }
+
+void check_levels(const Levels& levels, size_t count) {
+  if (levels.shape(0) != count) throw nb::value_error("levels: one for each point");
+  if (unlocked([&] { return std::any_of(levels.begin(), levels.end(), [](uint8_t level) { return level >= kLevels; }); }))
+    throw nb::value_error("levels: numbers from 0 to 4");
+}
+
+auto voxel_keys(const FloatPoints& points_map, const Levels& levels) {
+  const size_t count = points_map.shape(0);
+  check_levels(levels, count);
+  auto keys = zeros<int64_t>(count);
+  unlocked([&] {
+    for (size_t i = 0; i < count; ++i) keys[i] = voxel_key(points_map(i, 0), points_map(i, 1), points_map(i, 2), levels(i));
+  });
+  return as_numpy<int64_t>(std::move(keys));
+}
+
+// Voxels of one recording, extended view by view.
+class VoxelTable {
+ public:
+  // Adds the points of a view that lie in the box (2, 2) of the map, its low and its high (x, y). disparity: of every stride_px-th pixel,
+  // NaN unknown, of standard deviation sigma_px. Points and normals are means by the inverse variance of the depth.
+  void add(const Image32& disparity_px, double sigma_px, const StereoLens& lens, const SE3& map_from_cam,
+           const Array<double, 2, 2>& box_map);
+
+  using Triple = std::array<float, 3>;
+  // Mean points in map, unit normals, levels, and numbers of views, of those voxels whose normals do not cancel out.
+  struct Surfels {
+    std::vector<Triple> points, normals;
+    std::vector<uint8_t> levels;
+    std::vector<int64_t> views;
+  };
+  Surfels surfels() const;
+
+ private:
+  struct Voxel {
+    int64_t key;
+    float weight, offset[3], normal[3];  // sums; offsets are from the voxel's corner
+    int32_t last_view, views;
+  };
+  size_t slot_of(int64_t key) const;
+  void make_room(size_t more);
+
+  std::vector<Voxel> voxels_;
+  std::vector<int32_t> slots_;  // of a power of two, at most half of them taken: numbers of voxels, -1 none
+  int32_t views_ = 0;
+  std::vector<float> around_;  // of the view that is added
+};
 
 // Where the table has a key, or has room for it: voxels above each other are near in memory. Source: open addressing, Knuth vol. 3, 6.4;
 // the mixing of splitmix64.
@@ -114,10 +175,11 @@ void VoxelTable::make_room(size_t more) {
   for (size_t i = 0; i < voxels_.size(); ++i) slots_[slot_of(voxels_[i].key)] = int32_t(i);
 }
 
-void VoxelTable::add(Picture<const float> disparity, double sigma_px, StereoLens lens, const double* map_from_cam, const double* low,
-                     const double* high) {
+void VoxelTable::add(const Image32& disparity_px, double sigma_px, const StereoLens& lens, const SE3& map_from_cam,
+                     const Array<double, 2, 2>& box_map) {
+  const Picture<const float> disparity = disparity_px;
+  const double *const low = &box_map(0, 0), *const high = &box_map(1, 0);
   make_room(size_t(disparity.height) * size_t(disparity.width));
-  const SE3 pose = se3(map_from_cam);
   const int stride = stride_px(lens.focal);
   const double per_m = edges_per_m(lens.focal);
   const ptrdiff_t reach = std::clamp<ptrdiff_t>(kFitPx / stride, kLeastReach, kMostReach);
@@ -132,12 +194,12 @@ void VoxelTable::add(Picture<const float> disparity, double sigma_px, StereoLens
       const double z = lens.focal_baseline / px, sigma = z * z / lens.focal_baseline * sigma_px;
       if (!(z >= kMinRangeM && z <= kMaxRangeM) || sigma > kMaxSigmaShare * z) continue;
       const double u = double(column * stride), v = double(row * stride);
-      const Vec3 point = pose * Vec3{(u - lens.cx) * z / lens.focal, (v - lens.cy) * z / lens.focal, z};
+      const Vec3 point = map_from_cam * Vec3{(u - lens.cx) * z / lens.focal, (v - lens.cy) * z / lens.focal, z};
       if (!(point[0] >= low[0] && point[0] < high[0] && point[1] >= low[1] && point[1] < high[1])) continue;
       Vec3 normal;
       if (!fit_normal(around_.data() + row * row_step + column, row_step, stride, reach, u, v, lens, normal)) continue;
       const int level = level_at(z, per_m);
-      const Vec3 turned = pose.rotation * normal;
+      const Vec3 turned = map_from_cam.rotation * normal;
       const int64_t key = voxel_key(point[0], point[1], point[2], level);
       int32_t& slot = slots_[slot_of(key)];
       if (slot < 0) {
@@ -156,25 +218,55 @@ void VoxelTable::add(Picture<const float> disparity, double sigma_px, StereoLens
   ++views_;
 }
 
-size_t VoxelTable::surfels(float* points, float* normals, uint8_t* levels, int64_t* views) const {
-  size_t count = 0;
+VoxelTable::Surfels VoxelTable::surfels() const {
+  Surfels found;
+  const size_t most = voxels_.size();
+  found.points.reserve(most), found.normals.reserve(most), found.levels.reserve(most), found.views.reserve(most);
   for (const Voxel& voxel : voxels_) {
     const Vec3 normal = {voxel.normal[0], voxel.normal[1], voxel.normal[2]};
     const double length = norm(normal);
     if (!(length > 1e-9)) continue;
     const int level = int(voxel.key >> 3 * kBits);
+    Triple &point = found.points.emplace_back(), &unit = found.normals.emplace_back();
     for (int axis = 0; axis < 3; ++axis) {
       const double cell = double(voxel.key >> kBits * (2 - axis) & ((1 << kBits) - 1)) - kHalfSpan;
-      points[3 * count + size_t(axis)] = float(cell * edge_of(level) + double(voxel.offset[axis]) / double(voxel.weight));
-      normals[3 * count + size_t(axis)] = float(normal[axis] / length);
+      point[size_t(axis)] = float(cell * edge_of(level) + double(voxel.offset[axis]) / double(voxel.weight));
+      unit[size_t(axis)] = float(normal[axis] / length);
     }
-    levels[count] = uint8_t(level), views[count] = voxel.views;
-    ++count;
+    found.levels.push_back(uint8_t(level)), found.views.push_back(voxel.views);
   }
-  return count;
+  return found;
 }
 
-namespace {
+auto surfels_of(Shared<VoxelTable>& table) {
+  auto [points, normals, levels, views] = unlocked([&] { return table.surfels(); });
+  return std::tuple(as_numpy<float>(std::move(points)), as_numpy<float>(std::move(normals)), as_numpy<uint8_t>(std::move(levels)),
+                    as_numpy<int64_t>(std::move(views)));
+}
+
+enum Mark : uint8_t { kUnseen, kSeen, kSeenThrough };
+
+// Depths of a view. nearest_px: of every step_px-th pixel the largest disparity around it, 0 where its own is unknown. A point must lie
+// clear_sigmas standard deviations of the depth, and clear_m, before the pixel's depth to be seen through.
+struct DepthPicture {
+  Picture<const float> nearest_px;
+  double step_px, sigma_px;
+  StereoLens lens;
+  SE3 cam_from_map;
+  double clear_sigmas, clear_m;
+
+  DepthPicture(const Image32& nearest_px, int step_px, double sigma_px, const StereoLens& lens, const SE3& cam_from_map,
+               double clear_sigmas, double clear_m)
+      : nearest_px(nearest_px),
+        step_px(step_px),
+        sigma_px(sigma_px),
+        lens(lens),
+        cam_from_map(cam_from_map),
+        clear_sigmas(clear_sigmas),
+        clear_m(clear_m) {
+    if (step_px < 1) throw nb::value_error("step_px: at least 1");
+  }
+};
 
 struct Look {
   Mark mark = kUnseen;
@@ -188,8 +280,7 @@ Look look(Vec3 point_cam, int level, double per_m, const DepthPicture& view) {
   const double depth = point_cam[2];
   if (!(depth > kMinRangeM && depth < kMaxRangeM)) return found;
   found.u = lens.focal * point_cam[0] / depth + lens.cx, found.v = lens.focal * point_cam[1] / depth + lens.cy;
-  const ptrdiff_t column = whole_or_outside(std::floor(found.u / view.step_px + 0.5)),
-                  row = whole_or_outside(std::floor(found.v / view.step_px + 0.5));
+  const ptrdiff_t column = whole(std::floor(found.u / view.step_px + 0.5)), row = whole(std::floor(found.v / view.step_px + 0.5));
   const Picture<const float>& nearest = view.nearest_px;
   if (column < 0 || column >= nearest.width || row < 0 || row >= nearest.height || !(nearest.row(row)[column] > 0.0f)) return found;
   const double shown = lens.focal_baseline / nearest.row(row)[column];
@@ -210,30 +301,49 @@ double bilinear(Picture<const uint8_t> picture, double u, double v) {
   return (upper[0] * (1.0 - x) + upper[1] * x) * (1.0 - y) + (lower[0] * (1.0 - x) + lower[1] * x) * y;
 }
 
-}  // namespace
-
-void look_at(const float* points, const uint8_t* levels, size_t count, const DepthPicture& view, uint8_t* marks, float* pixels) {
-  const SE3 pose = se3(view.cam_from_map);
-  const double per_m = edges_per_m(view.lens.focal);
-  for (size_t i = 0; i < count; ++i) {
-    const Look found = look(pose * Vec3{points[3 * i], points[3 * i + 1], points[3 * i + 2]}, levels[i], per_m, view);
-    marks[i] = found.mark, pixels[2 * i] = float(found.u), pixels[2 * i + 1] = float(found.v);
-  }
+// Evidence of a view on points (N, 3) in map of voxels of these levels (N,): marks (N,), and pixels (N, 2) of points in range, else 0.
+auto look_at(const FloatPoints& points_map, const Levels& levels, const Image32& nearest_px, int step_px, double sigma_px,
+             const StereoLens& lens, const SE3& cam_from_map, double clear_sigmas, double clear_m) {
+  const size_t count = points_map.shape(0);
+  check_levels(levels, count);
+  const DepthPicture view(nearest_px, step_px, sigma_px, lens, cam_from_map, clear_sigmas, clear_m);
+  auto marks = zeros<uint8_t>(count);
+  auto pixels = zeros<std::array<float, 2>>(count);
+  const float* const points = points_map.data();
+  const uint8_t* const level_of = levels.data();
+  unlocked([&] {
+    const double per_m = edges_per_m(lens.focal);
+    for (size_t i = 0; i < count; ++i) {
+      const Look found = look(cam_from_map * Vec3{points[3 * i], points[3 * i + 1], points[3 * i + 2]}, level_of[i], per_m, view);
+      marks[i] = found.mark, pixels[i] = {float(found.u), float(found.v)};
+    }
+  });
+  return std::tuple(as_numpy<uint8_t>(std::move(marks)), as_numpy<float>(std::move(pixels)));
 }
 
-void weigh(const float* points, const uint8_t* levels, size_t count, const DepthPicture& view, Picture<const uint8_t> picture, Vec3 falloff,
-           double log_exposure, double* sums) {
-  if (picture.height < 2 || picture.width < 2) return;
-  const SE3 pose = se3(view.cam_from_map);
-  const double per_squared = 1.0 / (view.lens.focal * view.lens.focal), per_m = edges_per_m(view.lens.focal);
+// Adds what a view says of points, as of `look_at`, to sums (N, 4): 1 if it sees the point; its weight in views if it sees through it, as
+// a view that sees more finely than the voxel was seen counts more; and, of seen points, the grey level of the picture relative to the
+// exposure and to the lens, of these coefficients by powers of the squared tangent, over distance^4, and 1 over distance^4.
+void weigh(const FloatPoints& points_map, const Levels& levels, const Image32& nearest_px, int step_px, double sigma_px,
+           const StereoLens& lens, const SE3& cam_from_map, double clear_sigmas, double clear_m, const Image& picture, const Vec3& falloff,
+           double log_exposure, const MutableArray<double, -1, 4>& sums) {
+  const size_t count = points_map.shape(0);
+  check_levels(levels, count);
+  if (sums.shape(0) != count) throw nb::value_error("sums: a row for each point");
+  const DepthPicture view(nearest_px, step_px, sigma_px, lens, cam_from_map, clear_sigmas, clear_m);
+  if (picture.shape(0) < 2 || picture.shape(1) < 2) return;
+  const nb::gil_scoped_release others_run;
+  const float* const points = points_map.data();
+  const uint8_t* const level_of = levels.data();
+  const double per_squared = 1.0 / (lens.focal * lens.focal), per_m = edges_per_m(lens.focal);
   for (size_t i = 0; i < count; ++i) {
-    const Vec3 point = pose * Vec3{points[3 * i], points[3 * i + 1], points[3 * i + 2]};
-    const Look found = look(point, levels[i], per_m, view);
-    double* const sum = sums + 4 * i;
+    const Vec3 point = cam_from_map * Vec3{points[3 * i], points[3 * i + 1], points[3 * i + 2]};
+    const Look found = look(point, level_of[i], per_m, view);
+    double* const sum = &sums(i, 0);
     if (found.mark == kSeenThrough) sum[1] += found.weight;
     if (found.mark != kSeen) continue;
     sum[0] += 1.0;
-    const double off_u = found.u - view.lens.cx, off_v = found.v - view.lens.cy, squared = (off_u * off_u + off_v * off_v) * per_squared;
+    const double off_u = found.u - lens.cx, off_v = found.v - lens.cy, squared = (off_u * off_u + off_v * off_v) * per_squared;
     const double light = std::exp(log_exposure + squared * (falloff[0] + squared * (falloff[1] + squared * falloff[2])));
     const double distance = dot(point, point), weight = 1.0 / (distance * distance);
     sum[2] += bilinear(picture, found.u, found.v) / light * weight;
@@ -241,36 +351,45 @@ void weigh(const float* points, const uint8_t* levels, size_t count, const Depth
   }
 }
 
-Discs discs_before(const float* points_map, const float* normals_map, size_t count, const double* cam_from_map, double cosine, double far_m,
-                   Pinhole pinhole, double width, double height) {
+// Of discs (N, 3) with normals (N, 3), in map, those that face the camera within a cone, of this cosine of the half angle and this length:
+// near the picture of width x height where the lens is a pinhole fx fy cx cy, for which alone pixels are filled; fx is 0 for any other.
+// Numbers of surfels, their points in the camera and their pixels.
+auto discs_before(const FloatPoints& points_map, const FloatPoints& normals_map, const SE3& cam_from_map, double cosine, double far_m,
+                  const Array<double, 4>& pinhole, int width, int height) {
   constexpr double kRim = 0.1;  // of the width: discs whose centre is so far outside may reach in
-  const Mat3 rotation = mat3(cam_from_map, 4);
-  const Vec3 centre = -(transposed(rotation) * Vec3{cam_from_map[3], cam_from_map[7], cam_from_map[11]});
-  const double rim = kRim * width;
-  Discs found;
-  found.numbers.reserve(count), found.points.reserve(count), found.pixels.reserve(count);
-  for (size_t i = 0; i < count; ++i) {
-    const Vec3 off = Vec3{points_map[3 * i], points_map[3 * i + 1], points_map[3 * i + 2]} - centre;
-    const double squared = dot(off, off);
-    if (squared > far_m * far_m || squared < 1e-4) continue;
-    if (dot({normals_map[3 * i], normals_map[3 * i + 1], normals_map[3 * i + 2]}, off) >= 0.0) continue;
-    const double depth = dot(vec3(rotation[2]), off);
-    if (depth < cosine * std::sqrt(squared)) continue;
-    const double right = dot(vec3(rotation[0]), off), down = dot(vec3(rotation[1]), off);
-    double u = 0.0, v = 0.0;
-    if (pinhole.fx > 0.0) {
-      if (depth < 1e-9) continue;
-      u = pinhole.fx * right / depth + pinhole.cx, v = pinhole.fy * down / depth + pinhole.cy;
-      if (!(u > -rim && u < width + rim && v > -rim && v < height + rim)) continue;
+  const size_t count = points_map.shape(0);
+  if (normals_map.shape(0) != count) throw nb::value_error("normals_map: one for each point");
+  std::vector<int32_t> numbers;
+  std::vector<Vec3> points_cam;
+  std::vector<std::array<double, 2>> pixels;
+  unlocked([&] {
+    const float *const points = points_map.data(), *const normals = normals_map.data();
+    const double fx = pinhole(0), fy = pinhole(1), cx = pinhole(2), cy = pinhole(3);
+    const Mat3& rotation = cam_from_map.rotation;
+    const Vec3 centre = -(transposed(rotation) * cam_from_map.translation);
+    const double rim = kRim * width;
+    numbers.reserve(count), points_cam.reserve(count), pixels.reserve(count);
+    for (size_t i = 0; i < count; ++i) {
+      const Vec3 off = Vec3{points[3 * i], points[3 * i + 1], points[3 * i + 2]} - centre;
+      const double squared = dot(off, off);
+      if (squared > far_m * far_m || squared < 1e-4) continue;
+      if (dot({normals[3 * i], normals[3 * i + 1], normals[3 * i + 2]}, off) >= 0.0) continue;
+      const Vec3 point = rotation * off;
+      const double depth = point[2];
+      if (depth < cosine * std::sqrt(squared)) continue;
+      double u = 0.0, v = 0.0;
+      if (fx > 0.0) {
+        if (depth < 1e-9) continue;
+        u = fx * point[0] / depth + cx, v = fy * point[1] / depth + cy;
+        if (!(u > -rim && u < width + rim && v > -rim && v < height + rim)) continue;
+      }
+      numbers.push_back(int32_t(i));
+      points_cam.push_back(point);
+      pixels.push_back({u, v});
     }
-    found.numbers.push_back(int32_t(i));
-    found.points.push_back({right, down, depth});
-    found.pixels.push_back({u, v});
-  }
-  return found;
+  });
+  return std::tuple(as_numpy<int32_t>(std::move(numbers)), as_numpy<double>(std::move(points_cam)), as_numpy<double>(std::move(pixels)));
 }
-
-namespace {
 
 // Indices of points (M, 3) by bins of distance, near to far.
 std::vector<uint32_t> near_to_far(const double* points, size_t count, double far_m) {
@@ -297,14 +416,25 @@ void find_hidden(Picture<float> nearest, Picture<float> hidden) {
     }
 }
 
-}  // namespace
+// What is drawn into a view of H x W pixels: sums of weights, and of colour and depth along the ray times them.
+struct DiscImage {
+  ptrdiff_t rows, columns;
+  float *weight, *colour, *depth;
+};
 
-void draw_discs(const int32_t* numbers, const double* points_cam, const double* pixels, size_t count, const double* cam_from_map,
-                const float* normals_map, const uint8_t* levels, const uint8_t* colours, double far_m, double radius_edges, Rays rays,
-                float* weight, float* colour, float* depth) {
-  const ptrdiff_t rows = rays.height, columns = rays.width;
-  if (rows == 0 || columns == 0) return;
-  const Mat3 rotation = mat3(cam_from_map, 4);
+// Draws discs (M, 3) in the camera, pixels (M, 2) of their centres, of surfels of these numbers (M,), whose normals in map (N, 3),
+// levels and colours (N,) follow: each pixel's ray is cut with the disc's plane, and what lies close behind the nearest disc is one
+// surface with it. Radii are in edges. rays (H, W, 3) in the camera, NaN for none, and the finest pixels per radian around each (H, W).
+// Sums come as 0, and are 0 where nothing is known. Source: Zwicker et al. 2001, surface splatting.
+void draw(const Numbers& numbers_of, const Points& points, const Places& places, const Mat3& rotation, const FloatPoints& normals_of,
+          const Levels& levels_of, const Levels& colours_of, double far_m, double radius_edges, const double* rays,
+          const float* pixels_per_rad, const DiscImage& image) {
+  const auto [rows, columns, weight, colour, depth] = image;
+  const size_t count = numbers_of.size();
+  const int32_t* const numbers = numbers_of.data();
+  const double *const points_cam = points.data(), *const pixels = places.data();
+  const float* const normals_map = normals_of.data();
+  const uint8_t *const levels = levels_of.data(), *const colours = colours_of.data();
   const std::vector<uint32_t> order = near_to_far(points_cam, count, far_m);  // hidden discs then cost little
   const ptrdiff_t block_rows = (rows + kBlockPx - 1) / kBlockPx, block_columns = (columns + kBlockPx - 1) / kBlockPx;
   std::vector<float> nearest_m(size_t(rows * columns), std::numeric_limits<float>::infinity()),
@@ -318,15 +448,15 @@ void draw_discs(const int32_t* numbers, const double* points_cam, const double* 
       const size_t i = order[k], n = size_t(numbers[i]);
       const Vec3 centre = vec3(points_cam + 3 * i);
       const double distance = norm(centre), middle_u = pixels[2 * i], middle_v = pixels[2 * i + 1];
-      const ptrdiff_t at_u = std::clamp<ptrdiff_t>(whole_or_outside(middle_u), 0, columns - 1),
-                      at_v = std::clamp<ptrdiff_t>(whole_or_outside(middle_v), 0, rows - 1);
-      const double fine = rays.pixels_per_rad[at_v * columns + at_u], edge = edge_of(levels[n]);
+      const ptrdiff_t at_u = std::clamp<ptrdiff_t>(whole(middle_u), 0, columns - 1),
+                      at_v = std::clamp<ptrdiff_t>(whole(middle_v), 0, rows - 1);
+      const double fine = pixels_per_rad[at_v * columns + at_u], edge = edge_of(levels[n]);
       const double radius = std::max(radius_edges * edge, kMinPixels * distance / fine);
       const double reach = std::min(kMargin * radius / distance * fine, kMostPixels);
-      const ptrdiff_t first_u = std::max<ptrdiff_t>(0, whole_or_outside(std::ceil(middle_u - reach)));
-      const ptrdiff_t first_v = std::max<ptrdiff_t>(0, whole_or_outside(std::ceil(middle_v - reach)));
-      const ptrdiff_t last_u = std::min(columns, whole_or_outside(std::floor(middle_u + reach)) + 1);
-      const ptrdiff_t last_v = std::min(rows, whole_or_outside(std::floor(middle_v + reach)) + 1);
+      const ptrdiff_t first_u = std::max<ptrdiff_t>(0, whole(std::ceil(middle_u - reach)));
+      const ptrdiff_t first_v = std::max<ptrdiff_t>(0, whole(std::ceil(middle_v - reach)));
+      const ptrdiff_t last_u = std::min(columns, whole(std::floor(middle_u + reach)) + 1);
+      const ptrdiff_t last_v = std::min(rows, whole(std::floor(middle_v + reach)) + 1);
       if (first_u >= last_u || first_v >= last_v) continue;
       const double thick = kThickEdges * edge + kThickPerM * edge * edge;
       // Nothing of the disc is nearer than this. What float32 rounds away is added.
@@ -341,7 +471,7 @@ void draw_discs(const int32_t* numbers, const double* points_cam, const double* 
       for (ptrdiff_t v = first_v; v < last_v; ++v)
         for (ptrdiff_t u = first_u; u < last_u; ++u) {
           const ptrdiff_t at = v * columns + u;
-          const Vec3 ray = vec3(rays.at + 3 * at);
+          const Vec3 ray = vec3(rays + 3 * at);
           const double slope = dot(normal, ray);
           if (!(slope < -1e-3)) continue;  // true for the NaN of pixels that no ray reaches
           const double t = through / slope;
@@ -360,7 +490,47 @@ void draw_discs(const int32_t* numbers, const double* points_cam, const double* 
     }
 }
 
-namespace {
+auto draw_discs(const Numbers& numbers, const Points& points_cam, const Places& pixels, const SE3& cam_from_map,
+                const FloatPoints& normals_map, const Levels& levels, const Levels& colours, double far_m, double radius_edges,
+                const Array<double, -1, -1, 3>& rays, const Image32& pixels_per_rad) {
+  const size_t count = numbers.shape(0), surfels = normals_map.shape(0), rows = rays.shape(0), columns = rays.shape(1);
+  if (points_cam.shape(0) != count || pixels.shape(0) != count) throw nb::value_error("points_cam, pixels: one for each of numbers");
+  check_levels(levels, surfels);
+  if (colours.shape(0) != surfels) throw nb::value_error("colours: one for each normal");
+  const auto is_other = [&](int32_t n) { return n < 0 || size_t(n) >= surfels; };
+  if (unlocked([&] { return std::any_of(numbers.begin(), numbers.end(), is_other); }))
+    throw nb::value_error("numbers: of normals_map's rows");
+  if (pixels_per_rad.shape(0) != rows || pixels_per_rad.shape(1) != columns) throw nb::value_error("pixels_per_rad: one for each ray");
+  auto weight = zeros<float>(rows * columns), colour = zeros<float>(rows * columns), depth = zeros<float>(rows * columns);
+  const DiscImage image{ptrdiff_t(rows), ptrdiff_t(columns), weight.data(), colour.data(), depth.data()};
+  if (rows > 0 && columns > 0)
+    unlocked([&] {
+      draw(numbers, points_cam, pixels, cam_from_map.rotation, normals_map, levels, colours, far_m, radius_edges, rays.data(),
+           pixels_per_rad.data(), image);
+    });
+  return std::tuple(as_numpy<float, 2>(std::move(weight), {rows, columns}), as_numpy<float, 2>(std::move(colour), {rows, columns}),
+                    as_numpy<float, 2>(std::move(depth), {rows, columns}));
+}
+
+constexpr double kLeastAlpha = 1.0 / 255.0;  // smaller coverage of a pixel is not drawn
+
+// Gaussians in a picture, front to back: pixels (M, 2) of their centres, conics (M, 3) xx, xy, yy of the inverse covariances,
+// reaches (M, 2) in px beyond which the least alpha is not reached, peaks (M,) of alpha and greys (M,).
+struct Gaussians {
+  const double *pixels, *conics, *reaches_px, *peaks, *greys;
+  size_t count;
+
+  Gaussians(const Places& pixels, const Points& conics, const Places& reaches_px, const Reals& peaks, const Reals& greys)
+      : pixels(pixels.data()),
+        conics(conics.data()),
+        reaches_px(reaches_px.data()),
+        peaks(peaks.data()),
+        greys(greys.data()),
+        count(pixels.shape(0)) {
+    if (conics.shape(0) != count || reaches_px.shape(0) != count || peaks.shape(0) != count || greys.shape(0) != count)
+      throw nb::value_error("conics, reaches_px, peaks, greys: one for each of pixels");
+  }
+};
 
 // Calls visit(i, pixel's index, light before it, alpha, squared distance, (qu, qv) its derivatives) for each pixel of each Gaussian, and
 // takes the light; done(i) after each.
@@ -390,37 +560,82 @@ template <typename Visit, typename Done>
   }
 }
 
-}  // namespace
-
-void blend(const Gaussians& gaussians, Picture<double> through, double* picture) {
-  for_each_pixel(
-      gaussians, through,
-      [&](size_t i, ptrdiff_t at, double light, double alpha, double, double, double) {
-        picture[at] += light * alpha * gaussians.greys[i];
-      },
-      [](size_t) {});
+// Blends Gaussians: the share of light that passes all (H, W), and the picture (H, W). Source: Kerbl et al. 2023.
+auto blend(const Places& pixels, const Points& conics, const Places& reaches_px, const Reals& peaks, const Reals& greys, int width,
+           int height) {
+  constexpr int64_t kMostPixels = 1 << 25;
+  const Gaussians gaussians(pixels, conics, reaches_px, peaks, greys);
+  if (width < 0 || height < 0 || int64_t(width) * height > kMostPixels) throw nb::value_error("width, height: up to 2^25 pixels");
+  const size_t rows = size_t(height), columns = size_t(width);
+  std::vector<double> through, picture;
+  unlocked([&] {
+    through.assign(rows * columns, 1.0), picture.resize(rows * columns);
+    const auto add = [&](size_t i, ptrdiff_t at, double light, double alpha, double, double, double) {
+      picture[size_t(at)] += light * alpha * gaussians.greys[i];
+    };
+    for_each_pixel(gaussians, {through.data(), height, width}, add, [](size_t) {});
+  });
+  return std::tuple(as_numpy<double, 2>(std::move(through), {rows, columns}), as_numpy<double, 2>(std::move(picture), {rows, columns}));
 }
 
-void blend_backward(const Gaussians& gaussians, const double* opacities, double blur_px2, const double* slopes, const double* whole,
-                    ptrdiff_t height, ptrdiff_t width, double* gradients) {
-  std::vector<double> through(size_t(height * width), 1.0), picture(size_t(height * width));
-  double by_grey = 0.0, by_size = 0.0, by_opacity = 0.0;
-  for_each_pixel(
-      gaussians, {through.data(), height, width},
-      [&](size_t i, ptrdiff_t at, double light, double alpha, double squared, double qu, double qv) {
-        const double grey = gaussians.greys[i], slope = slopes[at],
-                     spread = blur_px2 * (gaussians.conics[3 * i] + gaussians.conics[3 * i + 2]);
-        picture[size_t(at)] += light * alpha * grey;
-        const double behind = whole[at] - picture[size_t(at)];
-        const double by_alpha = slope * (light * grey - behind / (1.0 - alpha)) * alpha;
-        by_grey += slope * light * alpha;
-        by_size += by_alpha * (squared - blur_px2 * (qu * qu + qv * qv) + spread);
-        by_opacity += by_alpha;
-      },
-      [&](size_t i) {
-        gradients[3 * i] = by_grey, gradients[3 * i + 1] = by_size, gradients[3 * i + 2] = by_opacity * (1.0 - opacities[i]);
-        by_grey = by_size = by_opacity = 0.0;
-      });
+// Gradients (M, 3) of a loss, whose slopes by the picture are (H, W), by grey, logarithm of the size and logit of the opacity
+// (M,). whole: the picture as `blend` made it. The pixels' own blur_px2 is on the diagonal of the covariances.
+// Source: Kerbl et al. 2023; Mip-Splatting, Yu et al. 2024.
+auto blend_backward(const Places& pixels, const Points& conics, const Places& reaches_px, const Reals& peaks, const Reals& greys,
+                    const Reals& opacities, double blur_px2, const Image64& slopes, const Image64& whole) {
+  const Gaussians gaussians(pixels, conics, reaches_px, peaks, greys);
+  if (opacities.shape(0) != gaussians.count) throw nb::value_error("opacities: one for each of pixels");
+  if (slopes.shape(0) != whole.shape(0) || slopes.shape(1) != whole.shape(1)) throw nb::value_error("slopes: of the picture's size");
+  auto gradients = zeros<std::array<double, 3>>(gaussians.count);
+  unlocked([&] {
+    const double *const slope_of = slopes.data(), *const whole_of = whole.data();
+    std::vector<double> through(whole.size(), 1.0), picture(whole.size());
+    double by_grey = 0.0, by_size = 0.0, by_opacity = 0.0;
+    const auto add = [&](size_t i, ptrdiff_t at, double light, double alpha, double squared, double qu, double qv) {
+      const double grey = gaussians.greys[i], slope = slope_of[at];
+      const double spread = blur_px2 * (gaussians.conics[3 * i] + gaussians.conics[3 * i + 2]);
+      picture[size_t(at)] += light * alpha * grey;
+      const double behind = whole_of[at] - picture[size_t(at)];
+      const double by_alpha = slope * (light * grey - behind / (1.0 - alpha)) * alpha;
+      by_grey += slope * light * alpha;
+      by_size += by_alpha * (squared - blur_px2 * (qu * qu + qv * qv) + spread);
+      by_opacity += by_alpha;
+    };
+    const auto keep = [&](size_t i) {
+      gradients[i] = {by_grey, by_size, by_opacity * (1.0 - opacities(i))};
+      by_grey = by_size = by_opacity = 0.0;
+    };
+    for_each_pixel(gaussians, {through.data(), ptrdiff_t(whole.shape(0)), ptrdiff_t(whole.shape(1))}, add, keep);
+  });
+  return as_numpy<double>(std::move(gradients));
+}
+
+}  // namespace
+
+void bind_surfels(nb::module_& module) {
+  module.attr("SURFEL_EDGE_M") = kEdgeM;
+  module.attr("SURFEL_LEVELS") = kLevels;
+  module.attr("SPLAT_LEAST_ALPHA") = kLeastAlpha;
+  module.attr("SURFEL_RANGE_M") = std::tuple(kMinRangeM, kMaxRangeM);
+  const auto points_map = "points_map"_a, normals_map = "normals_map"_a, levels = "levels"_a, nearest_px = "nearest_px"_a,
+             step_px = "step_px"_a, sigma_px = "sigma_px"_a, lens = "lens"_a, cam_from_map = "cam_from_map"_a,
+             clear_sigmas = "clear_sigmas"_a, clear_m = "clear_m"_a, far_m = "far_m"_a, pixels = "pixels"_a, conics = "conics"_a,
+             reaches_px = "reaches_px"_a, peaks = "peaks"_a, greys = "greys"_a;
+  module.def("surfel_stride_px", &stride_px, "focal_px"_a);
+  module.def("voxel_keys", &voxel_keys, points_map, levels);
+  nb::class_<Shared<VoxelTable>>(module, "VoxelTable")
+      .def(nb::init<>())
+      .def("add", in_turn<PythonLock::kReleased>(&VoxelTable::add), "disparity_px"_a, sigma_px, lens, "map_from_cam"_a, "box_map"_a)
+      .def("surfels", in_turn(&surfels_of));
+  module.def("look_at", &look_at, points_map, levels, nearest_px, step_px, sigma_px, lens, cam_from_map, clear_sigmas, clear_m);
+  module.def("weigh", &weigh, points_map, levels, nearest_px, step_px, sigma_px, lens, cam_from_map, clear_sigmas, clear_m, "picture"_a,
+             "falloff"_a, "log_exposure"_a, "sums"_a);
+  module.def("discs_before", &discs_before, points_map, normals_map, cam_from_map, "cosine"_a, far_m, "pinhole"_a, "width"_a, "height"_a);
+  module.def("draw_discs", &draw_discs, "numbers"_a, "points_cam"_a, pixels, cam_from_map, normals_map, levels, "colours"_a, far_m,
+             "radius_edges"_a, "rays"_a, "pixels_per_rad"_a);
+  module.def("blend", &blend, pixels, conics, reaches_px, peaks, greys, "width"_a, "height"_a);
+  module.def("blend_backward", &blend_backward, pixels, conics, reaches_px, peaks, greys, "opacities"_a, "blur_px2"_a, "slopes"_a,
+             "whole"_a);
 }
 
 }  // namespace fleetmap

@@ -5,8 +5,6 @@
 #include <limits>
 #include <random>
 
-#include "pnp_search.h"
-
 namespace fleetmap {
 namespace {
 

@@ -33,7 +33,7 @@ struct TrackerModel {
 // Images that a rig lacks are empty.
 struct TrackerFrame {
   StereoPair whole, halved;
-  Grey<const float> disparity_px;
+  Picture<const float> disparity_px;
   Clearance clearance;
 };
 

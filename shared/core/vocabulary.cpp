@@ -1,57 +1,127 @@
-#include "vocabulary.h"
+// The vocabulary's tree of binary words: descent to the words, and the nearest of the root's branches; places by their words.
+#include "bindings/in_turn.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 
 namespace fleetmap {
+namespace {
 
-void descend(Descriptors descriptors, const Tree& tree, int32_t* words) {
-  for (size_t i = 0; i < descriptors.count; ++i) {
-    int32_t node = 0;
-    while (tree.child_count[node] > 0) {
-      const int32_t first = tree.first_child[node], last = first + tree.child_count[node];
-      int best = kFar;
-      for (int32_t child = first; child < last; ++child) {
-        const int distance = hamming(descriptors[i], tree.centres[size_t(child)]);
+// Nodes are breadth first from the root; children are neighbours, none for a leaf. They come after their parent and before the end: every
+// descent ends in a leaf.
+void check_tree(const Packed& centres, const Numbers& first_child, const Numbers& child_count, const Numbers& word_of_node) {
+  const int64_t nodes = int64_t(centres.shape(0));
+  for (const Numbers* column : {&first_child, &child_count, &word_of_node})
+    if (int64_t(column->shape(0)) != nodes) throw nb::value_error("a vocabulary's columns have one number for each node");
+  if (nodes == 0) throw nb::value_error("a vocabulary has a root");
+  for (int64_t node = 0; node < nodes; ++node) {
+    const int64_t first = first_child(node), last = first + child_count(node);
+    if (child_count(node) > 0 && (first <= node || last > nodes)) throw nb::value_error("a vocabulary's children follow their parents");
+  }
+}
+
+// The word of each descriptor. Ties go to the lower node. Source: Nister and Stewenius 2006.
+auto descend(const Packed& packed, const Packed& packed_centres, const Numbers& first_child, const Numbers& child_count,
+             const Numbers& word_of_node) {
+  const Descriptors descriptors = packed, centres = packed_centres;
+  const int32_t *const first_of = first_child.data(), *const count_of = child_count.data(), *const word_of = word_of_node.data();
+  auto words = zeros<int32_t>(descriptors.count);
+  unlocked([&] {
+    check_tree(packed_centres, first_child, child_count, word_of_node);
+    for (size_t i = 0; i < descriptors.count; ++i) {
+      int32_t node = 0;
+      while (count_of[node] > 0) {
+        const int32_t first = first_of[node], last = first + count_of[node];
+        int best = kFar;
+        for (int32_t child = first; child < last; ++child)
+          if (const int distance = hamming(descriptors[i], centres[size_t(child)]); distance < best) best = distance, node = child;
+      }
+      words[i] = word_of[node];
+    }
+  });
+  return as_numpy<int32_t>(std::move(words));
+}
+
+// For each descriptor, the numbers of the nearest centre and of the second nearest: the same twice for one centre, 0 for none.
+// Ties go to the lower number.
+auto two_nearest(const Packed& packed, const Packed& packed_centres) {
+  const Descriptors descriptors = packed, centres = packed_centres;
+  auto found = zeros<std::array<int32_t, 2>>(descriptors.count);
+  unlocked([&] {
+    for (size_t i = 0; i < descriptors.count; ++i) {
+      int best = kFar, second = kFar + 1;
+      auto& [nearest, runner_up] = found[i];
+      for (size_t c = 0; c < centres.count; ++c) {
+        const int distance = hamming(descriptors[i], centres[c]);
         if (distance < best) {
-          best = distance;
-          node = child;
+          second = std::exchange(best, distance);
+          runner_up = std::exchange(nearest, int32_t(c));
+        } else if (distance < second) {
+          second = distance;
+          runner_up = int32_t(c);
         }
       }
     }
-    words[i] = tree.word_of_node[node];
+  });
+  return as_numpy<int32_t>(std::move(found));
+}
+
+using Weights = Array<float, -1>;
+
+// Places by their words: an inverted file. Source: Sivic and Zisserman 2003.
+class InvertedFile {
+ public:
+  explicit InvertedFile(int words) {
+    if (words < 1 || words > 1 << 24) throw nb::value_error("words: 1 to 2^24");
+    unlocked([&] { postings_.resize(size_t(words)); });
   }
-}
 
-void two_nearest(Descriptors descriptors, Descriptors centres, int32_t* found) {
-  for (size_t i = 0; i < descriptors.count; ++i) {
-    int best = kFar, second = kFar + 1;
-    int32_t nearest = 0, runner_up = 0;
-    for (size_t c = 0; c < centres.count; ++c) {
-      const int distance = hamming(descriptors[i], centres[c]);
-      if (distance < best) {
-        second = best;
-        best = distance;
-        runner_up = nearest;
-        nearest = int32_t(c);
-      } else if (distance < second) {
-        second = distance;
-        runner_up = int32_t(c);
-      }
-    }
-    found[2 * i] = nearest;
-    found[2 * i + 1] = runner_up;
+  // Adds the next place, by its words, which ascend, and their weights.
+  void add(const Numbers& word_ids, const Weights& weights) {
+    check(word_ids, weights);
+    for (size_t w = 0; w < word_ids.size(); ++w) postings_[size_t(word_ids(w))].push_back({places_, weights(w)});
+    ++places_;
   }
-}
 
-void InvertedFile::add(const int32_t* words, const float* weights, size_t count) {
-  for (size_t w = 0; w < count; ++w) postings_[size_t(words[w])].push_back({int32_t(places_), weights[w]});
-  ++places_;
-}
+  // For each place, the sum of the smaller weight of every word that both have: 1 - |a - b|_1 / 2 where weights sum to 1, as DBoW2.
+  std::vector<double> scores(const Numbers& word_ids, const Weights& weights) const {
+    check(word_ids, weights);
+    std::vector<double> scores(size_t(places_), 0.0);
+    for (size_t w = 0; w < word_ids.size(); ++w)
+      for (const float weight = weights(w); const auto& [place, held] : postings_[size_t(word_ids(w))])
+        scores[size_t(place)] += double(std::min(weight, held));
+    return scores;
+  }
 
-void InvertedFile::score(const int32_t* words, const float* weights, size_t count, double* scores) const {
-  std::fill_n(scores, places_, 0.0);
-  for (size_t w = 0; w < count; ++w)
-    for (const Posting& posting : postings_[size_t(words[w])]) scores[posting.place] += double(std::min(weights[w], posting.weight));
+ private:
+  void check(const Numbers& word_ids, const Weights& weights) const {
+    if (weights.shape(0) != word_ids.shape(0)) throw nb::value_error("weights: one for each word");
+    for (const int32_t word : word_ids)
+      if (word < 0 || size_t(word) >= postings_.size()) throw nb::value_error("word_ids: of the vocabulary");
+  }
+
+  struct Posting {
+    int32_t place;
+    float weight;
+  };
+  std::vector<std::vector<Posting>> postings_;  // of each word
+  int32_t places_ = 0;
+};
+
+using SharedFile = Shared<InvertedFile>;
+
+}  // namespace
+
+void bind_vocabulary(nb::module_& module) {
+  const auto descriptors = "descriptors"_a, centres = "centres"_a, word_ids = "word_ids"_a, weights = "weights"_a;
+  module.def("descend", &descend, descriptors, centres, "first_child"_a, "child_count"_a, "word_of_node"_a);
+  module.def("two_nearest", &two_nearest, descriptors, centres);
+  nb::class_<SharedFile>(module, "InvertedFile")
+      .def(nb::init<int>(), "words"_a)
+      .def("add", in_turn<PythonLock::kReleased>(&InvertedFile::add), word_ids, weights)
+      .def("scores", in_turn(+[](SharedFile& index, const Numbers& words, const Weights& of_words) {
+             return as_numpy<double>(unlocked([&] { return index.scores(words, of_words); }));
+           }),
+           word_ids, weights);
 }
 
 }  // namespace fleetmap

@@ -1,6 +1,6 @@
 """The compiled core, built from shared/core. Arrays must be C-contiguous and of the type named here; they are never converted.
 
-The headers there document each function. Images (H, W) uint8 grey, descriptors (N, 4) uint64 of 256 bits, pixels (N, 2) float32.
+The sources there document each function. Images (H, W) uint8 grey, descriptors (N, 4) uint64 of 256 bits, pixels (N, 2) float32.
 ValueError for invalid sizes and numbers, TypeError for another kind of array; input that is not finite raises no error.
 """
 
@@ -637,7 +637,7 @@ def share_in_view(
 def join_tracks(first: _Numbers, second: _Numbers, keyframes: _Numbers) -> _Numbers:
     """(V,) root of each node after the links first-second, except links that would put a keyframe twice into a group."""
 
-# --- grid: windows and tiles of cells, with 8 voxels each (see grid.h) ---
+# --- grid: windows and tiles of cells, with 8 voxels each (see grid.cpp) ---
 GRID_RAY_STRIDE_PX: int
 GRID_CLEAR_SIGMAS: float
 
@@ -1007,7 +1007,7 @@ class Filter:
         """Standard deviation of the time offset's true error."""
     imu_minus_cam_s: float
 
-# --- rendering of the simulator (render.h), and rays against boxes (rays.h) ---
+# --- rendering of the simulator (render.cpp), and rays against boxes (rays.cpp) ---
 
 class ScenePainter:
     """Paints the image of one camera: plane (6,) fx fy cx cy width height, rays (H, W, 4) of a lens or none."""

@@ -40,7 +40,7 @@ _MAX_TILES, _MAX_CELLS = 1 << 16, 1 << 25
 
 
 class GridIndex(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """Parameters of the tiles' numbers (see grid.h of the core), and the tiles by place and address; landmarks are 0."""
+    """Parameters of the tiles' numbers (see grid.cpp of the core), and the tiles by place and address; landmarks are 0."""
 
     format_version: Positive = GRID_FORMAT
     tile_size_m: float = TILE_SIZE_M

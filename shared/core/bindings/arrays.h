@@ -1,4 +1,4 @@
-// numpy arrays in and out of the core. Arguments are unconverted views; results own their data.
+// numpy arrays in and out of the core. Arguments are unconverted views, small ones of fixed size are copied; results own their data.
 #pragma once
 
 #include <nanobind/nanobind.h>
@@ -6,20 +6,48 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
+#include <array>
 #include <initializer_list>
+#include <type_traits>
 #include <utility>
 #include <vector>
 
 #include "allocations.h"
 #include "camera.h"
+#include "matching.h"
 
 namespace nb = nanobind;
 using namespace nb::literals;
 
+// An array among the arguments, as the core's functions take it.
 template <typename T, int64_t... kShape>
-using Array = nb::ndarray<const T, nb::shape<kShape...>, nb::c_contig, nb::device::cpu>;
+struct View : nb::ndarray<T, nb::shape<kShape...>, nb::c_contig, nb::device::cpu> {
+  operator fleetmap::Picture<T>() const
+    requires(sizeof...(kShape) == 2)
+  {
+    return {this->data(), ptrdiff_t(this->shape(0)), ptrdiff_t(this->shape(1))};
+  }
+  operator fleetmap::Descriptors() const
+    requires std::is_same_v<T, const uint64_t>
+  {
+    return {this->data(), this->shape(0)};
+  }
+  T* begin() const { return this->data(); }
+  T* end() const { return this->data() + this->size(); }
+};
 template <typename T, int64_t... kShape>
-using MutableArray = nb::ndarray<T, nb::shape<kShape...>, nb::c_contig, nb::device::cpu>;
+using Array = View<const T, kShape...>;
+template <typename T, int64_t... kShape>
+using MutableArray = View<T, kShape...>;
+
+using Packed = Array<uint64_t, -1, 4>;  // descriptors
+using Image = Array<uint8_t, -1, -1>;
+using Reals = Array<double, -1>;
+using Places = Array<double, -1, 2>;  // pixels
+using Points = Array<double, -1, 3>;
+using Indices = Array<int64_t, -1>;
+using Numbers = Array<int32_t, -1>;
+using Flags = MutableArray<bool, -1>;
 
 // A numpy array that owns the vector's numbers. Element: what the vector's hold, such as float for pixels.
 template <typename Element, int kDimensions, typename T>
@@ -29,10 +57,14 @@ nb::ndarray<nb::numpy, Element, nb::ndim<kDimensions>> as_numpy(std::vector<T>&&
   return {reinterpret_cast<Element*>(kept->data()), shape, owner};
 }
 
+// The same, with a row for each of the vector's values that is several of its elements.
 template <typename Element, typename T>
-nb::ndarray<nb::numpy, Element, nb::ndim<1>> as_numpy(std::vector<T>&& values) {
+auto as_numpy(std::vector<T>&& values) {
   const size_t count = values.size();
-  return as_numpy<Element, 1>(std::move(values), {count});
+  if constexpr (sizeof(T) == sizeof(Element))
+    return as_numpy<Element, 1>(std::move(values), {count});
+  else
+    return as_numpy<Element, 2>(std::move(values), {count, sizeof(T) / sizeof(Element)});
 }
 
 // A numpy array with a copy of a few numbers.
@@ -42,6 +74,50 @@ nb::ndarray<nb::numpy, double, nb::ndim<kDimensions>> copied(const double* from,
   for (size_t length : shape) count *= length;
   return as_numpy<double, kDimensions>(std::vector<double>(from, from + count), shape);
 }
+
+namespace nanobind::detail {
+
+template <typename T, int64_t... kShape>
+struct type_caster<View<T, kShape...>> {
+  using Base = make_caster<ndarray<T, shape<kShape...>, c_contig, device::cpu>>;
+  using Held = View<T, kShape...>;
+  NB_TYPE_CASTER(Held, Base::Name)
+  bool from_python(handle source, uint32_t flags, cleanup_list* cleanup) noexcept {
+    Base base;
+    if (!base.from_python(source, flags & ~uint32_t(cast_flags::convert), cleanup)) return false;
+    static_cast<typename Base::Value&>(value) = std::move(base.value);
+    return true;
+  }
+};
+
+// A value of a few numbers, which kLoad reads from memory.
+template <typename Value_, Value_ (*kLoad)(const double*), int64_t... kShape>
+struct copied_caster {
+  using Numbers = make_caster<View<const double, kShape...>>;
+  NB_TYPE_CASTER(Value_, Numbers::Name)
+  bool from_python(handle source, uint32_t flags, cleanup_list* cleanup) noexcept {
+    Numbers numbers;
+    if (!numbers.from_python(source, flags, cleanup)) return false;
+    value = kLoad(numbers.value.data());
+    return true;
+  }
+  static handle from_cpp(const Value_& value, rv_policy, cleanup_list* cleanup) noexcept {
+    double numbers[(kShape * ...)];
+    fleetmap::store(value, numbers);
+    const auto array = copied<sizeof...(kShape)>(numbers, {size_t(kShape)...});
+    return make_caster<decltype(array)>::from_cpp(array, rv_policy::automatic, cleanup);
+  }
+};
+template <>
+struct type_caster<fleetmap::Vec3> : copied_caster<fleetmap::Vec3, fleetmap::vec3, 3> {};
+template <>
+struct type_caster<fleetmap::Mat3> : copied_caster<fleetmap::Mat3, fleetmap::mat3, 3, 3> {};
+template <>
+struct type_caster<fleetmap::SE3> : copied_caster<fleetmap::SE3, fleetmap::se3, 4, 4> {};
+template <>
+struct type_caster<fleetmap::StereoLens> : copied_caster<fleetmap::StereoLens, fleetmap::stereo_lens, 4> {};
+
+}  // namespace nanobind::detail
 
 // The result of a computation that needs no Python, done without its lock. Checks of whole arrays belong in it, too.
 template <typename Compute>
@@ -57,5 +133,15 @@ std::vector<T> zeros(size_t count) {
   return unlocked([&] { return std::vector<T>(count); });
 }
 
-using Lens = Array<double, 4>;
-inline fleetmap::StereoLens lens_of(const Lens& lens) { return {lens(0), lens(1), lens(2), lens(3)}; }
+// A section of settings: an object of Python's with a number for each name.
+struct Settings {
+  nb::object section;
+  struct Number {
+    nb::object value;
+    template <typename T>
+    operator T() const {
+      return nb::cast<T>(value);
+    }
+  };
+  Number operator[](const char* name) const { return {section.attr(name)}; }
+};

@@ -3,38 +3,38 @@
 #include <cmath>
 
 #include "bundle.h"
-#include "solvers.h"
+#include "lapack.h"
 
-using namespace fleetmap;
-
+namespace fleetmap {
 namespace {
 
-template <int64_t... kShape>
-using Reals = Array<double, kShape...>;
-template <int64_t... kShape>
-using Indices = Array<int64_t, kShape...>;
-using Numbers = Array<int32_t, -1>;
+using Poses = Array<double, -1, 4, 4>;
+using Matrices6 = Array<double, -1, 6, 6>;
+using Table = Array<double, -1, -1>;
+using Ends = Array<int64_t, -1, 2>;
 
 void check(bool holds, const char* message) {
   if (!holds) throw nb::value_error(message);
 }
 
-template <typename Numbers>
-void check_below(const Numbers& indices, size_t count, const char* message) {
-  for (size_t n = 0; n < indices.size(); ++n) check(indices.data()[n] >= 0 && size_t(indices.data()[n]) < count, message);
+template <typename Column>
+void check_below(const Column& indices, size_t count, const char* message) {
+  for (const auto index : indices) check(index >= 0 && size_t(index) < count, message);
 }
 
-std::vector<double> copied(const double* from, size_t count) { return {from, from + count}; }
+std::vector<double> numbers(const double* from, size_t count) { return {from, from + count}; }
 
-std::vector<Vec3> points_of(const Reals<-1, 3>& points) {
+std::vector<Vec3> points_of(const Points& points) {
   std::vector<Vec3> out;
   for (size_t n = 0; n < points.shape(0); ++n) out.push_back(vec3(&points(n, 0)));
   return out;
 }
 
 // What moves where the calibration does: theta, its weight, the ways of the relative poses, which of theta is their scale, and the rows.
-using Calibration = std::tuple<Reals<-1>, Reals<-1>, Reals<-1, 3>, size_t, nb::callable>;
-using Rows = std::tuple<Reals<-1, 4>, Reals<-1, 4, 3>, Reals<-1, 4, -1>, Reals<-1, 3>>;
+using Calibration = std::tuple<Reals, Reals, Points, size_t, nb::callable>;
+template <int64_t... kShape>
+using Answer = nb::ndarray<const double, nb::shape<kShape...>, nb::c_contig, nb::device::cpu>;  // converted where that is needed
+using Rows = std::tuple<Answer<-1, 4>, Answer<-1, 4, 3>, Answer<-1, 4, -1>, Answer<-1, 3>>;
 
 auto poses_of(const BundleState& state) {
   auto matrices = zeros<double>(16 * state.map_from_body.size());
@@ -50,11 +50,11 @@ auto motions_of(const BundleState& state) {
 }
 
 auto points_of(const BundleState& state) {
-  return as_numpy<double, 2>(unlocked([&] { return state.points; }), {state.points.size(), 3});
+  return as_numpy<double>(unlocked([&] { return state.points; }));
 }
 
 auto calibration_of(const BundleState& state) {
-  return as_numpy<double, 1>(unlocked([&] { return state.calibration; }), {state.calibration.size()});
+  return as_numpy<double>(unlocked([&] { return state.calibration; }));
 }
 
 // What Python owns, for whoever does not hold its lock.
@@ -81,14 +81,13 @@ ImageRows rows_at(const nb::callable& said, const BundleState& state, bool deriv
   return {residuals.data(), by_point.data(), by_calibration.data(), reinterpret_cast<const Vec3*>(positions.data()), kept(rows)};
 }
 
-void make(BundleSolver* self, const Reals<4>& lens, const Reals<-1, 4, 4>& body_from_cams, const Reals<-1, 4, 4>& map_from_body,
-          const Reals<-1, -1>& motions, const Reals<-1, 3>& points_map, const Array<bool, -1, -1>& free, bool points_held,
-          const Numbers& obs_keyframe, const Numbers& obs_camera, const Numbers& obs_landmark, const Reals<-1, 3>& obs_pixels,
-          const Reals<-1, 2>& obs_sigma_px, const Indices<-1, 2>& relative_ends, const Reals<-1, 4, 4>& i_from_j,
-          const Reals<-1, 6, 6>& relative_information, const Indices<-1>& prior_keyframe, const Reals<-1, 4, 4>& prior_map_from_body,
-          const Reals<-1, 6, 6>& prior_information, const Indices<-1, 2>& edge_ends, const Reals<-1, 67>& increments,
-          const Reals<-1, 15, 15>& edge_information, const Reals<-1, -1>& motion_mean, const Reals<-1, -1>& motion_weight,
-          const Reals<3>& gravity, double huber, double cutoff, const std::optional<Calibration>& calibration) {
+void make(BundleSolver* self, const StereoLens& lens, const Poses& body_from_cams, const Poses& map_from_body, const Table& motions,
+          const Points& points_map, const Array<bool, -1, -1>& free, bool points_held, const Numbers& obs_keyframe,
+          const Numbers& obs_camera, const Numbers& obs_landmark, const Points& obs_pixels, const Places& obs_sigma_px,
+          const Ends& relative_ends, const Poses& i_from_j, const Matrices6& relative_information, const Indices& prior_keyframe,
+          const Poses& prior_map_from_body, const Matrices6& prior_information, const Ends& edge_ends,
+          const Array<double, -1, 67>& increments, const Array<double, -1, 15, 15>& edge_information, const Table& motion_mean,
+          const Table& motion_weight, const Vec3& gravity, double huber, double cutoff, const std::optional<Calibration>& calibration) {
   find_lapack();
   std::function<ImageRows(const BundleState&, bool)> rows;
   if (calibration)
@@ -125,10 +124,10 @@ void make(BundleSolver* self, const Reals<4>& lens, const Reals<-1, 4, 4>& body_
   check_below(edge_ends, keyframes, "edge_ends: keyframes");
 
   BundleProblem problem = {};
-  problem.focal_px = lens(0), problem.cx_px = lens(1), problem.cy_px = lens(2), problem.focal_baseline_px_m = lens(3);
+  problem.lens = lens;
   for (size_t v = 0; v < cameras; ++v) problem.body_from_cams.push_back(se3(&body_from_cams(v, 0, 0)));
   problem.unknowns = int(free.shape(1));
-  problem.free.assign(free.data(), free.data() + free.size());
+  problem.free.assign(free.begin(), free.end());
   problem.points_held = points_held;
   problem.observations.reserve(observations);
   for (size_t n = 0; n < observations; ++n) {
@@ -136,28 +135,28 @@ void make(BundleSolver* self, const Reals<4>& lens, const Reals<-1, 4, 4>& body_
     problem.observations.push_back({obs_keyframe(n), obs_camera(n), obs_landmark(n), pixels, {obs_sigma_px(n, 0), obs_sigma_px(n, 1)}});
   }
   for (size_t n = 0; n < prior_keyframe.shape(0); ++n)
-    problem.priors.push_back({int32_t(prior_keyframe(n)), se3(&prior_map_from_body(n, 0, 0)), copied(&prior_information(n, 0, 0), 36)});
+    problem.priors.push_back({int32_t(prior_keyframe(n)), se3(&prior_map_from_body(n, 0, 0)), numbers(&prior_information(n, 0, 0), 36)});
   for (size_t n = 0; n < relative_ends.shape(0); ++n)
     problem.relatives.push_back({int32_t(relative_ends(n, 0)),
                                  int32_t(relative_ends(n, 1)),
                                  se3(&i_from_j(n, 0, 0)),
-                                 copied(&relative_information(n, 0, 0), 36),
+                                 numbers(&relative_information(n, 0, 0), 36),
                                  {}});
   for (size_t n = 0; n < edge_ends.shape(0); ++n)
-    problem.edges.push_back({int32_t(edge_ends(n, 0)), int32_t(edge_ends(n, 1)), copied(&increments(n, 0), kIncrements),
-                             copied(&edge_information(n, 0, 0), 225)});
-  problem.gravity = vec3(gravity.data());
-  problem.motion_mean = copied(motion_mean.data(), motion_mean.size());
-  problem.motion_weight = copied(motion_weight.data(), motion_weight.size());
-  BundleState start = {{}, copied(motions.data(), motions.size()), points_of(points_map), {}};
+    problem.edges.push_back({int32_t(edge_ends(n, 0)), int32_t(edge_ends(n, 1)), numbers(&increments(n, 0), kIncrements),
+                             numbers(&edge_information(n, 0, 0), 225)});
+  problem.gravity = gravity;
+  problem.motion_mean = numbers(motion_mean.data(), motion_mean.size());
+  problem.motion_weight = numbers(motion_weight.data(), motion_weight.size());
+  BundleState start = {{}, numbers(motions.data(), motions.size()), points_of(points_map), {}};
   for (size_t k = 0; k < keyframes; ++k) start.map_from_body.push_back(se3(&map_from_body(k, 0, 0)));
   if (calibration) {
     const auto& [theta, weight, ways, scale, said] = *calibration;
     check(theta.shape(0) > 0 && weight.shape(0) == theta.shape(0) && scale < theta.shape(0),
           "calibration: a weight for each, one the scale");
     check(ways.shape(0) == problem.relatives.size(), "calibration: a way for each of relative_ends");
-    start.calibration = copied(theta.data(), theta.size());
-    problem.calibration_weight = copied(weight.data(), weight.size());
+    start.calibration = numbers(theta.data(), theta.size());
+    problem.calibration_weight = numbers(weight.data(), weight.size());
     problem.scale = scale;
     problem.rows = std::move(rows);
     for (size_t n = 0; n < ways.shape(0); ++n) problem.relatives[n].way = vec3(&ways(n, 0));
@@ -165,24 +164,15 @@ void make(BundleSolver* self, const Reals<4>& lens, const Reals<-1, 4, 4>& body_
   new (self) BundleSolver(std::move(problem), std::move(start), huber, cutoff);
 }
 
-auto squared_sigmas_of(const BundleSolver& solver) {
-  auto squared = unlocked([&] { return solver.squared_sigmas(); });
-  const size_t count = squared.size();
-  return as_numpy<double, 1>(std::move(squared), {count});
-}
-
 auto nodes_of(const BundleSolver& solver) {
-  auto sizes = unlocked([&] { return solver.node_sizes(); });
-  auto pairs = unlocked([&] { return solver.node_pairs(); });
-  const size_t count = sizes.size(), coupled = pairs.size();
-  return std::make_tuple(as_numpy<int64_t, 1>(std::move(sizes), {count}), as_numpy<int64_t, 2>(std::move(pairs), {coupled, 2}));
+  auto [sizes, pairs] = unlocked([&] { return std::pair(solver.node_sizes(), solver.node_pairs()); });
+  return std::tuple(as_numpy<int64_t>(std::move(sizes)), as_numpy<int64_t>(std::move(pairs)));
 }
 
-void factorise_sparsely(BundleSolver& solver, const Indices<-1>& order) {
+void factorise_sparsely(BundleSolver& solver, const Indices& order) {
   unlocked([&] {
-    const size_t count = solver.node_sizes().size();
-    check_order(order, count);
-    solver.factorise_sparsely({order.data(), order.data() + count});
+    check_order({order.begin(), order.end()}, solver.node_sizes().size());
+    solver.factorise_sparsely({order.begin(), order.end()});
   });
 }
 
@@ -194,32 +184,29 @@ auto optimize(BundleSolver& solver, double lambda_start, int max_iterations, dou
     if (PyErr_CheckSignals() != 0) throw nb::python_error();
   };
   auto outcome = unlocked([&] { return solver.optimize({lambda_start, relative_cost_tolerance, max_iterations}, interruptible); });
-  const size_t count = outcome.costs.size();
-  return std::make_tuple(as_numpy<double, 1>(std::move(outcome.costs), {count}), outcome.iterations, outcome.converged);
+  return std::tuple(as_numpy<double>(std::move(outcome.costs)), outcome.iterations, outcome.converged);
 }
 
 auto reduced(BundleSolver& solver, double damping) {
   std::vector<double> lower, b;
   unlocked([&] { solver.reduced(damping, lower, b); });
   const size_t count = b.size();
-  return std::make_tuple(as_numpy<double, 2>(std::move(lower), {count, count}), as_numpy<double, 1>(std::move(b), {count}));
+  return std::tuple(as_numpy<double, 2>(std::move(lower), {count, count}), as_numpy<double>(std::move(b)));
 }
 
-std::optional<nb::ndarray<nb::numpy, double, nb::ndim<1>>> step_of(BundleSolver& solver, double damping) {
+auto step_of(BundleSolver& solver, double damping) {
   std::vector<double> step;
-  if (!unlocked([&] { return solver.solve(damping, step); })) return {};
-  const size_t count = step.size();
-  return as_numpy<double, 1>(std::move(step), {count});
+  const bool is_solved = unlocked([&] { return solver.solve(damping, step); });
+  return is_solved ? std::optional(as_numpy<double>(std::move(step))) : std::nullopt;
 }
 
-auto inertial_residual(const Reals<2, 4, 4>& map_from_body, const Reals<2, 9>& motions, const Reals<3>& gravity,
-                       const Reals<67>& increments) {
-  auto moment = [&](size_t k) {
+auto inertial_residual(const Array<double, 2, 4, 4>& map_from_body, const Array<double, 2, 9>& motions, const Vec3& gravity,
+                       const Array<double, 67>& increments) {
+  const auto moment = [&](size_t k) {
     return Moment{se3(&map_from_body(k, 0, 0)), vec3(&motions(k, 0)), vec3(&motions(k, 3)), vec3(&motions(k, 6))};
   };
-  const auto edge = inertial_edge(moment(0), moment(1), vec3(gravity.data()), increments.data());
-  return std::make_tuple(as_numpy<double, 1>(copied(edge.residual, 15), {15}),
-                         as_numpy<double, 2>(copied(edge.jacobian[0], 15 * 30), {15, 30}));
+  const auto edge = inertial_edge(moment(0), moment(1), gravity, increments.data());
+  return std::tuple(copied<1>(edge.residual, {15}), copied<2>(edge.jacobian[0], {15, 30}));
 }
 
 }  // namespace
@@ -227,16 +214,13 @@ auto inertial_residual(const Reals<2, 4, 4>& map_from_body, const Reals<2, 9>& m
 void bind_bundle(nb::module_& module) {
   const auto damping = "damping"_a;
   nb::class_<BundleSolver>(module, "BundleSolver")
-      .def("__init__", &make, "lens"_a.noconvert(), "body_from_cams"_a.noconvert(), "map_from_body"_a.noconvert(), "motions"_a.noconvert(),
-           "points_map"_a.noconvert(), "free"_a.noconvert(), "points_held"_a, "obs_keyframe"_a.noconvert(), "obs_camera"_a.noconvert(),
-           "obs_landmark"_a.noconvert(), "obs_pixels"_a.noconvert(), "obs_sigma_px"_a.noconvert(), "relative_ends"_a.noconvert(),
-           "i_from_j"_a.noconvert(), "relative_information"_a.noconvert(), "prior_keyframe"_a.noconvert(),
-           "prior_map_from_body"_a.noconvert(), "prior_information"_a.noconvert(), "edge_ends"_a.noconvert(), "increments"_a.noconvert(),
-           "edge_information"_a.noconvert(), "motion_mean"_a.noconvert(), "motion_weight"_a.noconvert(), "gravity"_a.noconvert(), "huber"_a,
-           "cutoff"_a, "calibration"_a = nb::none())
+      .def("__init__", &make, "lens"_a, "body_from_cams"_a, "map_from_body"_a, "motions"_a, "points_map"_a, "free"_a, "points_held"_a,
+           "obs_keyframe"_a, "obs_camera"_a, "obs_landmark"_a, "obs_pixels"_a, "obs_sigma_px"_a, "relative_ends"_a, "i_from_j"_a,
+           "relative_information"_a, "prior_keyframe"_a, "prior_map_from_body"_a, "prior_information"_a, "edge_ends"_a, "increments"_a,
+           "edge_information"_a, "motion_mean"_a, "motion_weight"_a, "gravity"_a, "huber"_a, "cutoff"_a, "calibration"_a = nb::none())
       .def_prop_ro("unknowns", &BundleSolver::unknowns)
       .def("nodes", &nodes_of)
-      .def("factorise_sparsely", &factorise_sparsely, "order"_a.noconvert())
+      .def("factorise_sparsely", &factorise_sparsely, "order"_a)
       .def("cost", [](BundleSolver& solver) { return unlocked([&] { return solver.cost(); }); })
       .def("optimize", &optimize, "lambda_start"_a, "max_iterations"_a, "relative_cost_tolerance"_a)
       .def("reduced", &reduced, damping)
@@ -246,7 +230,9 @@ void bind_bundle(nb::module_& module) {
       .def("motions", [](const BundleSolver& solver) { return motions_of(solver.state()); })
       .def("points_map", [](const BundleSolver& solver) { return points_of(solver.state()); })
       .def("calibration", [](const BundleSolver& solver) { return calibration_of(solver.state()); })
-      .def("squared_sigmas", &squared_sigmas_of);
-  module.def("inertial_residual", &inertial_residual, "map_from_body"_a.noconvert(), "motions"_a.noconvert(), "gravity"_a.noconvert(),
-             "increments"_a.noconvert());
+      .def("squared_sigmas",
+           [](const BundleSolver& solver) { return as_numpy<double>(unlocked([&] { return solver.squared_sigmas(); })); });
+  module.def("inertial_residual", &inertial_residual, "map_from_body"_a, "motions"_a, "gravity"_a, "increments"_a);
 }
+
+}  // namespace fleetmap

@@ -2,20 +2,13 @@
 #pragma once
 
 #include "arrays.h"  // first: Python's header comes before the system's
-#include "image.h"
 #include "stereo.h"
 
-using Image = Array<uint8_t, -1, -1>;
-using Places = Array<double, -1, 2>;  // pixels (N, 2)
-
-template <typename Number>
-fleetmap::Grey<const Number> grey(const Array<Number, -1, -1>& image) {
-  return {image.data(), ptrdiff_t(image.shape(0)), ptrdiff_t(image.shape(1))};
-}
+// Distances of pixels from the robot's own body; not empty if given.
 inline fleetmap::Clearance clearance(const std::optional<Image>& px) {
   if (!px) return {};
   if (px->size() == 0) throw nb::value_error("clearance_px: not empty");
-  return {grey(*px)};
+  return {*px};
 }
 template <typename A, typename B>
 bool same_size(const A& a, const B& b) {
@@ -27,6 +20,12 @@ inline fleetmap::StereoLimits checked(const fleetmap::StereoLimits& limits) {
   for (const int half : {limits.wide_half, limits.narrow_half})
     if (half < 1 || half > fleetmap::kMostStereoHalf) throw nb::value_error("wide_half, narrow_half: 1 to 7");
   return limits;
+}
+
+// Those of StereoSettings.
+inline fleetmap::StereoLimits stereo_limits(const Settings& stereo, double max_disparity_px) {
+  return checked({max_disparity_px, stereo["min_correlation"], stereo["uniqueness"], stereo["wide_half_px"], stereo["narrow_half_px"],
+                  stereo["agreement_px"]});
 }
 
 // What a grid of corners' distances may hold.

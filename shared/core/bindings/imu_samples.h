@@ -2,13 +2,9 @@
 #pragma once
 
 #include "arrays.h"  // first: Python's header comes before the system's
-
 #include "preintegration.h"
 
-using Stamps = Array<int64_t, -1>;
-using Rows3 = Array<double, -1, 3>;
-
-inline fleetmap::ImuSamples imu_samples(const Stamps& stamps_ns, const Rows3& gyro_radps, const Rows3& accel_mps2) {
+inline fleetmap::ImuSamples imu_samples(const Indices& stamps_ns, const Points& gyro_radps, const Points& accel_mps2) {
   const size_t count = stamps_ns.shape(0);
   if (gyro_radps.shape(0) != count || accel_mps2.shape(0) != count)
     throw nb::value_error("gyro_radps, accel_mps2: a row for each of stamps_ns");

@@ -1,10 +1,9 @@
 // Objects of the core that several threads of Python may share.
 #pragma once
 
-#include <mutex>
-#include <utility>
+#include "arrays.h"  // first: Python's header comes before the system's
 
-#include "arrays.h"
+#include <mutex>
 
 template <typename Object>
 struct Shared : Object {
@@ -12,12 +11,32 @@ struct Shared : Object {
   std::mutex busy;
 };
 
-// A method that one thread at a time is in: it may let go of Python's lock while it computes, and others wait for it without that lock.
+// While it lives no other thread has a turn; others wait for it without Python's lock.
+struct Turn {
+  std::unique_lock<std::mutex> alone;
+  explicit Turn(std::mutex& busy) : alone(busy, std::try_to_lock) {
+    if (!alone) unlocked([&] { alone.lock(); });
+  }
+};
+
+// A function of an object that one thread at a time is in: it may let go of Python's lock while it computes.
 template <typename Object, typename Result, typename... Arguments>
-auto in_turn(Result (*method)(Object&, Arguments...)) {
-  return [method](Object& object, Arguments... arguments) -> Result {
-    std::unique_lock<std::mutex> turn(object.busy, std::try_to_lock);
-    if (!turn) unlocked([&] { turn.lock(); });
-    return method(object, std::forward<Arguments>(arguments)...);
+auto in_turn(Result (*function)(Object&, Arguments...)) {
+  return [function](Object& object, Arguments... arguments) -> Result {
+    const Turn turn(object.busy);
+    return function(object, std::forward<Arguments>(arguments)...);
+  };
+}
+
+// The same of a method that needs no Python; a short one keeps the lock.
+enum class PythonLock { kKept, kReleased };
+template <PythonLock kLock = PythonLock::kKept, typename Object, typename Result, typename... Arguments>
+auto in_turn(Result (Object::*method)(Arguments...)) {
+  return [method](Shared<Object>& object, Arguments... arguments) -> Result {
+    const Turn turn(object.busy);
+    const auto call = [&] { return (object.*method)(std::forward<Arguments>(arguments)...); };
+    if constexpr (kLock == PythonLock::kReleased) return unlocked(call);
+    const fleetmap::CountedStep counted;
+    return call();
   };
 }

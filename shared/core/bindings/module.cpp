@@ -9,29 +9,14 @@
 
 namespace nb = nanobind;
 
-void bind_aliases(nb::module_&);
-void bind_block_cholesky(nb::module_&);
-void bind_bundle(nb::module_&);
-void bind_camera(nb::module_&);
-void bind_corners(nb::module_&);
-void bind_filter(nb::module_&);
-void bind_grid(nb::module_&);
-void bind_imu_checks(nb::module_&);
-void bind_mono_window(nb::module_&);
-void bind_image_quality(nb::module_&);
-void bind_landmarks(nb::module_&);
-void bind_matching(nb::module_&);
-void bind_pair_matching(nb::module_&);
-void bind_patch_align(nb::module_&);
-void bind_pnp(nb::module_&);
-void bind_preintegration(nb::module_&);
-void bind_relocalization(nb::module_&);
-void bind_render(nb::module_&);
-void bind_stereo(nb::module_&);
-void bind_surfels(nb::module_&);
-void bind_track_joining(nb::module_&);
-void bind_tracking(nb::module_&);
-void bind_vocabulary(nb::module_&);
+namespace fleetmap {
+
+using Bind = void(nb::module_&);
+Bind bind_aliases, bind_block_cholesky, bind_bundle, bind_camera, bind_corners, bind_filter, bind_grid, bind_image_quality, bind_imu_checks,
+    bind_landmarks, bind_matching, bind_mono_window, bind_pair_matching, bind_patch_align, bind_pnp, bind_preintegration, bind_projection,
+    bind_rays, bind_relocalization, bind_render, bind_stereo, bind_surfels, bind_track_joining, bind_tracking, bind_vocabulary;
+
+}  // namespace fleetmap
 
 #if defined(__x86_64__)
 // Queried from the processor itself: not every compiler's library supports __builtin_cpu_supports.
@@ -52,28 +37,12 @@ NB_MODULE(_core, module) {
         "fleetmap needs a processor with AVX2 and FMA (x86-64-v3: Intel since Haswell, 2013; AMD since Excavator, 2015), which this one "
         "is not; in a virtual machine let it see the host's processor");
 #endif
-  module.def("allocations", &fleetmap::step_allocations);
-  bind_aliases(module);
-  bind_block_cholesky(module);
-  bind_bundle(module);
-  bind_corners(module);
-  bind_filter(module);
-  bind_grid(module);
-  bind_imu_checks(module);
-  bind_mono_window(module);
-  bind_camera(module);
-  bind_image_quality(module);
-  bind_landmarks(module);
-  bind_matching(module);
-  bind_pair_matching(module);
-  bind_patch_align(module);
-  bind_pnp(module);
-  bind_preintegration(module);
-  bind_relocalization(module);
-  bind_render(module);
-  bind_stereo(module);
-  bind_track_joining(module);
-  bind_vocabulary(module);
-  bind_surfels(module);
-  bind_tracking(module);
+  using namespace fleetmap;
+  module.def("allocations", &step_allocations);
+  for (Bind* const bind :
+       {bind_aliases,       bind_block_cholesky, bind_bundle,     bind_camera,    bind_corners,        bind_filter,        bind_grid,
+        bind_image_quality, bind_imu_checks,     bind_landmarks,  bind_matching,  bind_mono_window,    bind_pair_matching, bind_patch_align,
+        bind_pnp,           bind_preintegration, bind_projection, bind_rays,      bind_relocalization, bind_render,        bind_stereo,
+        bind_surfels,       bind_track_joining,  bind_tracking,   bind_vocabulary})
+    bind(module);
 }

@@ -1,24 +1,17 @@
-
 #include "images.h"  // first: Python's header comes before the system's
 
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
-#include <optional>
 
 #include "in_turn.h"
 #include "refinement.h"
 #include "tracking.h"
 
-using namespace fleetmap;
-
+namespace fleetmap {
 namespace {
 
-using Matrix2 = nb::ndarray<nb::numpy, double, nb::ndim<2>>;
 using Images = std::vector<nb::ndarray<nb::numpy, uint8_t, nb::ndim<2>>>;
-using Motion = Array<double, 4, 4>;
-using Points = Array<double, -1, 3>;
-using Ids = Array<int64_t, -1>;
 using SharedTracker = Shared<Tracker>;
 constexpr int kMostLevels = 30;
 
@@ -34,7 +27,7 @@ size_t checked_levels(int levels) {
 
 GreyImage pictured(const Image& image) {
   if (image.size() == 0) throw nb::value_error("images: not empty");
-  return grey(image);
+  return image;
 }
 
 Images halvings(const Image& image, int count) {
@@ -66,32 +59,33 @@ auto follow_pixels_of(const Image& before, const Image& now, const Places& pixel
     follow_down(first, second, down_from, half, pixels.data(), places.data(), held, count);
     check_back(first.level(0), second.level(0), half, pixels.data(), places.data(), within_px, margin_px, held, back.data(), count);
   });
-  return std::make_tuple(as_numpy<double, 2>(std::move(places), {count, 2}), as_numpy<bool>(std::move(found)));
+  return std::tuple(as_numpy<double, 2>(std::move(places), {count, 2}), as_numpy<bool>(std::move(found)));
 }
 
-void make_tracker(SharedTracker* tracker, const Lens& lens, const nb::object& settings, const nb::object& stereo, double max_disparity_px,
-                  const Limits& refinement) {
+void make_tracker(SharedTracker* tracker, const StereoLens& lens, const nb::object& section, const nb::object& stereo,
+                  double max_disparity_px, const Limits& refinement) {
   constexpr int kThreshold = 12, kBorderPx = 8;
   constexpr int64_t kMostPoints = 100'000;
-  const auto real = [](const nb::object& of, const char* name) { return nb::cast<double>(of.attr(name)); };
-  const auto whole = [](const nb::object& of, const char* name) { return nb::cast<int>(of.attr(name)); };
-  const StereoLimits limits = checked({max_disparity_px, real(stereo, "min_correlation"), real(stereo, "uniqueness"),
-                                       whole(stereo, "wide_half_px"), whole(stereo, "narrow_half_px"), real(stereo, "agreement_px")});
-  new (tracker) SharedTracker(TrackerModel{lens_of(lens),
-                                           checked_half(whole(settings, "window_px") / 2),
-                                           checked_levels(whole(settings, "pyramid_levels")),
-                                           real(settings, "back_check_px"),
-                                           real(settings, "ransac_px"),
-                                           size_t(std::clamp<int64_t>(whole(settings, "max_points"), 0, kMostPoints)),
-                                           size_t(std::max(whole(settings, "min_inliers"), 1)),
-                                           {kThreshold, kBorderPx, real(settings, "min_distance_px")},
+  const Settings settings{section}, of_pair{stereo};
+  const StereoLimits limits = stereo_limits(of_pair, max_disparity_px);
+  new (tracker) SharedTracker(TrackerModel{lens,
+                                           checked_half(int(settings["window_px"]) / 2),
+                                           checked_levels(settings["pyramid_levels"]),
+                                           settings["back_check_px"],
+                                           settings["ransac_px"],
+                                           size_t(std::clamp<int64_t>(settings["max_points"], 0, kMostPoints)),
+                                           size_t(std::max(int(settings["min_inliers"]), 1)),
+                                           {kThreshold, kBorderPx, settings["min_distance_px"]},
                                            refinement_of(refinement),
                                            limits,
-                                           real(stereo, "min_disparity_px")});
+                                           of_pair["min_disparity_px"]});
 }
 
-auto track_of(SharedTracker& tracker, const Image& left, const std::optional<std::tuple<Image, Image, Image>>& pair,
-              const std::optional<Array<float, -1, -1>>& disparity_px, const std::optional<Motion>& cam_from_previous, bool is_predicted,
+// Images that a frame can lack: the right one, and both at half size.
+using RightAndHalves = std::tuple<Image, Image, Image>;
+
+auto track_of(SharedTracker& tracker, const Image& left, const std::optional<RightAndHalves>& pair,
+              const std::optional<Array<float, -1, -1>>& disparity_px, const std::optional<SE3>& cam_from_previous, bool is_predicted,
               const std::optional<Points>& points_cam, const std::optional<Image>& clearance_px) {
   const GreyImage image = pictured(left);
   if (clearance_px && !same_size(left, *clearance_px)) throw nb::value_error("clearance_px: of the image's size");
@@ -102,47 +96,43 @@ auto track_of(SharedTracker& tracker, const Image& left, const std::optional<std
     frame.whole.right = pictured(right), frame.halved = {pictured(left_half), pictured(right_half)};
   }
   if (disparity_px && !same_size(left, *disparity_px)) throw nb::value_error("disparity_px: of the image's size");
-  if (disparity_px) frame.disparity_px = grey(*disparity_px);
+  if (disparity_px) frame.disparity_px = *disparity_px;
   if (points_cam && points_cam->shape(0) != tracker.ids().size()) throw nb::value_error("points_cam: one for each point");
   if (cam_from_previous && !tracker.has_begun()) throw nb::value_error("cam_from_previous: there is none, begin with a frame");
   check_corners(tracker.model().corners.distance, double(image.width), double(image.height));
-  const double* const known = points_cam ? points_cam->data() : nullptr;
   TrackedMotion found;
   unlocked([&] {
-    if (cam_from_previous) found = tracker.follow(image, se3(cam_from_previous->data()), is_predicted, known);
+    if (cam_from_previous) found = tracker.follow(image, *cam_from_previous, is_predicted, points_cam ? points_cam->data() : nullptr);
     tracker.renew(frame);
   });
-  std::optional<std::tuple<Matrix2, Matrix2>> motion;
-  double matrix[16];
-  store(found.cam_from_previous, matrix);
-  if (found.is_known) motion = std::make_tuple(copied<2>(matrix, {4, 4}), copied<2>(found.information, {6, 6}));
-  return std::make_tuple(motion, found.kept_share);
+  std::optional<std::tuple<SE3, nb::ndarray<nb::numpy, double, nb::ndim<2>>>> motion;
+  if (found.is_known) motion.emplace(found.cam_from_previous, copied<2>(found.information, {6, 6}));
+  return std::tuple(motion, found.kept_share);
 }
 
-auto common_ways_px_of(const Ids& old_ids, const Points& old_pixels, const Ids& ids, const Points& pixels) {
+auto common_ways_px_of(const Indices& old_ids, const Points& old_pixels, const Indices& ids, const Points& pixels) {
   if (old_ids.shape(0) != old_pixels.shape(0) || ids.shape(0) != pixels.shape(0)) throw nb::value_error("pixels: one for each id");
-  auto ways = common_ways_px(old_ids.data(), old_pixels.data(), old_ids.shape(0), ids.data(), pixels.data(), ids.shape(0));
-  return as_numpy<double>(std::move(ways));
+  return as_numpy<double>(common_ways_px(old_ids.data(), old_pixels.data(), old_ids.shape(0), ids.data(), pixels.data(), ids.shape(0)));
 }
 
 }  // namespace
 
 void bind_tracking(nb::module_& module) {
-  const auto image = "image"_a.noconvert(), pixels = "pixels"_a.noconvert(), lens = "lens"_a.noconvert();
-  module.def("halvings", &halvings, image, "count"_a);
-  module.def("follow_pixels", &follow_pixels_of, "before"_a.noconvert(), "now"_a.noconvert(), pixels, "predicted"_a.noconvert(), "half"_a,
-             "levels"_a, "within_px"_a, "margin_px"_a);
+  const auto pixels = "pixels"_a, left = "left"_a;
+  module.def("halvings", &halvings, "image"_a, "count"_a);
+  module.def("follow_pixels", &follow_pixels_of, "before"_a, "now"_a, pixels, "predicted"_a, "half"_a, "levels"_a, "within_px"_a,
+             "margin_px"_a);
   nb::class_<SharedTracker>(module, "Tracker")
-      .def("__init__", &make_tracker, lens, "settings"_a, "stereo"_a, "max_disparity_px"_a, "refinement"_a)
-      .def("begin", in_turn(+[](SharedTracker& tracker, const Image& left) { unlocked([&] { tracker.begin(pictured(left)); }); }),
-           "left"_a.noconvert())
+      .def("__init__", &make_tracker, "lens"_a, "settings"_a, "stereo"_a, "max_disparity_px"_a, "refinement"_a)
+      .def("begin", in_turn(+[](SharedTracker& tracker, const Image& image) { unlocked([&] { tracker.begin(pictured(image)); }); }), left)
       .def("add", in_turn(+[](SharedTracker& tracker, const Points& of) { return tracker.add(of.data(), of.shape(0)); }), pixels)
-      .def("track", in_turn(&track_of), "left"_a.noconvert(), "pair"_a.noconvert().none(), "disparity_px"_a.noconvert().none(),
-           "cam_from_previous"_a.noconvert().none(), "is_predicted"_a, "points_cam"_a.noconvert().none(),
-           "clearance_px"_a.noconvert().none() = nb::none())
-      .def_prop_ro("ids", in_turn(+[](SharedTracker& tracker) { return as_numpy<int64_t>(std::vector<int64_t>(tracker.ids())); }),
+      .def("track", in_turn(&track_of), left, "pair"_a, "disparity_px"_a, "cam_from_previous"_a, "is_predicted"_a, "points_cam"_a,
+           "clearance_px"_a = nb::none())
+      .def_prop_ro("ids", in_turn(+[](SharedTracker& tracker) { return as_numpy<int64_t>(std::vector(tracker.ids())); }),
                    nb::rv_policy::automatic)
       .def_prop_ro("pixels", in_turn(+[](SharedTracker& tracker) { return copied<2>(tracker.pixels().data(), {tracker.ids().size(), 3}); }),
                    nb::rv_policy::automatic);
-  module.def("common_ways_px", &common_ways_px_of, "old_ids"_a.noconvert(), "old_pixels"_a.noconvert(), "ids"_a.noconvert(), pixels);
+  module.def("common_ways_px", &common_ways_px_of, "old_ids"_a, "old_pixels"_a, "ids"_a, pixels);
 }
+
+}  // namespace fleetmap

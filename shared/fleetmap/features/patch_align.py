@@ -52,7 +52,7 @@ def refine_matches(reference: Patches, current: Patches, warps: Array, settings:
     """(N, 3) x, y, sigma_px in level-0 pixels of the current image; NaN where the patches do not agree.
 
     warps (N, 2, 3): the first two columns are reference_from_current of offsets on a surface that faces the camera, the third one is
-    the way of a pixel, for a slant of 1 and an offset of 1 (shared/core/patch_align.h). Each feature is aligned on the halving of the
+    the way of a pixel, for a slant of 1 and an offset of 1 (shared/core/patch_align.cpp). Each feature is aligned on the halving of the
     pyramid nearest to the scale at which it was found.
     """
     limits = settings.half_window_px, settings.max_shift_px, settings.min_correlation
