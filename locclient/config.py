@@ -133,6 +133,5 @@ def with_common(given: dict[str, Any]) -> dict[str, Any]:
 
 def with_insecure(config: LocclientConfig, *, insecure: bool) -> LocclientConfig:
     """Return the configuration, with [run] insecure set if `insecure`."""
-    return (
-        msgspec.structs.replace(config, run=msgspec.structs.replace(config.run, insecure=True)) if insecure else config
-    )
+    run = msgspec.structs.replace(config.run, insecure=config.run.insecure or insecure)
+    return msgspec.structs.replace(config, run=run)

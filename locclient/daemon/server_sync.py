@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
 from fleetmap.log_lines import LogLimit
 from fleetmap.mapformat.building import BuildingFrame
-from fleetmap.messages import RobotHealth, WantedVersion
+from fleetmap.messages import InitialPoseMessage, RobotHealth, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from fleetmap.threads import Jobs
 from locclient.delivery.outbox import Outbox
@@ -60,7 +60,7 @@ class ServerSync:
         self.links: Sequence[RobotLink] = ()
         self._refusals = LogLimit(_log)  # repeated refusals would fill the log
         self._upkeep, self._upkeep_at_s = upkeep, 0.0
-        self.client, self._outbox, self._retry_s = client, outbox, retry_s
+        self.client, self._outbox, self._retry_s, self._put_prior = client, outbox, retry_s, put_prior
         self._clock_s, self._wall_ns = clock_s, wall_ns
         self.health: deque[RobotHealth] = deque(maxlen=1)  # only the last one is sent
         self.changes: deque[VersionChange] = deque()
@@ -80,8 +80,8 @@ class ServerSync:
         self._last_ack: tuple[int | None, str] | None = None
         self._handles = [
             client.announce_presence(),
-            client.on_wanted(self._announced.append),
-            client.on_initial_pose(lambda told: put_prior(told_prior(told))),
+            client.hear("wanted", WantedVersion, self._announced.append),
+            client.hear("initial_pose", InitialPoseMessage, self._take_pose),
         ]
 
     def step(self) -> None:
@@ -98,6 +98,12 @@ class ServerSync:
             self._backoff_s = min(2 * self._backoff_s, _MAX_BACKOFF_S)
         else:
             self._backoff_s = _BACKOFF_S
+
+    def _take_pose(self, told: InitialPoseMessage) -> None:
+        site, robot = self.client.site, self.client.robot
+        if (told.site, told.robot) != (site, robot):
+            raise LinkError(f"a pose for robot {told.robot!r} of {told.site!r} was sent to {robot} of {site}")
+        self._put_prior(told_prior(told))
 
     def _keep_up(self) -> None:
         if self._clock_s() >= self._upkeep_at_s:

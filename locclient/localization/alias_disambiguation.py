@@ -155,9 +155,8 @@ def log_odds(one: ObservationHistory, other: ObservationHistory, one_shared: Fla
         return 0.0
     one_alike, other_alike = np.zeros(len(one.ids), bool), np.zeros(len(other.ids), bool)
     mark_shared(one, other, one_alike, other_alike)
-    return _support(common, (one, one_shared), (other, other_alike)) - _support(
-        common, (other, other_shared), (one, one_alike)
-    )
+    against = _support(common, (other, other_shared), (one, one_alike))
+    return _support(common, (one, one_shared), (other, other_alike)) - against
 
 
 def _support(looks: int, one: tuple[ObservationHistory, Flags], other: tuple[ObservationHistory, Flags]) -> float:

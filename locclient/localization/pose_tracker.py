@@ -102,9 +102,8 @@ class PoseTracker:
         """mounted: the cameras of the rig."""
         self._settings, self.settings = settings, settings.track
         self._mounted, self.base_from_body, self.maps = mounted, base_from_body, maps
-        self.on_restart: list[
-            Callable[[], None]
-        ] = []  # called when what was seen before says nothing of the robot's place any more
+        # Called when what was seen before says nothing of the robot's place any more.
+        self.on_restart: list[Callable[[], None]] = []
         self._view, self.body_from_cam = 0, mounted[0].body_from_cam  # of the last query
         self.prior: Prior | None = None
         self.candidates = HypothesisSet(settings.track)
@@ -423,9 +422,8 @@ class PoseTracker:
             assert lookalikes is not None
             told = f"{best.evidence} here, {lookalikes.recall:.0%} there"
             return QueryResult(None, f"a place that is not in the map may look the same: {told}")
-        if has_prior or (
-            not candidates.has_low_recall(best) and candidates.is_confirmed(best, fixes, is_one_map=is_one_map)
-        ):
+        is_telling = not candidates.has_low_recall(best)
+        if has_prior or (is_telling and candidates.is_confirmed(best, fixes, is_one_map=is_one_map)):
             moved_m = candidates.moved_m(best)
             candidates.reset()
             self._repeated.reset()

@@ -4,6 +4,7 @@ import logging
 import time
 from collections.abc import Callable, Iterable
 from contextlib import suppress
+from typing import TypeVar
 
 import msgspec
 
@@ -16,7 +17,6 @@ from fleetmap.messages import (
     PART_BYTES,
     ChunkRequest,
     FailureAck,
-    InitialPoseMessage,
     Part,
     RobotAck,
     SurveyArea,
@@ -39,6 +39,7 @@ from locclient.maps.map_source import (
 )
 from locclient.maps.tile_cache import TileCache
 
+T = TypeVar("T", bound=msgspec.Struct)
 _RETRY_S = 0.2
 _MAX_INCOMPLETE = 8
 
@@ -123,7 +124,7 @@ class MapClient(MapSource):
         """patience_s: maximum interruption of a fetch. Raises UsageError for names that cannot be keys."""
         super().__init__(site)
         self.bus, self._cache = bus, cache
-        self._robot = check_name(robot, "robot")
+        self.robot = check_name(robot, "robot")
         self._timeout_s = timeout_s
         self._chunks = ChunkReader(bus, timeout_s=timeout_s, patience_s=patience_s)
         self.trust: TrustedMap | None = None
@@ -157,23 +158,10 @@ class MapClient(MapSource):
         self.restored_ns, self.surveys = wanted.restored_ns, wanted.surveys
         return msgspec.structs.replace(wanted, restored_ns=0, surveys=())
 
-    def on_wanted(self, listener: Callable[[WantedVersion], None]) -> Handle:
-        """Call `listener`, on a thread of the bus, whenever the server wants another version."""
-        key = self._key("wanted")
-        return self.bus.subscribe(key, lambda _, payload: listener(decode_message(payload, WantedVersion)))
-
-    def on_initial_pose(self, listener: Callable[[InitialPoseMessage], None]) -> Handle:
-        """Call `listener`, on a thread of the bus, whenever an operator sets this robot's pose at the server."""
-
-        def hear(_: str, payload: bytes) -> None:
-            told = decode_message(payload, InitialPoseMessage)
-            if (told.site, told.robot) != (self.site, self._robot):
-                raise LinkError(
-                    f"a pose for robot {told.robot!r} of {told.site!r} was sent to {self._robot} of {self.site}"
-                )
-            listener(told)
-
-        return self.bus.subscribe(self._key("initial_pose"), hear)
+    def hear(self, name: str, kind: type[T], listener: Callable[[T], None]) -> Handle:
+        """Call `listener`, on a thread of the bus, with every message that the server publishes for this robot: `wanted`, when it wants
+        another version, and `initial_pose`, when an operator sets the robot's."""
+        return self.bus.subscribe(self._key(name), lambda _, payload: listener(decode_message(payload, kind)))
 
     def active(self) -> WantedVersion | None:
         """Return the active version, complete in the cache; None before the first one."""
@@ -334,7 +322,7 @@ class MapClient(MapSource):
 
     def ack(self, version: int | None, *, stamp_ns: int, refused: str = "") -> None:
         """Report to the server the running version and, if it is not the wanted one, the reason."""
-        own = {"site": self.site, "robot": self._robot}
+        own = {"site": self.site, "robot": self.robot}
         message = RobotAck(**own, stamp_ns=stamp_ns, version=version, refused=refused[:2000])
         self.publish("ack", message)
 
@@ -348,4 +336,4 @@ class MapClient(MapSource):
         self.bus.publish(self._key(name), encode_message(message), may_drop=may_drop)
 
     def _key(self, name: str) -> str:
-        return robot_key(self.site, self._robot, name)
+        return robot_key(self.site, self.robot, name)

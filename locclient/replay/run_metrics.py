@@ -104,9 +104,8 @@ def frame_wall_ms(frames: Frames) -> dict[str, float] | None:
 def stage_ms(frames: Frames) -> dict[str, float]:
     """Return mean CPU milliseconds per frame and stage, after the warm-up frames."""
     rows = [f.stage_s for f in frames[WARM_UP_FRAMES:]]
-    return {
-        name: 1e3 * float(np.mean([r.get(name, 0.0) for r in rows])) for name in sorted({n for r in rows for n in r})
-    }
+    names = sorted({name for row in rows for name in row})
+    return {name: 1e3 * float(np.mean([row.get(name, 0.0) for row in rows])) for name in names}
 
 
 def error_m(frames: Frames) -> dict[str, float] | None:

@@ -122,9 +122,8 @@ class FailureMonitor:
             self._search_causes.clear()
         else:
             self._search_causes[failure_cause(estimate)] += 1
-        return self._search.handle(
-            estimate.stamp_ns, is_found=found, is_driving=is_driving, may_be_mapped=may_be_mapped
-        )
+        how = {"is_found": found, "is_driving": is_driving, "may_be_mapped": may_be_mapped}
+        return self._search.handle(estimate.stamp_ns, **how)
 
     def _note_fix(self, estimate: Estimate) -> None:
         if estimate.fix is None and not estimate.refused:

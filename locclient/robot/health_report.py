@@ -88,9 +88,8 @@ class SearchWay:
     @property
     def words(self) -> str:
         """Return a text for users, empty while the robot is localized or was until recently."""
-        way = f"{self.metres:.1f} m" + (
-            f" and {self.unknown_s:.0f} s at an unknown speed" if self.unknown_s >= 1 else ""
-        )
+        unknown = f" and {self.unknown_s:.0f} s at an unknown speed" if self.unknown_s >= 1 else ""
+        way = f"{self.metres:.1f} m{unknown}"
         if self.is_long:
             return f"not localized over {way}: {self._causes.most_common(1)[0][0]}"
         if self.was_found or not self._frames:

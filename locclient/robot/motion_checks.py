@@ -61,9 +61,8 @@ class DockCheck:
 def _is_exact(prior: PositionPrior) -> bool:
     """Return True for a dock's report, not a zone or an operator's estimate."""
     covariance = prior.cov_rot_trans[3:5, 3:5]
-    return not prior.is_revisable and bool(
-        np.isfinite(covariance).all() and np.linalg.eigvalsh(covariance)[-1] <= _EXACT_M**2
-    )
+    is_known = not prior.is_revisable and np.isfinite(covariance).all()
+    return bool(is_known and np.linalg.eigvalsh(covariance)[-1] <= _EXACT_M**2)
 
 
 _WHEEL_NS = 500_000_000  # maximum age of wheel odometry
@@ -112,9 +111,8 @@ def imu_refused(late_s: float | None) -> dict[Flag, str]:
     """Return the flag of a disabled IMU, with its text. late_s: delay of its stamps by the images' rotation, None if not the cause."""
     words = f"it turns otherwise than the images; {_ASK} which axis is wrong"
     if late_s is not None:
-        when = (
-            f"its stamps are about {abs(late_s):.2f} s {'late' if late_s > 0 else 'early'} by the turns of the images"
-        )
+        side = "late" if late_s > 0 else "early"
+        when = f"its stamps are about {abs(late_s):.2f} s {side} by the turns of the images"
         words = f"{when}; stamp both by one clock, or {_ASK} for the timeshift_cam_imu to set"
     return {Flag.IMU_REFUSED: f"the IMU is left out: {words}"}
 

@@ -200,12 +200,13 @@ class Robot:
             self._site = estimate.floor
             if self.ring is not None and self.running is not None:  # recordings of failures need the map
                 self.ring.use(self.running, self._site)
-        if estimate.is_at_home:
-            self._versions.handle(estimate)
-        else:
-            self._versions.pause()
         level = self.building[self._site].entry.level if self.building else ""
         published = replace(self._odom.handle(estimate), building_from_map=self._building_from_map(), level=level)
+        odom_from_body = published.odom_from_base @ self.base_from_body
+        if estimate.is_at_home:
+            self._versions.handle(estimate, odom_from_body)
+        else:
+            self._versions.pause()
         speed_mps = self._speed.handle(wheel, estimate.odometry, published.odom_from_base)
         rolled = wheel if self._wheels_fault else bundle.wheel
         odometry, percept = self.localizer.perception.odometry, self.localizer.perception.percept
@@ -219,7 +220,6 @@ class Robot:
         failure = self.monitor.handle(estimate, speed_mps, may_be_mapped=is_covered)
         if self.ring is not None and percept is not None:
             self.ring.handle(percept, frame, estimate, self.localizer.start(), self.monitor.begun_ns)
-        odom_from_body = published.odom_from_base @ self.base_from_body
         context = None if failure is None else self._context(failure, odom_from_body)
         self._onsets.handle(estimate, frame, odom_from_body, self.monitor.begun_ns)
         dock_error_m = self._docks.handle(bundle.priors, estimate)

@@ -50,19 +50,20 @@ class VersionTrial:
     carried. Time without usable images counts against no version: the caller then tries the other one.
     """
 
-    def __init__(self, settings: TrialSettings, begun: Estimate) -> None:
+    def __init__(self, settings: TrialSettings, begun: Estimate, odom_from_body: Array) -> None:
+        """odom_from_body (4, 4): of the same frame, in an odometry frame that is not redefined once the robot is localized."""
         self._settings, self._begun_ns = settings, begun.stamp_ns
         self._map_from_odom: Array | None = None
         if begun.map_from_body is not None and begun.status is Status.TRACKING:
-            self._map_from_odom = begun.map_from_body @ se3_inverse(begun.odometry.odom_from_body)
-        self._last_m = begun.odometry.odom_from_body[:3, 3]
+            self._map_from_odom = begun.map_from_body @ se3_inverse(odom_from_body)
+        self._last_m = odom_from_body[:3, 3]
         self._path_m = 0.0
         self._fixes = self._contradictions = 0
         self.reason = "no frame was compared with it"
 
-    def handle(self, estimate: Estimate) -> bool | None:
+    def handle(self, estimate: Estimate, odom_from_body: Array) -> bool | None:
         """Return whether the version is confirmed or has failed with this frame, None while undecided; `reason` has its text."""
-        off_m = self._off_m(estimate)
+        off_m = self._off_m(estimate, odom_from_body)
         limit_m = self._settings.agreement_m + _DRIFT_SHARE * self._path_m
         age_s = (estimate.stamp_ns - self._begun_ns) * 1e-9
         if estimate.fix is not None and estimate.status is Status.TRACKING and off_m <= limit_m:
@@ -79,19 +80,13 @@ class VersionTrial:
             return True
         return False if age_s > self._settings.patience_s else None
 
-    def _off_m(self, estimate: Estimate) -> float:
+    def _off_m(self, estimate: Estimate, odom_from_body: Array) -> float:
         """Return the distance from the initial pose as propagated by odometry; 0 if either is unknown."""
-        odometry = estimate.odometry
-        if odometry.new_odom_from_old_odom is not None:
-            change = odometry.new_odom_from_old_odom
-            self._last_m = change[:3, :3] @ self._last_m + change[:3, 3]
-            if self._map_from_odom is not None:
-                self._map_from_odom = self._map_from_odom @ se3_inverse(change)
-        self._path_m += float(np.linalg.norm(odometry.odom_from_body[:3, 3] - self._last_m))
-        self._last_m = odometry.odom_from_body[:3, 3]
+        self._path_m += float(np.linalg.norm(odom_from_body[:3, 3] - self._last_m))
+        self._last_m = odom_from_body[:3, 3]
         if self._map_from_odom is None or estimate.map_from_body is None:
             return 0.0
-        predicted = self._map_from_odom @ odometry.odom_from_body
+        predicted = self._map_from_odom @ odom_from_body
         return float(np.linalg.norm(estimate.map_from_body[:3, 3] - predicted[:3, 3]))
 
 
@@ -109,7 +104,7 @@ class VersionTrials:
         self._candidate: LoadedMap | None = None
         self._trial: VersionTrial | None = None
         self._failed_reason: str | None = None  # of the candidate, while the good version is tried again
-        self._last: Estimate | None = None
+        self._last: tuple[Estimate, Array] | None = None
         self.changes: list[VersionChange] = []
 
     @property
@@ -137,15 +132,15 @@ class VersionTrials:
         if self.running is loaded:
             self._show(loaded)
 
-    def handle(self, estimate: Estimate) -> None:
-        """Count a frame for the trial, if there is one."""
-        self._last = estimate
+    def handle(self, estimate: Estimate, odom_from_body: Array) -> None:
+        """Count a frame for the trial, if there is one; odom_from_body as of `VersionTrial`."""
+        self._last = estimate, odom_from_body
         if self._candidate is None or self._good is None:
             return
         if self._trial is None:
             self._begin_trial()
         assert self._trial is not None
-        is_confirmed = self._trial.handle(estimate)
+        is_confirmed = self._trial.handle(estimate, odom_from_body)
         if is_confirmed is None:
             return
         if self._failed_reason is not None:
@@ -171,4 +166,4 @@ class VersionTrials:
 
     def _begin_trial(self) -> None:
         """Begin the trial at the last frame of the previous version; without one, at the next frame."""
-        self._trial = None if self._last is None else VersionTrial(self._settings, self._last)
+        self._trial = None if self._last is None else VersionTrial(self._settings, *self._last)

@@ -224,9 +224,8 @@ def _estimate(looks: Sequence[_Look]) -> tuple[Array, Array]:
     off = (score - information @ value) @ covariance
     scatter = np.sqrt((off**2).sum(axis=0) * len(looks) / max(len(looks) - 1, 1))
     sigma = np.maximum(np.sqrt(np.diag(covariance)), scatter)[:COUNT]
-    common = np.array([parameter.least_sigma for parameter in PARAMETERS]) * np.sqrt(
-        1.0 + _LOCAL_FLOORS**2 / len(looks)
-    )
+    least = np.array([parameter.least_sigma for parameter in PARAMETERS])
+    common = least * np.sqrt(1.0 + _LOCAL_FLOORS**2 / len(looks))
     is_shown = sigma < _JUDGED_SIGMA_SHARE * _PRIOR_SIGMA
     is_shown[IMAGE:] &= len(looks) >= _MIN_LOOKS
     return value[:COUNT], np.where(is_shown, np.hypot(sigma, common), np.inf)

@@ -36,9 +36,8 @@ def agrees(prior: PositionPrior, confirmed: Place, base_from_body: Array) -> boo
     covariance = _WIDER * prior.cov_rot_trans + confirmed.cov_rot_trans
     cov_m2 = covariance[3:5, 3:5] + _SIGMA_M**2 * np.eye(2)
     turn_rad = so3_log(prior.map_from_base[:3, :3].T @ map_from_base[:3, :3])[2]
-    return bool(
-        off_m @ np.linalg.solve(cov_m2, off_m) < _CHI2_999 and abs(turn_rad) < _BOUND_SIGMAS * np.sqrt(covariance[2, 2])
-    )
+    is_near = off_m @ np.linalg.solve(cov_m2, off_m) < _CHI2_999
+    return bool(is_near and abs(turn_rad) < _BOUND_SIGMAS * np.sqrt(covariance[2, 2]))
 
 
 class PriorSource(Protocol):

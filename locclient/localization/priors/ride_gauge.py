@@ -23,9 +23,8 @@ _GATE = 3.0  # sigmas of a speed that may be zero
 _MIN_MPS = 0.05  # of a ride: slower steps are vibrations of a floor
 _SLOWED_SHARE = 0.3  # of the largest speed, below which a ride may have ended
 _KNOWN_SHARE = 0.2  # of the largest speed: a speed with a larger sigma does not show the end of a ride
-_LONGEST_S = (
-    180.0  # of a ride: a robot that must find its place before it may roll would wait for ever after a wrong one
-)
+# Of a ride: a robot that must find its place before it may roll would wait for ever after a wrong one.
+_LONGEST_S = 180.0
 _BIAS_SIGMA_MPS2 = 0.3  # before the first rest
 _SCALE_SIGMA = 0.02  # of an accelerometer, calibrated or not
 

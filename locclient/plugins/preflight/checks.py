@@ -107,12 +107,10 @@ def _streams(source: Source, config: LocclientConfig, listen_s: float, rectifier
     is_live = config.source.kind != "recording"
     frame_hz = (len(stamps) - 1) / ((stamps[-1] - stamps[0]) * 1e-9) if len(stamps) > 1 else 0.0
     text = f"{frame_hz:.1f} Hz of frames"
-    unreadable = f"{counts.unreadable} unreadable messages"
-    if counts.unreadable:
-        unreadable += f" ({intake.unreadable_why})"
     if frame_hz < _MIN_FRAME_HZ:
-        hint = "check the camera, [topics] and the endpoint of [source]"
-        yield Finding(FAIL, "frames", f"{text} in {listen_s:g} s, {unreadable}; {hint}")
+        why = f" ({intake.unreadable_why})" if counts.unreadable else ""
+        hint = f"{counts.unreadable} unreadable messages{why}; check the camera, [topics] and the endpoint of [source]"
+        yield Finding(FAIL, "frames", f"{text} in {listen_s:g} s, {hint}")
     else:
         bad = counts.frames_disordered + counts.unreadable
         hint = f", {bad} of them out of order or unreadable: check the driver" if bad else ""
@@ -125,11 +123,13 @@ def _streams(source: Source, config: LocclientConfig, listen_s: float, rectifier
         yield Finding(OK if is_enough else FAIL, "imu", f"{imu_hz:.0f} Hz{hint}")
     if stamps and is_live:
         skew_s = (time.time_ns() - stamps[-1]) * 1e-9
-        if abs(skew_s) > _SKEW_S + 1.0 / max(frame_hz, 1.0):
+        is_off, text = (
+            abs(skew_s) > _SKEW_S + 1.0 / max(frame_hz, 1.0),
+            f"{1e3 * skew_s:.0f} ms behind the system's clock",
+        )
+        if is_off:
             text = f"frames are stamped {skew_s:.2f} s before now; let the driver stamp with the system's clock"
-            yield Finding(WARN, "stamps", text)
-        else:
-            yield Finding(OK, "stamps", f"{1e3 * skew_s:.0f} ms behind the system's clock")
+        yield Finding(WARN if is_off else OK, "stamps", text)
 
 
 def _pair(raw: CameraFrame | StoredFrame | None, rectifier: Rectifier) -> Iterator[Finding]:
@@ -139,15 +139,12 @@ def _pair(raw: CameraFrame | StoredFrame | None, rectifier: Rectifier) -> Iterat
     frame = rectifier.rectify(decode_frame(raw) if isinstance(raw, StoredFrame) else raw)
     if frame.right is None:
         return
-    order = pair_order(frame, OrbSettings())
+    order, level, text = pair_order(frame, OrbSettings()), OK, "the left image is the left one"
     if order in FAULTS:
-        yield Finding(FAIL, "left and right", FAULTS[order])
-    elif order is PairOrder.RIGHT:
-        yield Finding(OK, "left and right", "the left image is the left one")
-    else:
-        yield Finding(
-            WARN, "left and right", "not judged: too few features near the robot; check again with objects within 5 m"
-        )
+        level, text = FAIL, FAULTS[order]
+    elif order is not PairOrder.RIGHT:
+        level, text = WARN, "not judged: too few features near the robot; check again with objects within 5 m"
+    yield Finding(level, "left and right", text)
 
 
 class _StampRecorder(Intake):

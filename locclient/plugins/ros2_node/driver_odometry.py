@@ -79,11 +79,8 @@ class PoseHistory:
         (a, b), gap_ns = known[after - 1 : after + 1], stamps[after] - stamps[after - 1]
         if gap_ns > _GAP_NS:
             return Missing(f"none was stamped within {gap_ns * 1e-9:.1f} s around the frame", may_come=False)
-        gap_s, step_m, turn = (
-            gap_ns * 1e-9,
-            float(np.linalg.norm(b[:3, 3] - a[:3, 3])),
-            so3_log(a[:3, :3].T @ b[:3, :3]),
-        )
+        gap_s, turn = gap_ns * 1e-9, so3_log(a[:3, :3].T @ b[:3, :3])
+        step_m = float(np.linalg.norm(b[:3, 3] - a[:3, 3]))
         if step_m > _STEP_M + _SPEED_MPS * gap_s or np.linalg.norm(turn) > _STEP_RAD + _TURN_RADPS * gap_s:
             jump = f"it jumps by {step_m:.2f} m and {np.degrees(np.linalg.norm(turn)):.0f} degrees within {gap_s:.3f} s"
             return Missing(f"{jump}: was it reset, or do two programs publish it?", may_come=False)

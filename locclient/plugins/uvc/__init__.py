@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 
 import cv2
 import numpy as np
@@ -42,8 +43,9 @@ class UvcSource:
         self.calibration, self.has_depth = calibration, False
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
-        handles = [] if self._topics is None else self._topics.subscribe(intake)
-        try:
+        with ExitStack() as stack:
+            for handle in [] if self._topics is None else self._topics.subscribe(intake):
+                stack.callback(handle.close)
             while not wait(0.0):
                 capture = self._open()
                 try:
@@ -52,9 +54,6 @@ class UvcSource:
                     capture.release()
                 if wait(_REOPEN_S):
                     return
-        finally:
-            for handle in handles:
-                handle.close()
 
     def close(self) -> None:
         if self._topics is not None:

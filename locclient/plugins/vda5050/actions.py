@@ -90,9 +90,8 @@ class ActionBook:
     def fail(self, action: Action, error_type: str, words: str, level: str = "WARNING") -> None:
         """Mark the action as failed, with an error until another action of its kind is accepted."""
         self.set(action, "FAILED", words)
-        shown = {"actionId": action.action_id} | {
-            parameter.key: str(parameter.value)[:_MOST_SIGNS] for parameter in action.action_parameters[:20]
-        }
+        given = {each.key: str(each.value)[:_MOST_SIGNS] for each in action.action_parameters[:20]}
+        shown = {"actionId": action.action_id} | given
         topic = "map" if action.action_type in MAP_ACTIONS else "instant"
         self.add_error(topic, error_type, words, shown, level)
 

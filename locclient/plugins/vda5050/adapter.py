@@ -257,9 +257,8 @@ class FleetAdapter:
         sigmas = [_TILT_SIGMA_RAD] * 2 + [section.initial_sigma_rad] + [section.initial_sigma_m] * 2 + [_HEIGHT_SIGMA_M]
         fleet_from_base = se3(so3_exp(np.array([0.0, 0.0, place.theta_rad])), np.array([place.x_m, place.y_m, 0.0]))
         map_from_base = se3_inverse(fleet_from_map) @ fleet_from_base
-        self._robot.put_prior(
-            PositionPrior(now.estimate.stamp_ns + 1, map_from_base, np.diag(np.square(sigmas)), False, site)
-        )
+        covariance, soon_ns = np.diag(np.square(sigmas)), now.estimate.stamp_ns + 1
+        self._robot.put_prior(PositionPrior(soon_ns, map_from_base, covariance, False, site))
         return None
 
     def after_frame(

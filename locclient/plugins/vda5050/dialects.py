@@ -5,6 +5,7 @@ What 2.x cannot say becomes what is safe: a robot that is starting or was interv
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import msgspec
@@ -46,9 +47,7 @@ def dialect(version: str) -> Dialect:
     """Return the dialect of a version: 2.0.0, 2.1.0 or 3.0.0."""
     if version == "3.0.0":
         return Dialect(version, "v3", True, lambda name: name, lambda payload: payload, lambda _, content: content)
-    return Dialect(
-        version, "v2", version != "2.0.0", _old_action, _new_actions, lambda topic, m: _old(version, topic, m)
-    )
+    return Dialect(version, "v2", version != "2.0.0", _old_action, _new_actions, partial(_old, version))
 
 
 def _old_action(name: str) -> str:

@@ -175,7 +175,7 @@ def test_robots_see_published_things_only(world: World) -> None:
 
 def test_new_versions_are_announced_to_known_robots(world: World) -> None:
     heard: list[WantedVersion] = []
-    world.link.on_wanted(heard.append)
+    world.link.hear("wanted", WantedVersion, heard.append)
     assert world.link.wanted().version == 1  # asking makes it known
     assert world.service.announce_changes() == ["lab"]
     assert [message.version for message in heard] == [1]
