@@ -107,9 +107,10 @@ class RigFrames:
         if view == 0:
             self._leader = 0
             self._silent_since_ns.clear()
-        elif stamp_ns - self._silent_since_ns.setdefault(view, stamp_ns) > _DEAD_NS:
-            if self._leader == 0 or abs(stamp_ns - self._recent[self._leader][-1].stamp_ns) > _DEAD_NS:
-                self._leader = view
+        elif stamp_ns - self._silent_since_ns.setdefault(view, stamp_ns) > _DEAD_NS and (
+            self._leader == 0 or abs(stamp_ns - self._recent[self._leader][-1].stamp_ns) > _DEAD_NS
+        ):
+            self._leader = view
         return view == self._leader
 
     def _is_expected(self, recent: deque[StoredFrame]) -> bool:
