@@ -38,13 +38,11 @@ class ServiceManager:
     def _tell(self, text: str) -> None:
         if not self._address:
             return
-        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+        # If the socket is gone, the service continues, and its manager decides by the watchdog.
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender, suppress(OSError):
             sender.setblocking(False)  # a manager that does not read must not block the robot
-            try:
-                sender.connect(self._address)
-                sender.send(text.encode())
-            except OSError:
-                pass  # the socket is gone: the service continues, and its manager decides by the watchdog
+            sender.connect(self._address)
+            sender.send(text.encode())
 
     def _write(self, status: str) -> None:
         if self._folder is None:

@@ -32,6 +32,7 @@ from locclient.delivery.failure_checks import MAX_ROWS, check_record
 from locclient.localization.percept import Percept
 from locclient.localization.pose_tracker import Start
 from locclient.localization.settings import LocalizerSettings
+from locclient.robot.failure_onset import block_px, reduced
 from locclient.robot.failure_report import RobotProfile, without_detail
 from locclient.robot.failure_ring import Commands, FailureCut, RingFrame, UsedMap
 
@@ -152,12 +153,9 @@ def _with_depth(frame: RingFrame, profile: RobotProfile) -> Percept:
     if query is None or query.features is None:
         return frame.percept
     found, pixels = query.features.features, query.features.pixels.copy()
-    shown, camera = (
-        None if frame.picture is None else frame.picture.view(query.view),
-        profile.rig.mounted[query.view].camera,
-    )
+    shown = None if frame.picture is None else frame.picture.view(query.view)
     if shown is not None:
-        is_tried = query.features.is_tried
+        camera, is_tried = profile.rig.mounted[query.view].camera, query.features.is_tried
         untried = np.ones(len(found), bool) if is_tried is None else ~is_tried
         left = found.pixels[untried]
         disparities = stereo.disparities(shown, camera, left, profile.settings.stereo)[:, 0]
@@ -188,14 +186,10 @@ def _decoded_array(kind: type, value: Any) -> Any:
 # --- the recording's part ---------------------------------------------------------------------------------------------
 
 
-def _step(width_px: int) -> int:
-    return max(1, width_px // _WIDTH_PX)
-
-
 def _reduced_view(rig: MountedRig, view: int, *, is_pair: bool) -> list[CameraCalibration]:
     """Return the rectified cameras of a view at the pictures' size."""
     camera, body_from_cam = rig.mounted[view]
-    step = _step(camera.width_px)
+    step = block_px(camera.width_px, _WIDTH_PX)
     center = [(value + 0.5) / step - 0.5 for value in (camera.cx_px, camera.cy_px)]
     left = CameraCalibration(
         "radial-tangential",
@@ -220,11 +214,9 @@ def _reduced(frame: RectifiedFrame, pictures: str, view: int = 0) -> StoredFrame
 
 
 def _jpeg(image: Image, pictures: str) -> StoredImage:
-    step = _step(image.shape[1])
-    size = image.shape[1] // step, image.shape[0] // step
-    small = cv2.resize(image[: size[1] * step, : size[0] * step], size, interpolation=cv2.INTER_AREA)
+    small = reduced(image, _WIDTH_PX)
     if pictures == "blurred":
-        small = without_detail(np.asarray(small, np.uint8))
+        small = without_detail(small)
     data = b""
     for quality in _QUALITIES:
         data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()

@@ -37,7 +37,7 @@ class ReadyVersion:
 
 
 class MapSource(ABC):
-    """Source that a robot reads its map from."""
+    """Source that a robot reads its map from. The tile cache alone has the bytes of versions, and nothing else of a site."""
 
     def __init__(self, site: str) -> None:
         """Raises UsageError for an invalid site name."""
@@ -52,9 +52,9 @@ class MapSource(ABC):
         """Return the file of this kind that the site keeps beside its versions; None without one."""
         raise NotImplementedError
 
-    @abstractmethod
     def ready(self) -> ReadyVersion:
         """Return the version to run now."""
+        raise NotImplementedError
 
     @abstractmethod
     def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
@@ -92,13 +92,6 @@ class CachedMap(MapSource):
     def __init__(self, cache: TileCache, site: str) -> None:
         super().__init__(site)
         self._cache = cache
-
-    def ready(self) -> ReadyVersion:
-        """Return the active version; LinkError before the first one."""
-        active = self._cache.active(self.site)
-        if active is None:
-            raise LinkError(f"the cache has no version of site {self.site} yet; fetch one from a server first")
-        return ReadyVersion(active.wanted(self.site))
 
     def blob(self, sha256: str, max_bytes: int = 0) -> bytes:
         """Return the verified bytes of an address; LinkError if not in the cache."""

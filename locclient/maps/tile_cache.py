@@ -73,16 +73,13 @@ class TileCache:
         path = self._path(sha256)
         try:
             data = verified(path.read_bytes(), sha256)
-        except FileNotFoundError:
+        except (OSError, MapFormatError) as error:
             self._sizes.pop(sha256, None)
-            return None
-        except OSError as error:  # the bytes may be good
-            self._sizes.pop(sha256, None)
-            self._note(f"{path} cannot be read ({error.strerror}); check the disk and whose file it is")
-            return None
-        except MapFormatError as error:
-            self._note(f"cached {sha256} cannot be used and was removed: {error}")
-            self._remove(sha256)
+            if isinstance(error, MapFormatError):
+                self._note(f"cached {sha256} cannot be used and was removed: {error}")
+                self._try_unlink(path)
+            elif not isinstance(error, FileNotFoundError):  # the bytes may be good
+                self._note(f"{path} cannot be read ({error.strerror}); check the disk and whose file it is")
             return None
         with suppress(OSError):  # a read-only disk, or another account's file: readable, and never evicted
             os.utime(path)

@@ -80,11 +80,9 @@ class Comparison:
         what = f"version {self.version}" if self.version != self.summary.version else "this client"
         if self.first_difference_ns is None:
             return f"{what} gives the same result for every frame, poses at most {1e3 * self.apart_m:.1f} mm apart"
-        if now_s > BLIND_S:
-            return f"{what} would have failed too: no reliable position for {now_s:.1f} s now, {then_s:.1f} s then"
-        if then_s > BLIND_S:
-            return f"{what} would not have failed: no reliable position for {now_s:.1f} s now, {then_s:.1f} s then"
-        return f"{what} gives other results: no reliable position for {now_s:.1f} s now, {then_s:.1f} s then"
+        verdict = "would not have failed" if then_s > BLIND_S else "gives other results"
+        verdict = "would have failed too" if now_s > BLIND_S else verdict
+        return f"{what} {verdict}: no reliable position for {now_s:.1f} s now, {then_s:.1f} s then"
 
 
 def _is_same(then: Moment, now: Moment) -> bool:

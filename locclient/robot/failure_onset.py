@@ -122,7 +122,7 @@ class OnsetRecorder:
         for kind in [kind for kind in self._open if kind not in begun_ns]:
             del self._open[kind]
         if not self._pictures or stamp_ns - self._pictures[-1][0] >= _EVERY_NS:
-            self._pictures.append((stamp_ns, _small(_left(frame, estimate.view))))
+            self._pictures.append((stamp_ns, reduced(_left(frame, estimate.view))))
 
     @property
     def search(self) -> Onset | None:
@@ -171,7 +171,7 @@ class OnsetRecorder:
         chosen = {picture[0]: picture[1] for picture in before if picture is not None}
         belief, left = self._belief, _left(frame, view)
         map_from_body = None if belief is None else belief.carried_on(odom_from_body)
-        return Onset(stamp_ns, left, (*chosen.items(), (stamp_ns, _small(left))), belief, map_from_body, view)
+        return Onset(stamp_ns, left, (*chosen.items(), (stamp_ns, reduced(left))), belief, map_from_body, view)
 
     def _nearest(self, wanted_ns: int, before_ns: int) -> tuple[int, Image] | None:
         """Return the picture nearest to a stamp, at most 0.5 s off and before `before_ns`."""
@@ -185,9 +185,14 @@ def _left(frame: RectifiedFrame, view: int) -> Image:
     return (frame.view(view) or frame).left
 
 
-def _small(left: Image) -> Image:
-    """Return means of whole blocks of pixels, at a tenth of the cost of a free scale; narrower than twice PICTURE_WIDTH_PX."""
-    height, width = left.shape
-    step = max(1, width // PICTURE_WIDTH_PX)
-    whole = left[: height // step * step, : width // step * step]
+def block_px(width_px: int, about_px: int) -> int:
+    """Return the side of the blocks whose means are an image of at least so many pixels, and less than twice as many."""
+    return max(1, width_px // about_px)
+
+
+def reduced(image: Image, about_px: int = PICTURE_WIDTH_PX) -> Image:
+    """Return means of whole blocks of pixels by `block_px`, at a tenth of the cost of a free scale."""
+    height, width = image.shape
+    step = block_px(width, about_px)
+    whole = image[: height // step * step, : width // step * step]
     return np.asarray(cv2.resize(whole, (width // step, height // step), interpolation=cv2.INTER_AREA), np.uint8)
