@@ -1,4 +1,4 @@
-"""Poses that the tracker carries along with the odometry, which places compete, and a prior against places that a robot finds later."""
+"""Poses that the tracker carries along with the odometry, their covariances, which places compete, and priors against places found then."""
 
 from typing import cast
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fleetmap.features import orb
-from fleetmap.geometry import se3, se3_inverse, so3_exp
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.relocalizer import Fix
@@ -14,7 +14,7 @@ from fleetmap.sensors.rectification import MountedCamera, StereoCamera
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.held_maps import HeldMaps
 from locclient.localization.hypothesis_set import HypothesisSet
-from locclient.localization.place import Place
+from locclient.localization.place import Place, boxminus, boxplus
 from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
 from locclient.localization.pose_tracker import PoseTracker
 from locclient.localization.priors.prior import Prior
@@ -158,3 +158,45 @@ def test_what_is_near_grows_with_the_way() -> None:
     assert ride.prior.is_near(positions).tolist() == [True, False, False]
     ride.drive(8)
     assert ride.prior.is_near(positions).tolist() == [True, True, False]
+
+
+SAMPLES = 4000
+
+
+def spd(rng: np.random.Generator) -> Array:
+    """(6, 6) of some hundredths of radians and some tenths of metres."""
+    factor = rng.normal(size=(6, 6)) * np.repeat([0.01, 0.1], 3)[:, None]
+    return np.asarray(factor @ factor.T)
+
+
+def place(rng: np.random.Generator) -> Array:
+    return se3(so3_exp(rng.normal(size=3)), rng.normal(size=3) * 4.0)
+
+
+def drawn(mean: Array, covariance: Array, rng: np.random.Generator) -> list[Array]:
+    return [boxplus(mean, error) for error in rng.multivariate_normal(np.zeros(6), covariance, SAMPLES)]
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_place_led_back_along_the_way_and_a_place_led_on(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    known, way = Place(place(rng), spd(rng)), Place(place(rng), spd(rng))
+    pairs = list(zip(drawn(*known[:2], rng), drawn(*way[:2], rng), strict=True))
+    for (mean, claimed, _), found in (
+        (known.before(way), [at @ se3_inverse(since) for at, since in pairs]),
+        (known.at_end_of(way), [at @ since for at, since in pairs]),
+    ):
+        errors = np.array([boxminus(sample, mean) for sample in found])
+        scale = np.sqrt(np.diag(claimed))
+        np.testing.assert_allclose(
+            np.cov(errors.T) / np.outer(scale, scale), claimed / np.outer(scale, scale), atol=0.08
+        )
+        assert (np.abs(errors.mean(axis=0)) < 0.1 * scale).all()
+
+
+def test_there_and_back_is_where_one_began() -> None:
+    rng = np.random.default_rng(5)
+    known, way = Place(place(rng), spd(rng)), Place(place(rng), np.zeros((6, 6)))
+    again = known.at_end_of(way).before(way)
+    np.testing.assert_allclose(again.map_from_body, known.map_from_body, atol=1e-12)
+    np.testing.assert_allclose(again.cov_rot_trans, known.cov_rot_trans, atol=1e-12)

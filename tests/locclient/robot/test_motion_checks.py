@@ -1,18 +1,23 @@
-"""A robot drives or stands, by its wheels, its velocity, or how far its cameras moved; docks are the truth that a robot in service meets:
-compared once for each arrival, with places that it had claimed."""
+"""How fast a robot is, docks as the truth that it meets, and sensors that all others contradict: left out until they agree again."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
-from fleetmap.geometry import Array, se3, so3_exp
-from fleetmap.messages import Status
+from fleetmap.geometry import Array, rotation_angle_rad, se3, se3_inverse, so3_exp
+from fleetmap.messages import Cause, Flag, Status
 from fleetmap.odometry.estimate import OdometryStatus
-from fleetmap.sensors.samples import PositionPrior, WheelSample
+from fleetmap.sensors.rectification import Rectifier
+from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from locclient.localization.estimate import Estimate
-from locclient.robot.motion_checks import DockCheck, SpeedGauge
+from locclient.robot.motion_checks import DockCheck, SpeedGauge, WheelAgreement, imu_refused
+from locclient.robot.robot import Outcome, Robot
+from mapserver.store import MapStore
 from support.fleet.estimates import estimate
+from support.recordings.recording_samples import calibration
+from support.worlds import robot_world
 
 
 def speeds(
@@ -124,3 +129,158 @@ def test_odometry_that_begins_anew_is_no_way() -> None:
 
 def _moved(change: Array, said: Estimate) -> Array:
     return np.asarray(change @ said.odometry.odom_from_body)
+
+
+def drive(
+    agreement: WheelAgreement, mps: float, wheel_mps: float, metres: float, first: int = 0, **changes: Any
+) -> bool:
+    """Frames at 10 Hz, with changes of the odometry's estimates; whether the wheels are refused at their end."""
+    for n in range(first, first + round(metres / (0.1 * max(mps, wheel_mps)))):
+        moved = se3(np.eye(3), np.array([0.1 * mps, 0.0, 0.0]))
+        odometry = replace(estimate(0.1 * n).odometry, previous_from_body=moved, **changes)
+        wheel = WheelSample(odometry.stamp_ns, np.array([wheel_mps, 0.0, 0.0]), 0.0, 0.01, 0.01)
+        agreement.handle([wheel], odometry)
+    return agreement.is_refused
+
+
+@pytest.mark.parametrize(
+    ("factor", "metres", "is_refused"),
+    [
+        (1.0, 30.0, False),
+        (1.2, 30.0, False),
+        (-1.0, 5.0, True),
+        (0.5, 5.0, True),
+        (1000.0, 50000.0, True),
+        (0.0, 5.0, False),  # of a robot that is carried the wheels rest, too, and not for as long
+        (0.0, 20.0, True),
+    ],
+)
+def test_wheels_that_contradict_are_refused(factor: float, metres: float, *, is_refused: bool) -> None:
+    assert drive(WheelAgreement(np.eye(4)), 1.5, 1.5 * factor, metres) is is_refused
+
+
+def test_wheels_that_agree_again_are_used_again() -> None:
+    agreement = WheelAgreement(np.eye(4))
+    assert drive(agreement, 1.0, -1.0, 5.0)
+    assert drive(agreement, 1.0, 1.0, 4.0, first=50)
+    assert not drive(agreement, 1.0, 1.0, 4.0, first=90)
+
+
+@pytest.mark.parametrize("changes", [{"inlier_share": 0.1}, {"after_gap": True}])
+def test_images_that_cannot_be_followed_accuse_no_wheels(changes: dict[str, Any]) -> None:
+    """A starved processor leaves images metres apart; then it is the odometry that is wrong."""
+    assert not drive(WheelAgreement(np.eye(4)), 1.5, -1.5, 30.0, **changes)
+
+
+def test_an_imu_that_is_left_out_is_named_with_its_clock() -> None:
+    assert "turns otherwise" in imu_refused(None)["imu_refused"]
+    assert "about 0.10 s late" in imu_refused(0.101)["imu_refused"]
+    assert "about 0.20 s early" in imu_refused(-0.198)["imu_refused"]
+
+
+TURNED = so3_exp(np.array([0.0, 0.0, np.pi]))
+FRAMES = 100
+
+
+def driven(store: MapStore, *, views: int = 1, imu: float | None = 1, wheels: float | None = 1) -> list[Outcome]:
+    """Two laps of a robot in its map. imu, wheels: -1 for samples as of a body that looks back, None without them. views: 2 for a rig whose
+    second pair looks back and shows nothing."""
+    rig = calibration()
+    rear = [replace(c, body_from_cam=se3(TURNED, np.zeros(3)) @ c.body_from_cam) for c in rig.cameras]
+    rig = replace(rig, cameras=(*rig.cameras, *rear[: 2 * views - 2]), imu=None if imu is None else rig.imu)
+    robot = Robot(Rectifier(rig), robot_world.SETTINGS, robot_world.TRIAL)
+    robot.use(robot_world.loaded(store))
+    outcomes = []
+    for number, bundle in enumerate(robot_world.bundles(FRAMES)):
+        moved = se3_inverse(robot_world.truth(max(number - 1, 0))) @ robot_world.truth(number)
+        assert bundle.frame is not None
+        stamp_ns, velocity_mps = bundle.frame.stamp_ns, moved[:3, 3] / robot_world.FRAME_S * (wheels or 0)
+        turn = TURNED if imu == -1 else np.eye(3)
+        samples = ImuSamples(bundle.imu.stamps_ns, bundle.imu.gyro_radps @ turn, bundle.imu.accel_mps2 @ turn)
+        wheel = WheelSample(stamp_ns, velocity_mps, float(moved[1, 0]) / robot_world.FRAME_S, 0.05, 0.05)
+        frame = replace(bundle.frame, others=(None,) * (views - 1))
+        parts = {"imu": ImuSamples.empty() if imu is None else samples, "wheel": [] if wheels is None else [wheel]}
+        outcome = robot.handle(replace(bundle, frame=frame, **parts))
+        assert outcome is not None
+        outcomes.append(outcome)
+    return outcomes
+
+
+@pytest.mark.parametrize(
+    ("imu", "wheels", "against"),
+    [(-1, -1, "wheels and accelerometer"), (-1, None, "accelerometer"), (None, -1, "wheels")],
+)
+def test_a_robot_whose_front_and_rear_topics_are_exchanged_does_not_know_its_place(
+    store: MapStore, imu: int | None, wheels: int | None, against: str
+) -> None:
+    outcomes = driven(store, views=2, imu=imu, wheels=wheels)
+    told = next(n for n, outcome in enumerate(outcomes) if Flag.IMAGES_REFUSED in outcome.left_out)
+    assert told < FRAMES / 2
+    assert all(o.estimate.status is Status.LOST and o.estimate.map_from_body is None for o in outcomes[told + 1 :])
+    last = outcomes[-1]
+    assert list(last.left_out) == [Flag.IMAGES_REFUSED]
+    text = last.left_out[Flag.IMAGES_REFUSED]
+    assert f"by 180 degrees against {against}:" in text
+    assert "the topics of cam0 and cam1 are exchanged with those of cam2 and cam3" in text
+    assert last.estimate.calibration.text == text
+    assert [o.failure.failure.cause for o in outcomes if o.failure is not None] == [Cause.CALIBRATION]
+
+
+@pytest.mark.parametrize(
+    ("views", "imu", "wheels", "flag", "words"),
+    [
+        (1, 1, -1, Flag.WHEELS_REFUSED, "wheels drive backwards"),
+        (2, 1, -1, Flag.WHEELS_REFUSED, "wheels drive backwards"),
+        (1, 1, 1000, Flag.WHEELS_REFUSED, "they are in mm/s"),
+        (2, -1, 1, Flag.ACCELEROMETER_REFUSED, "the images contradict it"),
+    ],
+)
+def test_one_sensor_that_all_others_contradict_costs_itself(
+    store: MapStore, views: int, imu: int, wheels: float, flag: Flag, words: str
+) -> None:
+    outcomes = driven(store, views=views, imu=imu, wheels=wheels)
+    assert words in outcomes[-1].left_out[flag]
+    assert Flag.IMAGES_REFUSED not in {flag for o in outcomes for flag in o.left_out}
+    for number, outcome in enumerate(outcomes):
+        known = outcome.estimate.map_from_body
+        if outcome.estimate.status is Status.TRACKING:
+            assert known is not None
+            assert np.linalg.norm(known[:3, 3] - robot_world.truth(number)[:3, 3]) < 0.1
+    assert np.mean([o.estimate.status is Status.TRACKING for o in outcomes[20:]]) > 0.9
+
+
+@pytest.mark.parametrize("is_left", [True, False])
+def test_an_image_that_is_exchanged_with_one_of_another_view_is_named(store: MapStore, is_left: bool) -> None:
+    """The rear pair sees the room upside down."""
+    front = calibration()
+    rear_cameras = [replace(c, body_from_cam=se3(TURNED, np.zeros(3)) @ c.body_from_cam) for c in front.cameras]
+    both = replace(front, cameras=(*front.cameras, *rear_cameras))
+    robot = Robot(Rectifier(both), robot_world.SETTINGS, robot_world.TRIAL)
+    robot.use(robot_world.loaded(store))
+    outcomes = []
+    for bundle in robot_world.bundles(30):
+        seen = bundle.frame
+        left, right = (np.ascontiguousarray(image[::-1]) for image in (seen.left, seen.right))
+        rear = replace(seen, left=seen.left, right=right) if is_left else replace(seen, left=left, right=seen.right)
+        seen = replace(seen, left=left, others=(rear,)) if is_left else replace(seen, right=right, others=(rear,))
+        outcomes.append(robot.handle(replace(bundle, frame=seen)))
+    assert Status.TRACKING not in {outcome.estimate.status for outcome in outcomes}
+    assert "is exchanged with one of another view" in outcomes[-1].estimate.calibration.text
+    assert outcomes[-1].estimate.cause is Cause.CALIBRATION
+
+
+def test_while_a_gyro_contradicts_the_images_nobody_knows_which_of_them_is_right(store: MapStore) -> None:
+    """Its sign is reversed in the middle of a turn: one frame may be the images' fault, two are DEGRADED at once."""
+    robot, outcomes = Robot(robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL), []
+    robot.use(robot_world.loaded(store))
+    for number, bundle in enumerate(robot_world.bundles(60)):
+        sign = 1.0 if number < 35 else -1.0
+        outcomes.append(robot.handle(replace(bundle, imu=replace(bundle.imu, gyro_radps=sign * bundle.imu.gyro_radps))))
+    off_rad = [
+        rotation_angle_rad(o.estimate.map_from_body[:3, :3].T @ robot_world.truth(n)[:3, :3])
+        for n, o in enumerate(outcomes)
+        if o.estimate.status is Status.TRACKING
+    ]
+    assert max(off_rad) < 0.07
+    assert {o.estimate.status for o in outcomes[25:35]} == {Status.TRACKING}
+    assert any(Flag.IMU_REFUSED in o.left_out for o in outcomes)

@@ -1,4 +1,4 @@
-"""Sensors as a ROS 2 driver publishes them through rmw_zenoh, over real zenoh on loopback."""
+"""Sensors as a ROS 2 driver publishes them through rmw_zenoh, over real zenoh on loopback; frames of a rig from images one by one."""
 
 import time
 from collections.abc import Iterator
@@ -9,8 +9,19 @@ import pytest
 
 from fleetmap.bus import Bus
 from fleetmap.errors import UsageError
-from fleetmap.recordings import StoredFrame, Topics
-from fleetmap.recordings.images import decode_frame, depth_image, grey_image, png_image
+from fleetmap.geometry import se3, so3_exp
+from fleetmap.recordings import Topics
+from fleetmap.recordings.images import (
+    StoredFrame,
+    decode_depth,
+    decode_frame,
+    decode_grey,
+    depth_image,
+    grey_image,
+    png_image,
+    store_frame,
+)
+from fleetmap.recordings.ros2 import messages
 from fleetmap.recordings.ros2.messages import (
     encode_compressed_image,
     encode_image,
@@ -18,14 +29,16 @@ from fleetmap.recordings.ros2.messages import (
     encode_odometry,
     encode_prior,
 )
+from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import open_source
 from locclient.plugins.ros2_node.keys import RmwZenohKeys, attachment
-from locclient.plugins.ros2_node.source import Ros2Source, StereoPairs
+from locclient.plugins.ros2_node.source import RigFrames, Ros2Source, StereoPairs
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.recording_samples import calibration
+from support.recordings.rig_samples import simulated
 
 TOPICS = Topics(left="/rig/left/image_raw", right="/rig/right/image_raw", imu="/rig/imu")
 GID = bytes(range(16))
@@ -162,3 +175,156 @@ def test_one_camera_needs_no_right_image(has_depth: bool) -> None:
 def test_a_uvc_camera_has_a_pair() -> None:
     with pytest.raises(UsageError, match="uvc camera sends pairs"):
         open_source(SourceSection(kind="uvc", sensors="mono"), TOPICS)
+
+
+PERIOD_NS, LATE_NS = 50_000_000, 3_000_000
+IMAGE = grey_image(np.full((4, 4), 9, np.uint8))
+
+
+def rig() -> RigCalibration:
+    front, turned = calibration().cameras, se3(so3_exp(np.array([0.0, 0.0, np.pi])), np.zeros(3))
+    rear = (replace(camera, body_from_cam=turned @ camera.body_from_cam) for camera in front)
+    return RigCalibration((*front, *rear))
+
+
+def sent(frames: RigFrames, index: int, numbers: tuple[int, ...]) -> list[StoredFrame]:
+    """Return the frames that the images of these cameras complete, whose rear pair is stamped a little later."""
+    stamp_ns = 1_000_000_000 + index * PERIOD_NS
+    return [done for n in numbers for done in frames.add(n, stamp_ns + LATE_NS * (n > 1), IMAGE)]
+
+
+def test_each_frame_has_the_rear_pairs_images_although_they_come_later() -> None:
+    frames = RigFrames(rig())
+    done = [frame for k in range(6) for frame in sent(frames, k, (0, 1, 2, 3))]
+    assert [frame.stamp_ns for frame in done] == [1_000_000_000 + k * PERIOD_NS for k in range(6)]
+    later = [None if f.others[0] is None else f.others[0].stamp_ns - f.stamp_ns for f in done]
+    assert later == [None, *[LATE_NS] * 5]  # of the first nobody knew that another view sends
+
+
+def test_a_rear_pair_that_is_dead_delays_one_frame_and_comes_back() -> None:
+    frames = RigFrames(rig())
+    for k in range(3):
+        sent(frames, k, (0, 1, 2, 3))
+    counts = [len(sent(frames, k, (0, 1))) for k in range(3, 7)]
+    assert counts == [0, 2, 1, 1]
+    done = sent(frames, 7, (0, 1, 2, 3)) + sent(frames, 8, (0, 1, 2, 3))
+    assert done[-1].others[0] is not None
+
+
+def test_while_the_pair_in_front_is_dead_the_rear_pair_carries_on() -> None:
+    frames = RigFrames(rig())
+    for k in range(3):
+        sent(frames, k, (0, 1, 2, 3))
+    # It is dead for who hears nothing of it for half a second.
+    done = [frame for k in range(3, 20) for frame in sent(frames, k, (2, 3))]
+    black = [frame for frame in done if not decode_grey(frame.left).any()]
+    assert len(black) == 20 - 13 and all(frame.others[0] is not None for frame in black)
+    back = [frame for k in range(20, 24) for frame in sent(frames, k, (0, 1, 2, 3))]
+    assert all(decode_grey(frame.left).any() for frame in back)
+    stamps = [frame.stamp_ns for frame in (*done, *back)]
+    assert stamps == sorted(set(stamps))
+
+
+def black_in_front(frames: list[StoredFrame]) -> list[bool]:
+    return [not decode_grey(frame.left).any() for frame in frames]
+
+
+def test_a_front_that_never_sends_does_not_keep_the_rear_from_it() -> None:
+    frames = RigFrames(rig())
+    done = [frame for k in range(20) for frame in sent(frames, k, (2, 3))]
+    assert len(done) == 20 - 11 and all(black_in_front(done))
+    assert all(frame.others[0] is not None for frame in done)
+
+
+def test_of_two_views_beside_a_dead_one_the_first_gives_the_stamps() -> None:
+    """Side cameras 3 and 6 ms after each other: a frame a period, with both, not two."""
+    front, rear = rig().cameras[:2], rig().cameras[2]
+    turned = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3))
+    side = replace(rear, body_from_cam=turned @ rear.body_from_cam)
+    frames = RigFrames(RigCalibration((*front, rear, side)))
+
+    def at(k: int, *numbers: int) -> list[StoredFrame]:
+        stamps = {n: 1_000_000_000 + k * PERIOD_NS + LATE_NS * max(n - 1, 0) for n in numbers}
+        return [done for n, stamp_ns in stamps.items() for done in frames.add(n, stamp_ns, IMAGE)]
+
+    for k in range(3):
+        at(k, 0, 1, 2, 3)
+    done = [frame for k in range(3, 24) for frame in at(k, 2, 3)]
+    black = [frame for frame in done if not decode_grey(frame.left).any()]
+    assert len(black) == 24 - 13
+    assert all(each is not None for frame in black[1:] for each in frame.others)
+    done += [frame for k in range(24, 28) for frame in at(k, 0, 1, 3)]  # now the first of them dies
+    stamps = [frame.stamp_ns for frame in done]
+    assert stamps == sorted(set(stamps))
+    assert done[-1].others[0] is None and done[-1].others[1] is not None
+
+
+def test_a_rear_pair_with_another_clock_does_not_blind_the_front() -> None:
+    """An hour ahead, it belongs to no frame; the frames of the front are what they are."""
+    frames = RigFrames(rig())
+    done = []
+    for k in range(40):
+        stamp_ns = 1_000_000_000 + k * PERIOD_NS
+        for number in range(4):
+            done += frames.add(number, stamp_ns + 3600 * 10**9 * (number > 1), IMAGE)
+    assert [frame.stamp_ns for frame in done] == [1_000_000_000 + k * PERIOD_NS for k in range(40)]
+    assert not any(black_in_front(done)) and not any(frame.others[0] for frame in done)
+
+
+def test_images_of_half_the_rate_belong_to_every_second_frame_and_delay_no_other() -> None:
+    frames = RigFrames(rig())
+    counts, done = [], list[StoredFrame]()
+    for k in range(12):
+        found = [sent(frames, k, numbers) for numbers in ((0, 1), (2, 3) if k % 2 else ())]
+        counts.append([len(each) for each in found])
+        done += [frame for each in found for frame in each]
+    assert [frame.others[0] is not None for frame in done[4:]] == [k % 2 == 1 for k in range(4, 12)]
+    assert counts[4:] == [[1, 0], [0, 1]] * 4
+
+
+def test_a_clock_that_is_set_back_begins_anew() -> None:
+    frames = RigFrames(rig())
+    for k in range(100, 110):
+        sent(frames, k, (0, 1, 2, 3))
+    done = [frame for k in range(10) for frame in sent(frames, k, (0, 1, 2, 3))]
+    assert [frame.others[0] is not None for frame in done[-8:]] == [True] * 8
+
+
+def test_live_images_and_depth_make_one_view() -> None:
+    frames, stored = RigFrames(simulated("front-depth")[0]), store_frame(simulated("front-depth")[1][0])
+    (back,) = stored.others
+    assert back is not None and back.depth is not None and stored.right is not None
+    done = []
+    for k in range(4):
+        stamp_ns = 1_000_000_000 + k * 50_000_000
+        done += frames.add(2, stamp_ns, back.left)
+        done += frames.add(2, stamp_ns, back.depth, is_depth=True)
+        done += frames.add(0, stamp_ns, stored.left) + frames.add(1, stamp_ns, stored.right)
+    assert len(done) == 4
+    for frame in done:
+        (other,) = frame.others
+        assert other is not None and other.right is None and other.depth is back.depth and frame.depth is None
+
+
+def test_a_live_source_takes_the_topic_of_a_cameras_depth() -> None:
+    calibration, frames = simulated("front-depth")
+    hub, queue = MemoryHub(), Intake(frames=9, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
+    topics, stored = Topics(cam2_depth="/back/aligned_depth"), store_frame(frames[0])
+    (back,) = stored.others
+    assert back is not None
+    with MemoryBus(hub) as driver, MemoryBus(hub) as robot:
+        Ros2Source(robot, RmwZenohKeys(0), topics, calibration).subscribe(queue)
+        for topic, image in (
+            (topics.cam2, back.left),
+            ("/back/aligned_depth", back.depth),
+            (topics.left, stored.left),
+            (topics.right, stored.right),
+        ):
+            assert image is not None
+            payload = messages.encode_image(stored.stamp_ns, "cam", image)
+            driver.publish(RmwZenohKeys(0).key(topic, "sensor_msgs/Image"), payload)
+    frame = queue.take(1.0).frame
+    assert frame is not None
+    decoded = decode_frame(frame)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(decoded.others[0].depth_m, frames[0].others[0].depth_m)
+    assert decode_depth(back.depth).shape == (72, 96)  # type: ignore[arg-type]
