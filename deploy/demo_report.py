@@ -4,6 +4,7 @@ import json
 import sys
 import time
 from collections.abc import Sequence
+from functools import reduce
 from pathlib import Path
 from typing import Any
 from urllib.request import urlopen
@@ -51,12 +52,7 @@ REPLAY_ROWS = (
 
 def value_at(report: Report, path: str) -> Any:
     """Return the value at a dotted path; None if it or one of its parents is null."""
-    value: Any = report
-    for key in path.split("."):
-        if value is None:
-            return None
-        value = value[key]
-    return value
+    return reduce(lambda value, key: None if value is None else value[key], path.split("."), report)
 
 
 def table_of(titles: Sequence[str], reports: Sequence[Report], rows: Sequence[tuple[str, str, float, str]]) -> Table:

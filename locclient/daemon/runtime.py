@@ -83,15 +83,15 @@ class Runtime:
         # Owned by the localizing thread.
         self._figures = HealthFigures()
         self._bound_tracker = PositionBoundTracker(parts.tile_loader.settings)
-        self._last_frame_s: float | None = None
+        self._last_frame_s = time.monotonic()
         self._health_s, self._pose_ns = 0.0, -(2**62)
         self._refusals, self._unreadable = LogLimit(_log), 0
         self._cache_faults, self._outbox_counts = 0, dict[str, Figure]()
         # Owned by the disk thread.
         self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
-        self._fetched_again: set[str] = set()
+        self._fetched_again: set[tuple[WantedVersion, str]] = set()
         self._shown_grid: tuple[str, WantedVersion] | None = None  # with its site
-        self._refused_tiles: dict[str, dict[Cell, str]] = {}
+        self._refused_tiles: dict[WantedVersion, dict[Cell, str]] = {}
 
     def stop(self) -> None:
         self._stop.set()
@@ -177,8 +177,9 @@ class Runtime:
         if outcome is not None:
             self._last_frame_s = now_s
             self._after_frame(outcome)
-        elif self._last_frame_s is not None:
-            self._note_failure(robot.handle_silence(now_s - self._last_frame_s), now_s - self._last_frame_s)
+        else:
+            silent_s = now_s - self._last_frame_s
+            self._note_failure(robot.handle_silence(silent_s), silent_s)
         self._held = [loaded.wanted for loaded in robot.held]
         if server is not None:
             server.changes.extend(robot.take_changes())
@@ -233,7 +234,7 @@ class Runtime:
         self._manager.alive("no frames come" if is_silent else status)
 
     def _is_silent(self) -> bool:
-        return self._last_frame_s is not None and time.monotonic() - self._last_frame_s > _SILENT_S
+        return time.monotonic() - self._last_frame_s > _SILENT_S
 
     def _health(self) -> RobotHealth:
         counts: dict[str, Figure] = dict(asdict(self._parts.intake.counts))
@@ -282,7 +283,9 @@ class Runtime:
             try:
                 loaded = loader.load(version, bound)
             except FleetmapError as error:
-                self._note_unusable(version, str(error))
+                _log.warning("version %s cannot be loaded: %s", version.version, error)
+                self._offers.pop(version.manifest_sha256 or "", None)
+                self._fetches_again(version)
                 continue
             if loaded is not None:
                 self._loaded.append(replace(loaded, is_offer=version not in held))
@@ -290,8 +293,7 @@ class Runtime:
         if held:
             self._show_grid(held[0])
         loader.keep_only(wanted)
-        known = {version.manifest_sha256 or "" for version in wanted}
-        self._refused_tiles = {sha256: cells for sha256, cells in self._refused_tiles.items() if sha256 in known}
+        self._refused_tiles = {version: cells for version, cells in self._refused_tiles.items() if version in wanted}
 
     def _show_grid(self, version: WantedVersion) -> None:
         """Publish the grid of the map in which the robot is: of the confirmed version, or of another site's. If an older client did not
@@ -310,30 +312,27 @@ class Runtime:
             else:
                 grid = self._parts.tile_loader.grid(version, height_m)
         except FleetmapError as error:
-            why, key = str(error), f"grid {version.manifest_sha256}"
+            why = str(error)
             if was_elsewhere:  # a planner must not use the grid of where the robot was
                 _send(partial(publisher.show_grid, version.version or 0, NO_GRID, ""))
-            may_fetch = not site and isinstance(error, LinkError) and key not in self._fetched_again
-            if may_fetch and self._server is not None:
-                self._fetched_again.add(key)
-                self._server.refetch.append(version)
+            if not site and isinstance(error, LinkError) and self._fetches_again(version, "grid"):
                 return
         _send(partial(publisher.show_grid, version.version or 0, grid, why))
 
-    def _note_unusable(self, version: WantedVersion, reason: str) -> None:
-        """Fetch a version without manifest or tiles again, once; drop it if there is no server."""
-        _log.warning("version %s cannot be loaded: %s", version.version, reason)
-        self._offers.pop(version.manifest_sha256 or "", None)
-        if self._server is not None and version.manifest_sha256 not in self._fetched_again:
-            self._fetched_again.add(version.manifest_sha256 or "")
-            self._server.refetch.append(version)
+    def _fetches_again(self, version: WantedVersion, piece: str = "") -> bool:
+        """Fetch a version again for a missing piece, once for each; False without a server, or if that did not help."""
+        if self._server is None or (version, piece) in self._fetched_again:
+            return False
+        self._fetched_again.add((version, piece))
+        self._server.refetch.append(version)
+        return True
 
     def _note_refused_tiles(self, version: WantedVersion) -> None:
         """Log refused tiles once, and request them again."""
-        refused, sha256 = self._parts.tile_loader.refused(version), version.manifest_sha256 or ""
-        if refused == self._refused_tiles.get(sha256, {}):
+        refused = self._parts.tile_loader.refused(version)
+        if refused == self._refused_tiles.get(version, {}):
             return
-        self._refused_tiles[sha256] = refused
+        self._refused_tiles[version] = refused
         for cell, reason in refused.items():
             _log.warning("tile %s of version %s is refused: %s", cell, version.version, reason)
         if refused and self._server is not None:
