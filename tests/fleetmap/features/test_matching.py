@@ -52,41 +52,25 @@ def test_knn2_of_too_few() -> None:
     assert first[0] == 0
     assert (second == FAR).all()
     assert len(hamming_knn2(nothing, a)[0]) == 0
-    assert match_mutual(nothing, a, 64, 0.8).shape == (0, 2)
-    assert match_mutual(a, nothing, 64, 0.8).shape == (0, 2)
 
 
-@pytest.mark.parametrize(("max_distance", "ratio"), [(256, 1.0), (64, 0.8), (30, 0.95)])
-def test_mutual_is_brute_force(max_distance: int, ratio: float) -> None:
-    a, b = _family(np.random.default_rng(max_distance), 70)
-    table = _distances(a, b)
-    wanted = []
-    for i in range(len(a)):
-        j = int(table[i].argmin())
-        second = np.sort(table[i])[1]
-        if table[i, j] <= max_distance and table[i, j] < ratio * second and table[:, j].argmin() == i:
-            wanted.append((i, j))
-    assert len(wanted) > 5
-    np.testing.assert_array_equal(match_mutual(a, b, max_distance, ratio), wanted)
-
-
-@pytest.mark.parametrize(("max_distance", "ratio", "count"), [(256, 0.99, 4), (64, 0.8, 3), (64, 0.8, 1)])
-def test_mutual_within_nodes_is_brute_force_over_what_shares_one(max_distance: int, ratio: float, count: int) -> None:
-    rng = np.random.default_rng(count)
+@pytest.mark.parametrize("nodes", [0, 1, 3, 4])  # 0: all with all
+@pytest.mark.parametrize(("max_distance", "ratio"), [(256, 0.99), (256, 1.0), (64, 0.8), (30, 0.95)])
+def test_mutual_is_brute_force_over_what_shares_a_node(max_distance: int, ratio: float, nodes: int) -> None:
+    rng = np.random.default_rng(max_distance + nodes)
     a, b = _family(rng, 70)
-    nodes_a, nodes_b = (rng.integers(0, count, shape).astype(np.int32) for shape in ((len(a), 2), len(b)))
-    table = _distances(a, b)
+    nodes_a, nodes_b = (rng.integers(0, max(nodes, 1), shape).astype(np.int32) for shape in ((len(a), 2), len(b)))
+    table, wanted = _distances(a, b), []
     table[~(nodes_a[:, :, None] == nodes_b).any(axis=1)] = FAR
-    wanted = []
-    for i in range(len(a)):
-        j = int(table[i].argmin())
-        if table[i, j] <= max_distance and table[i, j] < ratio * np.sort(table[i])[1] and table[:, j].argmin() == i:
+    for i, row in enumerate(table):
+        j = int(row.argmin())
+        if row[j] <= max_distance and row[j] < ratio * np.sort(row)[1] and table[:, j].argmin() == i:
             wanted.append((i, j))
     assert len(wanted) > 5
-    np.testing.assert_array_equal(match_mutual(a, b, max_distance, ratio, (nodes_a, nodes_b)), wanted)
-    nothing = np.zeros((0, 32), np.uint8)
-    assert match_mutual(nothing, b, 64, 0.8, (nodes_a[:0], nodes_b)).shape == (0, 2)
-    assert match_mutual(a, nothing, 64, 0.8, (nodes_a, nodes_b[:0])).shape == (0, 2)
+    nothing, within = np.zeros((0, 32), np.uint8), (nodes_a, nodes_b) if nodes else None
+    np.testing.assert_array_equal(match_mutual(a, b, max_distance, ratio, within), wanted)
+    assert match_mutual(nothing, b, 64, 0.8, within and (nodes_a[:0], nodes_b)).shape == (0, 2)
+    assert match_mutual(a, nothing, 64, 0.8, within and (nodes_a, nodes_b[:0])).shape == (0, 2)
 
 
 def _projection_twin(

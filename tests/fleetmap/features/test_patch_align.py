@@ -40,6 +40,15 @@ def facing(reference_from_current: Array) -> Array:
     return np.concatenate([reference_from_current, np.zeros((len(reference_from_current), 2, 1))], axis=2)
 
 
+def aligned(before: Array, pixels: Array, now: Array, start: Array, warps: Array, octave: int = 0) -> Array:
+    """(N, 3) places in the picture now, from a start, of what was at pixels before; octave: of all its features."""
+    patches = [
+        Patches(half_pyramid(image), at, np.full(len(at), level, np.int8))
+        for image, at, level in ((before, pixels, 0), (now, start, octave))
+    ]
+    return patch_align.refine_matches(*patches, np.broadcast_to(warps, (len(pixels), 2, 3)).copy(), SETTINGS)
+
+
 @pytest.mark.parametrize(
     "current_from_reference",
     [np.eye(2), similarity(1.0, 30.0), similarity(1.15, -10.0), np.array([[1.1, 0.1], [-0.05, 0.9]])],
@@ -51,14 +60,7 @@ def test_known_warps_are_recovered(texture: Texture, current_from_reference: Arr
     pixels = core.spread_corners(reference, 120, 10.0, 12, 50, NOTHING)[0].astype(np.float64)
     expected = (pixels - CENTRE) @ current_from_reference.T + CENTRE
     start = expected + np.random.default_rng(1).uniform(-1.0, 1.0, expected.shape)
-    level0 = np.zeros(len(pixels), np.int8)
-    warp = facing(np.repeat(np.linalg.inv(current_from_reference)[None], len(pixels), axis=0))
-    found = patch_align.refine_matches(
-        Patches(half_pyramid(reference), pixels, level0),
-        Patches(half_pyramid(current), start, level0),
-        warp,
-        SETTINGS,
-    )
+    found = aligned(reference, pixels, current, start, facing(np.linalg.inv(current_from_reference)[None]))
     error = np.linalg.norm(found[:, :2] - expected, axis=1)
     assert np.isfinite(error).mean() > 0.8
     assert np.nanmedian(error) < 0.05
@@ -72,14 +74,7 @@ def test_features_of_different_octaves_meet_across_scales() -> None:
     reference, current = warped_pair(texture, similarity(1.9, 0.0))
     pixels = core.spread_corners(reference, 60, 8.0, 12, 75, NOTHING)[0].astype(np.float64)
     expected = (pixels - CENTRE) * 1.9 + CENTRE
-    count = len(pixels)
-    warp = facing(np.repeat(similarity(1 / 1.9, 0.0)[None], count, axis=0))
-    found = patch_align.refine_matches(
-        Patches(half_pyramid(reference), pixels, np.zeros(count, np.int8)),
-        Patches(half_pyramid(current), expected + 0.7, np.full(count, 4, np.int8)),
-        warp,
-        SETTINGS,
-    )
+    found = aligned(reference, pixels, current, expected + 0.7, facing(similarity(1 / 1.9, 0.0)[None]), octave=4)
     error = np.linalg.norm(found[:, :2] - expected, axis=1)
     assert np.isfinite(error).mean() > 0.5
     assert np.nanmedian(error) < 0.15
@@ -89,14 +84,8 @@ def test_patches_that_do_not_agree_are_refused(texture: Texture) -> None:
     u, v = pixel_grid(WIDTH, HEIGHT)
     reference, other = picture(texture, u, v), picture(smooth_texture(np.random.default_rng(77)), u, v)
     pixels = core.spread_corners(reference, 120, 10.0, 12, 30, NOTHING)[0].astype(np.float64)
-    level0, warp = np.zeros(len(pixels), np.int8), facing(np.repeat(np.eye(2)[None], len(pixels), axis=0))
     for current in (other, np.full_like(reference, 90)):
-        found = patch_align.refine_matches(
-            Patches(half_pyramid(reference), pixels, level0),
-            Patches(half_pyramid(current), pixels, level0),
-            warp,
-            SETTINGS,
-        )
+        found = aligned(reference, pixels, current, pixels, facing(np.eye(2)[None]))
         assert np.isfinite(found[:, 0]).mean() < 0.12
 
 
@@ -156,13 +145,11 @@ def test_a_wall_along_the_way_does_not_draw_patches_back() -> None:
     points = places_on_wall(pixels, np.eye(4))[0]
     current_from_reference = np.linalg.inv(reference_from_current)
     expected = CAMERA.pixel_from_point(transform_points(current_from_reference, points))[:, :2]
-    seen = [Patches(half_pyramid(grey[0]), pixels, np.zeros(len(pixels), np.int8))]
-    seen.append(Patches(half_pyramid(grey[1]), expected + 0.5, np.zeros(len(pixels), np.int8)))
     warps = patch_align.warps_from_motion(points, current_from_reference)
-    found = patch_align.refine_matches(seen[0], seen[1], warps, SETTINGS)
+    found = aligned(grey[0], pixels, grey[1], expected + 0.5, warps)
     error = np.linalg.norm(found[:, :2] - expected, axis=1)
     assert np.isfinite(error).mean() > 0.7
     assert np.nanmedian(error) < 0.05
     assert np.nanpercentile(error, 90) < 0.2
-    flat = patch_align.refine_matches(seen[0], seen[1], facing(warps[..., :2]), SETTINGS)
+    flat = aligned(grey[0], pixels, grey[1], expected + 0.5, facing(warps[..., :2]))
     assert np.nanmedian(np.linalg.norm(flat[:, :2] - expected, axis=1)) > 3 * np.nanmedian(error)

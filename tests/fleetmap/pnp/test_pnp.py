@@ -6,7 +6,7 @@ import pytest
 
 from fleetmap import core
 from fleetmap.geometry import Array, rotation_angle_rad, se3_exp, se3_inverse, se3_log, transform_points
-from fleetmap.pnp.pnp import Correspondences, pnp_with_rotation, ransac_pnp, refine_pnp
+from fleetmap.pnp.pnp import Correspondences, PnpResult, pnp_with_rotation, ransac_pnp, refine_pnp
 from fleetmap.sensors.rectification import StereoCamera
 
 CAMERA = StereoCamera(400.0, 320.0, 240.0, 0.12, 640, 480)
@@ -27,6 +27,11 @@ def seen(rng: np.random.Generator, count: int, *, noise: float = 0.0) -> tuple[A
 
 def error(cam_from_map: Array) -> Array:
     return se3_log(CAM_FROM_MAP @ se3_inverse(cam_from_map))
+
+
+def with_rotation(seen: tuple[Array, Array, Array], rotation: Array, sigma_rad: float = 0.01) -> PnpResult | None:
+    matches = Correspondences(CAMERA, *seen)
+    return pnp_with_rotation(matches, rotation, threshold_px=8.0, min_inliers=8, rotation_sigma_rad=sigma_rad)
 
 
 def test_clean_data_gives_the_camera_and_agrees_with_opencv() -> None:
@@ -150,13 +155,7 @@ def test_known_rotation_survives_70_percent_outliers() -> None:
     pixels[:wrong, 0], pixels[:wrong, 1] = rng.uniform(0, 640, wrong), rng.uniform(0, 480, wrong)
     pixels[:wrong, 2] = pixels[:wrong, 0] - rng.uniform(5, 40, wrong)
     nearly = se3_exp(np.array([0.004, -0.003, 0.005, 0, 0, 0]))[:3, :3] @ CAM_FROM_MAP[:3, :3]
-    found = pnp_with_rotation(
-        Correspondences(CAMERA, points, pixels, sigmas),
-        nearly,
-        threshold_px=8.0,
-        min_inliers=8,
-        rotation_sigma_rad=0.01,
-    )
+    found = with_rotation((points, pixels, sigmas), nearly)
     assert found is not None
     assert found.inliers[wrong:].mean() > 0.85
     assert found.inliers[:wrong].mean() < 0.1
@@ -166,15 +165,8 @@ def test_known_rotation_survives_70_percent_outliers() -> None:
 
 @pytest.mark.parametrize("sigma_rad", [1e-5, 0.1])
 def test_known_rotation_is_held_as_firmly_as_it_says(sigma_rad: float) -> None:
-    points, pixels, sigmas = seen(np.random.default_rng(11), 30)
     given = se3_exp(np.array([0.004, 0, 0, 0, 0, 0]))[:3, :3] @ CAM_FROM_MAP[:3, :3]
-    found = pnp_with_rotation(
-        Correspondences(CAMERA, points, pixels, sigmas),
-        given,
-        threshold_px=8.0,
-        min_inliers=8,
-        rotation_sigma_rad=sigma_rad,
-    )
+    found = with_rotation(seen(np.random.default_rng(11), 30), given, sigma_rad)
     assert found is not None
     turned = rotation_angle_rad(found.cam_from_source[:3, :3] @ given.T)
     assert turned < 0.001 if sigma_rad < 0.01 else turned == pytest.approx(0.004, abs=1e-4)
@@ -184,18 +176,8 @@ def test_nothing_that_agrees_gives_nothing() -> None:
     rng = np.random.default_rng(8)
     points, pixels, sigmas = seen(rng, 40)
     points = rng.uniform(-3, 3, points.shape)
-    rotation = CAM_FROM_MAP[:3, :3]
     assert ransac_pnp(Correspondences(CAMERA, points, pixels, sigmas), threshold_px=2.0, min_inliers=12, seed=1) is None
-    assert (
-        pnp_with_rotation(
-            Correspondences(CAMERA, points, pixels, sigmas),
-            rotation,
-            threshold_px=4.0,
-            min_inliers=12,
-            rotation_sigma_rad=0.01,
-        )
-        is None
-    )
+    assert with_rotation((points, pixels, sigmas), CAM_FROM_MAP[:3, :3]) is None
     empty = np.zeros((0, 3))
     assert refine_pnp(Correspondences(CAMERA, empty, empty, np.zeros((0, 2))), CAM_FROM_MAP) is None
     behind = transform_points(se3_inverse(CAM_FROM_MAP), np.array([[0.0, 0.0, -2.0]] * 5))

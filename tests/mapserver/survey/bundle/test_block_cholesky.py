@@ -106,12 +106,6 @@ def test_refuses_unknowns_that_nothing_measures_and_numbers_that_are_none(bad: f
     assert problem.solve(np.ones(len(problem.matrix))) is None
 
 
-def test_nodes_that_are_not_coupled_have_no_place() -> None:
-    pattern = block_cholesky(np.full(4, 6), np.array([[0, 1], [2, 3]]))
-    with pytest.raises(ValueError, match="coupled"):
-        pattern.places(np.array([3]), np.array([0]))
-
-
 def test_a_chain_fills_in_nothing() -> None:
     """Whatever number its nodes have: a chain's factor has no more blocks than the chain, but for zeros taken in on purpose."""
     numbers = np.random.default_rng(1).permutation(5000)
