@@ -13,16 +13,17 @@ from functools import partial
 import numpy as np
 
 from fleetmap.bus import Bus
-from fleetmap.errors import FleetmapError, UsageError
+from fleetmap.errors import FleetmapError, RecordingError, UsageError
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse, so3_log
 from fleetmap.messages import Status
 from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.odometry.estimate import OdometryStatus
+from fleetmap.recordings.ros2 import messages
 from fleetmap.recordings.ros2.cdr import pack, unpack
 from fleetmap.recordings.ros2.messages import FrameLink, decode_frame_links, encode_frame_links, encode_prior
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.samples import PositionPrior
+from fleetmap.sensors.samples import UNSAID_SIGMAS, PositionPrior
 from fleetmap.sensors.source_settings import Topics
 from fleetmap.sources.intake import Intake
 from locclient.hooks import OutputHook
@@ -31,19 +32,6 @@ from locclient.localization.place import transport_cov
 from locclient.outputs import OutputSection, Publisher
 from locclient.plugins.ros2_node.driver_odometry import DriverOdometry
 from locclient.plugins.ros2_node.keys import LATCHED, Qos, key_layout
-from locclient.plugins.ros2_node.navigation_messages import (
-    EMPTY,
-    BondStatus,
-    Diagnosis,
-    Motion,
-    decode_bond,
-    decode_initial_pose,
-    encode_bond,
-    encode_diagnostics,
-    encode_grid,
-    encode_motion,
-    encode_text,
-)
 from locclient.plugins.ros2_node.node import Ros2Node
 from locclient.robot.continuous_odom import PublishedPose
 
@@ -105,37 +93,25 @@ def requested(request: bytes, state: LifecycleState) -> Transition | None:
     return next((one for one in here if (one.label == label if label else one.id == number)), None)
 
 
-def encode_state(state: LifecycleState) -> bytes:
-    """Encode the response of lifecycle_msgs/srv/GetState."""
-    return pack("lifecycle_msgs/srv/GetState_Response", *_named(state))
-
-
-def encode_states() -> bytes:
-    """Encode the response of lifecycle_msgs/srv/GetAvailableStates."""
-    return pack("lifecycle_msgs/srv/GetAvailableStates_Response", [_named(state) for state in LifecycleState])
-
-
 def encode_transitions(transitions: Sequence[Transition], *, with_success: bool = False) -> bytes:
     """Encode the response of lifecycle_msgs/srv/GetAvailableTransitions; with_success: include those out of transition states."""
     both = [[one.steps[number] for one in transitions] for number in range(1 + with_success)]
-    steps = dict.fromkeys(_values(step) for listed in both for step in listed)
+    steps = dict.fromkeys(step_values(step) for listed in both for step in listed)
     return pack("lifecycle_msgs/srv/GetAvailableTransitions_Response", steps)
 
 
-def encode_events(stamp_ns: int, transition: Transition) -> list[bytes]:
-    """Encode two lifecycle_msgs/TransitionEvent: into the transition state, and out of it."""
-    return [pack("lifecycle_msgs/TransitionEvent", stamp_ns, *_values(step)) for step in transition.steps]
-
-
-def _named(state: LifecycleState) -> tuple[int, str]:
+def named(state: LifecycleState) -> tuple[int, str]:
+    """Return the values of a lifecycle_msgs/State."""
     return state.value, state.name.lower()
 
 
-def _values(step: Step) -> tuple[int | str, ...]:
+def step_values(step: Step) -> tuple[int | str, ...]:
+    """Return the values of a lifecycle_msgs/TransitionDescription."""
     number, label, start, goal = step
-    return number, label, *_named(start), *_named(goal)
+    return number, label, *named(start), *named(goal)
 
 
+EMPTY = pack("std_srvs/srv/Empty_Response", 0)
 _BOND_PERIOD_S, _BOND_TIMEOUT_S = 0.1, 4.0  # as in nav2
 _STUCK_S = 3.0  # without a sign of life from the localizing thread, after which the bond is not renewed
 _OK, _WARN, _ERROR = 0, 1, 2
@@ -167,7 +143,7 @@ class Ros2Localizer(Publisher):
         self._fix_refused = ""  # by the newest finished query: most frames finish none
         self._refused: deque[str] = deque(maxlen=1)
         self._alive_s = time.monotonic()
-        self._bond: BondStatus | None = None
+        self._bond = ""  # id of our side while there is one
         self._building_from_map: Array | None = None
         self._sent_tf: deque[bytes] = deque(maxlen=_OWN_TF)
         self._other_s, self._other = -_OTHER_S, ""
@@ -204,9 +180,11 @@ class Ros2Localizer(Publisher):
         node.subscribe(section.tf_topic, "tf2_msgs/TFMessage", self._hear_tf, Qos(100))
         if not section.publish_odom:
             node.subscribe(f"{section.tf_topic}_static", "tf2_msgs/TFMessage", self._driver.handle_tf_static, LATCHED)
-        node.serve("~/get_state", "lifecycle_msgs/srv/GetState", lambda _: encode_state(self._state))
+        state, states = "lifecycle_msgs/srv/GetState", "lifecycle_msgs/srv/GetAvailableStates"
+        known = pack(f"{states}_Response", [named(one) for one in LifecycleState])
+        node.serve("~/get_state", state, lambda _: pack(f"{state}_Response", *named(self._state)))
         node.serve("~/change_state", "lifecycle_msgs/srv/ChangeState", self._change_state)
-        node.serve("~/get_available_states", "lifecycle_msgs/srv/GetAvailableStates", lambda _: encode_states())
+        node.serve("~/get_available_states", states, lambda _: known)
         transitions = "lifecycle_msgs/srv/GetAvailableTransitions"
         node.serve(
             "~/get_available_transitions",
@@ -250,8 +228,8 @@ class Ros2Localizer(Publisher):
             odometry_frame = f"{section.sensor_frames or OutputSection().sensor_frames}odom"
         if before is not None and estimate.odometry.scale_known and stamp_ns > before[0].stamp_ns:
             motion = motion_between(before, (estimate, published), base_from_body)
-            self._send_odom(encode_motion(stamp_ns, odometry_frame, section.base_frame, motion))
-        self._send_status(encode_text(estimate.status.value))
+            self._send_odom(messages.encode_motion(stamp_ns, odometry_frame, section.base_frame, *motion))
+        self._send_status(pack("std_msgs/String", estimate.status.value))
 
     def _send_map_link(self, stamp_ns: int, map_from_odom: Array) -> None:
         if self._state is not LifecycleState.ACTIVE:  # deactivated while the frame waited for the driver's pose
@@ -266,9 +244,12 @@ class Ros2Localizer(Publisher):
 
     def alive(self, is_silent: bool) -> None:
         self._alive_s = time.monotonic()
-        self._send_diagnostics(encode_diagnostics(time.time_ns(), [self._diagnosis(is_silent)]))
+        level, words, values = self._diagnosis(is_silent)
+        status = (level, f"{self._section.node}: localization", words, self._robot, values.items())
+        self._send_diagnostics(pack("diagnostic_msgs/DiagnosticArray", time.time_ns(), "", [status]))
 
-    def _diagnosis(self, is_silent: bool) -> Diagnosis:
+    def _diagnosis(self, is_silent: bool) -> tuple[int, str, dict[str, str]]:
+        """Return level, message and values of a diagnostic_msgs/DiagnosticStatus."""
         estimate = None if self._last is None else self._last[0]
         level, words = _WARN, "no frame yet"
         values = {"lifecycle": self._state.name.lower(), "map": self._map_words}
@@ -296,7 +277,7 @@ class Ros2Localizer(Publisher):
             level, words = _ERROR, "no frames come"
         if self._refused:
             values["refused_initial_pose"] = self._refused[0]
-        return Diagnosis(level, f"{self._section.node}: localization", words, self._robot, values)
+        return level, words, values
 
     def _tf_fault(self) -> str:
         """Return the reason why /tf is unusable for planners, empty if it is usable. Log its begin and end."""
@@ -353,9 +334,9 @@ class Ros2Localizer(Publisher):
             self._state = transition.goal
             if transition.goal is LifecycleState.ACTIVE:
                 self._send_latched()
-                self._bond = BondStatus(self._section.node, str(uuid.uuid4()), is_active=True)
-        for event in encode_events(time.time_ns(), transition):
-            self._send_event(event)
+                self._bond = str(uuid.uuid4())
+        for step in transition.steps:
+            self._send_event(pack("lifecycle_msgs/TransitionEvent", time.time_ns(), *step_values(step)))
         _log.info("the node is %s", transition.goal.name.lower())
         return pack("lifecycle_msgs/srv/ChangeState_Response", True)
 
@@ -392,31 +373,33 @@ class Ros2Localizer(Publisher):
     def _beat(self) -> None:
         while not self._ended.wait(_BOND_PERIOD_S):
             bond = self._bond
-            if bond is not None and time.monotonic() - self._alive_s < _STUCK_S:
-                self._tell_bond(bond)
+            if bond and time.monotonic() - self._alive_s < _STUCK_S:
+                self._tell_bond(bond, is_active=True)
 
     def _hear_bond(self, message: bytes) -> None:
         """Acknowledge the end of the other side, as bondcpp does; the node stays active."""
-        other, own = decode_bond(message), self._bond
-        if own is not None and other.bond == own.bond and other.instance != own.instance and not other.is_active:
+        _, _, name, instance, is_active, *_ = unpack("bond/Status", message)
+        if self._bond and name == self._section.node and instance != self._bond and not is_active:
             self._break_bond()
 
     def _break_bond(self) -> None:
-        bond, self._bond = self._bond, None
-        if bond is not None:
-            self._tell_bond(BondStatus(bond.bond, bond.instance, is_active=False))
+        bond, self._bond = self._bond, ""
+        if bond:
+            self._tell_bond(bond, is_active=False)
 
-    def _tell_bond(self, bond: BondStatus) -> None:
+    def _tell_bond(self, bond: str, *, is_active: bool) -> None:
+        said = time.time_ns(), "", self._section.node, bond, is_active, _BOND_TIMEOUT_S, _BOND_PERIOD_S
         try:
-            self._send_bond(encode_bond(time.time_ns(), bond, _BOND_TIMEOUT_S, _BOND_PERIOD_S))
+            self._send_bond(pack("bond/Status", *said))
         except FleetmapError as error:
             _log.debug("the bond was not renewed: %s", error)
 
 
 def motion_between(
     before: tuple[Estimate, PublishedPose], after: tuple[Estimate, PublishedPose], base_from_body: Array
-) -> Motion:
-    """Return the mean velocity between two consecutive frames."""
+) -> tuple[Array, Array, Array, Array]:
+    """Return a frame's odom_from_base (4, 4) with its covariance (6, 6), and the mean velocity of the base since the frame before, in its
+    own axes (6,), linear m/s, then angular rad/s, with its covariance (6, 6); all in the order of ROS, translation first."""
     (earlier, then), (estimate, now) = before, after
     odometry, seconds = estimate.odometry, (estimate.stamp_ns - earlier.stamp_ns) * 1e-9
     step = se3_inverse(then.odom_from_base) @ now.odom_from_base
@@ -429,7 +412,42 @@ def motion_between(
     both = np.kron(np.eye(2), published_from_odometry)
     lever_m = now.odom_from_base[:3, :3] @ base_from_body[:3, 3]
     covariance = transport_cov(both @ odometry.cov_rot_trans @ both.T, -lever_m)
-    return Motion(now.odom_from_base, covariance, twist, twist_cov)
+    return now.odom_from_base, covariance[messages.HALVES_SWAPPED], twist, twist_cov
+
+
+def decode_initial_pose(data: bytes, map_frame: str) -> PositionPrior:
+    """geometry_msgs/PoseWithCovarianceStamped of an operator: a prior from now on, independent of its stamp.
+
+    RecordingError for another frame, a pose or covariance that is not finite, and an invalid covariance.
+    """
+    _, frame_id = messages.header_of(data)
+    if frame_id.lstrip("/") != map_frame:
+        raise RecordingError(f"an initial pose in the frame {frame_id!r} is not used; give it in {map_frame!r}")
+    try:
+        prior = messages.decode_prior(data)
+    except ValueError as error:
+        raise RecordingError(f"an initial pose is not used: {error}; give a finite pose and a quaternion") from error
+    cov = prior.cov_rot_trans
+    if not np.isfinite(cov).all():
+        raise RecordingError(
+            "an initial pose is not used: its covariance holds NaN or infinity; give variances, or zeros"
+        )
+    if not np.allclose(cov, cov.T, atol=1e-6) or np.linalg.eigvalsh((cov + cov.T) / 2)[0] < -1e-6:
+        raise RecordingError(
+            "an initial pose is not used: its covariance is not symmetric and positive; check its order"
+        )
+    said = np.diag(cov) > 0
+    unsaid = np.diag(np.where(said, 0.0, UNSAID_SIGMAS**2))
+    cov = np.where(np.outer(said, said), (cov + cov.T) / 2, 0.0) + unsaid
+    return PositionPrior(0, prior.map_from_base, cov, is_revisable=True)
+
+
+def encode_grid(stamp_ns: int, frame_id: str, grid: OccupancyGrid) -> bytes:
+    """nav_msgs/OccupancyGrid."""
+    height, width = grid.cells.shape
+    place, cells = messages.position_quat_xyzw(grid.map_from_grid), np.ascontiguousarray(grid.cells, np.int8).tobytes()
+    size = grid.resolution_m, width, height
+    return pack("nav_msgs/OccupancyGrid", stamp_ns, frame_id, stamp_ns, *size, place, cells)
 
 
 def sensor_links(section: OutputSection, calibration: RigCalibration) -> list[FrameLink]:
