@@ -26,7 +26,7 @@ from locclient.robot.robot import ImagePriors, Outcome
 from locclient.robot.version_trial import VersionChange
 
 if TYPE_CHECKING:
-    from fleetmap.bus import Bus
+    from fleetmap.bus.zenoh_bus import Bus
     from fleetmap.geometry import Array
     from fleetmap.sensors.calibration import RigCalibration
     from fleetmap.sensors.rectification import MountedCamera

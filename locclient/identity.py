@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, Self
 
 import msgspec
 
-from fleetmap.bus import Bus, TlsFiles, check_endpoint, handshake_fault, has_tls, is_loopback
+from fleetmap.bus.endpoints import TlsFiles, check_endpoint, handshake_fault, has_tls, is_loopback
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.encoding import to_json
 from fleetmap.errors import LinkError, StateError, UsageError, disk_errors
 from fleetmap.files import write_atomically

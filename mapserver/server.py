@@ -19,7 +19,7 @@ import uvicorn
 from fastapi import FastAPI
 from uvicorn.middleware.proxy_headers import ProxyHeadersMiddleware
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import UsageError
 from fleetmap.hooks import plugin
 from fleetmap.log_lines import log_to_stderr

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import cv2
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import LinkError, UsageError
 from fleetmap.free_memory import gc_frozen, give_back_free_memory
 from fleetmap.messages import WantedVersion

@@ -1,6 +1,6 @@
 """Publishers of estimates to the robot's own programs. To add one: a class, and a plug-in's `OutputHook` or a line in OUTPUTS."""
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.hooks import plugins

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from fleetmap.bus import Bus, is_loopback
+from fleetmap.bus.endpoints import is_loopback
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.trust import TrustedMap, ask_over
 from locclient.identity import MapAddress

@@ -8,7 +8,7 @@ from typing import TypeVar
 
 import msgspec
 
-from fleetmap.bus import Bus, Handle
+from fleetmap.bus.zenoh_bus import Bus, Handle
 from fleetmap.errors import LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
 from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame, aligned_frame
 from fleetmap.mapformat.manifest import MAX_MANIFEST_BYTES, Manifest, TileEntry

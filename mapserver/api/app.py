@@ -13,7 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import fleetmap
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.encoding import to_json
 from fleetmap.mapformat.manifest import MANIFEST_FORMAT
 from fleetmap.mapformat.tile_codec import TILE_FORMAT

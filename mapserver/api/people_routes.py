@@ -8,7 +8,8 @@ from collections.abc import Iterable
 from fastapi import FastAPI, Request, Response
 from starlette.exceptions import HTTPException
 
-from fleetmap.bus import Bus, check_endpoint, has_tls
+from fleetmap.bus.endpoints import check_endpoint, has_tls
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import StateError, UsageError
 from mapserver.api import parameters as p
 from mapserver.api import views

@@ -39,7 +39,7 @@ def enrol(
 
     A bundle is secret until it is used: transfer it on a USB stick or over SSH.
     """
-    from fleetmap.bus import check_endpoint
+    from fleetmap.bus.endpoints import check_endpoint
     from fleetmap.files import write_atomically
     from mapserver.trust.enrolment import LISTENING, RobotRegister
 

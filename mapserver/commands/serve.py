@@ -125,7 +125,7 @@ def serve(
     raise_file_limit()
     host, port = at.host_and_port()
     typer.echo(f"mapserver serve is starting with the store {store}; `ready` follows", err=True)
-    from fleetmap.bus import check_endpoint
+    from fleetmap.bus.endpoints import check_endpoint
     from mapserver.server import Server, end_process, listening
     from mapserver.serving.bus_access import check_binding, prepare_bus
     from mapserver.trust import prepare_lists

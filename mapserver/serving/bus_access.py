@@ -5,7 +5,8 @@ import time
 from collections import Counter
 from collections.abc import Callable
 
-from fleetmap.bus import Bus, has_tls, is_loopback
+from fleetmap.bus.endpoints import has_tls, is_loopback
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import UsageError
 from fleetmap.log_lines import LogLimit
 from mapserver.store import MapStore

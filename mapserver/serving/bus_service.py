@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import msgspec
 
-from fleetmap.bus import Bus, Handle
+from fleetmap.bus.zenoh_bus import Bus, Handle
 from fleetmap.errors import FleetmapError, LinkError
 from fleetmap.failure_summary import ReplayPart
 from fleetmap.log_lines import LogLimit

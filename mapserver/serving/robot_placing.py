@@ -2,7 +2,7 @@
 
 import math
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import StateError, UsageError
 from fleetmap.messages import InitialPoseMessage, encode_message, robot_key
 from mapserver.fleet.fleet import Fleet, RobotStatus

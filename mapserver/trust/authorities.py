@@ -20,7 +20,7 @@ from cryptography.hazmat.primitives import serialization as s
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from fleetmap.bus import TlsFiles
+from fleetmap.bus.endpoints import TlsFiles
 from fleetmap.errors import StateError, UsageError, disk_errors
 from fleetmap.files import write_atomically
 from fleetmap.trust.enrolment import certificate_info

@@ -14,7 +14,7 @@ from typing import Any
 import msgspec
 
 from fleetmap.access import Access, Holder, Purpose
-from fleetmap.bus import TlsFiles
+from fleetmap.bus.endpoints import TlsFiles
 from fleetmap.encoding import to_json
 from fleetmap.errors import LinkError, StateError, StoreError, disk_errors
 from fleetmap.files import write_atomically

@@ -108,7 +108,7 @@ def prepare_lists(store: MapStore, endpoint: str) -> None:
 
     Raises UsageError if a store without lists would be served to other machines, and if another account signs a site's.
     """
-    from fleetmap.bus import is_loopback  # imported late: it needs zenoh, builds do not
+    from fleetmap.bus.endpoints import is_loopback  # imported late: it needs zenoh, builds do not
 
     lists, keys = SignedLists(store.folder), KeyFolder(store.folder / "keys")
     if not lists.are_there:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
 from fleetmap.recordings.calibration_files import format_calibration
 from locclient.delivery.outbox import Outbox

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 import uvicorn
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.mapformat.names import sha256_hex
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics

@@ -14,8 +14,8 @@ import pytest
 import zenoh
 
 from fleetmap.access import Access, Act, Direction, Holder, Purpose
-from fleetmap.bus import Bus, TlsFiles, handshake_fault
-from fleetmap.bus.zenoh_bus import _config
+from fleetmap.bus.endpoints import TlsFiles, handshake_fault
+from fleetmap.bus.zenoh_bus import Bus, _config
 from fleetmap.errors import LinkError, UnreachableError
 from mapserver.trust.authorities import Authorities
 from support.fleet.memory_bus import MemoryBus, MemoryHub, permits

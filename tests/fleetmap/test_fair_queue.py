@@ -4,8 +4,8 @@ import threading
 import time
 from functools import partial
 
-from fleetmap.bus import Bus
 from fleetmap.bus.fair_queue import SHARED, FairQueue, sender_of
+from fleetmap.bus.zenoh_bus import Bus
 
 
 def test_the_sender_stands_in_the_key() -> None:

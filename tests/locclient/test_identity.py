@@ -10,7 +10,8 @@ import msgspec
 import pytest
 
 import locclient.identity as identity_module
-from fleetmap.bus import Bus, TlsFiles
+from fleetmap.bus.endpoints import TlsFiles
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import LinkError, StateError, UnreachableError, UsageError
 from fleetmap.messages import robot_key
 from locclient.config import LocclientConfig, RunSection, SourceSection

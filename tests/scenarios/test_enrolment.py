@@ -7,8 +7,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from fleetmap.bus import Bus
-from fleetmap.bus.zenoh_bus import _config
+from fleetmap.bus.zenoh_bus import Bus, _config
 from fleetmap.errors import UnreachableError
 from fleetmap.messages import WantedVersion, decode_message, encode_message, robot_key
 from locclient.identity import GivenAddress, RobotIdentity

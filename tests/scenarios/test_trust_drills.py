@@ -15,7 +15,7 @@ import pytest
 from tuf.api.metadata import MetaFile, Snapshot, Timestamp
 from typer.testing import CliRunner
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import FleetmapError
 from fleetmap.messages import WantedVersion
 from fleetmap.trust import AdmittedVersion, TrustedMap, ask_over

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-from fleetmap.bus import handshake_fault
+from fleetmap.bus.endpoints import handshake_fault
 from fleetmap.errors import FleetmapError, LinkError, UnreachableError
 from fleetmap.features.settings import OrbSettings
 from fleetmap.recordings import StoredFrame

@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import FleetmapError, RecordingError, UsageError
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse, so3_log

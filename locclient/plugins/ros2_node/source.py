@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fleetmap.bus import Bus, Handle
+from fleetmap.bus.zenoh_bus import Bus, Handle
 from fleetmap.errors import FleetmapError, RecordingError, UsageError
 from fleetmap.recordings import StoredFrame, Topics, read_calibration
 from fleetmap.recordings.images import StoredImage, grey_bits, grey_image, grey_peak

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO
 from urllib.parse import SplitResult, urlsplit
 
-from fleetmap.bus import is_loopback
+from fleetmap.bus.endpoints import is_loopback
 from fleetmap.errors import LinkError, MapFormatError, StateError, StoreError, UnreachableError, UsageError, disk_errors
 from fleetmap.mapformat.version_file import ExportReader, open_export
 from fleetmap.messages import WantedVersion

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from fleetmap.bus import is_loopback
+from fleetmap.bus.endpoints import is_loopback
 from fleetmap.config import Section
 from fleetmap.errors import UsageError, disk_errors
 

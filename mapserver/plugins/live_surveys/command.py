@@ -14,7 +14,7 @@ from fleetmap.errors import LinkError, UsageError
 from mapserver.commands.options import SurveyOptions, open_store
 
 if TYPE_CHECKING:
-    from fleetmap.bus import Bus
+    from fleetmap.bus.zenoh_bus import Bus
     from mapserver import BuildOptions
     from mapserver.config import MapserverConfig
     from mapserver.plugins.live_surveys.drives import Drive
@@ -143,7 +143,8 @@ def _stopping() -> Callable[[], bool]:
 
 
 def _bus(server: str | None, store: Path) -> "AbstractContextManager[Bus | None]":
-    from fleetmap.bus import Bus, check_endpoint, has_tls
+    from fleetmap.bus.endpoints import check_endpoint, has_tls
+    from fleetmap.bus.zenoh_bus import Bus
 
     if server is None:
         return nullcontext(None)

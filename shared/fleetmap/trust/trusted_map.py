@@ -17,7 +17,7 @@ from fleetmap.messages import ChunkRequest, Part, WantedVersion, decode_message,
 from fleetmap.trust.site_list import AdmittedVersion, SiteList, read_site_list, site_role
 
 if TYPE_CHECKING:
-    from fleetmap.bus import Bus
+    from fleetmap.bus.zenoh_bus import Bus
 
 Ask = Callable[[str], bytes | None]
 """Returns the bytes of a file of the signed lists, None if the server reports that it is absent; UnreachableError without a reply."""

@@ -11,7 +11,8 @@ from typing import Any
 from benchmarks.common.recorded_runs import parsed, write_results
 from benchmarks.fleet.server_process import resident_mb
 from fleetmap.access import Holder
-from fleetmap.bus import Bus, TlsFiles
+from fleetmap.bus.endpoints import TlsFiles
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import UnreachableError
 from fleetmap.messages import (
     robot_key,

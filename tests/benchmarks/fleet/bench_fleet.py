@@ -21,7 +21,7 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from benchmarks.common.recorded_runs import parsed, write_results
 from benchmarks.fleet.server_process import SITE, measured
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import FleetmapError
 from fleetmap.messages import (
     FailureAck,

@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks.common.recorded_runs import parsed, write_results
 from benchmarks.fleet.server_process import SITE, measured
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.mapformat.manifest import Manifest, decode_manifest
 from fleetmap.mapformat.names import verified
 from fleetmap.mapformat.tile import Tile

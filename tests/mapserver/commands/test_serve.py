@@ -14,7 +14,7 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.cli_options import Program
 from fleetmap.errors import StoreError, UnreachableError, UsageError
 from locclient.maps.map_client import MapClient

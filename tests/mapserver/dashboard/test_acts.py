@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Page, expect
 from typer.testing import CliRunner
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.encoding import to_json
 from fleetmap.messages import InitialPoseMessage, decode_message, robot_key
 from locclient.identity import RobotIdentity

@@ -10,7 +10,7 @@ import httpx
 import pytest
 from playwright.sync_api import Locator, Page, expect
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.mapformat.names import blob_path
 from fleetmap.messages import FailureAck, decode_message, encode_message, robot_key
 from mapserver.store import MapStore

@@ -11,7 +11,8 @@ from cryptography.hazmat.primitives.serialization import load_pem_private_key
 from cryptography.x509 import load_pem_x509_certificate
 
 from fleetmap.access import Purpose
-from fleetmap.bus import Bus, TlsFiles
+from fleetmap.bus.endpoints import TlsFiles
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import LinkError, StateError, UnreachableError, UsageError
 from fleetmap.messages import RobotHealth, decode_message, encode_message, robot_key
 from fleetmap.trust import enrolment

@@ -16,7 +16,7 @@ import httpx
 import msgspec
 import pytest
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import LinkError
 from fleetmap.mapformat.names import sha256_hex
 from fleetmap.messages import (

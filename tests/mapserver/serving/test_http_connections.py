@@ -16,7 +16,7 @@ import pytest
 import uvicorn
 from websockets.sync.client import connect
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.messages import RobotHealth, encode_message, robot_key
 from mapserver.operators.operators import Operators
 from mapserver.serving import http_connections as module

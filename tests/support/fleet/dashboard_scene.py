@@ -14,7 +14,7 @@ import cv2
 import numpy as np
 from playwright.sync_api import Page, expect
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.geometry import se3
 from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import (

@@ -25,8 +25,8 @@ from typing import Any
 REPOSITORY = Path(__file__).resolve().parents[3]
 sys.path[:0] = [str(REPOSITORY / part) for part in ("shared", "", "tests")]
 
-from fleetmap.bus import Bus  # noqa: E402
 from fleetmap.bus.endpoints import with_free_port  # noqa: E402
+from fleetmap.bus.zenoh_bus import Bus  # noqa: E402
 from fleetmap.errors import FleetmapError  # noqa: E402
 from fleetmap.messages import (  # noqa: E402
     FailureAck,

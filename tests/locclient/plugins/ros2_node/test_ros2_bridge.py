@@ -9,7 +9,7 @@ import pytest
 import zenoh
 import zenoh.ext
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.recordings import Topics
 from fleetmap.recordings.images import grey_image, png_image
 from fleetmap.recordings.ros2.messages import encode_compressed_image, encode_image

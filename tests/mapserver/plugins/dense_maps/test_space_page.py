@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.geometry import Array, se3
 from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import CameraNote, FailureAck, Placement, decode_message, encode_message, robot_key

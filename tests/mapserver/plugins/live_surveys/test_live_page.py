@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from playwright.sync_api import Page, expect
 
-from fleetmap.bus import Bus
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.messages import EstimateMessage, Placement, encode_message
 from mapserver.plugins.live_surveys.message import LiveMissing, LivePart, LiveRevisit, LiveSurveyState, live_key
 from mapserver.store import MapStore
