@@ -23,17 +23,8 @@ from mapserver.quality.figures import RigEvidence
 from mapserver.survey.executor import SERIAL, Executor
 
 # Wrong units, axes or cameras: a survey would not fail but give a wrong map. Gaps, blur and damage are tolerated.
-DECISIVE = {"camera-imu overlap", "gravity magnitude", "left and right", "epipolar error", "depth"}
-DECISIVE |= {
-    "gyro scale",
-    "gyro axes",
-    accelerometer_images.NAME,
-    METRES,
-    "repeated images",
-    images.FIXED_PATTERN,
-    images.LENS,
-    *(parameter.value for parameter in P),
-}
+DECISIVE = {"camera-imu overlap", "gravity magnitude", "left and right", "epipolar error", "depth", "repeated images"}
+DECISIVE |= {"gyro scale", "gyro axes", accelerometer_images.NAME, METRES, images.FIXED_PATTERN, images.LENS, *P}
 # Properties of a map that depend on the calibration only, and the checks that judge them.
 SUBJECTS = {
     "metric scale": ("baseline", "focal length"),

@@ -118,8 +118,7 @@ class KeptFrames:
         self.source, self._store = source, MappedImageStore(folder)
         self.stored, self.part, self.hash_into = source.stored, source.part, source.hash_into
         self._frames: dict[int, CameraFrame] = {}
-        self._bytes = 0
-        self._keeps = True
+        self._left_bytes = _KEPT_BYTES
 
     def frame(self, index: int) -> CameraFrame:
         """See FrameSource."""
@@ -127,18 +126,17 @@ class KeptFrames:
             self._store.note(index)
             return self._frames[index]
         frame = self.source.frame(index)
-        if self._keeps:
+        if self._left_bytes > 0:
             try:
                 self._frames[index] = self._kept(frame)
-                self._keeps = self._bytes < _KEPT_BYTES
             except StoreError:  # disk full: the frame is decoded again next time
-                self._keeps = False
+                self._left_bytes = 0
         return frame
 
     def _kept(self, frame: CameraFrame) -> CameraFrame:
         images = (frame.left, frame.right, frame.depth_m)
         left, right, depth_m = (None if image is None else self._store.keep([image])[0] for image in images)
-        self._bytes += sum(image.nbytes for image in images if image is not None)
+        self._left_bytes -= sum(image.nbytes for image in images if image is not None)
         others = tuple(None if other is None else self._kept(other) for other in frame.others)
         kept: dict[str, Any] = {"left": left, "right": right, "depth_m": depth_m}
         return replace(frame, **kept, others=others)

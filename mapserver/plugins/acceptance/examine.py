@@ -71,9 +71,7 @@ def examine(
         drives=[drive.figures for drive in found],
         similar=alike,
         similar_of=len(probes),
-        darkest_grey=darkest_grey(np.array([g for g, _ in levels]), np.array([hit for _, hit in levels]))
-        if levels
-        else None,
+        darkest_grey=darkest_grey(*map(np.array, zip(*levels, strict=True))) if levels else None,
         calibrations=merged([*known, *built, *(drive.figures.calibration for drive in found)]),
         incidents=incidents(maps, site, version, found),
     )
@@ -112,10 +110,8 @@ def areas_of(view: MapView, where: Where, drives: Sequence[Drive]) -> list[AreaF
     squares = {(n, 0): np.array(of_area) for n, of_area in enumerate(places.values())}
     seen = {found.tile[0]: found for found in tile_directions(squares)}
     for n, (name, of_area) in enumerate(places.items()):
-        directions = seen.get(n)
-        figures[name] = AreaFigures(name, len(of_area))
-        if directions is not None:
-            figures[name].seen, figures[name].missing = directions.seen, directions.missing
+        headings = (seen[n].seen, seen[n].missing) if n in seen else ({}, {})
+        figures[name] = AreaFigures(name, len(of_area), *headings)
 
     def area(place_m: Array) -> AreaFigures:
         return figures.setdefault(where(place_m), AreaFigures(where(place_m)))

@@ -18,6 +18,7 @@ from mapserver.plugins.dense_maps.expected_view import brightness, pinhole, resi
 from mapserver.plugins.dense_maps.exposure import lens_factor
 from mapserver.plugins.dense_maps.splats import Renderer, Splats, bounds, draw, parameters_of, with_parameters
 from mapserver.plugins.dense_maps.surfel_map import Surfels
+from mapserver.quality.probes import spread
 from mapserver.survey.survey_map import SurveyMap
 
 WIDTH_PX = 160
@@ -86,8 +87,7 @@ def looks_of(recording: Recording, survey: SurveyMap, surfels: Surfels, *, own_r
     stamps = survey.trajectory.stamps_ns
     rows = {int(stamp): row for row, stamp in enumerate(stamps.tolist()) if survey.trajectory_estimated[row]}
     placed = [(n, rows[s]) for n, s in enumerate(recording.frame_stamps_ns.tolist()) if s in rows]
-    if len(placed) > MOST_FRAMES:
-        placed = [placed[n] for n in np.linspace(0, len(placed) - 1, MOST_FRAMES).round().astype(int)]
+    placed = [placed[n] for n in spread(np.arange(len(placed)), MOST_FRAMES)]
     keyframes = set(survey.keyframe_stamps_ns.tolist())
     held = [pair for pair in placed[_HELD_FIRST::_HELD_OUT] if int(stamps[pair[1]]) not in keyframes]
     if not held:
@@ -95,8 +95,7 @@ def looks_of(recording: Recording, survey: SurveyMap, surfels: Surfels, *, own_r
             f"{recording.path}: {len(placed)} of {len(recording)} frames have poses in this version, and none of them can be held out "
             "to judge by; take the recording that the version was built from last, with all its frames"
         )
-    if len(held) > MOST_JUDGED:
-        held = [held[n] for n in np.linspace(0, len(held) - 1, MOST_JUDGED).round().astype(int)]
+    held = [held[n] for n in spread(np.arange(len(held)), MOST_JUDGED)]
     learned = [pair for k, pair in enumerate(placed) if k % _HELD_OUT != _HELD_FIRST]
     rectifier = Rectifier(
         recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD, pinhole=survey.camera

@@ -7,7 +7,8 @@ import pytest
 
 from fleetsim.recorder import Order
 from fleetsim.sensors.robots import LENSES
-from mapserver.calibration import CalibrationEstimate, CalibrationParameter, estimate_from
+from mapserver.calibration import CalibrationEstimate, CalibrationParameter
+from mapserver.calibration.estimate import estimate_from
 from mapserver.calibration.image_rows import Observations
 from mapserver.calibration.parameters import COLUMNS, DISTORTION, INDEX, UNKNOWNS, corrected_rig
 from support.worlds.calibration_scene import Stretch, make_stretch, measured, with_errors, zero_theta
