@@ -22,6 +22,7 @@ from mapserver.doctor.images import fine_structure, fixed_pattern
 from support.recordings.bag_samples import write_rosbag1
 from support.recordings.calibration_faults import baseline
 from support.recordings.painted_room import Ride, write_ride
+from support.recordings.spoiled_recording import changed
 
 run_checks = importlib.import_module("mapserver.doctor.run_checks")
 Change = Callable[[Recording], Recording]
@@ -191,19 +192,6 @@ def test_a_ros_1_bag_with_a_fault_is_named_alike(
     assert says in found[name].sentence
 
 
-class ScaledDepths:
-    """The frames of a recording, their depths in another unit."""
-
-    def __init__(self, recording: Recording, factor: float) -> None:
-        self._frames, self._factor = recording.frames, np.float32(factor)
-        self.stored, self.hash_into, self.close = self._frames.stored, self._frames.hash_into, self._frames.close
-
-    def frame(self, index: int) -> CameraFrame:
-        found = self._frames.frame(index)
-        assert found.depth_m is not None
-        return replace(found, depth_m=found.depth_m * self._factor)
-
-
 @pytest.mark.parametrize(
     ("factor", "has_wheels", "says"),
     [
@@ -222,7 +210,8 @@ def test_depths_in_another_unit(
     write_ride(path, Ride(4.0, 2.4), SensorSet.RGBD)
     with open_recording(path) as good:
         wheels = good.wheel if has_wheels else ()
-        found = run_checks.run_checks(replace(good, frames=ScaledDepths(good, factor), wheel=wheels), sampled=20)
+        scaled = changed(good, lambda frame: replace(frame, depth_m=frame.depth_m * np.float32(factor)))
+        found = run_checks.run_checks(replace(scaled, wheel=wheels), sampled=20)
     failed = {f.name: f.sentence for f in found.findings if f.verdict is Verdict.FAIL}
     assert (says in failed["metric scale"]) if says else not failed
     assert "wheels" not in failed

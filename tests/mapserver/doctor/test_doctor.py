@@ -34,6 +34,7 @@ from mapserver.doctor.sensors import (
 )
 from support.recordings.realdata import real_data
 from support.recordings.recording_samples import make_sample, write_euroc, write_mcap
+from support.recordings.spoiled_recording import changed
 
 SAMPLE = make_sample(26)
 
@@ -41,21 +42,6 @@ SAMPLE = make_sample(26)
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return open_recording(write_mcap(tmp_path_factory.mktemp("doctor") / "r", SAMPLE))
-
-
-class ChangedFrames:
-    """The frames of a recording, each changed on the way."""
-
-    def __init__(self, recording: Recording, change: Callable[[CameraFrame], CameraFrame]) -> None:
-        self.frames, self.change = recording.frames, change
-        self.stored, self.hash_into, self.close = (
-            recording.frames.stored,
-            recording.frames.hash_into,
-            recording.frames.close,
-        )
-
-    def frame(self, index: int) -> CameraFrame:
-        return self.change(self.frames.frame(index))
 
 
 def found(recording: Recording) -> dict[str, Finding]:
@@ -112,7 +98,7 @@ def test_a_good_recording_is_all_ok(good: Recording) -> None:
 def test_faults_in_the_images(
     good: Recording, name: str, change: Callable[[CameraFrame], CameraFrame], says: str
 ) -> None:
-    finding = found(replace(good, frames=ChangedFrames(good, change)))[name]
+    finding = found(changed(good, change))[name]
     assert finding.verdict is Verdict.FAIL
     assert says in finding.sentence
     if name == "epipolar error":
@@ -152,7 +138,7 @@ def test_light_that_flickers_is_named(good: Recording, share: float, bands: int,
         wave = np.sin(2 * np.pi * (0.4 * number + bands * rows)) if bands else (-1.0) ** number
         return replace(frame, left=np.clip(frame.left * (1 + share * wave), 0, 255).astype(np.uint8))
 
-    flickering = replace(good, frames=ChangedFrames(good, lit))
+    flickering = changed(good, lit)
     finding = flicker_check(flickering, flickering.read_frame)
     assert finding.verdict is verdict, finding
     assert ("10 ms with 50 Hz mains" in finding.sentence) == (verdict is not Verdict.OK)

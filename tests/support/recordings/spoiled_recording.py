@@ -29,6 +29,22 @@ class _Frames(WrappedFrames):
         return _Frames(self.source.part(self.indices[indices]), np.arange(len(indices)), self.spoil)
 
 
+@dataclass(frozen=True)
+class _ChangedFrames(WrappedFrames):
+    change: Callable[[CameraFrame], CameraFrame]
+
+    def frame(self, index: int) -> CameraFrame:
+        return self.change(self.source.frame(index))
+
+    def part(self, indices: NDArray[np.int64]) -> "_ChangedFrames":
+        return _ChangedFrames(self.source.part(indices), self.change)
+
+
+def changed(recording: Recording, change: Callable[[CameraFrame], CameraFrame]) -> Recording:
+    """The recording with each of its frames changed on the way."""
+    return replace(recording, frames=_ChangedFrames(recording.frames, change))
+
+
 def with_frames(
     recording: Recording, indices: NDArray[np.int64], spoil: Callable[[StoredFrame], StoredFrame] = lambda frame: frame
 ) -> Recording:
