@@ -169,42 +169,11 @@ def test_a_mask_of_an_image_has_its_holes(tmp_path: Path) -> None:
     picture = np.where(np.hypot(u - 160, v - 100) > 90, 255, 0).astype(np.uint8)  # the rim of a fisheye
     picture[150:, 100:180] = 1
     cv2.imwrite(str(tmp_path / "robot.png"), picture)
-    (tmp_path / "camchain.yaml").write_text(with_mask("robot.png"))
+    (tmp_path / "camchain.yaml").write_text(camchain("robot.png"))
     read = read_calibration(tmp_path / "camchain.yaml").cameras[0]
     differs = hidden_pixels(read.mask, SIZE_PX) != (picture > 0)
     edges = cv2.morphologyEx((picture > 0).astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) > 0
     assert not differs[~edges].any() and differs.mean() < 0.01
-
-
-def with_mask(value: str) -> str:
-    text = format_calibration(rig(None))
-    return text.replace("  timeshift_cam_imu", f"  mask: {value}\n  timeshift_cam_imu", 1)
-
-
-@pytest.mark.parametrize(
-    ("value", "words"),
-    [
-        ("small.png", "is 10x10, the camera's images are 320x200"),
-        ("missing.png", "cannot be read"),
-        ("../robot.png", "beside the calibration"),
-        ("/etc/hostname", "beside the calibration"),
-        ("[[[0, 0], [1, 1]]]", "three corners"),
-        ("[[[0, 0], [1, 1], [.inf, 2]]]", "near the image"),
-        ("[[0, 0], [1, 1]]", "write polygons"),
-        ("7", "write polygons"),
-        (str([[[0, k] for k in range(4001)]]), "simplify"),
-    ],
-)
-def test_an_invalid_mask_is_refused(tmp_path: Path, value: str, words: str) -> None:
-    cv2.imwrite(str(tmp_path / "small.png"), np.zeros((10, 10), np.uint8))
-    (tmp_path / "camchain.yaml").write_text(with_mask(value))
-    with pytest.raises(CalibrationError, match=words):
-        read_calibration(tmp_path / "camchain.yaml")
-
-
-def test_a_recordings_own_calibration_names_no_file() -> None:
-    with pytest.raises(CalibrationError, match="polygons instead"):
-        parse_calibration(with_mask("robot.png"), "text")
 
 
 def camchain(mask: object, cameras: int = 1) -> str:
@@ -230,6 +199,9 @@ def camchain(mask: object, cameras: int = 1) -> str:
         ("small.png", "small.png is 32x20"),
         ("bomb.png", "bomb.png cannot be read"),
         ("../white.png", "not a file beside the calibration"),
+        ("/etc/hostname", "not a file beside the calibration"),
+        ("[[0, 0], [1, 1]]", "write polygons"),
+        ("7", "write polygons"),
     ],
 )
 def test_a_mask_that_cannot_be_meant_is_refused(tmp_path: Path, mask: object, words: str) -> None:
@@ -244,6 +216,8 @@ def test_a_mask_that_cannot_be_meant_is_refused(tmp_path: Path, mask: object, wo
     (tmp_path / "cams.yaml").write_text(camchain(mask))
     with pytest.raises(CalibrationError, match=words):
         read_calibration(tmp_path / "cams.yaml")
+    with pytest.raises(CalibrationError, match="mask"):  # a recording's own names no file
+        parse_calibration(camchain(mask), "text")
 
 
 @pytest.mark.parametrize("kind", ["16 bits", "blue"])

@@ -9,7 +9,7 @@ import pytest
 from mcap.writer import CompressionType
 
 from fleetmap.errors import CalibrationError, RecordingError
-from fleetmap.geometry import se3, se3_exp, so3_exp
+from fleetmap.geometry import se3_exp
 from fleetmap.plugins.other_recorders.decoders import decode_camera_info
 from fleetmap.recordings import OpenOptions, Recording, format_calibration, open_recording
 from fleetmap.recordings.images import StoredImage
@@ -17,18 +17,10 @@ from fleetmap.recordings.mcap import reader
 from fleetmap.recordings.ros2 import messages as ros_messages
 from fleetmap.sensors.cameras import lens_of
 from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sensors.samples import PositionPrior, SensorSet, Trajectory, WheelSample
+from fleetmap.sensors.samples import SensorSet
 from support.recordings.mcap_samples import IMU, SAMPLE, Message, foreign_messages, write_foreign
 from support.recordings.recording_samples import FOCAL, HEIGHT, WIDTH, calibration, kalibr_text
 from support.recordings.rig_samples import simulated, write_rig
-
-WHEEL = WheelSample(int(SAMPLE.stamps_ns[1]), np.array([0.5, 0.01, 0.0]), 0.25, 0.02, 0.03)
-PRIOR = PositionPrior(
-    int(SAMPLE.stamps_ns[0]),
-    se3(so3_exp(np.array([0.0, 0.0, 0.7])), np.array([1.0, 2.0, 0.0])),
-    np.diag([np.inf, np.inf, 0.1, 0.04, 0.05, np.inf]),
-)
-TRUTH = Trajectory(SAMPLE.stamps_ns, np.stack(SAMPLE.world_from_body))
 
 
 def assert_is_the_sample(recording: Recording) -> None:
