@@ -70,12 +70,10 @@ def decode_summary(data: bytes) -> FailureSummary:
     try:
         summary = bounded(msgspec.msgpack.decode(data, type=FailureSummary))
     except (ValueError, RecursionError) as error:
-        raise RecordingError(
-            f"the failure's summary cannot be read ({error}); was it made by another fleetmap?"
-        ) from error
+        fault = f"the failure's summary cannot be read ({error})"
+        raise RecordingError(f"{fault}; was it made by another fleetmap?") from error
     stamps = [moment.stamp_ns for moment in summary.moments]
     if any(later <= earlier for earlier, later in pairwise(stamps)):
-        raise RecordingError(
-            "the moments of the failure's summary are not in the order of time; was it made by a robot?"
-        )
+        fault = "the moments of the failure's summary are not in the order of time"
+        raise RecordingError(f"{fault}; was it made by a robot?")
     return summary

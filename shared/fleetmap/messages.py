@@ -377,9 +377,8 @@ def decode_message(data: bytes, message_type: type[M]) -> M:
     try:
         return bounded(msgspec.msgpack.decode(data, type=message_type))
     except (ValueError, RecursionError) as error:
-        raise LinkError(
-            f"{len(data)} bytes are no {message_type.__name__} ({error}); do both sides run the same fleetmap?"
-        ) from error
+        fault = f"{len(data)} bytes are no {message_type.__name__} ({error})"
+        raise LinkError(f"{fault}; do both sides run the same fleetmap?") from error
 
 
 def part_of(data: bytes, question: bytes) -> bytes:

@@ -97,9 +97,8 @@ def grid_of(manifest: Manifest, blob: Callable[[str], bytes]) -> Tiles:
     for entry in read_index(blob(report.sha256)).tiles:
         place, cells = decode_grid_tile(blob(entry.sha256))
         if place != (entry.x, entry.y):
-            raise MapFormatError(
-                f"{where}: grid tile {place} stands in the place of {entry.x}, {entry.y}; it is damaged"
-            )
+            fault = f"grid tile {place} stands in the place of {entry.x}, {entry.y}"
+            raise MapFormatError(f"{where}: {fault}; it is damaged")
         tiles[place] = cells
     return tiles
 
@@ -159,9 +158,8 @@ def occupancy(tiles: Mapping[tuple[int, int], Counts], robot_height_m: float) ->
     """
     levels = np.ceil((robot_height_m - FLOOR_M) / SLICE_M - 1e-9)
     if not 1 <= levels <= SLICES:
-        raise UsageError(
-            f"a robot of {robot_height_m} m; the grid covers heights above {FLOOR_M} m and up to {TOP_M:.2f} m"
-        )
+        covered = f"the grid covers heights above {FLOOR_M} m and up to {TOP_M:.2f} m"
+        raise UsageError(f"a robot of {robot_height_m} m; {covered}")
     below = np.uint8((1 << int(levels)) - 1)
 
     def states(cells: Counts) -> NDArray[np.int8]:

@@ -88,9 +88,8 @@ def open_recording(path: Path | str, options: OpenOptions | None = None) -> Reco
     """
     path, options = Path(path), options or OpenOptions()
     if not path.exists():
-        raise RecordingError(
-            f"{path} does not exist; a recording is a folder (the parent of mav0 for EuRoC) or a file such as .mcap"
-        )
+        what = "a recording is a folder (the parent of mav0 for EuRoC) or a file such as .mcap"
+        raise RecordingError(f"{path} does not exist; {what}")
     if path.is_file() and (fault := what_file_instead(path)):
         raise RecordingError(f"{path} is {fault}")
     formats = recording_formats()
@@ -101,7 +100,6 @@ def open_recording(path: Path | str, options: OpenOptions | None = None) -> Reco
         raise RecordingError(f"{path} is an empty folder; copy the recording again")
     for suffixes, advice in chain(_ADVICE.items(), *(each.advice.items() for each in formats.values())):
         if path.name.lower().endswith(suffixes):
-            words = advice.format(path=path, stem=path.stem)
-            raise RecordingError(f"{path} has an unknown format; {words}")
+            raise RecordingError(f"{path} has an unknown format; {advice.format(path=path, stem=path.stem)}")
     known = "; ".join(f"{name}: {each.layout}" for name, each in formats.items())
     raise RecordingError(f"{path} has an unknown format. Known are {known}")

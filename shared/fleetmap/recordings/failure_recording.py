@@ -34,9 +34,8 @@ def attachments_of(path: Path) -> dict[str, bytes]:
         raise RecordingError(f"{path} is damaged: {scanned.issues[0].what}: {scanned.issues[0].detail}; fetch it again")
     missing = [name for name in (SUMMARY, LOCALIZER) if name not in scanned.attachments]
     if missing:
-        raise RecordingError(
-            f"{path} is not a failure's recording: {missing[0]} is missing; `locclient replay` plays others"
-        )
+        fault = f"is not a failure's recording: {missing[0]} is missing"
+        raise RecordingError(f"{path} {fault}; `locclient replay` plays others")
     return {name: scanned.attachments[name] for name in (SUMMARY, LOCALIZER)}
 
 

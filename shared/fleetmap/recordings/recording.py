@@ -33,9 +33,8 @@ def named_topics(words: Sequence[str] | None, others: Topics | None = None) -> T
     for word in words or ():
         role, sign, name = word.partition("=")
         if role not in roles or not sign:
-            raise UsageError(
-                f"--topic {word}: write ROLE=NAME, such as left=/camera/left; roles are {', '.join(roles)}"
-            )
+            form = "write ROLE=NAME, such as left=/camera/left"
+            raise UsageError(f"--topic {word}: {form}; roles are {', '.join(roles)}")
         found[role] = name
     return msgspec.structs.replace(others or Topics(), **found)
 
@@ -227,9 +226,8 @@ class Recording:
 
     def _check_index(self, index: int) -> None:
         if not 0 <= index < len(self):
-            raise RecordingError(
-                f"{self.path}: frame {index} was asked for, there are {len(self)} (0 to {len(self) - 1})"
-            )
+            there = f"there are {len(self)} (0 to {len(self) - 1})"
+            raise RecordingError(f"{self.path}: frame {index} was asked for, {there}")
 
 
 def _size(image: NDArray[Any]) -> str:
@@ -263,9 +261,8 @@ class FrameSelection:
         except ValueError:
             parts = []
         if not 2 <= len(parts) <= 3:
-            raise UsageError(
-                f"--frames {text!r}: invalid slice of frame numbers; write A:B:C, for example 0:600:2, 100: or ::2"
-            )
+            form = "write A:B:C, for example 0:600:2, 100: or ::2"
+            raise UsageError(f"--frames {text!r}: invalid slice of frame numbers; {form}")
         if step is not None and step < 1:
             backwards = "`locclient replay --reverse` plays backwards"
             raise UsageError(f"--frames {text!r}: the step {step} must be 1 or more; {backwards}")

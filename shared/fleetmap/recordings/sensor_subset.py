@@ -48,9 +48,8 @@ def reduced(recording: Recording, use: SensorSet | None) -> Recording:
     recording = recording.view(0)
     if use not in REDUCTIONS[recording.sensor_set]:
         possible = ", ".join(REDUCTIONS[recording.sensor_set])
-        raise RecordingError(
-            f"{recording.path} is {recording.sensor_set}, it cannot be used as {use}; use it as {possible}"
-        )
+        fault = f"is {recording.sensor_set}, it cannot be used as {use}"
+        raise RecordingError(f"{recording.path} {fault}; use it as {possible}")
     calibration, imu = recording.calibration, recording.imu
     if use not in _INERTIAL:
         calibration, imu = replace(calibration, imu=None), ImuSamples.empty()

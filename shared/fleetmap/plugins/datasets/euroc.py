@@ -31,10 +31,8 @@ def open_euroc(path: Path, options: OpenOptions) -> Recording:
     root = path.resolve().parent if path.name == "mav0" else path
     log = ReadLog()
     if not (root / "mav0/cam0").is_dir():
-        found = sorted(p.name for p in (root / "mav0").iterdir() if p.is_dir())
-        raise RecordingError(
-            f"{root}/mav0/cam0 is missing (there is {', '.join(found) or 'nothing'}); copy the recording again"
-        )
+        there = ", ".join(sorted(p.name for p in (root / "mav0").iterdir() if p.is_dir())) or "nothing"
+        raise RecordingError(f"{root}/mav0/cam0 is missing (there is {there}); copy the recording again")
     cameras = []
     for folder in (root / f"mav0/cam{number}" for number in range(_MOST_CAMERAS)):
         if folder.is_dir():

@@ -115,9 +115,8 @@ def read_image(path: Path) -> StoredImage:
     """Read an image file without decoding it; RecordingError if it is unreadable or too large."""
     try:
         if (size := path.stat().st_size) > MAX_IMAGE_BYTES:
-            raise RecordingError(
-                f"{path} has {size} bytes; images of at most {MAX_IMAGE_BYTES >> 20} MiB are read, remove it"
-            )
+            limit = f"images of at most {MAX_IMAGE_BYTES >> 20} MiB are read"
+            raise RecordingError(f"{path} has {size} bytes; {limit}, remove it")
         return StoredImage("file", path.read_bytes(), str(path))
     except OSError as error:
         raise RecordingError(f"{path} cannot be read ({error.strerror}); copy the recording again") from error
@@ -149,9 +148,8 @@ def existing_images(stamps_ns: Stamps, paths: Sequence[Path], what: str, log: Re
         log.note(f"{what}: images {fault}", f"{len(names)} of {len(series)}, the first is {names[0]}")
     if not kept:
         faults = "; ".join(f"{len(names)} {fault}, the first is {names[0]}" for fault, names in left_out.items())
-        raise RecordingError(
-            f"{what}: none of the {len(series)} images is there and readable ({faults}); copy the recording again"
-        )
+        none = f"none of the {len(series)} images is there and readable ({faults})"
+        raise RecordingError(f"{what}: {none}; copy the recording again")
     return series.take(np.array(kept, np.int64)[usual_size(sizes_px, what, log)])
 
 
@@ -336,7 +334,6 @@ def read_numbers(path: Path, widths: Sequence[int], log: ReadLog | None = None) 
     if log is not None and bad:
         log.note(f"{path.name}: unreadable lines", f"{len(bad)} left out; {bad[0]}")
     if not rows:
-        raise RecordingError(
-            f"{path} is empty; lines of {expected} finite numbers are expected, copy the recording again"
-        )
+        wanted = f"lines of {expected} finite numbers are expected"
+        raise RecordingError(f"{path} is empty; {wanted}, copy the recording again")
     return np.array([row or [np.nan] * widths[0] for row in rows])

@@ -116,9 +116,8 @@ def _bounded_reader() -> Any:
         from rosbags.rosbag1 import Reader, ReaderError
         from rosbags.rosbag1.reader import decompressors
     except ImportError as error:
-        raise RecordingError(
-            "ROS 1 bags need another library: pip install '.[bags]' in fleetmap's source folder"
-        ) from error
+        install = "pip install '.[bags]' in fleetmap's source folder"
+        raise RecordingError(f"ROS 1 bags need another library: {install}") from error
     kinds: dict[Any, str] = {each: kind.replace("none", "") for kind, each in decompressors.items()}
 
     class BoundedReader(Reader):

@@ -97,9 +97,8 @@ class SqliteFiles(AnyEncoding):
         try:
             found = self._databases[number].execute("SELECT data FROM messages WHERE rowid = ?", (row,)).fetchone()
         except sqlite3.Error as error:
-            raise RecordingError(
-                f"{file}: row {row} cannot be read; it is damaged, or was changed while it was read. {_recovery(file)}"
-            ) from error
+            fault = f"row {row} cannot be read; it is damaged, or was changed while it was read"
+            raise RecordingError(f"{file}: {fault}. {_recovery(file)}") from error
         if found is None or not isinstance(found[0], bytes):
             raise RecordingError(f"{file}: row {row} is gone; is it still being written?")
         return bytes(unpack_message(memoryview(found[0])))

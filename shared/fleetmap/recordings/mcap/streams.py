@@ -321,13 +321,11 @@ class MessageReader(ImageReader):
             image: StoredImage = self._container.decode(channel, self._container.read(place))
             return replace(image, where=where)
         except UNDECODABLE as error:
-            raise RecordingError(
-                f"{where}: {error}; the message is damaged, leave the frame out with --frames"
-            ) from error
+            how = "the message is damaged, leave the frame out with --frames"
+            raise RecordingError(f"{where}: {error}; {how}") from error
         except OSError as error:
-            raise RecordingError(
-                f"{where} cannot be read any more ({error.strerror}); was the recording moved?"
-            ) from error
+            fault = f"cannot be read any more ({error.strerror})"
+            raise RecordingError(f"{where} {fault}; was the recording moved?") from error
 
     def apart(self) -> "MessageReader":
         return MessageReader(self._opener, None, self.read_files)
