@@ -264,22 +264,20 @@ def grey_image(image: Image, where: str = "") -> StoredImage:
     return StoredImage("mono8", np.ascontiguousarray(image).tobytes(), where, width, height, width)
 
 
-def png_image(image: Image | NDArray[np.uint16], where: str = "") -> StoredImage:
+def png_image(image: Image | NDArray[np.uint16]) -> StoredImage:
     """Store a grey (H, W) image as PNG: lossless, at the fastest setting."""
-    _, data = cv2.imencode(".png", image, _FAST_PNG)
-    return StoredImage("file", data.tobytes(), where)
+    return StoredImage("file", cv2.imencode(".png", image, _FAST_PNG)[1].tobytes())
 
 
-def jpeg_image(image: Image, quality: int = 95, where: str = "") -> StoredImage:
+def jpeg_image(image: Image, quality: int) -> StoredImage:
     """Store a grey (H, W) uint8 image as JPEG: small, lossy."""
-    _, data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return StoredImage("file", data.tobytes(), where)
+    return StoredImage("file", cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes())
 
 
-def depth_image(depth_m: NDArray[np.float32], where: str = "") -> StoredImage:
+def depth_image(depth_m: NDArray[np.float32]) -> StoredImage:
     """Store depth in metres (H, W) as 32FC1 row by row, bit for bit."""
     height, width = depth_m.shape
-    return StoredImage("32FC1", np.ascontiguousarray(depth_m, "<f4").tobytes(), where, width, height, 4 * width)
+    return StoredImage("32FC1", np.ascontiguousarray(depth_m, "<f4").tobytes(), "", width, height, 4 * width)
 
 
 def file_kind(data: bytes) -> str:

@@ -238,9 +238,7 @@ def trajectory_of_rows(stamps_ns: Stamps, position_quat_wxyz: Array, log: ReadLo
     return Trajectory(stamps_ns[rows], np.stack(frame_from_body))
 
 
-def pair_stamps(
-    left_ns: Stamps, right_ns: Stamps, tolerance_ns: int = PAIR_TOLERANCE_NS
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def pair_stamps(left_ns: Stamps, right_ns: Stamps, tolerance_ns: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Indices (P,), (P,) of increasing left and right stamps that are each other's nearest, and within the tolerance."""
     if len(left_ns) == 0 or len(right_ns) == 0:
         return np.zeros(0, np.int64), np.zeros(0, np.int64)

@@ -34,19 +34,19 @@ class Source(Protocol):
 class RecordingSource:
     """Plays a recording instead of sensors, once, at `speed` times its rate; 0 plays as fast as frames are consumed and drops none."""
 
-    def __init__(self, recording: Recording, *, speed: float, clock_s: Callable[[], float] = time.monotonic) -> None:
-        self._recording, self._speed, self._clock_s = recording, speed, clock_s
+    def __init__(self, recording: Recording, *, speed: float) -> None:
+        self._recording, self._speed = recording, speed
         self._source = ReplaySource.of(recording, FrameSelection.parse(":"), reverse=False)
         self.calibration = recording.calibration
         self.has_depth = recording.sensor_set is SensorSet.RGBD
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
-        begun_s, recorded_s = self._clock_s(), 0.0
+        begun_s, recorded_s = time.monotonic(), 0.0
         for number, imu in enumerate(self._source.imu_before_each()):
             if number:
                 gap_ns = self._source.recorded_stamp_ns(number) - self._source.recorded_stamp_ns(number - 1)
                 recorded_s += min(gap_ns * 1e-9, _LONGEST_GAP_S)
-            ahead_s = recorded_s / self._speed - (self._clock_s() - begun_s) if self._speed else 0.0
+            ahead_s = recorded_s / self._speed - (time.monotonic() - begun_s) if self._speed else 0.0
             if wait(max(0.0, ahead_s)):
                 return
             while not self._speed and not intake.wait_for_room(_ROOM_WAIT_S):

@@ -20,6 +20,7 @@ from fleetmap.recordings.ros2.definitions import DEFINITIONS
 
 _HEAD = b"\x00\x01\x00\x00"  # plain CDR, little endian
 _NUMBERS = {"bool": "B", "byte": "B", "uint8": "B", "int32": "i", "uint32": "I", "uint64": "Q", "float32": "f"}
+_SIZES = {"B": 1, "i": 4, "I": 4, "Q": 8, "f": 4}
 _TIME, _BYTES = "builtin_interfaces/Time", ("uint8[]", "int8[]")
 Fields = tuple[Any, ...]  # types, counts of neighbouring float64, and Fields of the messages of a sequence
 
@@ -87,9 +88,8 @@ class _Reader:
         return np.frombuffer(self._take(8 * count), np.dtype(self._order + "f8")).astype(np.float64)
 
     def _number(self, code: str) -> Any:
-        size = struct.calcsize(code)
-        self._align(size)
-        return struct.unpack(self._order + code, self._take(size))[0]
+        self._align(_SIZES[code])
+        return struct.unpack(self._order + code, self._take(_SIZES[code]))[0]
 
     def _align(self, size: int) -> None:
         self._at += -(self._at - len(_HEAD)) % size
@@ -131,5 +131,4 @@ def _put(out: bytearray, fields: Fields, values: Any) -> None:
 
 
 def _put_number(out: bytearray, code: str, value: float) -> None:
-    size = struct.calcsize(code)
-    out += b"\0" * (-(len(out) - len(_HEAD)) % size) + struct.pack("<" + code, value)
+    out += b"\0" * (-(len(out) - len(_HEAD)) % _SIZES[code]) + struct.pack("<" + code, value)

@@ -101,10 +101,12 @@ def decode_imu(messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
         *columns, frame_ids = zip(*(decode_imu([data]) for data in messages), strict=True)
         stamps_ns, gyro, accel = (np.concatenate(column) for column in columns)
         return stamps_ns, gyro, accel, frame_ids[0]
-    _, frame_id, _ = unpack("sensor_msgs/Imu", messages[0])  # ValueError if it is too short
+    _, frame_id = header_of(messages[0])
     order = byte_order(messages[0])
     name_bytes = int(np.frombuffer(messages[0][12:16], order + "u4")[0])
     start = 16 + name_bytes + (-(12 + name_bytes) % 8)
+    if len(messages[0]) < start + 8 * _IMU_DOUBLES:
+        raise ValueError(f"an Imu message of {len(messages[0])} bytes is too short")
     table = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)
     seconds = np.ascontiguousarray(table[:, 4:8]).view(order + "i4")[:, 0].astype(np.int64)
     nanoseconds = np.ascontiguousarray(table[:, 8:12]).view(order + "u4")[:, 0].astype(np.int64)
@@ -153,7 +155,7 @@ def encode_motion(
 def decode_prior(data: bytes) -> PositionPrior:
     """geometry_msgs/PoseWithCovarianceStamped as map_from_base."""
     stamp_ns, _, values = unpack("geometry_msgs/PoseWithCovarianceStamped", data)
-    position_m, quat_xyzw, cov = np.split(values, [3, 7])
+    position_m, quat_xyzw, cov = values[:3], values[3:7], values[7:]
     if not np.isfinite(values[:7]).all() or abs(float(np.linalg.norm(quat_xyzw)) - 1) > 0.01:
         raise ValueError(f"the quaternion {quat_xyzw.tolist()} is not of unit length")
     map_from_base = se3(rotation_from_quat_wxyz(quat_xyzw[[3, 0, 1, 2]]), position_m)
