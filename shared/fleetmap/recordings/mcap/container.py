@@ -12,6 +12,7 @@ from fleetmap.recordings.ros2.cdr import unpack
 from fleetmap.sensors.samples import DataIssue, Stamps
 
 CALIBRATION_ATTACHMENT = "calibration.yaml"
+_MOST_ISSUES = 20
 UNDECODABLE = (ValueError, AttributeError)  # the second: a field that a schema in the file lacks
 Place = tuple[int, ...]  # position of a message in its file, as numbered by its container
 
@@ -67,5 +68,6 @@ class Container(KeptBytes):
         """Close the files."""
 
     def note(self, what: str, detail: str) -> None:
-        """Note an unreadable part."""
-        self.issues.append(DataIssue(what, detail))
+        """Note an unreadable part, unless there are very many."""
+        if len(self.issues) < _MOST_ISSUES:
+            self.issues.append(DataIssue(what, detail))

@@ -36,7 +36,6 @@ _MESSAGE_HEAD = struct.Struct("<HIQQ")
 _LARGEST_RECORD_BYTES = 1 << 31  # larger lengths are not those of a record
 _MAX_RECORD_BYTES = MAX_MESSAGE_BYTES + (64 << 10)  # an uncompressed chunk, with its header
 _KEPT_CHUNKS = 2  # unpacked chunks kept, so that sequential reading is cheap
-_MOST_ISSUES = 20
 _PARSED: dict[int, Any] = {
     Opcode.SCHEMA: records.Schema,
     Opcode.CHANNEL: records.Channel,
@@ -150,17 +149,17 @@ class McapFile(Container):
         opcode, length = _RECORD_HEAD.unpack(head.ljust(_RECORD_HEAD.size, b"\0"))
         if rest < 0:
             why = "it ends inside a record's head" if head else "the recorder was stopped hard"
-            self._note("the file has no end mark", why)
+            self.note("the file has no end mark", why)
         elif not 1 <= opcode < 0x80 or length > _LARGEST_RECORD_BYTES:
-            self._note("not an MCAP record", f"{rest} bytes from byte {at} on are not readable in sequence")
+            self.note("not an MCAP record", f"{rest} bytes from byte {at} on are not readable in sequence")
         elif length > rest:
             missing = f"{length - rest} of {length} bytes of the record at byte {at} are missing"
-            self._note("the file ends inside a record", missing)
+            self.note("the file ends inside a record", missing)
             if opcode == Opcode.CHUNK:
                 yield from self._chunk(start, self._bytes(start, min(rest, _MAX_RECORD_BYTES)), is_cut=True)
         elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
             if self._bytes(max(0, self.size - len(MAGIC)), len(MAGIC)) != MAGIC:
-                self._note("the file ends inside its index", "no message is missing")
+                self.note("the file ends inside its index", "no message is missing")
             return 0
         else:
             if length > _MAX_RECORD_BYTES:
@@ -182,10 +181,8 @@ class McapFile(Container):
             if is_cut and chunk.compression:
                 raise ValueError("the rest of a compressed chunk says nothing")
             unpacked = memoryview(self.unpack(chunk.compression, chunk.data, chunk.uncompressed_size))
-            is_sound = len(unpacked) == chunk.uncompressed_size
-            if chunk.uncompressed_crc and is_sound:
-                is_sound = zlib.crc32(unpacked) == chunk.uncompressed_crc
-            if not is_cut and not is_sound:
+            is_whole, crc = len(unpacked) == chunk.uncompressed_size, chunk.uncompressed_crc
+            if not is_cut and not (is_whole and (not crc or zlib.crc32(unpacked) == crc)):
                 raise ValueError("checksum")
         except ValueError:
             self._bad_chunks.append((at, len(content)))
@@ -218,7 +215,7 @@ class McapFile(Container):
                 raise ValueError(f"message of an unknown channel {channel_id}")
             data = unpack_message(content[head:], self.unpack)
         except ValueError as error:
-            self._note("a damaged record", f"kind {opcode} at byte {at}: {error}")
+            self.note("a damaged record", f"kind {opcode} at byte {at}: {error}")
             return
         yield self._channels[channel_id], log_time, (at + head, len(content) - head, chunk_at), data
 
@@ -270,10 +267,6 @@ class McapFile(Container):
                     starts.append(record.chunk_start_offset)
             at += length
         return sorted(starts)
-
-    def _note(self, what: str, detail: str) -> None:
-        if len(self.issues) < _MOST_ISSUES:
-            self.issues.append(DataIssue(what, detail))
 
 
 def _parsed(opcode: int, content: bytes | memoryview) -> Any:
