@@ -160,15 +160,13 @@ def test_a_lens_that_changes_leaves_its_frames_out(
             )
 
 
-def test_a_lens_that_always_changes_is_refused(tmp_path: Path) -> None:
-    lens = calibration().cameras[0]
-    infos = [replace(lens, intrinsics_px=lens.intrinsics_px * (1 + 0.01 * n)) for n in range(25)]
-    messages = [m for m in drive() if m[0] != "/cam0/camera_info"]
-    for number, info in enumerate(infos):
+def always_zooming() -> list[Message]:
+    lens, messages = calibration().cameras[0], [m for m in drive() if m[0] != "/cam0/camera_info"]
+    for number in range(25):
+        info = replace(lens, intrinsics_px=lens.intrinsics_px * (1 + 0.01 * number))
         data = ros_messages.encode_camera_info(number, "cam0_optical", info)
         messages.append(("/cam0/camera_info", "sensor_msgs/CameraInfo", number, data))
-    with pytest.raises(CalibrationError, match=r"/cam0/camera_info describes more than 20 lenses.*autofocus"):
-        open_recording(write_foreign(tmp_path / "a.mcap", messages))
+    return messages
 
 
 def setting(
@@ -219,21 +217,6 @@ def test_binning_and_roi_are_used(
             assert back == pytest.approx(whole.intrinsics_px[2 + axis])
             assert camera.intrinsics_px[axis] * scale[axis] == pytest.approx(whole.intrinsics_px[axis])
         assert says_so(recording, says)
-
-
-@pytest.mark.parametrize(
-    ("messages", "says"),
-    [
-        (
-            setting((2, 2), (0, 0, 0, 0), (100, 80)),
-            r"100x80 px, which the CameraInfo \(.*binning 2 x 2\) does not make.*roi",
-        ),
-        (setting((1, 1), (116, 68, 120, 100), (100, 50)), r"100x50 px.*roi 120x100 at \(116, 68\)"),
-    ],
-)
-def test_binning_that_does_not_make_the_images_is_refused(tmp_path: Path, messages: list[Message], says: str) -> None:
-    with pytest.raises(CalibrationError, match=says):
-        open_recording(write_foreign(tmp_path / "a.mcap", messages))
 
 
 @pytest.mark.parametrize(
@@ -297,6 +280,12 @@ def says_so(recording: Recording, says: str) -> bool:
             [m for m in drive() if m[0] != LEFT] + [cut(LEFT, 0, 900)[0]],
             r"ends before .* \(none of 1 left images can be read\)",
         ),
+        (always_zooming(), r"/cam0/camera_info describes more than 20 lenses.*autofocus"),
+        (
+            setting((2, 2), (0, 0, 0, 0), (100, 80)),
+            r"100x80 px, which the CameraInfo \(.*binning 2 x 2\) does not make.*roi",
+        ),
+        (setting((1, 1), (116, 68, 120, 100), (100, 50)), r"100x50 px.*roi 120x100 at \(116, 68\)"),
     ],
 )
 def test_a_value_that_nothing_stands_in_for_is_named(tmp_path: Path, messages: list[Message], says: str) -> None:
