@@ -10,7 +10,7 @@ import inspect
 import types
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_args, get_origin
 
 import typer
 import typer.core
@@ -48,12 +48,12 @@ def expand_options(command: Command) -> Command:
     """Replace the dataclass parameters of a command by their fields, as separate options."""
     groups: dict[str, Any] = {}
     parameters: list[inspect.Parameter] = []
-    for parameter in inspect.signature(command, eval_str=True).parameters.values():
+    for name, parameter in inspect.signature(command, eval_str=True).parameters.items():
+        shown = [parameter]
         if dataclasses.is_dataclass(parameter.annotation):
-            groups[parameter.name] = parameter.annotation
-            parameters += _fields(parameter.annotation)
-        else:
-            parameters.append(parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY))
+            groups[name] = parameter.annotation
+            shown = [*inspect.signature(groups[name], eval_str=True).parameters.values()]
+        parameters += [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in shown]
 
     @functools.wraps(command)
     def run(**values: Any) -> None:
@@ -64,19 +64,6 @@ def expand_options(command: Command) -> Command:
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {}  # the signature above is complete
     return run
-
-
-def _fields(kind: Any) -> list[inspect.Parameter]:
-    hints = get_type_hints(kind, include_extras=True)
-    return [
-        inspect.Parameter(
-            field.name,
-            inspect.Parameter.KEYWORD_ONLY,
-            default=inspect.Parameter.empty if field.default is dataclasses.MISSING else field.default,
-            annotation=hints[field.name],
-        )
-        for field in dataclasses.fields(kind)
-    ]
 
 
 def make_app(commands: Commands, callback: Command, read_config: ReadConfig, hook: str = "") -> typer.Typer:
