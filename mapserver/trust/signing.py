@@ -11,6 +11,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, cast
 
+from fleetmap.bus.endpoints import is_loopback
 from fleetmap.errors import FleetmapError, StateError, UsageError, disk_errors
 from fleetmap.trust import AdmittedVersion, SiteList, site_role
 from fleetmap.trust.site_list import VersionState
@@ -108,8 +109,6 @@ def prepare_lists(store: MapStore, endpoint: str) -> None:
 
     Raises UsageError if a store without lists would be served to other machines, and if another account signs a site's.
     """
-    from fleetmap.bus.endpoints import is_loopback  # imported late: it needs zenoh, builds do not
-
     lists, keys = SignedLists(store.folder), KeyFolder(store.folder / "keys")
     if not lists.are_there:
         if not is_loopback(endpoint):
