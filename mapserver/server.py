@@ -27,8 +27,8 @@ from fleetmap.threads import ended_by_threads
 from mapserver.api.app import Lifespan, create_app
 from mapserver.api.guard import GuardSettings
 from mapserver.api.metrics import Metrics
+from mapserver.api.parameters import ApiSettings
 from mapserver.api.sign_in_proxy import ProxiedPeople
-from mapserver.api.version_routes import ApiSettings
 from mapserver.config import MapserverConfig
 from mapserver.dashboard.install import install_dashboard
 from mapserver.fleet.fleet import Fleet

@@ -1,40 +1,53 @@
-"""The HTTP API. No page of it names an address outside; the interactive documentation of FastAPI does, so it is off."""
+"""The HTTP API, its OpenAPI document and JSON, and the endpoints of the server itself: state, version, metrics, alerts.
 
-import shlex
+No page of it names an address outside; the interactive documentation of FastAPI does, so it is off. The document is FastAPI's own, with
+problem documents for its validation errors. Stamps keep all digits: nanoseconds since 1970 exceed 2^53, above which programs that use
+doubles round.
+"""
+
 import time
 from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
+from functools import partial
 from http import HTTPMethod
-from itertools import accumulate
+from typing import Any
 
-from fastapi import Depends, FastAPI, Request, Response
+from fastapi import APIRouter, Depends, FastAPI, Response
+from fastapi.openapi.utils import get_openapi
+from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import fleetmap
 from fleetmap.bus.zenoh_bus import Bus
-from fleetmap.encoding import to_json
+from fleetmap.errors import StateError
 from fleetmap.mapformat.manifest import MANIFEST_FORMAT
 from fleetmap.mapformat.tile_codec import TILE_FORMAT
-from mapserver.api import building_routes, describe, fleet_routes, inbox_routes, problems, views
+from mapserver.api import (
+    building_routes,
+    fleet_routes,
+    inbox_routes,
+    people_routes,
+    problems,
+    version_routes,
+    views,
+)
 from mapserver.api import parameters as p
-from mapserver.api.bytes_response import bytes_response
-from mapserver.api.file_routes import install_file_routes
-from mapserver.api.guard import Guard
+from mapserver.api.guard import Guard, Sender
 from mapserver.api.metrics import CONTENT_TYPE, Metrics
-from mapserver.api.people_routes import install_people_routes
 from mapserver.api.request_limits import RequestLimits
-from mapserver.api.server_routes import install_server_routes
-from mapserver.api.version_routes import ApiSettings, install_version_routes
+from mapserver.api.views import Problem
+from mapserver.fleet.alerts import active_alerts
 from mapserver.fleet.fleet import Fleet
+from mapserver.hooks import route_hooks
 from mapserver.operators.operators import Operators
-from mapserver.serving.robot_placing import RobotPlacing
-from mapserver.store import JobInfo, MapStore
+from mapserver.serving.server_health import ServerHealth, server_health
+from mapserver.store import MapStore
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
-USUAL_SETTINGS = ApiSettings()
-_MAX_PAGE_BYTES = 4_000_000
+USUAL_SETTINGS = p.ApiSettings()
+router = APIRouter()
 
 
 def create_app(
@@ -43,7 +56,7 @@ def create_app(
     metrics: Metrics,
     bus: Bus | None,
     lifespan: Lifespan | None = None,
-    settings: ApiSettings = USUAL_SETTINGS,
+    settings: p.ApiSettings = USUAL_SETTINGS,
 ) -> FastAPI:
     """Return the application over an open store. `bus`: checked for readiness, and notifies robots; None if the server has none."""
     app = FastAPI(
@@ -55,147 +68,81 @@ def create_app(
         lifespan=lifespan,
         responses=problems.PROBLEM_RESPONSES,
         dependencies=[Depends(p.known_parameters)],
-        default_response_class=describe.ExactJson,
+        default_response_class=ExactJson,
     )
     problems.install(app)
     operators = settings.guard.operators or Operators(store)
     app.add_middleware(Guard, settings=replace(settings.guard, operators=operators))
     app.add_middleware(RequestLimits)
     app.add_middleware(_Measured, metrics=metrics)
-    app.state.store, app.state.resurvey, app.state.placing = store, settings.resurvey, RobotPlacing(store, fleet, bus)
-    app.state.nights, app.state.uploads = settings.nights, set()
-    for routes in (inbox_routes, fleet_routes, building_routes):
+    app.state.served = p.Served(store, fleet, metrics, bus, settings, operators, set())
+    app.include_router(router)
+    for routes in (version_routes, people_routes, inbox_routes, fleet_routes, building_routes):
         app.include_router(routes.router)
-    _install_service_routes(app, store, fleet, metrics, bus)
-    _install_list_routes(app, store, fleet)
-    _install_map_routes(app, store)
-    install_file_routes(app, store)
-    install_version_routes(app, store, settings)
-    install_server_routes(app, store, fleet, settings)
-    install_people_routes(app, store, operators, bus)
-    describe.install(app)
+    for install in route_hooks().values():
+        install(app, store, partial(version_routes.offered_file, store))
+    _describe(app)
     return app
 
 
-def _install_service_routes(app: FastAPI, store: MapStore, fleet: Fleet, metrics: Metrics, bus: Bus | None) -> None:
-    @app.get("/healthz")
-    def healthz() -> views.ServiceState:
-        """The process runs."""
-        return views.ServiceState("ok")
-
-    @app.get("/readyz")
-    def readyz() -> views.ServiceState:
-        """The store answers, robots' reports can be stored, and the bus is open."""
-        store.sites()
-        if fleet.storage_fault:
-            raise HTTPException(503, f"reports of robots cannot be stored: {fleet.storage_fault}")
-        if bus is not None and bus.closed():
-            raise HTTPException(503, "the bus is closed; the server is stopping")
-        return views.ServiceState("ok")
-
-    @app.get("/version")
-    def version() -> views.ServerVersion:
-        """Version and formats of the server."""
-        return views.ServerVersion(str(fleetmap.__version__), TILE_FORMAT, MANIFEST_FORMAT)
-
-    @app.get("/metrics", response_class=Response)
-    def metrics_text() -> Response:
-        """Metrics in Prometheus's text format."""
-        return Response(metrics.text(), headers={"Content-Type": CONTENT_TYPE})
+@router.get("/healthz")
+def healthz() -> views.ServiceState:
+    """The process runs."""
+    return views.OK
 
 
-def _install_list_routes(app: FastAPI, store: MapStore, fleet: Fleet) -> None:
-    @app.get("/v1/sites")
-    def sites(limit: p.Limit = 100, cursor: p.NameCursor = None) -> views.SiteList:
-        """Sites by name."""
-        found = [info for info in store.sites() if cursor is None or info.site > cursor]
-        return views.SiteList(*p.page(found, limit, lambda info: info.site))
-
-    @app.get("/v1/sites/{site}/versions")
-    def versions(site: p.Site, limit: p.Limit = 100, cursor: p.NumberCursor = None) -> views.VersionList:
-        """Versions of a site, oldest first, drafts too."""
-        found = store.versions(site, after=cursor or 0, limit=limit + 1)
-        shown, following = p.page(found, limit, lambda info: str(info.version))
-        return views.VersionList([views.version_view(store, info) for info in shown], following)
-
-    @app.get("/v1/sites/{site}/events")
-    def events(
-        site: p.Site, since: p.Since = None, until: p.Until = None, limit: p.Limit = 100, cursor: p.NumberCursor = None
-    ) -> views.EventList:
-        """Events of a site, oldest first: actor, action, time and reason."""
-        store.current(site)  # raises for an unknown site
-        found = store.events(site, p.time_range(since, until), after=cursor or 0, limit=limit + 1)
-        return views.EventList(*p.page(found, limit, lambda event: str(event.id)))
-
-    @app.get("/v1/jobs")
-    def jobs(
-        site: p.SiteFilter = None,
-        since: p.Since = None,
-        until: p.Until = None,
-        limit: p.Limit = 100,
-        cursor: p.NumberCursor = None,
-    ) -> views.JobList:
-        """Jobs (of a site) that began within a range of time, newest first."""
-        found = store.jobs(site, p.time_range(since, until), before=cursor, limit=limit + 1)
-        return views.JobList(*p.page(found, limit, lambda job: str(job.id)))
-
-    @app.get("/v1/jobs/{job}")
-    def job(job: p.Number) -> JobInfo:
-        """One job."""
-        return store.job(job)
-
-    @app.get("/v1/robots")
-    def robots(site: p.SiteFilter = None, limit: p.Limit = 100, cursor: p.NameCursor = None) -> views.RobotList:
-        """Robots (of a site) by site and name: the version that each runs and should run, and its last messages.
-
-        A page ends early where these are long.
-        """
-        found = [robot for robot in fleet.robots(site) if cursor is None or f"{robot.site}/{robot.robot}" > cursor]
-        found.sort(key=lambda robot: f"{robot.site}/{robot.robot}")
-        shown, following = p.page(found, limit, lambda robot: f"{robot.site}/{robot.robot}")
-        sizes = accumulate(len(to_json(robot)) for robot in shown)
-        fitting = max(1, sum(size <= _MAX_PAGE_BYTES for size in sizes))
-        if fitting < len(shown):
-            return views.RobotList(*p.page(shown, fitting, lambda robot: f"{robot.site}/{robot.robot}"))
-        return views.RobotList(shown, following)
+@router.get("/readyz")
+def readyz(service: p.Service) -> views.ServiceState:
+    """The store answers, robots' reports can be stored, and the bus is open."""
+    service.store.sites()
+    if service.fleet.storage_fault:
+        raise HTTPException(503, f"reports of robots cannot be stored: {service.fleet.storage_fault}")
+    if service.bus is not None and service.bus.closed():
+        raise HTTPException(503, "the bus is closed; the server is stopping")
+    return views.OK
 
 
-def _install_map_routes(app: FastAPI, store: MapStore) -> None:
-    @app.get("/v1/sites/{site}/versions/{version}", response_class=Response)
-    def manifest(request: Request, site: p.Site, version: p.Version) -> Response:
-        """The manifest of a version, byte by byte as robots verify it."""
-        sha256 = store.version(site, version).manifest_sha256
-        return bytes_response(request, store.blob(sha256), sha256, "application/json", immutable=True)
-
-    @app.get("/v1/sites/{site}/current")
-    def current(site: p.Site) -> views.VersionView:
-        """The current version of a site."""
-        info = store.current(site)
-        if info is None:
-            raise HTTPException(
-                404,
-                f"site {site} has no published version; "
-                f"publish one with `mapserver publish --site {site} --store {shlex.quote(str(store.folder))}`",
-            )
-        return views.version_view(store, info)
-
-    @app.head("/v1/tiles/{sha256}", response_class=Response, include_in_schema=False)
-    @app.get("/v1/tiles/{sha256}", response_class=Response)
-    def tile(request: Request, sha256: p.Sha256) -> Response:
-        """The bytes of a tile."""
-        return _blob(request, store, sha256, "tile")
-
-    @app.head("/v1/vocabularies/{sha256}", response_class=Response, include_in_schema=False)
-    @app.get("/v1/vocabularies/{sha256}", response_class=Response)
-    def vocabulary(request: Request, sha256: p.Sha256) -> Response:
-        """The bytes of a vocabulary."""
-        return _blob(request, store, sha256, "vocabulary")
+@router.get("/version")
+def version() -> views.ServerVersion:
+    """Version and formats of the server."""
+    return views.ServerVersion(
+        fleetmap=str(fleetmap.__version__), tile_format=TILE_FORMAT, manifest_format=MANIFEST_FORMAT
+    )
 
 
-def _blob(request: Request, store: MapStore, sha256: str, kind: str) -> Response:
-    if store.served_kind(sha256) != kind:
-        raise HTTPException(404, f"no published {kind} has SHA-256 {sha256}")
-    return bytes_response(request, store.blob(sha256), sha256, "application/octet-stream", immutable=True)
+@router.get("/metrics", response_class=Response)
+def metrics_text(service: p.Service) -> Response:
+    """Metrics in Prometheus's text format."""
+    return Response(service.metrics.text(), headers={"Content-Type": CONTENT_TYPE})
+
+
+@router.get("/v1/server")
+def server(service: p.Service) -> ServerHealth:
+    """State of the server: version, disk, store, memory, days until certificates and signed lists expire, retention."""
+    settings = service.settings
+    return server_health(service.store, service.fleet, settings.ingest, settings.certificate)
+
+
+@router.get("/v1/alerts", response_model=views.AlertList)
+def alerts(service: p.Service, page: p.NamePage) -> Any:
+    """Active alerts, by site, name and subject."""
+    found = active_alerts(service.store, service.fleet, service.settings.alerts, time.time_ns())
+    return page.of(views.AlertList, found, lambda alert: f"{alert.site}/{alert.name}/{alert.about}")
+
+
+@router.post("/v1/alerts/test")
+def test(service: p.Service, sender: Sender, act: views.Act) -> views.AlertTest:
+    """Send a test alert to the webhook and wait for its answer; 502 if it is not accepted, 409 without a webhook."""
+    actor, webhook = sender.of(act), service.settings.webhook
+    if webhook is None:
+        raise StateError(
+            "no webhook is set: name its address as `webhook` in [alerts] of the server's configuration file, and restart the server"
+        )
+    is_accepted, answer = webhook.test(time.time_ns())
+    service.store.audit("alert_test", answer, actor=actor)
+    if not is_accepted:
+        raise HTTPException(502, f"{answer}; check `webhook` and `token_file` in [alerts], and the receiver")
+    return views.AlertTest(detail=answer)
 
 
 class _Measured:
@@ -222,3 +169,62 @@ class _Measured:
             method = scope["method"] if scope["method"] in HTTPMethod.__members__ else "other"
             self._metrics.count_http(method, route, status, time.perf_counter() - started_s)
         return None
+
+
+class ExactJson(JSONResponse):
+    """An answer whose fields `..._ns` are decimal numbers in strings."""
+
+    def render(self, content: Any) -> bytes:
+        return super().render(_exact(content))
+
+
+def _exact(value: Any) -> Any:
+    if isinstance(value, dict):
+        # The type is that of an integer, and not of a bool
+        return {k: str(v) if type(v) is int and str(k).endswith("_ns") else _exact(v) for k, v in value.items()}
+    return [_exact(item) for item in value] if isinstance(value, list) else value
+
+
+def _describe(app: FastAPI) -> None:
+    """Install the OpenAPI document in `app`; it is built at the first request."""
+
+    def document() -> dict[str, Any]:
+        if app.openapi_schema is None:
+            app.openapi_schema = _described(app)
+        return app.openapi_schema
+
+    app.openapi = document  # type: ignore[method-assign]
+
+
+def _described(app: FastAPI) -> dict[str, Any]:
+    found = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
+    schemas = found["components"]["schemas"]
+    for name in ("HTTPValidationError", "ValidationError"):
+        schemas.pop(name, None)
+    schemas["Problem"] = Problem.model_json_schema()
+    found["components"]["securitySchemes"] = {
+        "token": {"type": "http", "scheme": "bearer"},
+        "session": {"type": "apiKey", "in": "cookie", "name": "__Host-fleetmap"},
+    }
+    for path, operations in found["paths"].items():
+        for operation in operations.values():
+            operation["responses"].pop("422", None)  # one of 4XX
+            if path not in ("/healthz", "/readyz"):
+                operation["security"] = [{}, {"token": []}, {"session": []}]
+    _describe_stamps(found)
+    return found
+
+
+def _describe_stamps(schema: Any) -> None:
+    """Describe stamps as strings in the document, in place."""
+    if isinstance(schema, list):
+        for item in schema:
+            _describe_stamps(item)
+    elif isinstance(schema, dict):
+        for name, value in schema.items():
+            if isinstance(name, str) and name.endswith("_ns") and isinstance(value, dict):
+                for kind in (value, *value.get("anyOf", ())):
+                    if kind.get("type") == "integer":
+                        kind.update(type="string", pattern=r"^-?[0-9]+$")
+            else:
+                _describe_stamps(value)

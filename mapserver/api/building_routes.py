@@ -4,18 +4,17 @@ A file is sent as the body; author and reason are then in the query.
 """
 
 import asyncio
-from collections.abc import AsyncIterator, Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Query, Request, Response
 from starlette.exceptions import HTTPException
 
 from fleetmap.encoding import to_plain
-from fleetmap.errors import StateError, UsageError
 from mapserver.api import parameters as p
 from mapserver.api import views
-from mapserver.api.guard import By, actor_of
+from mapserver.api.guard import By, Sender
+from mapserver.api.problems import refused_with
 from mapserver.fleet.building import align, estimate_alignment, forget_alignment, keep_areas, replace_areas, undo_areas
 from mapserver.floor_plan.pins import MAX_PINS, parse_pin
 from mapserver.floor_plan.plan_file import decode_plan
@@ -76,7 +75,7 @@ def replace(
 ) -> dict[str, Any]:
     """Replace the areas of a site by those of a file, as `mapserver areas import`. Areas drawn in the building stay in its frame."""
     store.current(site)
-    with _refused_with(422):
+    with refused_with(422):
         kept = replace_areas(store, site, data, by, tag=_given(if_match))
     _tag(response, store, site)
     return kept.geojson(site)
@@ -86,13 +85,13 @@ def replace(
 def remove(store: p.Store, site: p.Site, by: By, if_match: IfMatch = None) -> views.ServiceState:
     """Remove the areas of a site; their past counts stay."""
     keep_areas(store, site, None, "no areas", by, tag=_given(if_match))
-    return views.ServiceState("ok")
+    return views.OK
 
 
 @router.post("/v1/sites/{site}/areas/undo")
-def undo(request: Request, store: p.Store, site: p.Site, act: views.Act) -> dict[str, Any]:
+def undo(store: p.Store, sender: Sender, site: p.Site, act: views.Act) -> dict[str, Any]:
     """Bring back the areas and corrections of a site as before their last change; once more, and they are as now."""
-    return undo_areas(store, site, actor_of(request, act.actor, act.reason)).geojson(site)
+    return undo_areas(store, site, sender.of(act)).geojson(site)
 
 
 @router.get("/v1/sites/{site}/alignment")
@@ -119,7 +118,7 @@ def set_alignment(
     store.current(site)
     if bool(data) != (plan is not None):
         raise HTTPException(422, "send a picture as the body with its name as `plan`, or neither of them")
-    with _refused_with(422):
+    with refused_with(422):
         drawing = None if plan is None else decode_plan(plan, data)
         found, _ = align(store, site, [parse_pin(text) for text in pin], drawing, metres_per_pixel, by)
     return dict(to_plain(found))
@@ -129,7 +128,7 @@ def set_alignment(
 def estimate(store: p.Store, site: p.Site, pin: Pins, metres_per_pixel: Scale = None) -> dict[str, Any]:
     """The pose of the map that these pins would give, with what is left at each; nothing is kept."""
     store.current(site)
-    with _refused_with(422):
+    with refused_with(422):
         found, fit = estimate_alignment(store, site, [parse_pin(text) for text in pin], None, metres_per_pixel)
     return dict(to_plain(found)) | {"far_sigma_m": fit.far_sigma_m, "is_checked": fit.is_checked}
 
@@ -138,9 +137,9 @@ def estimate(store: p.Store, site: p.Site, pin: Pins, metres_per_pixel: Scale = 
 def forget(store: p.Store, site: p.Site, by: By) -> views.ServiceState:
     """Remove the alignment of a site and its floor plan; 409 while areas are drawn in the building."""
     store.current(site)
-    with _refused_with(409):
+    with refused_with(409):
         forget_alignment(store, site, by)
-    return views.ServiceState("ok")
+    return views.OK
 
 
 def _tag(response: Response, store: MapStore, site: str) -> None:
@@ -149,14 +148,3 @@ def _tag(response: Response, store: MapStore, site: str) -> None:
 
 def _given(if_match: str | None) -> str | None:
     return None if if_match in (None, "*") else if_match.removeprefix("W/").strip('"')
-
-
-@contextmanager
-def _refused_with(status: int) -> Iterator[None]:
-    """Answer a UsageError of the block with this status: it is not about the path."""
-    try:
-        yield
-    except StateError:
-        raise
-    except UsageError as error:
-        raise HTTPException(status, str(error)) from error

@@ -1,23 +1,27 @@
 """Endpoints of fleet health: figures by site, robot, version, tile, area or cause; failures; tiles to resurvey."""
 
 import time
-from typing import Annotated, Any, NamedTuple, cast
+from dataclasses import replace
+from itertools import accumulate
+from typing import Annotated, Any, NamedTuple
 
 from fastapi import APIRouter, Depends, Query, Request, Response
 
-from fleetmap.encoding import to_plain
+from fleetmap.encoding import to_json, to_plain
 from fleetmap.mapformat.names import sha256_hex
 from fleetmap.messages import InitialPoseMessage
 from mapserver.api import parameters as p
 from mapserver.api import views
 from mapserver.api.bytes_response import PICTURE_HEADERS, bytes_response
-from mapserver.api.guard import actor_of
+from mapserver.api.guard import Sender
+from mapserver.fleet.building import ask_for_survey, end_request
 from mapserver.fleet.resurvey_list import ResurveyList, resurvey_list
-from mapserver.fleet.survey_requests import ask_for_survey, end_request
 from mapserver.fleet_statistics.kpis import HOUR_NS, hour_of, kpis
-from mapserver.fleet_statistics.resurvey_decision import ResurveySettings, route_geojson
+from mapserver.fleet_statistics.resurvey_decision import route_geojson
 from mapserver.floor_plan.survey_requests import SurveyRequest
-from mapserver.serving.robot_placing import RobotPlacing
+from mapserver.serving.robot_placing import place_robot
+
+_MAX_PAGE_BYTES = 4_000_000
 
 
 class Span(NamedTuple):
@@ -27,95 +31,78 @@ class Span(NamedTuple):
     end: int
 
 
-def _span(hours: p.Hours = 24, since: p.Since = None, until: p.Until = None) -> Span:
-    since_ns, until_ns = p.time_range(since, until)
+def _span(within: p.TimeRange, hours: p.Hours = 24) -> Span:
+    since_ns, until_ns = within
     end = hour_of(time.time_ns()) + 1 if until_ns is None else hour_of(until_ns - 1) + 1
     return Span(end - hours if since_ns is None else hour_of(since_ns), end)
 
 
 Asked = Annotated[Span, Depends(_span)]
-
-
-async def _resurvey(request: Request) -> ResurveySettings:
-    return cast(ResurveySettings, request.app.state.resurvey)
-
-
-async def _placing(request: Request) -> RobotPlacing:
-    return cast(RobotPlacing, request.app.state.placing)
-
-
-Resurvey = Annotated[ResurveySettings, Depends(_resurvey)]
-Placing = Annotated[RobotPlacing, Depends(_placing)]
 router = APIRouter()
+
+
+@router.get("/v1/robots", response_model=views.RobotList)
+def robots(service: p.Service, page: p.NamePage, site: p.SiteFilter = None) -> Any:
+    """Robots (of a site) by site and name: the version that each runs and should run, and its last messages.
+
+    A page ends early where these are long.
+    """
+    robots, name = service.fleet.robots(site), lambda robot: f"{robot.site}/{robot.robot}"
+    sizes = accumulate(len(to_json(robot)) for robot in page.cut(robots, name)[0])
+    fitting = max(1, sum(size <= _MAX_PAGE_BYTES for size in sizes))
+    return replace(page, limit=min(page.limit, fitting)).of(views.RobotList, robots, name)
 
 
 @router.post("/v1/sites/{site}/robots/{robot}/initial_pose")
 def initial_pose(
-    request: Request, placing: Placing, site: p.Site, robot: p.Robot, act: views.PlaceAct
+    service: p.Service, sender: Sender, site: p.Site, robot: p.Robot, act: views.PlaceAct
 ) -> views.ServiceState:
     """Send an operator's pose to a robot: it overrides the tracked pose until fixes outweigh it. `ok`: the robot was notified."""
-    told = InitialPoseMessage(
-        site=site,
-        robot=robot,
-        x_map_m=act.x_map_m,
-        y_map_m=act.y_map_m,
-        heading_rad=act.heading_rad,
-        sigma_m=act.sigma_m,
-    )
-    placing.tell(told, actor_of(request, act.actor, act.reason))
-    return views.ServiceState("ok")
+    place = act.model_dump(exclude={"actor", "reason"})
+    told = InitialPoseMessage(site=site, robot=robot, **place)
+    place_robot(service.store, service.fleet, service.bus, told, sender.of(act))
+    return views.OK
 
 
-@router.get("/v1/fleet/measures")
+@router.get("/v1/fleet/measures", response_model=views.KpisList)
 def fleet_measures(
-    store: p.Store,
-    span: Asked,
-    by: p.Axis = "site",
-    site: p.SiteFilter = None,
-    limit: p.Limit = 100,
-    cursor: p.NameCursor = None,
-) -> views.KpisList:
+    store: p.Store, span: Asked, page: p.NamePage, by: p.Axis = "site", site: p.SiteFilter = None
+) -> Any:
     """Failures per robot-day with interval, availability and the rest, by site, robot, version, tile, area or cause.
 
     Whole hours are counted, including those that contain `since` and `until`.
     """
     found = store.fleet.counters(site, by, since_hour=span.first, until_hour=span.end)
-    chosen = [(f"{key[0]}/{key[1]}", key, counts) for key, counts in found.items()]
-    chosen = sorted(item for item in chosen if cursor is None or item[0] > cursor)
-    shown, following = p.page(chosen, limit, lambda item: item[0])
-    return views.KpisList(by, [views.KpisView(*key, kpis(counts)) for _, key, counts in shown], following)
+    shown, following = page.cut(found.items(), lambda item: "/".join(item[0]))
+    measures = [views.KpisView(site=site, key=key, measures=kpis(counts)) for (site, key), counts in shown]
+    return views.KpisList(by=by, measures=measures, next=following)
 
 
-@router.get("/v1/sites/{site}/hours")
+@router.get("/v1/sites/{site}/hours", response_model=views.HourList)
 def fleet_hours(
-    store: p.Store,
-    site: p.Site,
-    span: Asked,
-    by: p.Axis = "site",
-    key: p.KeyFilter = None,
-    limit: p.Limit = 100,
-    cursor: p.NumberCursor = None,
-) -> views.HourList:
+    store: p.Store, site: p.Site, span: Asked, page: p.NumberPage, by: p.Axis = "site", key: p.KeyFilter = None
+) -> Any:
     """The same figures hour by hour, of a site or of one of its robots, versions, tiles, areas or causes."""
     store.current(site)  # raises for an unknown site
-    first = max(span.first, (cursor or -1) + 1)
+    first = max(span.first, -1 if page.cursor is None else page.cursor + 1)
     found = store.fleet.hours(site, by, key=key, since_hour=first, until_hour=span.end)
-    shown, following = p.page(list(found.items()), limit, lambda item: str(item[0]))
-    return views.HourList([views.HourView(hour * HOUR_NS, kpis(counts)) for hour, counts in shown], following)
+    shown, following = page.cut(found.items(), lambda item: item[0])
+    hours = [views.HourView(hour_ns=hour * HOUR_NS, measures=kpis(counts)) for hour, counts in shown]
+    return views.HourList(hours=hours, next=following)
 
 
-@router.get("/v1/failures")
-def failures(store: p.Store, query: Annotated[p.FailureQuery, Query()]) -> views.FailureList:
+@router.get("/v1/failures", response_model=views.FailureList)
+def failures(store: p.Store, query: Annotated[p.FailureQuery, Query()]) -> Any:
     """Failures, latest arrival first; kind `suspected` marks estimated silent failures."""
     found = store.fleet.failures(query.filter(), before=query.cursor, limit=query.limit + 1)
-    return views.FailureList(*p.page(found, query.limit, lambda failure: str(failure.number)))
+    return query.page.of(views.FailureList, found, lambda failure: failure.number)
 
 
 @router.get("/v1/failures/{number}")
 def failure(store: p.Store, number: p.Number) -> views.FailureView:
     """One failure with the robot's report."""
     found = store.fleet.failure(number)
-    return views.FailureView(found.failure, to_plain(found.report), found.pictures)
+    return views.FailureView(failure=found.failure, report=to_plain(found.report), pictures=found.pictures)
 
 
 @router.get("/v1/failures/{number}/pictures/{place}", response_class=Response)
@@ -135,26 +122,26 @@ def replay(request: Request, store: p.Store, number: p.Number) -> Response:
 
 
 @router.get("/v1/sites/{site}/resurvey")
-def resurvey(settings: Resurvey, store: p.Store, site: p.Site) -> ResurveyList:
+def resurvey(service: p.Service, site: p.Site) -> ResurveyList:
     """Tiles to resurvey, the most urgent first, each with its reasons, and a route through them."""
-    return resurvey_list(store, site, settings, time.time_ns())
+    return resurvey_list(service.store, site, service.settings.resurvey, time.time_ns())
 
 
 @router.post("/v1/sites/{site}/resurvey/requests")
-def ask(request: Request, store: p.Store, site: p.Site, act: views.SurveyAct) -> SurveyRequest:
+def ask(store: p.Store, sender: Sender, site: p.Site, act: views.SurveyAct) -> SurveyRequest:
     """Request a survey of a polygon; its tiles stay on the list until the request is closed."""
-    return ask_for_survey(store, site, act.corners_map_m, actor_of(request, act.actor, act.reason))
+    return ask_for_survey(store, site, act.corners_map_m, sender.of(act))
 
 
 @router.post("/v1/sites/{site}/resurvey/requests/{asked}/end")
-def end(request: Request, store: p.Store, site: p.Site, asked: p.RequestId, act: views.Act) -> views.ServiceState:
+def end(store: p.Store, sender: Sender, site: p.Site, asked: p.RequestId, act: views.Act) -> views.ServiceState:
     """Remove a request from the list because it was surveyed or is no longer wanted."""
-    end_request(store, site, asked, actor_of(request, act.actor, act.reason))
-    return views.ServiceState("ok")
+    end_request(store, site, asked, sender.of(act))
+    return views.OK
 
 
 @router.get("/v1/sites/{site}/resurvey/route")
-def resurvey_route(settings: Resurvey, store: p.Store, site: p.Site) -> dict[str, Any]:
+def resurvey_route(service: p.Service, site: p.Site) -> dict[str, Any]:
     """The route as GeoJSON, with metres in `map` instead of degrees."""
-    found = resurvey_list(store, site, settings, time.time_ns())
+    found = resurvey(service, site)
     return route_geojson(site, found.version or 0, found.route)

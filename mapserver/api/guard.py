@@ -5,6 +5,7 @@ With sign-in on, every request except those in `_OPEN` needs a scope; an unliste
 
 import logging
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from html import escape
 from ipaddress import ip_address
@@ -22,6 +23,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from fleetmap.errors import StoreError
 from mapserver.api.problems import problem
 from mapserver.api.sign_in_proxy import SignInProxy, proxied_name
+from mapserver.api.views import Act
 from mapserver.operators.operators import LIFE_S, Operators
 from mapserver.operators.roles import Identity
 from mapserver.operators.roles import Scope as Right
@@ -81,24 +83,40 @@ class GuardSettings:
         return who or (None if self.proxy is None else self.proxy.identify(scope, address_of(scope)))
 
 
-def actor_of(request: Request, typed: str | None, reason: str) -> Actor:
-    """Return the actor of an API request: the authenticated operator, or `typed` if sign-in is off."""
-    who: Identity | None = getattr(request.state, "operator", None)
-    if who is None:
-        if not typed:
-            raise HTTPException(422, "`actor` is missing: name the person who acts")
-        return Actor(typed, reason, "", address_of(request.scope))
-    if typed and typed != who.name:
-        raise HTTPException(403, f"the request comes from {who.name} and names {typed[:80]!r}; leave `actor` out")
-    return who.actor(reason)
+class _Sender:
+    """Who sends a request: the authenticated operator, None if sign-in is off."""
+
+    def __init__(self, request: Request) -> None:
+        self.who: Identity | None = getattr(request.state, "operator", None)
+        self._address = address_of(request.scope)
+
+    def of(self, act: Act) -> Actor:
+        """Return the actor of a change: the authenticated operator, or the one that it names if sign-in is off."""
+        if self.who is None:
+            if not act.actor:
+                raise HTTPException(422, "`actor` is missing: name the person who acts")
+            return Actor(act.actor, act.reason, "", self._address)
+        if act.actor and act.actor != self.who.name:
+            words = f"the request comes from {self.who.name} and names {act.actor[:80]!r}; leave `actor` out"
+            raise HTTPException(403, words)
+        return self.who.actor(act.reason)
+
+    def check_has(self, scopes: Iterable[str]) -> None:
+        """Raise 403 for rights that the sender lacks."""
+        if self.who is not None and (beyond := set(scopes) - self.who.scopes):
+            words = f"{self.who.name} cannot give the right to {sorted(beyond)[0]!r} without having it"
+            raise HTTPException(403, words)
+
+
+Sender = Annotated[_Sender, Depends()]
 
 
 def _acting(
-    request: Request,
+    sender: Sender,
     actor: Annotated[str | None, Query(min_length=1, max_length=200, examples=["ada"])] = None,
     reason: Annotated[str, Query(max_length=2000, examples=["racks were moved"])] = "",
 ) -> Actor:
-    return actor_of(request, actor, reason)
+    return sender.of(Act(actor=actor, reason=reason))
 
 
 By = Annotated[Actor, Depends(_acting)]

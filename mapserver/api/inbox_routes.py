@@ -3,16 +3,16 @@
 import asyncio
 import logging
 import time
-from pathlib import Path as File
-from typing import cast
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Depends, Request, Response
 from starlette.exceptions import HTTPException
 
 from fleetmap.errors import StateError, UsageError
+from mapserver.api import parameters as p
 from mapserver.api import views
-from mapserver.api.guard import By, actor_of
-from mapserver.api.parameters import Box, Number, RecordingName, Site, Store
+from mapserver.api.guard import By, Sender
+from mapserver.api.problems import refused_with
 from mapserver.drafting.job_lock import log_path
 from mapserver.nightly.inbox import contents, put_back, sites_of
 from mapserver.nightly.upload import Upload
@@ -34,15 +34,13 @@ _log = logging.getLogger(__name__)
 router = APIRouter()
 
 
-def _runs(request: Request) -> NightRuns:
-    if request.app.state.nights is None:
+def _runs(service: p.Service) -> NightRuns:
+    if service.settings.nights is None:
         raise StateError(NO_INBOX)
-    return cast(NightRuns, request.app.state.nights)
+    return service.settings.nights
 
 
-def _uploads(request: Request) -> set[File]:
-    """The files that are being uploaded."""
-    return cast(set[File], request.app.state.uploads)
+Runs = Annotated[NightRuns, Depends(_runs)]
 
 
 def _logged(store: MapStore, kind: str, words: str, site: str, actor: Actor) -> None:
@@ -53,68 +51,82 @@ def _logged(store: MapStore, kind: str, words: str, site: str, actor: Actor) -> 
 
 
 @router.get("/v1/sites/{site}/inbox")
-def inbox(request: Request, store: Store, site: Site) -> views.Inbox:
+def inbox(runs: Runs, store: p.Store, site: p.Site) -> views.Inbox:
     """Recordings in the inbox of a site: those that wait, were held or are bad with the reason, and how many are in a version."""
-    folder = _runs(request).inbox
-    if site not in {*sites_of(folder), *store.sites_with_jobs(), *(info.site for info in store.sites())}:
+    if site not in {*sites_of(runs.inbox), *store.sites_with_jobs(), *(info.site for info in store.sites())}:
         raise UsageError(f"no inbox of a site {site}; its first upload makes one")
-    here = contents(folder / site, SETTLE_S, time.time_ns())
-    return views.Inbox(site, here.waiting, here.held, here.bad, here.done)
+    here = contents(runs.inbox / site, SETTLE_S, time.time_ns())
+    return views.Inbox(site=site, waiting=here.waiting, held=here.held, bad=here.bad, done=here.done)
 
 
 @router.put("/v1/sites/{site}/inbox/{name}", status_code=201, openapi_extra=_FILE)
-async def upload(request: Request, store: Store, site: Site, name: RecordingName, who: By) -> views.Uploaded:
+async def upload(
+    request: Request, runs: Runs, service: p.Service, site: p.Site, name: p.RecordingName, who: By
+) -> views.Uploaded:
     """Upload a recording as the request's body; it is there once all of it is. The first one of a site makes its inbox."""
-    folder, uploads = _runs(request).inbox / site, _uploads(request)
+    folder, uploads = runs.inbox / site, service.uploads
     if folder / name in uploads:
         raise StateError(f"{name} is being uploaded already; wait for its end")
     if len(uploads) >= _MOST_UPLOADS:
         raise HTTPException(429, f"{_MOST_UPLOADS} uploads go on; try again when one has ended", {"Retry-After": "30"})
     uploads.add(folder / name)
     try:
-        stated = request.headers.get("content-length")
-        part = await asyncio.to_thread(Upload, folder, name, None if stated is None else int(stated))
-        try:
-            data = bytearray()
-            async for chunk in request.stream():
-                data += chunk
-                if len(data) >= _WRITTEN_BYTES:
-                    await asyncio.to_thread(part.write, bytes(data))
-                    data.clear()
-            await asyncio.to_thread(part.write, bytes(data))
-            await asyncio.to_thread(part.end)
-        finally:
-            await asyncio.to_thread(part.discard)
-        await asyncio.to_thread(_logged, store, "recording_uploaded", f"{name}, {part.size_bytes} bytes", site, who)
-        return views.Uploaded(name, part.size_bytes)
-    except StateError:
-        raise
-    except UsageError as error:
-        raise HTTPException(422, str(error)) from error
+        with refused_with(422):
+            stated = request.headers.get("content-length")
+            part = await asyncio.to_thread(Upload, folder, name, None if stated is None else int(stated))
+            try:
+                data = bytearray()
+                async for chunk in request.stream():
+                    data += chunk
+                    if len(data) >= _WRITTEN_BYTES:
+                        await asyncio.to_thread(part.write, bytes(data))
+                        data.clear()
+                await asyncio.to_thread(part.write, bytes(data))
+                await asyncio.to_thread(part.end)
+            finally:
+                await asyncio.to_thread(part.discard)
+        words = f"{name}, {part.size_bytes} bytes"
+        await asyncio.to_thread(_logged, service.store, "recording_uploaded", words, site, who)
+        return views.Uploaded(name=name, size_bytes=part.size_bytes)
     finally:
         uploads.discard(folder / name)
 
 
 @router.post("/v1/sites/{site}/inbox/{box}/{name}/retry")
-def retry(request: Request, store: Store, site: Site, box: Box, name: RecordingName, act: views.Act) -> views.Inbox:
+def retry(
+    runs: Runs, store: p.Store, sender: Sender, site: p.Site, box: p.Box, name: p.RecordingName, act: views.Act
+) -> views.Inbox:
     """Move a held or bad recording back into the inbox, for the next build."""
-    who = actor_of(request, act.actor, act.reason)
-    put_back(_runs(request).inbox / site, box, name)
+    who = sender.of(act)
+    put_back(runs.inbox / site, box, name)
     _logged(store, "recording_tried_again", f"{name}, which was {box}", site, who)
-    return inbox(request, store, site)
+    return inbox(runs, store, site)
 
 
 @router.post("/v1/sites/{site}/build", status_code=202)
-def build(request: Request, store: Store, site: Site, act: views.Act) -> JobInfo:
+def build(runs: Runs, store: p.Store, sender: Sender, site: p.Site, act: views.Act) -> JobInfo:
     """Build, judge and publish what waits in the inbox of a site, as `mapserver nightly` does; the answer is its job, which goes on."""
-    who = actor_of(request, act.actor, act.reason)
-    if site not in sites_of(_runs(request).inbox):
+    who = sender.of(act)
+    if site not in sites_of(runs.inbox):
         raise StateError(f"nothing was ever uploaded for site {site}; upload a recording first")
-    return _runs(request).start(site, lambda: _logged(store, "build_started", "of what waits in the inbox", site, who))
+    return runs.start(site, lambda: _logged(store, "build_started", "of what waits in the inbox", site, who))
+
+
+@router.get("/v1/jobs", response_model=views.JobList)
+def jobs(store: p.Store, within: p.TimeRange, page: p.NumberPage, site: p.SiteFilter = None) -> Any:
+    """Jobs (of a site) that began within a range of time, newest first."""
+    found = store.jobs(site, within, before=page.cursor, limit=page.limit + 1)
+    return page.of(views.JobList, found, lambda job: job.id)
+
+
+@router.get("/v1/jobs/{job}")
+def job(store: p.Store, job: p.Number) -> JobInfo:
+    """One job."""
+    return store.job(job)
 
 
 @router.get("/v1/jobs/{job}/log", response_class=Response, responses={200: _TEXT})
-def job_log(store: Store, job: Number) -> Response:
+def job_log(store: p.Store, job: p.Number) -> Response:
     """The last 64 KiB of a job's log, also while it runs."""
     store.job(job)  # raises for an unknown one
     try:

@@ -5,73 +5,92 @@ those of the twenty robots of a site that are lost for longest.
 """
 
 from collections import Counter as Counts
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from typing import TypeVar
+from itertools import chain
 
 from prometheus_client import CollectorRegistry, Counter, Histogram, ProcessCollector, generate_latest
-from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.core import Metric
 from prometheus_client.registry import Collector
 
 from fleetmap.errors import FleetmapError, StateError, StoreError, UsageError
 from fleetmap.messages import Flag, Status
 from mapserver.fleet.alerts import AlertSettings, lost_since_ns
 from mapserver.fleet.fleet import Fleet
-from mapserver.fleet_statistics.kpis import Counters
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS, calibration_figures
 from mapserver.floor_plan.areas import OUTSIDE
 from mapserver.serving.server_health import HTTP
-from mapserver.store import MapStore
+from mapserver.store import MapStore, SiteInfo
 from mapserver.trust.http_certificate import HttpCertificate
 from mapserver.trust.status import trust_status
 
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 _SEEN_WITHIN_S = 60.0
 _BUCKETS_S = (0.001, 0.0025, 0.005, 0.01, 0.025, 0.05, 0.1, 0.25, 1.0, 5.0)
-Family = TypeVar("Family", CounterMetricFamily, GaugeMetricFamily)
 
-# Counters: name of the metric, help, and column.
-_SITE_SUMS = (
-    ("reports", "Health reports.", "reports"),
-    ("failures", "Position failures that robots reported.", "failures"),
-    ("silent_failures_estimated", "Silent failures, an estimate.", "silent_estimated"),
-    ("unreported_blindness", "Stretches of blindness without a reported failure.", "unreported_blindness"),
-    ("observed_seconds", "Time that reports cover.", "observed_ms"),
-    ("driving_seconds", "Driving time; a robot-day is 57600 s.", "driving_ms"),
-    ("driving_judged_seconds", "Driving time, including unknown speed.", "judged_ms"),
-    ("driving_localised_seconds", "Of that localised.", "found_ms"),
-    ("usable_seconds", "Driving time with a usable position.", "usable_ms"),
-    ("after_first_fix_seconds", "Of it since the run's first fix.", "after_fix_ms"),
-    ("localised_seconds", "Of that TRACKING.", "localised_ms"),
-    ("frames", "Received frames.", "frames"),
-    ("frames_dropped", "Of them dropped, by robots that are too slow.", "frames_dropped"),
-    ("docks", "Arrivals at docks.", "docks"),
-    ("docks_wrong", "Of them with an estimate more than 0.30 m off.", "docks_wrong"),
-)
-_VERSION_SUMS = (
-    ("failures", "Failures on a version.", "failures"),
-    ("silent_failures_estimated", "Silent failures, an estimate.", "silent_estimated"),
-    ("driving_seconds", "Driving with a version.", "driving_ms"),
-)
-_AREA_SUMS = (
-    ("failures", "Failures in a named area.", "failures"),
-    ("driving_seconds", "Driving in a named area.", "driving_ms"),
-    ("driving_localised_seconds", "Of that localised.", "found_ms"),
-)
-_ROBOTS = {
-    "robots": "Robots that ever reported.",
-    "robots_seen": "Robots that reported in the last minute.",
-    "robots_current": "Robots on the wanted version.",
-    "robots_present": "Robots on the bus now.",
-    "robots_copied": "Robots of which two were there at once within the last hour.",
-    "robots_overloaded": "Robots seen in the last minute that drop a tenth of their frames or more.",
-    "robots_lost": "Robots that have not known their position for longer than [alerts] lost_s.",
-    "clock_skew_max_seconds": "Largest clock error of a robot.",
-    "map_word_hours_max": "Age of the oldest map approval on a robot seen in the last minute.",
+# Counters by axis: name of the metric, help, and column.
+_SUMS = {
+    "site": (
+        ("reports", "Health reports.", "reports"),
+        ("failures", "Position failures that robots reported.", "failures"),
+        ("silent_failures_estimated", "Silent failures, an estimate.", "silent_estimated"),
+        ("unreported_blindness", "Stretches of blindness without a reported failure.", "unreported_blindness"),
+        ("observed_seconds", "Time that reports cover.", "observed_ms"),
+        ("driving_seconds", "Driving time; a robot-day is 57600 s.", "driving_ms"),
+        ("driving_judged_seconds", "Driving time, including unknown speed.", "judged_ms"),
+        ("driving_localised_seconds", "Of that localised.", "found_ms"),
+        ("usable_seconds", "Driving time with a usable position.", "usable_ms"),
+        ("after_first_fix_seconds", "Of it since the run's first fix.", "after_fix_ms"),
+        ("localised_seconds", "Of that TRACKING.", "localised_ms"),
+        ("frames", "Received frames.", "frames"),
+        ("frames_dropped", "Of them dropped, by robots that are too slow.", "frames_dropped"),
+        ("docks", "Arrivals at docks.", "docks"),
+        ("docks_wrong", "Of them with an estimate more than 0.30 m off.", "docks_wrong"),
+    ),
+    "version": (
+        ("failures", "Failures on a version.", "failures"),
+        ("silent_failures_estimated", "Silent failures, an estimate.", "silent_estimated"),
+        ("driving_seconds", "Driving with a version.", "driving_ms"),
+    ),
+    "area": (
+        ("failures", "Failures in a named area.", "failures"),
+        ("driving_seconds", "Driving in a named area.", "driving_ms"),
+        ("driving_localised_seconds", "Of that localised.", "found_ms"),
+    ),
 }
-_LOST_WORDS = "Time since such a robot lost its position, of those of a site that are lost for longest."
+# Gauges, of a site or of the server: name of the metric, and help.
+_GAUGES = {
+    "site_current_version": "Current version, 0 for none.",
+    "site_canary_version": "Version in canary, 0 for none.",
+    "site_night_failed": "1 where the last night failed.",
+    "site_robots": "Robots that ever reported.",
+    "site_robots_seen": "Robots that reported in the last minute.",
+    "site_robots_current": "Robots on the wanted version.",
+    "site_robots_present": "Robots on the bus now.",
+    "site_robots_copied": "Robots of which two were there at once within the last hour.",
+    "site_robots_overloaded": "Robots seen in the last minute that drop a tenth of their frames or more.",
+    "site_robots_lost": "Robots that have not known their position for longer than [alerts] lost_s.",
+    "site_robots_status": "Robots seen in the last minute.",
+    "site_robots_calibration": "Robots seen in the last minute that drift, by parameter.",
+    "site_robot_lost_seconds": "Time since such a robot lost its position, of those of a site that are lost for longest.",
+    "site_clock_skew_max_seconds": "Largest clock error of a robot.",
+    "site_map_word_hours_max": "Age of the oldest map approval on a robot seen in the last minute.",
+    "trust_faults": "Faults that block new maps for robots, now or soon.",
+    "trust_days_left": "Days until a role expires.",
+    "certificate_days_left": "Days until a certificate expires.",
+    "store_disk_free_bytes": "Free space of the store's disk.",
+    "store_disk_total_bytes": "Size of the store's disk.",
+    "store_disk_days_left": "Days until the store's disk is full at its growth of the last days.",
+}
+_COUNTERS = {
+    "site_canaries_rolled_back": "Versions rolled back.",
+    "site_cause_failures": "Failures by cause.",
+    **{f"{axis}_{name}": words for axis, sums in _SUMS.items() for name, words, _ in sums},
+}
 _MOST_LOST = 20  # of a site: each is a series of its own
 _USUAL_ALERTS = AlertSettings()
+Figure = tuple[str, float, dict[str, str]]
+"""Name, value and labels of a metric."""
 
 
 class Metrics:
@@ -120,34 +139,66 @@ class _FleetCollector(Collector):
     ) -> None:
         self._store, self._fleet, self._alerts, self._certificate = store, fleet, alerts, certificate
 
-    def collect(self) -> Iterator[Metric]:
-        """State of sites and robots, sums by site, version and cause."""
-        sites, counters = self._store.sites(), self._store.fleet.counters
-        current = {(info.site,): info.current_version or 0 for info in sites}
-        yield _filled(_gauge("site_current_version", "Current version, 0 for none."), current.items())
-        tried = {row.site: row.version for row in self._store.canaries(running=True)}
-        trials = [((info.site,), tried.get(info.site, 0)) for info in sites]
-        yield _filled(_gauge("site_canary_version", "Version in canary, 0 for none."), trials)
-        nights = {info.site: self._store.last_night(info.site) for info in sites}
-        failed = [((site,), float(night is not None and night.state == "failed")) for site, night in nights.items()]
-        yield _filled(_gauge("site_night_failed", "1 where the last night failed."), failed)
-        rolled_back = Counts(row.site for row in self._store.canaries() if row.state == "rolled_back")
-        family = CounterMetricFamily("fleetmap_site_canaries_rolled_back", "Versions rolled back.", labels=["site"])
-        yield _filled(family, (((info.site,), rolled_back[info.site]) for info in sites))
-        yield from self._robots([info.site for info in sites])
-        yield from _trust(self._store, self._certificate)
-        yield from _disk(self._store)
-        totals = [((site,), counts) for (site, _), counts in counters(None, "site").items()]
-        yield from _sums("site", _SITE_SUMS, ["site"], totals)
-        kept = {(info.site, str(version.version)) for info in sites for version in self._store.versions(info.site)}
-        by_version = [(key, counts) for key, counts in counters(None, "version").items() if key in kept]
-        yield from _sums("version", _VERSION_SUMS, ["site", "version"], by_version)
-        named = {(info.site, name) for info in sites for name in (*self._area_names(info.site), OUTSIDE)}
-        by_area = [(key, counts) for key, counts in counters(None, "area").items() if key in named]
-        yield from _sums("area", _AREA_SUMS, ["site", "area"], by_area)
-        by_cause = counters(None, "cause").items()
-        family = CounterMetricFamily("fleetmap_site_cause_failures", "Failures by cause.", labels=["site", "cause"])
-        yield _filled(family, ((key, counts.failures + counts.suspected) for key, counts in by_cause))
+    def collect(self) -> list[Metric]:
+        """All metrics of the tables, also those without a figure."""
+        counters = {name: Metric(f"fleetmap_{name}", words, "counter") for name, words in _COUNTERS.items()}
+        gauges = {name: Metric(f"fleetmap_{name}", words, "gauge") for name, words in _GAUGES.items()}
+        sites = self._store.sites()
+        figures = (*map(self._site, sites), *map(self._robots, sites), self._trust(), self._disk(), self._sums(sites))
+        for name, value, labels in chain(*figures):
+            metric, ending = (counters[name], "_total") if name in counters else (gauges[name], "")
+            metric.add_sample(metric.name + ending, labels, value)
+        return [*gauges.values(), *counters.values()]
+
+    def _site(self, info: SiteInfo) -> Iterator[Figure]:
+        site, night = {"site": info.site}, self._store.last_night(info.site)
+        canaries = self._store.canaries(info.site)
+        yield "site_current_version", info.current_version or 0, site
+        yield "site_canary_version", next((row.version for row in canaries if row.state == "running"), 0), site
+        yield "site_canaries_rolled_back", sum(row.state == "rolled_back" for row in canaries), site
+        yield "site_night_failed", night is not None and night.state == "failed", site
+
+    def _robots(self, info: SiteInfo) -> Iterator[Figure]:
+        site, now_ns = {"site": info.site}, self._store.now_ns()
+        own = self._fleet.robots(info.site)
+        seen = [robot for robot in own if robot.seconds_since <= _SEEN_WITHIN_S]
+        health = [robot.last_health or {} for robot in seen]
+        proofs = [each.get("metrics", {}).get("map_word_hours") for each in health]
+        hours = [proof for proof in proofs if isinstance(proof, int | float)]
+        since = [(lost_since_ns(robot, self._alerts, now_ns), robot.robot) for robot in seen]
+        lost = sorted((since_ns, name) for since_ns, name in since if since_ns is not None)
+        yield "site_robots", len(own), site
+        yield "site_robots_seen", len(seen), site
+        yield "site_robots_current", sum(robot.version == robot.wanted_version is not None for robot in own), site
+        yield "site_robots_present", sum(robot.is_present is True for robot in own), site
+        yield "site_robots_copied", sum(robot.is_copied for robot in own), site
+        yield "site_robots_overloaded", sum(Flag.OVERLOADED in each.get("flags", ()) for each in health), site
+        yield "site_clock_skew_max_seconds", max((abs(robot.clock_ahead_s or 0.0) for robot in own), default=0.0), site
+        yield "site_map_word_hours_max", max(hours, default=0.0), site
+        yield "site_robots_lost", len(lost), site
+        for since_ns, name in lost[:_MOST_LOST]:
+            yield "site_robot_lost_seconds", (now_ns - since_ns) / 1e9, site | {"robot": name}
+        said = (each.get("status") for each in health)
+        statuses = Counts(status if status in set(Status) else "other" for status in said)
+        for status in (*Status, "other"):
+            yield "site_robots_status", statuses[status], site | {"status": status}
+        drifts = Counts(f.name for each in health for f in calibration_figures(each) if f.is_drifted)
+        for name in PARAMETERS:
+            yield "site_robots_calibration", drifts[name], site | {"parameter": name}
+
+    def _sums(self, sites: Sequence[SiteInfo]) -> Iterator[Figure]:
+        """Sums of sites, and of the versions and areas that are in the store; failures by cause."""
+        versions = {(info.site, str(found.version)) for info in sites for found in self._store.versions(info.site)}
+        areas = {(info.site, name) for info in sites for name in (*self._area_names(info.site), OUTSIDE)}
+        for axis, kept in (("site", None), ("version", versions), ("area", areas)):
+            for key, counts in self._store.fleet.counters(None, axis).items():
+                if kept is None or key in kept:
+                    labels = {axis: key[1], "site": key[0]}
+                    for name, _, column in _SUMS[axis]:
+                        per = 1e3 if column.endswith("_ms") else 1  # seconds
+                        yield f"{axis}_{name}", getattr(counts, column) / per, labels
+        for (site, cause), counts in self._store.fleet.counters(None, "cause").items():
+            yield "site_cause_failures", counts.failures + counts.suspected, {"site": site, "cause": cause}
 
     def _area_names(self, site: str) -> list[str]:
         try:
@@ -155,104 +206,30 @@ class _FleetCollector(Collector):
         except FleetmapError:  # areas of a building plan, after the map's alignment was removed
             return []
 
-    def _robots(self, sites: list[str]) -> Iterator[Metric]:
-        robots = self._fleet.robots()
-        gauges = {name: _gauge(f"site_{name}", words) for name, words in _ROBOTS.items()}
-        statuses = _gauge("site_robots_status", "Robots seen in the last minute.", "status")
-        lost, now_ns = _gauge("site_robot_lost_seconds", _LOST_WORDS, "robot"), self._store.now_ns()
-        drifting = _gauge(
-            "site_robots_calibration", "Robots seen in the last minute that drift, by parameter.", "parameter"
-        )
-        for site in sites:
-            own = [robot for robot in robots if robot.site == site]
-            seen = [robot for robot in own if robot.seconds_since <= _SEEN_WITHIN_S]
-            health = [robot.last_health or {} for robot in seen]
-            proofs = [each.get("metrics", {}).get("map_word_hours") for each in health]
-            figures = {
-                "robots": len(own),
-                "robots_seen": len(seen),
-                "robots_current": sum(robot.version == robot.wanted_version is not None for robot in own),
-                "robots_present": sum(robot.is_present is True for robot in own),
-                "robots_copied": sum(robot.is_copied for robot in own),
-                "robots_overloaded": sum(Flag.OVERLOADED in each.get("flags", ()) for each in health),
-                "clock_skew_max_seconds": max((abs(robot.clock_ahead_s or 0.0) for robot in own), default=0.0),
-                "map_word_hours_max": max((hours for hours in proofs if isinstance(hours, int | float)), default=0.0),
-            }
-            since = [(lost_since_ns(robot, self._alerts, now_ns), robot.robot) for robot in seen]
-            longest = sorted((since_ns, name) for since_ns, name in since if since_ns is not None)
-            figures["robots_lost"] = len(longest)
-            _filled(lost, [((site, name), (now_ns - since_ns) / 1e9) for since_ns, name in longest[:_MOST_LOST]])
-            for name, figure in figures.items():
-                gauges[name].add_metric([site], figure)
-            counts = Counts(each.get("status") for each in health)
-            other = len(health) - sum(counts[status] for status in Status)
-            _filled(statuses, [((site, status), counts[status]) for status in Status])
-            _filled(statuses, [((site, "other"), other)])
-            drifts = Counts(f.name for each in health for f in calibration_figures(each) if f.is_drifted)
-            _filled(drifting, [((site, name), drifts[name]) for name in PARAMETERS])
-        yield from (*gauges.values(), lost, statuses, drifting)
+    def _disk(self) -> Iterator[Figure]:
+        """No figures from a disk that does not answer."""
+        with suppress(StoreError):
+            found = self._store.disk_space()
+            if found.days_left is not None:
+                yield "store_disk_days_left", found.days_left, {}
+            yield "store_disk_free_bytes", found.free_bytes, {}
+            yield "store_disk_total_bytes", found.total_bytes, {}
 
-
-def _disk(store: MapStore) -> Iterator[Metric]:
-    """No figures from a disk that does not answer."""
-    free = GaugeMetricFamily("fleetmap_store_disk_free_bytes", "Free space of the store's disk.")
-    total = GaugeMetricFamily("fleetmap_store_disk_total_bytes", "Size of the store's disk.")
-    left = GaugeMetricFamily(
-        "fleetmap_store_disk_days_left", "Days until the store's disk is full at its growth of the last days."
-    )
-    with suppress(StoreError):
-        found = store.disk_space()
-        if found.days_left is not None:
-            left.add_metric([], found.days_left)
-        free.add_metric([], found.free_bytes)
-        total.add_metric([], found.total_bytes)
-    yield from (free, total, left)
-
-
-def _trust(store: MapStore, http: HttpCertificate | None) -> Iterator[Metric]:
-    """Days that certificates and signed lists last; of those of the bus no figures for a store that is not signed."""
-    faults = GaugeMetricFamily("fleetmap_trust_faults", "Faults that block new maps for robots, now or soon.")
-    days = GaugeMetricFamily("fleetmap_trust_days_left", "Days until a role expires.", labels=["role"])
-    words = "Days until a certificate expires."
-    certificates = GaugeMetricFamily("fleetmap_certificate_days_left", words, labels=["certificate"])
-    if http is not None:
-        with suppress(UsageError):  # while its file is replaced
-            certificates.add_metric([HTTP], http.days_left())
-    try:
-        found = trust_status(store)
-    except StateError:  # an unsigned store
-        pass
-    except StoreError:  # unreadable lists
-        faults.add_metric([], 1)
-    else:
-        faults.add_metric([], len(found.faults))
+    def _trust(self) -> Iterator[Figure]:
+        """Days that certificates and signed lists last; of those of the bus no figures for a store that is not signed."""
+        if self._certificate is not None:
+            with suppress(UsageError):  # while its file is replaced
+                yield "certificate_days_left", self._certificate.days_left(), {"certificate": HTTP}
+        try:
+            found = trust_status(self._store)
+        except StateError:  # an unsigned store
+            return
+        except StoreError:  # unreadable lists
+            yield "trust_faults", 1, {}
+            return
+        yield "trust_faults", len(found.faults), {}
         for role in found.roles:
             if role.days_left is not None:
-                days.add_metric([role.role], role.days_left)
+                yield "trust_days_left", role.days_left, {"role": role.role}
         for each in found.certificates:
-            certificates.add_metric([each.file], each.days_left)
-    yield faults
-    yield days
-    yield certificates
-
-
-def _gauge(name: str, words: str, *labels: str) -> GaugeMetricFamily:
-    return GaugeMetricFamily(f"fleetmap_{name}", words, labels=["site", *labels])
-
-
-def _sums(
-    prefix: str,
-    sums: Iterable[tuple[str, str, str]],
-    labels: list[str],
-    counters: Sequence[tuple[tuple[str, ...], Counters]],
-) -> Iterator[Metric]:
-    for name, words, column in sums:
-        family = CounterMetricFamily(f"fleetmap_{prefix}_{name}", words, labels=labels)
-        per = 1e3 if column.endswith("_ms") else 1  # seconds
-        yield _filled(family, ((key, getattr(counts, column) / per) for key, counts in counters))
-
-
-def _filled(family: Family, values: Iterable[tuple[tuple[str, ...], float]]) -> Family:
-    for labels, value in values:
-        family.add_metric(labels, value)
-    return family
+            yield "certificate_days_left", each.days_left, {"certificate": each.file}

@@ -1,7 +1,12 @@
-"""Parameters of paths and queries, and pages of long lists: `limit` items behind `cursor`, `next` the following page's cursor."""
+"""What endpoints are given: the service, parameters of paths and queries, and pages of long lists.
 
-from collections.abc import Callable, Sequence
-from typing import Annotated, Literal, TypeVar, cast
+A page has `limit` items behind `cursor`; `next` is the following page's cursor.
+"""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path as File
+from typing import Annotated, Any, Literal, NamedTuple, cast
 
 from fastapi import Depends, Path, Query, Request
 from fastapi.dependencies.utils import get_flat_params
@@ -11,13 +16,62 @@ from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 
-from fleetmap.errors import UsageError
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.mapformat.names import NAME_PATTERN, SHA256_PATTERN
+from mapserver.api.guard import GuardSettings
+from mapserver.api.metrics import Metrics
 from mapserver.api.moments import read_range
+from mapserver.api.problems import refused_with
+from mapserver.fleet.alerts import AlertSettings
+from mapserver.fleet.fleet import Fleet
+from mapserver.fleet.ingest import IngestSettings
+from mapserver.fleet_statistics.canary_decision import CanarySettings
+from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
+from mapserver.operators.operators import Operators
 from mapserver.operators.roles import OPERATOR_PATTERN
+from mapserver.quality.gate import GateSettings
+from mapserver.serving.night_runs import NightRuns
 from mapserver.store import FailureFilter, MapStore
+from mapserver.trust.http_certificate import HttpCertificate
 
-Item = TypeVar("Item")
+
+class ApiSettings(NamedTuple):
+    """Settings of access, the gate, canaries, tiles, alerts and reports; the certificate of HTTP, webhook and inbox, None without one."""
+
+    guard: GuardSettings = GuardSettings()
+    gate: GateSettings = GateSettings()
+    canary: CanarySettings = CanarySettings()
+    resurvey: ResurveySettings = ResurveySettings()
+    alerts: AlertSettings = AlertSettings()
+    ingest: IngestSettings = IngestSettings()
+    certificate: HttpCertificate | None = None
+    webhook: Any = None
+    nights: NightRuns | None = None
+
+
+class Served(NamedTuple):
+    """What endpoints work with. bus: None if the server has none; uploads: the files that are being uploaded."""
+
+    store: MapStore
+    fleet: Fleet
+    metrics: Metrics
+    bus: Bus | None
+    settings: ApiSettings
+    operators: Operators
+    uploads: set[File]
+
+
+async def _served(request: Request) -> Served:
+    return cast(Served, request.app.state.served)
+
+
+async def _store(request: Request) -> MapStore:
+    return cast(Served, request.app.state.served).store
+
+
+Service = Annotated[Served, Depends(_served)]
+Store = Annotated[MapStore, Depends(_store)]
+"""The open store of the application."""
 
 Site = Annotated[str, Path(pattern=NAME_PATTERN, examples=["hall"])]
 Robot = Annotated[str, Path(pattern=NAME_PATTERN, examples=["tug-7"])]
@@ -55,12 +109,13 @@ Since = Annotated[
 Until = Annotated[str | None, Query(max_length=40, description=f"before: {_TIME}", examples=[None])]
 
 
-def time_range(since: str | None, until: str | None) -> tuple[int | None, int | None]:
+def time_range(since: Since = None, until: Until = None) -> tuple[int | None, int | None]:
     """Return nanoseconds since 1970, None for an open end; 422 for an invalid time or an end before the start."""
-    try:
+    with refused_with(422):
         return read_range(since, until)
-    except UsageError as error:
-        raise HTTPException(422, str(error)) from error
+
+
+TimeRange = Annotated[tuple[int | None, int | None], Depends(time_range)]
 
 
 async def known_parameters(request: HTTPConnection) -> None:
@@ -79,14 +134,6 @@ async def known_parameters(request: HTTPConnection) -> None:
         raise HTTPException(422, f"unknown query parameter {unknown[0][:40]!r}; {words}")
 
 
-async def _store(request: Request) -> MapStore:
-    return cast(MapStore, request.app.state.store)
-
-
-Store = Annotated[MapStore, Depends(_store)]
-"""The open store of the application."""
-
-
 class FailureQuery(BaseModel):
     """Filters and the page of a list of failures."""
 
@@ -102,13 +149,50 @@ class FailureQuery(BaseModel):
     limit: Limit = 100
     cursor: NumberCursor = None
 
+    @property
+    def page(self) -> "_ByNumber":
+        return _ByNumber(self.limit, self.cursor)
+
     def filter(self) -> FailureFilter:
         since_ns, until_ns = time_range(self.since, self.until)
         named = self.model_dump(exclude={"limit", "cursor", "since", "until"})
         return FailureFilter(**named, since_ns=since_ns, until_ns=until_ns)
 
 
-def page(items: Sequence[Item], limit: int, cursor_of: Callable[[Item], str]) -> tuple[list[Item], str | None]:
-    """The first `limit` of `items` and the next page's cursor; `items` holds one more if there are more."""
-    shown = list(items[:limit])
-    return shown, cursor_of(shown[-1]) if len(items) > limit else None
+@dataclass(frozen=True, slots=True)
+class _Page:
+    limit: Limit = 100
+
+    def cut(self, items: Iterable[Any], key: Callable[[Any], Any]) -> tuple[list[Any], str | None]:
+        """The first `limit` items and the next page's cursor, of items behind this one's cursor, one more if there are more."""
+        found = list(items)
+        shown = found[: self.limit]
+        return shown, str(key(shown[-1])) if len(found) > self.limit else None
+
+    def of(self, kind: type[BaseModel], items: Iterable[Any], key: Callable[[Any], Any]) -> Any:
+        """The items of this page as one of the lists of `views`."""
+        shown, following = self.cut(items, key)
+        return kind(**{next(iter(kind.model_fields)): shown, "next": following})
+
+
+@dataclass(frozen=True, slots=True)
+class _ByNumber(_Page):
+    """A page of a list whose items are asked for behind a number."""
+
+    cursor: NumberCursor = None
+
+
+@dataclass(frozen=True, slots=True)
+class _ByName(_Page):
+    """A page of a list by name, of all its items."""
+
+    cursor: NameCursor = None
+
+    def cut(self, items: Iterable[Any], key: Callable[[Any], Any]) -> tuple[list[Any], str | None]:
+        behind = (item for item in items if self.cursor is None or str(key(item)) > self.cursor)
+        return _Page.cut(self, sorted(behind, key=key), key)
+
+
+NamePage = Annotated[_ByName, Depends()]
+NumberPage = Annotated[_ByNumber, Depends()]
+"""The page of a list that is asked for."""

@@ -1,6 +1,8 @@
 """Errors of the HTTP API as RFC 9457 problem documents."""
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from http import HTTPStatus
 from typing import Any
 
@@ -52,6 +54,17 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(HTTPException, _http_error)
     app.add_exception_handler(RequestValidationError, _validation_error)
     app.add_exception_handler(Exception, _unexpected)
+
+
+@contextmanager
+def refused_with(status: int) -> Iterator[None]:
+    """Answer a UsageError of the block with this status: it is not about the path."""
+    try:
+        yield
+    except StateError:
+        raise
+    except UsageError as error:
+        raise HTTPException(status, str(error)) from error
 
 
 def _fleetmap_error(request: Request, error: Exception) -> Response:

@@ -1,106 +1,206 @@
-"""Endpoints of releases: quality, differences, publishing, promoting, rolling back, canaries."""
+"""Endpoints of sites, versions and their bytes, and of releases: quality, publishing, promoting, rolling back, canaries."""
 
+import base64
+import hashlib
 import shlex
 import time
-from typing import Any, NamedTuple, cast
+from functools import lru_cache
+from typing import Any, cast
 
-from fastapi import FastAPI, Request
+from fastapi import APIRouter, Request, Response
 from starlette.exceptions import HTTPException
+from starlette.responses import StreamingResponse
 
+from fleetmap.errors import StateError
+from fleetmap.mapformat.version_file import ExportHead
 from mapserver import releases
+from mapserver.api import parameters as p
 from mapserver.api import views
-from mapserver.api.guard import GuardSettings, actor_of
-from mapserver.api.parameters import Site, Version
-from mapserver.fleet.alerts import AlertSettings
+from mapserver.api.bytes_response import bytes_response
+from mapserver.api.guard import Sender
 from mapserver.fleet.canary_controller import find
-from mapserver.fleet.ingest import IngestSettings
 from mapserver.fleet_statistics.canary_decision import CanarySettings, number_of
-from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
-from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
-from mapserver.serving.night_runs import NightRuns
 from mapserver.store import CanaryRow, MapStore, VersionInfo
-from mapserver.trust.http_certificate import HttpCertificate
+
+_DIGESTS_KEPT = 256
+router = APIRouter()
 
 
-class ApiSettings(NamedTuple):
-    """Settings of access, the gate, canaries, tiles, alerts and reports; the certificate of HTTP, webhook and inbox, None without one."""
-
-    guard: GuardSettings = GuardSettings()
-    gate: GateSettings = GateSettings()
-    canary: CanarySettings = CanarySettings()
-    resurvey: ResurveySettings = ResurveySettings()
-    alerts: AlertSettings = AlertSettings()
-    ingest: IngestSettings = IngestSettings()
-    certificate: HttpCertificate | None = None
-    webhook: Any = None
-    nights: NightRuns | None = None
+@router.get("/v1/sites", response_model=views.SiteList)
+def sites(store: p.Store, page: p.NamePage) -> Any:
+    """Sites by name."""
+    return page.of(views.SiteList, store.sites(), lambda info: info.site)
 
 
-def install_version_routes(app: FastAPI, store: MapStore, settings: ApiSettings) -> None:
-    """Add the endpoints; the guard checks the right to change versions."""
+@router.get("/v1/sites/{site}/versions", response_model=views.VersionList)
+def versions(store: p.Store, site: p.Site, page: p.NumberPage) -> Any:
+    """Versions of a site, oldest first, drafts too."""
+    found = store.versions(site, after=page.cursor or 0, limit=page.limit + 1)
+    return page.of(views.VersionList, [views.version_view(store, info) for info in found], lambda info: info.version)
 
-    @app.get("/v1/sites/{site}/versions/{version}/quality")
-    def quality(site: Site, version: Version) -> views.QualityView:
-        """Gate results of a version, and the report of its build."""
-        info = store.version(site, version)
-        report = store.manifest(site, version).report
-        return views.QualityView(site, version, info.state, store.verdicts(site, version), store.trusted(info), report)
 
-    @app.get("/v1/sites/{site}/versions/{before}/diff/{after}")
-    def diff(site: Site, before: Version, after: Version) -> Difference:
-        """Difference between two versions: tiles, landmarks, bytes to fetch, quality side by side."""
-        return releases.difference(store, site, before, after)
+@router.get("/v1/sites/{site}/events", response_model=views.EventList)
+def events(store: p.Store, site: p.Site, within: p.TimeRange, page: p.NumberPage) -> Any:
+    """Events of a site, oldest first: actor, action, time and reason."""
+    store.current(site)  # raises for an unknown site
+    found = store.events(site, within, after=page.cursor or 0, limit=page.limit + 1)
+    return page.of(views.EventList, found, lambda event: event.id)
 
-    @app.post("/v1/sites/{site}/versions/{version}/publish")
-    def publish(request: Request, site: Site, version: Version, act: views.PublishAct) -> views.VersionView:
-        """Check a draft by the gate and make it current."""
-        actor = actor_of(request, act.actor, act.reason)
-        if act.trust_calibration:
-            releases.trust_calibration(store, store.version(site, version), actor)
-        releases.publish(store, site, version, actor=actor, force=act.force, gate=settings.gate)
-        return views.version_view(store, store.version(site, version))
 
-    @app.post("/v1/sites/{site}/versions/{version}/promote")
-    def promote(request: Request, site: Site, version: Version, act: views.Act) -> views.VersionView:
-        """Make an earlier published version current."""
-        releases.promote(store, site, version, actor=actor_of(request, act.actor, act.reason))
-        return views.version_view(store, store.version(site, version))
+@router.get("/v1/sites/{site}/versions/{version}", response_class=Response)
+def manifest(request: Request, store: p.Store, site: p.Site, version: p.Version) -> Response:
+    """The manifest of a version, byte by byte as robots verify it."""
+    sha256 = store.version(site, version).manifest_sha256
+    return bytes_response(request, store.blob(sha256), sha256, "application/json", immutable=True)
 
-    @app.post("/v1/sites/{site}/rollback")
-    def rollback(request: Request, site: Site, act: views.RollbackAct) -> views.VersionView:
-        """Make the previous current version current again; the present one retires. A running canary is withdrawn instead."""
-        actor = actor_of(request, act.actor, act.reason)
-        releases.roll_back(store, site, to=act.to, canary=act.canary, actor=actor)
-        return views.version_view(store, cast(VersionInfo, store.current(site)))
 
-    @app.get("/v1/sites/{site}/canary")
-    def canary(site: Site) -> views.CanaryView:
-        """The latest canary version, with its counts beside those of the other robots."""
-        store.current(site)
-        found = store.canaries(site)
-        if not found:
-            raise HTTPException(
-                404,
-                f"site {site} never had a canary; `mapserver promote VERSION "
-                f"--canary 5% --site {site} --store {shlex.quote(str(store.folder))}` starts one",
-            )
-        return _view(store, found[0], settings.canary)
+@router.get("/v1/sites/{site}/current")
+def current(store: p.Store, site: p.Site) -> views.VersionView:
+    """The current version of a site."""
+    info = store.current(site)
+    if info is None:
+        raise HTTPException(
+            404,
+            f"site {site} has no published version; "
+            f"publish one with `mapserver publish --site {site} --store {shlex.quote(str(store.folder))}`",
+        )
+    return views.version_view(store, info)
 
-    @app.post("/v1/sites/{site}/versions/{version}/canary")
-    def start_canary(request: Request, site: Site, version: Version, act: views.CanaryAct) -> views.CanaryView:
-        """Let a share of the robots run a version before the others; a draft goes through the gate first.
 
-        `rollback` withdraws it, promoting it ends it early; otherwise the server decides by the failures of both groups.
-        """
-        share = settings.canary.share if act.share is None else act.share
-        actor = actor_of(request, act.actor, act.reason)
-        releases.start_canary(store, site, version, share, actor=actor, gate=settings.gate)
-        return _view(store, store.canaries(site)[0], settings.canary)
+@router.head("/v1/tiles/{sha256}", response_class=Response, include_in_schema=False)
+@router.get("/v1/tiles/{sha256}", response_class=Response)
+def tile(request: Request, store: p.Store, sha256: p.Sha256) -> Response:
+    """The bytes of a tile."""
+    return _blob(request, store, sha256, "tile")
+
+
+@router.head("/v1/vocabularies/{sha256}", response_class=Response, include_in_schema=False)
+@router.get("/v1/vocabularies/{sha256}", response_class=Response)
+def vocabulary(request: Request, store: p.Store, sha256: p.Sha256) -> Response:
+    """The bytes of a vocabulary."""
+    return _blob(request, store, sha256, "vocabulary")
+
+
+def _blob(request: Request, store: MapStore, sha256: str, kind: str) -> Response:
+    if store.served_kind(sha256) != kind:
+        raise HTTPException(404, f"no published {kind} has SHA-256 {sha256}")
+    return bytes_response(request, store.blob(sha256), sha256, "application/octet-stream", immutable=True)
+
+
+@lru_cache(maxsize=_DIGESTS_KEPT)
+def _digest(store: MapStore, _manifest_sha256: str, site: str, version: int) -> bytes:
+    """SHA-256 of the file of a version. Cached: the manifest's hash determines it."""
+    whole = hashlib.sha256()
+    for chunk in store.version_file(site, version)[1]():
+        whole.update(chunk)
+    return whole.digest()
+
+
+def offered_file(store: MapStore, site: str, version: int) -> tuple[ExportHead, bytes]:
+    """Return head and SHA-256 of the file of a version; StateError for a draft."""
+    info = store.version(site, version)
+    if info.state == "draft":
+        raise StateError(f"version {version} of site {site} is a draft; publish it before robots may have it")
+    return store.version_file(site, version)[0], _digest(store, info.manifest_sha256, site, version)
+
+
+@router.head("/v1/sites/{site}/versions/{version}/file", response_class=Response, include_in_schema=False)
+@router.get("/v1/sites/{site}/versions/{version}/file", response_class=Response)
+def file(request: Request, store: p.Store, site: p.Site, version: p.Version) -> Response:
+    """A published version as one file, byte by byte the same every time; its SHA-256 is the ETag."""
+    head, sha256 = offered_file(store, site, version)
+    headers = {
+        "ETag": f'"{sha256.hex()}"',
+        "Repr-Digest": f"sha-256=:{base64.b64encode(sha256).decode()}:",
+        "Cache-Control": "public, max-age=31536000, immutable",
+        "Content-Disposition": f'attachment; filename="{site}-{version}.fmex"',
+    }
+    if request.headers.get("if-none-match") == headers["ETag"]:
+        return Response(status_code=304, headers=headers)
+    headers["Content-Length"] = str(head.file_bytes())
+    if request.method == "HEAD":
+        return Response(headers=headers, media_type="application/octet-stream")
+    chunks = store.version_file(site, version)[1]()
+    return StreamingResponse(chunks, headers=headers, media_type="application/octet-stream")
+
+
+@router.get("/v1/sites/{site}/versions/{version}/quality")
+def quality(store: p.Store, site: p.Site, version: p.Version) -> views.QualityView:
+    """Gate results of a version, and the report of its build."""
+    info = store.version(site, version)
+    return views.QualityView(
+        site=site,
+        version=version,
+        state=info.state,
+        verdicts=store.verdicts(site, version),
+        trusted_calibrations=store.trusted(info),
+        report=store.manifest(site, version).report,
+    )
+
+
+@router.get("/v1/sites/{site}/versions/{before}/diff/{after}")
+def diff(store: p.Store, site: p.Site, before: p.Version, after: p.Version) -> Difference:
+    """Difference between two versions: tiles, landmarks, bytes to fetch, quality side by side."""
+    return releases.difference(store, site, before, after)
+
+
+@router.post("/v1/sites/{site}/versions/{version}/publish")
+def publish(
+    service: p.Service, sender: Sender, site: p.Site, version: p.Version, act: views.PublishAct
+) -> views.VersionView:
+    """Check a draft by the gate and make it current."""
+    store, actor = service.store, sender.of(act)
+    if act.trust_calibration:
+        releases.trust_calibration(store, store.version(site, version), actor)
+    releases.publish(store, site, version, actor=actor, force=act.force, gate=service.settings.gate)
+    return views.version_view(store, store.version(site, version))
+
+
+@router.post("/v1/sites/{site}/versions/{version}/promote")
+def promote(store: p.Store, sender: Sender, site: p.Site, version: p.Version, act: views.Act) -> views.VersionView:
+    """Make an earlier published version current."""
+    releases.promote(store, site, version, actor=sender.of(act))
+    return views.version_view(store, store.version(site, version))
+
+
+@router.post("/v1/sites/{site}/rollback")
+def rollback(store: p.Store, sender: Sender, site: p.Site, act: views.RollbackAct) -> views.VersionView:
+    """Make the previous current version current again; the present one retires. A running canary is withdrawn instead."""
+    releases.roll_back(store, site, to=act.to, canary=act.canary, actor=sender.of(act))
+    return views.version_view(store, cast(VersionInfo, store.current(site)))
+
+
+@router.get("/v1/sites/{site}/canary")
+def canary(service: p.Service, site: p.Site) -> views.CanaryView:
+    """The latest canary version, with its counts beside those of the other robots."""
+    store = service.store
+    store.current(site)
+    found = store.canaries(site)
+    if not found:
+        raise HTTPException(
+            404,
+            f"site {site} never had a canary; `mapserver promote VERSION "
+            f"--canary 5% --site {site} --store {shlex.quote(str(store.folder))}` starts one",
+        )
+    return _view(store, found[0], service.settings.canary)
+
+
+@router.post("/v1/sites/{site}/versions/{version}/canary")
+def start_canary(
+    service: p.Service, sender: Sender, site: p.Site, version: p.Version, act: views.CanaryAct
+) -> views.CanaryView:
+    """Let a share of the robots run a version before the others; a draft goes through the gate first.
+
+    `rollback` withdraws it, promoting it ends it early; otherwise the server decides by the failures of both groups.
+    """
+    store, settings = service.store, service.settings
+    share = settings.canary.share if act.share is None else act.share
+    releases.start_canary(store, site, version, share, actor=sender.of(act), gate=settings.gate)
+    return _view(store, store.canaries(site)[0], settings.canary)
 
 
 def _view(store: MapStore, row: CanaryRow, settings: CanarySettings) -> views.CanaryView:
-    members = [
-        robot.robot for robot in store.robots(row.site) if number_of(row.site, row.version, robot.robot) < row.threshold
-    ]
-    return views.CanaryView(row, find(store, row, settings, time.time_ns()), members)
+    robots = (robot.robot for robot in store.robots(row.site))
+    members = [name for name in robots if number_of(row.site, row.version, name) < row.threshold]
+    return views.CanaryView(canary=row, finding=find(store, row, settings, time.time_ns()), robots=members)

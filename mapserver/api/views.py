@@ -1,15 +1,14 @@
 """Response and request bodies of the API."""
 
-from dataclasses import dataclass
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, model_validator
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, create_model, model_validator
 
 from fleetmap.encoding import MOST
 from fleetmap.mapformat.names import NAME_PATTERN
 from mapserver.fleet.alerts import Alert
+from mapserver.fleet.building import MOST_CORNERS
 from mapserver.fleet.fleet import RobotStatus
-from mapserver.fleet.survey_requests import MOST_CORNERS
 from mapserver.fleet_statistics.canary_decision import CanaryFinding
 from mapserver.fleet_statistics.kpis import Kpis
 from mapserver.nightly.inbox import InboxEntry
@@ -56,48 +55,7 @@ def version_view(store: MapStore, info: VersionInfo) -> VersionView:
     return VersionView.model_validate(info).model_copy(update={"trusted_calibrations": store.trusted(info)})
 
 
-@dataclass(frozen=True, slots=True)
-class SiteList:
-    """Sites by name."""
-
-    sites: list[SiteInfo]
-    next: str | None
-
-
-@dataclass(frozen=True, slots=True)
-class VersionList:
-    """Versions of a site, oldest first."""
-
-    versions: list[VersionView]
-    next: str | None
-
-
-@dataclass(frozen=True, slots=True)
-class RobotList:
-    """Robots that ever reported, by site and name."""
-
-    robots: list[RobotStatus]
-    next: str | None
-
-
-@dataclass(frozen=True, slots=True)
-class EventList:
-    """Events of a site, oldest first: actor, action, time (nanoseconds since 1970) and reason."""
-
-    events: list[Event]
-    next: str | None
-
-
-@dataclass(frozen=True, slots=True)
-class JobList:
-    """Jobs, newest first."""
-
-    jobs: list[JobInfo]
-    next: str | None
-
-
-@dataclass(frozen=True, slots=True)
-class Inbox:
+class Inbox(BaseModel):
     """Recordings in the inbox of a site, at most 1000 of each kind; done: number of those in a version."""
 
     site: str
@@ -107,16 +65,14 @@ class Inbox:
     done: int
 
 
-@dataclass(frozen=True, slots=True)
-class Uploaded:
+class Uploaded(BaseModel):
     """A recording that was uploaded."""
 
     name: str
     size_bytes: int
 
 
-@dataclass(frozen=True, slots=True)
-class QualityView:
+class QualityView(BaseModel):
     """Quality of a version: gate results, oldest first, calibrations trusted by an operator, and the build's report."""
 
     site: str
@@ -127,8 +83,7 @@ class QualityView:
     report: dict[str, Any]
 
 
-@dataclass(frozen=True, slots=True)
-class KpisView:
+class KpisView(BaseModel):
     """The figures of one robot, version, tile, cause or site; key is empty for a site as a whole."""
 
     site: str
@@ -136,41 +91,14 @@ class KpisView:
     measures: Kpis
 
 
-@dataclass(frozen=True, slots=True)
-class KpisList:
-    """Figures by site and key."""
-
-    by: str
-    measures: list[KpisView]
-    next: str | None
-
-
-@dataclass(frozen=True, slots=True)
-class HourView:
+class HourView(BaseModel):
     """The figures of one hour; hour_ns: its start, nanoseconds since 1970."""
 
     hour_ns: int
     measures: Kpis
 
 
-@dataclass(frozen=True, slots=True)
-class HourList:
-    """Figures by the hour, oldest first; hours without reports are left out."""
-
-    hours: list[HourView]
-    next: str | None
-
-
-@dataclass(frozen=True, slots=True)
-class FailureList:
-    """Failures, the last to arrive first."""
-
-    failures: list[FailureRow]
-    next: str | None
-
-
-@dataclass(frozen=True, slots=True)
-class FailureView:
+class FailureView(BaseModel):
     """One failure. report: the robot's report without pictures; pictures: those still stored."""
 
     failure: FailureRow
@@ -178,8 +106,7 @@ class FailureView:
     pictures: list[PictureRow]
 
 
-@dataclass(frozen=True, slots=True)
-class CanaryView:
+class CanaryView(BaseModel):
     """The latest canary version and its decision; robots: the known robots that take part."""
 
     canary: CanaryRow
@@ -187,8 +114,7 @@ class CanaryView:
     robots: list[str]
 
 
-@dataclass(frozen=True, slots=True)
-class TokenView:
+class TokenView(BaseModel):
     """A valid token: its number, its scopes and its end. The token itself is not stored."""
 
     number: str
@@ -196,8 +122,7 @@ class TokenView:
     ends_ns: int
 
 
-@dataclass(frozen=True, slots=True)
-class OperatorView:
+class OperatorView(BaseModel):
     """An operator, or with the role `program` a name that has tokens alone. sessions: number of the open ones."""
 
     name: str
@@ -207,24 +132,14 @@ class OperatorView:
     tokens: list[TokenView]
 
 
-@dataclass(frozen=True, slots=True)
-class OperatorList:
-    """Operators and programs by name."""
-
-    operators: list[OperatorView]
-    next: str | None
-
-
-@dataclass(frozen=True, slots=True)
-class Secret:
+class Secret(BaseModel):
     """A new password or token; no other answer has it."""
 
     name: str
     secret: str
 
 
-@dataclass(frozen=True, slots=True)
-class EnrolledRobot:
+class EnrolledRobot(BaseModel):
     """A robot that is admitted to the bus. certificate: the name in it; days_left: of it, or of the bundle while that is not used."""
 
     site: str
@@ -234,14 +149,6 @@ class EnrolledRobot:
     is_used: bool
     days_left: float
     state: str
-
-
-@dataclass(frozen=True, slots=True)
-class EnrolledList:
-    """Enrolled robots of a site, by name."""
-
-    robots: list[EnrolledRobot]
-    next: str | None
 
 
 Decimal = Annotated[float, Field(ge=-MOST, le=MOST)]
@@ -362,23 +269,13 @@ class Problem(BaseModel):
     instance: str
 
 
-@dataclass(frozen=True, slots=True)
-class AlertList:
-    """Active alerts, by site, name and subject. since_ns: start; the time of the answer if it is unknown."""
-
-    alerts: list[Alert]
-    next: str | None
-
-
-@dataclass(frozen=True, slots=True)
-class AlertTest:
+class AlertTest(BaseModel):
     """Answer of the webhook to an accepted test alert."""
 
     detail: str
 
 
-@dataclass(frozen=True, slots=True)
-class ServerVersion:
+class ServerVersion(BaseModel):
     """Version of the server, and the newest formats that it reads and writes."""
 
     fleetmap: str
@@ -386,8 +283,38 @@ class ServerVersion:
     manifest_format: int
 
 
-@dataclass(frozen=True, slots=True)
-class ServiceState:
+class ServiceState(BaseModel):
     """`ok`, or the missing part."""
 
     status: str
+
+
+OK = ServiceState(status="ok")
+
+
+def _list(name: str, words: str, **fields: Any) -> Any:
+    """The model of a part of a list: its items, what they are, and the cursor of the following part."""
+    return create_model(name, __doc__=words, **fields, next=str | None)
+
+
+SiteList = _list("SiteList", "Sites by name.", sites=list[SiteInfo])
+VersionList = _list("VersionList", "Versions of a site, oldest first.", versions=list[VersionView])
+RobotList = _list("RobotList", "Robots that ever reported, by site and name.", robots=list[RobotStatus])
+EventList = _list(
+    "EventList",
+    "Events of a site, oldest first: actor, action, time (nanoseconds since 1970) and reason.",
+    events=list[Event],
+)
+JobList = _list("JobList", "Jobs, newest first.", jobs=list[JobInfo])
+KpisList = _list("KpisList", "Figures by site and key.", by=str, measures=list[KpisView])
+HourList = _list(
+    "HourList", "Figures by the hour, oldest first; hours without reports are left out.", hours=list[HourView]
+)
+FailureList = _list("FailureList", "Failures, the last to arrive first.", failures=list[FailureRow])
+OperatorList = _list("OperatorList", "Operators and programs by name.", operators=list[OperatorView])
+EnrolledList = _list("EnrolledList", "Enrolled robots of a site, by name.", robots=list[EnrolledRobot])
+AlertList = _list(
+    "AlertList",
+    "Active alerts, by site, name and subject. since_ns: start; the time of the answer if it is unknown.",
+    alerts=list[Alert],
+)

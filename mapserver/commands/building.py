@@ -211,7 +211,7 @@ def set_(
 ) -> None:
     """Make aligned sites the floors of a building; robots of each of them then know all of its floors."""
     from fleetmap.mapformat.building import Building
-    from mapserver.fleet.floors import floors_of, keep_building, single_lifts
+    from mapserver.fleet.building import floors_of, keep_building, single_lifts
 
     building = Building(name=name, floors=tuple(map(_entry, floor)))
     with open_store(store) as maps:
@@ -226,17 +226,17 @@ def set_(
 @expand_options
 def remove_building(name: _Name, *, store: StoreFolder, by: ActorOptions) -> None:
     """Let the floors of a building be sites of their own again; their maps stay."""
-    from mapserver.fleet import floors
+    from mapserver.fleet import building
 
     with open_store(store) as maps:
-        removed = floors.remove_building(maps, name, by.named())
+        removed = building.remove_building(maps, name, by.named())
     typer.echo(f"{name}: {', '.join(floor.site for floor in removed.floors)} are no floors of one building any more")
 
 
 @expand_options
 def list_buildings(*, store: StoreFolder, json: Json = False) -> None:
     """List the buildings with their floors and lifts."""
-    from mapserver.fleet.floors import buildings
+    from mapserver.fleet.building import buildings
 
     with open_store(store, read_only=True) as maps:
         found = buildings(maps)
@@ -264,7 +264,7 @@ def _entry(text: str) -> "FloorEntry":
 
 
 def _print(maps: "MapStore", building: "Building") -> None:
-    from mapserver.fleet.floors import floors_of
+    from mapserver.fleet.building import floors_of
 
     lifts = {floor.entry.site: ", ".join(sorted(floor.lifts)) for floor in floors_of(maps, building)}
     typer.echo(f"{building.name}:")

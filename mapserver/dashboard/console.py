@@ -23,7 +23,7 @@ from fleetmap.errors import FleetmapError, StoreError, UsageError
 from fleetmap.mapformat.names import sha256_hex
 from mapserver.api.guard import SIGN_IN, SIGN_OUT
 from mapserver.api.moments import moment_text, read_moment, read_range, written, zone_of
-from mapserver.api.version_routes import ApiSettings
+from mapserver.api.parameters import ApiSettings
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots

@@ -1,4 +1,4 @@
-"""Installation of the dashboard in the API's server: pages under /dashboard, and their pictures."""
+"""Installation of the dashboard in the API's server: pages under /dashboard, their pictures, and sign-in."""
 
 import time
 from collections.abc import Callable
@@ -6,30 +6,32 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Literal
+from urllib.parse import parse_qs
 
+from anyio import to_thread
 from fastapi import FastAPI, Request, Response
-from fastapi.responses import RedirectResponse
+from fastapi.responses import HTMLResponse, RedirectResponse
 from starlette.middleware.gzip import GZipMiddleware
 
 from fleetmap.errors import FleetmapError, StateError
 from mapserver.api.bytes_response import PICTURE_HEADERS
-from mapserver.api.version_routes import ApiSettings
+from mapserver.api.guard import SIGN_IN, SIGN_OUT, STYLE, GuardSettings, address_of, set_session
+from mapserver.api.parameters import ApiSettings
 from mapserver.dashboard import (
     administration,
     failure,
     failures,
     map_page,
     overview,
-    people,
     robot,
     robots,
-    sign_in_page,
     survey_jobs,
 )
 from mapserver.dashboard.console import PATH, Console, Services
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots
+from mapserver.dashboard.rendering import TEMPLATES
 from mapserver.fleet.alerts import active_alerts
 from mapserver.fleet.fleet import Fleet
 from mapserver.hooks import part_hooks
@@ -38,6 +40,7 @@ from mapserver.store import MapStore
 LASTING = "private, max-age=31536000, immutable"  # versions do not change
 Hear = Callable[[str, str, Callable[[str, bytes], None]], None]
 """`BusService.hear`."""
+_MAX_ADDRESS = 300  # percent-encoded it must fit into the sign-in's body, beside name and password
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +78,7 @@ def install_dashboard(
     console.nothing_else()
     _install_files(pages, services)
     app.mount(PATH, pages)
-    sign_in_page.install(app, settings.guard)
+    _install_sign_in(app, settings.guard)
 
     @app.get("/", include_in_schema=False)
     def to_dashboard(request: Request) -> RedirectResponse:
@@ -112,7 +115,7 @@ def _install_administration(console: Console) -> None:
     console.page(
         "administration", "administration.html", administration.page, link=_link("Administration"), of_site=False
     )
-    console.page("administration/people", "people.html", people.page, of_site=False)
+    console.page("administration/people", "people.html", administration.people, of_site=False)
 
 
 def _install_files(pages: FastAPI, services: Services) -> None:
@@ -137,3 +140,56 @@ def _install_files(pages: FastAPI, services: Services) -> None:
 def file_response(data: bytes, media_type: str, cache_control: str = LASTING) -> Response:
     """Answer with a file; LASTING for one that never changes."""
     return Response(data, media_type=media_type, headers={"Cache-Control": cache_control, **PICTURE_HEADERS})
+
+
+def _install_sign_in(app: FastAPI, settings: GuardSettings) -> None:
+    """Adds the page and its two actions: without scripts, for those whom nobody knows yet."""
+
+    @app.get(SIGN_IN, include_in_schema=False)
+    def sign_in_page(request: Request, next: str = "/") -> Response:
+        """The form; whoever needs none goes on."""
+        if not settings.is_sign_in_on or settings.identify(request.scope) is not None:
+            return RedirectResponse(_local(next), 303)
+        return _sign_in_page(next)
+
+    @app.post(SIGN_IN, include_in_schema=False)
+    async def sign_in(request: Request) -> Response:
+        """Begins a session."""
+        given = {
+            name: values[0] for name, values in parse_qs((await request.body()).decode("utf-8", "replace")).items()
+        }
+        then, name, operators = given.get("next", "/"), given.get("name", "").strip().lower(), settings.operators
+        if operators is None:
+            return RedirectResponse(_local(then), 303)
+        found = await to_thread.run_sync(operators.sign_in, name, given.get("password", ""), address_of(request.scope))
+        if not found.session:
+            page = _sign_in_page(then, name, found.refusal, 429 if found.retry_s else 401)
+            if found.retry_s:
+                page.headers["Retry-After"] = str(found.retry_s)
+            return page
+        response = RedirectResponse(_local(then), 303)
+        set_session(response, request.scope, found.session)
+        return response
+
+    @app.post(SIGN_OUT, include_in_schema=False)
+    def sign_out(request: Request) -> Response:
+        """Ends the session."""
+        who = settings.identify(request.scope)
+        if who is not None and settings.operators is not None:
+            settings.operators.sign_out(who)
+        response = RedirectResponse(SIGN_IN, 303)
+        set_session(response, request.scope, "")
+        return response
+
+
+def _sign_in_page(then: str, name: str = "", refusal: str = "", status: int = 200) -> HTMLResponse:
+    shown = {"style": STYLE, "action": SIGN_IN, "then": _local(then), "name": name, "refusal": refusal}
+    page = TEMPLATES.get_template("sign_in.html").render(shown)
+    return HTMLResponse(page, status, {"Cache-Control": "no-store"})
+
+
+def _local(address: str) -> str:
+    """The address where it is one of this server, else the first page: a link from elsewhere must not lead on to elsewhere."""
+    is_local = address.startswith("/") and not address.startswith(("//", "/\\")) and address.isprintable()
+    is_local = is_local and len(address) <= _MAX_ADDRESS
+    return address if is_local and not address.startswith((SIGN_IN, SIGN_OUT)) else "/"

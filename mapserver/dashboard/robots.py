@@ -4,11 +4,11 @@ from collections import Counter
 from typing import NamedTuple
 
 from fleetmap.errors import UsageError
+from mapserver.dashboard.administration import cannot_enrol
 from mapserver.dashboard.console import PageContext, Services
 from mapserver.dashboard.fleet_health import SiteHealth
 from mapserver.dashboard.live import ORDER, LiveRobot
 from mapserver.dashboard.overview import remarks, since_words, site_line
-from mapserver.dashboard.people import cannot_enrol
 from mapserver.floor_plan.areas import Areas
 from mapserver.trust.enrolment import RobotRegister
 

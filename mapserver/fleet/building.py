@@ -1,5 +1,11 @@
-"""Operators' knowledge of a site's building: its named areas, and the pose of the map in its floor plan. Both are kept with the site."""
+"""Operators' knowledge of a site's building: named areas, requested surveys, the pose of the map in its plan, and the floors.
 
+All are kept with the site. A survey of a polygon is requested until a version covers it or the request is closed. The floors are a file of
+each of their sites, which robots get with the site's signed list.
+"""
+
+import hashlib
+import shlex
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -9,17 +15,21 @@ import msgspec
 import numpy as np
 
 from fleetmap.encoding import to_json
-from fleetmap.errors import StateError, UsageError
+from fleetmap.errors import MapFormatError, StateError, UsageError
 from fleetmap.geometry import Array
-from fleetmap.mapformat.building import ALIGNMENT, AREAS, FLOORS
-from mapserver.fleet.survey_requests import ask_for_survey
+from fleetmap.mapformat.building import ALIGNMENT, AREAS, FLOORS, Building, Floor, FloorEntry, read_building, read_lifts
 from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment, map_corners_m
 from mapserver.floor_plan.areas import MAX_REASON, Area, Areas, Correction, CorrectionKind, read_areas
 from mapserver.floor_plan.masks import check_masks_on_map
 from mapserver.floor_plan.pins import Fit, Pin, fit_pins
 from mapserver.floor_plan.plan_file import PlanFile, upwards
+from mapserver.floor_plan.survey_requests import ASKED, KIND, SurveyRequest
 from mapserver.store import Actor, MapStore
 from mapserver.store.map_store import AREAS_BEFORE
+
+MOST_REQUESTS, MOST_CORNERS = 100, 200
+MOST_SIDE_M = 500.0
+Corners = Sequence[tuple[float, float]]
 
 
 def keep_areas(
@@ -174,3 +184,114 @@ def alignment_words(found: Alignment) -> str:
     turned = f"turned by {degrees(frame.yaw_rad):.3f} degrees +- {degrees(frame.sigma_rad):.3f}"
     at = f"the map's origin at {frame.x_m:.3f}, {frame.y_m:.3f} m of the building"
     return f"by {found.method}: {at}, {turned}, {found.metres_per_unit:.6g} m per unit of the plan"
+
+
+def ask_for_survey(store: MapStore, site: str, corners_map_m: Corners, actor: Actor) -> SurveyRequest:
+    """Store a request, and log it in the site's history.
+
+    UsageError for an unknown site or an invalid polygon (simple, at most MOST_SIDE_M each way), StateError without a map and for too many.
+    """
+    if store.current(site) is None:
+        raise StateError(f"site {site} has no published map to resurvey; publish one first")
+    if len(store.survey_requests(site)) >= MOST_REQUESTS:
+        raise StateError(f"site {site} has {MOST_REQUESTS} open requests; close some first")
+    if not 3 <= len(corners_map_m) <= MOST_CORNERS:
+        raise UsageError(f"{len(corners_map_m)} corners; draw the polygon with 3 to {MOST_CORNERS}")
+    ring = [[round(float(x), 2), round(float(y), 2)] for x, y in corners_map_m]
+    asked_ns = store.now_ns()
+    who = {"name": "survey", "asked_ns": asked_ns, "actor": actor.name, "reason": actor.reason}
+    geometry = {"type": "Polygon", "coordinates": [[*ring, *ring[:1]]]}
+    feature = {"type": "Feature", "geometry": geometry, "properties": who}
+    data = to_json({"type": "FeatureCollection", "frame": "map", "features": [feature]})
+    (area,) = read_areas(data, None).areas  # refuses polygons that are not simple
+    sides_m = np.ptp(np.array(ring), axis=0)
+    if sides_m.max() > MOST_SIDE_M:
+        raise UsageError(f"{sides_m[0]:.0f} x {sides_m[1]:.0f} m; draw several of at most {MOST_SIDE_M:g} m each way")
+    made = SurveyRequest(hashlib.sha256(data).hexdigest()[:8], asked_ns, actor.name, actor.reason, ring)
+    middle = np.array(ring).mean(axis=0)
+    named = store.areas(site).at(*middle.tolist())
+    words = f"{ASKED}{f'{named}, ' if named else ''}{area.size_m2:.0f} m2 around {middle[0]:.1f}, {middle[1]:.1f} m"
+    store.keep_site_files(site, {KIND + made.id: data}, words, actor=actor)
+    return made
+
+
+def end_request(store: MapStore, site: str, request: str, actor: Actor) -> None:
+    """Remove a request from the list because it was surveyed or is no longer wanted. UsageError for an unknown one."""
+    store.current(site)  # raises for an unknown site
+    if request not in {known.id for known in store.survey_requests(site)}:
+        raise UsageError(f"site {site} has no open request {request[:40]!r} for a survey; it may be closed already")
+    store.keep_site_files(site, {KIND + request: None}, "done", actor=actor)
+
+
+def keep_building(store: MapStore, building: Building, actor: Actor) -> Building:
+    """Make the sites the floors of a building, and return it, from below; sites that it had before leave it.
+
+    Raises UsageError for an unknown site, one without a version or pose, one of another building, for repeated levels or heights, for names
+    that cannot be printed in a line, and for a single floor.
+    """
+    for text in (building.name, *(floor.level for floor in building.floors)):
+        if not (0 < len(text) <= 64 and text.isprintable() and text == text.strip()):
+            raise UsageError(f"name {text[:80]!r} of a building or level: use 1 to 64 characters of one line")
+    if len(building.floors) < 2:
+        raise UsageError(f"building {building.name!r}: two floors or more make a building; name each with --floor")
+    try:
+        building = read_building(to_json(building))
+    except MapFormatError as error:
+        raise UsageError(str(error)) from error
+    sites = [floor.site for floor in building.floors]
+    for site in sites:
+        if store.current(site) is None:  # it raises for an unknown site
+            how = f"publish one with `mapserver publish --site {site}`"
+            raise UsageError(f"site {site} has no published version, and robots need the maps of all floors; {how}")
+        known = store.building(site)
+        if known is not None and known.name != building.name:
+            how = f"`mapserver building remove {shlex.quote(known.name)}` first, or set that one"
+            raise UsageError(f"site {site} is a floor of {known.name!r}; {how}")
+        if store.alignment(site) is None:
+            raise UsageError(f"site {site} has no pose in the building; run `mapserver align --site {site} --pin ...`")
+    for known in buildings(store):
+        if known.name == building.name:
+            _forget(store, [floor.site for floor in known.floors if floor.site not in sites], known, actor)
+    data = to_json(building)
+    for floor in building.floors:
+        words = f"{building.name}: level {floor.level}, {floor.height_m:g} m"
+        store.keep_site_files(floor.site, {FLOORS: data}, words, actor=actor)
+    return building
+
+
+def remove_building(store: MapStore, name: str, actor: Actor) -> Building:
+    """Let each floor of a building be a site of its own again, and return the building; UsageError for an unknown one."""
+    for known in buildings(store):
+        if known.name == name:
+            _forget(store, [floor.site for floor in known.floors], known, actor)
+            return known
+    raise UsageError(f"there is no building {name[:80]!r}; `mapserver building list` shows all")
+
+
+def _forget(store: MapStore, sites: Sequence[str], building: Building, actor: Actor) -> None:
+    for site in sites:
+        store.keep_site_files(site, {FLOORS: None}, f"no floor of {building.name}", actor=actor)
+
+
+def buildings(store: MapStore) -> list[Building]:
+    """Return all buildings, by name."""
+    found = {known.name: known for info in store.sites() if (known := store.building(info.site)) is not None}
+    return [found[name] for name in sorted(found)]
+
+
+def floors_of(store: MapStore, building: Building) -> list[Floor]:
+    """Return the floors with their poses and lifts; one whose alignment was removed is left out."""
+
+    def floor(entry: FloorEntry) -> Floor | None:
+        alignment = store.alignment(entry.site)
+        if alignment is None:
+            return None
+        return Floor(entry, alignment.frame, read_lifts(store.site_file(entry.site, AREAS), alignment.frame))
+
+    return [found for entry in building.floors if (found := floor(entry)) is not None]
+
+
+def single_lifts(floors: Sequence[Floor]) -> list[str]:
+    """Return the lifts that only one floor has: robots in them cannot come out elsewhere."""
+    names = [name for floor in floors for name in floor.lifts]
+    return sorted(name for name in set(names) if names.count(name) == 1)

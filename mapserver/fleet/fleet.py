@@ -7,10 +7,15 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from fleetmap.encoding import to_plain
 from fleetmap.errors import LinkError, StoreError, UsageError
+from fleetmap.files import write_atomically
+from fleetmap.mapformat.manifest import Name
 from fleetmap.mapformat.names import check_name
 from fleetmap.messages import (
     MAX_THUMBNAIL_BYTES,
@@ -25,11 +30,11 @@ from fleetmap.messages import (
 )
 from mapserver.fleet.ingest import Ingest, IngestSettings
 from mapserver.fleet.rate_limit import RateLimit
-from mapserver.fleet.rejected_reports import rejection, set_aside
 from mapserver.fleet.replay_intake import ReplayIntake
 from mapserver.fleet_statistics.canary_decision import number_of
 from mapserver.fleet_statistics.clock_skew import ClockSkew
 from mapserver.store import CanaryRow, MapStore
+from mapserver.store.files import check_no_link, make_folder
 from mapserver.store.rows import RobotInfo
 
 MAX_ROBOTS = 10_000
@@ -43,6 +48,8 @@ _COPIED_NS = 3_600_000_000_000  # time for which a detected copy is reported
 # A robot reports once a second; of two programs under one name every other report follows the last one within half a second, or before it.
 _SOONEST_NS, _TWO_REPORT = 700_000_000, 20
 _USUAL = IngestSettings()
+_log = logging.getLogger(__name__)
+_MAX_KEPT = 100
 _log = logging.getLogger(__name__)
 
 
@@ -361,3 +368,37 @@ def _check_sender(site: str, robot: str, message: RobotAck | RobotHealth | Failu
         raise LinkError(f"robot {robot!r} of {site!r} reports in the name of {message.robot!r} of {message.site!r}")
     if abs(message.stamp_ns) > MAX_STAMP_NS:
         raise LinkError(f"robot {robot!r} of {site!r} sent the stamp {message.stamp_ns} ns; check its clock")
+
+
+class _IdOnly(msgspec.Struct, frozen=True):
+    id: Name
+
+
+def rejection(payload: bytes, reason: str) -> FailureAck:
+    """Return the answer that stops a robot from resending an unreadable report; raises LinkError if its id is unreadable too."""
+    try:
+        known = msgspec.msgpack.decode(payload, type=_IdOnly)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise LinkError(reason) from error
+    return FailureAck(id=known.id, refused=reason[:2000])
+
+
+def set_aside(folder: Path, moment: str, robot: tuple[str, str], payload: bytes, reason: str) -> None:
+    """Keep a rejected report with its reason; only the latest ones are kept. A full disk loses only these. robot: site and name."""
+    site, name = robot
+    _log.warning("a failure of robot %r of site %r is permanently refused: %s", name[:80], site[:80], reason)
+    try:
+        sender = f"{check_name(site, 'site')}-{check_name(name, 'robot')}"
+    except UsageError:
+        sender = "unknown"
+    try:
+        check_no_link(folder.parent, folder)
+        make_folder(folder)
+        path = folder / f"{moment}-{sender}.msgpack"
+        write_atomically(path, [payload])
+        write_atomically(path.with_suffix(".reason.txt"), [f"{reason}\n".encode("utf-8", "replace")])
+        for old in sorted(folder.glob("*.msgpack"))[:-_MAX_KEPT]:
+            old.unlink()
+            old.with_suffix(".reason.txt").unlink(missing_ok=True)
+    except (OSError, StoreError) as error:
+        _log.warning("the refused report could not be kept in %s: %s", folder, error)

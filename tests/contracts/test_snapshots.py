@@ -31,7 +31,7 @@ def is_as_kept(name: str, text: str) -> bool:
 
 
 def test_openapi(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mapserver.api.file_routes.route_hooks", dict)  # without plug-ins
+    monkeypatch.setattr("mapserver.api.app.route_hooks", dict)  # without plug-ins
     with MapStore.open(tmp_path, create=True) as store:
         fleet = Fleet(store)
         document = create_app(store, fleet, Metrics(store, fleet), None).openapi()

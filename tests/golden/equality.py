@@ -37,7 +37,7 @@ from locclient.maps.map_source import LocalMapSource
 from locclient.replay.replay import load_map
 from locclient.robot.robot import Robot
 from locclient.robot.version_trial import TrialSettings
-from mapserver.fleet.floors import keep_building
+from mapserver.fleet.building import keep_building
 from mapserver.floor_plan.alignment import Alignment, encode_alignment
 from mapserver.store import NOBODY, MapStore
 from support.recordings.realdata import DATA

@@ -4,6 +4,7 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,9 +21,9 @@ if TYPE_CHECKING:
     from mapserver.plugins.live_surveys.drives import Drive
     from mapserver.plugins.live_surveys.live_viewer import LiveViewer
     from mapserver.plugins.live_surveys.message import LiveSurveyState
-    from mapserver.plugins.live_surveys.viewer_address import ViewerAddress
     from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer
     from mapserver.survey.settings import SurveySettings
+_LOOPBACK = "127.0.0.1"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +67,6 @@ def live(
         )
     from fleetmap.console import plain_console
     from fleetmap.plugins.viewer_channels import require_foxglove
-    from mapserver.plugins.live_surveys.viewer_address import viewer_address
 
     at = None if options.foxglove is None else viewer_address(options.foxglove, insecure=options.insecure)
     if at is not None:
@@ -157,12 +157,12 @@ def _bus(server: str | None, store: Path) -> "AbstractContextManager[Bus | None]
     return Bus.connect(server, tls=tls)
 
 
-def _foxglove(at: "ViewerAddress | None", site: str) -> "AbstractContextManager[FoxgloveServer | None]":
+def _foxglove(at: tuple[str, int] | None, site: str) -> "AbstractContextManager[FoxgloveServer | None]":
     if at is None:
         return nullcontext(None)
     from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer
 
-    server = FoxgloveServer(at, site)
+    server = FoxgloveServer(*at, site)
     typer.echo(f"foxglove: {server.url}")
     return server
 
@@ -179,3 +179,24 @@ def _teller(bus: "Bus | None", viewer: "LiveViewer | None") -> "Callable[[LiveSu
             viewer.tell(state)
 
     return tell
+
+
+def viewer_address(text: str, *, insecure: bool) -> tuple[str, int]:
+    """Parse the value of `--foxglove`, PORT on loopback or HOST:PORT; port 0 picks a free one.
+
+    Raises UsageError for an invalid address, and for one that other machines can reach unless allowed: viewers do not sign in.
+    """
+    host, _, port = text.rpartition(":")
+    host = host.strip("[]") or _LOOPBACK
+    if not (port.isascii() and port.isdecimal()) or int(port) > 65535:
+        raise UsageError(f"--foxglove {text!r}: write it like 8765 or {_LOOPBACK}:8765")
+    try:
+        is_local = host == "localhost" or ip_address(host).is_loopback
+    except ValueError:
+        is_local = False
+    if not (is_local or insecure):
+        raise UsageError(
+            f"--foxglove {text}: viewers do not sign in, and other machines could see everything; leave {host} out and come "
+            "through ssh -L, or pass --insecure on a network that only you can reach"
+        )
+    return host, int(port)

@@ -8,6 +8,7 @@ import signal
 import threading
 import time
 from collections import Counter, deque
+from collections.abc import Mapping, Sequence
 from multiprocessing.connection import Connection
 from typing import NamedTuple, Self
 
@@ -48,34 +49,21 @@ class MapSketch(NamedTuple):
     newest keyframe. cells and missing: coverage and gaps of the drive, updated periodically; see LiveSurveyState.
     """
 
-    keyframes: int
-    path_m: Array
-    part: NDArray[np.uint8]
-    parts: list[LivePart]
-    landmarks_m: Array
-    loops_m: Array
-    loops: int
-    refused: dict[str, int]
-    revisits: tuple[LiveRevisit, ...]
-    estimate: LiveEstimate | None
-    cells: Array
-    missing: list[LiveMissing]
+    keyframes: int = 0
+    path_m: Array = np.zeros((0, 2))
+    part: NDArray[np.uint8] = np.zeros(0, np.uint8)
+    parts: Sequence[LivePart] = ()
+    landmarks_m: Array = np.zeros((0, 2))
+    loops_m: Array = np.zeros((0, 4))
+    loops: int = 0
+    refused: Mapping[str, int] = {}
+    revisits: Sequence[LiveRevisit] = ()
+    estimate: LiveEstimate | None = None
+    cells: Array = np.zeros((0, 3))
+    missing: Sequence[LiveMissing] = ()
 
 
-NO_SKETCH = MapSketch(
-    0,
-    np.zeros((0, 2)),
-    np.zeros(0, np.uint8),
-    [],
-    np.zeros((0, 2)),
-    np.zeros((0, 4)),
-    0,
-    {},
-    (),
-    None,
-    np.zeros((0, 3)),
-    [],
-)
+NO_SKETCH = MapSketch()
 _Item = tuple[RectifiedFrame, NewKeyframe]
 
 
@@ -90,7 +78,8 @@ class MappingProcess:
         self._theirs, self._needed = theirs, (config, rig)
         self._waiting: queue.Queue[_Item | None] = queue.Queue()
         self._sent = 0
-        self._latest, self._failed = NO_SKETCH, ""
+        self.sketch = NO_SKETCH  # after the newest processed keyframe
+        self.failed = ""  # why no more keyframes are accepted
         self._put_s: deque[float] = deque()  # of keyframes not yet in a sketch
         self.longest_lag_s = 0.0  # from a keyframe to its sketch
         self._threads = [threading.Thread(target=work, daemon=True) for work in (self._send, self._receive)]
@@ -112,31 +101,19 @@ class MappingProcess:
         self.finish()
 
     @property
-    def sketch(self) -> MapSketch:
-        """Return the map after the newest processed keyframe."""
-        return self._latest
-
-    @property
     def behind(self) -> int:
         """Number of keyframes in the queue."""
-        return self._sent - self._latest.keyframes
-
-    @property
-    def failed(self) -> str:
-        """Return why no more keyframes are accepted; empty without a fault."""
-        return self._failed
+        return self._sent - self.sketch.keyframes
 
     def put(self, frame: RectifiedFrame, keyframe: NewKeyframe) -> None:
         """Queue one more keyframe; returns at once.
 
         A map that lags too far is given up: the build at the end does not need it.
         """
-        if self._failed:
+        if self.failed:
             return
         if self.behind >= _MAX_WAITING:
-            self._failed = (
-                f"mapping was {_MAX_WAITING} keyframes behind and was given up; the finished map is built nevertheless"
-            )
+            self._fail(f"mapping was {_MAX_WAITING} keyframes behind and was given up")
             self._waiting.put(None)
             return
         self._sent += 1
@@ -170,26 +147,24 @@ class MappingProcess:
         except OSError:  # the process has ended: `_receive` reports the reason
             pass
         except Exception as error:
-            self._failed = self._failed or _given_up(error)
+            self._fail(f"mapping was given up ({type(error).__name__}: {error})")
 
     def _receive(self) -> None:
         try:
             while (answer := self._ours.recv()) is not None:
                 if isinstance(answer, str):
-                    self._failed = answer
-                    return
-                shown = answer.keyframes - self._latest.keyframes
-                self._latest = answer
+                    return self._fail(answer)
+                shown = answer.keyframes - self.sketch.keyframes
+                self.sketch = answer
                 for _ in range(shown):
                     self.longest_lag_s = max(self.longest_lag_s, time.monotonic() - self._put_s.popleft())
         except (EOFError, OSError):
-            self._failed = self._failed or "the mapping process ended; the finished map is built nevertheless"
+            self._fail("the mapping process ended")
         except Exception as error:
-            self._failed = self._failed or _given_up(error)
+            self._fail(f"mapping was given up ({type(error).__name__}: {error})")
 
-
-def _given_up(error: Exception) -> str:
-    return f"mapping was given up ({type(error).__name__}: {error}); the finished map is built nevertheless"
+    def _fail(self, words: str) -> None:
+        self.failed = self.failed or f"{words}; the finished map is built nevertheless"
 
 
 def _map(pipe: Connection) -> None:
@@ -216,7 +191,7 @@ def _map(pipe: Connection) -> None:
     except (EOFError, OSError):  # the survey was killed
         pass
     except Exception as error:  # a fault here must not end the survey
-        pipe.send(f"mapping failed ({type(error).__name__}: {error}); the finished map is built nevertheless")
+        pipe.send(f"mapping failed ({type(error).__name__}: {error})")
 
 
 def _quality(growing: LiveMap, rig: LiveRig) -> tuple[Array, list[LiveMissing]]:

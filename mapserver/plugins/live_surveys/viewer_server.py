@@ -13,7 +13,6 @@ from foxglove.websocket import ChannelView, Client, ServerListener
 from fleetmap.errors import FleetmapError, UsageError
 from fleetmap.log_lines import LogLimit
 from fleetmap.plugins.viewer_channels.channels import CHANNELS, Shown, encoding_of
-from mapserver.plugins.live_surveys.viewer_address import ViewerAddress
 
 _WAITING = 32  # messages of a topic that are not encoded yet
 _BACKLOG = 256  # encoded messages waiting for one viewer; the library drops the oldest
@@ -27,8 +26,8 @@ class FoxgloveServer:
     A new viewer gets the last message of each topic. dropped: number of messages that arrived too fast to be encoded.
     """
 
-    def __init__(self, address: ViewerAddress, name: str) -> None:
-        """name: shown by viewers. Raises UsageError if it cannot listen there."""
+    def __init__(self, host: str, port: int, name: str) -> None:
+        """host, port: for viewers; name: shown by viewers. Raises UsageError if it cannot listen there."""
         self.dropped = 0
         self._context = Context()
         # All before any viewer connects: an early subscription to a channel that is created later may be refused as unknown.
@@ -44,18 +43,15 @@ class FoxgloveServer:
         try:
             self._server = foxglove.start_server(
                 name=name,
-                host=address.host,
-                port=address.port,
+                host=host,
+                port=port,
                 server_listener=_Listener(self),
                 message_backlog_size=_BACKLOG,
                 context=self._context,
             )
         except (RuntimeError, OSError) as error:
-            raise UsageError(
-                f"--foxglove {address.host}:{address.port}: cannot listen there ({error}); choose another"
-            ) from error
-        host = f"[{address.host}]" if ":" in address.host else address.host
-        self.url = f"ws://{host}:{self._server.port}"
+            raise UsageError(f"--foxglove {host}:{port}: cannot listen there ({error}); choose another") from error
+        self.url = f"ws://{f'[{host}]' if ':' in host else host}:{self._server.port}"
         self._thread = threading.Thread(target=self._serve, daemon=True, name="foxglove")
         self._thread.start()
 

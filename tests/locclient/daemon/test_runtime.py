@@ -48,7 +48,7 @@ from mapserver.dashboard.overview import remarks
 from mapserver.fleet.alerts import AlertSettings, active_alerts
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.bus_service import BusService
-from mapserver.serving.robot_placing import RobotPlacing
+from mapserver.serving.robot_placing import place_robot
 from mapserver.store import Actor, FailureFilter, MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.recording_samples import calibration
@@ -303,7 +303,7 @@ def test_a_robot_that_is_told_its_place_believes_it_until_fixes_outweigh_it(worl
 
     def tell() -> None:
         with MemoryBus(world.hub) as server:
-            RobotPlacing(world.store, world.fleet, server).tell(told, Actor("ada", "it was pushed"))
+            place_robot(world.store, world.fleet, server, told, Actor("ada", "it was pushed"))
 
     source.before[60] = tell
     Runtime(parts, ServiceManager("")).run()

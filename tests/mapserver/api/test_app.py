@@ -13,7 +13,7 @@ from fleetmap.mapformat.manifest import decode_manifest
 from fleetmap.mapformat.names import blob_path, sha256_hex
 from fleetmap.mapformat.tile_codec import TILE_FORMAT, decode_tile
 from fleetmap.messages import RobotAck, RobotHealth, Thumbnail
-from mapserver.api import app as app_module
+from mapserver.api import fleet_routes
 from mapserver.quality.figures import Evidence, RigEvidence
 from mapserver.store import DraftContent
 from mapserver.trust import init_here
@@ -237,7 +237,7 @@ def test_a_page_of_robots_has_a_bounded_size(server: Server, monkeypatch: pytest
         cursor, pages = answer.json()["next"], pages + 1
     assert names == [f"r{number:03d}" for number in range(120)]
     assert pages == 2
-    monkeypatch.setattr(app_module, "_MAX_PAGE_BYTES", 1 << 40)
+    monkeypatch.setattr(fleet_routes, "_MAX_PAGE_BYTES", 1 << 40)
     assert len(server.client.get("/v1/robots?limit=1000").content) > 6_000_000, "the control"
 
 

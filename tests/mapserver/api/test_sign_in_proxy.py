@@ -14,8 +14,8 @@ from fleetmap.errors import UsageError
 from mapserver.api.app import create_app
 from mapserver.api.guard import GuardSettings
 from mapserver.api.metrics import Metrics
+from mapserver.api.parameters import ApiSettings
 from mapserver.api.sign_in_proxy import PAGE_S, ProxiedPeople, SignInProxy
-from mapserver.api.version_routes import ApiSettings
 from mapserver.commands.serve import HttpOptions
 from mapserver.operators.operators import Operators
 from mapserver.store import Actor, MapStore

@@ -17,8 +17,7 @@ from fleetmap.messages import InitialPoseMessage, decode_message, robot_key
 from locclient.identity import RobotIdentity
 from mapserver import releases
 from mapserver.cli import app
-from mapserver.fleet.building import replace_areas
-from mapserver.fleet.survey_requests import ask_for_survey, end_request
+from mapserver.fleet.building import ask_for_survey, end_request, replace_areas
 from mapserver.store import Actor, DraftContent, MapStore
 from mapserver.trust import init_here
 from mapserver.trust.enrolment import RobotRegister

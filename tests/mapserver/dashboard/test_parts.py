@@ -21,14 +21,13 @@ from mapserver import releases
 from mapserver.dashboard import fleet_parts, map_layers
 from mapserver.dashboard.administration import ending_row
 from mapserver.dashboard.console import PageContext
-from mapserver.dashboard.data import MapData
+from mapserver.dashboard.data import MapData, grid_picture
 from mapserver.dashboard.fleet_health import HealthData, trend_words
 from mapserver.dashboard.live import LiveRobots, live_robot
 from mapserver.dashboard.map_page import one_way
 from mapserver.dashboard.plan import make_plan
 from mapserver.dashboard.rendering import TEMPLATES
-from mapserver.dashboard.robot_history import band, curve, stretches, way
-from mapserver.dashboard.underlays import grid_picture
+from mapserver.dashboard.robot import band, curve, stretches, way
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, rate

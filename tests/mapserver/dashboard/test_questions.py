@@ -11,7 +11,7 @@ import pytest
 from playwright.sync_api import Locator, Page, TimeoutError, expect
 
 from mapserver import releases
-from mapserver.fleet.survey_requests import ask_for_survey
+from mapserver.fleet.building import ask_for_survey
 from mapserver.store import Actor, MapStore
 from mapserver.trust.enrolment import RobotRegister
 from support.fleet.dashboard_scene import SITE, Served, marks, opened, overlapping, serving, talking

@@ -20,8 +20,7 @@ from fleetmap.mapformat.building import (
     read_lifts,
 )
 from mapserver.cli import app
-from mapserver.fleet.building import forget_alignment, keep_areas
-from mapserver.fleet.floors import floors_of, keep_building
+from mapserver.fleet.building import floors_of, forget_alignment, keep_areas, keep_building
 from mapserver.floor_plan.alignment import Alignment, encode_alignment
 from mapserver.releases import publish
 from mapserver.store import NOBODY, MapStore

@@ -11,7 +11,7 @@ import pytest
 
 from fleetmap.errors import LinkError, StateError, StoreError
 from fleetmap.failure_summary import MAX_DRIVE_BYTES, ReplayPart
-from mapserver.fleet.survey_requests import ask_for_survey, end_request
+from mapserver.fleet.building import ask_for_survey, end_request
 from mapserver.floor_plan.survey_requests import courses
 from mapserver.nightly import robot_drives, upload
 from mapserver.nightly.robot_drives import RobotDrives

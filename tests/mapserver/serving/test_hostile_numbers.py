@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from fleetmap import failure_summary, messages
 from fleetmap.messages import FailureReport, Placement, PoseMessage, RobotAck, RobotHealth, robot_key
-from mapserver.api.version_routes import ApiSettings
+from mapserver.api.parameters import ApiSettings
 from mapserver.cli import app
 from mapserver.dashboard.install import install_dashboard
 from mapserver.fleet.rate_limit import RateLimit

@@ -8,7 +8,7 @@ import pytest
 
 from fleetmap.errors import StateError, UsageError
 from fleetmap.messages import InitialPoseMessage, RobotHealth, decode_message, robot_key
-from mapserver.serving.robot_placing import RobotPlacing
+from mapserver.serving.robot_placing import place_robot
 from mapserver.store import Actor
 from support.fleet.served_api import Server, check_problem, served_api
 
@@ -70,7 +70,7 @@ def test_a_robot_that_is_away_is_not_told(server: Server, monkeypatch: pytest.Mo
     assert answered(1.0, here) == 200
     word = InitialPoseMessage(site="lab", robot="r1", x_map_m=1.5, y_map_m=2.0)
     with pytest.raises(StateError, match="no bus"):
-        RobotPlacing(server.store, server.fleet, None).tell(word, Actor("ada"))
+        place_robot(server.store, server.fleet, None, word, Actor("ada"))
     with pytest.raises(UsageError, match="must be numbers"):
         nowhere = InitialPoseMessage(site="lab", robot="r1", x_map_m=math.nan, y_map_m=2.0)
-        RobotPlacing(server.store, server.fleet, server.bus).tell(nowhere, Actor("ada"))
+        place_robot(server.store, server.fleet, server.bus, nowhere, Actor("ada"))

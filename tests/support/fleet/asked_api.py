@@ -24,11 +24,10 @@ from mapserver import releases
 from mapserver.api.app import create_app
 from mapserver.api.guard import GuardSettings
 from mapserver.api.metrics import Metrics
-from mapserver.api.version_routes import ApiSettings
+from mapserver.api.parameters import ApiSettings
 from mapserver.drafting.job_lock import log_path
-from mapserver.fleet.building import align, replace_areas
+from mapserver.fleet.building import align, ask_for_survey, replace_areas
 from mapserver.fleet.fleet import Fleet
-from mapserver.fleet.survey_requests import ask_for_survey
 from mapserver.floor_plan.pins import parse_pin
 from mapserver.operators.operators import Operators
 from mapserver.operators.roles import Scope

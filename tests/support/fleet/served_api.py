@@ -12,7 +12,7 @@ from starlette.types import Message
 
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
-from mapserver.api.version_routes import ApiSettings
+from mapserver.api.parameters import ApiSettings
 from mapserver.fleet.fleet import Fleet
 from mapserver.serving.night_runs import NightRuns
 from mapserver.store import MapStore

@@ -7,7 +7,7 @@ import numpy as np
 
 from fleetmap.mapformat.building import Building, BuildingFrame, FloorEntry
 from fleetmap.mapformat.tile import Tile
-from mapserver.fleet.floors import keep_building
+from mapserver.fleet.building import keep_building
 from mapserver.floor_plan.alignment import Alignment, encode_alignment
 from mapserver.store import NOBODY, MapStore
 from support.worlds import robot_world

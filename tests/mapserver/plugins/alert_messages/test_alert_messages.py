@@ -15,7 +15,7 @@ from fastapi.testclient import TestClient
 from fleetmap.errors import UsageError
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
-from mapserver.api.version_routes import ApiSettings
+from mapserver.api.parameters import ApiSettings
 from mapserver.fleet.alerts import Alert, AlertSettings
 from mapserver.fleet.fleet import Fleet
 from mapserver.plugins import alert_messages

@@ -9,11 +9,11 @@ import pytest
 
 from fleetmap.errors import LinkError
 from fleetmap.messages import encode_message
-from mapserver.api.version_routes import ApiSettings
+from mapserver.api.parameters import ApiSettings
 from mapserver.dashboard.install import install_dashboard
 from mapserver.plugins.live_surveys import message
-from mapserver.plugins.live_surveys.heard import SILENT_S, LiveSurveys
 from mapserver.plugins.live_surveys.message import LiveSurveyState, live_key
+from mapserver.plugins.live_surveys.page import SILENT_S, LiveSurveys
 from mapserver.serving.bus_service import BusService
 from support.fleet.hostile_messages import check_refusals, extremes, structs_of
 from support.fleet.memory_bus import MemoryBus

@@ -15,14 +15,14 @@ from fleetmap.geometry import se3, so3_exp
 from fleetmap.messages import EstimateMessage, Placement
 from fleetmap.plugins.viewer_channels import channels
 from fleetmap.plugins.viewer_channels.channels import ChannelMessage, Shown
+from mapserver.plugins.live_surveys.command import viewer_address
 from mapserver.plugins.live_surveys.live_viewer import SurveyChannels
 from mapserver.plugins.live_surveys.message import LiveSurveyState
-from mapserver.plugins.live_surveys.viewer_address import ViewerAddress, viewer_address
 from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer
 from support.fleet.foxglove_client import FoxgloveClient
 from support.fleet.foxglove_schemas import decoded, matrix
 
-FREE = ViewerAddress("127.0.0.1", 0)
+FREE = ("127.0.0.1", 0)
 TURNED = se3(so3_exp(np.array([0.1, -0.2, 0.7])), np.array([1.0, -2.0, 3.0]))
 POINTS = np.array([[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
 HANGING = """
@@ -39,7 +39,7 @@ with connect(sys.argv[1], subprotocols=["foxglove.sdk.v1"]) as viewer:
 
 @pytest.fixture
 def server() -> Iterator[FoxgloveServer]:
-    with FoxgloveServer(FREE, "hall") as made:
+    with FoxgloveServer(*FREE, "hall") as made:
         yield made
 
 
@@ -101,7 +101,7 @@ def test_a_viewer_that_hangs_keeps_nobody_waiting() -> None:
     """It reads no more while 60 MB are shown; another viewer gets them all, giving them takes no time, nor does the end."""
     data = os.urandom(60_000)
     with ExitStack() as stack:
-        server = stack.enter_context(FoxgloveServer(FREE, "hall"))
+        server = stack.enter_context(FoxgloveServer(*FREE, "hall"))
         server.show([Shown.now(channels.jpeg("/camera", 0, data))])
         with FoxgloveClient(server.url, within_s=60.0) as viewer:
             viewer.subscribe(["/camera"])
@@ -141,7 +141,7 @@ def test_what_comes_too_quickly_is_dropped_and_counted() -> None:
             time.sleep(0.01)
         return channels.place("/fixes", 1, np.eye(4))
 
-    with FoxgloveServer(FREE, "hall") as server:
+    with FoxgloveServer(*FREE, "hall") as server:
         assert not server.wants("/fixes")
         with FoxgloveClient(server.url) as viewer:
             viewer.subscribe(["/fixes"])
@@ -158,9 +158,9 @@ def test_what_comes_too_quickly_is_dropped_and_counted() -> None:
 def test_a_port_in_use_is_told_at_once(server: FoxgloveServer) -> None:
     port = int(server.url.rpartition(":")[2])
     with pytest.raises(UsageError, match=f"--foxglove 127.0.0.1:{port}: cannot listen there.*choose another"):
-        FoxgloveServer(ViewerAddress("127.0.0.1", port), "hall")
+        FoxgloveServer("127.0.0.1", port, "hall")
     with pytest.raises(UsageError, match="cannot listen there"):
-        FoxgloveServer(ViewerAddress("no.such.name.invalid", 0), "hall")
+        FoxgloveServer("no.such.name.invalid", 0, "hall")
 
 
 def test_surveys_are_shown_in_their_own_frame_or_in_the_map() -> None:
@@ -190,10 +190,10 @@ def test_surveys_are_shown_in_their_own_frame_or_in_the_map() -> None:
 
 
 def test_addresses() -> None:
-    assert viewer_address("8765", insecure=False) == ViewerAddress("127.0.0.1", 8765)
-    assert viewer_address("localhost:0", insecure=False) == ViewerAddress("localhost", 0)
-    assert viewer_address("[::1]:9", insecure=False) == ViewerAddress("::1", 9)
-    assert viewer_address("0.0.0.0:1", insecure=True) == ViewerAddress("0.0.0.0", 1)
+    assert viewer_address("8765", insecure=False) == ("127.0.0.1", 8765)
+    assert viewer_address("localhost:0", insecure=False) == ("localhost", 0)
+    assert viewer_address("[::1]:9", insecure=False) == ("::1", 9)
+    assert viewer_address("0.0.0.0:1", insecure=True) == ("0.0.0.0", 1)
     for text in ("", "x", "127.0.0.1", "70000", "-1", "1:", "127.0.0.1:x", "²"):
         with pytest.raises(UsageError, match="write it like 8765"):
             viewer_address(text, insecure=False)
