@@ -37,11 +37,10 @@ def report(
 ) -> None:
     """Write a one-page report for the shift leader: failures per robot-day, worst robots, versions, causes, tiles to resurvey."""
     from mapserver.dashboard.shift_page import html_page
-    from mapserver.fleet.shift_summary import summarise
 
     settings = settings_of(context)
     with open_store(store, read_only=True) as maps:
-        page = html_page(summarise(maps, site, hours, time.time_ns(), settings.canary, settings.resurvey))
+        page = html_page(maps, site, hours, time.time_ns(), settings.canary, settings.resurvey)
     write_output(out, page.encode())
     typer.echo(str(out))
 

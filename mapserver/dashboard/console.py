@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, date, tzinfo
 from pathlib import Path
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import HTMLResponse, StreamingResponse
@@ -109,6 +109,17 @@ class PageContext:
         return f"{self.root}/plans/{self.site}/{version}.png"
 
 
+class _Page(NamedTuple):
+    """A page. under: the page that leads to it; the others as `Console.page` says."""
+
+    under: str
+    template: str | Template
+    fill: Callable[..., dict[str, object]]
+    knows: Sequence[str]
+    under_way: Callable[[], list[str]] = list
+    of_site: bool = True
+
+
 @dataclass(frozen=True, slots=True)
 class Console:
     """Where pages are added. links: title and icon of each page that all pages link to, by its path, in their order."""
@@ -130,7 +141,7 @@ class Console:
         @self.app.exception_handler(404)
         async def missing(request: Request, _: Exception) -> Response:
             """Within the frame, with a way back."""
-            return await self._shown(request, "none", "", no_page, tuple(request.query_params))
+            return await self._shown(request, _Page("none", "", no_page, tuple(request.query_params)))
 
     def page(
         self,
@@ -153,20 +164,15 @@ class Console:
         """
         if link is not None:
             self.links[path] = link
+        page = _Page(under or path.partition("/")[0], template, fill, knows, under_way, of_site)
 
         @self.app.get(f"/{path}", include_in_schema=False)
         async def shown(request: Request) -> Response:
             """A page."""
-            return await self._shown(
-                request, under or path.partition("/")[0], template, fill, knows, under_way, of_site=of_site
-            )
+            return await self._shown(request, page)
 
     def stream(
-        self,
-        path: str,
-        one: Callable[..., dict[str, object]],
-        *,
-        under_way: Callable[[], list[str]] = list,
+        self, path: str, one: Callable[..., dict[str, object]], *, under_way: Callable[[], list[str]] = list
     ) -> None:
         """Adds what a page follows: looked at every second and told when it has changed, for as long as the session lasts.
 
@@ -197,47 +203,37 @@ class Console:
 
             return StreamingResponse(events(), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
 
-    async def _shown(
-        self,
-        request: Request,
-        page: str,
-        template: str | Template,
-        fill: Callable[..., dict[str, object]],
-        knows: Sequence[str],
-        under_way: Callable[[], list[str]] = list,
-        *,
-        of_site: bool = True,
-    ) -> Response:
-        root, site, found, status = _root(request), request.query_params.get("site"), {}, 200
-        sites: list[str] = []
+    async def _shown(self, request: Request, page: _Page) -> Response:
+        template, site, found, status = page.template, request.query_params.get("site"), {}, 200
+        root, sites = _root(request), list[str]()
         try:
-            growing, stored = await load(under_way), await load(self.services.maps.sites)
+            growing, stored = await load(page.under_way), await load(self.services.maps.sites)
             sites = sorted({*stored, *growing})
             if site is None and growing:
                 site = growing[0]
-            elif not of_site:
+            elif not page.of_site:
                 site = site if site in sites else next(iter(sites), "")
             elif site not in growing:
                 site = await load(self.services.maps.chosen_site, site)
-            if unknown := [name for name in request.query_params if name not in {"site", *knows}]:
-                names = ", ".join(("site", *knows))
+            if unknown := [name for name in request.query_params if name not in {"site", *page.knows}]:
+                names = ", ".join(("site", *page.knows))
                 raise UsageError(f"unknown parameter {unknown[0][:40]!r}; this page knows {names}")
             zone = zone_of(request.cookies.get(_ZONE_COOKIE))
             context = PageContext(root, site, zone, request.query_params)
-            found = {"context": context} | await load(lambda: fill(self.services, context, **request.path_params))
+            found = {"context": context} | await load(lambda: page.fill(self.services, context, **request.path_params))
         except FleetmapError as error:
             template, found = "problem.html", {"words": str(error)}
             status = 503 if isinstance(error, StoreError) else 404
             site = site if site in sites else None  # links lead somewhere
-        listed = f"{root}/{page if page in self.links else ''}"  # what is of one site is not looked for in another
+        listed = f"{root}/{page.under if page.under in self.links else ''}"  # what is of one site is not looked for in another
         look, who = request.cookies.get(_LOOK_COOKIE, ""), getattr(request.state, "operator", None)
         frame = {
             "root": root,
             "api": PageContext(root, "").api,
             "pages": self.links,
-            "page": page,
+            "page": page.under,
             "sites": sites,
-            "elsewhere": listed if request.path_params or page not in self.links else None,
+            "elsewhere": listed if request.path_params or page.under not in self.links else None,
             "site": site,
             "look": look if look in _THEMES else "",
             "theme": _THEMES.get(look, "print"),

@@ -78,7 +78,7 @@ def install_dashboard(
     console.nothing_else()
     _install_files(pages, services)
     app.mount(PATH, pages)
-    _install_sign_in(app, settings.guard)
+    install_sign_in(app, settings.guard)
 
     @app.get("/", include_in_schema=False)
     def to_dashboard(request: Request) -> RedirectResponse:
@@ -142,7 +142,7 @@ def file_response(data: bytes, media_type: str, cache_control: str = LASTING) ->
     return Response(data, media_type=media_type, headers={"Cache-Control": cache_control, **PICTURE_HEADERS})
 
 
-def _install_sign_in(app: FastAPI, settings: GuardSettings) -> None:
+def install_sign_in(app: FastAPI, settings: GuardSettings) -> None:
     """Adds the page and its two actions: without scripts, for those whom nobody knows yet."""
 
     @app.get(SIGN_IN, include_in_schema=False)

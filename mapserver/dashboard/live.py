@@ -38,32 +38,31 @@ def words_of(status: str) -> tuple[str, str]:
 class LiveRobot:
     """One robot as a page shows it; place: x and y of its last estimate in `map`, None where it never sent one; heading: from x to y.
 
-    state: the status that it sent, empty before. since_ns: since when it is localised, uncertain or not localised, whichever it is.
     metrics: figures of its last health report. calibration: what the map shows of its cameras, empty for a robot that does not report it.
     """
 
-    name: str
+    status: RobotStatus
     words: str
     tone: str
-    state: str
-    since_ns: int | None
     place_m: tuple[float, float] | None
     heading_rad: float | None
-    version: int | None
-    wanted_version: int | None
-    seconds_since: float
     flags: tuple[str, ...]
-    refused: str
-    is_canary: bool
-    is_copied: bool
-    clock_ahead_s: float | None
     metrics: Mapping[str, Any]
     calibration: tuple[CalibrationFigure, ...] = ()
 
     @property
+    def name(self) -> str:
+        return self.status.robot
+
+    @property
+    def refused(self) -> str:
+        """Why it does not run the wanted version, empty if it does."""
+        return str((self.status.last_ack or {}).get("refused", ""))
+
+    @property
     def is_behind(self) -> bool:
         """Whether it runs another version than it should."""
-        return self.version != self.wanted_version
+        return self.status.version != self.status.wanted_version
 
     def where(self, areas: Areas) -> str:
         """Where it was last, as people know it; empty where it never said."""
@@ -134,25 +133,15 @@ def live_robot(status: RobotStatus) -> LiveRobot:
     if status.seconds_since > (SILENT_S if status.is_present is not False else _LEFT_S):
         words, tone = SILENT
     place = estimate.get("position_map_m")
-    is_somewhere = place is not None and None not in place
     return LiveRobot(
-        name=status.robot,
-        words=words,
-        tone=tone,
-        state="" if sent is None else str(sent),
-        since_ns=status.state_since_ns,
-        place_m=(float(place[0]), float(place[1])) if place is not None and is_somewhere else None,
-        heading_rad=_heading(estimate.get("quat_wxyz")),
-        version=status.version,
-        wanted_version=status.wanted_version,
-        seconds_since=status.seconds_since,
-        flags=tuple(health.get("flags", ())),
-        refused=str((status.last_ack or {}).get("refused", "")),
-        is_canary=status.is_canary,
-        is_copied=status.is_copied,
-        clock_ahead_s=status.clock_ahead_s,
-        metrics=health.get("metrics") or {},
-        calibration=calibration_figures(health),
+        status,
+        words,
+        tone,
+        (float(place[0]), float(place[1])) if place is not None and None not in place else None,
+        _heading(estimate.get("quat_wxyz")),
+        tuple(health.get("flags", ())),
+        health.get("metrics") or {},
+        calibration_figures(health),
     )
 
 

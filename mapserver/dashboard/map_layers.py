@@ -6,9 +6,9 @@ Maps draw these by `static/map/index.js`; the field `kind` says how.
 import base64
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import cv2
+import msgspec
 import numpy as np
 
 from fleetmap.geometry import Array
@@ -24,39 +24,36 @@ Box = tuple[float, float, float, float]
 """Low x, low y, high x, high y."""
 
 
-@dataclass(frozen=True, slots=True)
-class Picture:
+class _Drawn(msgspec.Struct, frozen=True, tag_field="kind", tag=str.lower):
+    """Its kind is the name of its class."""
+
+
+class Picture(_Drawn, frozen=True):
     """A picture over a box; tone `ink`: drawn in middle grey, which pages lighten on dark ground."""
 
     url: str
     box: Box
     tone: str = "ink"
-    kind: Literal["picture"] = "picture"
 
 
-@dataclass(frozen=True, slots=True)
-class Square:
+class Square(_Drawn, frozen=True):
     """A square of the map. full: from 0 to 1, how dark."""
 
     box: Box
     tone: str
     words: str
     full: float = 1.0
-    kind: Literal["square"] = "square"
 
 
-@dataclass(frozen=True, slots=True)
-class Outline:
+class Outline(_Drawn, frozen=True, tag="area"):
     """A named area. tone: of one that corrects the map."""
 
     rings: list[list[tuple[float, float]]]
     words: str
     tone: str = ""
-    kind: Literal["area"] = "area"
 
 
-@dataclass(frozen=True, slots=True)
-class Line:
+class Line(_Drawn, frozen=True):
     """A line through places. width: pixels; hue: degrees, in the place of the tone's colour."""
 
     points: list[tuple[float, float]]
@@ -64,19 +61,15 @@ class Line:
     words: str = ""
     width: float = 2.5
     hue: int | None = None
-    kind: Literal["line"] = "line"
 
 
-@dataclass(frozen=True, slots=True)
-class Dots:
+class Dots(_Drawn, frozen=True):
     """Many places; points: x and y in turn."""
 
     points: list[float]
-    kind: Literal["dots"] = "dots"
 
 
-@dataclass(frozen=True, slots=True)
-class Mark:
+class Mark(_Drawn, frozen=True):
     """Something at a place. tone: its colour; shape: circle, square, triangle, cross or arrow; words: said where the pointer is.
 
     name: is written beside it where there is room, and what marks are told apart by when they move. heading_rad: from x towards y.
@@ -90,7 +83,6 @@ class Mark:
     address: str | None = None
     name: str = ""
     heading_rad: float | None = None
-    kind: Literal["mark"] = "mark"
 
 
 Item = Picture | Square | Outline | Line | Dots | Mark

@@ -73,7 +73,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         return {"shown": None}
     rows, events = maps.store.releases(site), maps.store.last_events(site, _EVENTS_SHOWN)
     verdicts = maps.store.last_verdicts(site)
-    robots = [robot.version for robot in services.robots.look(site).robots]
+    robots = [robot.status.version for robot in services.robots.look(site).robots]
     asked, before, after = (number(context.query.get(name), name) for name in ("version", "before", "after"))
     known = (asked, after, maps.current_version(site), max(rows.versions, default=None))
     shown = next((number for number in known if number is not None), None)

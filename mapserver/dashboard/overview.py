@@ -68,7 +68,7 @@ def site_line(live: LiveSite) -> dict[str, str]:
     if not live.robots:
         return {"tone": "quiet", "words": "No robot has reported yet; `locclient run` on a robot does."}
     if not online:
-        last_s = min(robot.seconds_since for robot in live.robots)
+        last_s = min(robot.status.seconds_since for robot in live.robots)
         return {"tone": "quiet", "words": f"All robots are offline; the last one reported {age(last_s)} ago."}
     troubled = sum(map(_is_troubled, online))
     counts = ((lost, "not localised"), (unsure, "uncertain"), (troubled, "localised with a problem"))
@@ -88,18 +88,20 @@ def _is_troubled(robot: LiveRobot) -> bool:
 def _troubles(robot: LiveRobot) -> list[str]:
     """What is wrong beside the state."""
     found = [f"refuses a version: {robot.refused}"] if robot.refused else []
-    found += ["is there twice: has another robot its name, or was its certificate copied?"] if robot.is_copied else []
+    found += (
+        ["is there twice: has another robot its name, or was its certificate copied?"] if robot.status.is_copied else []
+    )
     found += [dropped_words(robot.metrics)] if Flag.OVERLOADED in robot.flags else []
-    if robot.is_behind and robot.wanted_version is not None:
-        found.append(f"runs version {robot.version or 'none'}, should run {robot.wanted_version}")
-    if robot.clock_ahead_s is not None and abs(robot.clock_ahead_s) >= 1:
-        found.append(f"clock wrong by {robot.clock_ahead_s:+.0f} s")
+    if robot.is_behind and robot.status.wanted_version is not None:
+        found.append(f"runs version {robot.status.version or 'none'}, should run {robot.status.wanted_version}")
+    if robot.status.clock_ahead_s is not None and abs(robot.status.clock_ahead_s) >= 1:
+        found.append(f"clock wrong by {robot.status.clock_ahead_s:+.0f} s")
     return found + [f"{PARAMETERS[f.name]} drifts" for f in robot.calibration if f.is_drifted]
 
 
 def remarks(robot: LiveRobot) -> list[str]:
     """What it reports, what is wrong, and whether it tries a version."""
-    trial = ["tries a new version"] if robot.is_canary else []
+    trial = ["tries a new version"] if robot.status.is_canary else []
     flags = [flag.replace("_", " ") for flag in robot.flags if flag != Flag.OVERLOADED]
     return flags + _troubles(robot) + trial
 
@@ -107,10 +109,12 @@ def remarks(robot: LiveRobot) -> list[str]:
 def since_words(context: PageContext, robot: LiveRobot) -> tuple[str, str]:
     """For how long it is in its state or was not heard, and since which moment; empty where that is not known."""
     if robot.tone == "quiet":
-        return age(robot.seconds_since), ""
-    if robot.since_ns is None:
+        return age(robot.status.seconds_since), ""
+    if robot.status.state_since_ns is None:
         return "", ""
-    return age(max(0.0, time.time() - robot.since_ns / 1e9)), context.moment(robot.since_ns) or ""
+    return age(max(0.0, time.time() - robot.status.state_since_ns / 1e9)), context.moment(
+        robot.status.state_since_ns
+    ) or ""
 
 
 def _robot(context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Areas) -> dict[str, object]:

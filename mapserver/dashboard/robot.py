@@ -165,7 +165,7 @@ def _page(services: Services, context: PageContext, robot: LiveRobot) -> dict[st
     failures = services.maps.store.fleet.failures(wanted, limit=FAILURES_SHOWN)
     within = [row for row in failures if row.happened_ns >= since_ns]
     curves = [(words, form, curve(rows, name, (since_ns, until_ns))) for words, name, form in _CURVES]
-    version = robot.version or services.maps.current_version(context.site)
+    version = robot.status.version or services.maps.current_version(context.site)
     drawn = None
     if version is not None and services.maps.has_version(context.site, version):
         trail = way(rows, shown, services.settings.ingest.trace_every_s)
@@ -198,10 +198,10 @@ def _now(services: Services, context: PageContext, robot: LiveRobot) -> dict[str
     where = robot.where(services.maps.store.areas(context.site))
     state, exact = robot.words.capitalize(), ""
     if robot.tone == "quiet":
-        state += f", last heard {age(robot.seconds_since)} ago"
-    elif robot.since_ns is not None:
-        state += f" for {age(max(0.0, time.time() - robot.since_ns / 1e9))}"
-        exact = f"since {context.moment(robot.since_ns)}"
+        state += f", last heard {age(robot.status.seconds_since)} ago"
+    elif robot.status.state_since_ns is not None:
+        state += f" for {age(max(0.0, time.time() - robot.status.state_since_ns / 1e9))}"
+        exact = f"since {context.moment(robot.status.state_since_ns)}"
     flags = f" It reports: {', '.join(robot.flags)}.".replace("_", " ") if robot.flags else ""
     words = f"{', '.join(filter(None, [state, where]))}.{flags}"
     return {
@@ -213,11 +213,11 @@ def _now(services: Services, context: PageContext, robot: LiveRobot) -> dict[str
 
 def _facts(robot: LiveRobot) -> list[tuple[str, str]]:
     """What it says of itself, as far as it does."""
-    version, clock_s = str(robot.version or "none"), robot.clock_ahead_s
+    version, clock_s = str(robot.status.version or "none"), robot.status.clock_ahead_s
     found = [
-        ("Map version", f"{version}, should be {robot.wanted_version}" if robot.is_behind else version),
+        ("Map version", f"{version}, should be {robot.status.wanted_version}" if robot.is_behind else version),
         ("Refuses a version", robot.refused),
-        ("Tries a new version", "yes" if robot.is_canary else ""),
+        ("Tries a new version", "yes" if robot.status.is_canary else ""),
         *(
             (words, form.format(value))
             for words, name, form in _FIGURES

@@ -90,7 +90,7 @@ def _row(context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Area
         "since": f"{since} ago" if since else "",
         "where": robot.where(areas),
         "remarks": ", ".join(remarks(robot)),
-        "map": "none" if robot.version is None else str(robot.version),
+        "map": "none" if robot.status.version is None else str(robot.status.version),
         "cpu": f"{cpu_ms:.1f} ms" if isinstance(cpu_ms, int | float) else "",
         "failures": "0" if own is None else str(own.failures.events + own.failures_running),
     }

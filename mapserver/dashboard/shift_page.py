@@ -9,25 +9,49 @@ from mapserver.api.moments import moment_text
 from mapserver.dashboard import fleet_parts
 from mapserver.dashboard.fleet_parts import Bar, Bars, Figure
 from mapserver.dashboard.rendering import TEMPLATES, share
-from mapserver.fleet.shift_summary import FleetSummary
-from mapserver.fleet_statistics.kpis import HOUR_NS, Rate, format_rate
+from mapserver.fleet.canary_controller import find
+from mapserver.fleet.resurvey_list import resurvey_list
+from mapserver.fleet_statistics.canary_decision import CanarySettings
+from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, Kpis, Rate, format_rate, hour_of, kpis
+from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
+from mapserver.store import FailureFilter, MapStore
 
 _STYLE = Path(__file__).parent / "static" / "style.css"
 _ROWS = 15
 _BARS = 24
+_SHOWN_FAILURES = 50
 _UNKNOWN = "not known"
 
 
-def html_page(summary: FleetSummary) -> str:
-    """The page as a file's content."""
-    step = -(-summary.hours // _BARS)
+def html_page(
+    store: MapStore,
+    site: str,
+    hours: int,
+    now_ns: int,
+    canary: CanarySettings = CanarySettings(),  # noqa: B008  frozen
+    resurvey: ResurveySettings = ResurveySettings(),  # noqa: B008
+) -> str:
+    """The page as a file's content: the last `hours` of a site beside as many before; UsageError for an unknown site. canary, resurvey:
+    their settings.
+    """
+    current, until, step = store.current(site), hour_of(now_ns) + 1, -(-hours // _BARS)
+    since, wanted = until - hours, FailureFilter(site=site, since_ns=(until - hours) * HOUR_NS)
+    total = _total(store, site, since, until)
+    trials = (fleet_parts.trial_of(row, find(store, row, canary, now_ns)) for row in store.canaries(site)[:1])
     return TEMPLATES.get_template("shift.html").render(
-        summary=summary,
+        site=site,
+        until_ns=now_ns,
+        hours=hours,
+        version=None if current is None else current.version,
+        total=total,
         style=Markup(_STYLE.read_text("utf-8")),
-        shown=_figures(summary),
-        tried=fleet_parts.trials_shown((fleet_parts.trial_of(*trial) for trial in summary.trials), _moment),
-        by_hour=_by_hour(summary, step),
+        shown=_figures(total, _total(store, site, since - hours, since)),
+        tried=fleet_parts.trials_shown(trials, _moment),
+        by_hour=_by_hour(store.fleet.hours(site, "site", since_hour=since), range(since, until, step)),
         step=step,
+        tables={axis: _table(store, site, axis, since) for axis in ("robot", "version", "area", "cause")},
+        concerns=resurvey_list(store, site, resurvey, now_ns).tiles,
+        failures=store.fleet.failures(wanted, limit=_SHOWN_FAILURES),
         most=_ROWS,
         moment=_moment,
         share=_share,
@@ -35,19 +59,28 @@ def html_page(summary: FleetSummary) -> str:
     )
 
 
+def _total(store: MapStore, site: str, since: int, until: int) -> Kpis:
+    found = store.fleet.counters(site, "site", since_hour=since, until_hour=until)
+    return kpis(found.get((site, ""), Counters()))
+
+
+def _table(store: MapStore, site: str, axis: str, since: int) -> list[tuple[str, Kpis]]:
+    """The figures of each key, the worst first."""
+    rows = [(key, kpis(counts)) for (_, key), counts in store.fleet.counters(site, axis, since_hour=since).items()]
+    return sorted(rows, key=lambda row: (-row[1].failures.events, -row[1].silent_estimated.events, row[0]))
+
+
 def _moment(stamp_ns: int | None) -> str | None:
     """By the clock of the machine that writes the page."""
     return moment_text(stamp_ns, None)
 
 
-def _figures(summary: FleetSummary) -> list[Figure]:
+def _figures(total: Kpis, before: Kpis) -> list[Figure]:
     """Those that are known."""
-    total = summary.total
-    before = f"; before: {_rate(summary.before.failures)}"
     first_fix, frame = total.first_fix_mean_s, total.frame_ms_mean
     found = [
         fleet_parts.localised_figure("Localised while driving", total),
-        fleet_parts.rate_figure("Failures per robot-day", total.failures, before),
+        fleet_parts.rate_figure("Failures per robot-day", total.failures, f"; before: {_rate(before.failures)}"),
         fleet_parts.rate_figure("Silent failures per robot-day, an estimate", total.silent_estimated, ""),
         Figure("Time with a usable position", share(total.availability), f"of {total.observed_h:.1f} h observed"),
         Figure("Localised after the first fix", share(total.localised_share), "of the time since then"),
@@ -58,15 +91,14 @@ def _figures(summary: FleetSummary) -> list[Figure]:
     return [figure for figure in found if figure.value is not None]
 
 
-def _by_hour(summary: FleetSummary, step: int) -> Bars:
+def _by_hour(found: dict[int, Counters], starts: range) -> Bars:
     """Failures over the time of the page, in bars of so many hours."""
-    counts = {hour: found.failures.events for hour, found in summary.by_hour}
-    until, bars = summary.until_ns // HOUR_NS + 1, []
-    for start in range(until - summary.hours, until, step):
-        count = sum(counts.get(hour, 0) for hour in range(start, start + step))
+    counts, bars = {hour: kpis(counters).failures.events for hour, counters in found.items()}, []
+    for start in starts:
+        count = sum(counts.get(hour, 0) for hour in range(start, start + starts.step))
         hour = str(datetime.fromtimestamp(start * HOUR_NS // 10**9).hour)
         words = f"{_moment(start * HOUR_NS)}: {count}"
-        bars.append(Bar(hour if step == 1 else "", count, count, count, words))
+        bars.append(Bar(hour if starts.step == 1 else "", count, count, count, words))
     return Bars("Failures over time", bars)
 
 

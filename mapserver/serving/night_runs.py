@@ -92,18 +92,10 @@ class NightRuns:
         return next((job for job in self._store.jobs(site, limit=1) if job.kind == "nightly"), None)
 
     def _started(self, site: str, errors: int) -> "subprocess.Popen[bytes]":
-        options = ["--site", site, "--inbox", str(self.inbox / site), "--store", str(self._store.folder)]
         config = [] if self._config is None else ["--config", str(self._config)]
-        command = [
-            sys.executable,
-            "-m",
-            "mapserver.end_with_server",
-            *config,
-            "nightly",
-            *options,
-            "--settle-s",
-            f"{SETTLE_S:g}",
-        ]
+        folders = ["--inbox", str(self.inbox / site), "--store", str(self._store.folder)]
+        command = [sys.executable, "-m", "mapserver.end_with_server", *config, "nightly", "--site", site, *folders]
+        command += ["--settle-s", f"{SETTLE_S:g}"]
         with disk_errors("a build cannot be started", "see the memory of this machine", FleetmapError):
             process = subprocess.Popen(
                 command,

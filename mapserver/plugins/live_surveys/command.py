@@ -19,9 +19,8 @@ if TYPE_CHECKING:
     from mapserver import BuildOptions
     from mapserver.config import MapserverConfig
     from mapserver.plugins.live_surveys.drives import Drive
-    from mapserver.plugins.live_surveys.live_viewer import LiveViewer
     from mapserver.plugins.live_surveys.message import LiveSurveyState
-    from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer
+    from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer, LiveViewer
     from mapserver.survey.settings import SurveySettings
 _LOOPBACK = "127.0.0.1"
 
@@ -71,7 +70,7 @@ def live(
     at = None if options.foxglove is None else viewer_address(options.foxglove, insecure=options.insecure)
     if at is not None:
         require_foxglove("--foxglove")
-        from mapserver.plugins.live_surveys.live_viewer import LiveViewer
+        from mapserver.plugins.live_surveys.viewer_server import LiveViewer
     from fleetmap.recordings.sensor_subset import named_sensor_set
     from mapserver.plugins.live_surveys.live_survey import LiveRequest, run_live
 
@@ -117,13 +116,8 @@ def _driven(
 
     assert record is not None
     drive = SensorDrive(open_source(given.source, given.topics), record, given.topics)
-    kinds = {
-        (2, True): SensorSet.STEREO_INERTIAL,
-        (2, False): SensorSet.STEREO,
-        (1, True): SensorSet.MONO_INERTIAL,
-        (1, False): SensorSet.MONO,
-    }
-    kind = kinds[len(drive.calibration.cameras), drive.calibration.imu is not None]
+    rig = "stereo" if len(drive.calibration.cameras) > 1 else "mono"
+    kind = SensorSet(rig if drive.calibration.imu is None else f"{rig}-inertial")
     yield drive, survey_settings(build.config, SensorSet.RGBD if drive.has_depth else kind)
 
 

@@ -150,26 +150,22 @@ class _Survey:
 
     def follow(self, is_stopped: Callable[[], bool]) -> None:
         """Track all frames, each when it is due; call `check` first."""
-        request, drive = self._request, self._drive
-        rectifier = drive.rectifier
+        drive, told_s = self._drive, 0.0
         # One thread per process, and no garbage collection of the survey's objects: both would delay frames.
         with _one_thread(), MappingProcess(self._config, self._rig) as mapping:
-            self._track(LiveTracking(drive.calibration, rectifier, request.settings), mapping, is_stopped)
+            tracking = LiveTracking(drive.calibration, drive.rectifier, self._request.settings)
+            with closing(drive.frames()) as frames:
+                for due in frames:
+                    if is_stopped():
+                        break
+                    if due is not None:
+                        self._take(due, tracking, mapping)
+                    self._look(mapping)
+                    if time.monotonic() - told_s >= _TELL_EVERY_S:
+                        told_s = time.monotonic()
+                        self.say("tracking")
             mapping.finish()
             self._look(mapping)
-
-    def _track(self, tracking: LiveTracking, mapping: MappingProcess, is_stopped: Callable[[], bool]) -> None:
-        told_s = 0.0
-        with closing(self._drive.frames()) as frames:
-            for due in frames:
-                if is_stopped():
-                    break
-                if due is not None:
-                    self._take(due, tracking, mapping)
-                self._look(mapping)
-                if time.monotonic() - told_s >= _TELL_EVERY_S:
-                    told_s = time.monotonic()
-                    self.say("tracking")
 
     def _take(self, due: DueFrame, tracking: LiveTracking, mapping: MappingProcess) -> None:
         tracked = tracking.handle(due.frame, due.imu, due.wheel)
@@ -196,7 +192,7 @@ class _Survey:
             latency = round(float(median), 2), round(float(high), 2)
         return LiveFigures(
             frames=len(self._stamps_ns),
-            seconds=self._seconds(),
+            seconds=(self._stamps_ns[-1] - self._stamps_ns[0]) * 1e-9 if self._stamps_ns else 0.0,
             keyframes=len(self._qualities),
             latency_ms=latency,
             late_frames=self._late(),
@@ -207,9 +203,6 @@ class _Survey:
             parts=len(self._sketch.parts),
             mapping_failed=self._failed,
         )
-
-    def _seconds(self) -> float:
-        return (self._stamps_ns[-1] - self._stamps_ns[0]) * 1e-9 if self._stamps_ns else 0.0
 
     def _late(self) -> int:
         """Return the number of frames processed later than the time to the next frame."""

@@ -20,7 +20,7 @@ from mapserver.api.app import create_app
 from mapserver.api.guard import Guard, GuardSettings, set_session
 from mapserver.api.metrics import Metrics
 from mapserver.api.parameters import ApiSettings
-from mapserver.dashboard.install import install as install_sign_in
+from mapserver.dashboard.install import install_sign_in
 from mapserver.operators.operators import IDLE_S, Operators
 from mapserver.store import Actor
 from support.fleet.quick_passwords import use_quick_passwords

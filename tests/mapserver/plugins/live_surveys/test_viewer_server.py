@@ -16,9 +16,8 @@ from fleetmap.messages import EstimateMessage, Placement
 from fleetmap.plugins.viewer_channels import channels
 from fleetmap.plugins.viewer_channels.channels import ChannelMessage, Shown
 from mapserver.plugins.live_surveys.command import viewer_address
-from mapserver.plugins.live_surveys.live_viewer import SurveyChannels
 from mapserver.plugins.live_surveys.message import LiveSurveyState
-from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer
+from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer, SurveyChannels
 from support.fleet.foxglove_client import FoxgloveClient
 from support.fleet.foxglove_schemas import decoded, matrix
 
