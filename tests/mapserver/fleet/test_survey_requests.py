@@ -13,7 +13,7 @@ from fleetmap.sensors.samples import Trajectory
 from mapserver import releases
 from mapserver.cli import app
 from mapserver.drafting.draft import covered_requests
-from mapserver.fleet import survey_requests as requests
+from mapserver.fleet import building as requests
 from mapserver.fleet.building import ask_for_survey, end_request
 from mapserver.fleet.resurvey_list import resurvey_list
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
