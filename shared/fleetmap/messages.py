@@ -235,8 +235,6 @@ class PoseMessage(msgspec.Struct, frozen=True, kw_only=True):
         cls, stamp_ns: int, map_from_base: Array, cov_rot_trans: Array, status: str, map_version: int | None
     ) -> Self:
         """Convert map_from_base (4, 4) with cov_rot_trans (6, 6) to a message."""
-        assert map_from_base.shape == (4, 4)
-        assert cov_rot_trans.shape == (6, 6)
         placed = Placement.of(map_from_base)
         return cls(
             stamp_ns=int(stamp_ns),

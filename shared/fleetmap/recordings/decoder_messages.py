@@ -17,13 +17,8 @@ try:
     _LIBC.rewind.argtypes = _LIBC.fflush.argtypes = [ctypes.c_void_p]
     # Never closed: another thread may still print to it
     _CAUGHT = _LIBC.open_memstream(ctypes.byref(_text), ctypes.byref(_size))
-except (
-    OSError,
-    ValueError,
-    AttributeError,
-    TypeError,
-):  # a C library with another symbol name: nothing is captured
-    _CAUGHT = None
+except (OSError, ValueError, AttributeError, TypeError):
+    _CAUGHT = None  # a C library with another symbol name: nothing is captured
 
 
 def with_messages(decode: Callable[[], T]) -> tuple[T, str]:

@@ -183,20 +183,15 @@ def collect(
     container: Container, stream_of: Callable[[Channel], Stream | None], log: ReadLog
 ) -> tuple[list[Stream], list[Channel]]:
     """Read the messages of all channels for which there is a stream; also return the other channels."""
-    streams: dict[int, Stream] = {}
-    unused: dict[int, Channel] = {}
+    found: dict[int, tuple[Channel, Stream | None]] = {}
     for channel, logged_ns, place, data in container.messages():
-        if channel.id in unused:
-            continue
-        stream = streams.get(channel.id) or stream_of(channel)
-        if stream is None:
-            unused[channel.id] = channel
-            continue
-        streams[channel.id] = stream
-        stream.take(bytes(data), place, min(logged_ns, LAST_NS), log)  # MCAP's times have a bit more
+        if channel.id not in found:
+            found[channel.id] = channel, stream_of(channel)
+        if stream := found[channel.id][1]:
+            stream.take(bytes(data), place, min(logged_ns, LAST_NS), log)  # MCAP's times have a bit more
     log.issues += container.issues
     log.files[:0] = container.files
-    return list(streams.values()), list(unused.values())
+    return [s for _, s in found.values() if s], [channel for channel, s in found.values() if s is None]
 
 
 def assemble(

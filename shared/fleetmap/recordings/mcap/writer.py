@@ -57,7 +57,6 @@ class McapRecordingWriter:
         self._channels: dict[str, int] = {}
         self._schemas: dict[str, int] = {}
         self._counts: Counter[str] = Counter()
-        self._links_are_written = False
         self._advice = "make space, or choose another place" + ("; it holds what came before" if in_place else "")
         with self._disk_errors():
             self._file = self._part.open("wb")
@@ -151,12 +150,12 @@ class McapRecordingWriter:
     def _write_image(
         self, topic: str, stamp_ns: int, frame_id: str, image: StoredImage, *, is_depth: bool = False
     ) -> None:
-        kind = images.file_kind(image.data) if image.encoding == "file" else image.encoding
-        if kind in ("jpeg", "png", INVERSE_DEPTH):
-            is_png_depth = is_depth and kind != INVERSE_DEPTH
-            form = f"16UC1; {kind} compressed" if is_png_depth else image.form or kind
+        kind = images.file_kind(image.data) if image.encoding == "file" else "rows"
+        is_inverse = image.encoding == INVERSE_DEPTH
+        if is_inverse or kind in ("jpeg", "png"):
+            form = f"16UC1; {kind} compressed" if is_depth and not is_inverse else image.form or kind
             data = messages.encode_compressed_image(stamp_ns, frame_id, image, form)
-            transport = "compressedDepth" if kind == INVERSE_DEPTH else "compressed"
+            transport = "compressedDepth" if is_inverse else "compressed"
             self._write(f"{topic}/{transport}", "sensor_msgs/CompressedImage", stamp_ns, data)
             return
         rows = image
@@ -169,8 +168,7 @@ class McapRecordingWriter:
         self._write(topic, "sensor_msgs/Image", stamp_ns, messages.encode_image(stamp_ns, frame_id, rows))
 
     def _write(self, topic: str, type_name: str, stamp_ns: int, data: bytes) -> None:
-        if not self._links_are_written:
-            self._links_are_written = True
+        if not self._channels and type_name != "tf2_msgs/TFMessage":  # the mounting before all else
             mounted = [(f"cam{i}", camera.body_from_cam) for i, camera in enumerate(self._calibration.cameras)]
             links = [messages.FrameLink(BODY_FRAME, name, body_from_cam) for name, body_from_cam in mounted]
             links.append(messages.FrameLink(BASE_FRAME, BODY_FRAME, self._calibration.base_from_body))
