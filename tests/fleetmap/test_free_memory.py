@@ -17,9 +17,8 @@ def test_what_was_freed_below_something_that_is_in_use_is_given_back() -> None:
     def resident_mb() -> float:
         return int(Path("/proc/self/statm").read_text().split()[1]) * mmap.PAGESIZE / 2**20
 
-    blocks = [
-        np.ones(6_000) for _ in range(3_000)
-    ]  # 137 MB in the heap, as they are too small for a mapping of their own
+    # 137 MB in the heap, as they are too small for a mapping of their own
+    blocks = [np.ones(6_000) for _ in range(3_000)]
     last = blocks[-1]
     blocks.clear()
     held_mb = resident_mb()

@@ -124,9 +124,8 @@ def test_one_bad_value_costs_one_value(
     paths = [write_foreign(tmp_path / "a.mcap", messages)]
     if "another type" not in says:  # rosbags' writers have one type a topic
         paths.append(write_rosbag2(tmp_path / "bag", messages))
-    if not any(
-        word in says for word in ("ends before", "damaged", "another type")
-    ):  # nor do they make ROS 1 of a broken message
+    # Nor do they make ROS 1 of a broken message
+    if not any(word in says for word in ("ends before", "damaged", "another type")):
         paths.append(write_rosbag1(tmp_path / "a.bag", messages))
     for path in paths:
         with open_recording(path) as recording:
