@@ -159,10 +159,9 @@ class Problem:
         rotation, motion, way = shares.tolist()
         inertial, data = None, self.data
         if data.is_inertial:
-            velocities, gyro, accel = np.split(state.motions, 3, axis=1)
             edges = [(e.first, e.first + 1, e.believed(rotation, motion)) for e in self.inertial]
             known = MotionPrior(0, np.concatenate([data.start.motions[0, :3], np.zeros(6)]), _BIAS_SIGMAS)
-            inertial = InertialTerms(velocities, gyro, accel, edges, [known])
+            inertial = InertialTerms(state.motions, edges, [known])
         return BundleProblem(
             rig=Rig.of_one(data.rectifier.camera, data.rectifier.body_from_cam),
             map_from_body=state.map_from_body,

@@ -14,7 +14,7 @@ from fleetmap.sensors.calibration import ImuNoise, RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample, wheel_between
 from mapserver.calibration.parameters import LENS_SIGMAS
-from mapserver.survey.bundle.factors import FLOOR_SIGMA, packed_increments
+from mapserver.survey.bundle.bundle_adjustment import FLOOR_SIGMA, packed_increments
 from mapserver.survey.state import RelativeTerm
 
 

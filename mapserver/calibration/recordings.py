@@ -136,9 +136,7 @@ def busiest_stretch(
     number = np.flatnonzero(chosen).tolist()
     pixels = _with_rows(marks.obs_pixels, marks.obs_keyframe, [keyframes[k] for k in number])
     sigmas = np.column_stack([marks.obs_sigma_px, np.full(len(pixels), _ROW_SIGMA_PX)])
-    motions = np.zeros((len(part.stamps_ns), 9))
-    if motion.inertial:
-        motions = np.column_stack([motion.velocities_mps, motion.gyro_bias_radps, motion.accel_bias_mps2])
+    motions = motion.motions if motion.inertial else np.zeros((len(part.stamps_ns), 9))
     calibration, rectifier = rig
     return CalibrationData(
         calibration=calibration if motion.inertial else replace(calibration, imu=None),

@@ -55,7 +55,6 @@ from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merge
 from mapserver.quality.probes import alias_step_m
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
 from mapserver.store.archive import decode_archive, encode_archive
-from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.merge.multi_session import MergedMap
 from mapserver.survey.settings import SurveySettings
@@ -249,7 +248,7 @@ def _survey(
                 f"{run.request.recordings[0]}: too few estimated frames have a ground truth; build without "
                 "--frame-from-ground-truth"
             )
-        joined = replace(joined, map=transform_map(joined.map, truth_from_estimate(estimate, truth)))
+        joined = replace(joined, map=joined.map.transformed(truth_from_estimate(estimate, truth)))
     return BuildResult(surveyed, joined, found, corrections, is_first=base is None)
 
 

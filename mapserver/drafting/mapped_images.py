@@ -15,7 +15,7 @@ from fleetmap.errors import StoreError, disk_errors
 from fleetmap.free_memory import give_back_free_memory
 from fleetmap.geometry import AnyArray
 from fleetmap.sensors.samples import CameraFrame
-from mapserver.survey.state import MemoryImageStore, Pictures
+from mapserver.survey.state import ImageStore, Pictures
 
 if TYPE_CHECKING:
     from fleetmap.recordings import FrameSource
@@ -26,8 +26,8 @@ _KEPT_BYTES = 1_000_000_000  # the first minute of a pair of 752 x 480 at 20 Hz
 _ALIGNED_BYTES = 64
 
 
-class MappedImageStore:
-    """An ImageStore over an unnamed file in `folder`, deleted by the system with the process. Methods may be called from any thread."""
+class MappedImageStore(ImageStore):
+    """A store in an unnamed file in `folder`, deleted by the system with the process. Methods may be called from any thread."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -76,9 +76,9 @@ class MappedImageStore:
         """See ImageStore."""
         return MappedImageStore(self._folder)
 
-    def __reduce__(self) -> tuple[type[MemoryImageStore], tuple[()]]:
+    def __reduce__(self) -> tuple[type[ImageStore], tuple[()]]:
         """Pickle as an empty in-memory store: another process may lack the folder."""
-        return MemoryImageStore, ()
+        return ImageStore, ()
 
     def note(self, number: int) -> None:
         """Record a read; after a number of reads the file leaves memory."""

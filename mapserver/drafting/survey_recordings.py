@@ -45,7 +45,6 @@ from mapserver.evaluation.trajectory_error import check_truth
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.bundle.stereo_yaw_check import StereoYaw
 from mapserver.survey.finish.dock_alignment import aligned_by_priors
-from mapserver.survey.finish.map_transform import scaled, scaled_state
 from mapserver.survey.merge.multi_session import MergedMap, chained
 from mapserver.survey.odometry_pass import LEAD_NS, parts_between_lifts
 from mapserver.survey.settings import SurveySettings
@@ -262,7 +261,7 @@ class BegunSurvey:
         rectifier, seen = Rectifier(calibration), replace(recording, calibration=calibration, frames=self._whole.frames)
         inputs = survey_inputs_of(seen, self._indices, rectifier, None)
         is_believed = rig is recording.calibration
-        with nullcontext(images) if is_believed or images is None else images.apart() as images:
+        with nullcontext(images) if is_believed else images.apart() as images:
             chain = begin_survey(inputs, self._settings, replace(self._tools, images=images))
             self._tools.at("local adjustment", 1, 1)
             if is_believed:
@@ -458,7 +457,7 @@ def _aligned(done: Survey, recording: Recording) -> tuple[Survey, Array | None]:
     aligned = aligned_by_priors(done.map, recording.priors, recording.calibration.base_from_body)
     if aligned is None:
         return done, None
-    in_metres = replace(done, map=scaled(done.map, aligned.scale), state=scaled_state(done.state, aligned.scale))
+    in_metres = replace(done, map=done.map.scaled(aligned.scale), state=done.state.scaled(aligned.scale))
     return in_metres, aligned.map_from_survey
 
 

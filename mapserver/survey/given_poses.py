@@ -1,21 +1,19 @@
 """Poses of another system in place of odometry: the first stage of a survey with a given initial trajectory."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 
 from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse, so3_log
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
-from fleetmap.odometry.tracking.tracker import MotionSince, Tracker
+from fleetmap.odometry.tracking.tracker import Tracker
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Trajectory
-from mapserver.survey.keyframes.keyframes import KeyframePolicy, make_keyframes
-from mapserver.survey.odometry_pass import summary_of
+from mapserver.survey.keyframes.keyframes import KeyframePolicy, sharpness
+from mapserver.survey.odometry_pass import TrackedFrame, followed
 from mapserver.survey.pose_graph.odometry_factors import carried
-from mapserver.survey.rig import used_cameras
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import FrameTracks, OdometryPass
+from mapserver.survey.state import OdometryPass
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 # Assumed drift of the poses, a random walk: standard deviations after one metre.
@@ -44,38 +42,32 @@ def poses_as_odometry(
     policy, rectifier = KeyframePolicy(settings.keyframes, inputs.keyframes_at), inputs.rectifier
     tracker = Tracker(rectifier.camera, settings.odometry.tracker, settings.stereo)
     estimates: list[OdometryEstimate] = []
-    seen: list[FrameTracks] = []
 
-    def chosen() -> Iterator[tuple[int, RectifiedFrame]]:
-        for number, raw in enumerate(inputs.frames):
-            frame = raw if isinstance(raw, RectifiedFrame) else rectifier.rectify(raw)
-            tools.at("odometry", number + 1, inputs.frame_count)
-            tracked = tracker.track(frame, _motion_to(odom_from_cam, number))
-            estimate = OdometryEstimate(
-                stamp_ns=frame.stamp_ns,
-                frame_index=number,
-                odom_from_body=odom_from_body[number],
-                cov_rot_trans=covariances[number],
-                velocity_odom_mps=velocities[number],
-                gyro_bias_radps=gyro_bias,
-                status=OdometryStatus.TRACKING,
-                track_ids=tracked.ids,
-                scene_depth_m=_scene_depth_m(tracked.pixels, rectifier.camera),
-                inlier_share=tracked.inlier_share,
-                after_gap=tracked.by_descriptors,
-                inertial=inertial,
-                track_pixels=tracked.pixels,
-            )
-            seen.append(FrameTracks.of_frame(estimate))
-            estimates.append(replace(estimate, track_ids=np.zeros(0, np.int64), track_pixels=None))
-            if policy.wants(summary_of(frame, estimate, odom_from_body[number])):
-                yield number, frame
+    def handle(frame: RectifiedFrame) -> TrackedFrame:
+        number = len(estimates)
+        tracked = tracker.track(frame, lambda earlier: se3_inverse(odom_from_cam[number]) @ odom_from_cam[earlier])
+        estimate = OdometryEstimate(
+            stamp_ns=frame.stamp_ns,
+            frame_index=number,
+            odom_from_body=odom_from_body[number],
+            cov_rot_trans=covariances[number],
+            velocity_odom_mps=velocities[number],
+            gyro_bias_radps=gyro_bias,
+            status=OdometryStatus.TRACKING,
+            track_ids=tracked.ids,
+            scene_depth_m=_scene_depth_m(tracked.pixels, rectifier.camera),
+            inlier_share=tracked.inlier_share,
+            after_gap=tracked.by_descriptors,
+            inertial=inertial,
+            track_pixels=tracked.pixels,
+        )
+        estimates.append(replace(estimate, track_ids=np.zeros(0, np.int64), track_pixels=None))
+        is_keyframe = policy.wants(estimate, odom_from_body[number], sharpness(frame))
+        return TrackedFrame(number, frame, estimate, odom_from_body[number], is_keyframe)
 
-    keyframes = list(make_keyframes(chosen(), used_cameras(rectifier), settings, tools.images, tools.executor))
+    keyframes, tracks = followed(handle, inputs, settings, tools)
     tied = np.ones(len(given), bool)
-    return OdometryPass(
-        estimates, odom_from_body, covariances, tied, keyframes, inertial, tracks=FrameTracks.joined(seen)
-    )
+    return OdometryPass(estimates, odom_from_body, covariances, tied, keyframes, inertial, tracks=tracks)
 
 
 def _upright(given: Trajectory, inputs: SurveyInputs, inertial: bool) -> tuple[Array, Array]:
@@ -89,11 +81,6 @@ def _upright(given: Trajectory, inputs: SurveyInputs, inertial: bool) -> tuple[A
         return frame_from_body, np.zeros(3)
     start_from_frame = se3_inverse(frame_from_body[0])
     return start_from_frame @ frame_from_body, np.zeros(3)
-
-
-def _motion_to(odom_from_cam: Array, number: int) -> MotionSince:
-    """Return the motion of the camera to a frame from earlier ones, by the poses (F, 4, 4)."""
-    return lambda earlier: np.asarray(se3_inverse(odom_from_cam[number]) @ odom_from_cam[earlier])
 
 
 def _levelled(given: Trajectory, inputs: SurveyInputs) -> Array:

@@ -1,6 +1,6 @@
 """Odometry over all frames, with selection of keyframes: the first stage of a survey."""
 
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,11 +13,11 @@ from fleetmap.odometry.mono.mono_modes import make_odometry
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample, wheel_between
-from mapserver.survey.keyframes.keyframes import FrameSummary, KeyframePolicy, make_keyframes, sharpness
+from mapserver.survey.keyframes.keyframes import KeyframePolicy, make_keyframes, sharpness
 from mapserver.survey.pose_graph.odometry_factors import carried, odometry_factors
 from mapserver.survey.rig import rig_of, used_cameras
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.state import FrameTracks, KeyframeMotion, Landmarks, OdometryPass, SurveyState
+from mapserver.survey.state import FrameTracks, Keyframe, KeyframeMotion, Landmarks, OdometryPass, SurveyState, turned
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
 
 LEAD_NS = 30_000_000  # lead of IMU and wheels over a frame, whose stamp may be too early
@@ -61,7 +61,7 @@ class OdometryRun:
         number = len(self.chain.estimates)
         since = self._odometry.motion_since(number - 1) if number else None
         frame_from_body = self.chain.append(estimate, None if since is None else since[1])
-        wanted = self._policy.wants(summary_of(frame, estimate, frame_from_body))
+        wanted = self._policy.wants(estimate, frame_from_body, sharpness(frame))
         return TrackedFrame(number, frame, estimate, frame_from_body, wanted)
 
 
@@ -79,25 +79,11 @@ class SampleFeed:
 
 
 def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> OdometryPass:
-    """Feed frames (in order), the IMU and the wheels up to each into the odometry.
-
-    In parallel the executor extracts the features of the chosen keyframes.
-    """
+    """Feed frames (in order), the IMU and the wheels up to each into the odometry."""
     rectifier = inputs.rectifier
     run = OdometryRun(inputs.calibration, rectifier, settings, inputs.keyframes_at)
     feed = SampleFeed(inputs.imu, inputs.wheel, rectifier.imu_minus_cam_s)
-    seen: list[FrameTracks] = []
-
-    def chosen() -> Iterator[tuple[int, RectifiedFrame]]:
-        for raw in inputs.frames:
-            frame = raw if isinstance(raw, RectifiedFrame) else rectifier.rectify(raw)
-            tracked = run.handle(frame, *feed.until(frame.stamp_ns))
-            seen.append(FrameTracks.of_frame(tracked.estimate))
-            tools.at("odometry", tracked.number + 1, inputs.frame_count)
-            if tracked.is_keyframe:
-                yield tracked.number, tracked.frame
-
-    keyframes = list(make_keyframes(chosen(), used_cameras(rectifier), settings, tools.images, tools.executor))
+    keyframes, tracks = followed(lambda frame: run.handle(frame, *feed.until(frame.stamp_ns)), inputs, settings, tools)
     estimates = run.chain.estimates
     inertial = bool(estimates) and inputs.calibration.imu is not None and estimates[-1].inertial
     done = OdometryPass(
@@ -109,9 +95,30 @@ def run_odometry(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTo
         inertial,
         bool(estimates) and estimates[-1].scale_known,
         inertial and len(inputs.wheel) > 0 and settings.odometry.filter.use_wheels,
-        FrameTracks.joined(seen),
+        tracks,
     )
     return done if rectifier.camera.baseline_m > 0 else longest_run(done, rectifier.body_from_cam)
+
+
+def followed(
+    handle: Callable[[RectifiedFrame], TrackedFrame], inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools
+) -> tuple[list[Keyframe], FrameTracks]:
+    """Return the keyframes that `handle` chooses of all frames, given in order, and the points that it tracks.
+
+    In parallel the executor extracts the features of the chosen keyframes.
+    """
+    seen: list[FrameTracks] = []
+
+    def chosen() -> Iterator[tuple[int, RectifiedFrame]]:
+        for raw in inputs.frames:
+            tracked = handle(raw if isinstance(raw, RectifiedFrame) else inputs.rectifier.rectify(raw))
+            seen.append(FrameTracks.of_frame(tracked.estimate))
+            tools.at("odometry", tracked.number + 1, inputs.frame_count)
+            if tracked.is_keyframe:
+                yield tracked.number, tracked.frame
+
+    keyframes = list(make_keyframes(chosen(), used_cameras(inputs.rectifier), settings, tools))
+    return keyframes, FrameTracks.joined(seen)
 
 
 def initial_state(odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:
@@ -120,14 +127,13 @@ def initial_state(odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:
     estimates = [odometry.estimates[n] for n in numbers]
     map_from_body = odometry.odom_from_body[numbers]
     body_velocities = [e.odom_from_body[:3, :3].T @ e.velocity_odom_mps for e in estimates]
+    biases = [np.concatenate([e.gyro_bias_radps, e.accel_bias_mps2]) for e in estimates]
     motion = KeyframeMotion(
         inertial=odometry.inertial,
         imu=inputs.imu,
         noise=inputs.calibration.imu,
         imu_minus_cam_s=rectifier.imu_minus_cam_s,
-        velocities_mps=np.einsum("kij,kj->ki", map_from_body[:, :3, :3], np.array(body_velocities)),
-        gyro_bias_radps=np.array([e.gyro_bias_radps for e in estimates]),
-        accel_bias_mps2=np.array([e.accel_bias_mps2 for e in estimates]),
+        motions=turned(np.column_stack([body_velocities, biases]), map_from_body[:, :3, :3]),
         relative=[] if odometry.inertial else odometry_factors(odometry, map_from_body),
     )
     return SurveyState(
@@ -207,12 +213,6 @@ class FrameChain:
         """(F, 6, 6) in the axes of `odom_from_body`."""
         turn = np.kron(np.eye(2), self._frame.frame_from_odom[:3, :3].T)
         return np.asarray(turn @ np.array(self._covariances).reshape(-1, 6, 6) @ turn.T)
-
-
-def summary_of(frame: RectifiedFrame, estimate: OdometryEstimate, frame_from_body: Array) -> FrameSummary:
-    """Return the data of a frame for the selection of keyframes."""
-    e = estimate
-    return FrameSummary(frame.stamp_ns, frame_from_body, e.track_ids, e.scene_depth_m, sharpness(frame), e.after_gap)
 
 
 def longest_run(odometry: OdometryPass, body_from_cam: Array) -> OdometryPass:

@@ -77,6 +77,23 @@ def survey_camera(camera: StereoCamera) -> StereoCamera:
     return camera if camera.baseline_m > 0 else replace(camera, baseline_m=RGBD_BASELINE_M)
 
 
+def scaled_bodies(map_from_body: Array, body_from_cam: Array, scale: float) -> Array:
+    """Return bodies (K, 4, 4) whose cameras, mounted at body_from_cam (4, 4), are `scale` times as far from the origin."""
+    map_from_cam = map_from_body @ body_from_cam
+    map_from_cam[:, :3, 3] *= scale
+    return np.asarray(map_from_cam @ se3_inverse(body_from_cam))
+
+
+def projection_by_point(camera: StereoCamera, points_cam: Array) -> Array:
+    """Return (M, 3, 3) derivatives of u, v and disparity by points (M, 3) in the camera."""
+    x, y, z = points_cam.T
+    rows, focal_px = np.zeros((len(z), 3, 3)), camera.focal_px
+    rows[:, 0, 0] = rows[:, 1, 1] = focal_px / z
+    rows[:, 0, 2], rows[:, 1, 2] = -focal_px * x / z**2, -focal_px * y / z**2
+    rows[:, 2, 2] = -focal_px * camera.baseline_m / z**2
+    return rows
+
+
 def frame_of_camera(frame: RectifiedFrame, number: int) -> RectifiedFrame | None:
     """Return the frame of a camera; None if it has no images at this moment."""
     seen = frame.view(number)

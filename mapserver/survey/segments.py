@@ -12,8 +12,6 @@ import numpy as np
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
-from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, Stamps, WheelSample, wheel_between
 from mapserver.survey.keyframes.keyframes import set_aside
 from mapserver.survey.odometry_pass import initial_state
@@ -25,7 +23,6 @@ from mapserver.survey.state import (
     ImageStore,
     Keyframe,
     Landmarks,
-    MemoryImageStore,
     OdometryPass,
     SurveyState,
 )
@@ -64,11 +61,10 @@ class _Task:
 
 @dataclass(frozen=True, slots=True)
 class _Shared:
-    """Data of a process common to all tasks. begin: computes the chain of one piece."""
+    """Data of a process common to all tasks. begin: computes the chain of one piece; inputs: of the survey, without its samples."""
 
     begin: Begin
-    calibration: RigCalibration
-    rectifier: Rectifier
+    inputs: SurveyInputs
     settings: SurveySettings
 
 
@@ -83,7 +79,6 @@ class SegmentSurvey:
 
     segment: Segment
     odometry: OdometryPass
-    tracks: FrameTracks
     state: SurveyState
     matched: set[tuple[int, int]]
     led: Array
@@ -105,14 +100,18 @@ def in_segments(begin: Begin, inputs: SurveyInputs, settings: SurveySettings, to
         return begin(inputs, settings, tools)
     stamps_ns = inputs.parts.stamps_ns
     segments = planned(stamps_ns, settings.segments)
-    shared = _Shared(begin, inputs.calibration, inputs.rectifier, settings)
-    images = MemoryImageStore() if tools.images is None else tools.images
-    tools = replace(tools, images=images)
-    made = list(_in_parallel(segments, shared, inputs, tools, images)) if len(segments) > 1 else []
+    if len(segments) == 1:
+        return begin(inputs, settings, tools)
+    shared = _Shared(begin, replace(inputs, frames=(), imu=ImuSamples.empty(), wheel=(), parts=None), settings)
+    made = list(_in_parallel(segments, shared, inputs, tools))
     refused: dict[int, str] = {}
     while wrong := _refusals(made):
         refused |= wrong
-        made = list(_made_again(made, refused, shared, inputs, tools, images))
+        made = [
+            # In this process: it may be long, and the survey's own store keeps its pictures out of memory.
+            known or (whole, _survey_segment(shared, _task_of(whole, inputs, tools), tools))
+            for whole, known in _regrouped(made, refused)
+        ]
     cuts = tuple(
         Cut(s.begin, float(stamps_ns[s.begin] - stamps_ns[0]) * 1e-9, refused.get(s.begin)) for s in segments[1:]
     )
@@ -140,14 +139,14 @@ def planned(stamps_ns: Stamps, settings: SegmentSettings) -> list[Segment]:
 
 
 def _in_parallel(
-    segments: Sequence[Segment], shared: _Shared, inputs: SurveyInputs, tools: SurveyTools, images: ImageStore
+    segments: Sequence[Segment], shared: _Shared, inputs: SurveyInputs, tools: SurveyTools
 ) -> Iterator[_Made]:
     """Yield the result of each; pictures returned by processes are put into the survey's own store as they arrive."""
-    tasks = (_task_of(segment, inputs, images) for segment in segments)
+    tasks = (_task_of(segment, inputs, tools) for segment in segments)
     for segment, survey in zip(segments, tools.executor.map(_survey_segment, shared, tasks), strict=True):
         tools.at("odometry", segment.last + 1, inputs.frame_count)
         tools.release()
-        yield segment, survey if isinstance(survey, str) else _stored(survey, images)
+        yield segment, survey if isinstance(survey, str) else _stored(survey, tools.images)
 
 
 def _stored(survey: SegmentSurvey, images: ImageStore) -> SegmentSurvey:
@@ -167,7 +166,7 @@ def _kept(keyframe: Keyframe, images: ImageStore, numbers: dict[int, int]) -> Ke
     return set_aside(kept, images)
 
 
-def _task_of(segment: Segment, inputs: SurveyInputs, images: ImageStore) -> _Task:
+def _task_of(segment: Segment, inputs: SurveyInputs, tools: SurveyTools) -> _Task:
     """Return the segment with its part of the inputs, and with the store of its pictures.
 
     Samples before its first frame are excluded: IMU data without a picture would look like rest during constant motion.
@@ -183,27 +182,25 @@ def _task_of(segment: Segment, inputs: SurveyInputs, images: ImageStore) -> _Tas
         inputs.imu.between(since_ns, until_ns),
         tuple(wheel_between(inputs.wheel, since_ns, until_ns)),
         frozenset(frame - segment.lead for frame in ends),
-        images,
+        tools.images,
     )
 
 
 def _survey_segment(shared: _Shared, task: _Task, tools: SurveyTools | None = None) -> SegmentSurvey | str:
     """Return the survey of one segment in any process, or the text of the reason if there is none."""
-    segment = task.segment
-    inputs = SurveyInputs(
-        task.frames,
-        segment.last - segment.lead + 1,
-        task.imu,
-        shared.calibration,
-        shared.rectifier,
-        task.wheel,
+    inputs = replace(
+        shared.inputs,
+        frames=task.frames,
+        frame_count=task.segment.last - task.segment.lead + 1,
+        imu=task.imu,
+        wheel=task.wheel,
         keyframes_at=task.keyframes_at,
     )
     try:
         chain = shared.begin(inputs, shared.settings, tools or SurveyTools(images=task.images))
     except SurveyError as error:
         return str(error)
-    return _without_lead(chain, segment)
+    return _without_lead(chain, task.segment)
 
 
 def _without_lead(chain: AdjustedChain, segment: Segment) -> SegmentSurvey:
@@ -213,9 +210,7 @@ def _without_lead(chain: AdjustedChain, segment: Segment) -> SegmentSurvey:
     chosen = np.array([frame >= first for frame in odometry.keyframe_frames])
     number = np.cumsum(chosen) - 1
     keyframes = [k for k, keep in zip(odometry.keyframes, chosen, strict=True) if keep]
-    state = chain.state.of(chosen)
-    odom_from_body, tracks = odometry.odom_from_body, odometry.tracks
-    assert tracks is not None
+    state, odom_from_body = chain.state.of(chosen), odometry.odom_from_body
     kept = replace(
         odometry,
         estimates=[replace(e, frame_index=e.frame_index + lead) for e in odometry.estimates[first:end]],
@@ -223,12 +218,11 @@ def _without_lead(chain: AdjustedChain, segment: Segment) -> SegmentSurvey:
         covariances=odometry.covariances[first:end],
         tracked=odometry.tracked[first:end],
         keyframes=[k.numbered(k.frame_index + lead) for k in keyframes],
-        tracks=None,
+        tracks=odometry.tracks.part(first, end),
     )
     return SegmentSurvey(
         segment,
         kept,
-        tracks.part(first, end),
         replace(state, motion=replace(state.motion, imu=ImuSamples.empty())),
         {(int(number[i]), int(number[j])) for i, j in chain.matched if chosen[i] and chosen[j]},
         se3_inverse(odom_from_body[settled]) @ odom_from_body[first],
@@ -249,19 +243,16 @@ def _doubt(chain: AdjustedChain, frames: slice) -> str | None:
 
 def _refusals(made: Sequence[_Made]) -> dict[int, str]:
     """Return why neighbours cannot be joined, by the frame between them."""
-    found = {}
-    for (_, before), (segment, after) in pairwise(made):
-        if isinstance(before, str):
-            found[segment.begin] = before
-        elif isinstance(after, str):
-            found[segment.begin] = after
-        elif (reason := refusal(before, after)) is not None:
-            found[segment.begin] = reason
-    return found
+    reasons = {after[0].begin: _refusal(before[1], after[1]) for before, after in pairwise(made)}
+    return {frame: reason for frame, reason in reasons.items() if reason is not None}
 
 
-def refusal(before: SegmentSurvey, after: SegmentSurvey) -> str | None:
+def _refusal(before: SegmentSurvey | str, after: SegmentSurvey | str) -> str | None:
     """Return why two neighbours cannot be joined, None if they can: both were reliable, and agree on the motion there."""
+    if isinstance(before, str):
+        return before
+    if isinstance(after, str):
+        return after
     if before.lost is not None:
         return f"the odometry before it was in doubt: {before.lost}"
     if after.unsettled is not None:
@@ -283,30 +274,18 @@ def refusal(before: SegmentSurvey, after: SegmentSurvey) -> str | None:
     return None
 
 
-def _made_again(
-    made: Sequence[_Made],
-    refused: dict[int, str],
-    shared: _Shared,
-    inputs: SurveyInputs,
-    tools: SurveyTools,
-    images: ImageStore,
-) -> Iterator[_Made]:
-    """Yield merged neighbours that could not be joined, each as one segment; none if that is the whole survey, which needs no segments."""
-    groups: list[list[_Made]] = []
+def _regrouped(made: Sequence[_Made], refused: dict[int, str]) -> list[tuple[Segment, _Made | None]]:
+    """Return segments with their results, and merged neighbours that could not be joined as one segment without any.
+
+    None if that is the whole survey, which needs no segments.
+    """
+    groups: list[tuple[Segment, _Made | None]] = []
     for each in made:
         if groups and each[0].begin in refused:
-            groups[-1].append(each)
+            groups[-1] = replace(groups[-1][0], last=each[0].last), None
         else:
-            groups.append([each])
-    if len(groups) == 1:
-        return
-    for group in groups:
-        if len(group) == 1:
-            yield group[0]
-            continue
-        whole = Segment(group[0][0].lead, group[0][0].begin, group[-1][0].last)
-        # In this process: it may be long, and the survey's own store keeps its pictures out of memory.
-        yield whole, _survey_segment(shared, _task_of(whole, inputs, images), tools)
+            groups.append((each[0], each))
+    return groups if len(groups) > 1 else []
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,7 +312,7 @@ def _joined(segments: Sequence[SegmentSurvey], cuts: tuple[Cut, ...], inputs: Su
                 _laid_on(last.joined_from_odom @ odom_from_body[-1], after.odometry.odom_from_body[0], level),
                 _laid_on(last.joined_from_map @ map_from_body[-1], after.state.map_from_body[0], level),
                 last.first_keyframe + len(before.odometry.keyframes) - 1,
-                last.first_track + int(before.tracks.ids.max(initial=-1)) + 1,
+                last.first_track + int(before.odometry.tracks.ids.max(initial=-1)) + 1,
             )
         )
     odometry = replace(_joined_odometry(placed), cuts=cuts)
@@ -365,7 +344,7 @@ def _joined_odometry(placed: Sequence[_Placed]) -> OdometryPass:
         own = turn @ odometry.covariances @ turn.T
         covariances.append(own + np.array([carried(gained, lever_m) for lever_m in levers_m]))
         reached = covariances[-1][-1]
-        tracks = each.made.tracks
+        tracks = odometry.tracks
         # A shared frame ends after its rows of the later segment.
         starts[-1] = starts[-1][:-1] if size else starts[-1]
         starts.append(size + tracks.starts[1:])
@@ -391,23 +370,19 @@ def _in_turn(parts: Sequence[Array]) -> Array:
 
 def _joined_state(placed: Sequence[_Placed], odometry: OdometryPass, inputs: SurveyInputs) -> SurveyState:
     """Return landmarks of all segments; one seen in two is two landmarks, until landmarks are built again."""
-    velocities, places, points, marks, number = [], [], [], [], 0
+    motions, places, points, marks, number = [], [], [], [], 0
     for each in placed:
         own, turn = each.made.state, each.joined_from_map
-        velocities.append(own.motion.velocities_mps @ turn[:3, :3].T)
+        velocities, biases = np.split(own.motion.motions, [3], axis=1)
+        motions.append(np.column_stack([velocities @ turn[:3, :3].T, biases]))
         places.append(turn @ own.map_from_body)
         points.append(own.landmarks.points_map @ turn[:3, :3].T + turn[:3, 3])
         seen_by = own.landmarks.obs_keyframe + np.int32(each.first_keyframe)
         owners = (own.landmarks.obs_landmark + number).astype(np.int32)
         marks.append(replace(own.landmarks, obs_keyframe=seen_by, obs_landmark=owners))
         number += len(points[-1])
-    state, motions = initial_state(odometry, inputs), [each.made.state.motion for each in placed]
-    motion = replace(
-        state.motion,
-        velocities_mps=_in_turn(velocities),
-        gyro_bias_radps=_in_turn([m.gyro_bias_radps for m in motions]),
-        accel_bias_mps2=_in_turn([m.accel_bias_mps2 for m in motions]),
-    )
+    state = initial_state(odometry, inputs)
+    motion = replace(state.motion, motions=_in_turn(motions))
     landmarks = Landmarks.concatenated(np.concatenate(points), marks)
     state = replace(state, map_from_body=_in_turn(places), motion=motion, landmarks=landmarks)
     if odometry.inertial:

@@ -7,7 +7,7 @@
 | `close_loops` | the chain, vocabulary, zones, position priors | `SurveyState` after the pose graph, in `map` by priors, and the `Loops` |
 | `match_again` | keyframes after loops, matched pairs | the images of all cameras matched again, and adjusted |
 | `refine` | that | observations and keyframes again, at better poses; each camera's error of yaw |
-| `keep_largest` | the adjusted state, odometry, loops | their part in the connected component that becomes the map |
+| `find_components`, `only_kept` | the adjusted state, odometry, loops | their part in the connected component that becomes the map |
 | `place_frames`, `assemble` | the kept state | all frames, and the map; inconsistent observations are culled |
 
 For a long recording, the first two run segment by segment. `mapserver build` calls `begin_survey`, measures the calibration from its
@@ -27,23 +27,20 @@ from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3_inverse
 from mapserver.survey.bundle.bundle_rounds import bundle_rounds, local_windows
 from mapserver.survey.bundle.stereo_yaw_check import StereoYaw, estimate_stereo_yaw, without_stereo_yaw
-from mapserver.survey.finish.culling import Culled
 from mapserver.survey.finish.frame_adjustment import place_frames
-from mapserver.survey.finish.map_assembly import assemble
+from mapserver.survey.finish.map_assembly import Culled, assemble
 from mapserver.survey.finish.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
 from mapserver.survey.given_poses import poses_as_odometry
 from mapserver.survey.loops.connected_components import (
     Component,
-    Components,
-    SigmaBetween,
     between_kept,
     find_components,
     find_groups,
     only_kept,
+    sigma_between,
     without_doubted,
 )
 from mapserver.survey.loops.loops import LoopCloser, Loops
-from mapserver.survey.loops.sim3_loops import gate_covariances, solve_scaled
 from mapserver.survey.odometry_pass import initial_state, run_odometry
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.odometry_factors import blackout_factors, chain_edges, odometry_factors
@@ -55,6 +52,7 @@ from mapserver.survey.pose_graph.position_priors import (
     placed_by_priors,
     prior_edges,
 )
+from mapserver.survey.pose_graph.sim3_pose_graph import gate_covariances, solve_scaled
 from mapserver.survey.rig import rig_of
 from mapserver.survey.segments import in_segments
 from mapserver.survey.settings import SurveySettings
@@ -102,14 +100,6 @@ def survey(inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools | None
     return finish_survey(begin_survey(inputs, config.settings, tools), inputs, config, tools)
 
 
-def survey_from(
-    odometry: OdometryPass, inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools | None = None
-) -> Survey:
-    """Run all stages after the initial trajectory."""
-    tools = tools or SurveyTools()
-    return finish_survey(adjust_chain(odometry, inputs, config.settings, tools), inputs, config, tools)
-
-
 def begin_survey(inputs: SurveyInputs, settings: SurveySettings, tools: SurveyTools) -> AdjustedChain:
     """Run the stages before loop closure, for a long recording by segments. Raises SurveyError if there is too little."""
     return in_segments(_whole, inputs, settings, tools)
@@ -135,7 +125,8 @@ def finish_survey(chain: AdjustedChain, inputs: SurveyInputs, config: SurveyConf
     odometry, state, stereo_yaws = refine(match_again(chain, known, settings, tools), settings, tools)
     tools.at("global adjustment", 2, 2)
     frames_of = np.array(odometry.keyframe_frames, np.int64)
-    state, odometry, loops, components = keep_largest(state, odometry, loops, settings)
+    components = find_components(state, sigma_between(odometry), settings.join_sigma_m)
+    state, odometry, loops = only_kept(state, odometry, loops, components.kept)
     placed = place_frames(odometry, state, settings, stereo_yaws[0].correction_px, tools.executor)
     survey_map, rows, culled = assemble(state, odometry, placed, settings)
     between = between_kept(len(survey_map.trajectory), frames_of, components.kept)
@@ -184,9 +175,9 @@ def _with_neighbours(
 ) -> tuple[SurveyState, set[tuple[int, int]]]:
     """Return the state with the landmarks that the first camera sees in neighbouring keyframes, and the matched pairs of them."""
     allowed_m = drift_allowance_m(odometry.covariances[odometry.keyframe_frames], state.map_from_body[:, :3, 3])
-    posed, previous = _posed(odometry, state), settings.pairs.previous
+    posed = _posed(odometry, state)
     finder = PairFinder(posed, settings.pairs, tools.executor)
-    candidates = finder.candidates(previous=previous, only_near=max(settings.loops.min_gap_keyframes, previous))
+    candidates = finder.candidates(max(settings.loops.min_gap_keyframes, settings.pairs.previous))
     pairs = finder.match(
         candidates,
         allowed_m,
@@ -210,15 +201,15 @@ def close_loops(
         placed, terms = placed_by_priors(state.map_from_body, marginals, inputs.priors, base_from_body, odometry)
         marginals = GraphMarginals(placed, known)
         state = replace(state.moved(placed), priors=learn_priors(marginals, terms))
-    groups = find_groups(state, _sigmas_m(odometry), settings.join_sigma_m)
+    groups = find_groups(state, sigma_between(odometry), settings.join_sigma_m)
     posed = _posed(odometry, replace(state, rig=rig_of(inputs.rectifier)))
     closer = LoopCloser(
         posed,
         config,
         marginals,
         begun.matched,
-        tools.executor,
         groups,
+        tools.executor,
         find_groups(state, lambda *_: np.inf, 0.0) if odometry.scale_known else None,
         measures_scale=not odometry.scale_known,
     )
@@ -230,10 +221,10 @@ def close_loops(
         return _solved(state, closer.begin, chain, loops)
     if not loops.edges:
         return state, loops
-    scaled = solve_scaled(state.map_from_body, chain, loops.edges, closer.scales, scale_walk)
-    state = state.moved(scaled.map_from_body)
+    map_from_body, weights = solve_scaled(state.map_from_body, chain, loops.edges, closer.scales, scale_walk)
+    state = state.moved(map_from_body)
     factors = odometry_factors(odometry, state.map_from_body)
-    return replace(state, motion=replace(state.motion, relative=factors)), loops.without_outliers(scaled.loop_weights)
+    return replace(state, motion=replace(state.motion, relative=factors)), loops.without_outliers(weights)
 
 
 def _solved(state: SurveyState, map_from_body: Array, chain: list[PoseEdge], loops: Loops) -> tuple[SurveyState, Loops]:
@@ -305,7 +296,7 @@ def _observed(
 ) -> tuple[Landmarks, Mask]:
     """Return the landmarks of all images, and the keyframes (K,) that their adjustment can do without."""
     finder = PairFinder(posed, settings.pairs, tools.executor)
-    candidates, tracks = finder.candidates(previous=settings.pairs.previous), None
+    candidates, tracks = finder.candidates(), None
     if known is not None:
         first, (matched, tracks) = posed.numbers[:, 0].tolist(), known
         done = {(first[i], first[j]) for i, j in matched}
@@ -337,14 +328,6 @@ def _stereo_yaws(state: SurveyState, redundant: Mask, settings: SurveySettings) 
     return tuple(estimate_stereo_yaw(part, settings, camera) for camera in range(len(part.rig)))
 
 
-def keep_largest(
-    state: SurveyState, odometry: OdometryPass, loops: Loops, settings: SurveySettings
-) -> tuple[SurveyState, OdometryPass, Loops, Components]:
-    """Return the largest connected component, which becomes the map, and all components."""
-    components = find_components(state, _sigmas_m(odometry), settings.join_sigma_m)
-    return *only_kept(state, odometry, loops, components.kept), components
-
-
 def _with_depths(odometry: OdometryPass, state: SurveyState, depths: MonoDepths | None) -> OdometryPass:
     """Return the keyframes of one camera with depths by their present poses; unchanged for rigs that measure depth."""
     if depths is None:
@@ -354,11 +337,6 @@ def _with_depths(odometry: OdometryPass, state: SurveyState, depths: MonoDepths 
 
 def _posed(odometry: OdometryPass, state: SurveyState) -> RigImages:
     return RigImages.of(odometry.keyframes, state.map_from_body, state.rig)
-
-
-def _sigmas_m(odometry: OdometryPass) -> SigmaBetween:
-    covariances = odometry.covariances[odometry.keyframe_frames]
-    return SigmaBetween(np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2))
 
 
 def _progress_of(tools: SurveyTools, stage: str, total: int) -> Callable[[int], None]:

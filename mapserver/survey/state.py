@@ -2,9 +2,9 @@
 
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from itertools import count
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from fleetmap import core
 from fleetmap.features import orb, patch_align
 from fleetmap.features.settings import StereoSettings
-from fleetmap.geometry import AnyArray, Array
+from fleetmap.geometry import AnyArray, Array, transform_points
 from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples
-from mapserver.survey.rig import Rig
+from mapserver.survey.rig import Rig, scaled_bodies
 
 Indices = NDArray[np.int64]
 Numbers = NDArray[np.int32]
@@ -32,48 +32,36 @@ class Pictures:
     pyramid: patch_align.Pyramid
 
 
-class ImageStore(Protocol):
-    """Storage for pictures and features of keyframes: those of a long survey do not fit in memory. Thread-safe."""
+class ImageStore:
+    """Storage for pictures and features of keyframes, unchanged and in memory. Thread-safe.
+
+    Those of a long survey do not fit in memory: `drafting/mapped_images.py` keeps them in a file.
+    """
+
+    def __init__(self) -> None:
+        self._numbers = count()
+        self._stored: dict[int, Pictures] = {}
 
     def put(self, pictures: Pictures) -> int:
         """Store pictures and return their number for `get`."""
+        number = next(self._numbers)
+        self._stored[number] = pictures
+        return number
 
     def get(self, number: int) -> Pictures:
         """Return the stored pictures."""
+        return self._stored[number]
 
     def keep(self, arrays: Sequence[AnyArray]) -> list[AnyArray]:
         """Return the same arrays, not necessarily held in memory."""
+        return list(arrays)
 
     def release(self) -> None:
         """End a stage: results of `keep` may leave memory until they are read again."""
 
     def apart(self) -> AbstractContextManager["ImageStore"]:
         """Return a separate store, for a survey that is not continued: it is freed with its last reference."""
-
-
-class MemoryImageStore:
-    """Keeps all pictures in memory, unchanged."""
-
-    def __init__(self) -> None:
-        self._numbers = count()
-        self._pictures: dict[int, Pictures] = {}
-
-    def put(self, pictures: Pictures) -> int:
-        number = next(self._numbers)
-        self._pictures[number] = pictures
-        return number
-
-    def get(self, number: int) -> Pictures:
-        return self._pictures[number]
-
-    def keep(self, arrays: Sequence[AnyArray]) -> list[AnyArray]:
-        return list(arrays)
-
-    def release(self) -> None:
-        pass
-
-    def apart(self) -> AbstractContextManager[ImageStore]:
-        return nullcontext(MemoryImageStore())
+        return nullcontext(ImageStore())
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,13 +99,13 @@ class Keyframe:
 
     def with_pyramid(self) -> "Keyframe":
         """Return the same keyframe with the left picture's pyramid and the depth image in memory, and no right picture."""
-        images, pyramid = MemoryImageStore(), self.pyramid
+        images, pyramid = ImageStore(), self.pyramid
         frame = RectifiedFrame(self.stamp_ns, pyramid[0], None, self.frame.disparity_px)
         return replace(self, images=images, image_number=images.put(Pictures(frame, pyramid)), others=())
 
     def without_pictures(self) -> "Keyframe":
         """Return the same keyframe with an empty image store, cheap to send if only features are compared."""
-        return replace(self, images=MemoryImageStore(), image_number=0, others=())
+        return replace(self, images=ImageStore(), image_number=0, others=())
 
     def numbered(self, frame_index: int) -> "Keyframe":
         """Return the same keyframe with another frame number."""
@@ -233,8 +221,8 @@ class OdometryPass:
 
     odom_from_body (F, 4, 4), covariances (F, 6, 6) in odom axes, rotation first; tracked (F,): True for frames connected to
     earlier ones; inertial: True if gravity was estimated; scale_known: True if lengths are metres; has_wheels: True if wheel odometry
-    was used; tracks: the tracked points, None if absent; cuts: planned starts of segments. With one camera only tracked
-    frames have one frame and scale, and only they give keyframes.
+    was used; tracks: the tracked points; cuts: planned starts of segments. With one camera only tracked frames have one frame and scale,
+    and only they give keyframes.
     """
 
     estimates: list[OdometryEstimate]
@@ -245,13 +233,18 @@ class OdometryPass:
     inertial: bool
     scale_known: bool = True
     has_wheels: bool = False
-    tracks: FrameTracks | None = None
+    tracks: FrameTracks = field(default_factory=lambda: FrameTracks.joined([]))
     cuts: tuple[Cut, ...] = ()
 
     @property
     def keyframe_frames(self) -> list[int]:
         """Frame number of each keyframe."""
         return [k.frame_index for k in self.keyframes]
+
+    @property
+    def stamps_ns(self) -> Indices:
+        """(F,) of all frames."""
+        return np.array([e.stamp_ns for e in self.estimates], np.int64)
 
 
 @dataclass(frozen=True)
@@ -353,17 +346,16 @@ class PriorTerm:
 class KeyframeMotion:
     """Velocities and biases at K keyframes; inertial is False for a rig without a gravity estimate.
 
-    velocities_mps, gyro_bias_radps, accel_bias_mps2 (K, 3); relative: odometry between neighbours, used without an IMU, and if
-    pictures show nothing. goes_on (K,): True if an inertial factor connects a keyframe with the previous one; None means all True.
+    motions (K, 9): velocity in map m/s, gyro bias rad/s, accelerometer bias m/s^2. relative: odometry between neighbours, used without an
+    IMU, and if pictures show nothing. goes_on (K,): True if an inertial factor connects a keyframe with the previous one; None means all
+    True.
     """
 
     inertial: bool
     imu: ImuSamples
     noise: ImuNoise | None
     imu_minus_cam_s: float
-    velocities_mps: Array
-    gyro_bias_radps: Array
-    accel_bias_mps2: Array
+    motions: Array
     relative: list[RelativeTerm]
     goes_on: Mask | None = None
 
@@ -371,13 +363,8 @@ class KeyframeMotion:
         """Return that of the chosen keyframes (K,), renumbered."""
         number = np.cumsum(chosen) - 1
         kept = [r for r in self.relative if chosen[r.i] and chosen[r.j]]
-        return replace(
-            self,
-            velocities_mps=self.velocities_mps[chosen],
-            gyro_bias_radps=self.gyro_bias_radps[chosen],
-            accel_bias_mps2=self.accel_bias_mps2[chosen],
-            relative=[replace(r, i=int(number[r.i]), j=int(number[r.j])) for r in kept],
-        )
+        relative = [replace(r, i=int(number[r.i]), j=int(number[r.j])) for r in kept]
+        return replace(self, motions=self.motions[chosen], relative=relative)
 
 
 @dataclass(frozen=True)
@@ -412,14 +399,18 @@ class SurveyState:
 
     def of(self, chosen: Mask) -> "SurveyState":
         """Return a separate state of the chosen keyframes (K,) and of the landmarks seen by two of them."""
-        number = np.cumsum(chosen) - 1
-        marks = self.landmarks.keep_observations(chosen[self.landmarks.obs_keyframe], 2)
+        marks, number = self.landmarks.keep_observations(chosen[self.landmarks.obs_keyframe], 2), np.cumsum(chosen) - 1
         marks = replace(marks, obs_keyframe=number[marks.obs_keyframe].astype(np.int32))
+        return self.with_landmarks(chosen, marks)
+
+    def with_landmarks(self, chosen: Mask, landmarks: Landmarks) -> "SurveyState":
+        """Return a separate state of the chosen keyframes (K,) with their landmarks, which have the new numbers of keyframes."""
+        number = np.cumsum(chosen) - 1
         return replace(
             self,
             stamps_ns=self.stamps_ns[chosen],
             map_from_body=self.map_from_body[chosen],
-            landmarks=marks,
+            landmarks=landmarks,
             motion=self.motion.of(chosen),
             priors=[replace(p, k=int(number[p.k])) for p in self.priors if chosen[p.k]],
         )
@@ -427,5 +418,21 @@ class SurveyState:
     def moved(self, map_from_body: Array) -> "SurveyState":
         """Return the state with its keyframes, and their velocities, moved to map_from_body (K, 4, 4)."""
         rotations = map_from_body[:, :3, :3] @ self.map_from_body[:, :3, :3].transpose(0, 2, 1)
-        velocities = np.einsum("kij,kj->ki", rotations, self.motion.velocities_mps)
-        return replace(self, map_from_body=map_from_body, motion=replace(self.motion, velocities_mps=velocities))
+        motions = turned(self.motion.motions, rotations)
+        return replace(self, map_from_body=map_from_body, motion=replace(self.motion, motions=motions))
+
+    def transformed(self, new_from_map: Array) -> "SurveyState":
+        """Return the state in another frame, as `SurveyMap.transformed`."""
+        landmarks = replace(self.landmarks, points_map=transform_points(new_from_map, self.landmarks.points_map))
+        return replace(self.moved(new_from_map @ self.map_from_body), landmarks=landmarks)
+
+    def scaled(self, scale: float) -> "SurveyState":
+        """Return the state `scale` times as large, as `SurveyMap.scaled`."""
+        landmarks = replace(self.landmarks, points_map=scale * self.landmarks.points_map)
+        bodies = scaled_bodies(self.map_from_body, self.rig.body_from_cam[0], scale)
+        return replace(self, map_from_body=bodies, landmarks=landmarks)
+
+
+def turned(motions: Array, rotations: Array) -> Array:
+    """Return motions (K, 9) with their velocities rotated by (K, 3, 3)."""
+    return np.column_stack([np.einsum("kij,kj->ki", rotations, motions[:, :3]), motions[:, 3:]])

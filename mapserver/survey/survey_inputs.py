@@ -64,10 +64,10 @@ class SurveyConfig:
 
 @dataclass(frozen=True)
 class SurveyTools:
-    """Resources that do not change the result. images: in memory for None."""
+    """Resources that do not change the result."""
 
     progress: Progress = no_progress
-    images: ImageStore | None = None
+    images: ImageStore = field(default_factory=ImageStore)
     executor: Executor = SERIAL
 
     def at(self, stage: str, done: int, total: int) -> None:
@@ -78,8 +78,7 @@ class SurveyTools:
 
     def release(self) -> None:
         """Allow features of keyframes to leave memory until they are read again."""
-        if self.images is not None:
-            self.images.release()
+        self.images.release()
 
 
 @dataclass(frozen=True)

@@ -1,13 +1,14 @@
 """The map of a survey: keyframes, landmarks, observations, and the trajectory of all frames."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Stamps, Trajectory
+from mapserver.survey.rig import scaled_bodies
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +64,27 @@ class SurveyMap:
         """The selected frames whose poses are measured in the map."""
         chosen = self.trajectory_estimated
         return Trajectory(self.trajectory.stamps_ns[chosen], self.trajectory.frame_from_body[chosen])
+
+    def transformed(self, new_from_map: Array) -> "SurveyMap":
+        """Return the same survey in another frame; new_from_map (4, 4) is rigid, so measurements are unchanged."""
+        return replace(
+            self,
+            map_from_body=new_from_map @ self.map_from_body,
+            points_map=transform_points(new_from_map, self.points_map),
+            trajectory=Trajectory(self.trajectory.stamps_ns, new_from_map @ self.trajectory.frame_from_body),
+        )
+
+    def scaled(self, scale: float) -> "SurveyMap":
+        """Return the same survey `scale` times as large, then in metres; the cameras' mount, already in metres, is unchanged."""
+        frames = scaled_bodies(self.trajectory.frame_from_body, self.body_from_cam, scale)
+        return replace(
+            self,
+            map_from_body=scaled_bodies(self.map_from_body, self.body_from_cam, scale),
+            points_map=scale * self.points_map,
+            point_sigma_m=scale * self.point_sigma_m,
+            trajectory=Trajectory(self.trajectory.stamps_ns, frames),
+            scale_known=True,
+        )
 
 
 def history_of(survey_map: SurveyMap) -> History:

@@ -15,7 +15,7 @@ from mapserver.drafting.report import BuildReport
 from mapserver.fleet_statistics.kpis import Kpis
 from mapserver.nightly.night import NightReport
 from mapserver.quality import figures
-from mapserver.survey.merge.pipeline import Counts
+from mapserver.survey.merge.multi_session import Counts
 from support.fleet.contracts_documents import REPOSITORY, code_words, generate_docs, rows, section, text
 
 ROOTS = ("shared", "mapserver", "locclient", "deploy", "docs", "examples", "tests")

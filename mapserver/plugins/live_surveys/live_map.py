@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse
+from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_adjoint, se3_inverse
 from fleetmap.messages import Cause, Status
 from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.plugins.live_surveys.live_values import (
@@ -26,14 +26,14 @@ from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import apply_result, bundle_problem
 from mapserver.survey.bundle.problem import MotionPrior
 from mapserver.survey.keyframes.keyframes import make_keyframe
-from mapserver.survey.loops.connected_components import MIN_SHARED, SigmaBetween, bridges
+from mapserver.survey.loops.connected_components import MIN_SHARED, bridges, grown_sigma
 from mapserver.survey.loops.keyframe_groups import KeyframeGroups
 from mapserver.survey.loops.loops import LoopCloser, LoopRecord, Loops, LoopVerdict, body_edge
-from mapserver.survey.loops.sim3_loops import gate_covariances, solve_scaled
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
-from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, optimize_pose_graph
+from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
+from mapserver.survey.pose_graph.sim3_pose_graph import gate_covariances, solve_scaled
 from mapserver.survey.rig import CameraKind, Rig, survey_camera
-from mapserver.survey.state import Keyframe, KeyframeMotion, RelativeTerm, RigImages, SurveyState
+from mapserver.survey.state import Keyframe, KeyframeMotion, RelativeTerm, RigImages, SurveyState, turned
 from mapserver.survey.survey_inputs import SurveyConfig
 from mapserver.survey.tracks.matching import PairFinder
 from mapserver.survey.tracks.mono_depths import MonoDepths
@@ -212,7 +212,7 @@ class LiveMap:
         window, newest = self._keyframes[first:], len(self._keyframes) - 1
         settings, chain_from_body = self._settings.pairs, np.array(self._chain_from_body[first:])
         finder = PairFinder(RigImages.of(window, chain_from_body, self._mounted), settings)
-        wanted = [pair for pair in finder.candidates(previous=settings.previous) if pair[1] == newest - first]
+        wanted = [pair for pair in finder.candidates() if pair[1] == newest - first]
 
         def allowed_m(i: int, j: int) -> float:
             gained = self._walked_m2[first + j] - self._walked_m2[first + i]
@@ -235,7 +235,9 @@ class LiveMap:
         for pair in found:
             if pair.i == pair.j - 1:
                 edge = body_edge(pair, self._rig.body_from_cam)
-                carry = adjoint(se3_inverse(edge.i_from_j))  # from the axes of the newest to those of the previous one
+                carry = se3_adjoint(
+                    se3_inverse(edge.i_from_j)
+                )  # from the axes of the newest to those of the previous one
                 tied = carry @ edge.cov_rot_trans @ carry.T
                 if np.trace(by_odometry[:3, :3]) > _LOST * np.trace(tied[:3, :3]):
                     return np.asarray(tied)
@@ -263,13 +265,13 @@ class LiveMap:
         level_from_body = state.map_from_body
         chain_from_level = se3(self._level.T, np.zeros(3))
         for n in np.flatnonzero(free).tolist():
-            k, motion = first + n, state.motion
+            k, (velocity_mps, gyro_bias, accel_bias) = first + n, np.split(state.motion.motions[n], 3)
             self._chain_from_body[k] = chain_from_level @ level_from_body[n]
             self._news[k] = replace(
                 self._news[k],
-                velocity_body_mps=level_from_body[n, :3, :3].T @ motion.velocities_mps[n],
-                gyro_bias_radps=motion.gyro_bias_radps[n],
-                accel_bias_mps2=motion.accel_bias_mps2[n],
+                velocity_body_mps=level_from_body[n, :3, :3].T @ velocity_mps,
+                gyro_bias_radps=gyro_bias,
+                accel_bias_mps2=accel_bias,
             )
         self._keep_points(first, state, keep)
 
@@ -289,15 +291,13 @@ class LiveMap:
         rig, news = self._rig, self._news[first:]
         level_from_body = se3(self._level, np.zeros(3)) @ np.array(self._chain_from_body[first:])
         inertial = rig.imu_noise is not None and all(new.inertial for new in news)
-        velocities = np.array([new.velocity_body_mps for new in news])
+        motions = [np.r_[new.velocity_body_mps, new.gyro_bias_radps, new.accel_bias_mps2] for new in news]
         motion = KeyframeMotion(
             inertial=inertial,
             imu=joined_imu([new.imu for new in news]),
             noise=rig.imu_noise,
             imu_minus_cam_s=rig.imu_minus_cam_s,
-            velocities_mps=np.einsum("kij,kj->ki", level_from_body[:, :3, :3], velocities),
-            gyro_bias_radps=np.array([new.gyro_bias_radps for new in news]),
-            accel_bias_mps2=np.array([new.accel_bias_mps2 for new in news]),
+            motions=turned(np.array(motions), level_from_body[:, :3, :3]),
             relative=[] if inertial else self._relative(first),
         )
         posed = RigImages.of(self._keyframes[first:], level_from_body, self._mounted)
@@ -339,7 +339,7 @@ class LiveMap:
             if len(pair.features) >= MIN_SHARED:
                 joins.append((pair.i, pair.j))
         before = np.flatnonzero(self._seeing[:first])
-        sigmas_m = SigmaBetween(np.array([new.variance_m2 for new in self._news]))
+        sigmas_m = grown_sigma(np.array([new.variance_m2 for new in self._news]))
         since = int(before[-1]) if len(before) else 0
         joins += bridges(self._seeing, sigmas_m, self._settings.join_sigma_m, since)
         for a, b in joins:
@@ -359,7 +359,7 @@ class LiveMap:
         if self._closer is None:
             measures_scale = not rig.scale_known
             self._closer = LoopCloser(
-                posed, self._options, marginals, matched, groups=self._joined, measures_scale=measures_scale
+                posed, self._options, marginals, matched, self._joined, measures_scale=measures_scale
             )
             self._closer.close(0)
         else:
@@ -372,5 +372,6 @@ class LiveMap:
             solved = optimize_pose_graph(self._closer.begin, [*self._chain, *edges])
             self._map_from_body, self._loop_weights = solved.map_from_body, solved.loop_weights
         else:
-            scaled = solve_scaled(self._closer.begin, self._chain, edges, self._closer.scales, scale_walk)
-            self._map_from_body, self._loop_weights = scaled.map_from_body, scaled.loop_weights
+            self._map_from_body, self._loop_weights = solve_scaled(
+                self._closer.begin, self._chain, edges, self._closer.scales, scale_walk
+            )

@@ -4,17 +4,37 @@ The core solves (shared/core/bundle.h); this module checks a problem and passes 
 adjustment, a modern synthesis; inertial terms after Forster et al. 2017.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
+import scipy.sparse
+import scipy.sparse.linalg
 from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.errors import SurveyError
-from fleetmap.geometry import Array
-from fleetmap.inertial import GRAVITY_MAP
-from mapserver.survey.bundle.elimination_order import minimum_degree
-from mapserver.survey.bundle.factors import pack_terms
+from fleetmap.geometry import AnyArray, Array
+from fleetmap.inertial import GRAVITY_MAP, Preintegrated
 from mapserver.survey.bundle.problem import BundleProblem, BundleResult
 from mapserver.survey.settings import BundleSettings
+
+# Lower bound of an increment's covariance: below is rounding error, and the bound keeps empty intervals invertible.
+FLOOR_SIGMA = np.repeat([1e-7, 1e-6, 1e-7, 1e-9, 1e-8], 3)
+
+# Parts of an increment in the core's order, and their sizes.
+_INCREMENTS = {
+    "dt_s": 1,
+    "delta_rotation": 9,
+    "delta_velocity_mps": 3,
+    "delta_position_m": 3,
+    "d_rotation_d_gyro": 9,
+    "d_velocity_d_gyro": 9,
+    "d_velocity_d_accel": 9,
+    "d_position_d_gyro": 9,
+    "d_position_d_accel": 9,
+    "gyro_bias_radps": 3,
+    "accel_bias_mps2": 3,
+}
 
 
 def optimize(problem: BundleProblem, settings: BundleSettings) -> BundleResult:
@@ -27,31 +47,31 @@ def optimize(problem: BundleProblem, settings: BundleSettings) -> BundleResult:
     cost = solver.cost()
     if not (np.isfinite(cost) and np.isfinite(solver.squared_sigmas()).all()):
         raise SurveyError(f"bundle adjustment starts with cost {cost}; {_first_bad(problem, solver.squared_sigmas())}")
-    costs, iterations, converged = solver.optimize(
-        settings.lambda_start, settings.max_iterations, settings.relative_cost_tolerance
-    )
-    motions, inertial = solver.motions(), problem.inertial is not None
+    costs, *_ = solver.optimize(settings.lambda_start, settings.max_iterations, settings.relative_cost_tolerance)
     return BundleResult(
         map_from_body=solver.map_from_body(),
         points_map=solver.points_map(),
-        velocities_map_mps=motions[:, :3].copy() if inertial else None,
-        gyro_bias_radps=motions[:, 3:6].copy() if inertial else None,
-        accel_bias_mps2=motions[:, 6:9].copy() if inertial else None,
+        motions=None if problem.inertial is None else solver.motions(),
         costs=costs.tolist(),
         squared_sigmas=solver.squared_sigmas(),
-        iterations=iterations,
-        converged=converged,
     )
 
 
 def solver_of(problem: BundleProblem, settings: BundleSettings) -> core.BundleSolver:
     """Return the core's solver at the values of `problem`; SurveyError if nothing fixes the map."""
     _check(problem)
+    count, inertial, relative, priors = len(problem.map_from_body), problem.inertial, problem.relative, problem.priors
+    motions, edges = (np.zeros((count, 0)), []) if inertial is None else (inertial.motions, inertial.edges)
+    summed = [increment for _, _, increment in edges]
+    mean, weight = np.zeros(motions.shape), np.zeros(motions.shape)
+    for prior in [] if inertial is None else inertial.priors:
+        mean[prior.k] = np.where(np.isfinite(prior.sigma), prior.mean, 0.0)
+        weight[prior.k] = 1.0 / prior.sigma**2
     solver = core.BundleSolver(
         problem.rig.camera.lens,
         np.ascontiguousarray(problem.rig.body_from_cam, np.float64),
         np.ascontiguousarray(problem.map_from_body, np.float64),
-        _motions(problem),
+        np.ascontiguousarray(motions, np.float64),
         np.ascontiguousarray(problem.points_map, np.float64).reshape(-1, 3),
         _free_unknowns(problem),
         problem.points_held,
@@ -60,7 +80,17 @@ def solver_of(problem: BundleProblem, settings: BundleSettings) -> core.BundleSo
         np.ascontiguousarray(problem.obs_landmark, np.int32),
         np.ascontiguousarray(problem.obs_pixels, np.float64),
         np.ascontiguousarray(problem.obs_sigma_px, np.float64),
-        *pack_terms(problem),
+        np.array([(term.i, term.j) for term in relative], np.int64).reshape(-1, 2),
+        _stacked([term.i_from_j for term in relative], 4),
+        _stacked([term.information for term in relative], 6),
+        np.array([term.k for term in priors], np.int64),
+        _stacked([term.map_from_body for term in priors], 4),
+        _stacked([term.information for term in priors], 6),
+        np.array([(i, j) for i, j, _ in edges], np.int64).reshape(-1, 2),
+        packed_increments(summed),
+        _informations(_stacked([increment.cov for increment in summed], 15)),
+        mean,
+        weight,
         GRAVITY_MAP,
         settings.huber_sigmas,
         settings.cutoff_sigmas,
@@ -72,13 +102,39 @@ def solver_of(problem: BundleProblem, settings: BundleSettings) -> core.BundleSo
     return solver
 
 
-def _motions(problem: BundleProblem) -> Array:
-    """Return (K, 9) velocity, gyro bias, accelerometer bias; (K, 0) without inertial terms."""
-    inertial = problem.inertial
-    if inertial is None:
-        return np.zeros((len(problem.map_from_body), 0))
-    parts = inertial.velocities_map_mps, inertial.gyro_bias_radps, inertial.accel_bias_mps2
-    return np.concatenate(parts, axis=1, dtype=np.float64)
+def _stacked(matrices: Sequence[Array], size: int) -> Array:
+    """Return matrices (n, size, size), of which there may be none."""
+    return np.array(matrices, np.float64).reshape(-1, size, size)
+
+
+def packed_increments(summed: Sequence[Preintegrated]) -> Array:
+    """Return (E, 67): dt, dR, dv, dp, the five derivatives by the biases, and the biases of linearisation."""
+    parts = [np.array([getattr(each, name) for each in summed]).reshape(-1, size) for name, size in _INCREMENTS.items()]
+    return np.concatenate(parts, axis=1)
+
+
+def _informations(covariances: Array) -> Array:
+    """Return inverse covariances (E, 15, 15), scaled first: rotation and velocity differ by many orders of magnitude."""
+    sigma = np.sqrt(np.einsum("eaa->ea", covariances) + FLOOR_SIGMA**2)
+    outer = sigma[:, :, None] * sigma[:, None, :]
+    inverse = np.linalg.inv((covariances + np.diag(FLOOR_SIGMA**2)) / outer)
+    return np.asarray(0.5 * (inverse + inverse.transpose(0, 2, 1)) / outer)
+
+
+def minimum_degree(count: int, pairs: AnyArray) -> AnyArray:
+    """Return (N,) an elimination order of nodes with little fill-in; `pairs` (B, 2) are coupled nodes.
+
+    SuperLU computes the minimum degree order from a matrix with one unknown per node, at negligible cost.
+    """
+    nodes, pairs = np.arange(count), pairs[pairs[:, 0] != pairs[:, 1]]
+    ends = np.concatenate([pairs, pairs[:, ::-1]])
+    # Laplacian plus identity: positive definite for any pairs.
+    rows, cols = np.concatenate([nodes, ends[:, 0], ends[:, 0]]), np.concatenate([nodes, ends[:, 0], ends[:, 1]])
+    values = np.concatenate([np.ones(count + len(ends)), np.full(len(ends), -1.0)])
+    graph = scipy.sparse.csc_array((values, (rows, cols)), shape=(count, count))
+    options = {"SymmetricMode": True}
+    factor = scipy.sparse.linalg.splu(graph, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    return np.argsort(factor.perm_c)
 
 
 def _first_bad(problem: BundleProblem, squared: Array) -> str:

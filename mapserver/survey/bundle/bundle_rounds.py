@@ -65,12 +65,7 @@ def local_windows(state: SurveyState, settings: SurveySettings) -> SurveyState:
         state,
         map_from_body=state.map_from_body.copy(),
         landmarks=replace(marks, points_map=marks.points_map.copy()),
-        motion=replace(
-            motion,
-            velocities_mps=motion.velocities_mps.copy(),
-            gyro_bias_radps=motion.gyro_bias_radps.copy(),
-            accel_bias_mps2=motion.accel_bias_mps2.copy(),
-        ),
+        motion=replace(motion, motions=motion.motions.copy()),
     )
     for start in range(0, max(count - window // 2, 1), window // 2):
         free = np.zeros(count, bool)
@@ -126,18 +121,12 @@ def _adjust_window(state: SurveyState, settings: SurveySettings, free: NDArray[n
     relative = [term for k in np.flatnonzero(used).tolist() for term in index.relative.get(k, ())]
     keyframe = (np.cumsum(used) - 1)[marks.obs_keyframe[rows]]
     landmark = np.searchsorted(touched, marks.obs_landmark[rows])
-    part = replace(
-        state,
-        stamps_ns=state.stamps_ns[used],
-        map_from_body=state.map_from_body[used],
-        motion=replace(motion, relative=relative).of(used),
-        landmarks=marks.taken(rows, marks.points_map[touched], keyframe, landmark),
-    )
+    landmarks = marks.taken(rows, marks.points_map[touched], keyframe, landmark)
+    part = replace(state, motion=replace(motion, relative=relative)).with_landmarks(used, landmarks)
     result = optimize(bundle_problem(part, settings, free[used]), settings.rough_bundle)
     part = apply_result(part, result)
     state.map_from_body[used], marks.points_map[touched] = part.map_from_body, part.landmarks.points_map
-    motion.velocities_mps[used], motion.gyro_bias_radps[used] = part.motion.velocities_mps, part.motion.gyro_bias_radps
-    motion.accel_bias_mps2[used] = part.motion.accel_bias_mps2
+    motion.motions[used] = part.motion.motions
 
 
 def bundle_problem(state: SurveyState, settings: SurveySettings, free: NDArray[np.bool_] | None) -> BundleProblem:
@@ -149,23 +138,21 @@ def bundle_problem(state: SurveyState, settings: SurveySettings, free: NDArray[n
     fixed = np.zeros(len(state.stamps_ns), bool) if free is None else ~free
     if not fixed.any() and not priors:
         fixed[0] = True
-    holds_all = free is None or bool(free[0])
+    holds_all, inertial = free is None or bool(free[0]), None
+    if motion.inertial:
+        held = None if holds_all else fixed
+        inertial = InertialTerms(motion.motions, inertial_edges(state, settings, held), fixed=held)
     return BundleProblem(
         rig=state.rig,
         map_from_body=state.map_from_body,
         fixed=fixed,
         points_map=marks.points_map,
         **{name: getattr(marks, name) for name in OBSERVED},
-        inertial=_inertial(state, settings, fixed if not holds_all else None) if motion.inertial else None,
+        inertial=inertial,
         relative=motion.relative,
         priors=priors,
         gauge="yaw_position" if motion.inertial and holds_all and not priors else "pose",
     )
-
-
-def _inertial(state: SurveyState, settings: SurveySettings, held: NDArray[np.bool_] | None) -> InertialTerms:
-    motion, edges = state.motion, inertial_edges(state, settings, held)
-    return InertialTerms(motion.velocities_mps, motion.gyro_bias_radps, motion.accel_bias_mps2, edges, fixed=held)
 
 
 def inertial_edges(
@@ -181,8 +168,8 @@ def inertial_edges(
         goes_on = motion.goes_on is None or motion.goes_on[k + 1]
         if is_held or not goes_on or is_pause(motion.imu.stamps_ns, start, end):
             continue
-        biases = motion.gyro_bias_radps[k], motion.accel_bias_mps2[k]
-        edges.append((first + k, first + k + 1, preintegrate(motion.imu, start, end, *biases, noise)))
+        _, gyro_bias, accel_bias = np.split(motion.motions[k], 3)
+        edges.append((first + k, first + k + 1, preintegrate(motion.imu, start, end, gyro_bias, accel_bias, noise)))
     return edges
 
 
@@ -199,9 +186,6 @@ def scaled_noise(noise: ImuNoise, settings: SurveySettings) -> ImuNoise:
 
 def apply_result(state: SurveyState, result: BundleResult) -> SurveyState:
     """Return the state with its variables at the values of `result`."""
-    motion, velocities = state.motion, result.velocities_map_mps
-    gyro, accel = result.gyro_bias_radps, result.accel_bias_mps2
-    if velocities is not None and gyro is not None and accel is not None:
-        motion = replace(motion, velocities_mps=velocities, gyro_bias_radps=gyro, accel_bias_mps2=accel)
+    motion = state.motion if result.motions is None else replace(state.motion, motions=result.motions)
     landmarks = replace(state.landmarks, points_map=result.points_map)
     return replace(state, map_from_body=result.map_from_body, landmarks=landmarks, motion=motion)

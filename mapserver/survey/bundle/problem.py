@@ -33,13 +33,11 @@ class MotionPrior:
 class InertialTerms:
     """Motion between keyframes by the IMU.
 
-    velocities_map_mps, gyro_bias_radps, accel_bias_mps2 (K, 3). edges: (i, j, Preintegrated), j after i.
-    fixed (K,): keyframes with fixed motion and biases, none if absent.
+    motions (K, 9): see KeyframeMotion. edges: (i, j, Preintegrated), j after i. fixed (K,): keyframes with fixed motion and biases, none
+    if absent.
     """
 
-    velocities_map_mps: Array
-    gyro_bias_radps: Array
-    accel_bias_mps2: Array
+    motions: Array
     edges: list[tuple[int, int, Preintegrated]]
     priors: list[MotionPrior] = field(default_factory=list)
     fixed: NDArray[np.bool_] | None = None
@@ -115,28 +113,21 @@ OBSERVED = ("obs_keyframe", "obs_camera", "obs_landmark", "obs_pixels", "obs_sig
 class BundleResult:
     """The optimum.
 
-    map_from_body (K, 4, 4), points_map (N, 3); velocities and biases (K, 3), None without inertial terms. costs: half the robust sum of
-    squares at the start and after every accepted step. squared_sigmas (M,): each observation's squared residual in sigmas, in the problem's
-    order, huge for points behind the camera.
+    map_from_body (K, 4, 4), points_map (N, 3); motions (K, 9), None without inertial terms. costs: half the robust sum of squares at the
+    start and after every accepted step. squared_sigmas (M,): each observation's squared residual in sigmas, in the problem's order, huge
+    for points behind the camera.
     """
 
     map_from_body: Array
     points_map: Array
-    velocities_map_mps: Array | None
-    gyro_bias_radps: Array | None
-    accel_bias_mps2: Array | None
+    motions: Array | None
     costs: list[float]
     squared_sigmas: Array
-    iterations: int
-    converged: bool
 
 
 def continued(problem: BundleProblem, result: BundleResult) -> BundleProblem:
     """Return `problem` at the values of `result`."""
     moved = replace(problem, map_from_body=result.map_from_body, points_map=result.points_map)
-    inertial, gyro, accel = problem.inertial, result.gyro_bias_radps, result.accel_bias_mps2
-    if inertial is not None and result.velocities_map_mps is not None and gyro is not None and accel is not None:
-        moved.inertial = replace(
-            inertial, velocities_map_mps=result.velocities_map_mps, gyro_bias_radps=gyro, accel_bias_mps2=accel
-        )
+    if problem.inertial is not None and result.motions is not None:
+        moved.inertial = replace(problem.inertial, motions=result.motions)
     return moved

@@ -71,8 +71,6 @@ def place_frames(
     chain = _Chain(odometry, state, settings, correction_px)
     placed, seen = chain.map_from_body.copy(), np.zeros(len(chain.map_from_body), bool)
     seen[chain.numbers] = np.bincount(state.landmarks.obs_keyframe, minlength=len(chain.numbers)) >= MIN_SEEN
-    if odometry.tracks is None:
-        return PlacedFrames(placed, seen)
     ends = pairwise([-1, *chain.numbers.tolist(), len(placed)])
     batches = in_batches([(a, b) for a, b in ends if b - a > 1], _BATCH)
     built = ([i for a, b in batch if (i := chain.interval(a, b)) is not None] for batch in batches)
@@ -105,8 +103,8 @@ class _Chain:
     ) -> None:
         self._odometry, self._state, self._noise = odometry, state, settings.noise
         self._imu_noise = None if state.motion.noise is None else scaled_noise(state.motion.noise, settings)
-        self._stamps_ns = np.array([e.stamp_ns for e in odometry.estimates], np.int64)
-        self.numbers = np.array([k.frame_index for k in odometry.keyframes], np.int64)
+        self._stamps_ns = odometry.stamps_ns
+        self.numbers = np.array(odometry.keyframe_frames, np.int64)
         self.map_from_body = frame_trajectory(
             self._stamps_ns, odometry.odom_from_body, self.numbers.tolist(), state.map_from_body
         )
@@ -120,7 +118,8 @@ class _Chain:
         beside = self.numbers[max(first - _BESIDE, 0) : last + _BESIDE + 1]
         frames = self._frames_between(a, b)
         nodes = np.union1d(frames, beside)
-        ids, which, pixels = self._seen_by(nodes)
+        ids, which, pixels = self._odometry.tracks.of(nodes)
+        pixels[:, 2] += self._correction_px * disparity_shift(self._state.rig.camera, pixels)
         fixed = self.is_keyframe[nodes]
         _, marks = np.unique(ids, return_inverse=True)
         points, known = self._points(nodes, which, marks, pixels)
@@ -155,13 +154,6 @@ class _Chain:
         if a < 0 and len(lost):
             return frames[lost[-1] + 1 :]
         return frames[: lost[0]] if b == len(self.is_keyframe) and len(lost) else frames
-
-    def _seen_by(self, nodes: Indices) -> tuple[Indices, Indices, Array]:
-        """Return all observations of the nodes: track (M,), node (M,), pixels (M, 3)."""
-        assert self._odometry.tracks is not None
-        ids, which, pixels = self._odometry.tracks.of(nodes)
-        pixels[:, 2] += self._correction_px * disparity_shift(self._state.rig.camera, pixels)
-        return ids, which, pixels
 
     def _points(self, nodes: Indices, which: Indices, marks: Indices, pixels: Array) -> tuple[Array, Mask]:
         """Return initial points_map (N, 3) and which are known: by a disparity, preferably of the nearest keyframe, else by rays."""
@@ -203,21 +195,18 @@ class _Chain:
         motion, offset_ns = self._state.motion, int(self._state.motion.imu_minus_cam_s * 1e9)
         assert self._imu_noise is not None
         nearest = np.clip(np.searchsorted(self.numbers, nodes), 0, len(self.numbers) - 1)
-        gyro, accel = motion.gyro_bias_radps[nearest], motion.accel_bias_mps2[nearest]
+        motions = np.pad(motion.motions[nearest, 3:], ((0, 0), (3, 0)))
         stamps_ns = self._stamps_ns[nodes] + offset_ns
-        velocities = np.zeros((len(nodes), 3))
         seconds = (stamps_ns[joined] - stamps_ns[joined[0]]) * 1e-9
-        velocities[joined] = np.gradient(self.map_from_body[nodes[joined], :3, 3], seconds, axis=0)
+        priors = [MotionPrior(k, motions[k].copy(), _BIAS_SIGMAS) for k in joined[[0, -1]].tolist()]
+        motions[joined, :3] = np.gradient(self.map_from_body[nodes[joined], :3, 3], seconds, axis=0)
         edges = []
         for i, j in pairwise(joined.tolist()):
             start_ns, end_ns = int(stamps_ns[i]), int(stamps_ns[j])
             if not is_pause(motion.imu.stamps_ns, start_ns, end_ns):
-                edges.append((i, j, preintegrate(motion.imu, start_ns, end_ns, gyro[i], accel[i], self._imu_noise)))
-        priors = [
-            MotionPrior(k, np.concatenate([np.zeros(3), gyro[k], accel[k]]), _BIAS_SIGMAS)
-            for k in joined[[0, -1]].tolist()
-        ]
-        return InertialTerms(velocities, gyro, accel, edges, priors)
+                biases = motions[i, 3:6], motions[i, 6:]
+                edges.append((i, j, preintegrate(motion.imu, start_ns, end_ns, *biases, self._imu_noise)))
+        return InertialTerms(motions, edges, priors)
 
     def _relative(self, nodes: Indices, joined: Indices, sees: Mask) -> list[RelativeTerm]:
         """Return odometry between neighbours: weakly without an IMU, and at full weight if either sees too little."""

@@ -83,13 +83,10 @@ def adjust_visits(
 
 def _with_keyframes_of(state: SurveyState, used: NDArray[np.bool_], part: SurveyState) -> SurveyState:
     """Return `state` with the used keyframes (K,) from `part`."""
-    motion = state.motion
-    map_from_body, velocities = state.map_from_body.copy(), motion.velocities_mps.copy()
-    gyro_bias, accel_bias = motion.gyro_bias_radps.copy(), motion.accel_bias_mps2.copy()
-    map_from_body[used], velocities[used] = part.map_from_body, part.motion.velocities_mps
-    gyro_bias[used], accel_bias[used] = part.motion.gyro_bias_radps, part.motion.accel_bias_mps2
-    motion = replace(motion, velocities_mps=velocities, gyro_bias_radps=gyro_bias, accel_bias_mps2=accel_bias)
-    return replace(state, map_from_body=map_from_body, motion=motion)
+    map_from_body, motions = state.map_from_body.copy(), state.motion.motions.copy()
+    map_from_body[used] = part.map_from_body
+    motions[used] = part.motion.motions
+    return replace(state, map_from_body=map_from_body, motion=replace(state.motion, motions=motions))
 
 
 def _seen_by(redundant: NDArray[np.bool_], marks: Landmarks, adjusted: Landmarks, numbers: Indices) -> Landmarks:

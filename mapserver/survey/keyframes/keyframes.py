@@ -2,42 +2,41 @@
 
 from collections import deque
 from collections.abc import Container, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.features import orb, patch_align, stereo
 from fleetmap.features.extraction import extract
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
-from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.rig import frame_of_camera
 from mapserver.survey.settings import KeyframeSettings, SurveySettings
-from mapserver.survey.state import ImageStore, Keyframe, MemoryImageStore, Pictures
+from mapserver.survey.state import ImageStore, Keyframe, Pictures
+from mapserver.survey.survey_inputs import SurveyTools
 
 _BATCH = 2  # frames for one call: 0.05 s each
 
 
 def make_keyframe(frame: RectifiedFrame, frame_index: int, camera: StereoCamera, settings: SurveySettings) -> Keyframe:
     """Detect, describe and stereo-match one frame; its pictures stay in memory."""
-    return next(make_keyframes([(frame_index, frame)], [(0, camera)], settings))
+    return next(make_keyframes([(frame_index, frame)], [(0, camera)], settings, SurveyTools()))
 
 
 def make_keyframes(
     frames: Iterable[tuple[int, RectifiedFrame]],
     cameras: Sequence[tuple[int, StereoCamera]],
     settings: SurveySettings,
-    images: ImageStore | None = None,
-    executor: Executor = SERIAL,
+    tools: SurveyTools,
 ) -> Iterator[Keyframe]:
     """Return keyframes of numbered frames; the executor extracts features while the next frames are awaited.
 
-    cameras: see `rig.used_cameras`. images: store for the pictures; by default memory.
+    cameras: see `rig.used_cameras`.
     """
-    kept = MemoryImageStore() if images is None else images
+    kept = tools.images
     waiting: deque[tuple[int, list[RectifiedFrame | None]]] = deque()
     models, black = [camera for _, camera in cameras], list[int]()
     first, scales = models[0], [_disparity_scale(models[0], camera) for camera in models]
@@ -59,7 +58,7 @@ def make_keyframes(
         black.extend([number] if frame is None else [])
         return number
 
-    for found in executor.map(_extract, (models, settings), batches()):
+    for found in tools.executor.map(_extract, (models, settings), batches()):
         for each in found:
             number, seen = waiting.popleft()
             assert seen[0] is not None
@@ -102,54 +101,43 @@ def set_aside(keyframe: Keyframe, store: ImageStore) -> Keyframe:
     return replace(keyframe, features=orb.Features(*features), disparities=disparities, points_cam=points_cam)
 
 
-@dataclass(frozen=True, slots=True)
-class FrameSummary:
-    """Input of the keyframe policy: odometry of one frame, its tracked points, its sharpness."""
-
-    stamp_ns: int
-    odom_from_body: Array
-    track_ids: NDArray[np.int64]
-    scene_depth_m: float
-    sharpness: float
-    after_gap: bool
-
-
 class KeyframePolicy:
     """Chooses by overlap with the last keyframe, by motion, or by count; never a blurred frame unless tracking would break."""
 
     def __init__(self, settings: KeyframeSettings, required: Container[int] = ()) -> None:
         """required: numbers of frames, counted from 0, that are always chosen."""
         self._settings, self._required = settings, required
-        self._last: FrameSummary | None = None
+        self._last: tuple[OdometryEstimate, Array] | None = None
         self._sharpness: deque[float] = deque(maxlen=31)
         self._count = -1
 
-    def wants(self, frame: FrameSummary) -> bool:
-        """True if this frame becomes a keyframe; frames must come in order."""
+    def wants(self, estimate: OdometryEstimate, frame_from_body: Array, sharpness: float) -> bool:
+        """True if this frame becomes a keyframe; frames must come in order. frame_from_body (4, 4): in one frame for all."""
         self._count += 1
-        self._sharpness.append(frame.sharpness)
-        chosen = self._chooses(frame)
+        self._sharpness.append(sharpness)
+        chosen = self._chooses(estimate, frame_from_body)
         if chosen:
-            self._last = frame
+            self._last = estimate, frame_from_body
         return chosen
 
-    def _chooses(self, frame: FrameSummary) -> bool:
-        s, last = self._settings, self._last
-        if last is None or frame.after_gap or self._count in self._required or s.policy == "every":
+    def _chooses(self, estimate: OdometryEstimate, frame_from_body: Array) -> bool:
+        s = self._settings
+        if self._last is None or estimate.after_gap or self._count in self._required or s.policy == "every":
             return True
         if s.policy == "every-nth":
             return self._count % s.every_nth == 0
-        overlap = len(np.intersect1d(frame.track_ids, last.track_ids)) / max(len(last.track_ids), 1)
+        last, frame_from_last = self._last
+        overlap = len(np.intersect1d(estimate.track_ids, last.track_ids)) / max(len(last.track_ids), 1)
         if overlap < s.break_overlap:
             return True
-        if frame.sharpness < s.min_sharpness * float(np.median(self._sharpness)):
+        if self._sharpness[-1] < s.min_sharpness * float(np.median(self._sharpness)):
             return False
-        moved = se3_inverse(last.odom_from_body) @ frame.odom_from_body
+        moved = se3_inverse(frame_from_last) @ frame_from_body
         return bool(
             overlap < s.min_overlap
             or np.degrees(rotation_angle_rad(moved[:3, :3])) > s.max_rotation_deg
-            or np.linalg.norm(moved[:3, 3]) > s.max_parallax * frame.scene_depth_m
-            or (frame.stamp_ns - last.stamp_ns) * 1e-9 > s.max_interval_s
+            or np.linalg.norm(moved[:3, 3]) > s.max_parallax * estimate.scene_depth_m
+            or (estimate.stamp_ns - last.stamp_ns) * 1e-9 > s.max_interval_s
         )
 
 

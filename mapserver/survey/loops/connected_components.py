@@ -18,6 +18,7 @@ from mapserver.survey.loops.loops import Loops
 from mapserver.survey.settings import MIN_SEEN
 from mapserver.survey.state import OdometryPass, SurveyState
 
+SigmaBetween = Callable[[int, int], float]
 MIN_SHARED = 15  # landmarks; a loop needs as many matches
 _MIN_KEYFRAMES = 2
 _UNKNOWN_M = 1e3
@@ -56,7 +57,7 @@ class Components:
         return np.asarray(self.labels == next(n for n, component in enumerate(self.components) if component.kept))
 
 
-def find_components(state: SurveyState, odometry_sigmas_m: "SigmaBetween", join_sigma_m: float) -> Components:
+def find_components(state: SurveyState, odometry_sigmas_m: SigmaBetween, join_sigma_m: float) -> Components:
     """Return the components of an adjusted survey, ordered by time; SurveyError if no keyframes are connected.
 
     Keyframes are connected if they share landmarks, or if odometry between two consecutive ones that are not blind is accurate
@@ -90,7 +91,7 @@ def find_components(state: SurveyState, odometry_sigmas_m: "SigmaBetween", join_
     return Components(labels, components, [component(run, False, _BLIND) for run in runs if len(run)])
 
 
-def find_groups(state: SurveyState, sigmas_m: Callable[[int, int], float], join_sigma_m: float) -> KeyframeGroups:
+def find_groups(state: SurveyState, sigmas_m: SigmaBetween, join_sigma_m: float) -> KeyframeGroups:
     """Return the same before loops are closed: there may be many groups, and none is chosen."""
     rows, columns = _shared_landmarks(state, MIN_SHARED)
     seeing = _seeing(state)
@@ -103,7 +104,7 @@ def _seeing(state: SurveyState) -> NDArray[np.bool_]:
 
 
 def bridges(
-    seeing: NDArray[np.bool_], sigmas_m: Callable[[int, int], float], join_sigma_m: float, first: int = 0
+    seeing: NDArray[np.bool_], sigmas_m: SigmaBetween, join_sigma_m: float, first: int = 0
 ) -> list[tuple[int, int]]:
     """Yield keyframes connected by odometry, from `first` on; seeing (K,): False for blind ones. See find_components."""
     seen = first + np.flatnonzero(seeing[first:])
@@ -119,16 +120,15 @@ def bridges(
     return joins
 
 
-class SigmaBetween:
-    """Standard deviation, in metres, of keyframe b relative to keyframe a by odometry."""
+def sigma_between(odometry: OdometryPass) -> SigmaBetween:
+    """Return the standard deviation, in metres, of keyframe b relative to keyframe a by odometry: the growth of its variance."""
+    covariances = odometry.covariances[odometry.keyframe_frames]
+    return grown_sigma(np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2))
 
-    def __init__(self, variances_m2: Array) -> None:
-        """variances_m2 (K,) of the odometry's position at the keyframes, summed over the axes."""
-        self._variances = variances_m2
 
-    def __call__(self, a: int, b: int) -> float:
-        """Return the growth of the variance between them, as a standard deviation."""
-        return float(np.sqrt(max(self._variances[b] - self._variances[a], 0.0)))
+def grown_sigma(variances_m2: Array) -> SigmaBetween:
+    """Return the same of keyframes with these variances (K,) of the position, summed over the axes."""
+    return lambda a, b: float(np.sqrt(max(variances_m2[b] - variances_m2[a], 0.0)))
 
 
 def without_doubted(odometry: OdometryPass, doubted: Sequence[int]) -> OdometryPass:
@@ -164,7 +164,5 @@ def _shared_landmarks(state: SurveyState, at_least: int) -> tuple[NDArray[np.int
 
 def between_kept(frames: int, keyframe_frames: NDArray[np.int64], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return (F,) frames whose neighbouring keyframes, previous and next, are both kept."""
-    after = np.searchsorted(keyframe_frames, np.arange(frames))
-    exact = keyframe_frames[np.minimum(after, len(kept) - 1)] == np.arange(frames)
-    before = np.where(exact, after, np.maximum(after - 1, 0))
-    return np.asarray(kept[before] & kept[np.minimum(after, len(kept) - 1)])
+    before, after = np.searchsorted(keyframe_frames, [np.arange(1, frames + 1), np.arange(frames)])
+    return np.asarray(kept[np.maximum(before - 1, 0)] & kept[np.minimum(after, len(kept) - 1)])

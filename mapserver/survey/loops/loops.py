@@ -9,20 +9,21 @@ from numpy.typing import NDArray
 
 from fleetmap.bow.place_index import PlaceIndex
 from fleetmap.bow.vocabulary import BowVector
-from fleetmap.geometry import Array, se3_inverse, se3_log, transform_points
+from fleetmap.geometry import Array, se3_adjoint, se3_inverse, se3_log, transform_points
+from fleetmap.relocalization.landmark_visibility import image_cells
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.executor import SERIAL, Executor
 from mapserver.survey.loops.keyframe_groups import KeyframeGroups, Revisit, WaitingRevisits
-from mapserver.survey.loops.sim3_loops import measured_log_scale
 from mapserver.survey.pose_graph.graph_marginals import CHI2_3_0999, GraphMarginals
-from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint
+from mapserver.survey.pose_graph.pose_graph import PoseEdge
+from mapserver.survey.pose_graph.sim3_pose_graph import measured_log_scale
+from mapserver.survey.rig import projection_by_point
 from mapserver.survey.state import Keyframe, RigImages
 from mapserver.survey.survey_inputs import SurveyConfig
 from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PairTask, PredictedMotion, match_pair, match_task
 
 # Matched points share calibration and depth errors: a pair's own covariance is too narrow by about this factor.
 _CORRELATION = 3.0
-_CHUNK = 64  # candidates per gating step
 _SIDES = 16  # directions of a possible repetition of the site
 _ALIAS_SCORE = 0.7  # of a candidate's score, above which another place looks the same
 # Of the view's reach, and of the gate, beyond which a match is certainly of another place
@@ -110,15 +111,15 @@ class LoopCloser:
         config: SurveyConfig,
         marginals: GraphMarginals,
         matched: Iterable[tuple[int, int]],
+        groups: KeyframeGroups,
         executor: Executor = SERIAL,
-        groups: KeyframeGroups | None = None,
         pieces: KeyframeGroups | None = None,
         *,
         measures_scale: bool = False,
     ) -> None:
-        """matched: pairs of keyframes matched as neighbours, which are not loops. groups: joined here by certain revisits; None
-        if all keyframes belong together. pieces: keyframes that pictures link; None if the motion between them is not to be doubted.
-        Pairs, groups, marginals, records and edges have the numbers of keyframes, matches those of the images in `posed`.
+        """matched: pairs of keyframes matched as neighbours, which are not loops. groups: joined here by certain revisits. pieces:
+        keyframes that pictures link; None if the motion between them is not to be doubted. Pairs, groups, marginals, records and edges
+        have the numbers of keyframes, matches those of the images in `posed`.
         """
         self.loops, self.learned = Loops(), list[PoseEdge]()
         self.groups, self.scales = groups, dict[tuple[int, int], tuple[float, float]]()
@@ -158,66 +159,50 @@ class LoopCloser:
 
     def close(self, i: int) -> None:
         """Search revisits of image i among the earlier ones, then add it to the index. Call in order."""
-        candidates = self._gate(i, self._alike(i))
-        self._decide(self._verify(i, candidates))
+        keyframe = int(self._keyframe[i])
+        numbers, gap = self._posed.numbers[:, self._camera[i]], self._settings.min_gap_keyframes
+        if keyframe >= gap:
+            ids = self._index.place_ids
+            new = (ids <= numbers[keyframe - gap]) & ~np.isin(ids, numbers[self._neighbours.get(keyframe, [])])
+            alike, scores = self._index.query(self._vectors[i], new, self._settings.depth)
+            if len(alike):
+                self._decide(self._verify(i, alike, scores, self._gate(keyframe, alike, scores)))
         self._index.add(i, self._vectors[i])
 
-    def _alike(self, i: int) -> "_Candidates":
-        """Return old images that share words with image i and are not matched with it."""
-        ids, none = self._index.place_ids, _Candidates(np.zeros(0, np.int64), np.zeros(0), [])
-        numbers, keyframe = self._posed.numbers[:, self._camera[i]], int(self._keyframe[i])
-        if keyframe < self._settings.min_gap_keyframes:
-            return none
-        new = ids <= numbers[keyframe - self._settings.min_gap_keyframes]
-        new &= ~np.isin(ids, numbers[self._neighbours.get(keyframe, [])])
-        if not new.any():
-            return none
-        ids, scores = self._index.query(self._vectors[i], new, self._settings.depth)
-        return _Candidates(ids, scores, [])
+    def _gate(self, i: int, ids: NDArray[np.int64], scores: Array) -> list[int]:
+        """Return numbers of at most `top` of the old images (C,) that may be seen from possible poses of keyframe i, the best first.
 
-    def _gate(self, i: int, found: "_Candidates") -> "_Candidates":
-        """Choose at most `top` candidates that may be seen from possible poses of image i.
-
-        With repeated aisles the most similar candidates may all be in other aisles, so the gate goes down the
-        list and records the refused ones.
+        With repeated aisles the most similar ones may all be in other aisles, so the gate goes down the list and records the refused
+        ones. Further ones, out of reach of a keyframe that no picture links to theirs, may show that the motion between them is wrong.
         """
-        far, zoned, beyond = list[int](), list[int](), list[int]()
-        i, bodies = int(self._keyframe[i]), self._keyframe[found.ids]
-        for start in range(0, len(found.ids), _CHUNK):
-            js = bodies[start : start + _CHUNK]
-            reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[i], self._depths_m[js])
-            reachable, known = self._marginals.gate(i, js, reach_m, _WELL_KNOWN)
-            # A loop there would add no information; the global adjustment matches what both see anyway.
-            apart_m = np.linalg.norm(self._map_from_body[js, :3, 3] - self._map_from_body[i, :3, 3], axis=1)
-            known &= apart_m < _ALIAS_REACH * reach_m
-            for n, is_reachable in enumerate(reachable.tolist(), start):
-                here, there = self._map_from_body[[i, bodies[n]], :3, 3]
-                if not is_reachable and len(beyond) < self._settings.top and self._are_unlinked(i, int(bodies[n])):
-                    beyond.append(n)
-                elif not is_reachable:
-                    far.append(n)
-                elif known[n - start] and not self._are_unlinked(i, int(bodies[n])):
-                    continue
-                elif not self._config.zones.compatible(here, there):
-                    zoned.append(n)
-                else:
-                    found.chosen.append(n)
-        for refused, reason in ((far, _FAR), (zoned, "in different zones")):
+        bodies, top, here_m = self._keyframe[ids], self._settings.top, self._map_from_body[i, :3, 3]
+        reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[i], self._depths_m[bodies])
+        reachable, known = self._marginals.gate(i, bodies, reach_m, _WELL_KNOWN)
+        places_m = self._map_from_body[bodies, :3, 3]
+        known &= np.linalg.norm(places_m - here_m, axis=1) < _ALIAS_REACH * reach_m
+        unlinked = np.array([self._are_unlinked(i, j) for j in bodies.tolist()])
+        beyond = np.flatnonzero(~reachable & unlinked)[:top].tolist()
+        # A loop where the pose is known would add no information; the global adjustment matches what both see anyway.
+        near = np.flatnonzero(reachable & (unlinked | ~known)).tolist()
+        chosen = [n for n in near if self._config.zones.compatible(here_m, places_m[n])]
+        far = np.setdiff1d(np.flatnonzero(~reachable), beyond).tolist()
+        for refused, reason in ((far, _FAR), (sorted({*near} - {*chosen}), "in different zones")):
             if refused:
-                first, *others = (int(bodies[n]) for n in refused)
-                fate = float(found.scores[refused[0]]), LoopVerdict.GATED_OUT, reason
+                first, *others = bodies[refused].tolist()
+                fate = float(scores[refused[0]]), LoopVerdict.GATED_OUT, reason
                 self.loops.records.append(LoopRecord(i, first, *fate, also=tuple(others)))
-        found.chosen[self._settings.top :] = beyond
-        return found
+        return [*chosen[:top], *beyond]
 
-    def _verify(self, i: int, found: "_Candidates") -> list[tuple[PoseEdge, LoopRecord]]:
-        """Return the candidates that pass every single test, with their edges; record the others."""
+    def _verify(
+        self, i: int, ids: NDArray[np.int64], scores: Array, chosen: list[int]
+    ) -> list[tuple[PoseEdge, LoopRecord]]:
+        """Return the chosen ones of old images (C,) that pass every single test, with their edges; record the others."""
         verified: list[tuple[PoseEdge, LoopRecord]] = []
-        tasks = [PairTask.of([self._predict(i, int(found.ids[n]))], self._inputs) for n in found.chosen]
+        tasks = [PairTask.of([self._predict(i, int(ids[n]))], self._inputs) for n in chosen]
         matches = self._executor.map(match_task, self._shared, tasks)
-        i, bodies = int(self._keyframe[i]), self._keyframe[found.ids]
-        for n, (match,) in zip(found.chosen, matches, strict=True):
-            j, score = int(bodies[n]), float(found.scores[n])
+        i, bodies = int(self._keyframe[i]), self._keyframe[ids]
+        for n, (match,) in zip(chosen, matches, strict=True):
+            j, score = int(bodies[n]), float(scores[n])
             others = np.array([edge.j for edge, _ in verified], np.int64)
             same = others[~self._are_apart(j, others)].tolist() if len(others) else []
             if len(same) >= self._settings.per_place:
@@ -225,7 +210,7 @@ class LoopCloser:
                 self.loops.records.append(LoopRecord(i, j, score, LoopVerdict.REJECTED, reason))
                 continue
             edge = None if match is None else self._edge(match)
-            aliases = found.ids[found.scores >= _ALIAS_SCORE * score]
+            aliases = ids[scores >= _ALIAS_SCORE * score]
             verdict, reason = self._examined(match, edge, aliases)
             record = LoopRecord(i, j, score, verdict, reason, 0 if match is None else len(match.features))
             if edge is not None and verdict is LoopVerdict.ACCEPTED:
@@ -241,7 +226,8 @@ class LoopCloser:
         if match is None or edge is None:
             return LoopVerdict.REJECTED, "too few features agree on one motion"
         count, settings = len(match.features), self._settings
-        cells = _cells(self._posed.images[match.j], match.features[:, 1], self._posed.rig.camera)
+        pixels = self._posed.images[match.j].features.pixels[match.features[:, 1]]
+        cells = len(np.unique(image_cells(pixels, self._posed.rig.camera)))
         if count < settings.min_inliers or cells < settings.min_cells:
             return LoopVerdict.REJECTED, f"{count} matches in {cells} of 48 cells are too few or too crowded"
         innovation = self._marginals.innovation_squared(edge)
@@ -271,19 +257,17 @@ class LoopCloser:
             if spread > tolerance:
                 reason = f"candidates {spread:.2f} m apart exclude each other"
                 records.append(replace(record, verdict=LoopVerdict.AMBIGUOUS, reason=reason))
-            elif self.groups is None or self._is_of_one_group(edge):
+            elif self._is_of_one_group(edge):
                 records.append(record)
                 self._accept(edge)
             else:
                 revisit = Revisit(edge, len(records))
                 records.append(replace(record, verdict=LoopVerdict.AMBIGUOUS, reason=_WAITING))
-                sure = self._waiting.add(revisit, self.groups, self._marginals)
-                for each in sure:
-                    verdict = LoopVerdict.ACCEPTED
-                    records[each.record] = replace(records[each.record], verdict=verdict, reason="verified")
-                    self.groups.join(each.edge.i, each.edge.j)
-                for each in sure:
-                    self._accept(each.edge)
+                for sure in self._waiting.add(revisit, self.groups, self._marginals):
+                    accepted = replace(records[sure.record], verdict=LoopVerdict.ACCEPTED, reason="verified")
+                    records[sure.record] = accepted
+                    self.groups.join(sure.edge.i, sure.edge.j)
+                    self._accept(sure.edge)
 
     def _are_unlinked(self, i: int, j: int) -> bool:
         """Return True for keyframes of two pieces: their relative pose is that of odometry which no picture confirms."""
@@ -348,8 +332,6 @@ class LoopCloser:
 
     def _is_possible(self, edge: PoseEdge, steps: Array) -> NDArray[np.bool_]:
         """Return (M,) True where the new keyframe may be a step (M, 3) beside the place that the edge gives it."""
-        if not len(steps):
-            return np.zeros(0, np.bool_)
         return np.asarray(self._marginals.innovations_squared_beside(edge, steps) <= self._settings.max_innovation)
 
     def _is_elsewhere(self, one: PoseEdge, other: PoseEdge) -> bool:
@@ -378,7 +360,7 @@ class LoopCloser:
             self._repetition.see(edge.i, step_m, float(np.trace(cov[3:, 3:])) / 3)
 
     def _is_of_one_group(self, edge: PoseEdge) -> bool:
-        return self.groups is None or self.groups.of(edge.i) == self.groups.of(edge.j)
+        return self.groups.of(edge.i) == self.groups.of(edge.j)
 
     def _cam_from_cam(self, j: int, i: int) -> Array:
         """Return the motion (4, 4) between the cameras of two images."""
@@ -407,7 +389,7 @@ class LoopCloser:
         if old.from_views:
             return edge
         per_px = by_disparity(old.points_cam[match.features[:, 0]], match.j_from_i, self._posed.rig.camera)
-        shared = self._config.settings.noise.disparity_sigma_px * adjoint(mount) @ per_px
+        shared = self._config.settings.noise.disparity_sigma_px * se3_adjoint(mount) @ per_px
         return replace(edge, cov_rot_trans=edge.cov_rot_trans + np.outer(shared, shared))
 
     def _neighbours_agree(self, match: PairMatch) -> bool | None:
@@ -445,13 +427,13 @@ class Repetition:
         weight = 1.0 / variance_m2
         # A repetition by a step implies one by its opposite.
         signs = np.where(self._means @ step_m < 0, -1.0, 1.0)
-        away = np.linalg.norm(signs[:, None] * self._means - step_m, axis=1) if len(signs) else np.zeros(0)
-        n = int(np.argmin(away)) if len(away) else 0
-        if not len(away) or away[n] > _SAME_SHARE * np.linalg.norm(step_m):
+        away = np.linalg.norm(signs[:, None] * self._means - step_m, axis=1)
+        if away.min(initial=np.inf) > _SAME_SHARE * np.linalg.norm(step_m):
             self._means = np.vstack([self._means, step_m])
             self._weights = np.append(self._weights, weight)
             self._seen_by.append({keyframe})
             return
+        n = int(np.argmin(away))
         self._means[n] += weight / (self._weights[n] + weight) * (signs[n] * step_m - self._means[n])
         self._weights[n] += weight
         self._seen_by[n].add(keyframe)
@@ -463,21 +445,12 @@ class Repetition:
         return np.concatenate([believed, -believed])
 
 
-@dataclass(frozen=True, slots=True)
-class _Candidates:
-    """Old keyframes by similarity to a new one: ids (C,), scores (C,), descending; chosen: numbers of those to be verified."""
-
-    ids: NDArray[np.int64]
-    scores: Array
-    chosen: list[int]
-
-
 def body_edge(match: PairMatch, body_from_cam: Array, old_body_from_cam: Array | None = None) -> PoseEdge:
     """Return body i from body j as a loop; the match has camera i (its j) from camera j (its i), which may be mounted differently."""
     body_from_body = (
         body_from_cam @ match.j_from_i @ se3_inverse(body_from_cam if old_body_from_cam is None else old_body_from_cam)
     )
-    carry = adjoint(body_from_cam)
+    carry = se3_adjoint(body_from_cam)
     covariance = _CORRELATION**2 * carry @ match.cov_rot_trans @ carry.T + np.diag([1e-6] * 3 + [1e-5] * 3)
     return PoseEdge(match.j, match.i, body_from_body, covariance, is_loop=True)
 
@@ -490,13 +463,10 @@ def by_disparity(points_cam: Array, new_from_old: Array, camera: StereoCamera) -
     """
     seen = points_cam[np.isfinite(points_cam).all(axis=1)]
     nearer = -seen * seen[:, 2:] / (camera.focal_px * camera.baseline_m)
-    x, y, z = np.moveaxis(transform_points(new_from_old, seen), 1, 0)
-    rows = np.zeros((len(seen), 3, 3))
-    rows[:, 0, 0] = rows[:, 1, 1] = camera.focal_px / z
-    rows[:, 0, 2], rows[:, 1, 2] = -camera.focal_px * x / z**2, -camera.focal_px * y / z**2
-    rows[:, 2, 2] = -camera.focal_px * camera.baseline_m / z**2
+    there = transform_points(new_from_old, seen)
+    rows = projection_by_point(camera, there)
     shift = np.einsum("nab,nb->na", rows, nearer @ new_from_old[:3, :3].T) - [0.0, 0.0, 1.0]
-    turns = np.cross(np.eye(3), np.stack([x, y, z], axis=1)[:, None]).transpose(0, 2, 1)
+    turns = np.cross(np.eye(3), there[:, None]).transpose(0, 2, 1)
     jacobian = np.concatenate([rows @ turns, rows], axis=2).reshape(-1, 6)
     return np.asarray(-np.linalg.lstsq(jacobian, shift.ravel(), rcond=None)[0])
 
@@ -507,11 +477,3 @@ def _around(distance_m: float) -> Array:
         return np.zeros((0, 3))
     angles = np.arange(_SIDES) * (2 * np.pi / _SIDES)
     return distance_m * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(_SIDES)])
-
-
-def _cells(keyframe: Keyframe, features: NDArray[np.int32], camera: StereoCamera) -> int:
-    """Return how many of 8 x 6 image cells contain a feature."""
-    pixels = keyframe.features.pixels[features]
-    column = np.clip(pixels[:, 0] / camera.width_px * 8, 0, 7).astype(int)
-    row = np.clip(pixels[:, 1] / camera.height_px * 6, 0, 5).astype(int)
-    return len(np.unique(column * 6 + row))

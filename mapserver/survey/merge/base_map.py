@@ -5,7 +5,7 @@ import numpy as np
 from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat.tile import Tile
-from fleetmap.relocalization.landmark_visibility import Rows, VisibleLandmarks, visible_landmarks
+from fleetmap.relocalization.landmark_visibility import VisibleLandmarks, visible_landmarks
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.finish.landmark_visibility import viewing_cones
@@ -61,10 +61,6 @@ class BaseMap:
             place_landmark_ids=tuple(seen),
         )
         return MapView([whole], vocabulary, self.camera.focal_px)
-
-    def reference_cameras(self, rows: Rows) -> Array:
-        """Return (V, 4, 4) map_from_cam of the source keyframes of the patches of `rows`."""
-        return np.asarray(self.map_from_cam[self.map.obs_keyframe[self.references[rows]]])
 
 
 def baseline_ratio(camera: StereoCamera, other: StereoCamera) -> float:

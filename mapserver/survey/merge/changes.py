@@ -1,29 +1,55 @@
 """Changes of a map by a survey: moved keyframes and landmarks, and new landmarks."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, Rings, inside_any, se3_inverse
 from fleetmap.relocalization.landmark_visibility import COLUMNS, ROWS, Rows, image_cells
-from mapserver.survey.finish.culling import parallax_rad
-from mapserver.survey.merge.area_corrections import SurveyLimits
+from mapserver.survey.finish.map_assembly import parallax_rad
 from mapserver.survey.merge.base_map import BaseMap
-from mapserver.survey.merge.guided_matching import Sighting
+from mapserver.survey.merge.guided_matching import Sightings
 from mapserver.survey.merge.joint_adjustment import JointSolution, free_observations
 from mapserver.survey.merge.landmark_persistence import Shift, shifts
 from mapserver.survey.merge.merge import Change
 from mapserver.survey.settings import SessionSettings, SurveySettings
 from mapserver.survey.stages import Survey
-from mapserver.survey.state import Keyframe, Landmarks, RigImages
+from mapserver.survey.state import Landmarks, RigImages
 
 _CELLS = COLUMNS * ROWS
 _MIN_IN_CELL = 3  # fewer confirmed landmarks do not prove a gap in the map
 _LACKING_SHARE = 0.6
 _KEYFRAME_MOVED = 22.458  # 0.999 of chi-square with 6 degrees of freedom
+_CLOCKS_BEGIN_NS = 946_684_800_000_000_000  # the year 2000: earlier stamps count from a start, not from 1970
 Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, slots=True)
+class SurveyLimits:
+    """Polygons of a published map in which operators limit what surveys change.
+
+    frozen: neither add, move nor remove landmarks, nor move or add places. unused: add no landmarks. since: add no landmarks if the
+    survey ended before a time, in nanoseconds since 1970.
+    """
+
+    frozen: tuple[Rings, ...] = ()
+    unused: tuple[Rings, ...] = ()
+    since: tuple[tuple[Rings, int], ...] = ()
+
+    def freezes(self, points_map: Array) -> Mask:
+        """Return (N,) which points (N, 3) lie in a frozen polygon."""
+        return inside_any(points_map, self.frozen)
+
+    def closes(self, points_map: Array, end_ns: int) -> Mask:
+        """Return (N,) where a survey that ended at end_ns by its own clock may not add landmarks."""
+        late = [rings for rings, since_ns in self.since if is_before(end_ns, since_ns)]
+        return inside_any(points_map, (*self.frozen, *self.unused, *late))
+
+
+def is_before(end_ns: int, since_ns: int) -> bool:
+    """True if a recording's last stamp precedes a time; a clock that does not count from 1970 cannot tell."""
+    return _CLOCKS_BEGIN_NS < end_ns < since_ns
 
 
 def what_changes(
@@ -33,8 +59,6 @@ def what_changes(
     joint: JointSolution,
     gone: Mask,
     settings: SurveySettings,
-    *,
-    anchored: bool,
     limits: SurveyLimits,
 ) -> tuple[Change, int, int]:
     """Return the change, and how many keyframes and landmarks of the map moved. gone (N,): faded landmarks.
@@ -43,19 +67,19 @@ def what_changes(
     """
     marks, map_from_cam = survey.state.landmarks.by_image(posed.numbers), posed.map_from_cam
     moved_keyframes = np.zeros(len(base.map_from_cam), bool)
-    moved_keyframes[joint.base_keyframes] = _keyframes_moved(base, joint, settings.sessions) if anchored else True
+    moved_keyframes[joint.base_keyframes] = _keyframes_moved(base, joint, settings.sessions)
     moved_keyframes &= ~limits.freezes(base.map_from_cam[:, :3, 3])
     cameras = base.map_from_cam.copy()
     cameras[joint.base_keyframes] = joint.base_from_body @ posed.rig.body_from_cam[0]
     judged = shifts(base, map_from_cam, joint.sightings, settings)
-    points, moved = _moved_points(base, joint, judged, moved_keyframes, cameras, anchored=anchored)
+    points, moved = _moved_points(base, joint, judged, moved_keyframes, cameras)
     frozen = limits.freezes(base.points_map)
     points[frozen], moved[frozen] = base.points_map[frozen], False
     alone = judged.significant & ~moved[judged.rows] & ~gone[judged.rows] & ~frozen[judged.rows]
     keep = ~gone
     keep[judged.rows[alone]] = False
     free = free_observations(marks, joint.sightings)
-    fresh = _new_landmarks(base, posed.images, marks, joint, free, settings.sessions)
+    fresh = _new_landmarks(base, marks, joint, free, settings.sessions)
     fresh &= known_well(survey, joint, settings)
     fresh &= ~limits.closes(joint.own_points_map, int(survey.map.trajectory.stamps_ns[-1]))
     again = _resighted(base, judged.rows[alone], judged.points_map[alone], joint.sightings)
@@ -81,7 +105,9 @@ def known_well(survey: Survey, joint: JointSolution, settings: SurveySettings) -
 
 
 def _keyframes_moved(base: BaseMap, joint: JointSolution, settings: SessionSettings) -> Mask:
-    """Return (B,) keyframes of the map that the new survey moved by more than their anchors allow."""
+    """Return (B,) keyframes of the map that the new survey moved: those of a published one by more than their anchors allow."""
+    if not joint.measured.is_anchored:
+        return np.ones(len(joint.base_keyframes), bool)
     before = base.map_from_body[joint.base_keyframes]
     shift_m = np.linalg.norm(joint.base_from_body[:, :3, 3] - before[:, :3, 3], axis=1)
     turns = joint.base_from_body[:, :3, :3] @ before[:, :3, :3].transpose(0, 2, 1)
@@ -91,7 +117,7 @@ def _keyframes_moved(base: BaseMap, joint: JointSolution, settings: SessionSetti
 
 
 def _moved_points(
-    base: BaseMap, joint: JointSolution, judged: Shift, moved_keyframes: Mask, cameras: Array, *, anchored: bool
+    base: BaseMap, joint: JointSolution, judged: Shift, moved_keyframes: Mask, cameras: Array
 ) -> tuple[Array, Mask]:
     """Return the positions of the map's landmarks (N, 3), and which (N,) moved with their keyframes.
 
@@ -100,7 +126,7 @@ def _moved_points(
     """
     points, references = base.points_map.copy(), base.map.obs_keyframe[base.references]
     moved = moved_keyframes[references] & (base.references >= 0)
-    if anchored:
+    if joint.measured.is_anchored:
         moved[judged.rows[~judged.significant]] = False
     rigid = cameras[references[moved]] @ se3_inverse(base.map_from_cam[references[moved]])
     points[moved] = np.einsum("nij,nj->ni", rigid[:, :3, :3], base.points_map[moved]) + rigid[:, :3, 3]
@@ -110,13 +136,8 @@ def _moved_points(
 
 
 def _new_landmarks(
-    base: BaseMap,
-    images: Sequence[Keyframe],
-    marks: Landmarks,
-    joint: JointSolution,
-    free: NDArray[np.bool_],
-    settings: SessionSettings,
-) -> NDArray[np.bool_]:
+    base: BaseMap, marks: Landmarks, joint: JointSolution, free: Mask, settings: SessionSettings
+) -> Mask:
     """Return (N,) own landmarks of the survey to add to the map; free (M,): observations that show none of the map's.
 
     A part of a picture (one of 48) is covered if at least `covered_share` as many landmarks of the map are seen in it
@@ -124,36 +145,27 @@ def _new_landmarks(
     """
     counts = np.bincount(marks.obs_landmark[free], minlength=len(marks.points_map))
     confirmed = (counts >= settings.min_confirmations) & np.isfinite(joint.own_points_map).all(axis=1)
-    chosen = free & confirmed[marks.obs_landmark]
-    lacking = np.zeros(len(chosen), bool)
-    for k, (_, sighting) in enumerate(zip(images, joint.sightings, strict=True)):
-        own = np.flatnonzero(chosen & (marks.obs_keyframe == k))
-        cells = image_cells(marks.obs_pixels[own, :2], base.camera)
-        fresh = np.bincount(cells, minlength=_CELLS)
-        known = np.zeros(_CELLS, np.int64)
-        if sighting is not None:
-            known = np.bincount(image_cells(sighting.pixels[:, :2], base.camera), minlength=_CELLS)
-        bare = (fresh >= _MIN_IN_CELL) & (known <= settings.covered_share * fresh)
-        lacking[own] = bare[cells] if sighting is not None else True
+    chosen, seen = free & confirmed[marks.obs_landmark], joint.sightings
+    part = _CELLS * marks.obs_keyframe + image_cells(marks.obs_pixels[:, :2], base.camera)
+    fresh, known = (
+        np.bincount(parts, minlength=_CELLS * len(seen.located))
+        for parts in (part[chosen], _CELLS * seen.image + image_cells(seen.pixels[:, :2], base.camera))
+    )
+    bare = (fresh >= _MIN_IN_CELL) & (known <= settings.covered_share * fresh)
+    lacking = chosen & (bare[part] | ~seen.located[marks.obs_keyframe])
     share = np.bincount(marks.obs_landmark[lacking], minlength=len(counts)) / np.maximum(counts, 1)
     return np.asarray(confirmed & (share >= _LACKING_SHARE))
 
 
-def _resighted(base: BaseMap, rows: Rows, points_map: Array, sightings: Sequence[Sighting | None]) -> Landmarks:
+def _resighted(base: BaseMap, rows: Rows, points_map: Array, sightings: Sightings) -> Landmarks:
     """Return landmarks of the map by the new survey alone: rows (R,) at points_map (R, 3) with their sightings."""
     number = np.full(len(base.points_map), -1)
     number[rows] = np.arange(len(rows))
-    seen = [(k, s.only(number[s.rows] >= 0)) for k, s in enumerate(sightings) if s is not None]
-    if not seen:
-        return Landmarks.empty()
-    keyframe = np.concatenate([np.full(len(s.rows), k, np.int32) for k, s in seen])
-    landmark = np.concatenate([number[s.rows] for _, s in seen]).astype(np.int32)
-    order = np.lexsort((keyframe, landmark))
-    features = np.concatenate([s.features for _, s in seen])[order]
-    pixels = np.concatenate([s.pixels for _, s in seen])[order]
-    sigmas_px = np.concatenate([s.sigmas_px for _, s in seen])[order]
-    owners = keyframe[order], np.zeros_like(keyframe), landmark[order]
-    return Landmarks(points_map, *owners, features.astype(np.int32), pixels, sigmas_px)
+    seen = sightings.only(number[sightings.rows] >= 0)
+    order = np.lexsort((seen.image, number[seen.rows]))
+    owners = seen.image[order], np.zeros(len(order)), number[seen.rows[order]], seen.features[order]
+    images, cameras, landmarks, features = (column.astype(np.int32) for column in owners)
+    return Landmarks(points_map, images, cameras, landmarks, features, seen.pixels[order], seen.sigmas_px[order])
 
 
 def fewer_keyframes(marks: Landmarks, enough: int) -> Landmarks:

@@ -45,6 +45,7 @@ class Confirmation:
     blocks: int
     low: float
     high: float
+    error_rate: float
 
     @property
     def share(self) -> float:
@@ -120,7 +121,7 @@ def _bounded(is_seen: NDArray[np.bool_], blocks: Array, error_rate: float) -> Co
     """Return the share of cells (C,) in blocks (C, 3), with its bounds."""
     count = len(is_seen)
     if count == 0:
-        return Confirmation(0, 0, 0, 0.0, 1.0)
+        return Confirmation(0, 0, 0, 0.0, 1.0, error_rate)
     share = float(is_seen.mean())
     _, block = np.unique(blocks, axis=0, return_inverse=True)
     off = np.bincount(block.reshape(-1), is_seen - share)
@@ -130,4 +131,4 @@ def _bounded(is_seen: NDArray[np.bool_], blocks: Array, error_rate: float) -> Co
     k = share * effective
     low = float(betaincinv(k, effective - k + 1, error_rate)) if k > 0 else 0.0
     high = float(betaincinv(k + 1, effective - k, 1.0 - error_rate)) if k < effective else 1.0
-    return Confirmation(count, int(is_seen.sum()), len(off), low, high)
+    return Confirmation(count, int(is_seen.sum()), len(off), low, high, error_rate)

@@ -1,6 +1,8 @@
 """Guided matching of the map's landmarks in keyframes of a new survey, to a fraction of a pixel."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,18 +22,40 @@ from mapserver.survey.state import Keyframe
 _CORRELATION = 3.0  # as for loops: common errors of matched points make a fix's covariance too small
 
 
-@dataclass(frozen=True, slots=True)
-class Sighting:
-    """The map's landmarks in one keyframe: rows (P,) as features (P,), pixels (P, 3), sigmas_px (P, 2)."""
+class Sighting(NamedTuple):
+    """The map's landmarks in one image: rows (P,) as features (P,), pixels (P, 3), sigmas_px (P, 2)."""
 
     rows: Rows
     features: Rows
     pixels: Array
     sigmas_px: Array
 
-    def only(self, keep: NDArray[np.bool_]) -> "Sighting":
-        """Return the chosen part."""
-        return Sighting(self.rows[keep], self.features[keep], self.pixels[keep], self.sigmas_px[keep])
+
+_NOTHING = Sighting(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 2)))
+
+
+@dataclass(frozen=True, slots=True)
+class Sightings:
+    """The sightings by all images (I,) of a survey, joined: the image (P,) of each; located (I,): images that have one, if only empty."""
+
+    located: NDArray[np.bool_]
+    image: Rows
+    rows: Rows
+    features: Rows
+    pixels: Array
+    sigmas_px: Array
+
+    @classmethod
+    def of(cls, images: Sequence[Sighting | None]) -> "Sightings":
+        """Join those of each image."""
+        image = np.repeat(np.arange(len(images)), [0 if seen is None else len(seen.rows) for seen in images])
+        parts = zip(_NOTHING, *(seen for seen in images if seen is not None), strict=True)
+        columns: list[Any] = [np.concatenate(part) for part in parts]
+        return cls(np.array([seen is not None for seen in images]), image, *columns)
+
+    def only(self, keep: NDArray[np.bool_]) -> "Sightings":
+        """Return the chosen part (P,)."""
+        return replace(self, **{name: getattr(self, name)[keep] for name in ("image", *Sighting._fields)})
 
 
 def session_relocalizer(base: BaseMap, vocabulary: Vocabulary, settings: SurveySettings) -> Relocalizer:
@@ -125,12 +149,10 @@ def _aligned(
 
 def _warps(base: BaseMap, rows: Rows, cam_from_map: Array) -> Array:
     """Return (P, 2, 3) warps for `patch_align.refine_matches`; NaN if degenerate."""
-    cameras = base.reference_cameras(rows)
     warps = np.empty((len(rows), 2, 3))
     order = base.map.obs_keyframe[base.references[rows]]
     for k in np.unique(order):
-        own = np.flatnonzero(order == k)
-        reference_from_map = se3_inverse(cameras[own[0]])
-        points = transform_points(reference_from_map, base.points_map[rows[own]])
-        warps[own] = patch_align.warps_from_motion(points, cam_from_map @ cameras[own[0]])
+        own, map_from_reference = np.flatnonzero(order == k), base.map_from_cam[k]
+        points = transform_points(se3_inverse(map_from_reference), base.points_map[rows[own]])
+        warps[own] = patch_align.warps_from_motion(points, cam_from_map @ map_from_reference)
     return warps

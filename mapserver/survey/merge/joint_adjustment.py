@@ -20,7 +20,7 @@ from mapserver.survey.bundle.bundle_rounds import bundle_problem, inertial_edges
 from mapserver.survey.bundle.measured_noise import measured_sigmas
 from mapserver.survey.bundle.problem import OBSERVED, BundleProblem, BundleResult, InertialTerms, continued
 from mapserver.survey.merge.base_map import BaseMap, baseline_ratio, with_baseline
-from mapserver.survey.merge.guided_matching import Sighting
+from mapserver.survey.merge.guided_matching import Sightings
 from mapserver.survey.merge.merge import Change
 from mapserver.survey.pose_graph.odometry_factors import floor_of
 from mapserver.survey.pose_graph.position_priors import in_frame, judged_priors, level_fit
@@ -42,7 +42,7 @@ class Measured:
     keyframes (K,), cameras (K,), landmarks (N,): numbers of those of the map in the problem, where each keyframe is an image by a camera;
     -1 if not included.
     map_from_docks (4, 4): the map keeps the frame of its first survey, whose docks place it only to their own accuracy; None for a map
-    without docks.
+    without docks. is_anchored: True for a published map.
     """
 
     problem: BundleProblem
@@ -50,6 +50,7 @@ class Measured:
     cameras: Rows
     landmarks: Rows
     map_from_docks: Array | None = None
+    is_anchored: bool = False
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,7 @@ class Joined:
     rig_from_body: Array
 
     @classmethod
-    def to(cls, problem: BundleProblem, state: SurveyState, sightings: Sequence[Sighting | None]) -> "Joined":
+    def to(cls, problem: BundleProblem, state: SurveyState, sightings: Sightings) -> "Joined":
         """Return the numbers after the map's. A feature that shows a landmark of the map counts as its observation alone."""
         old, points = len(problem.map_from_body), len(problem.points_map)
         rig, cameras = _with_cameras_of(problem.rig, state.rig)
@@ -107,7 +108,7 @@ class JointSolution:
     base_rows: Rows
     base_points_map: Array
     own_points_map: Array
-    sightings: list[Sighting | None]
+    sightings: Sightings
     measured: Measured
     own: Joined
     priors_refused: int
@@ -118,7 +119,7 @@ def adjust_jointly(
     known: Measured | None,
     state: SurveyState,
     map_from_body: Array,
-    sightings: list[Sighting | None],
+    sightings: Sightings,
     settings: SurveySettings,
     *,
     finely: bool,
@@ -148,27 +149,22 @@ def _solved(
     known: Measured | None,
     state: SurveyState,
     map_from_body: Array,
-    sightings: list[Sighting | None],
+    sightings: Sightings,
     settings: SurveySettings,
     how: BundleSettings,
 ) -> JointSolution:
     """Solve one adjustment: first the map's keyframes and landmarks, then the survey's."""
     known = known or _published(base, state, sightings, settings.sessions)
     own = Joined.to(known.problem, state, sightings)
-    problem = _joint_problem(known, own, state, map_from_body, sightings, settings)
+    problem = _joint_problem(known, own, _carried(state, map_from_body), sightings, settings)
     result = optimize(replace(problem, obs_sigma_px=measured_sigmas(problem, how.huber_sigmas)), how)
     map_from_docks, old = known.map_from_docks, own.first_keyframe
     if map_from_docks is not None:
         stay = level_fit(problem.map_from_body[:old, :3, 3], result.map_from_body[:old, :3, 3])
         result, map_from_docks = _in_frame(result, stay), stay @ map_from_docks
         problem.priors = [in_frame(prior, stay) for prior in problem.priors]
-
-    fits = result.squared_sigmas < settings.noise.cut_sigmas**2
-    fitting, start = list[Sighting | None](), len(known.problem.obs_keyframe)
-    for sighting in sightings:
-        count = 0 if sighting is None else len(sighting.rows)
-        fitting.append(None if sighting is None else sighting.only(fits[start : start + count]))
-        start += count
+    start = len(known.problem.obs_keyframe)
+    fits = result.squared_sigmas[start : start + len(sightings.rows)] < settings.noise.cut_sigmas**2
     base_keyframes, base_rows = np.flatnonzero(known.keyframes >= 0), np.flatnonzero(known.landmarks >= 0)
     places = problem.rig.as_bodies(result.map_from_body)
     own_points_map = np.full((len(own.landmarks), 3), np.nan)
@@ -180,7 +176,7 @@ def _solved(
         base_rows=base_rows,
         base_points_map=result.points_map[known.landmarks[base_rows]],
         own_points_map=own_points_map,
-        sightings=fitting,
+        sightings=sightings.only(fits),
         measured=replace(known, problem=continued(problem, result), map_from_docks=map_from_docks),
         own=own,
         priors_refused=sum(not prior.is_believed for prior in state.priors),
@@ -202,25 +198,18 @@ def _with_cameras_of(rig: Rig, own: Rig) -> tuple[Rig, Rows]:
 
 
 def _joint_problem(
-    known: Measured,
-    own: Joined,
-    state: SurveyState,
-    map_from_body: Array,
-    sightings: Sequence[Sighting | None],
-    settings: SurveySettings,
+    known: Measured, own: Joined, state: SurveyState, seen: Sightings, settings: SurveySettings
 ) -> BundleProblem:
     """Return the map's problem with the survey's keyframes, landmarks, motion and observations of both."""
-    earlier, marks, old = known.problem, own.marks, own.first_keyframe
-    seen = [(n, s) for n, s in enumerate(sightings) if s is not None]
-    turn, carried = _carried(state, map_from_body)
+    earlier, marks, old, map_from_body = known.problem, own.marks, own.first_keyframe, state.map_from_body
     pixels, sigmas_px = with_baseline(
-        np.concatenate([*(s.pixels for _, s in seen), marks.obs_pixels[own.rows]]),
-        np.concatenate([*(s.sigmas_px for _, s in seen), marks.obs_sigma_px[own.rows]]),
+        np.concatenate([seen.pixels, marks.obs_pixels[own.rows]]),
+        np.concatenate([seen.sigmas_px, marks.obs_sigma_px[own.rows]]),
         baseline_ratio(own.rig.camera, state.rig.camera),
     )
-    images = np.concatenate([*(np.full(len(s.rows), n) for n, s in seen), marks.obs_keyframe[own.rows]])
-    landmarks = [*(known.landmarks[s.rows] for _, s in seen), own.landmarks[marks.obs_landmark[own.rows]]]
-    owners = own.keyframe[images], own.camera[images], np.concatenate(landmarks)
+    images = np.concatenate([seen.image, marks.obs_keyframe[own.rows]])
+    landmarks = np.concatenate([known.landmarks[seen.rows], own.landmarks[marks.obs_landmark[own.rows]]])
+    owners = own.keyframe[images], own.camera[images], landmarks
     columns = zip(OBSERVED, (*owners, pixels, sigmas_px), strict=True)
     observed: dict[str, Any] = {name: np.concatenate([getattr(earlier, name), column]) for name, column in columns}
     fixed = np.concatenate([earlier.fixed, np.zeros(len(map_from_body), bool)])
@@ -230,30 +219,32 @@ def _joint_problem(
         rig=own.rig,
         map_from_body=np.concatenate([earlier.map_from_body, map_from_body @ se3_inverse(own.rig_from_body)]),
         fixed=fixed,
-        points_map=np.concatenate([earlier.points_map, carried[own.landmarks >= 0]]),
+        points_map=np.concatenate([earlier.points_map, state.landmarks.points_map[own.landmarks >= 0]]),
         **observed,
     )
     if own.is_alike:
         relative = [RelativeTerm(r.i + old, r.j + old, r.i_from_j, r.information) for r in state.motion.relative]
         priors = [replace(p, k=p.k + old) for p in _placed(state.priors, known) if p.is_believed]
         problem = replace(problem, relative=earlier.relative + relative, priors=earlier.priors + priors)
-    problem.inertial = _inertial(earlier, state, turn, settings, own.is_alike)
+    felt = state.motion.inertial and own.is_alike
+    if earlier.inertial is not None or felt:
+        before = earlier.inertial or InertialTerms(np.zeros((old, 9)), [])
+        edges = before.edges + (inertial_edges(state, settings, first=old) if felt else [])
+        motions = np.concatenate([before.motions, state.motion.motions])
+        problem.inertial = replace(before, motions=motions, edges=edges)
     return problem
 
 
-def _published(
-    base: BaseMap, state: SurveyState, sightings: Sequence[Sighting | None], settings: SessionSettings
-) -> Measured:
+def _published(base: BaseMap, state: SurveyState, sightings: Sightings, settings: SessionSettings) -> Measured:
     """Return the constraints of a published map: keyframes with landmarks seen by the survey, with an anchor for each.
 
     All landmarks that two of these keyframes see take part, and relative poses stand for what the map's surveys knew beyond: the
     observations of earlier landmarks by a later survey are not kept. By the new survey's landmarks alone a keyframe with few of
     them would move with their noise, up to 9 mm.
     """
-    rows = np.unique(np.concatenate([np.zeros(0, np.int64), *(s.rows for s in sightings if s is not None)]))
     used = np.zeros(len(base.points_map), bool)
     landmarks, keyframes = np.full(len(base.points_map), -1), np.full(len(base.map_from_body), -1)
-    used[rows] = True
+    used[sightings.rows] = True
     held = np.unique(base.map.obs_keyframe[used[base.map.obs_landmark]]).astype(np.int64)
     keyframes[held] = np.arange(len(held))
     own = keyframes[base.map.obs_keyframe] >= 0
@@ -274,7 +265,7 @@ def _published(
         relative=_steps(base, held),
         priors=[PriorTerm(n, base.map_from_body[k], np.diag(1.0 / sigma**2)) for n, k in enumerate(held)],
     )
-    return Measured(problem, keyframes, np.zeros_like(keyframes), landmarks)
+    return Measured(problem, keyframes, np.zeros_like(keyframes), landmarks, is_anchored=True)
 
 
 def _steps(base: BaseMap, held: Rows) -> list[RelativeTerm]:
@@ -295,49 +286,28 @@ def _placed(priors: Sequence[PriorTerm], known: Measured) -> list[PriorTerm]:
 
 def _in_frame(result: BundleResult, new_from_map: Array) -> BundleResult:
     """Return the result in another upright frame; new_from_map (4, 4)."""
-    velocities = result.velocities_map_mps
-    return replace(
-        result,
-        map_from_body=new_from_map @ result.map_from_body,
-        points_map=transform_points(new_from_map, result.points_map),
-        velocities_map_mps=None if velocities is None else velocities @ new_from_map[:3, :3].T,
-    )
+    motions = result.motions
+    if motions is not None:
+        motions = np.column_stack([motions[:, :3] @ new_from_map[:3, :3].T, motions[:, 3:]])
+    points_map = transform_points(new_from_map, result.points_map)
+    return replace(result, map_from_body=new_from_map @ result.map_from_body, points_map=points_map, motions=motions)
 
 
-def _carried(state: SurveyState, map_from_body: Array) -> tuple[Array, Array]:
-    """Return the rotations of the survey's keyframes (K, 3, 3), and its landmarks (N, 3) moved with their defining keyframes."""
+def _carried(state: SurveyState, map_from_body: Array) -> SurveyState:
+    """Return the survey with its keyframes at map_from_body (K, 4, 4), and its landmarks moved with their defining keyframes."""
     marks = state.landmarks
     turn = map_from_body[:, :3, :3] @ state.map_from_body[:, :3, :3].transpose(0, 2, 1)
     shift = map_from_body[:, :3, 3] - np.einsum("kij,kj->ki", turn, state.map_from_body[:, :3, 3])
     first = marks.obs_keyframe[marks.firsts]
-    return turn, np.einsum("nij,nj->ni", turn[first], marks.points_map) + shift[first]
+    points_map = np.einsum("nij,nj->ni", turn[first], marks.points_map) + shift[first]
+    return replace(state.moved(map_from_body), landmarks=replace(marks, points_map=points_map))
 
 
-def free_observations(marks: Landmarks, sightings: Sequence[Sighting | None]) -> NDArray[np.bool_]:
+def free_observations(marks: Landmarks, sightings: Sightings) -> NDArray[np.bool_]:
     """Return (M,) observations of the survey's own landmarks, by image, whose feature shows no landmark of the map."""
-    stride = int(marks.obs_feature.max(initial=0)) + 1
-    taken = [k * stride + s.features[s.features < stride] for k, s in enumerate(sightings) if s is not None]
+    stride = 1 + max(int(marks.obs_feature.max(initial=0)), int(sightings.features.max(initial=0)))
     codes = marks.obs_keyframe.astype(np.int64) * stride + marks.obs_feature
-    return ~np.isin(codes, np.concatenate(taken)) if taken else np.ones(len(codes), bool)
-
-
-def _inertial(
-    earlier: BundleProblem, state: SurveyState, turn: Array, settings: SurveySettings, own_rig: bool
-) -> InertialTerms | None:
-    """Return the motion of the map's keyframes, if known, followed by the survey's; turn (K, 3, 3): rotation of its keyframes since."""
-    motion, old, felt = state.motion, len(earlier.map_from_body), state.motion.inertial and own_rig
-    if earlier.inertial is None and not felt:
-        return None
-    none = np.zeros((old, 3))
-    before = earlier.inertial or InertialTerms(none, none, none, [])
-    velocities = np.einsum("kij,kj->ki", turn, motion.velocities_mps)
-    return replace(
-        before,
-        velocities_map_mps=np.concatenate([before.velocities_map_mps, velocities]),
-        gyro_bias_radps=np.concatenate([before.gyro_bias_radps, motion.gyro_bias_radps]),
-        accel_bias_mps2=np.concatenate([before.accel_bias_mps2, motion.accel_bias_mps2]),
-        edges=before.edges + (inertial_edges(state, settings, first=old) if felt else []),
-    )
+    return ~np.isin(codes, sightings.image * stride + sightings.features)
 
 
 def begun(state: SurveyState, survey_map: SurveyMap, landmarks: Rows, settings: SurveySettings) -> Measured:

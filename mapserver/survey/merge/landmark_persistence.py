@@ -9,10 +9,12 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.pnp.pnp import GATE_SQUARED
 from fleetmap.relocalization.landmark_visibility import Rows
-from mapserver.survey.finish.map_assembly import point_information
+from fleetmap.sensors.rectification import StereoCamera
+from mapserver.survey.finish.map_assembly import point_information, points_in_cameras
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.confirmation import EDGE_PX, WIDER_VIEW_RAD, due
-from mapserver.survey.merge.guided_matching import Sighting, keyframe_features
+from mapserver.survey.merge.guided_matching import Sightings, keyframe_features
+from mapserver.survey.rig import projection_by_point
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Keyframe
 
@@ -37,20 +39,17 @@ class LandmarkCounts:
 
 
 def count_landmarks(
-    base: BaseMap, keyframes: Sequence[Keyframe], map_from_cam: Array, sightings: Sequence[Sighting | None]
+    base: BaseMap, keyframes: Sequence[Keyframe], map_from_cam: Array, sightings: Sightings
 ) -> LandmarkCounts:
     """Return counts over keyframes (K) at map_from_cam (K, 4, 4); those without a sighting do not count."""
-    expected, seen = np.zeros(len(base.points_map), np.int64), np.zeros(len(base.points_map), np.int64)
-    for keyframe, place, sighting in zip(keyframes, map_from_cam, sightings, strict=True):
-        if sighting is None:
-            continue
-        visible = base.visible(place, -EDGE_PX, WIDER_VIEW_RAD)
+    expected = np.zeros(len(base.points_map), np.int64)
+    for k in np.flatnonzero(sightings.located).tolist():
+        visible = base.visible(map_from_cam[k], -EDGE_PX, WIDER_VIEW_RAD)
         is_due = np.zeros(len(expected), bool)
-        is_due[visible.rows[due(visible, keyframe_features(keyframe).pixels)]] = True
-        is_due[sighting.rows] = True
+        is_due[visible.rows[due(visible, keyframe_features(keyframes[k]).pixels)]] = True
+        is_due[sightings.rows[sightings.image == k]] = True
         expected += is_due
-        seen[sighting.rows] += 1
-    return LandmarkCounts(expected, seen)
+    return LandmarkCounts(expected, np.bincount(sightings.rows, minlength=len(expected)))
 
 
 def missed_since(base: BaseMap, counts: LandmarkCounts) -> NDArray[np.int64]:
@@ -82,85 +81,71 @@ class Shift:
     significant: NDArray[np.bool_]
 
 
-def shifts(base: BaseMap, map_from_cam: Array, sightings: Sequence[Sighting | None], settings: SurveySettings) -> Shift:
+def shifts(base: BaseMap, map_from_cam: Array, sightings: Sightings, settings: SurveySettings) -> Shift:
     """Compare each landmark, triangulated by its sightings alone from cameras map_from_cam (K, 4, 4), with its position in the map.
 
     The difference is judged by both covariances, for fixed keyframes, and `still_m` for their omissions; also most
     sightings must individually contradict the old position (smaller differences do not affect robots) and nearly
     all must support the new one: occlusion corners have no fixed position.
     """
-    seen = [(k, s) for k, s in enumerate(sightings) if s is not None]
-    landmark = np.concatenate([s.rows for _, s in seen]) if seen else np.zeros(0, np.int64)
-    rows, numbers, counts = np.unique(landmark, return_inverse=True, return_counts=True)
+    rows, which, counts = np.unique(sightings.rows, return_inverse=True, return_counts=True)
     enough = counts >= _MIN_SIGHTINGS
-    keep = enough[numbers] if len(rows) else np.zeros(0, bool)
-    renumbered = np.cumsum(enough) - 1
-    rows, numbers = rows[enough], renumbered[numbers[keep]].astype(np.int32)
-    if not len(rows):
-        return Shift(rows, np.zeros((0, 3)), np.zeros(0, bool))
-    cameras = np.repeat(map_from_cam[[k for k, _ in seen]], [len(s.rows) for _, s in seen], axis=0)[keep]
-    pixels = np.concatenate([s.pixels for _, s in seen])[keep]
-    sigmas = np.concatenate([s.sigmas_px for _, s in seen])[keep]
-    points = base.points_map[rows].copy()
-    new = _triangulated(base, points, cameras, numbers, pixels, sigmas)
+    rows, counts, seen = rows[enough], counts[enough], sightings.only(enough[which])
+    numbers = (np.cumsum(enough) - 1)[which][enough[which]].astype(np.int32)
+    before = base.points_map[rows]
+    looks = _Looks(base.camera, map_from_cam[seen.image], numbers, seen.pixels, seen.sigmas_px)
+    now = looks.triangulated(before)
     own = np.isin(base.map.obs_landmark, rows)
     old_numbers = np.searchsorted(rows, base.map.obs_landmark[own]).astype(np.int32)
-    old_cameras, has_depth = base.map_from_cam[base.map.obs_keyframe[own]], np.isfinite(base.obs_pixels[own, 2])
-    old = point_information(
-        base.camera, old_cameras, base.points_map[rows], old_numbers, has_depth, base.obs_sigma_px[own]
-    )
-    info = point_information(base.camera, cameras, new, numbers, np.isfinite(pixels[:, 2]), sigmas)
+    old_cameras = base.map_from_cam[base.map.obs_keyframe[own]]
+    known = _Looks(base.camera, old_cameras, old_numbers, base.obs_pixels[own], base.obs_sigma_px[own])
     slack = 1e-6 * np.eye(3)
-    spread = np.linalg.inv(old + slack) + np.linalg.inv(info + slack) + settings.sessions.still_m**2 * np.eye(3)
-    off = new - base.points_map[rows]
+    spread = np.linalg.inv(known.information(before) + slack) + np.linalg.inv(looks.information(now) + slack)
+    spread += settings.sessions.still_m**2 * np.eye(3)
+    off = now - before
     squared = np.einsum("ni,ni->n", off, np.linalg.solve(spread, off[:, :, None])[:, :, 0])
-    counts = np.bincount(numbers, minlength=len(rows))
-    old_squared, new_squared = (
-        _squared(base, p, cameras, numbers, pixels, sigmas) for p in (base.points_map[rows], new)
-    )
-    doubted = np.bincount(numbers, old_squared > _AGAINST, len(rows)) > _DOUBTED * counts
-    settled = np.bincount(numbers, new_squared < GATE_SQUARED, len(rows)) >= _SETTLED * counts
-    return Shift(rows, new, doubted & settled & (squared > settings.sessions.significance))
+    doubted = np.bincount(numbers, looks.squared(before) > _AGAINST, len(rows)) > _DOUBTED * counts
+    settled = np.bincount(numbers, looks.squared(now) < GATE_SQUARED, len(rows)) >= _SETTLED * counts
+    return Shift(rows, now, doubted & settled & (squared > settings.sessions.significance))
 
 
-def _squared(
-    base: BaseMap, points_map: Array, map_from_cam: Array, landmark: NDArray[np.int32], pixels: Array, sigmas_px: Array
-) -> Array:
-    """Return (M,) squared residuals of observations in sigmas."""
-    cam_from_map = se3_inverse(map_from_cam)
-    seen = np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], points_map[landmark]) + cam_from_map[:, :3, 3]
-    residual = _residuals(base, seen, pixels) / sigmas_px[:, [0, 0, 1]]
-    return np.asarray(np.square(np.nan_to_num(residual)).sum(axis=1))
+@dataclass(frozen=True, slots=True)
+class _Looks:
+    """M observations of points by known cameras: map_from_cam (M, 4, 4), landmark (M,), pixels (M, 3), sigmas_px (M, 2)."""
 
+    camera: StereoCamera
+    map_from_cam: Array
+    landmark: NDArray[np.int32]
+    pixels: Array
+    sigmas_px: Array
 
-def _residuals(base: BaseMap, points_cam: Array, pixels: Array) -> Array:
-    """Return (M, 3) of u, v and disparity; NaN without a right match."""
-    predicted = base.camera.pixel_from_point(np.column_stack([points_cam[:, :2], np.maximum(points_cam[:, 2], 0.05)]))
-    return np.column_stack(
-        [pixels[:, :2] - predicted[:, :2], pixels[:, 0] - pixels[:, 2] - predicted[:, 0] + predicted[:, 2]]
-    )
+    def information(self, points_map: Array) -> Array:
+        """Return (R, 3, 3) of points (R, 3)."""
+        has_depth = np.isfinite(self.pixels[:, 2])
+        return point_information(self.camera, self.map_from_cam, points_map, self.landmark, has_depth, self.sigmas_px)
 
+    def residuals(self, points_map: Array) -> tuple[Array, Array]:
+        """Return (M, 3) of u, v and disparity, NaN without a right match, and the points seen (M, 3), at least 5 cm before a camera."""
+        seen = points_in_cameras(self.map_from_cam, points_map[self.landmark])
+        predicted, pixels = self.camera.pixel_from_point(seen), self.pixels
+        disparity = pixels[:, 0] - pixels[:, 2] - predicted[:, 0] + predicted[:, 2]
+        return np.column_stack([pixels[:, :2] - predicted[:, :2], disparity]), seen
 
-def _triangulated(
-    base: BaseMap, points_map: Array, map_from_cam: Array, landmark: NDArray[np.int32], pixels: Array, sigmas_px: Array
-) -> Array:
-    """Return points (R, 3) with the best fit to their observations (M) from known cameras: some steps of Gauss-Newton."""
-    camera, points = base.camera, points_map.copy()
-    cam_from_map = se3_inverse(map_from_cam)
-    for _ in range(4):
-        seen = np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], points[landmark]) + cam_from_map[:, :3, 3]
-        residual = _residuals(base, seen, pixels)
-        z, f = np.maximum(seen[:, 2], 0.05), camera.focal_px
-        rows = np.zeros((len(z), 3, 3))
-        rows[:, 0, 0] = rows[:, 1, 1] = f / z
-        rows[:, 0, 2], rows[:, 1, 2] = -f * seen[:, 0] / z**2, -f * seen[:, 1] / z**2
-        rows[:, 2, 2] = -f * camera.baseline_m / z**2
-        sigma = np.column_stack([sigmas_px[:, 0], sigmas_px[:, 0], sigmas_px[:, 1]])
-        weight = np.where(np.isfinite(residual), 1.0 / sigma, 0.0)
-        jacobian = (rows * weight[:, :, None]) @ cam_from_map[:, :3, :3]
-        hessian, pull = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
-        np.add.at(hessian, landmark, jacobian.transpose(0, 2, 1) @ jacobian)
-        np.add.at(pull, landmark, np.einsum("mij,mi->mj", jacobian, np.nan_to_num(residual) * weight))
-        step = np.linalg.solve(hessian + 1e-6 * np.eye(3), pull[:, :, None])[:, :, 0]
-        points += np.clip(step, -0.5, 0.5)
-    return points
+    def squared(self, points_map: Array) -> Array:
+        """Return (M,) squared residuals in sigmas."""
+        residual, _ = self.residuals(points_map)
+        return np.asarray(np.square(np.nan_to_num(residual / self.sigmas_px[:, [0, 0, 1]])).sum(axis=1))
+
+    def triangulated(self, points_map: Array) -> Array:
+        """Return points (R, 3) with the best fit to their observations: some steps of Gauss-Newton from points_map (R, 3)."""
+        points, cam_from_map = points_map.copy(), se3_inverse(self.map_from_cam)
+        for _ in range(4):
+            residual, seen = self.residuals(points)
+            weight = np.where(np.isfinite(residual), 1.0 / self.sigmas_px[:, [0, 0, 1]], 0.0)
+            jacobian = (projection_by_point(self.camera, seen) * weight[:, :, None]) @ cam_from_map[:, :3, :3]
+            hessian, pull = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+            np.add.at(hessian, self.landmark, jacobian.transpose(0, 2, 1) @ jacobian)
+            np.add.at(pull, self.landmark, np.einsum("mij,mi->mj", jacobian, np.nan_to_num(residual) * weight))
+            step = np.linalg.solve(hessian + 1e-6 * np.eye(3), pull[:, :, None])[:, :, 0]
+            points += np.clip(step, -0.5, 0.5)
+        return points

@@ -43,6 +43,7 @@ _MOST_PLACES, _MOST_LOOKS = 4, 240  # compared alignments, keyframes used
 _SAME_PLACE_M = 1.2
 _BESIDE_M, _BESIDE_COSINE = 2.0, 0.8  # limits of distance and heading to a place of the map, to be located there
 _PRIOR_M = 3.0  # limit between an alignment and the position priors
+_DRIVE_ON = "drive a longer way through places that are in the map, the same way round"
 
 
 class MembershipVerdict(StrEnum):
@@ -85,7 +86,7 @@ class Membership:
 
 @dataclass(frozen=True, slots=True)
 class SessionPlace:
-    """A session's pose: map_from_body (K, 4, 4) of its keyframes, the agreeing fixes and how many of them were accepted."""
+    """A session's pose: map_from_body (K, 4, 4) of its keyframes, the agreeing fixes and how many were accepted, and what it sees there."""
 
     map_from_body: Array
     placed: Alignment
@@ -101,6 +102,21 @@ class SessionPlace:
     @property
     def figures(self) -> str:
         return f"of {self.seen.cells} parts of the map expected there it sees {self.seen.seen}"
+
+    @property
+    def evidence(self) -> MembershipEvidence:
+        return MembershipEvidence(
+            fixes=len(self.placed.fixes),
+            places=self.placed.places,
+            cells_expected=self.seen.cells,
+            cells_seen=self.seen.seen,
+            seen_share=round(self.seen.share, 4),
+            share_low=round(self.seen.low, 4),
+            share_high=round(self.seen.high, 4),
+            error_rate=self.seen.error_rate,
+            competitor_share=self.competitor_share,
+            priors_off_m=self.priors_off_m,
+        )
 
 
 @dataclass(frozen=True)
@@ -137,7 +153,7 @@ class MembershipTest:
         self.tried = 0
 
     def locate(self) -> SessionPlace | Membership:
-        """Return the session's pose if fixes give one and no other is similar. The map's confirmation there is judged later."""
+        """Return the session's pose if fixes give one, no other is similar, and its view of the map does not contradict it there."""
         session, settings, by_priors = self._session, self._settings, self._session.by_priors
         ks = _spread(range(len(session.survey_from_body)), settings.fix_keyframes)
         if by_priors is not None:  # plus as many that priors put near a place of the map
@@ -154,8 +170,7 @@ class MembershipTest:
             most = found[0] if found else Alignment((), np.eye(4), 0)
             return Membership(
                 f"it was not found in the map: at most {len(most.fixes)} fixes of {len(ks)} keyframes at {most.places} places agree "
-                f"on its pose, {settings.min_fixes} at {settings.min_places} are needed; drive a longer way through places "
-                "that are in the map, the same way round",
+                f"on its pose, {settings.min_fixes} at {settings.min_places} are needed; {_DRIVE_ON}",
                 evidence=MembershipEvidence(len(most.fixes), most.places, error_rate=settings.join_error_rate),
             )
         # At the priors' pose there may be few fixes: most of it is new, and a similar place in the map may have more.
@@ -167,8 +182,12 @@ class MembershipTest:
             seen = self.confirmation(map_from_body)
             places.append(SessionPlace(map_from_body, placed, believed, seen, priors_off_m))
         chosen = self._chosen(places)
-        best = max(places, key=lambda one: len(one.placed.fixes)) if isinstance(chosen, Membership) else chosen
-        return self._broken(best, found) or chosen
+        if isinstance(chosen, Membership):
+            return self._broken(max(places, key=lambda one: len(one.placed.fixes)), found) or chosen
+        held = self._broken(chosen, found)
+        if held is None and contradicts(chosen.seen):
+            held = self.judged(chosen)
+        return held or chosen
 
     def _broken(self, chosen: SessionPlace, found: Sequence[Alignment]) -> Membership | None:
         """Return why a session is held of which some keyframes agree on another place than its own motion gives them.
@@ -193,7 +212,7 @@ class MembershipTest:
                 f"its motion is broken: {len(ks)} of its keyframes, the first after {ks[0] / len(linked):.0%} of them, agree on a place "
                 f"{off_m:.1f} m from where it puts them; it slipped, was lifted, or its stamps are wrong: drive again, or build its parts "
                 "alone, with --frames",
-                evidence=self.evidence(chosen, chosen.seen),
+                evidence=chosen.evidence,
             )
         return None
 
@@ -231,43 +250,24 @@ class MembershipTest:
         ]
         return confirmation(view.points_map, looks, self._firm, self._settings.join_error_rate)
 
-    def evidence(self, located: SessionPlace, seen: Confirmation) -> MembershipEvidence:
-        """Return the figures of a pose with this confirmation."""
-        return MembershipEvidence(
-            fixes=len(located.placed.fixes),
-            places=located.placed.places,
-            cells_expected=seen.cells,
-            cells_seen=seen.seen,
-            seen_share=round(seen.share, 4),
-            share_low=round(seen.low, 4),
-            share_high=round(seen.high, 4),
-            error_rate=self._settings.join_error_rate,
-            competitor_share=located.competitor_share,
-            priors_off_m=located.priors_off_m,
-        )
-
-    def judged(self, located: SessionPlace, seen: Confirmation) -> Membership | None:
-        """Return why a session with this confirmation is not joined; None if it is."""
+    def judged(self, place: SessionPlace) -> Membership | None:
+        """Return why a session with the confirmation there is not joined; None if it is."""
+        seen = place.seen
         if _speaks_for_itself(seen):
             return None
-        located = replace(located, seen=seen)
-        evidence = self.evidence(located, seen)
         if not contradicts(seen):
             bounds = f"{seen.low:.0%} to {seen.high:.0%} where more than {_SHARED_SHARE:.0%} certainly, and half in total, are needed"
-            return Membership(
-                f"it is not certain that it belongs here: {located.figures}, {bounds}; drive a longer way through places that are in the "
-                "map, the same way round",
-                evidence=evidence,
-            )
-        figures = f"{located.figures}, at most {seen.high:.0%} where half is needed"
-        if located.priors_off_m is None:
+            reason = f"it is not certain that it belongs here: {place.figures}, {bounds}; {_DRIVE_ON}"
+            return Membership(reason, evidence=place.evidence)
+        figures = f"{place.figures}, at most {seen.high:.0%} where half is needed"
+        if place.priors_off_m is None:
             return Membership(
                 f"the most similar place is not its own: {figures}; it was recorded elsewhere, or where or in a direction in which "
                 "the map was not: drive past a dock, the same way round as the survey, or build it as another --site",
-                evidence=evidence,
+                evidence=place.evidence,
             )
         reason = f"it was recorded elsewhere, or all has changed: {figures}; build it as another --site"
-        return Membership(reason, MembershipVerdict.FOREIGN, evidence)
+        return Membership(reason, MembershipVerdict.FOREIGN, place.evidence)
 
     def _chosen(self, found: list[SessionPlace]) -> SessionPlace | Membership:
         """Return the pose with the most evidence; undecided if another is as good and no position prior distinguishes them."""
@@ -283,27 +283,25 @@ class MembershipTest:
         chosen = near[0] if len(alike) > 1 and len(near) == 1 else best
         competitor_share = max((round(one.seen.share, 4) for one in others), default=None)
         chosen = replace(chosen, competitor_share=competitor_share)
-        evidence = self.evidence(chosen, chosen.seen)
         if len(alike) > 1 and len(near) != 1:
             seen = " and ".join(f"{one.seen.seen} of {one.seen.cells}" for one in alike[:2])
             return Membership(
                 f"{len(alike)} places of the map look alike: it sees {seen} parts of the map there; drive on to where they "
                 "differ, or past a dock",
-                evidence=evidence,
+                evidence=chosen.evidence,
             )
         if chosen.priors_off_m is None or chosen.is_where_priors_say:
             return chosen
         if contradicts(chosen.seen):
             return Membership(
                 f"it was not found where its docks are, and the most similar place, {chosen.priors_off_m:.1f} m from there, is "
-                f"not its own: {chosen.figures}; drive a longer way through places that are in the map, the same way round, or build it "
-                "as another --site",
-                evidence=evidence,
+                f"not its own: {chosen.figures}; {_DRIVE_ON}, or build it as another --site",
+                evidence=chosen.evidence,
             )
         return Membership(
             f"its docks and its view of the map give places {chosen.priors_off_m:.1f} m apart: correct the docks' positions, or leave "
             "them out",
-            evidence=evidence,
+            evidence=chosen.evidence,
         )
 
 

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import AnyArray, Array, se3_inverse
 from fleetmap.relocalization.landmark_visibility import Rows
-from mapserver.survey.finish.map_assembly import cut_patches, medoid_descriptors, point_information
+from mapserver.survey.finish.map_assembly import cut_patches, medoid_descriptors, point_sigmas_m
 from mapserver.survey.merge.base_map import BaseMap, as_recorded
 from mapserver.survey.merge.landmark_persistence import LandmarkCounts, missed_since
 from mapserver.survey.state import Keyframe, Landmarks
@@ -58,10 +58,7 @@ def merged(
     ids = np.where(is_new, whole.next_landmark_id + np.cumsum(is_new) - 1, base.map.landmark_ids[rows])
     descriptors = medoid_descriptors(added, keyframes)
     descriptors[~is_new] = base.descriptors[rows[~is_new]]  # robots match and already have the old one
-    cameras, has_depth = change.map_from_cam[added.obs_keyframe], np.isfinite(added.obs_pixels[:, 2])
-    observations = (added.obs_landmark, has_depth, added.obs_sigma_px)
-    information = point_information(base.camera, cameras, added.points_map, *observations)
-    sigmas_m = 1.0 / np.sqrt(np.maximum(np.linalg.eigvalsh(information)[:, 0], 1e-6))
+    sigmas_m = point_sigmas_m(base.camera, change.map_from_cam, added)
     offered = (per_keyframe >= min_place_landmarks) & ~np.asarray(no_place)
     came = np.zeros(len(added.points_map), np.uint32)
     history = History(

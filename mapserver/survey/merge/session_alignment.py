@@ -6,12 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, se3_adjoint, se3_inverse, turn_both
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.relocalizer import Fix, Relocalizer
 from fleetmap.time_sliced import finished
 from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMarginals
-from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, optimize_pose_graph
+from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
 
 _WIDEST_PX = 60.0  # window size at which a descriptor still finds its feature more often than another one
 _ANY_TURN_RAD = 0.5  # beyond which two fixes always disagree
@@ -58,9 +58,7 @@ def find_fixes(relocalizer: Relocalizer, images: Images, ks: Sequence[int], body
 
 def _at_body(k: int, fix: Fix, body_from_cam: Array) -> SessionFix:
     """Return the fix of keyframe k, its covariance converted from map axes to the camera's and then to the body."""
-    turn = np.zeros((6, 6))
-    turn[:3, :3] = turn[3:, 3:] = fix.map_from_cam[:3, :3].T
-    carry = adjoint(body_from_cam) @ turn
+    carry = se3_adjoint(body_from_cam) @ turn_both(fix.map_from_cam[:3, :3].T)
     return SessionFix(
         k, fix.map_from_cam @ se3_inverse(body_from_cam), carry @ fix.cov_rot_trans @ carry.T, fix.inliers
     )
@@ -110,7 +108,7 @@ def _agreeing(seed: int, fixes: Sequence[SessionFix], survey_from_body: Array, c
     covariances = chain.relative_covs(own.k, numbers[near])
     best: dict[int, tuple[float, int]] = {}
     for row, covariance in zip(near.tolist(), covariances, strict=True):
-        carry = adjoint(measured[row])
+        carry = se3_adjoint(measured[row])
         spread = covariance + own.cov_rot_trans + carry @ fixes[row].cov_rot_trans @ carry.T + _MAP_SHAPE
         squared = float(innovation[row] @ np.linalg.solve(spread, innovation[row]))
         if squared < min(CHI2_6_0999, best.get(fixes[row].k, (np.inf, 0))[0]):

@@ -90,7 +90,13 @@ def improved(
             assert isinstance(noise, gtsam.noiseModel.Gaussian)
             weaker = gtsam.noiseModel.Gaussian.SqrtInformation(noise.R() * np.sqrt(weight))
             graph.push_back(loop.cloneWithNewNoiseModel(weaker))
+    return descended(graph, values, steps)[0]
+
+
+def descended(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, steps: int) -> tuple[gtsam.Values, int]:
+    """Return the values after at most `steps` of Levenberg-Marquardt, and their number."""
     settings = gtsam.LevenbergMarquardtParams()
     settings.setLinearSolverType("MULTIFRONTAL_CHOLESKY")
     settings.setMaxIterations(steps)
-    return gtsam.LevenbergMarquardtOptimizer(graph, values, settings).optimize()
+    optimizer = gtsam.LevenbergMarquardtOptimizer(graph, start, settings)
+    return optimizer.optimize(), int(optimizer.iterations())

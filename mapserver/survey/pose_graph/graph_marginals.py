@@ -6,28 +6,20 @@ matrix products without factorisation, and an accepted loop is an update. First 
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from fleetmap.features.matching import Indices
-from fleetmap.geometry import Array, se3_inverse, se3_log, so3_left_jacobian
+from fleetmap.geometry import Array, se3_adjoint, se3_inverse, se3_log, so3_left_jacobian
 from mapserver.survey.pose_graph.chain_covariance import ChainCovariance
-from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint, check_edges, optimize_pose_graph
+from mapserver.survey.pose_graph.pose_graph import PoseEdge, check_edges, optimize_pose_graph
+from mapserver.survey.state import Mask
 
 CHI2_3_0999 = 16.266  # 0.999 of chi-square with 3 degrees of freedom: a position
 CHI2_6_0999 = 22.458  # with 6: a pose
 _FIRST_ORDER_RAD = 0.5  # a loop that rotates the graph further must not be added to first order
-
-
-class Gate(NamedTuple):
-    """Of keyframes j (M,): may they be within reach of keyframe i; is i_from_j known as well as asked, in all directions at once."""
-
-    reachable: NDArray[np.bool_]
-    known: NDArray[np.bool_]
 
 
 class GraphMarginals:
@@ -52,7 +44,7 @@ class GraphMarginals:
         chain, others = _chain_and_others(len(map_from_body), edges)
         steps = [np.zeros((6, 6)), *(self._cov_map(edge) for edge in chain)]
         self._covariance = ChainCovariance(np.cumsum(steps, axis=0))
-        self._learned = 0
+        self.learned = 0  # edges besides those of the chain
         for edge in others:
             self._measure(edge)
 
@@ -62,11 +54,6 @@ class GraphMarginals:
         placed = self._map_from_body.copy()
         placed[:, :3, 3] += self._middle_m
         return placed
-
-    @property
-    def learned(self) -> int:
-        """Number of edges besides those of the chain."""
-        return self._learned
 
     def add(self, edge: PoseEdge) -> None:
         """Add an edge, such as a loop just accepted: it narrows the covariances and moves the graph.
@@ -79,7 +66,7 @@ class GraphMarginals:
             solved = optimize_pose_graph(self.map_from_body, self._edges, robust=False)
             self._linearise(solved.map_from_body, self._edges)
             return
-        said_map = adjoint(self._map_from_body[edge.i]) @ self._innovation(edge)
+        said_map = se3_adjoint(self._map_from_body[edge.i]) @ self._innovation(edge)
         self._map_from_body = _moved(self._map_from_body, self._measure(edge) @ said_map)
 
     def relative_cov(self, i: int, j: int) -> Array:
@@ -89,26 +76,25 @@ class GraphMarginals:
     def relative_covs(self, i: int, js: Indices) -> Array:
         """Return (M, 6, 6) covariances of i_from_j for each j of js (M,)."""
         cov_map = self._covariance.of_differences(i, js)
-        i_from_map = adjoint(se3_inverse(self._map_from_body[i]))
+        i_from_map = se3_adjoint(se3_inverse(self._map_from_body[i]))
         return np.asarray(i_from_map @ cov_map @ i_from_map.T)
 
-    def gate(self, i: int, js: Indices, reach_m: float | Array, sigmas: Array) -> Gate:
-        """Return what one query of the covariances says about keyframes js (M,); sigmas (6,) of `known`."""
+    def gate(self, i: int, js: Indices, reach_m: float | Array, sigmas: Array) -> tuple[Mask, Mask]:
+        """Return (M,) which keyframes js are `reachable`, and for which i_from_j is known to sigmas (6,) in all directions at once.
+
+        Both by one query of the covariances.
+        """
         covariances = self.relative_covs(i, js)
         known = np.linalg.eigvalsh(covariances / (sigmas[:, None] * sigmas))[:, -1] < 1.0
-        return Gate(self._may_reach(i, js, reach_m, covariances, CHI2_3_0999), known)
+        return self.reachable(i, js, reach_m, covariances), known
 
-    def reachable(self, i: int, js: Indices, reach_m: float | Array, chi2: float = CHI2_3_0999) -> NDArray[np.bool_]:
+    def reachable(self, i: int, js: Indices, reach_m: float | Array, covariances: Array | None = None) -> Mask:
         """Return (M,) True if keyframe j may be within `reach_m` of keyframe i, given the uncertainty of their distance.
 
-        True if (distance - reach)^2 / variance of the distance is at most `chi2`: no position within the reach is
-        nearer than that in Mahalanobis distance, so no possible one is excluded.
+        True if (distance - reach)^2 / variance of the distance is within 0.999 of chi-square: no position within the reach is
+        nearer than that in Mahalanobis distance, so no possible one is excluded. covariances: `relative_covs`, if known.
         """
-        return self._may_reach(i, js, reach_m, self.relative_covs(i, js), chi2)
-
-    def _may_reach(
-        self, i: int, js: Indices, reach_m: float | Array, covariances: Array, chi2: float
-    ) -> NDArray[np.bool_]:
+        covariances = self.relative_covs(i, js) if covariances is None else covariances
         positions_map = self._map_from_body[:, :3, 3]
         apart = (positions_map[js] - positions_map[i]) @ self._map_from_body[i, :3, :3]  # in the axes of i
         distance_m = np.linalg.norm(apart, axis=1)
@@ -116,7 +102,7 @@ class GraphMarginals:
         direction = apart / np.maximum(distance_m, 1e-12)[:, None]
         # A perturbation (r, t) moves j by r x apart + t; the first part is perpendicular to the direction.
         variance = np.einsum("ma,mab,mb->m", direction, covariances[:, 3:, 3:], direction)
-        return np.asarray(beyond_m**2 <= chi2 * variance)
+        return np.asarray(beyond_m**2 <= CHI2_3_0999 * variance)
 
     def innovation_squared(self, edge: PoseEdge) -> float:
         """Return the squared Mahalanobis distance, 6 degrees of freedom, of a measured edge from the graph's prediction.
@@ -151,12 +137,12 @@ class GraphMarginals:
 
     def _cov_map(self, edge: PoseEdge) -> Array:
         """Return (6, 6) covariance of an edge, of a perturbation in map axes."""
-        map_from_i = adjoint(self._map_from_body[edge.i])
+        map_from_i = se3_adjoint(self._map_from_body[edge.i])
         return np.asarray(map_from_i @ edge.cov_rot_trans @ map_from_i.T)
 
     def _measure(self, edge: PoseEdge) -> Array:
         """Return (K, 6, 6) displacement of each keyframe per innovation of the edge, which is then part of the graph."""
-        self._learned += 1
+        self.learned += 1
         return self._covariance.measure(edge.i, edge.j, self._cov_map(edge))
 
 

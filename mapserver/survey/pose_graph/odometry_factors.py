@@ -78,7 +78,7 @@ def chain_edges(odometry: OdometryPass, state: SurveyState) -> list[PoseEdge]:
 
 def _neighbours(odometry: OdometryPass) -> Iterator[tuple[int, int, int]]:
     """Yield number of each keyframe but the last, its frame and that of the next one."""
-    for k, (a, b) in enumerate(pairwise(keyframe.frame_index for keyframe in odometry.keyframes)):
+    for k, (a, b) in enumerate(pairwise(odometry.keyframe_frames)):
         yield k, a, b
 
 

@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.sensors.samples import PositionPrior
@@ -135,7 +134,7 @@ def judged_priors(priors: Sequence[PriorTerm], map_from_body: Array) -> tuple[li
 
 def _usable(priors: Sequence[PositionPrior], odometry: OdometryPass) -> list[PositionPrior]:
     """Return the priors of devices with known position in the plane and a frame near in time."""
-    stamps_ns = _stamps_ns(odometry)
+    stamps_ns = odometry.stamps_ns
     return [
         prior
         for prior in priors
@@ -149,8 +148,7 @@ def _terms(
     priors: Sequence[PositionPrior], base_from_body: Array, odometry: OdometryPass, map_from_body: Array
 ) -> list[PriorTerm]:
     """Return a term for each usable prior, at the keyframe nearest in time; map_from_body (K, 4, 4)."""
-    stamps_ns = _stamps_ns(odometry)
-    frames = np.array([keyframe.frame_index for keyframe in odometry.keyframes])
+    stamps_ns, frames = odometry.stamps_ns, np.array(odometry.keyframe_frames)
     found = []
     for prior in priors:
         frame = int(np.argmin(np.abs(stamps_ns - prior.stamp_ns)))
@@ -168,10 +166,6 @@ def _terms(
             covariance = covariance + turned @ edge_covariance(odometry, first, last) @ turned.T
         found.append(PriorTerm(k, map_from_k, np.asarray(np.linalg.inv(covariance), np.float64)))
     return found
-
-
-def _stamps_ns(odometry: OdometryPass) -> NDArray[np.int64]:
-    return np.array([estimate.stamp_ns for estimate in odometry.estimates], np.int64)
 
 
 def _one_a_visit(priors: Sequence[PositionPrior], terms: Sequence[PriorTerm], marginals: GraphMarginals) -> list[int]:
@@ -237,9 +231,6 @@ def _edge(reference: PriorTerm, term: PriorTerm) -> PoseEdge:
 
 def _finite(prior: PositionPrior) -> Array:
     """Return its covariance (6, 6) with large variances instead of infinite ones, which are uncorrelated."""
-    variances = np.diag(prior.cov_rot_trans)
-    finite = np.where(np.isfinite(prior.cov_rot_trans), prior.cov_rot_trans, 0.0)
-    unknown = ~np.isfinite(variances)
-    finite[unknown] = finite[:, unknown] = 0.0
-    finite[unknown, unknown] = _UNKNOWN_VARIANCE[unknown]
-    return finite
+    covariance, known = prior.cov_rot_trans, np.isfinite(np.diag(prior.cov_rot_trans))
+    finite = np.where(np.isfinite(covariance) & known & known[:, None], covariance, 0.0)
+    return np.asarray(finite + np.diag(np.where(known, 0.0, _UNKNOWN_VARIANCE)))

@@ -1,10 +1,12 @@
 """Selection of keyframe pairs to match, and checks of the measured motion against the predicted one."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from mapserver.survey.executor import SERIAL, Executor, in_batches
@@ -15,7 +17,6 @@ from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PairTask, Pred
 _NEAR_CANDIDATES = 40
 _BATCH = 32  # pairs: 0.1 s of work; sending their twenty keyframes costs a few milliseconds
 _MAX_VIEW_ANGLE_DEG = 75.0
-_NOBODY: list[int] = []
 
 
 class PairFinder:
@@ -27,13 +28,13 @@ class PairFinder:
         self._inputs = MatchInputs([k.without_pictures() for k in posed.images], posed.rig.camera, settings)
         self._shared = replace(self._inputs, keyframes={})
 
-    def candidates(self, *, previous: int, only_near: int | None = None) -> list[tuple[int, int]]:
+    def candidates(self, only_near: int | None = None) -> list[tuple[int, int]]:
         """Return pairs of images (i, j), i < j: those of a camera in the last few keyframes, and the most covisible by predicted view.
 
         only_near: maximum distance in keyframes, before loops have been closed.
         """
         positions, axes = self._map_from_cam[:, :3, 3], self._map_from_cam[:, :3, 2]
-        settings, numbers = self._settings, self._posed.numbers
+        settings, numbers, previous = self._settings, self._posed.numbers, self._settings.previous
         reach_m = 2.0 * np.array([image.median_depth_m for image in self._posed.images])
         around = None if only_near is not None else NearPlaces(positions, reach_m)
         found: list[tuple[int, int]] = []
@@ -64,62 +65,43 @@ class PairFinder:
         allowed_m: Callable[[int, int], float],
         *,
         rotation_sigma_rad: float | None,
-        is_known: bool = True,
         progress: Callable[[int], None],
     ) -> list[PairMatch]:
         """Return verified matches whose measured motion agrees with the predicted one to within allowed_m of their keyframes."""
-        predictions: list[_Prediction] = []
+        predictions: list[tuple[int, int, PredictedMotion]] = []
         for i, j in candidates:
             j_from_i = se3_inverse(self._map_from_cam[j]) @ self._map_from_cam[i]
-            predictions.append((i, j, PredictedMotion(j_from_i, rotation_sigma_rad, is_known)))
-        matches, number = [], 0
-        batches: list[list[_Prediction]] = in_batches(predictions, _BATCH)
-        tasks = (PairTask.of(batch, self._inputs) for batch in batches)
-        for batch, found in zip(batches, self._executor.map(match_task, self._shared, tasks), strict=True):
-            for (i, j, predicted), match in zip(batch, found, strict=True):
-                if match is not None:
-                    most_m = allowed_m(int(self._keyframe[i]), int(self._keyframe[j]))
-                    if _agrees(match.j_from_i, predicted.j_from_i, most_m):
-                        matches.append(match)
-                progress(number)
-                number += 1
+            predictions.append((i, j, PredictedMotion(j_from_i, rotation_sigma_rad, is_known=True)))
+        matches = []
+        tasks = (PairTask.of(batch, self._inputs) for batch in in_batches(predictions, _BATCH))
+        found = chain.from_iterable(self._executor.map(match_task, self._shared, tasks))
+        for number, ((i, j, predicted), match) in enumerate(zip(predictions, found, strict=True)):
+            if match is not None:
+                most_m = allowed_m(int(self._keyframe[i]), int(self._keyframe[j]))
+                if _agrees(match.j_from_i, predicted.j_from_i, most_m):
+                    matches.append(match)
+            progress(number)
         return matches
 
 
 class NearPlaces:
     """Places (K, 3) that can reach each other, by reaches (K,): a query costs the near places, not the whole site.
 
-    Each lies in a cell at least as wide as its reach; widths double from level to level.
+    Those whose reaches differ by less than a factor of two are in one tree.
     """
 
     def __init__(self, positions_m: Array, reach_m: Array) -> None:
         self._positions_m, self._reach_m = positions_m, reach_m
-        least_m = max(float(np.median(reach_m)), 1e-3)
-        self._widths_m = least_m * 2.0 ** np.ceil(np.log2(np.maximum(reach_m / least_m, 1.0)))
-        # Limit of keyframes in the grid, so that later ones are not queried
-        self._cells: dict[float, dict[tuple[int, int], list[int]]] = {}
-        self._filled = 0
+        levels = np.ceil(np.log2(np.maximum(reach_m, 1e-3)))
+        numbers = [np.flatnonzero(levels == level) for level in np.unique(levels)]
+        self._trees = [(own, cKDTree(positions_m[own]), float(reach_m[own].max())) for own in numbers]
 
     def before(self, j: int, until: int) -> NDArray[np.int64]:
-        """Return ascending numbers below `until` of all that may reach j or be reached from it. `until` must not decrease."""
-        for k in range(self._filled, until):
-            width_m = float(self._widths_m[k])
-            x, y = np.floor(self._positions_m[k, :2] / width_m).astype(np.int64).tolist()
-            self._cells.setdefault(width_m, {}).setdefault((x, y), []).append(k)
-        self._filled = max(self._filled, until)
-        found: list[int] = []
-        for width_m, cells in self._cells.items():
-            reach_m, place_m = max(float(self._reach_m[j]), width_m), self._positions_m[j, :2]
-            low, high = (np.floor((place_m + side * reach_m) / width_m).astype(np.int64) for side in (-1.0, 1.0))
-            (x, y), (columns, rows) = low.tolist(), (high - low + 1).tolist()
-            around: Iterable[list[int]] = cells.values()
-            if columns * rows < len(cells):
-                around = [cells.get((x + n % columns, y + n // columns), _NOBODY) for n in range(columns * rows)]
-            found += [k for cell in around for k in cell]
-        return np.array(sorted(found), np.int64)
-
-
-_Prediction = tuple[int, int, PredictedMotion]
+        """Return ascending numbers below `until` of all that may reach j or be reached from it."""
+        place_m, reach_m = self._positions_m[j], float(self._reach_m[j])
+        near = [own[tree.query_ball_point(place_m, max(reach_m, most_m))] for own, tree, most_m in self._trees]
+        found = np.sort(np.concatenate(near))
+        return found[: np.searchsorted(found, until)]
 
 
 def _agrees(measured: Array, predicted: Array, allowed_m: float) -> bool:

@@ -81,7 +81,7 @@ def build_landmarks(
     table, points_cam = _tracks_from_reference(posed.images, tracks, is_redundant)
     if not len(table):
         return Landmarks.empty()
-    reference = posed.map_from_cam[table[_is_first(table), 0]]
+    reference = posed.map_from_cam[table[np.unique(_reference_rows(table)), 0]]
     points_map = np.einsum("nij,nj->ni", reference[:, :3, :3], points_cam) + reference[:, :3, 3]
     pixels, sigmas = _observe(posed, table, points_map, settings, executor)
     columns = posed.keyframe[table[:, 0]], posed.camera[table[:, 0]], table[:, 1], table[:, 2]
@@ -99,7 +99,7 @@ def refine_observations(
     images, map_from_cam = posed.numbers[marks.obs_keyframe, marks.obs_camera], posed.map_from_cam
     table = np.column_stack([images, marks.obs_landmark, marks.obs_feature])
     anew = np.zeros(len(marks.points_map), bool)
-    reference = table[np.maximum.accumulate(np.where(_is_first(table), np.arange(len(table)), 0)), 0]
+    reference = table[_reference_rows(table), 0]
     for start in range(0, len(table), _ROWS):  # rotations of a site's observations would be gigabytes
         part = slice(start, start + _ROWS)
         points, seen = marks.points_map[table[part, 1]], (table[part, 0], reference[part])
@@ -127,9 +127,10 @@ def _warps(
     return np.asarray(cam_from_map[own, :3, :3] @ map_from_cam[reference, :3, :3]), np.asarray(scale)
 
 
-def _is_first(table: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return (M,) True for observations that are the first of their landmark."""
-    return np.asarray(np.diff(table[:, 1], prepend=-1) != 0)
+def _reference_rows(table: NDArray[np.int64]) -> Indices:
+    """Return (M,) the row of each observation's reference, the first one of its landmark."""
+    is_first = np.diff(table[:, 1], prepend=-1) != 0
+    return np.maximum.accumulate(np.where(is_first, np.arange(len(table)), 0))
 
 
 def _tracks_from_reference(
@@ -165,8 +166,7 @@ def _observe(
     posed: RigImages, table: NDArray[np.int64], points_map: Array, settings: SurveySettings, executor: Executor
 ) -> tuple[Array, Array]:
     """Return pixels (M, 3) and sigmas (M, 2) of observations (image, landmark, feature), references first in each landmark."""
-    images, map_from_cam, is_reference = posed.images, posed.map_from_cam, _is_first(table)
-    reference_row = np.maximum.accumulate(np.where(is_reference, np.arange(len(table)), 0))
+    images, map_from_cam, reference_rows = posed.images, posed.map_from_cam, _reference_rows(table)
     groups = in_batches(np.unique(table[:, 0]).tolist(), _BATCH)
     by_image = np.argsort(table[:, 0], kind="stable")
     firsts = np.searchsorted(table[by_image, 0], [group[0] for group in groups])
@@ -174,11 +174,10 @@ def _observe(
 
     def batches() -> Iterator[_ObservationBatch]:
         for group, rows in zip(groups, rows_of, strict=True):
-            references = table[reference_row[rows]]
-            sources = np.unique(references[:, 0]).tolist()
-            known = {k: images[k].with_pyramid() for k in sorted({*group, *sources})}
-            at = {k: map_from_cam[k] for k in known}
-            yield _ObservationBatch(table[rows], references, is_reference[rows], points_map[table[rows, 1]], known, at)
+            references = table[reference_rows[rows]]
+            known = sorted({*group, *references[:, 0].tolist()})
+            posed_images = {k: (images[k].with_pyramid(), map_from_cam[k]) for k in known}
+            yield _ObservationBatch(table[rows], references, points_map[table[rows, 1]], posed_images)
 
     pixels, sigmas = np.empty((len(table), 3)), np.empty((len(table), 2))
     found = executor.map(_observe_batch, settings, batches())
@@ -189,41 +188,34 @@ def _observe(
 
 @dataclass(frozen=True, slots=True)
 class _ObservationBatch:
-    """Observations (M, 3) in some images, their references (M, 3), a mask of the references among them, their landmarks,
-    and the required images and poses."""
+    """Observations (M, 3) in some images, their references (M, 3), their landmarks (M, 3), and the required images with map_from_cam."""
 
     table: NDArray[np.int64]
     references: NDArray[np.int64]
-    is_reference: NDArray[np.bool_]
     points_map: Array
-    images: dict[int, Keyframe]
-    map_from_cam: dict[int, Array]
+    images: dict[int, tuple[Keyframe, Array]]
 
 
 def _observe_batch(settings: SurveySettings, batch: _ObservationBatch) -> tuple[Array, Array]:
     """Return pixels (M, 3) and sigmas (M, 2) of one batch."""
-    noise, align, images = settings.noise, settings.align, batch.images
+    noise, align = settings.noise, settings.align
     limits = align.half_window_px, align.max_shift_px, align.min_correlation
     pixels, sigmas = np.empty((len(batch.table), 3)), np.empty((len(batch.table), 2))
     for k in np.unique(batch.table[:, 0]).tolist():
         rows = np.flatnonzero(batch.table[:, 0] == k)
-        own = images[k]
-        features, references, is_reference = batch.table[rows, 2], batch.references[rows], batch.is_reference[rows]
-        points_map = batch.points_map[rows]
-        left, sigma = (
-            own.features.pixels[features].copy(),
-            noise.descriptor_sigma_px * 1.2 ** own.features.octaves[features].astype(np.float64),
-        )
-        sigma[is_reference] = noise.aligned_sigma_px
-        cam_from_map = se3_inverse(batch.map_from_cam[k])
-        others = np.flatnonzero(~is_reference)
-        others = others[np.argsort(references[others, 0], kind="stable")]
-        sources, starts = np.unique(references[others, 0], return_index=True)
-        for source, inner in zip(sources.tolist(), np.split(others, starts)[1:], strict=True):
-            cam_from_source = cam_from_map @ batch.map_from_cam[source]
-            points_source = transform_points(se3_inverse(batch.map_from_cam[source]), points_map[inner])
-            theirs = _patch_features(images[source], references[inner, 2])
-            ours = _patch_features(own, features[inner])
+        own, map_from_cam = batch.images[k]
+        features, references, points_map = batch.table[rows, 2], batch.references[rows], batch.points_map[rows]
+        left = own.features.pixels[features].copy()
+        sigma = noise.descriptor_sigma_px * 1.2 ** own.features.octaves[features].astype(np.float64)
+        for source in np.unique(references[:, 0]).tolist():
+            inner = np.flatnonzero(references[:, 0] == source)
+            if source == k:
+                sigma[inner] = noise.aligned_sigma_px
+                continue
+            other, map_from_source = batch.images[source]
+            points_source = transform_points(se3_inverse(map_from_source), points_map[inner])
+            theirs, ours = _patch_features(other, references[inner, 2]), _patch_features(own, features[inner])
+            cam_from_source = se3_inverse(map_from_cam) @ map_from_source
             refined = core.align_observations(theirs, ours, points_source, cam_from_source, *limits)
             sure = np.isfinite(refined[:, 0])
             left[inner[sure]] = refined[sure, :2]

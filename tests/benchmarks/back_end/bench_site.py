@@ -25,7 +25,6 @@ import numpy as np
 
 from benchmarks.common.recorded_runs import write_results
 from benchmarks.common.simulated_survey import SimulatedSurvey, drawn_alignment, session_of, simulated_survey
-from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.samples import SensorSet, Trajectory
 from fleetsim.scene.layout import Layout
@@ -33,9 +32,8 @@ from mapserver.config import survey_settings
 from mapserver.drafting.mapped_images import MappedImageStore
 from mapserver.drafting.worker import open_executor
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
-from mapserver.survey.stages import survey_from
-from mapserver.survey.state import ImageStore, MemoryImageStore
-from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
+from mapserver.survey.state import ImageStore
+from mapserver.survey.survey_inputs import SurveyTools
 
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
 _WRONG_M = 0.5 * Layout.bay_m  # half of the smallest step by which the site repeats
@@ -50,9 +48,9 @@ def measure(drive: Path, keyframes: int) -> dict[str, Any]:
 
 def _measure(survey: SimulatedSurvey, store: ImageStore) -> dict[str, Any]:
     Path("/proc/self/clear_refs").write_text("5")  # the peak from now on
-    begun_s, options = time.process_time(), SurveyConfig(SETTINGS, default_vocabulary())
+    begun_s = time.process_time()
     with drawn_alignment(survey), open_executor(1, None) as executor:
-        made = survey_from(survey.odometry, survey.inputs, options, SurveyTools(images=store, executor=executor))
+        made = survey.surveyed(SETTINGS, SurveyTools(images=store, executor=executor))
     cpu_s, peak_mb = time.process_time() - begun_s, _peak_mb()
     truth = survey.map_from_body[[k.frame_index for k in made.odometry.keyframes]]
     return {
@@ -113,7 +111,7 @@ def main() -> None:
     parser.add_argument("--cut", type=Path, default=None, help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.cut is not None:
-        SimulatedSurvey.read(given.drive, given.one, MemoryImageStore()).write(given.cut)
+        SimulatedSurvey.read(given.drive, given.one, ImageStore()).write(given.cut)
         return
     if given.one is not None:
         print(json.dumps(measure(given.drive, given.one)), flush=True)

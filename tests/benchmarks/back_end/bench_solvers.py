@@ -53,9 +53,9 @@ def pose_graphs() -> dict[str, Figures]:
         map_from_body, edges = parse_g2o((DATA / "pose_graphs" / f"{name}.g2o").read_text())
         seconds, own = timed(lambda: optimize_pose_graph(map_from_body, edges, robust=False))  # noqa: B023
         starts = {"odometry": _chained(map_from_body, edges), "shaken": _shaken(own.map_from_body)}
-        costs = [optimize_pose_graph(start, edges, robust=False).cost_after for start in starts.values()]
-        best = min([own.cost_after, *costs])
-        found[name] = {"cost": own.cost_after, "above_best": own.cost_after / best - 1.0, "cpu_s": seconds}
+        costs = [optimize_pose_graph(start, edges, robust=False).cost for start in starts.values()]
+        best = min([own.cost, *costs])
+        found[name] = {"cost": own.cost, "above_best": own.cost / best - 1.0, "cpu_s": seconds}
         found[name] |= _with_wrong_loops(map_from_body, edges, own.map_from_body)
     return found
 

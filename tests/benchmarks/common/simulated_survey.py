@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common.estimator_loop import EstimatorTracker, blank
+from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.features import orb, patch_align
-from fleetmap.geometry import AnyArray, Array
+from fleetmap.geometry import Array
 from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import wheel_between
@@ -28,8 +29,9 @@ from mapserver.survey.executor import Executor
 from mapserver.survey.keyframes.keyframes import set_aside
 from mapserver.survey.odometry_pass import OdometryRun, SampleFeed
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.stages import Survey, adjust_chain, finish_survey
 from mapserver.survey.state import FrameTracks, ImageStore, Keyframe, OdometryPass, Pictures, RigImages
-from mapserver.survey.survey_inputs import SurveyInputs
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyTools
 from mapserver.survey.tracks import tracks
 from support.estimator.simulated_run import EstimatorSession
 
@@ -42,8 +44,8 @@ _TURNING_M = 4.0
 _EVER_NS = -(2**62)
 
 
-class GreyPictures:
-    """An ImageStore in which every keyframe has the same picture: patches are cut of it, nothing is measured in it."""
+class GreyPictures(ImageStore):
+    """A store in which every keyframe has the same picture: patches are cut of it, nothing is measured in it."""
 
     def __init__(self) -> None:
         left = np.random.default_rng(1).integers(0, 255, _SIZE_PX, np.uint8)
@@ -56,13 +58,6 @@ class GreyPictures:
     def get(self, number: int) -> Pictures:
         """The one there is."""
         return self._pictures
-
-    def keep(self, arrays: Sequence[AnyArray]) -> list[AnyArray]:
-        """As they are."""
-        return list(arrays)
-
-    def release(self) -> None:
-        """Nothing to do."""
 
 
 @dataclass(frozen=True)
@@ -77,6 +72,11 @@ class SimulatedSurvey:
     landmarks: list[NDArray[np.uint64]]
     exact_px: list[NDArray[np.float32]]
     map_from_body: Array
+
+    def surveyed(self, settings: SurveySettings, tools: SurveyTools | None = None) -> Survey:
+        """All stages after the odometry."""
+        tools, config = tools or SurveyTools(), SurveyConfig(settings, default_vocabulary())
+        return finish_survey(adjust_chain(self.odometry, self.inputs, settings, tools), self.inputs, config, tools)
 
     def write(self, path: Path) -> None:
         """Writes it so that `read` need not hold more of it in memory than is asked for."""

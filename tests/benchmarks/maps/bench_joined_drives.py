@@ -38,7 +38,7 @@ from mapserver.drafting.survey_recordings import (
     survey_recording,
 )
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
-from mapserver.survey.merge import pipeline
+from mapserver.survey.merge import multi_session
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.joint_adjustment import JointSolution
 from mapserver.survey.merge.multi_session import MapMerger, MergedMap, Session
@@ -125,7 +125,7 @@ def added(base: SurveyMap | None, surveys: Sequence[RecordingSurvey]) -> MergedM
 def noted_moves() -> Iterator[list[Array]]:
     """The distances (B,) by which each adjustment moves the map's keyframes; a published map itself keeps them where that is in doubt."""
     moves = list[Array]()
-    adjust = pipeline.adjust_jointly
+    adjust = multi_session.adjust_jointly
 
     def noting(base: BaseMap, *rest: Any, finely: bool) -> JointSolution:
         solution = adjust(base, *rest, finely=finely)
@@ -134,7 +134,7 @@ def noted_moves() -> Iterator[list[Array]]:
             moves.append(np.linalg.norm((solution.base_from_body - before)[:, :3, 3], axis=1))
         return solution
 
-    with patch.object(pipeline, "adjust_jointly", noting):
+    with patch.object(multi_session, "adjust_jointly", noting):
         yield moves
 
 

@@ -51,7 +51,7 @@ def decided(here: SiteMap, moved: Drive, docks: Array | None) -> dict[str, Any]:
     located = test.locate()
     if isinstance(located, Membership):
         return {"verdict": located.verdict.value, "cells": 0, "share": 0.0, "error_m": None, "reason": located.reason}
-    refused = test.judged(located, located.seen)
+    refused = test.judged(located)
     verdict = MembershipVerdict.JOINED if refused is None else refused.verdict
     off_m = error_m(located.map_from_body, moved.map_from_body, [fix.k for fix in located.placed.fixes])
     figures = {"cells": located.seen.cells, "share": round(located.seen.share, 3), "error_m": round(off_m, 4)}

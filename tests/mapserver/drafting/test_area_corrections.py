@@ -13,7 +13,7 @@ from mapserver.drafting.area_corrections import AreaCorrections, corrections_of
 from mapserver.floor_plan.areas import Area, Areas, Correction, CorrectionKind
 from mapserver.quality.gate import GateSettings, judge
 from mapserver.survey.merge import multi_session
-from mapserver.survey.merge.area_corrections import SurveyLimits, is_before
+from mapserver.survey.merge.changes import SurveyLimits, is_before
 from mapserver.survey.merge.merge import kept
 from mapserver.survey.merge.multi_session import MergedMap
 from mapserver.survey.settings import SurveySettings

@@ -14,7 +14,6 @@ from fleetmap.sensors.samples import Trajectory
 from mapserver.drafting.draft import read_zones
 from mapserver.drafting.progress import ProgressView, StageTimes
 from mapserver.evaluation.trajectory_error import accuracy, check_truth
-from mapserver.survey.finish.map_transform import transform_map
 from mapserver.survey.survey_map import SurveyMap
 from support.storage.map_samples import random_survey
 
@@ -28,11 +27,11 @@ def seen(survey: SurveyMap) -> np.ndarray:
 
 def test_moving_a_survey_changes_nothing_that_was_measured() -> None:
     survey = random_survey(np.random.default_rng(1))
-    there = transform_map(survey, NEW_FROM_MAP)
+    there = survey.transformed(NEW_FROM_MAP)
     np.testing.assert_allclose(seen(there), seen(survey), atol=1e-9)
     np.testing.assert_allclose(there.map_from_body[0], NEW_FROM_MAP @ survey.map_from_body[0], atol=1e-12)
     np.testing.assert_allclose(there.trajectory.frame_from_body, there.map_from_body, atol=1e-12)
-    back = transform_map(there, se3_inverse(NEW_FROM_MAP))
+    back = there.transformed(se3_inverse(NEW_FROM_MAP))
     np.testing.assert_allclose(back.points_map, survey.points_map, atol=1e-9)
     assert there.descriptors is survey.descriptors
 

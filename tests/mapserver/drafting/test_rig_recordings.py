@@ -70,12 +70,12 @@ def test_a_keyframe_has_the_views_of_its_pinhole() -> None:
     single = Rectifier(sides)
     assert rig_of(single).kinds == (CameraKind.STEREO, CameraKind.SINGLE)
     rows = [(0, single.rectify(frames[0]))]
-    (seen,) = next(make_keyframes(rows, used_cameras(single), SurveySettings())).others
+    (seen,) = next(make_keyframes(rows, used_cameras(single), SurveySettings(), SurveyTools())).others
     assert len(seen.features) > 0 and np.isnan(seen.disparities).all()
     one = replace(calibration, cameras=calibration.cameras[1:])
     assert len(used_cameras(Rectifier(one))) == 1
     rows = [(0, frame), *((n, replace(frame, others=(None,))) for n in (1, 2))]
-    first, alone, again = make_keyframes(rows, cameras, SurveySettings())
+    first, alone, again = make_keyframes(rows, cameras, SurveySettings(), SurveyTools())
     assert alone.others[0].image_number == again.others[0].image_number, "one picture of nothing is enough"
     assert alone.image_number != again.image_number and alone.others[0].stamp_ns == frame.stamp_ns
     assert [len(view.features) > 0 for view in first.others] == [True]
@@ -90,7 +90,9 @@ def test_a_shorter_baseline_of_another_view_is_converted_to_the_first_one() -> N
     frame, cameras = rectifier.rectify(frames[0]), used_cameras(rectifier)
     first, (number, rear) = cameras
     short = [first, (number, replace(rear, baseline_m=rear.baseline_m / 2))]
-    (same,), (nearer,) = (next(make_keyframes([(0, frame)], how, SurveySettings())).others for how in (cameras, short))
+    (same,), (nearer,) = (
+        next(make_keyframes([(0, frame)], how, SurveySettings(), SurveyTools())).others for how in (cameras, short)
+    )
     known = np.isfinite(same.points_cam).all(axis=1) & np.isfinite(nearer.points_cam).all(axis=1)
     np.testing.assert_allclose(nearer.points_cam[known], same.points_cam[known] / 2, rtol=1e-9)
 
@@ -101,7 +103,7 @@ def test_depth_of_another_view_is_read_as_disparities_of_the_first_baseline() ->
     rectifier, settings = Rectifier(calibration), SurveySettings()
     assert rig_of(rectifier).kinds == (CameraKind.STEREO, CameraKind.DEPTH)
     rows = [(0, rectifier.rectify(frames[0]))]
-    (rear,) = next(make_keyframes(rows, used_cameras(rectifier), settings)).others
+    (rear,) = next(make_keyframes(rows, used_cameras(rectifier), settings, SurveyTools())).others
     seen = np.flatnonzero(np.isfinite(rear.disparities[:, 0]))
     pixels = rear.features.pixels[seen]
     columns, lines = np.rint(pixels).astype(int).T

@@ -20,9 +20,7 @@ from fleetsim.motion.routes import Route
 from fleetsim.recorder import Order, prepare
 from fleetsim.scenarios import SCENARIOS
 from mapserver.config import survey_settings
-from mapserver.survey.finish.map_transform import transform_map
-from mapserver.survey.stages import Survey, survey_from
-from mapserver.survey.survey_inputs import SurveyConfig
+from mapserver.survey.stages import Survey
 from mapserver.tiles.tiling import tiles_from_survey
 from support.estimator.landmarks import LandmarkField
 from support.estimator.simulated_run import EstimatorSession
@@ -50,13 +48,13 @@ def surveyed(name: str, views: int, rig: str = "front-rear") -> tuple[SimulatedS
     first, *others = driven(name, rig=rig)[:views]
     made = simulated_survey(first, SETTINGS, others)
     with drawn_alignment(made):
-        return made, survey_from(made.odometry, made.inputs, SurveyConfig(SETTINGS, default_vocabulary()))
+        return made, made.surveyed(SETTINGS)
 
 
 def robots_view(made: SimulatedSurvey, done: Survey) -> MapView:
     """The survey as robots have it, in the frame of the truth at its beginning."""
     shift = made.map_from_body[0] @ se3_inverse(done.map.trajectory.frame_from_body[0])
-    tiles = tiles_from_survey(transform_map(done.map, shift))
+    tiles = tiles_from_survey(done.map.transformed(shift))
     return MapView(tiles, default_vocabulary(), done.map.camera.focal_px)
 
 
@@ -140,6 +138,6 @@ def test_the_way_back_is_tied_to_the_way_out_by_the_other_view() -> None:
 def test_the_same_survey_gives_the_same_bytes(views: int) -> None:
     made, done = surveyed(_ALONG, views)
     with drawn_alignment(made):
-        again = survey_from(made.odometry, made.inputs, SurveyConfig(SETTINGS, default_vocabulary()))
+        again = made.surveyed(SETTINGS)
     assert again.map.points_map.tobytes() == done.map.points_map.tobytes()
     assert again.map.map_from_body.tobytes() == done.map.map_from_body.tobytes()

@@ -65,7 +65,7 @@ def surveyed(
     rectifier = Rectifier(rig)
     inputs = SurveyInputs(iter(frames), len(frames), ImuSamples.empty(), rig, rectifier, parts=Parts(frames))
     config = SurveyConfig(msgspec.structs.replace(SETTINGS, segments=segments), default_vocabulary())
-    return survey(inputs, config, SurveyTools(executor=executor, images=images))
+    return survey(inputs, config, SurveyTools(executor=executor, images=images or ImageStore()))
 
 
 @lru_cache(maxsize=1)

@@ -3,8 +3,8 @@
 import numpy as np
 
 from fleetmap.errors import SurveyError
-from fleetmap.geometry import Array, rotation_from_quat_wxyz, se3
-from mapserver.survey.pose_graph.pose_graph import PoseEdge, adjoint
+from fleetmap.geometry import Array, rotation_from_quat_wxyz, se3, se3_adjoint
+from mapserver.survey.pose_graph.pose_graph import PoseEdge
 
 _VERTEX, _EDGE = "VERTEX_SE3:QUAT", "EDGE_SE3:QUAT"
 _ROTATION_FIRST = np.array([3, 4, 5, 0, 1, 2])
@@ -56,5 +56,5 @@ def _edge(i: int, j: int, numbers: Array) -> PoseEdge:
     upper[np.triu_indices(6)] = numbers[7:]
     information = (upper + np.triu(upper, 1).T)[np.ix_(_ROTATION_FIRST, _ROTATION_FIRST)]
     i_from_j = _se3_of(numbers)
-    carried = adjoint(i_from_j)
+    carried = se3_adjoint(i_from_j)
     return PoseEdge(i, j, i_from_j, carried @ np.linalg.inv(information) @ carried.T, is_loop=abs(i - j) != 1)

@@ -15,7 +15,7 @@ from mapserver.plugins.dense_maps.surfel_map import SurfelTiles
 from mapserver.plugins.dense_maps.survey_grid import GridGrower, grow
 from mapserver.plugins.dense_maps.survey_surfels import SurfelGrower
 from mapserver.survey.rig import Rig
-from mapserver.survey.state import MemoryImageStore
+from mapserver.survey.state import ImageStore
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT, WIDTH
 from support.worlds.box_room import ROOM_M, depth_of, stereo_pair
 
@@ -26,7 +26,7 @@ CAMERA = StereoCamera(FOCAL, WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5, BASELINE_M, WIDT
 class Seen:
     frame: RectifiedFrame
     frame_index: int
-    images: MemoryImageStore = field(default_factory=MemoryImageStore)
+    images: ImageStore = field(default_factory=ImageStore)
 
 
 def session_at(places: list[Array], camera: StereoCamera = CAMERA, *, has_depth: bool = False) -> MappedSession:

@@ -98,8 +98,8 @@ def _inertial_terms(times: Array, velocities: Array) -> InertialTerms:
         (k, k + 1, preintegrate(imu, int(stamps[k]), int(stamps[k + 1]), GYRO_BIAS, ACCEL_BIAS, NOISE))
         for k in range(len(times) - 1)
     ]
-    ones = np.ones((len(times), 1))
-    return InertialTerms(velocities.copy(), ones * GYRO_BIAS, ones * ACCEL_BIAS, edges)
+    biases = np.tile(np.r_[GYRO_BIAS, ACCEL_BIAS], (len(times), 1))
+    return InertialTerms(np.column_stack([velocities, biases]), edges)
 
 
 def disturbed(problem: BundleProblem, *, seed: int, rot_rad: float, trans_m: float, points_m: float) -> BundleProblem:
@@ -154,8 +154,7 @@ def plain_residuals(problem: BundleProblem, pose_step: Array, motion_step: Array
 
 
 def _inertial_residuals(inertial: InertialTerms, map_from_body: Array, motion_step: Array) -> list[Array]:
-    velocity = inertial.velocities_map_mps + motion_step[:, :3]
-    gyro, accel = inertial.gyro_bias_radps + motion_step[:, 3:6], inertial.accel_bias_mps2 + motion_step[:, 6:]
+    velocity, gyro, accel = np.split(inertial.motions + motion_step, 3, axis=1)
     parts = []
     for i, j, summed in inertial.edges:
         delta_rot, delta_vel, delta_pos = corrected(summed, gyro[i], accel[i])

@@ -66,8 +66,7 @@ def scene(keyframes: int, seed: int, *, drift: float, outliers: float = 0.0) -> 
         started, keyframe, np.zeros_like(keyframe), landmark, np.arange(len(table), dtype=np.int32), table[:, 2:] + noise,
         np.tile([SIGMA_PX, SIGMA_DISPARITY_PX], (len(table), 1)),
     )  # fmt: skip
-    nothing = np.zeros((keyframes, 3))
-    motion = KeyframeMotion(False, ImuSamples.empty(), None, 0.0, nothing, nothing.copy(), nothing.copy(), [])
+    motion = KeyframeMotion(False, ImuSamples.empty(), None, 0.0, np.zeros((keyframes, 9)), [])
     stamps = np.arange(keyframes, dtype=np.int64) * 100_000_000
     return Scene(
         SurveyState(stamps, guessed.copy(), Rig.of_one(CAMERA, BODY_FROM_CAM), motion, marks),

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.merge.base_map import BaseMap
-from mapserver.survey.merge.guided_matching import Sighting
+from mapserver.survey.merge.guided_matching import Sighting, Sightings
 from mapserver.survey.survey_map import History, SurveyMap
 from support.worlds.bundle_scene import BODY_FROM_CAM, CAMERA, make_scene
 
@@ -23,7 +23,7 @@ class SessionScene:
     map_from_cam: Array
     visible: list[NDArray[np.int64]]
 
-    def sightings(self, points_map: Array, seed: int) -> list[Sighting | None]:
+    def sightings(self, points_map: Array, seed: int) -> Sightings:
         """Noisy observations by the later survey of landmarks now at points_map (N, 3)."""
         rng = np.random.default_rng(seed)
         found: list[Sighting | None] = []
@@ -32,7 +32,7 @@ class SessionScene:
             noise = rng.normal(0, SIGMA_PX, pixels.shape)
             noise[:, 2] = noise[:, 0] - noise[:, 2]
             found.append(Sighting(rows, np.arange(len(rows)), pixels + noise, np.full((len(rows), 2), SIGMA_PX)))
-        return found
+        return Sightings.of(found)
 
 
 def session_scene(seed: int, *, landmarks: int = 300, history: History | None = None) -> SessionScene:

@@ -9,7 +9,7 @@ import scipy.sparse.linalg
 
 from fleetmap import core
 from fleetmap.geometry import AnyArray, Array
-from mapserver.survey.bundle.elimination_order import minimum_degree
+from mapserver.survey.bundle.bundle_adjustment import minimum_degree
 
 Pairs = Callable[[np.random.Generator], list[tuple[int, int]]]
 NODES = 60

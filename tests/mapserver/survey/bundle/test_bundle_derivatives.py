@@ -38,9 +38,7 @@ def _problem(*, inertial: bool, body_from_others: Array = ONE) -> BundleProblem:
         PriorTerm(2, map_from_body[2] @ se3_exp(rng.normal(size=6) * 0.05), root.T @ root + np.eye(6))
     )
     if problem.inertial is not None:
-        problem.inertial.velocities_map_mps += rng.normal(size=(5, 3)) * 0.1
-        problem.inertial.gyro_bias_radps += rng.normal(size=(5, 3)) * 0.01
-        problem.inertial.accel_bias_mps2 += rng.normal(size=(5, 3)) * 0.1
+        problem.inertial.motions += rng.normal(size=(5, 9)) * np.repeat([0.1, 0.01, 0.1], 3)
         mean, sigma = rng.normal(size=9) * 0.1, np.array([np.inf] * 3 + [0.01] * 3 + [0.1] * 3)
         problem.inertial.priors.append(MotionPrior(1, mean, sigma))
     return problem

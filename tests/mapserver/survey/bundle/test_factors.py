@@ -12,6 +12,7 @@ from fleetmap.sensors.samples import ImuSamples
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.problem import BundleProblem, continued
 from mapserver.survey.settings import BundleSettings
+from mapserver.survey.state import turned
 from support.worlds.bundle_gtsam import gtsam_graph
 from support.worlds.bundle_scene import ACCEL_BIAS, GYRO_BIAS, NOISE, Scene, disturbed, make_scene
 from support.worlds.inertial_motion import sample_motion
@@ -23,14 +24,9 @@ def _unknowing(scene: Scene, *, seed: int) -> BundleProblem:
     """0.3 m and 2 degrees off, velocities off, biases unknown and preintegrated as zero."""
     problem = disturbed(scene.problem, seed=seed, rot_rad=0.02, trans_m=0.17, points_m=0.2)
     assert problem.inertial is not None
-    shape = problem.inertial.gyro_bias_radps.shape
-    velocities = scene.velocities_map_mps + np.random.default_rng(seed).normal(size=shape) * 0.3
-    inertial = replace(
-        problem.inertial,
-        velocities_map_mps=velocities,
-        gyro_bias_radps=np.zeros(shape),
-        accel_bias_mps2=np.zeros(shape),
-    )
+    velocities = scene.velocities_map_mps
+    velocities = velocities + np.random.default_rng(seed).normal(size=velocities.shape) * 0.3
+    inertial = replace(problem.inertial, motions=np.pad(velocities, ((0, 0), (0, 6))))
     edges = [
         (i, j, preintegrate(_imu(scene), e.start_ns, e.end_ns, np.zeros(3), np.zeros(3), NOISE))
         for i, j, e in problem.inertial.edges
@@ -52,16 +48,17 @@ def test_sparse_frames_converge_to_the_truth(step_s: float, dense_unknowns: int)
     for _ in range(3):
         result = optimize(problem, settings)
         problem = continued(problem, result)
-        inertial, gyro, accel = problem.inertial, result.gyro_bias_radps, result.accel_bias_mps2
-        assert inertial is not None and gyro is not None and accel is not None
+        inertial = problem.inertial
+        assert inertial is not None
         inertial.edges = [
-            (i, j, preintegrate(_imu(scene), e.start_ns, e.end_ns, gyro[i], accel[i], NOISE))
+            (i, j, preintegrate(_imu(scene), e.start_ns, e.end_ns, *np.split(inertial.motions[i, 3:], 2), NOISE))
             for i, j, e in inertial.edges
         ]
     np.testing.assert_allclose(result.map_from_body, scene.problem.map_from_body, atol=2e-3)
-    np.testing.assert_allclose(result.gyro_bias_radps, np.tile(GYRO_BIAS, (12, 1)), atol=2e-4)
-    np.testing.assert_allclose(result.accel_bias_mps2, np.tile(ACCEL_BIAS, (12, 1)), atol=2e-2)
-    np.testing.assert_allclose(result.velocities_map_mps, scene.velocities_map_mps, atol=1e-2)
+    assert result.motions is not None
+    np.testing.assert_allclose(result.motions[:, 3:6], np.tile(GYRO_BIAS, (12, 1)), atol=2e-4)
+    np.testing.assert_allclose(result.motions[:, 6:], np.tile(ACCEL_BIAS, (12, 1)), atol=2e-2)
+    np.testing.assert_allclose(result.motions[:, :3], scene.velocities_map_mps, atol=1e-2)
 
 
 def _within(dense_unknowns: int) -> BundleSettings:
@@ -80,7 +77,7 @@ def test_gravity_decides_roll_and_pitch() -> None:
         gauge="yaw_position",
         map_from_body=tilted_from_map @ problem.map_from_body,
         points_map=problem.points_map @ tilted_from_map[:3, :3].T + tilted_from_map[:3, 3],
-        inertial=replace(problem.inertial, velocities_map_mps=problem.inertial.velocities_map_mps @ tilt.T),
+        inertial=replace(problem.inertial, motions=turned(problem.inertial.motions, np.tile(tilt, (10, 1, 1)))),
     )
     result = optimize(tilted, PATIENT)
     # compare without yaw: up, as each keyframe sees it
@@ -96,9 +93,9 @@ def test_held_motion_stays() -> None:
     assert problem.inertial is not None
     held = np.array([True, False, False, False, False, False])
     result = optimize(replace(problem, inertial=replace(problem.inertial, fixed=held)), PATIENT)
-    assert result.velocities_map_mps is not None
-    np.testing.assert_array_equal(result.velocities_map_mps[0], scene.velocities_map_mps[0])
-    assert (result.velocities_map_mps[1:] != scene.velocities_map_mps[1:]).all()
+    assert result.motions is not None
+    is_unchanged = result.motions[:, :3] == scene.velocities_map_mps
+    assert is_unchanged[0].all() and not is_unchanged[1:].any()
 
 
 def test_same_optimum_as_gtsam() -> None:

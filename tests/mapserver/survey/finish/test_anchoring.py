@@ -9,7 +9,6 @@ from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp, transfo
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.samples import PositionPrior, Trajectory
 from mapserver.survey.finish.dock_alignment import aligned_by_priors
-from mapserver.survey.finish.map_transform import scaled, transform_map
 from mapserver.survey.odometry_pass import longest_run
 from mapserver.survey.state import OdometryPass
 from mapserver.survey.survey_map import SurveyMap
@@ -50,7 +49,7 @@ def test_two_docks_give_the_metres() -> None:
     assert found is not None
     assert found.scale == pytest.approx(TRUE_SCALE, rel=4 * found.scale_sigma_share)
     assert found.scale_sigma_share < 0.005
-    there = transform_map(scaled(survey, found.scale), found.map_from_survey)
+    there = survey.scaled(found.scale).transformed(found.map_from_survey)
     assert there.scale_known
     assert there.trajectory.positions_m == pytest.approx(
         truth[:, :3, 3], abs=0.25
@@ -69,7 +68,7 @@ def test_docks_that_leave_the_scale_open_change_nothing() -> None:
 
 def test_a_scaled_map_is_seen_by_its_cameras_as_before() -> None:
     survey = random_survey(np.random.default_rng(7))
-    larger = scaled(replace(survey, scale_known=False), 2.5)
+    larger = replace(survey, scale_known=False).scaled(2.5)
     assert larger.scale_known
     for before, after in ((survey, larger),):
         for k in range(len(before.map_from_body)):

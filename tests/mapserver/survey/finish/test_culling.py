@@ -8,9 +8,9 @@ from fleetmap import core
 from fleetmap.features.matching import packed
 from fleetmap.features.orb import Features
 from fleetmap.geometry import Array
-from mapserver.survey.finish.culling import cull, parallax_rad, redundant
+from mapserver.survey.finish.map_assembly import cull, parallax_rad, redundant
 from mapserver.survey.settings import CullSettings
-from mapserver.survey.state import Keyframe, Landmarks, MemoryImageStore
+from mapserver.survey.state import ImageStore, Keyframe, Landmarks
 from support.worlds.corridor_scene import CAMERA, scene
 
 
@@ -24,7 +24,7 @@ def keyframes(count: int, features: int, seed: int = 0) -> list[Keyframe]:
                 np.zeros((features, 2)), np.zeros(features, np.int8), np.zeros(features, np.float32),
                 rng.integers(0, 256, (features, 32), dtype=np.uint8),
             ),
-            np.zeros((features, 2)), np.zeros((features, 3)), MemoryImageStore(), 0,
+            np.zeros((features, 2)), np.zeros((features, 3)), ImageStore(), 0,
         )
         for k in range(count)
     ]  # fmt: skip
@@ -41,25 +41,16 @@ def seen_by(table: Array, landmarks: int) -> Landmarks:
 def test_keyframes_that_repeat_each_other_do_not_all_go() -> None:
     """Eight keyframes see the same forty landmarks: each goes while three others see them, so three stay, the ends among them."""
     table = np.array([(n, k) for n in range(40) for k in range(8)])
-    marks = seen_by(table, 40)
-    gone = redundant(marks, np.zeros(len(table), np.int64), np.ones(40, bool), 8, CullSettings())
+    lasting = np.ones(40, bool)
+    gone = redundant(seen_by(table, 40), np.zeros(len(table), np.int64), lasting, 8, CullSettings())
     assert gone.sum() == 5
     assert not gone[[0, 7]].any()
-
-
-def test_a_keyframe_that_sees_nearer_is_not_repeated_by_others() -> None:
-    """Keyframe 3 sees at octave 0 what the others see at octave 4: from farther, or as larger corners."""
-    table = np.array([(n, k) for n in range(40) for k in range(8)])
-    octaves = np.where(table[:, 1] == 3, 0, 4)
-    gone = redundant(seen_by(table, 40), octaves, np.ones(40, bool), 8, CullSettings())
-    assert not gone[3]
-    assert gone.sum() >= 3
-
-
-def test_what_only_few_see_keeps_its_keyframes() -> None:
-    table = np.array([(n, k) for n in range(40) for k in (n % 8, (n + 1) % 8)])
-    table = table[np.lexsort((table[:, 1], table[:, 0]))]
-    assert not redundant(seen_by(table, 40), np.zeros(len(table), np.int64), np.ones(40, bool), 8, CullSettings()).any()
+    # Keyframe 3 sees at octave 0 what the others see at octave 4: from farther, or as larger corners.
+    finer = redundant(seen_by(table, 40), np.where(table[:, 1] == 3, 0, 4), lasting, 8, CullSettings())
+    assert not finer[3]
+    assert finer.sum() >= 3
+    few = np.array([(n, k) for n in range(40) for k in sorted({n % 8, (n + 1) % 8})])
+    assert not redundant(seen_by(few, 40), np.zeros(len(few), np.int64), lasting, 8, CullSettings()).any()
 
 
 def test_a_double_goes_and_its_neighbours_stay() -> None:

@@ -12,7 +12,7 @@ from mapserver.survey.bundle.bundle_rounds import bundle_rounds
 from mapserver.survey.finish.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
 from mapserver.survey.rig import Rig
 from mapserver.survey.settings import BundleSettings, CullSettings, SurveySettings
-from mapserver.survey.state import Keyframe, Landmarks, MemoryImageStore, RigImages
+from mapserver.survey.state import ImageStore, Keyframe, Landmarks, RigImages
 from mapserver.survey.tracks.tracks import Tracks
 from support.worlds.bundle_scene import make_scene
 from support.worlds.corridor_scene import BODY_FROM_CAM, CAMERA, Scene, scene
@@ -29,7 +29,7 @@ def keyframes(octaves: list[int]) -> list[Keyframe]:
                 np.zeros((FEATURES, 2)), np.full(FEATURES, octave, np.int8), np.zeros(FEATURES, np.float32),
                 np.zeros((FEATURES, 32), np.uint8),
             ),
-            np.zeros((FEATURES, 2)), np.zeros((FEATURES, 3)), MemoryImageStore(), 0,
+            np.zeros((FEATURES, 2)), np.zeros((FEATURES, 3)), ImageStore(), 0,
         )
         for k, octave in enumerate(octaves)
     ]  # fmt: skip
@@ -128,10 +128,8 @@ def laps_of(given: Scene, laps: int, seed: int) -> tuple[Scene, np.ndarray]:
         marks.points_map, keyframe[order], np.zeros_like(keyframe), observed[order], np.arange(len(observed))[order],
         (np.tile(marks.obs_pixels, (laps, 1)) + noise)[order], np.tile(marks.obs_sigma_px, (laps, 1))[order],
     )  # fmt: skip
-    guessed, nothing = np.tile(state.map_from_body, (laps, 1, 1)), np.zeros((laps * count, 3))
-    motion = replace(
-        state.motion, velocities_mps=nothing, gyro_bias_radps=nothing.copy(), accel_bias_mps2=nothing.copy()
-    )
+    guessed = np.tile(state.map_from_body, (laps, 1, 1))
+    motion = replace(state.motion, motions=np.zeros((laps * count, 9)))
     whole = replace(
         state, stamps_ns=np.arange(laps * count, dtype=np.int64) * 100_000_000, map_from_body=guessed, motion=motion,
         landmarks=landmarks,

@@ -62,22 +62,6 @@ SQUARE = np.array([[0, 0], [4, 0], [4, 4], [0, 4.0]])
 BENT = np.array([[10, 0], [14, 0], [14, 4], [13, 4], [13, 1], [11, 1], [11, 4], [10, 4.0]])
 
 
-@pytest.mark.parametrize(
-    ("x", "y", "names"),
-    [
-        (2, 2, {"square"}),
-        (4.001, 2, set()),
-        (10.5, 3, {"bent"}),
-        (12, 0.5, {"bent"}),
-        (12, 3, set()),
-    ],
-)
-def test_positions_are_in_their_zones(x: float, y: float, names: set[str]) -> None:
-    for turn in (1, -1):  # clockwise or not
-        zones = Zones({"square": SQUARE[::turn], "bent": BENT[::turn]})
-        assert zones.at(np.array([x, y, 7.0])) == names
-
-
 def test_only_different_zones_exclude_each_other() -> None:
     zones = Zones({"square": SQUARE, "bent": BENT, "both": np.array([[-1, -1], [20, -1], [20, 2], [-1, 2.0]])})
     in_square, in_bent, outside = np.array([2, 3.0]), np.array([10.5, 3.0]), np.array([50, 50.0])

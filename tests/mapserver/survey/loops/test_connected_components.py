@@ -12,6 +12,7 @@ from mapserver.survey.loops.connected_components import (
     SigmaBetween,
     between_kept,
     find_components,
+    grown_sigma,
     only_kept,
 )
 from mapserver.survey.loops.loops import Loops
@@ -48,7 +49,7 @@ def survey(seen: list[range], loops: list[tuple[int, int]] | None = None) -> Sur
         np.arange(len(seen), dtype=np.int64) * 1_000_000_000, places,
         Rig.of_one(StereoCamera(200.0, 160.0, 120.0, 0.1, 320, 240), np.eye(4)),
         KeyframeMotion(
-            False, ImuSamples.empty(), None, 0.0, each, each, each,
+            False, ImuSamples.empty(), None, 0.0, np.tile(each, 3),
             [RelativeTerm(k, k + 1, np.eye(4), np.eye(6)) for k in range(len(seen) - 1)],
         ),
         marks,
@@ -68,18 +69,55 @@ def chain(first: int, keyframes: int) -> list[range]:
 
 def sigmas(grows_m: list[float]) -> SigmaBetween:
     """Odometry that adds so much, root of summed squares, from each keyframe to the next."""
-    return SigmaBetween(np.concatenate([[0.0], np.cumsum(np.square(grows_m))]))
+    return grown_sigma(np.concatenate([[0.0], np.cumsum(np.square(grows_m))]))
 
 
 BLIND = [range(0), range(0)]
 
 
-def test_an_unbroken_survey_is_one_part_and_stays_as_it_is() -> None:
+def test_an_unbroken_survey_stays_as_it_is() -> None:
     whole = survey(chain(0, 6))
     found = find_components(whole, sigmas([9.0] * 5), 0.1)
-    assert [(p.kept, p.keyframes) for p in found.components] == [(True, 6)]
-    assert not found.stray
     assert only_kept(whole, guessed(whole), Loops(), found.kept)[0] is whole
+
+
+@pytest.mark.parametrize(
+    ("seen", "grows_m", "loops", "parts", "stray"),
+    [
+        (chain(0, 6), [9.0] * 5, [], [(5.0, 6, True)], []),
+        (chain(0, 4) + BLIND + chain(1000, 6), [0.01] * 3 + [0.05] * 3 + [0.01] * 5, [], [(11.0, 12, True)], []),
+        # 0.04 m is within the joining sigma of 0.1 m, three times that is not.
+        (
+            chain(0, 8) + BLIND + chain(1000, 4), [0.01] * 7 + [0.02, 0.05, 5.0] + [0.01] * 3, [],
+            [(8.0, 9, True), (13.0, 4, False)], [(9.0, 1)],
+        ),
+        # The largest part is the one with most that see.
+        (
+            chain(0, 4) + BLIND * 3 + chain(1000, 3), [0.01] * 3 + [5.0] + [0.001] * 8, [],
+            [(3.0, 4, True), (12.0, 9, False)], [],
+        ),
+        # A bridge is as long as the darkness: each step alone would be sure enough.
+        (
+            chain(0, 4) + BLIND * 5 + chain(1000, 6), [0.01] * 3 + [0.05] * 11 + [0.01] * 5, [],
+            [(3.0, 4, False), (19.0, 6, True)], [(13.0, 10)],
+        ),
+        (
+            chain(0, 4) + BLIND + chain(1000, 6), [0.01] * 3 + [5.0] * 3 + [0.01] * 5, [(1, 9)],
+            [(11.0, 10, True)], [(5.0, 2)],
+        ),
+    ],
+    ids=["unbroken", "a blink", "a way into the dark", "many blind", "a long darkness", "a loop"],
+)  # fmt: skip
+def test_parts_are_joined_by_pictures_loops_and_sure_odometry(
+    seen: list[range],
+    grows_m: list[float],
+    loops: list[tuple[int, int]],
+    parts: list[tuple[float, int, bool]],
+    stray: list[tuple[float, int]],
+) -> None:
+    found = find_components(survey(seen, loops), sigmas(grows_m), 0.1)
+    assert [(p.end_s, p.keyframes, p.kept) for p in found.components] == parts
+    assert [(p.end_s, p.keyframes) for p in found.stray] == stray
 
 
 def test_what_lies_beyond_a_long_darkness_is_left_out_and_named() -> None:
@@ -90,9 +128,9 @@ def test_what_lies_beyond_a_long_darkness_is_left_out_and_named() -> None:
     assert "left out: 4 keyframes from 0.0 to 3.0 s" in found.components[0].remark()
     edges = [PoseEdge(0, 3, np.eye(4), np.eye(6), is_loop=True), PoseEdge(6, 9, np.eye(4), np.eye(6), is_loop=True)]
     kept, guess, loops = only_kept(dark, guessed(dark), Loops(edges=edges), found.kept)
-    assert len(kept.stamps_ns) == len(kept.map_from_body) == len(kept.motion.velocities_mps) == 6
+    assert len(kept.stamps_ns) == len(kept.map_from_body) == len(kept.motion.motions) == 6
     assert kept.stamps_ns[0] == 6_000_000_000
-    np.testing.assert_array_equal(kept.motion.gyro_bias_radps[:, 0], np.arange(6, 12))
+    np.testing.assert_array_equal(kept.motion.motions[:, 3], np.arange(6, 12))
     assert [(r.i, r.j) for r in kept.motion.relative] == [(k, k + 1) for k in range(5)]
     assert [(e.i, e.j) for e in loops.edges] == [(0, 3)]
     assert [k.frame_index for k in guess.keyframes] == list(range(12, 24, 2))
@@ -100,41 +138,6 @@ def test_what_lies_beyond_a_long_darkness_is_left_out_and_named() -> None:
     assert (np.bincount(kept.landmarks.obs_landmark) >= 2).all()
     assert set(kept.landmarks.obs_keyframe.tolist()) == set(range(6))
     np.testing.assert_array_equal(between_kept(23, np.arange(0, 23, 2), found.kept), np.arange(23) >= 12)
-
-
-def test_a_blink_is_bridged_by_odometry_and_takes_the_blind_along() -> None:
-    blink = survey(chain(0, 4) + BLIND + chain(1000, 6))
-    found = find_components(blink, sigmas([0.01] * 3 + [0.05] * 3 + [0.01] * 5), 0.1)
-    assert [(p.kept, p.keyframes) for p in found.components] == [(True, 12)]
-    assert not found.stray
-
-
-def test_what_leads_nowhere_is_taken_only_as_far_as_it_is_sure() -> None:
-    """0.04 m is within the joining sigma of 0.1 m, three times that is not."""
-    dark = survey(chain(0, 8) + BLIND + chain(1000, 4))
-    found = find_components(dark, sigmas([0.01] * 7 + [0.02, 0.05, 5.0] + [0.01] * 3), 0.1)
-    assert [(p.end_s, p.keyframes, p.kept) for p in found.components] == [(8.0, 9, True), (13.0, 4, False)]
-    assert [(p.start_s, p.keyframes) for p in found.stray] == [(9.0, 1)]
-
-
-def test_the_largest_part_is_the_one_with_most_that_see() -> None:
-    dark = survey(chain(0, 4) + BLIND * 3 + chain(1000, 3))
-    found = find_components(dark, sigmas([0.01] * 3 + [5.0] + [0.001] * 8), 0.1)
-    assert [(p.keyframes, p.kept) for p in found.components] == [(4, True), (9, False)]
-
-
-def test_a_bridge_is_as_long_as_the_darkness_not_as_its_steps() -> None:
-    """Each step alone would be sure enough."""
-    dark = survey(chain(0, 4) + BLIND * 5 + chain(1000, 6))
-    found = find_components(dark, sigmas([0.01] * 3 + [0.05] * 11 + [0.01] * 5), 0.1)
-    assert [p.kept for p in found.components] == [False, True]
-
-
-def test_a_loop_joins_what_darkness_parted() -> None:
-    dark = survey(chain(0, 4) + BLIND + chain(1000, 6), loops=[(1, 9)])
-    found = find_components(dark, sigmas([0.01] * 3 + [5.0] * 3 + [0.01] * 5), 0.1)
-    assert [(p.kept, p.keyframes) for p in found.components] == [(True, 10)]
-    assert [p.keyframes for p in found.stray] == [2]
 
 
 def test_nothing_that_hangs_together_is_refused() -> None:

@@ -71,6 +71,7 @@ def closed(
         SurveyConfig(settings, vocabulary, zones or Zones()),
         GraphMarginals(map_from_body, chain),
         {(k, k + 1) for k in range(steps)},
+        KeyframeGroups(((k, k + 1) for k in range(steps)), len(whole)),
     )
     for k in range(len(whole)):
         closer.close(k)
@@ -105,6 +106,7 @@ def looked(
         SurveyConfig(settings, vocabulary, Zones()),
         GraphMarginals(path, chain),
         {(k, k + 1) for k in range(len(chain))},
+        KeyframeGroups(((k, k + 1) for k in range(len(chain))), len(whole)),
         pieces=pieces,
     )
     for k in range(until):

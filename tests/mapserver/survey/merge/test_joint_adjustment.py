@@ -11,9 +11,8 @@ from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples, Trajectory
 from mapserver.survey.bundle.bundle_rounds import bundle_problem, bundle_rounds
-from mapserver.survey.finish.map_transform import transform_state
 from mapserver.survey.merge.base_map import BaseMap
-from mapserver.survey.merge.guided_matching import Sighting
+from mapserver.survey.merge.guided_matching import Sightings
 from mapserver.survey.merge.joint_adjustment import Measured, adjust_jointly
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import KeyframeMotion, Landmarks, PriorTerm, RelativeTerm, SurveyState
@@ -91,8 +90,7 @@ def drive(
     often = np.flatnonzero(np.bincount(seen, minlength=len(points))[seen] >= 2)
     order = often[np.lexsort((seen_by[often], seen[often]))]
     used, landmark = np.unique(seen[order], return_inverse=True)
-    none = np.zeros((len(truth), 3))
-    motion = KeyframeMotion(False, ImuSamples.empty(), None, 0.0, none, none, none, [])
+    motion = KeyframeMotion(False, ImuSamples.empty(), None, 0.0, np.zeros((len(truth), 9)), [])
     keyframe, camera = np.divmod(seen_by[order].astype(np.int32), np.int32(len(cameras)))
     owners = keyframe, camera, landmark.astype(np.int32), order.astype(np.int32)
     marks = Landmarks(points[used], *owners, observed[order], np.tile(CLAIMED_PX, (len(order), 1)))
@@ -116,7 +114,7 @@ def ate_m(true: Array, found: Array) -> float:
     return float(np.sqrt(np.square(a - b @ fit[:3, :3].T - fit[:3, 3]).sum(axis=1).mean()))
 
 
-def beside(first: Drive, later: Drive, points: int) -> tuple[Measured, list[Sighting | None]]:
+def beside(first: Drive, later: Drive, points: int) -> tuple[Measured, Sightings]:
     """What holds the first drive's map, and what the later one sees of it."""
     known = Measured(
         bundle_problem(first.state, SETTINGS, None),
@@ -125,12 +123,15 @@ def beside(first: Drive, later: Drive, points: int) -> tuple[Measured, list[Sigh
     )
     row = np.full(points, -1)
     row[first.points] = np.arange(len(first.points))
-    sightings: list[Sighting | None] = []
-    for n in range(len(later.map_from_body) * len(later.state.rig)):
-        features = np.flatnonzero((later.seen_by == n) & (row[later.seen] >= 0))
-        sigmas = np.tile(CLAIMED_PX, (len(features), 1))
-        sightings.append(Sighting(row[later.seen[features]], features, later.pixels[features], sigmas))
-    return known, sightings
+    features = np.flatnonzero(row[later.seen] >= 0)
+    features = features[np.argsort(later.seen_by[features], kind="stable")]
+    located, sigmas = (
+        np.ones(len(later.map_from_body) * len(later.state.rig), bool),
+        np.tile(CLAIMED_PX, (len(features), 1)),
+    )
+    return known, Sightings(
+        located, later.seen_by[features], row[later.seen[features]], features, later.pixels[features], sigmas
+    )
 
 
 def by(camera: StereoCamera, made: Drive) -> Drive:
@@ -267,7 +268,7 @@ def test_docks_that_know_the_heading_to_a_degree_do_not_turn_the_map() -> None:
     points, at_edge = shelves(rng)
     first, later = (drive(points, at_edge, [(-2, 0), (LENGTH_M - 2, 0)], rng) for _ in range(2))
     off = se3(so3_exp(np.array([0, 0, np.radians(1.0)])), np.zeros(3))
-    state = transform_state(replace(first.state, priors=docked(first, [0])), off)
+    state = replace(first.state, priors=docked(first, [0])).transformed(off)
     known, sightings = beside(replace(first, state=state), later, len(points))
     known, base = replace(known, map_from_docks=np.eye(4)), cast(Any, None)
     start = off @ later.state.map_from_body
@@ -314,9 +315,8 @@ def test_a_published_map_is_held_by_all_that_it_knows_of_itself() -> None:
     first, later = (drive(points, at_edge, [(-2, 0), (LENGTH_M - 4, 0)], rng) for _ in range(2))
     _, sightings = beside(first, later, len(points))
     few = rng.random(len(points)) < 1 / 12
-    found = [None if s is None else s.only(few[s.rows]) for s in sightings]
-    base = published(first)
-    joint = adjust_jointly(base, None, later.state, later.map_from_body, found, SETTINGS, finely=True)
+    base, sightings = published(first), sightings.only(few[sightings.rows])
+    joint = adjust_jointly(base, None, later.state, later.map_from_body, sightings, SETTINGS, finely=True)
     moved_m = np.linalg.norm((joint.base_from_body - base.map_from_body[joint.base_keyframes])[:, :3, 3], axis=1)
     assert moved_m.max() < 0.005
 

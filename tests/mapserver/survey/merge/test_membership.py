@@ -19,7 +19,7 @@ def verdict(test: MembershipTest) -> tuple[MembershipVerdict, SessionPlace | Mem
     located = test.locate()
     if isinstance(located, Membership):
         return located.verdict, located
-    refused = test.judged(located, located.seen)
+    refused = test.judged(located)
     return (MembershipVerdict.JOINED, located) if refused is None else (refused.verdict, refused)
 
 

@@ -52,14 +52,6 @@ def test_agreeing_fixes_are_one_set_and_strays_do_not_matter() -> None:
     assert np.linalg.norm(off[:3, 3]) < 0.15
 
 
-def test_two_places_that_explain_the_survey_alike_are_both_found() -> None:
-    fixes = [fix(k, m) for k in range(0, 20, 2) for m in (MAP_FROM_SURVEY, shifted(5.0))]
-    first, second = found(fixes)[:2]
-    assert len(first.fixes) == len(second.fixes) == 10
-    apart = first.map_from_survey[:3, 3] - second.map_from_survey[:3, 3]
-    assert abs(np.linalg.norm(apart) - 5.0) < 0.3
-
-
 def test_fixes_that_agree_with_each_other_but_not_with_the_motion_between_them_are_apart() -> None:
     """Bays repeat each 1.4 m, the survey moved 1.0 m: what lies within the old bound of 0.3 m + 2 % is no agreement any more."""
     fixes = [fix(k, se3(np.eye(3), np.array([0.2 * k, 0.0, 0.0])) @ MAP_FROM_SURVEY) for k in range(0, 20, 2)]

@@ -7,16 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, skew
+from fleetmap.geometry import Array, se3, se3_adjoint, se3_exp, se3_inverse, skew
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.survey.bundle.bundle_rounds import bundle_problem
-from mapserver.survey.loops.connected_components import SigmaBetween
+from mapserver.survey.loops.connected_components import grown_sigma
 from mapserver.survey.odometry_pass import FrameChain
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.odometry_factors import blackout_factors, chain_edges
-from mapserver.survey.pose_graph.pose_graph import adjoint
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import OdometryPass
 from support.worlds.corridor_scene import scene
@@ -73,9 +72,7 @@ def test_no_inertial_factor_spans_a_pause_which_odometry_bridges(pause_s: float,
         inertial=True,
         imu=imu,
         noise=ImuNoise(2e-4, 1e-5, 2e-3, 1e-4),
-        velocities_mps=np.zeros((4, 3)),
-        gyro_bias_radps=np.zeros((4, 3)),
-        accel_bias_mps2=np.zeros((4, 3)),
+        motions=np.zeros((4, 9)),
     )
     state = replace(state, stamps_ns=stamps_ns, motion=motion)
     guess = OdometryPass(
@@ -106,7 +103,7 @@ def test_beginning_anew_does_not_join_what_nothing_joins() -> None:
     whole = chain(
         (estimate(0.0), None), (estimate(0.01), None), (estimate(0.04), None), (anew, None), (estimate(0.01), None)
     )
-    between = SigmaBetween(np.trace(whole[:, 3:, 3:], axis1=1, axis2=2))
+    between = grown_sigma(np.trace(whole[:, 3:, 3:], axis1=1, axis2=2))
     assert between(1, 2) == pytest.approx(np.sqrt(3 * 0.03))
     assert between(2, 3) > 1.0
     assert between(3, 4) == pytest.approx(np.sqrt(3 * 0.01))
@@ -135,7 +132,7 @@ def test_edges_of_the_chain_add_up_to_what_odometry_does_not_know() -> None:
     odom_from_body = se3(np.eye(3), np.array([30.0, -20.0, 1.0])) @ np.tile(np.eye(4), (count, 1, 1))
     covariances, about = np.zeros((count, 6, 6)), np.tile(np.eye(6), (count, 1, 1))
     for k in range(1, count):
-        carry = adjoint(odom_from_body[k - 1])
+        carry = se3_adjoint(odom_from_body[k - 1])
         covariances[k] = covariances[k - 1] + carry @ noise @ carry.T
         odom_from_body[k] = odom_from_body[k - 1] @ step
     about[:, 3:, :3] = [-skew(place) for place in odom_from_body[:, :3, 3]]
@@ -144,7 +141,7 @@ def test_edges_of_the_chain_add_up_to_what_odometry_does_not_know() -> None:
         [SimpleNamespace(frame_index=k) for k in range(count)], inertial=True,
     )  # fmt: skip
     graph = GraphMarginals(odom_from_body, chain_edges(known, SimpleNamespace(map_from_body=odom_from_body)))
-    carry = adjoint(se3_inverse(odom_from_body[20]))
+    carry = se3_adjoint(se3_inverse(odom_from_body[20]))
     expected = carry @ (covariances[-1] - covariances[20]) @ carry.T
     ratios = np.sqrt(np.diag(graph.relative_cov(20, count - 1)) / np.diag(expected))
     assert (ratios > 1.0).all()  # the floor adds to it

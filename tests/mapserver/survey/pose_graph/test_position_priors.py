@@ -16,7 +16,7 @@ from mapserver.survey.pose_graph.position_priors import (
     placed_by_priors,
     prior_edges,
 )
-from mapserver.survey.state import PriorTerm
+from mapserver.survey.state import OdometryPass, PriorTerm
 
 _AISLE_M = 4.5
 _STEP = np.diag(np.square([0.003, 0.003, 0.01, 0.03, 0.03, 0.03]))
@@ -45,13 +45,9 @@ def _graph(rng: np.random.Generator, bend_rad: float = 0.0) -> tuple[list[PoseEd
         edges.append(PoseEdge(k, k + 1, step, _STEP, is_loop=False))
         placed.append(placed[-1] @ step)
     odom_from_body = np.stack(placed)
-    keyframes = [SimpleNamespace(frame_index=k) for k in range(len(truth))]
-    estimates = [SimpleNamespace(stamp_ns=k * _PERIOD_NS) for k in range(len(truth))]
-    return (
-        edges,
-        odom_from_body,
-        SimpleNamespace(estimates=estimates, odom_from_body=odom_from_body, keyframes=keyframes),
-    )
+    frames: list[Any] = [SimpleNamespace(frame_index=k, stamp_ns=k * _PERIOD_NS) for k in range(len(truth))]
+    certain = np.zeros((len(truth), 6, 6)), np.ones(len(truth), bool)
+    return edges, odom_from_body, OdometryPass(frames, odom_from_body, *certain, frames, inertial=False)
 
 
 def _priors(
