@@ -10,7 +10,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.calibration.estimator import Adjusted, adjust, prior_information
 from mapserver.calibration.motion_rows import CalibrationData
-from mapserver.calibration.parameters import COLUMNS, INDEX, SHOWN, CalibrationParameter, RigAxes, corrected_rig
+from mapserver.calibration.parameters import COLUMNS, INDEX, CalibrationParameter, RigAxes, corrected_rig
 
 P = CalibrationParameter
 _PAIR = {P.BASELINE, P.FOCAL_RATIO, P.PAIR_PITCH, P.PAIR_YAW, P.PAIR_ROLL, P.BASELINE_Y, P.BASELINE_Z}
@@ -183,9 +183,3 @@ def _reason(name: CalibrationParameter, *, has_pair: bool, has_imu: bool, has_wh
         "there is neither an IMU nor wheel odometry": name.startswith("camera position") and not has_metres,
     }
     return next((words for words, is_lacking in lacks.items() if is_lacking), _ADVICE[name])
-
-
-def in_words(parameter: ParameterEstimate) -> tuple[str, str]:
-    """A correction and its sigma, in per cent, degrees, milliseconds, millimetres or pixels."""
-    scale, unit, _ = SHOWN[parameter.name.unit]
-    return f"{parameter.estimate * scale:+.3f} {unit}", f"{parameter.sigma * scale:.3f} {unit}"

@@ -22,7 +22,7 @@ from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.drafting.area_corrections import AreaCorrections, driven_since
 from mapserver.drafting.draft_evidence import Before, DraftMap, JudgedSession, examine_draft, replayed_probes
-from mapserver.drafting.extras import ChosenDraft, MappedSession, made_extras
+from mapserver.drafting.extras import ChosenDraft, Extra, MappedSession
 from mapserver.drafting.job_lock import Job, JobProgress, recorded_job
 from mapserver.drafting.mapped_images import MappedImageStore
 from mapserver.drafting.progress import ProgressView, StageTimes
@@ -51,6 +51,7 @@ from mapserver.drafting.survey_recordings import (
 from mapserver.drafting.view_check import TileChooser, asked_views
 from mapserver.drafting.worker import open_executor, single_threaded_libraries
 from mapserver.evaluation.trajectory_error import Accuracy, accuracy, truth_from_estimate
+from mapserver.hooks import stage_hooks
 from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged
 from mapserver.quality.probes import alias_step_m
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
@@ -270,7 +271,8 @@ def _keep(run: _Run, built: BuildResult, parent: Before | None, maps: MapStore) 
         for s, session in zip(built.taken, judged, strict=True)
     ]
     before = None if parent is None else parent.manifest
-    extras = made_extras(ChosenDraft(sessions, run.settings, built.corrections, before, maps))
+    chosen = ChosenDraft(sessions, run.settings, built.corrections, before, maps)
+    extras: dict[str, Extra] = {key: made for stage in stage_hooks().values() for key, made in stage(chosen).items()}
     run.times.begin("examining")
     evidence = msgspec.structs.replace(_evidence(run, built, judged, tiles, parent), views=views)
     run.times.begin("storing")

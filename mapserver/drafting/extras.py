@@ -9,7 +9,6 @@ import msgspec
 from fleetmap.geometry import Array
 from fleetmap.mapformat.manifest import Manifest
 from mapserver.drafting.area_corrections import AreaCorrections
-from mapserver.hooks import stage_hooks
 from mapserver.store import MapStore
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import Survey
@@ -40,8 +39,3 @@ class Extra(NamedTuple):
     report: msgspec.Struct | None
     kind: str
     blobs: Sequence[bytes]
-
-
-def made_extras(draft: ChosenDraft) -> dict[str, Extra]:
-    """Return what the installed stages make, by the key of its report."""
-    return {key: extra for stage in stage_hooks().values() for key, extra in stage(draft).items()}

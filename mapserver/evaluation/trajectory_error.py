@@ -23,8 +23,6 @@ class AteResult:
     """
 
     rmse_m: float
-    mean_m: float
-    median_m: float
     max_m: float
     scale: float
     matched: int
@@ -64,8 +62,6 @@ def absolute_trajectory_error(
     errors = np.linalg.norm(transform_points(frame_from_estimate, scale * mine.positions_m) - true.positions_m, axis=1)
     return AteResult(
         rmse_m=rms(errors),
-        mean_m=float(errors.mean()),
-        median_m=float(np.median(errors)),
         max_m=float(errors.max()),
         scale=scale,
         matched=len(mine),

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from fleetmap.recordings import Recording, Topics
     from fleetmap.sensors.calibration import RigCalibration
-    from mapserver.calibration import CalibrationEstimate
+    from mapserver.calibration import CalibrationEstimate, ParameterEstimate
     from mapserver.survey.survey_inputs import SurveyTools
 
 
@@ -135,14 +135,21 @@ def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Pa
         _write(out, guessed_file(found, name), advice)
 
 
+def _in_words(parameter: "ParameterEstimate") -> tuple[str, str]:
+    """A correction and its sigma, in per cent, degrees, milliseconds, millimetres or pixels."""
+    from mapserver.calibration.parameters import SHOWN
+
+    scale, unit, _ = SHOWN[parameter.name.unit]
+    return f"{parameter.estimate * scale:+.3f} {unit}", f"{parameter.sigma * scale:.3f} {unit}"
+
+
 def corrected_file(estimate: "CalibrationEstimate", rig: "RigCalibration", names: list[str]) -> str:
     """Return the text of a camchain: the corrected rig, with comments on measured and unchanged values."""
     from fleetmap.recordings import format_calibration
-    from mapserver.calibration.estimate import in_words
 
     lines = [f"# Measured by `mapserver calibrate` from {', '.join(names)}."]
     for p in estimate.parameters:
-        value, sigma = in_words(p)
+        value, sigma = _in_words(p)
         what = f"corrected by {value}, sigma {sigma}" if p.is_judged else f"NOT JUDGED, old value kept: {p.reason}"
         lines.append(f"# {p.name.value}: {what}")
     if len(rig.views) > 1:
@@ -157,15 +164,13 @@ def _print(console: "Console", estimate: "CalibrationEstimate") -> None:
     from rich.table import Table
     from rich.text import Text
 
-    from mapserver.calibration.estimate import in_words
-
     table = Table(
         title=f"{estimate.keyframes} keyframes, {estimate.observations} observations; corrections to the calibration"
     )
     for column in ("parameter", "correction", "sigma", "verdict"):
         table.add_column(column, overflow="fold")
     for p in estimate.parameters:
-        value, sigma = in_words(p)
+        value, sigma = _in_words(p)
         verdict = Text("measured", "green") if p.is_judged else Text(f"not judged: {p.reason}", "dim")
         table.add_row(Text(p.name.value), Text(value), Text(sigma), verdict)
     console.print(table)
