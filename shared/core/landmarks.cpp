@@ -224,7 +224,7 @@ auto twins(const Packed& packed, const Points& points_map, int reach, int most, 
   const Descriptors descriptors = packed;
   const double* const points = points_map.data();
   unlocked([&] {
-    const auto compare = [=, marks = repeated.data()](size_t i, size_t j) {  // by value: marks could be any of them
+    const auto compare = [=, marks = repeated.data()](size_t i, size_t j) __attribute__((always_inline)) {
       const double *a = points + 3 * i, *b = points + 3 * j, off_x = a[0] - b[0], off_y = a[1] - b[1];
       if (off_x * off_x + off_y * off_y <= own_m * own_m || std::abs(a[2] - b[2]) > height_m) return;
       if (hamming(descriptors[i], descriptors[j]) <= max_bits) marks[i] = marks[j] = 1;

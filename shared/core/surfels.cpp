@@ -252,21 +252,14 @@ struct DepthPicture {
   Picture<const float> nearest_px;
   double step_px, sigma_px;
   StereoLens lens;
-  SE3 cam_from_map;
   double clear_sigmas, clear_m;
-
-  DepthPicture(const Image32& nearest_px, int step_px, double sigma_px, const StereoLens& lens, const SE3& cam_from_map,
-               double clear_sigmas, double clear_m)
-      : nearest_px(nearest_px),
-        step_px(step_px),
-        sigma_px(sigma_px),
-        lens(lens),
-        cam_from_map(cam_from_map),
-        clear_sigmas(clear_sigmas),
-        clear_m(clear_m) {
-    if (step_px < 1) throw nb::value_error("step_px: at least 1");
-  }
 };
+
+DepthPicture depth_picture(const Image32& nearest_px, int step_px, double sigma_px, const StereoLens& lens, double clear_sigmas,
+                           double clear_m) {
+  if (step_px < 1) throw nb::value_error("step_px: at least 1");
+  return {nearest_px, double(step_px), sigma_px, lens, clear_sigmas, clear_m};
+}
 
 struct Look {
   Mark mark = kUnseen;
@@ -306,15 +299,16 @@ auto look_at(const FloatPoints& points_map, const Levels& levels, const Image32&
              const StereoLens& lens, const SE3& cam_from_map, double clear_sigmas, double clear_m) {
   const size_t count = points_map.shape(0);
   check_levels(levels, count);
-  const DepthPicture view(nearest_px, step_px, sigma_px, lens, cam_from_map, clear_sigmas, clear_m);
+  const DepthPicture view = depth_picture(nearest_px, step_px, sigma_px, lens, clear_sigmas, clear_m);
   auto marks = zeros<uint8_t>(count);
   auto pixels = zeros<std::array<float, 2>>(count);
   const float* const points = points_map.data();
   const uint8_t* const level_of = levels.data();
   unlocked([&] {
+    const SE3 pose = cam_from_map;
     const double per_m = edges_per_m(lens.focal);
     for (size_t i = 0; i < count; ++i) {
-      const Look found = look(cam_from_map * Vec3{points[3 * i], points[3 * i + 1], points[3 * i + 2]}, level_of[i], per_m, view);
+      const Look found = look(pose * Vec3{points[3 * i], points[3 * i + 1], points[3 * i + 2]}, level_of[i], per_m, view);
       marks[i] = found.mark, pixels[i] = {float(found.u), float(found.v)};
     }
   });
@@ -330,14 +324,15 @@ void weigh(const FloatPoints& points_map, const Levels& levels, const Image32& n
   const size_t count = points_map.shape(0);
   check_levels(levels, count);
   if (sums.shape(0) != count) throw nb::value_error("sums: a row for each point");
-  const DepthPicture view(nearest_px, step_px, sigma_px, lens, cam_from_map, clear_sigmas, clear_m);
+  const DepthPicture view = depth_picture(nearest_px, step_px, sigma_px, lens, clear_sigmas, clear_m);
   if (picture.shape(0) < 2 || picture.shape(1) < 2) return;
   const nb::gil_scoped_release others_run;
   const float* const points = points_map.data();
   const uint8_t* const level_of = levels.data();
+  const SE3 pose = cam_from_map;
   const double per_squared = 1.0 / (lens.focal * lens.focal), per_m = edges_per_m(lens.focal);
   for (size_t i = 0; i < count; ++i) {
-    const Vec3 point = cam_from_map * Vec3{points[3 * i], points[3 * i + 1], points[3 * i + 2]};
+    const Vec3 point = pose * Vec3{points[3 * i], points[3 * i + 1], points[3 * i + 2]};
     const Look found = look(point, level_of[i], per_m, view);
     double* const sum = &sums(i, 0);
     if (found.mark == kSeenThrough) sum[1] += found.weight;
