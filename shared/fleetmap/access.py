@@ -95,31 +95,25 @@ class Access:
         if not groups:  # zenoh refuses empty lists, and lists that are missing
             groups = {(Rule(_NOBODY, Direction.IN, (Act.PUT,), (_NOBODY,)),): [_NOBODY]}
         rules = {rule.id: rule for group in groups for rule in group}
-        subjects = [{"id": names[0], "cert_common_names": names} for names in groups.values()]
-        policies = [{"rules": [r.id for r in group], "subjects": [names[0]]} for group, names in groups.items()]
+        access = {
+            "enabled": True,
+            "default_permission": "deny",
+            "rules": [
+                {"id": r.id, "permission": "allow", "flows": [r.flow], "messages": r.acts, "key_exprs": r.keys}
+                for r in rules.values()
+            ],
+            "subjects": [{"id": names[0], "cert_common_names": names} for names in groups.values()],
+            "policies": [{"rules": [r.id for r in group], "subjects": [names[0]]} for group, names in groups.items()],
+        }
+        rates = [{"key_expr": robot_key("*", "*", what), "freq": hz} for what, hz in _MOST_HZ.items()]
+        reports = {"id": "reports", "flows": [Direction.IN], "messages": [Act.PUT]}
+        report_bytes = {"key_exprs": [robot_key("*", "*", "*")], "size_limit": _REPORT_BYTES}
+        questions = {"id": "questions", "flows": [Direction.IN], "messages": [Act.QUERY]}
+        question_bytes = {"key_exprs": ["fleetmap/**"], "size_limit": _QUESTION_BYTES}
         return {
-            "access_control": {
-                "enabled": True,
-                "default_permission": "deny",
-                "rules": [
-                    {"id": r.id, "permission": "allow", "flows": [r.flow], "messages": r.acts, "key_exprs": r.keys}
-                    for r in rules.values()
-                ],
-                "subjects": subjects,
-                "policies": policies,
-            },
-            "downsampling": [
-                {
-                    "id": "reports",
-                    "flows": [Direction.IN],
-                    "messages": [Act.PUT],
-                    "rules": [{"key_expr": robot_key("*", "*", what), "freq": hz} for what, hz in _MOST_HZ.items()],
-                }
-            ],
-            "low_pass_filter": [
-                _size_limit("reports", Act.PUT, robot_key("*", "*", "*"), _REPORT_BYTES),
-                _size_limit("questions", Act.QUERY, "fleetmap/**", _QUESTION_BYTES),
-            ],
+            "access_control": access,
+            "downsampling": [reports | {"rules": rates}],
+            "low_pass_filter": [reports | report_bytes, questions | question_bytes],
         }
 
 
@@ -148,7 +142,3 @@ def _rules(holder: Holder) -> tuple[Rule, ...]:
         Rule(f"{name}-ordered", Direction.OUT, (Act.PUT,), own(ORDERS)),
         Rule(f"{name}-alive", Direction.IN, (Act.SHOW_ALIVE,), own(ALIVE)),
     )
-
-
-def _size_limit(name: str, act: Act, key: str, most_bytes: int) -> dict[str, Any]:
-    return {"id": name, "flows": [Direction.IN], "messages": [act], "key_exprs": [key], "size_limit": most_bytes}
