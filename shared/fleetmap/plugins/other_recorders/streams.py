@@ -202,7 +202,7 @@ def _lenses(images: Sequence[ImageStream], streams: Sequence[Stream]) -> _Lenses
                 f"{streams[0].channel.topic} describes more than {_MOST_LENSES} lenses, from {setting_of(infos[0])} to "
                 f"{setting_of(info)}; a map needs one: switch off zoom and autofocus, or pass a calibration with --calibration FILE"
             )
-    stamps_ns = [stamp_ns for stream in images for stamp_ns in stream.stamps_ns]
+    stamps_ns = [stamp_ns for stream in images for stamp_ns, *_ in stream.images]
     if not numbers:
         return _Lenses(infos, np.zeros(len(stamps_ns), np.int64))
     rows = np.searchsorted([stamp_ns for stamp_ns, _ in told], stamps_ns, side="right") - 1
@@ -240,7 +240,7 @@ def _calibration(
                 zeros = "holds zeros, as drivers without a calibration send it; calibrate the camera, or"
                 fault = f"every CameraInfo beside {image_topic} {zeros}"
             raise CalibrationError(f"{container.path}: {fault} pass a calibration with --calibration FILE")
-        sizes_px = [size for stream in roles[side] for size in stream.sizes_px]
+        sizes_px = [size_px for stream in roles[side] for *_, size_px in stream.images]
         of_usual = [size for size, n in zip(sizes_px, told.numbers, strict=True) if n == told.usual]
         size_px = Counter(of_usual).most_common(1)[0][0]
         info = info_of_images(told.infos[told.usual], size_px, f"{container.path}: {image_topic}")

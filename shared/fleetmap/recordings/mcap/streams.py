@@ -3,7 +3,6 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -73,11 +72,9 @@ class Stream:
 
 @dataclass(eq=False)
 class ImageStream(Stream):
-    """Images by their place, stamp and size. why_damaged: the reason for the first one that was left out."""
+    """Images: stamp, log time, place and size of each. why_damaged: the reason for the first one that was left out."""
 
-    stamps_ns: list[int] = field(default_factory=list)
-    places: list[Place] = field(default_factory=list)
-    sizes_px: list[tuple[int, int]] = field(default_factory=list)
+    images: list[tuple[int, int, Place, tuple[int, int]]] = field(default_factory=list)
     why_damaged: str = ""
 
     def take(self, data: bytes, place: Place, logged_ns: int, log: ReadLog) -> None:
@@ -94,10 +91,7 @@ class ImageStream(Stream):
             log.damaged_ns += [stamp_ns] if stamp_ns else []
             return
         self.container.keep(0)
-        self.stamps_ns.append(stamp_ns)
-        self.sizes_px.append(size_px)
-        self.places.append(place)
-        self.log_times_ns.append(logged_ns)
+        self.images.append((stamp_ns, logged_ns, place, size_px))
 
 
 Roles = Mapping[str, Sequence[Any]]
@@ -248,18 +242,18 @@ def assemble(
 def _images(
     streams: Sequence[ImageStream], what: str, log: ReadLog, usable: NDArray[np.bool_] | None = None
 ) -> ImageSeries:
-    damaged = sum(stream.damaged for stream in streams)
-    sources = tuple((stream.channel, place) for stream in streams for place in stream.places)
-    if damaged:
+    images = [(stream.channel, *image) for stream in streams for image in stream.images]
+    if damaged := sum(stream.damaged for stream in streams):
         why = next(stream.why_damaged for stream in streams if stream.why_damaged)
-        if not sources:
+        if not images:
             raise RecordingError(f"{why} (none of {damaged} {what} can be read)")
-        log.note(f"{what} left out", f"{damaged} of {damaged + len(sources)}; the first: {why}")
-    sent, logged = chain(*(s.stamps_ns for s in streams)), chain(*(s.log_times_ns for s in streams))
-    stamps_ns, order = as_logged(list(sent), list(logged), what, log)
-    kept = usual_size([size for stream in streams for size in stream.sizes_px], what, log)
+        log.note(f"{what} left out", f"{damaged} of {damaged + len(images)}; the first: {why}")
+    sent, logged = [image[1] for image in images], [image[2] for image in images]
+    stamps_ns, order = as_logged(sent, logged, what, log)
+    kept = usual_size([size_px for *_, size_px in images], what, log)
     if usable is not None:
         kept &= usable
+    sources = tuple((channel, place) for channel, _, _, place, _ in images)
     return ImageSeries(stamps_ns, sources).take(order[kept[order]]).forward(what, log)
 
 
