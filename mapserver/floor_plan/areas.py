@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.encoding import to_plain
+from fleetmap.encoding import decode_json, to_plain
 from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, Rings, inside_any, inside_rings, se3_inverse, transform_points
 from fleetmap.mapformat.building import BuildingFrame
@@ -229,12 +229,8 @@ def read_areas(data: bytes, building: BuildingFrame | None) -> Areas:
     """
     if len(data) > MAX_AREAS_BYTES:
         raise UsageError(f"areas of more than {MAX_AREAS_BYTES} bytes; draw them with fewer corners")
-    try:
-        collection = msgspec.json.decode(data, type=_Collection)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise UsageError(
-            f"areas: {error}; give a GeoJSON FeatureCollection of polygons with properties.name, and {_MASK_WORDS}"
-        ) from error
+    wanted = f"give a GeoJSON FeatureCollection of polygons with properties.name, and {_MASK_WORDS}"
+    collection = decode_json(data, _Collection, f"areas: {{}}; {wanted}", UsageError)
     if collection.frame is None:
         words = 'add "frame": "map" or "frame": "building" beside "features", and write metres'
         raise UsageError(

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 
-from fleetmap.encoding import to_json
+from fleetmap.encoding import decode_json, to_json
 from fleetmap.errors import MapFormatError
 from fleetmap.geometry import AnyArray
 from fleetmap.mapformat.container import pack, unpack
@@ -139,7 +139,4 @@ def _read_head(payload: bytes) -> tuple[_Head, int]:
     if len(payload) < _HEAD_SIZE.size:
         raise MapFormatError(f"archive: {len(payload)} bytes are too few for its head; the bytes are damaged")
     end = _HEAD_SIZE.size + int(_HEAD_SIZE.unpack_from(payload)[0])
-    try:
-        return msgspec.json.decode(payload[_HEAD_SIZE.size : end], type=_Head), end
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise MapFormatError(f"archive: head {error}; the bytes are damaged") from error
+    return decode_json(payload[_HEAD_SIZE.size : end], _Head, "archive: head {}; the bytes are damaged"), end

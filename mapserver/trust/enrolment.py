@@ -15,7 +15,7 @@ import msgspec
 
 from fleetmap.access import Access, Holder, Purpose
 from fleetmap.bus.endpoints import TlsFiles
-from fleetmap.encoding import to_json
+from fleetmap.encoding import decode_json, to_json
 from fleetmap.errors import LinkError, StateError, StoreError, disk_errors
 from fleetmap.files import write_atomically
 from fleetmap.mapformat.names import check_name
@@ -124,10 +124,7 @@ class RobotRegister:
             return []
         with disk_errors(f"{self._path} cannot be read", "check the account"):
             data = self._path.read_bytes()
-        try:
-            found = msgspec.json.decode(data, type=list[EnrolledRobot])
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-            raise StoreError(f"{self._path} cannot be read ({error}); restore it") from error
+        found = decode_json(data, list[EnrolledRobot], f"{self._path} cannot be read ({{}}); restore it", StoreError)
         return [entry for entry in found if site in {None, entry.site}]
 
     def access(self) -> Access:

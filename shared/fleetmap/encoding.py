@@ -6,6 +6,8 @@ from typing import Any, Literal, TypeVar
 import msgspec
 import numpy as np
 
+from fleetmap.errors import FleetmapError, MapFormatError
+
 T = TypeVar("T")
 MOST = 1e12
 """Largest magnitude of a stranger's number with decimals: far above any metre or covariance, and its products stay finite."""
@@ -33,6 +35,14 @@ def to_json(value: object, *, indent: int = 0, order: Literal["deterministic", "
     """Encode as JSON, with null for NaN and infinity. indent: spaces; 0 writes one line. order: of keys, as in msgspec's encoder."""
     data = msgspec.json.encode(value, enc_hook=python_value, order=order)
     return msgspec.json.format(data, indent=indent) if indent else data
+
+
+def decode_json(data: bytes, kind: type[T], refusal: str, error: type[FleetmapError] = MapFormatError) -> T:
+    """Decode JSON as a type; the error for anything else: its text is `refusal`, with the reason in place of {}."""
+    try:
+        return msgspec.json.decode(data, type=kind)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as reason:
+        raise error(refusal.replace("{}", str(reason))) from reason
 
 
 def bounded(value: T) -> T:

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.encoding import to_json
+from fleetmap.encoding import decode_json, to_json
 from fleetmap.errors import MapFormatError, NewerFormatError, StateError, UsageError
 from fleetmap.geometry import se3
 from fleetmap.mapformat.grid_tile import (
@@ -140,10 +140,7 @@ def read_index(data: bytes) -> GridIndex:
 
 def decode_index(data: bytes, kind: type[T], what: str, **own: object) -> T:
     """Decode an index of tiles; MapFormatError for anything else, NewerFormatError unless all but its `own` values are the defaults."""
-    try:
-        index = msgspec.json.decode(data, type=kind)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise MapFormatError(f"index of {what}: {error}; it is damaged or of another program") from error
+    index = decode_json(data, kind, f"index of {what}: {{}}; it is damaged or of another program")
     if msgspec.structs.replace(index, **own) != kind():
         number = getattr(index, "format_version", None)
         raise NewerFormatError(f"index of {what} of format {number}: made by another fleetmap; update this one")

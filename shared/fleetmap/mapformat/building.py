@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import msgspec
 import numpy as np
 
+from fleetmap.encoding import decode_json
 from fleetmap.errors import MapFormatError, UsageError
 from fleetmap.geometry import Array, Rings, inside_any, se3, se3_inverse, so3_exp, transform_points
 from fleetmap.mapformat.names import check_name
@@ -49,10 +50,7 @@ class _Alignment(msgspec.Struct):
 
 def aligned_frame(data: bytes) -> BuildingFrame:
     """The frame in a site's file of kind ALIGNMENT; MapFormatError for anything else."""
-    try:
-        return msgspec.json.decode(data, type=_Alignment).frame
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise MapFormatError(f"the site's alignment cannot be read ({error}); run `mapserver align` again") from error
+    return decode_json(data, _Alignment, "the site's alignment cannot be read ({}); run `mapserver align` again").frame
 
 
 MAX_FLOORS_BYTES = 64_000
@@ -105,14 +103,12 @@ def read_building(data: bytes) -> Building:
     """Read a site's file of kind FLOORS, with its floors from below; MapFormatError for anything else, and for repeated sites, levels or
     heights.
     """
+    building = decode_json(data, Building, "a building of these floors cannot be read ({}); set the building again")
     try:
-        building = msgspec.json.decode(data, type=Building)
         for floor in building.floors:
             check_name(floor.site, "site")
     except UsageError as error:
         raise MapFormatError(str(error)) from error
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise MapFormatError(f"a building of these floors cannot be read ({error}); set the building again") from error
     for what in ("site", "level", "height_m"):
         values = [getattr(floor, what) for floor in building.floors]
         if twice := [value for value in values if values.count(value) > 1]:

@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 
-from fleetmap.encoding import to_json
+from fleetmap.encoding import decode_json, to_json
 from fleetmap.errors import MapFormatError, NewerFormatError
 from fleetmap.mapformat.building import BUILDING_KEY, BuildingFrame
 from fleetmap.mapformat.names import NAME_PATTERN, SHA256_PATTERN
@@ -108,15 +108,13 @@ def decode_manifest(data: bytes) -> Manifest:
         raise MapFormatError(
             f"manifest of {len(data)} bytes, the limit is {MAX_MANIFEST_BYTES}; it is damaged or not ours"
         )
-    try:
-        number = msgspec.json.decode(data, type=_FormatOnly).format_version
-        if number > MANIFEST_FORMAT:
-            raise NewerFormatError(
-                f"manifest has format {number}, this fleetmap reads up to {MANIFEST_FORMAT}; update fleetmap to read it"
-            )
-        manifest = msgspec.json.decode(data, type=Manifest)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise MapFormatError(f"manifest: {error}; it is damaged or not a manifest") from error
+    refusal = "manifest: {}; it is damaged or not a manifest"
+    number = decode_json(data, _FormatOnly, refusal).format_version
+    if number > MANIFEST_FORMAT:
+        raise NewerFormatError(
+            f"manifest has format {number}, this fleetmap reads up to {MANIFEST_FORMAT}; update fleetmap to read it"
+        )
+    manifest = decode_json(data, Manifest, refusal)
     building_frame(manifest)
     return manifest
 

@@ -15,6 +15,13 @@ from fleetmap.mapformat.container import pack, unpack
 from fleetmap.mapformat.tile import Ids, Tile, check_increasing, check_tile
 
 _RATIO = 32767.0
+# Coarse steps save bytes at no cost: a quantum of 2 mm adds 0.6 mm to the standard deviation of
+# landmarks that are known to a few millimetres at best, and robots tolerate 75 degrees beyond the directions.
+_SIDE_STEPS = 8192  # quanta of a tile's side
+_DIRECTION_STEPS = 42
+_HALF_ANGLE_STEPS = 60
+_DISTANCE_M = (0.1, 8)  # smallest value, codes per octave
+_SIGMA_M = (1e-4, 4)
 
 
 def log_code(values: NDArray[np.float32], smallest: float, steps_per_octave: int) -> NDArray[np.uint8]:
@@ -28,38 +35,36 @@ def log_value(codes: NDArray[np.uint8], smallest: float, steps_per_octave: int) 
     return (smallest * np.exp2(codes.astype(np.float64) / steps_per_octave)).astype(np.float32)
 
 
-def half_angle_code(angles_rad: NDArray[np.float32], steps: int) -> NDArray[np.uint8]:
-    """Codes of angles from 0 to pi in steps of pi / `steps`, at most 255 of them."""
-    return np.clip(np.round(angles_rad.astype(np.float64) * (steps / np.pi)), 0, steps).astype(np.uint8)
+def half_angle_code(angles_rad: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """Codes of angles from 0 to pi."""
+    steps = np.round(angles_rad.astype(np.float64) * (_HALF_ANGLE_STEPS / np.pi))
+    return np.clip(steps, 0, _HALF_ANGLE_STEPS).astype(np.uint8)
 
 
-def half_angle_value(codes: NDArray[np.uint8], steps: int) -> NDArray[np.float32]:
-    """Angles in radians of codes; those above `steps` mean pi."""
-    return (np.minimum(codes, steps) * (np.pi / steps)).astype(np.float32)
+def half_angle_value(codes: NDArray[np.uint8]) -> NDArray[np.float32]:
+    """Angles in radians of codes; those above the last one mean pi."""
+    return (np.minimum(codes, _HALF_ANGLE_STEPS) * (np.pi / _HALF_ANGLE_STEPS)).astype(np.float32)
 
 
-def direction_code(directions: NDArray[np.float32], steps: int) -> NDArray[np.int8]:
-    """(N, 2) octahedral codes of directions (N, 3), from -steps to steps. Source: Meyer et al. 2010.
-
-    Neighbouring codes are about 1.0 degree apart with 127 steps, 2.9 with 42.
-    """
+def direction_code(directions: NDArray[np.float32]) -> NDArray[np.int8]:
+    """(N, 2) octahedral codes, about 2.9 degrees apart, of directions (N, 3). Source: Meyer et al. 2010."""
     # Twice, because directions on the folded edge of the octahedron have two codes: the second pass picks one.
-    return _direction_code(direction_value(_direction_code(directions, steps), steps), steps)
+    return _direction_code(direction_value(_direction_code(directions)))
 
 
-def _direction_code(directions: NDArray[np.float32], steps: int) -> NDArray[np.int8]:
+def _direction_code(directions: NDArray[np.float32]) -> NDArray[np.int8]:
     vectors = directions.astype(np.float64)
     vectors = vectors / np.abs(vectors).sum(axis=1, keepdims=True)
     upper = vectors[:, :2]
     signs = np.where(upper >= 0, 1.0, -1.0)
     folded = (1.0 - np.abs(upper[:, ::-1])) * signs
     plane = np.where(vectors[:, 2:] < 0, folded, upper)
-    return np.asarray(np.clip(np.round(plane * steps), -steps, steps), np.int8)
+    return np.asarray(np.clip(np.round(plane * _DIRECTION_STEPS), -_DIRECTION_STEPS, _DIRECTION_STEPS), np.int8)
 
 
-def direction_value(codes: NDArray[np.int8], steps: int) -> NDArray[np.float32]:
+def direction_value(codes: NDArray[np.int8]) -> NDArray[np.float32]:
     """(N, 3) unit directions of octahedral codes (N, 2)."""
-    plane = np.clip(codes.astype(np.float64), -steps, steps) / steps
+    plane = np.clip(codes.astype(np.float64), -_DIRECTION_STEPS, _DIRECTION_STEPS) / _DIRECTION_STEPS
     z = 1.0 - np.abs(plane).sum(axis=1, keepdims=True)
     signs = np.where(plane >= 0, 1.0, -1.0)
     folded = (1.0 - np.abs(plane[:, ::-1])) * signs
@@ -146,15 +151,6 @@ _HEAD = struct.Struct("<iidiIII")
 _PLACE_STEPS_PER_M = 65536.0
 
 
-# Coarse steps save bytes at no cost: a quantum of 2 mm adds 0.6 mm to the standard deviation of
-# landmarks that are known to a few millimetres at best, and robots tolerate 75 degrees beyond the directions.
-_SIDE_STEPS = 8192  # quanta of a tile's side
-_DIRECTION_STEPS = 42
-_HALF_ANGLE_STEPS = 60
-_DISTANCE_M = (0.1, 8)  # smallest value, codes per octave
-_SIGMA_M = (1e-4, 4)
-
-
 def encode_tile(tile: Tile) -> bytes:
     """Encode a tile; raises MapFormatError for a tile that is invalid or does not fit."""
     check_tile(tile)
@@ -175,8 +171,8 @@ def encode_tile(tile: Tile) -> bytes:
         planes(plane_codes[:, 1], 2),
         planes((z_codes - z_base).astype(np.uint32), 3),
         np.ascontiguousarray(tile.descriptors, np.uint8).tobytes(),
-        direction_code(tile.view_directions_map, _DIRECTION_STEPS).T.tobytes(),
-        half_angle_code(tile.view_half_angle_rad, _HALF_ANGLE_STEPS).tobytes(),
+        direction_code(tile.view_directions_map).T.tobytes(),
+        half_angle_code(tile.view_half_angle_rad).tobytes(),
         log_code(tile.max_distance_m, *_DISTANCE_M).tobytes(),
         log_code(tile.sigma_m, *_SIGMA_M).tobytes(),
         *_place_columns(tile),
@@ -226,10 +222,8 @@ def decode_tile(data: bytes) -> Tile:
             axis=1,
         ),
         descriptors=columns.bytes(count * 32).reshape(count, 32).copy(),
-        view_directions_map=direction_value(
-            columns.bytes(count * 2).view(np.int8).reshape(2, count).T, _DIRECTION_STEPS
-        ),
-        view_half_angle_rad=half_angle_value(columns.bytes(count), _HALF_ANGLE_STEPS),
+        view_directions_map=direction_value(columns.bytes(count * 2).view(np.int8).reshape(2, count).T),
+        view_half_angle_rad=half_angle_value(columns.bytes(count)),
         max_distance_m=log_value(columns.bytes(count), *_DISTANCE_M),
         sigma_m=log_value(columns.bytes(count), *_SIGMA_M),
         place_ids=columns.increasing(places),

@@ -115,25 +115,23 @@ class AccelerometerCheck:
         axes = np.array([[*each.ravel(), -1.0] for each in SIGNED_AXES])
         squares = np.einsum("ka,ab,kb->k", axes, left, axes)
         ups = -(axes @ solved.T)[:, 3:]
-        given = next(k for k, each in enumerate(SIGNED_AXES) if (each == np.eye(3)).all())
+        given, whole = (
+            next(k for k, each in enumerate(SIGNED_AXES) if (each == a).all()) for a in (np.eye(3), -np.eye(3))
+        )
         size = float(np.linalg.norm(ups[given]))
         best = float(squares.min())
         variance = max(1.0, best / max(3.0 * self._windows - 6.0, 1.0))
         self._judged = left, float(squares[given]), best, variance
         sigma_mps2 = float(np.sqrt(variance * np.trace(np.linalg.inv(normal[9:15, 9:15])[3:, 3:])))
         if abs(size - GRAVITY_MPS2) > _GRAVITY_OFF_MPS2 + _REACH_SIGMAS * sigma_mps2:
-            self.fault = (
-                _size_in_words(size, float(np.median(np.linalg.norm(imu.accel_mps2, axis=1))))
-                if self._windows >= _SIZE_WINDOWS
-                else ""
-            )
+            if self._windows >= _SIZE_WINDOWS:
+                self.fault = _size_in_words(size, float(np.median(np.linalg.norm(imu.accel_mps2, axis=1))))
             return
         ups_base = ups @ (self._base_from_body[:3, :3] @ self._run[0][2].T).T / max(size, 1e-9)
         is_up = ups_base[:, 2] > _UPRIGHT
         is_possible = squares < best + _NAMED_SQUARES * variance
         is_contradicted = squares[given] > max(best + _SURE_SQUARES * variance, _SURE_RATIO * best)
         # Upside down: once it shows whether all axes are reversed, or one.
-        whole = next(k for k, each in enumerate(SIGNED_AXES) if (each == -np.eye(3)).all())
         is_told = not is_possible[whole] or self._windows > _MANY_WINDOWS
         is_reversed = on_wheels and ups_base[given, 2] < -_UPRIGHT and is_told
         if not is_contradicted and not is_reversed:

@@ -65,9 +65,7 @@ class EarlierFrame:
     @property
     def sigmas(self) -> tuple[float, float]:
         """The largest sigmas of rotation and position."""
-        widest = np.linalg.eigvalsh(np.stack([self.cov_rot_trans[:3, :3], self.cov_rot_trans[3:, 3:]]))[:, -1]
-        rotation, position = np.sqrt(np.maximum(widest, 0.0))
-        return float(rotation), float(position)
+        return _sigmas(self.cov_rot_trans)
 
 
 class Relocalizer:
@@ -126,9 +124,8 @@ class Relocalizer:
         max_trials = settings.top_places_found if fixes else settings.top_places
         for place in self._ranked(query, allowed, failed):
             map_from_place = self.view.map_from_cam[place]
-            if _count_at([fix.map_from_cam for fix in fixes], map_from_place):
-                continue
-            if _count_at(tried, map_from_place) >= _TRIALS_AT_A_PLACE:
+            is_known = _count_at([fix.map_from_cam for fix in fixes], map_from_place) > 0
+            if is_known or _count_at(tried, map_from_place) >= _TRIALS_AT_A_PLACE:
                 continue
             if len(tried) >= max_trials:
                 break
@@ -301,8 +298,7 @@ class Relocalizer:
         depth = self._finder.median_distance_m(np.ascontiguousarray(map_from_cam))
         if np.isnan(depth):
             return np.inf
-        widest = np.linalg.eigvalsh(np.stack([cov_rot_trans[:3, :3], cov_rot_trans[3:, 3:]]))[:, -1]
-        angle, position = (float(sigma) for sigma in np.sqrt(widest))
+        angle, position = _sigmas(cov_rot_trans)
         three_sigmas_px = 3.0 * self._camera.focal_px * (position / max(depth, 0.5) + angle)
         return max(self._settings.fix.guided_radius_px, three_sigmas_px)
 
@@ -314,6 +310,12 @@ def is_reliable(fix: Fix, settings: FixSettings, strong_inliers: int = STRONG_IN
     """
     has_recall = fix.inliers >= settings.min_inliers and fix.landmark_recall >= settings.min_recall
     return fix.inliers >= strong_inliers or has_recall
+
+
+def _sigmas(cov_rot_trans: Array) -> tuple[float, float]:
+    widest = np.linalg.eigvalsh(np.stack([cov_rot_trans[:3, :3], cov_rot_trans[3:, 3:]]))[:, -1]
+    rotation, position = np.sqrt(np.maximum(widest, 0.0))
+    return float(rotation), float(position)
 
 
 def _count_at(places: Sequence[Array], map_from_cam: Array) -> int:

@@ -16,6 +16,7 @@ from cryptography.hazmat.primitives import serialization as s
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 
+from fleetmap.encoding import decode_json
 from fleetmap.errors import LinkError, UsageError
 from fleetmap.messages import Name, decode_message, encode_message
 
@@ -72,12 +73,8 @@ class CertificateInfo:
 
 def decode_bundle(data: bytes) -> Bundle:
     """Decode a bundle file; UsageError for anything else."""
-    try:
-        return msgspec.json.decode(data, type=Bundle)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise UsageError(
-            f"this is not an enrolment bundle ({error}); `mapserver robots enrol ROBOT` on the server makes one"
-        ) from error
+    advice = "`mapserver robots enrol ROBOT` on the server makes one"
+    return decode_json(data, Bundle, f"this is not an enrolment bundle ({{}}); {advice}", UsageError)
 
 
 def new_key() -> bytes:

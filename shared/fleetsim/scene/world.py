@@ -78,8 +78,8 @@ class World:
         self.decals = self._lay_decals()
         self.floor_numbers = np.array([self.textures.concrete_coarse, self.textures.dirt], np.int32)
         self._built = lru_cache(_MOST_BUILT_CHUNKS)(lambda key: self._build(key, is_plain=False))
-        self._lit = lru_cache(_MOST_BAKED_CHUNKS)(self._light_detailed)
-        self._plain = lru_cache(None)(self._light_plain)
+        self._lit = lru_cache(_MOST_BAKED_CHUNKS)(lambda key: self._light(key, is_plain=False))
+        self._plain = lru_cache(None)(lambda key: self._light(key, is_plain=True))
         self._scenes = lru_cache(_MOST_SCENES)(self._assemble)
 
     def scene_around(self, x_m: float, y_m: float) -> Scene:
@@ -131,14 +131,13 @@ class World:
     def _neighbours(self, key: tuple[int, int], columns: int, rows: int) -> list[tuple[int, int]]:
         return [other for other in self._keys if abs(other[0] - key[0]) <= columns and abs(other[1] - key[1]) <= rows]
 
-    def _light_detailed(self, key: tuple[int, int]) -> LitFaces:
-        """Light with shadows from the boxes of the chunk and the eight around it; further lamps are not counted."""
-        parts = {other: self.detailed_faces(*other) for other in sorted(self._neighbours(key, 1, 1))}
-        shift = sum(len(part.boxes) for other, part in parts.items() if other < key)
-        boxes = np.concatenate([part.boxes for part in parts.values()])
-        return self._bake(self.detailed_faces(*key), key, boxes, shift, has_shadows=True)
-
-    def _bake(self, faces: Faces, key: tuple[int, int], boxes: Array, shift: int, *, has_shadows: bool) -> LitFaces:
+    def _light(self, key: tuple[int, int], *, is_plain: bool) -> LitFaces:
+        """Light, of a detailed chunk with shadows from the boxes in it and the eight around it; further lamps are not counted."""
+        boxes, shift, faces = np.zeros((0, 8)), 0, self._build(key, is_plain=True) if is_plain else self._built(key)
+        if not is_plain:
+            parts = {other: self._built(other) for other in sorted(self._neighbours(key, 1, 1))}
+            shift = sum(len(part.boxes) for other, part in parts.items() if other < key)
+            boxes = np.concatenate([part.boxes for part in parts.values()])
         rectangles = np.array([self._hall.rectangle(*other) for other in self._neighbours(key, 1, 1)])
         low = np.array([rectangles[:, 0].min(), rectangles[:, 1].min(), 0.0]) - 0.5
         high = np.array([rectangles[:, 2].max(), rectangles[:, 3].max(), self.layout.ceiling_m]) + 0.5
@@ -149,18 +148,15 @@ class World:
 
         def bake(first: int, last: int) -> None:
             columns = (faces.quads[first:last], faces.numbers[first:last], faces.owners[first:last])
-            grid.bake(*columns, shift, lamps, LAMP_REACH_M, has_shadows, light)
+            grid.bake(*columns, shift, lamps, LAMP_REACH_M, not is_plain, light)
 
         cuts = np.searchsorted(faces.numbers[:, 3], faces.light_samples * np.arange(1, 4) / 4)
         edges = [0, *(int(cut) for cut in cuts), len(faces)]
         starts, ends = edges[:-1], edges[1:]
         list(self._workers.map(bake, starts, ends) if self._workers else map(bake, starts, ends))
-        if not has_shadows:
+        if is_plain:
             light *= _PLAIN_LIGHT
         return LitFaces(faces, light, faces.bounds_m())
-
-    def _light_plain(self, key: tuple[int, int]) -> LitFaces:
-        return self._bake(self._build(key, is_plain=True), key, np.zeros((0, 8)), 0, has_shadows=False)
 
     def _assemble(self, centre: tuple[int, int]) -> Scene:
         near = set(self._neighbours(centre, NEAR_COLUMNS, NEAR_ROWS))

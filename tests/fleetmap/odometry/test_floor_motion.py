@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
-from fleetmap.odometry.floor_motion import FloorMotion
+from fleetmap.odometry.lift_check import FloorMotion
 
 # Anywhere on the robot, by any axes: nobody has told how the body is mounted.
 MOUNTED = se3(so3_exp(np.array([1.1, -0.8, 0.4])), np.array([0.3, 0.1, 0.4]))  # robot_from_body

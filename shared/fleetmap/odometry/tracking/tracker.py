@@ -108,26 +108,25 @@ class Tracker:
         """
         self._frame_index += 1
         previous, self._previous = self._previous, frame
-        far = previous is not None and (frame.stamp_ns - previous.stamp_ns) * 1e-9 > self._settings.max_gap_s
-        if previous is None or far:
+        if previous is None:
             self._points.begin(frame.left)
-        if previous is not None and far:
+            self._step(frame)
+            return Tracked(self._ids(), self._points.pixels, (), None, 1.0, by_descriptors=False)
+        if (frame.stamp_ns - previous.stamp_ns) * 1e-9 > self._settings.max_gap_s:
+            self._points.begin(frame.left)
             earlier, share = self._rematch(previous, frame, motion_since, rotation_sigma_rad)
             motion = next((e.cam_from_earlier for e in earlier if e.frame_index == self._frame_index - 1), None)
             self._step(frame)
             return Tracked(self._ids(), self._points.pixels, earlier, motion, share, by_descriptors=True)
         self._memory.clear()
-        if previous is None:
-            self._step(frame)
-            return Tracked(self._ids(), self._points.pixels, (), None, 1.0, by_descriptors=False)
         guess = motion_since(self._frame_index - 1)
         is_predicted = guess is not None and rotation_sigma_rad is not None
         guess, before, points_cam = np.eye(4) if guess is None else guess, self._points.ids, None
         if self._points_in_camera is not None:
             points_cam = self._points_in_camera(before)
             points_cam[~(points_cam[:, 2] > 0.0)] = np.nan
-        found, share = self._step(frame, guess, is_predicted, points_cam)
-        motion, information = found or (None, None)
+        solved, share = self._step(frame, guess, is_predicted, points_cam)
+        motion, information = solved or (None, None)
         if motion is None and points_cam is not None:
             # Without parallax none of the tracked points can be triangulated: they suffice to continue.
             motion = guess if np.isin(self._points.ids, before).sum() >= self._settings.min_inliers else None

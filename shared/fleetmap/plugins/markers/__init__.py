@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from fleetmap.encoding import decode_json
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Placement
@@ -44,10 +45,7 @@ def read_markers(path: Path) -> MarkerList:
     """Read a list (JSON); UsageError that names the fault."""
     with disk_errors(f"the list of markers {path} cannot be read", "", UsageError):
         data = path.read_bytes()
-    try:
-        listed = msgspec.json.decode(data, type=MarkerList)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise UsageError(f"{path} is no list of markers ({error}); {_ADVICE}") from error
+    listed = decode_json(data, MarkerList, f"{path} is no list of markers ({{}}); {_ADVICE}", UsageError)
     for marker in listed.markers:
         numbers = np.array([*marker.map_from_marker.position_m, *marker.map_from_marker.quat_wxyz])
         if not np.isfinite(numbers).all() or not 0.99 < np.linalg.norm(numbers[3:]) < 1.01:
