@@ -110,15 +110,8 @@ def _detect_level(
     """Pixels (N, 2) of the image and angles (N,) of the corners of a level."""
     scale = SCALE_FACTOR**level
     height, width = (round(s / scale) for s in image.shape)
-    scaled = (
-        image
-        if level == 0
-        else np.asarray(cv2.resize(image, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
-    )
-    limits = settings.min_distance_px, settings.fast_threshold, _BORDER_PX
-    chosen, _ = core.spread_corners(
-        scaled, quota, *limits, np.zeros((0, 2), np.float32), clearance_px, scale, _PATCH_RADIUS
-    )
-    return (scale * chosen.astype(np.float64)).astype(np.float32), core.centroid_angles_deg(
-        scaled, chosen, _PATCH_RADIUS
-    )
+    scaled = image if level == 0 else np.asarray(cv2.resize(image, (width, height)), np.uint8)
+    limits, nowhere = (settings.min_distance_px, settings.fast_threshold, _BORDER_PX), np.zeros((0, 2), np.float32)
+    chosen, _ = core.spread_corners(scaled, quota, *limits, nowhere, clearance_px, scale, _PATCH_RADIUS)
+    pixels = (scale * chosen.astype(np.float64)).astype(np.float32)
+    return pixels, core.centroid_angles_deg(scaled, chosen, _PATCH_RADIUS)

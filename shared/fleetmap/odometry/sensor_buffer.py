@@ -30,9 +30,8 @@ class SensorBuffer:
         self._pending: list[ImuSamples] = []
         self._wheel: list[WheelSample] = []
         self._last_gyro_radps = np.full((1, 3), np.nan)
-        self._unequal = (
-            0.0  # samples known to have no repeated one before them; never enough for a coarse gyro, which repeats some
-        )
+        # Samples known to have no repeated one before them; never enough for a coarse gyro, which repeats some.
+        self._unequal = 0.0
 
     def add_imu(self, samples: ImuSamples) -> None:
         """Add samples newer than any before; `imu` has them after `absorb`."""

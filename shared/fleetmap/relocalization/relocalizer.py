@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fleetmap.features import orb
 from fleetmap.features.extraction import extract_in_slices
 from fleetmap.features.matching import match_mutual
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, length, se3_inverse
 from fleetmap.pnp.pnp import Correspondences, PnpResult, pnp_with_rotation, ransac_pnp
 from fleetmap.relocalization.alias_search import AliasCandidate, LandmarkSet, find_aliases
 from fleetmap.relocalization.frame_features import FrameFeatures
@@ -196,9 +196,8 @@ class Relocalizer:
         around = [places_around(map_from_cam, place, SAME_PLACE_M, _SAME_PLACE_COSINE) for place in failed]
         is_tried = np.any([(map_from_cam == place).all(axis=(1, 2)) for place in failed], axis=0)
         is_open = ~is_tried & (np.sum(around, axis=0) < _TRIALS_AT_A_PLACE)
-        places = self.view.similar_places(
-            query.features.descriptors, is_open if allowed is None else allowed & is_open, top
-        )
+        is_wanted = is_open if allowed is None else allowed & is_open
+        places = self.view.similar_places(query.features.descriptors, is_wanted, top)
         if len(places):
             return places
         failed.clear()
@@ -289,9 +288,8 @@ class Relocalizer:
         measured = query.measured(features, self._camera, settings.stereo)
         scale = orb.SCALE_FACTOR ** np.minimum(query.features.octaves[features], 5).astype(np.float64)
         sigmas = settings.fix.feature_sigma_px * scale
-        return Correspondences(
-            self._camera, self.view.points_map[rows], measured, np.column_stack([sigmas, np.maximum(sigmas, 1.0)])
-        )
+        both = np.column_stack([sigmas, np.maximum(sigmas, 1.0)])
+        return Correspondences(self._camera, self.view.points_map[rows], measured, both)
 
     def _radius_px(self, map_from_cam: Array, cov_rot_trans: Array) -> float:
         """Three sigmas of a landmark's predicted pixel, at the median distance of the expected landmarks."""
@@ -326,9 +324,7 @@ def _count_at(places: Sequence[Array], map_from_cam: Array) -> int:
 
 
 def _is_new(fix: Fix, others: Sequence[Fix]) -> bool:
-    return not any(_same(fix, other) for other in others)
-
-
-def _same(a: Fix, b: Fix) -> bool:
-    cosine = 0.5 * (np.trace(a.map_from_cam[:3, :3].T @ b.map_from_cam[:3, :3]) - 1)
-    return bool(np.linalg.norm(a.map_from_cam[:3, 3] - b.map_from_cam[:3, 3]) < 0.5 and cosine > np.cos(np.radians(10)))
+    """True if no other fix lies within 0.5 m and 10 degrees."""
+    own = fix.map_from_cam
+    near = [o.map_from_cam for o in others if length(own[:3, 3] - o.map_from_cam[:3, 3]) < 0.5]
+    return not any(0.5 * (np.trace(own[:3, :3].T @ other[:3, :3]) - 1) > np.cos(np.radians(10)) for other in near)
