@@ -5,7 +5,7 @@ Euler angles are safe here: a ground robot never pitches anywhere near 90 degree
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,28 +40,29 @@ def _segment_matrix() -> Array:
 _MATRIX = _segment_matrix()
 
 
-class UniformSpline:
+class UniformSpline(NamedTuple):
     """Approximating spline: control point k (D,) belongs to start_s + k knot_s.
 
     No overshoot, four continuous derivatives.
     """
 
-    def __init__(self, start_s: float, knot_s: float, control: Array) -> None:
-        self._start_s, self._knot_s, self._control = start_s, knot_s, control
+    start_s: float
+    knot_s: float
+    control: Array
 
     def at(self, times_s: Array, derivative: int = 0) -> Array:
         """(N, D) values, or the given derivative per s^derivative, at times (N,), clamped to where all six control points exist."""
-        reach_s = (DEGREE - 1) / 2 * self._knot_s
-        last_s = self._start_s + (len(self._control) - 1) * self._knot_s - reach_s
-        position = (np.clip(times_s, self._start_s + reach_s, last_s) - self._start_s) / self._knot_s + (DEGREE + 1) / 2
-        segment = np.clip(np.floor(position).astype(np.int64), DEGREE, len(self._control) - 1)
+        reach_s = (DEGREE - 1) / 2 * self.knot_s
+        last_s = self.start_s + (len(self.control) - 1) * self.knot_s - reach_s
+        position = (np.clip(times_s, self.start_s + reach_s, last_s) - self.start_s) / self.knot_s + (DEGREE + 1) / 2
+        segment = np.clip(np.floor(position).astype(np.int64), DEGREE, len(self.control) - 1)
         u = position - segment
         powers = np.zeros((len(u), DEGREE + 1))
         for exponent in range(derivative, DEGREE + 1):
             factor = np.prod(np.arange(exponent - derivative + 1, exponent + 1)) if derivative else 1.0
             powers[:, exponent] = factor * u ** (exponent - derivative)
-        weights = powers @ _MATRIX / self._knot_s**derivative
-        window = self._control[segment[:, None] - DEGREE + np.arange(DEGREE + 1)]
+        weights = powers @ _MATRIX / self.knot_s**derivative
+        window = self.control[segment[:, None] - DEGREE + np.arange(DEGREE + 1)]
         return np.asarray(np.einsum("nk,nkd->nd", weights, window))
 
 

@@ -100,16 +100,11 @@ def time_path(route: Route, limits: Limits) -> TimedPath:
     # A wait would lengthen the step before it, which would be driven slowly: a second sample holds the position.
     times = np.cumsum(durations)
     held = np.array(sorted(stops), np.int64)
-    waits = np.array([stops[int(index)] for index in held])
-    times_held = np.insert(times, held, times[held] - waits) if len(held) else times
-    points_held = np.insert(points, held, points[held], axis=0) if len(held) else points
-    yaw_held = np.insert(yaw, held, yaw[held]) if len(held) else yaw
-    ends = ([0.0], times_held, [times_held[-1] + route.rest_s])
-    return TimedPath(
-        np.concatenate(ends),
-        np.concatenate([points_held[:1], points_held, points_held[-1:]]),
-        np.concatenate([yaw_held[:1], yaw_held, yaw_held[-1:]]),
-    )
+    waits = np.array([stops[int(index)] for index in held], np.float64)
+    times_held = np.insert(times, held, times[held] - waits)
+    points_held, yaw_held = np.insert(points, held, points[held], axis=0), np.insert(yaw, held, yaw[held])
+    whole = np.concatenate([[0.0], times_held, [times_held[-1] + route.rest_s]])
+    return TimedPath(whole, np.pad(points_held, ((1, 1), (0, 0)), "edge"), np.pad(yaw_held, 1, "edge"))
 
 
 def check_clear(points_map: Array, layout: Layout, clearance_m: float) -> None:

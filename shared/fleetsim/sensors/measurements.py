@@ -84,26 +84,14 @@ def measure_priors(
 ) -> tuple[PositionPrior, ...]:
     """A dock at the start (5 cm, 1 degree), then a zone each zone_period_s (1 m, heading unknown) unless that is 0."""
     dock_sigma, zone_sigma = (0.0, 0.0, 0.02, 0.05, 0.05, 0.02), (0.0, 0.0, np.inf, 1.0, 1.0, 0.02)
-    priors = [_prior(motion, base_from_body, 0.0, np.array(dock_sigma), rng)]
-    if zone_period_s > 0:
-        times = np.arange(zone_period_s, motion.duration_s, zone_period_s)
-        priors += [_prior(motion, base_from_body, float(t), np.array(zone_sigma), rng) for t in times]
+    zones_s = np.arange(zone_period_s, motion.duration_s, zone_period_s) if zone_period_s > 0 else ()
+    priors = list[PositionPrior]()
+    for moment_s in (np.array([time_s]) for time_s in (0.0, *zones_s)):
+        sigma = np.array(zone_sigma if priors else dock_sigma)
+        map_from_base = motion.map_from_body(moment_s)[0] @ np.linalg.inv(base_from_body)
+        error = np.where(np.isfinite(sigma), sigma, 0.0) * rng.standard_normal(6)
+        rotation = so3_exp(error[:3]) @ map_from_base[:3, :3] if np.isfinite(sigma[2]) else np.eye(3)
+        told = np.append(np.where(sigma[:2] == 0.0, 0.05, sigma[:2]), sigma[2:])
+        place = se3(rotation, map_from_base[:3, 3] + error[3:])
+        priors.append(PositionPrior(int(stamps_from_s(moment_s)[0]), place, np.diag(told**2)))
     return tuple(priors)
-
-
-def _prior(
-    motion: Motion, base_from_body: Array, time_s: float, sigma: Array, rng: np.random.Generator
-) -> PositionPrior:
-    map_from_body = motion.map_from_body(np.array([time_s]))[0]
-    map_from_base = map_from_body @ np.linalg.inv(base_from_body)
-    known = np.where(np.isfinite(sigma), sigma, 0.0) * rng.standard_normal(6)
-    turned = map_from_base.copy()
-    turned[:3, :3] = so3_exp(known[:3]) @ map_from_base[:3, :3]
-    if not np.isfinite(sigma[2]):
-        turned[:3, :3] = np.eye(3)
-    turned[:3, 3] += known[3:]
-    tilt = np.where(sigma[:2] == 0.0, 0.05, sigma[:2])
-    variance = np.concatenate([tilt, sigma[2:]]) ** 2
-    return PositionPrior(
-        int(stamps_from_s(np.array([time_s]))[0]), se3(turned[:3, :3], turned[:3, 3]), np.diag(variance)
-    )
