@@ -82,7 +82,7 @@ class Perception:
             Percept(odometry, image, self._motions(motions_from), view_causes=tuple(causes)),
         )
         if self.gauges:
-            if self.odometry.refuses_imu or self.odometry.accelerometer_fault:
+            if self.odometry.refuses_imu or self.odometry.accelerometer.fault:
                 self.gauge.doubt()
             dt_s = 0.0 if last is None else (odometry.stamp_ns - last.odometry.stamp_ns) * 1e-9
             self.percept.ride = self.gauge.advance(odometry.stamp_ns + self._imu_minus_cam_ns, dt_s)

@@ -250,7 +250,7 @@ class Robot:
             return {**self._images_refused, **self._wheels_unused, **self._load.overload}
         wheels = self._wheels.refused or self._wheels_unused
         imu = imu_refused(odometry.imu_late_s) if odometry.refuses_imu else {}
-        return {**imu, **accelerometer_refused(odometry.accelerometer_fault), **wheels, **self._load.overload}
+        return {**imu, **accelerometer_refused(odometry.accelerometer.fault), **wheels, **self._load.overload}
 
     def handle_silence(self, for_s: float) -> FailureContext | None:
         """Return the failure of a source without frames for so many seconds."""

@@ -82,16 +82,13 @@ class GyroClock:
         self._grams = _KEPT * self._grams + rows.transpose(0, 2, 1) @ rows
         self._frames = _KEPT * self._frames + len(batch)
 
-    def squares(self) -> Array:
-        """Squared residuals of each shift, in variances."""
+    def _judge(self, latest_s: float) -> None:
         grams = self._grams + _PRIOR
         known, crossed = grams[:, :4, :4], grams[:, :4, 4:]
         explained = (crossed * np.linalg.solve(known, crossed)).sum(axis=(1, 2))
         left = np.trace(grams[:, 4:, 4:], axis1=1, axis2=2) - explained
-        return np.asarray(left / max(_TURN_SIGMA_RAD**2, left.min() / max(3.0 * self._frames - 12.0, 1.0)))
-
-    def _judge(self, latest_s: float) -> None:
-        squares = self.squares()
+        variance = max(_TURN_SIGMA_RAD**2, left.min() / max(3.0 * self._frames - 12.0, 1.0))
+        squares = left / variance  # residuals of each shift
         # Shift 0 is always included: the filter of a rig with exact clocks finds no offset.
         first_s = min(0.5 * _STEP_S - self._limit_s, 0.0)
         last_s = max(min(self._limit_s, latest_s) - 0.5 * _STEP_S, 0.0)

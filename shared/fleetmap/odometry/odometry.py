@@ -117,11 +117,6 @@ class Odometry:
         """Delay of the IMU's stamps relative to the calibration if the IMU is excluded for it; None otherwise."""
         return self._clock.off_s
 
-    @property
-    def accelerometer_fault(self) -> str:
-        """Reason why the accelerometer is not used, its axes or unit; empty if it is, or may be."""
-        return self.accelerometer.fault
-
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """earlier_from_now (4, 4) since a frame (counted from 0) as known now, and its covariance.
 

@@ -139,7 +139,7 @@ def test_the_odometry_goes_on_without_what_is_wrong(wrong: str, frames: int, mon
         odometry.handle_imu(imu.between(fed_ns, k * FRAME_NS + 1))
         fed_ns = k * FRAME_NS + 1
         estimates.append(odometry.handle_stereo(stereo_frame(k * FRAME_NS)))
-    assert ("wrong sign" in odometry.accelerometer_fault) == (wrong == "accelerometer")
+    assert ("wrong sign" in odometry.accelerometer.fault) == (wrong == "accelerometer")
     assert odometry.refuses_imu == (wrong == "clock")
     assert odometry.imu_late_s == (0.1 if wrong == "clock" else None)
     assert estimates[25].inertial or wrong == "accelerometer"

@@ -11,6 +11,7 @@ from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import Array, Rings, se3, se3_inverse, so3_exp
 from fleetmap.mapformat.building import BuildingFrame, Floor, FloorEntry
 from fleetmap.messages import Status
+from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.relocalization.map_view import CovisibleLandmarks
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration
@@ -28,15 +29,13 @@ CABIN = np.array([[8.0, -1.2], [11.0, -1.2], [11.0, 1.2], [8.0, 1.2]])
 STAND_M = 9.5  # along x, inside
 WRONG_M = 0.5
 NOISE = ImuNoise(1.7e-4, 2e-5, 2e-3, 3e-4)
-SEEN_SHARE, COMPARED_SHARE = (
-    0.75,
-    0.9,
-)  # of map queries with a fix; of comparisons with a floor at the place of a fix on another one
+# Of map queries with a fix; of comparisons with a floor at the place of a fix on another one.
+SEEN_SHARE, COMPARED_SHARE = 0.75, 0.9
 
 
 class Odometry(ScriptedOdometry):
     refuses_imu = False
-    accelerometer_fault = ""
+    accelerometer = AccelerometerCheck(np.eye(4))
 
     def handle_imu(self, _: ImuSamples) -> None:
         """The scripted motion needs none."""
