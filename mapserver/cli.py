@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from fleetmap.cli_exit import require_extra, run_cli
 from fleetmap.cli_options import Commands, ConfigFile, Options, Version, make_app
-from mapserver.commands.build import build, nightly
+from mapserver.commands.build import build
 from mapserver.commands.building import AREAS, BUILDING, align
 from mapserver.commands.fleet import FLEET
 from mapserver.commands.operators import OPERATORS
@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 COMMANDS: Commands = {
     "build": build,
-    "nightly": nightly,
     "publish": publish,
     "promote": promote,
     "rollback": rollback,

@@ -1,15 +1,13 @@
-"""`mapserver build` and `nightly`: a draft from recordings, and the site's next version from new ones."""
+"""`mapserver build`: a draft in the store from recordings."""
 
-import time
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetmap.cli_options import ConfigFile, expand_options, settings_of
-from fleetmap.errors import BusyError, FleetmapError, UsageError, disk_errors
+from fleetmap.cli_options import ConfigFile, expand_options
+from fleetmap.errors import UsageError
 from mapserver.commands.options import SurveyOptions, check_output
 
 if TYPE_CHECKING:
@@ -89,54 +87,3 @@ def _other_trajectory(file: Path | None, frame: str | None, scale: float | None)
         if value is not None:
             raise UsageError(f"{option} describes --trajectory FILE, which is missing; add it")
     return None
-
-
-@dataclass(frozen=True, kw_only=True)
-class NightlyOptions(SurveyOptions):
-    """Options of `nightly` beside those of `build`."""
-
-    inbox: Annotated[Path, typer.Option(metavar="DIR", help="Folder that recordings are copied into.")]
-    settle_s: Annotated[
-        float, typer.Option("--settle-s", min=0, help="A recording unchanged for this many seconds is complete.")
-    ] = 300.0
-
-
-@expand_options
-def nightly(context: typer.Context, options: NightlyOptions, config: ConfigFile = None) -> None:
-    """Check, build, judge and publish the recordings in the inbox; one run at a time for each site.
-
-    Status 0 also for an empty inbox, 4 if the gate refuses, 5 if another run is at work.
-    """
-    options.check()
-    from fleetmap.console import plain_console
-    from fleetmap.recordings import FrameSelection
-    from mapserver.nightly.night import NightRequest, run_night
-
-    FrameSelection.parse(options.frames)
-    settings, build = settings_of(context), options.build_options(context, report=None)
-    retention = settings.ingest.retention()
-    request = NightRequest(
-        options.site, options.inbox, options.store, time.time_ns(), options.settle_s, build, retention
-    )
-    try:
-        sentence = run_night(request, settings.gate, plain_console(stderr=True))
-    except BusyError:
-        raise
-    except FleetmapError:
-        with suppress(FleetmapError):  # the first error is the one to report
-            _write_report(options)
-        raise
-    _write_report(options)
-    typer.echo(sentence)
-
-
-def _write_report(options: NightlyOptions) -> None:
-    from fleetmap.encoding import to_json
-    from mapserver.nightly.night import last_report
-
-    report = options.report
-    content = None if report is None else last_report(options.store, options.site)
-    if report is None or content is None:
-        return
-    with disk_errors(f"{report} cannot be written", "the store's jobs hold the same report"):
-        report.write_bytes(to_json(content, indent=2) + b"\n")

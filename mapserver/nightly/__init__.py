@@ -1,1 +1,1 @@
-"""The nightly job of a site: read new recordings, check them, build on the current version, publish if the gate accepts it."""
+"""The inbox of a site: recordings that arrive, and what became of them."""

@@ -11,31 +11,26 @@ sockets and devices are bad, as is any entry with a read error. One entry never 
 
 import fcntl
 import hashlib
-import json
 import os
+import resource
 import shutil
 import signal
 import stat
-import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, count
-from math import ceil
 from pathlib import Path
 
-from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, RecordingError, StateError, StoreError, UsageError, disk_errors
 from fleetmap.files import sync_path, write_atomically
 from fleetmap.log_lines import printable
 from fleetmap.mapformat.names import is_name
-from fleetmap.recordings import OpenOptions, file_suffixes
-from mapserver.fleet.bounded_process import ProcessLimits, run_bounded
-from mapserver.nightly import reading
+from fleetmap.recordings import file_suffixes
 from mapserver.store.files import check_no_link, make_folder
 
 DONE, HELD, BAD = "done", "held", "bad"
-_HASH_SIGNS = 12
+HASH_SIGNS = 12
 _MAX_NAME_BYTES = 220  # of 255: room for `.reason.txt` after it
 _UPLOAD_NAME_BYTES = 200  # room for the hash and a number before it
 _UNFINISHED = (".part", ".partial", ".filepart", ".crdownload", ".tmp")
@@ -45,9 +40,6 @@ _MOST_LISTED = 1000
 _KINDS = {stat.S_IFLNK: "a symbolic link", stat.S_IFIFO: "a FIFO", stat.S_IFSOCK: "a socket"}
 # Limit of one recording: an hour of two cameras at 30 Hz has 216,000 files
 _MOST_FILES, _DEEPEST = 2_000_000, 32
-# Time limit to read one: this, and 1 s for each 4 MiB on the disk; sparse files do not raise it
-_READ_S, _SLOWEST_BYTES_PER_S = 600, 4 << 20
-_LEAST_MEMORY_BYTES, _OPEN_FILES = 4 << 30, 1024
 _DAY_S = 86_400
 _FOR_READING = os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
 
@@ -63,19 +55,6 @@ class Arrivals:
     waiting: tuple[tuple[Path, str], ...]
     bad: tuple[tuple[Path, str], ...] = ()
     others: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class InboxRecording:
-    """A readable recording; found: gaps reported by its reader, as text."""
-
-    path: Path
-    sha256: str
-    found: str = ""
-
-    def why(self, reason: str) -> str:
-        """Return a reason together with the reader's findings, which are often its cause."""
-        return f"{reason}; when it was read: {self.found}" if self.found else reason
 
 
 def arrivals(inbox: Path, settle_s: float, now_ns: int, *, is_brief: bool = False) -> Arrivals:
@@ -106,44 +85,24 @@ def arrivals(inbox: Path, settle_s: float, now_ns: int, *, is_brief: bool = Fals
         except FileNotFoundError:
             waiting.append((path, "it changes right now"))
         except (OSError, RecordingError) as error:
-            bad.append((path, reading.why_unreadable(path, error)))
+            bad.append((path, why_unreadable(path, error)))
     return Arrivals(tuple(complete), tuple(waiting), tuple(bad), tuple(others))
 
 
-def identify(path: Path, options: OpenOptions) -> InboxRecording | str | None:
-    """Return a recording with its hash, or the reason why it is unreadable; None if it changed meanwhile.
-
-    Its memory and time are limited. StoreError if this machine cannot start a process.
-    """
-    try:
-        before, seconds = _state(path)
-        sha256, words = _read(path, options, seconds)
-        found = InboxRecording(path, sha256, words) if sha256 else words
-        return found if _state(path)[0] == before else None
-    except FileNotFoundError:
-        return None
-    except (OSError, RecordingError) as error:
-        return reading.why_unreadable(path, error)
+def why_unreadable(path: Path, error: Exception) -> str:
+    """Return the reason, with the next step."""
+    if isinstance(error, FleetmapError):
+        return str(error)
+    if isinstance(error, MemoryError):
+        most_bytes = resource.getrlimit(resource.RLIMIT_AS)[0]
+        return f"{path} takes more than {most_bytes >> 20} MiB of memory to read; is it damaged? Copy it again"
+    if isinstance(error, OSError):
+        named = os.fsdecode(error.filename) if isinstance(error.filename, str | bytes) else path
+        return f"{named} cannot be read ({error.strerror or error}); give this account read access, or copy it again"
+    return f"{path} cannot be read ({type(error).__name__}: {str(error)[:200]}); try `mapserver doctor {path}`"
 
 
-def _read(path: Path, options: OpenOptions, seconds: float) -> tuple[str, str]:
-    """Return the result of `reading.read`, in a process of its own. StoreError if this machine cannot start one."""
-    limits = ProcessLimits(_most_memory_bytes(), ceil(seconds), seconds, open_files=_OPEN_FILES)
-    given = [str(path), str(options.calibration_file or ""), to_json(options.topics).decode()]
-    try:
-        with disk_errors("no process can be started", "see memory and disk of this machine"):
-            ended = run_bounded([sys.executable, "-m", reading.__name__, *given], limits, f"the reading of {path}")
-    except StoreError:
-        raise
-    except FleetmapError as error:
-        return "", str(error)
-    if ended.status:
-        return "", f"{path} cannot be read: {ended.errors.strip().rpartition(chr(10))[2][:500]}"
-    sha256, words = json.loads(ended.output)
-    return sha256, words
-
-
-def _parts(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
+def parts(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
     """Yield an entry and all of its contents, links not followed. Raises RecordingError for other than files and folders, OSError."""
     left, number = [(path, 0)], 0
     while left:
@@ -163,21 +122,10 @@ def _parts(path: Path) -> Iterator[tuple[Path, os.stat_result]]:
                 left += [(part / entry.name, depth + 1) for entry in entries]
 
 
-def _state(path: Path) -> tuple[object, float]:
-    """Return the files of an entry, to detect changes, and the time limit to read it in seconds."""
-    parts = list(_parts(path))
-    state = {(part, status.st_ino, status.st_size, status.st_ctime_ns) for part, status in parts}
-    return state, _READ_S + sum(512 * status.st_blocks for _, status in parts) / _SLOWEST_BYTES_PER_S
-
-
-def _most_memory_bytes() -> int:
-    return max(_LEAST_MEMORY_BYTES, os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") // 2)
-
-
 def _unfinished(path: Path, settle_s: float, now_ns: int) -> str | None:
-    """Return why a recording is incomplete; None if it is complete. Raises as `_parts`."""
+    """Return why a recording is incomplete; None if it is complete. Raises as `parts`."""
     newest_ns, reason = 0, None
-    for part, status in _parts(path):
+    for part, status in parts(path):
         # Not mtime, which copying tools set back: ctime cannot be set.
         newest_ns = max(newest_ns, status.st_ctime_ns)
         if reason is None and part.suffix in _UNFINISHED:
@@ -215,10 +163,10 @@ def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> 
     Raises StoreError if the disk refuses; the recording then stays in place.
     """
     folder = path.parent / where
-    prefix = "" if sha256 is None or path.name.startswith(sha256[:_HASH_SIGNS]) else f"{sha256[:_HASH_SIGNS]}-"
+    prefix = "" if sha256 is None or path.name.startswith(sha256[:HASH_SIGNS]) else f"{sha256[:HASH_SIGNS]}-"
     name = f"{prefix}{path.name}"
     if not is_safe_name(f"99-{name}"):
-        digest = hashlib.sha256(os.fsencode(path.name)).hexdigest()[:_HASH_SIGNS]
+        digest = hashlib.sha256(os.fsencode(path.name)).hexdigest()[:HASH_SIGNS]
         name = f"{prefix}unnamed-{digest}{path.suffix if path.suffix in file_suffixes() else ''}"
     check_no_link(path.parent, folder)
     with disk_errors(f"{path} cannot be moved to {folder}", "check the rights and space of the inbox"):
@@ -278,15 +226,15 @@ def contents(inbox: Path, settle_s: float, now_ns: int) -> InboxContents:
     waiting = [_entry(inbox / name, reasons[name]) for name in sorted(reasons) if is_safe_name(name)]
     kept: dict[str, list[InboxEntry]] = {HELD: [], BAD: []}
     for where, entries in kept.items():
-        for name in _names(inbox / where)[:_MOST_LISTED]:
+        for name in names(inbox / where)[:_MOST_LISTED]:
             path, reason = inbox / where / name, ""
             with suppress(OSError), os.fdopen(os.open(f"{path}{_REASON}", _FOR_READING), "rb") as file:
                 reason = (file.read(_REASON_BYTES) or b"").decode("utf-8", "replace").strip()
             entries.append(_entry(path, reason.replace(f"{inbox}/", "")))
-    return InboxContents(waiting[:_MOST_LISTED], kept[HELD], kept[BAD], len(_names(inbox / DONE)))
+    return InboxContents(waiting[:_MOST_LISTED], kept[HELD], kept[BAD], len(names(inbox / DONE)))
 
 
-def _names(folder: Path) -> list[str]:
+def names(folder: Path) -> list[str]:
     """Return the names of recordings that were put away; none of a folder that is a link."""
     with suppress(FileNotFoundError, StoreError):
         check_no_link(folder.parent, folder)
@@ -356,15 +304,3 @@ def remove_old(inbox: Path, days: float, now_ns: int, *, dry_run: bool = False) 
                         Path(f"{path}{_REASON}").unlink(missing_ok=True)
                     found += 1
     return found
-
-
-def kept(inbox: Path, sha256s: list[str]) -> list[Path]:
-    """Return the recordings of these hashes still in the inbox, in the same order: done, or held and later published by an operator."""
-    found: dict[str, Path] = {}
-    for where in (DONE, HELD):
-        for name in _names(inbox / where):
-            with suppress(OSError, RecordingError):  # it holds something other than files and folders
-                for _ in _parts(inbox / where / name):
-                    pass
-                found.setdefault(name[:_HASH_SIGNS], inbox / where / name)
-    return [found[sha256[:_HASH_SIGNS]] for sha256 in sha256s if sha256[:_HASH_SIGNS] in found]

@@ -13,7 +13,6 @@ from fleetmap.messages import Cause, Flag
 from locclient.replay.run_metrics import METRICS
 from mapserver.drafting.report import BuildReport
 from mapserver.fleet_statistics.kpis import Kpis
-from mapserver.nightly.night import NightReport
 from mapserver.quality import figures
 from mapserver.survey.merge.multi_session import Counts
 from support.fleet.contracts_documents import REPOSITORY, code_words, generate_docs, rows, section, text
@@ -39,7 +38,7 @@ def test_every_command_that_reads_a_recording_takes_the_names_of_its_topics() ->
         if any(p.param_type_name == "argument" and "RECORDING" in (p.metavar or p.name.upper()) for p in command.params)
     }
     assert len(readers) >= 4
-    for path in readers | {"mapserver nightly"}:
+    for path in readers:
         assert "--topic" in {option for parameter in commands[path].params for option in parameter.opts}, path
 
 
@@ -94,7 +93,6 @@ RUN_KEYS = {"aligned_error_m", "peak_rss_mb", "map_version", "not_localised_m", 
         (REPORTS, "Build", _fields(BuildReport)),
         (REPORTS, "Sessions", _fields(Counts) | {"recording", "joined", "verdict", "reason", "evidence"}),
         (REPORTS, "Evidence", _fields(*EVIDENCE)),
-        (REPORTS, "Nightly", _fields(NightReport) | {"state", "message"}),
         (REPORTS, "Replay", set(METRICS) | RUN_KEYS),
         (REPORTS, "Fleet", _fields(Kpis)),
     ],

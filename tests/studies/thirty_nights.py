@@ -27,7 +27,7 @@ from locclient.replay import run_metrics
 from mapserver import open_map
 from mapserver.config import MapserverConfig
 from mapserver.fleet.fleet import Fleet
-from mapserver.nightly.night import NightRequest, last_report, run_night
+from mapserver.plugins.nightly_builds.night import NightRequest, last_report, run_night
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from studies.study import PAGES, Column, Row, publish, results, table

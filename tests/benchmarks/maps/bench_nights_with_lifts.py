@@ -39,7 +39,7 @@ from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
 from mapserver.drafting.draft import BuildOptions
 from mapserver.library import build_map
-from mapserver.nightly.night import NightRequest, last_report, run_night
+from mapserver.plugins.nightly_builds.night import NightRequest, last_report, run_night
 from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, MapStore
 from mapserver.store.archive import decode_archive

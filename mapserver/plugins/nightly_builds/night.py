@@ -24,8 +24,8 @@ from mapserver.drafting.draft import BuildOptions, BuildRequest, build_draft
 from mapserver.drafting.job_lock import INTERRUPTED, end_interrupted, held, logged, only_one
 from mapserver.library import settings_for
 from mapserver.nightly import inbox as boxes
-from mapserver.nightly.inbox import InboxRecording
 from mapserver.nightly.retention import apply_retention
+from mapserver.plugins.nightly_builds.recordings import InboxRecording, identify, kept
 from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, FleetRetention, MapStore, VersionInfo
 
@@ -203,7 +203,7 @@ class _Night:
                 self._put_away(path, boxes.BAD, None, _ENDED.format(nights=ceil(self._report.ended[name])))
                 continue
             self._look_at([path])
-            recorded = boxes.identify(path, self._request.options.opening)
+            recorded = identify(path, self._request.options.opening)
             if recorded is None:
                 self._wait(name, "incomplete: it changed while it was read")
             elif isinstance(recorded, str):
@@ -251,7 +251,7 @@ class _Night:
         entries = () if current is None else self._maps.manifest(request.site, current).recordings
         options = replace(
             request.options,
-            replay=tuple(boxes.kept(request.inbox, [entry.sha256 for entry in entries])),
+            replay=tuple(kept(request.inbox, [entry.sha256 for entry in entries])),
             actor=self._actor(),
             job=self._report.job,
             look_at=self._look_at,

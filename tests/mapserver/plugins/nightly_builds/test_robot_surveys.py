@@ -25,8 +25,8 @@ from mapserver.drafting.draft import BuildOptions
 from mapserver.fleet.building import keep_areas
 from mapserver.floor_plan.survey_requests import courses
 from mapserver.library import build_map, open_map
-from mapserver.nightly.night import NightRequest, run_night
 from mapserver.nightly.robot_drives import RobotDrives
+from mapserver.plugins.nightly_builds.night import NightRequest, run_night
 from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, MapStore
 from support.recordings.recording_samples import START_NS, write_mcap

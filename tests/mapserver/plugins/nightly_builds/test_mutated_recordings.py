@@ -1,6 +1,6 @@
 """Mutated recordings of failures and drives: each is judged within 20 s of the processor and 512 MB.
 
-MUTATED=10000 python -m pytest tests/mapserver/fleet/test_mutated_recordings.py
+MUTATED=10000 python -m pytest tests/mapserver/plugins/nightly_builds/test_mutated_recordings.py
 """
 
 import os
@@ -19,7 +19,7 @@ from rosbags.rosbag2 import CompressionMode
 from fleetmap.errors import FleetmapError
 from fleetmap.recordings import OpenOptions
 from mapserver.fleet.replay_judge import judged
-from mapserver.nightly.reading import read
+from mapserver.plugins.nightly_builds.reading import read
 from support.fleet.failed_robot import small_file
 from support.recordings.bag_samples import write_rosbag1, write_rosbag2
 from support.recordings.mcap_samples import foreign_messages

@@ -38,20 +38,22 @@ from mapserver.config import survey_settings
 from mapserver.drafting.draft import BuildOptions, BuildRequest, Draft
 from mapserver.drafting.survey_recordings import OpenRecordings, RecordingOptions, admit_recordings, survey_all
 from mapserver.nightly import inbox as boxes
-from mapserver.nightly import night, reading
 from mapserver.nightly.inbox import arrivals
-from mapserver.nightly.night import NightRequest, last_report, run_night
-from mapserver.nightly.reading import read
+from mapserver.plugins.nightly_builds import night, reading, recordings
+from mapserver.plugins.nightly_builds.night import NightReport, NightRequest, last_report, run_night
+from mapserver.plugins.nightly_builds.reading import read
+from mapserver.plugins.nightly_builds.recordings import InboxRecording, identify
 from mapserver.quality.gate import GateSettings
 from mapserver.store import DraftContent, FleetRetention, MapStore
 from mapserver.survey.settings import SurveySettings
 from support.command_line import status
+from support.fleet.contracts_documents import code_words, rows, section
 from support.recordings.recording_samples import make_sample, write_euroc
 from support.storage.faulty_disk import Disk, in_child
 from support.storage.map_samples import draft_details, random_tile
 
 LATER_NS = 3_600 * 10**9
-READ = boxes._read
+READ = recordings._read
 Build = Callable[..., tuple[Draft, None]]
 
 
@@ -93,7 +95,7 @@ def built(
 @pytest.fixture(autouse=True)
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(night, "build_draft", built)
-    monkeypatch.setattr(boxes, "_read", lambda path, options, _: read(path, options))
+    monkeypatch.setattr(recordings, "_read", lambda path, options, _: read(path, options))
 
 
 @pytest.fixture
@@ -486,10 +488,10 @@ def test_a_fault_of_the_program_leaves_one_recording_out_of_a_build() -> None:
     [("_READ_S", 0.05, "was ended after 0 s"), ("_most_memory_bytes", lambda: 1 << 20, "monday")],
 )
 def test_reading_has_limits(hall: Path, monkeypatch: pytest.MonkeyPatch, limit: str, value: object, said: str) -> None:
-    monkeypatch.setattr(boxes, "_read", READ)
-    assert isinstance(boxes.identify(hall / "inbox/monday", OpenOptions()), boxes.InboxRecording)
-    monkeypatch.setattr(boxes, limit, value)
-    found = boxes.identify(hall / "inbox/monday", OpenOptions())
+    monkeypatch.setattr(recordings, "_read", READ)
+    assert isinstance(identify(hall / "inbox/monday", OpenOptions()), InboxRecording)
+    monkeypatch.setattr(recordings, limit, value)
+    found = identify(hall / "inbox/monday", OpenOptions())
     assert isinstance(found, str)
     assert said in found
 
@@ -615,3 +617,8 @@ def test_the_command_says_how_it_ended(
     assert run("--report", str(hall / "night.json")) == 4
     assert json.loads((hall / "night.json").read_text())["state"] == "failed"
     assert "number of landmarks" in capsys.readouterr().err
+
+
+def test_its_report_is_documented() -> None:
+    documented = {code_words(row[0])[0] for row in rows(section("docs/reports.md", "Nightly"))}
+    assert documented == NightReport.__dataclass_fields__.keys() | {"state", "message"}
