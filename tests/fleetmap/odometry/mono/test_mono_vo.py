@@ -6,7 +6,7 @@ import pytest
 from fleetmap import core
 from fleetmap.geometry import Array, align_points, rotation_angle_rad, se3, se3_inverse, so3_exp, transform_points
 from fleetmap.odometry.mono.mono_vo import VisualOdometry
-from fleetmap.odometry.mono.two_view import two_view_motion
+from fleetmap.odometry.mono.two_view import TwoView, two_view_motion
 from fleetmap.odometry.settings import MonocularSettings
 from fleetmap.sensors.rectification import StereoCamera
 
@@ -22,6 +22,11 @@ def cloud(rng: np.random.Generator, count: int, depth: tuple[float, float] = (3.
 def seen(points: Array, cam_from_map: Array, rng: np.random.Generator, sigma_px: float) -> Array:
     pixels = CAMERA.pixel_from_point(transform_points(cam_from_map, points))[:, :2]
     return np.asarray(pixels + sigma_px * rng.normal(size=pixels.shape))
+
+
+def two_views(rng: np.random.Generator, points: Array, b_from_a: Array, sigma_px: float) -> TwoView | None:
+    a, b = seen(points, np.eye(4), rng, sigma_px), seen(points, b_from_a, rng, sigma_px)
+    return two_view_motion(CAMERA, a, b, threshold_px=1.0, seed=1)
 
 
 def test_two_views_give_direction_and_rotation() -> None:
@@ -52,20 +57,14 @@ def test_a_flat_scene_gives_the_truth_or_nothing(slope: float) -> None:
     points = cloud(rng, 200)
     plane = 5.0 / (1.0 - slope * points[:, 0] / points[:, 2])
     points *= (plane / points[:, 2])[:, None]
-    found = two_view_motion(
-        CAMERA, seen(points, np.eye(4), rng, 0.3), seen(points, B_FROM_A, rng, 0.3), threshold_px=1.0, seed=1
-    )
+    found = two_views(rng, points, B_FROM_A, 0.3)
     assert found is None or is_right(found.b_from_a)
 
 
 def test_a_turn_on_the_spot_is_no_motion() -> None:
     """Nothing can be placed without parallax: the rays stay parallel."""
     rng = np.random.default_rng(5)
-    points = cloud(rng, 200)
-    turned = se3(so3_exp(np.array([0.0, 0.15, 0.0])), np.zeros(3))
-    found = two_view_motion(
-        CAMERA, seen(points, np.eye(4), rng, 0.2), seen(points, turned, rng, 0.2), threshold_px=1.0, seed=1
-    )
+    found = two_views(rng, cloud(rng, 200), se3(so3_exp(np.array([0.0, 0.15, 0.0])), np.zeros(3)), 0.2)
     assert found is None or found.parallax_rad < np.radians(0.5)
 
 

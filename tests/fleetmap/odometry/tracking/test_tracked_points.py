@@ -18,18 +18,18 @@ from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, rig, stereo_fram
 
 WIDTH, HEIGHT, FOCAL_PX, DISPARITY_PX = 320, 200, 250.0, 10.0
 LENS = np.array([FOCAL_PX, 160.0, 100.0, 25.0])
+COLUMNS, ROWS = (side.ravel() for side in np.meshgrid(np.arange(30.0, 300.0, 15.0), np.arange(30.0, 180.0, 10.0)))
+TEXTURE, (U, V) = smooth_texture(np.random.default_rng(7)), pixel_grid(WIDTH, HEIGHT)
 FRAME_NS = 50_000_000
 IMU = ImuNoise(2e-4, 1e-5, 2e-3, 1e-4)
 
 
 def test_what_moves_otherwise_ends() -> None:
     """All is 2.5 m away and moves by 2 px, but for a part that moves by -3 px; points without depth go on with either."""
-    texture, (u, v) = smooth_texture(np.random.default_rng(7)), pixel_grid(WIDTH, HEIGHT)
-    before, now = picture(texture, u, v), picture(texture, u - 2.0, v)
-    now[60:140, 100:200] = picture(texture, u + 3.0, v)[60:140, 100:200]
+    before, now = picture(TEXTURE, U, V), picture(TEXTURE, U - 2.0, V)
+    now[60:140, 100:200] = picture(TEXTURE, U + 3.0, V)[60:140, 100:200]
     tracker = core.Tracker(LENS, TrackerSettings(max_points=0), StereoSettings(), 50.0, REFINEMENT)
-    columns, rows = np.meshgrid(np.arange(30.0, 300.0, 15.0), np.arange(30.0, 180.0, 10.0))
-    pixels = np.column_stack([columns.ravel(), rows.ravel(), columns.ravel() - DISPARITY_PX])
+    pixels = np.column_stack([COLUMNS, ROWS, COLUMNS - DISPARITY_PX])
     pixels[::4, 2] = np.nan
     tracker.begin(before)
     assert tracker.add(pixels) == 0
@@ -56,15 +56,13 @@ def test_what_moves_otherwise_ends() -> None:
 
 def test_points_that_are_known_need_no_disparity() -> None:
     """A single camera's points, from where several frames saw them: its motion is found by them."""
-    texture, (u, v) = smooth_texture(np.random.default_rng(7)), pixel_grid(WIDTH, HEIGHT)
-    columns, rows = np.meshgrid(np.arange(30.0, 300.0, 15.0), np.arange(30.0, 180.0, 10.0))
-    pixels = np.column_stack([columns.ravel(), rows.ravel(), np.full(columns.size, np.nan)])
+    pixels = np.column_stack([COLUMNS, ROWS, np.full(COLUMNS.size, np.nan)])
     points = 2.5 * np.column_stack([(pixels[:, :2] - LENS[1:3]) / FOCAL_PX, np.ones(len(pixels))])
     for known, is_found in ((points, True), (None, False)):
         tracker = core.Tracker(LENS * [1, 1, 1, 0], TrackerSettings(), StereoSettings(), 0.0, REFINEMENT)
-        tracker.begin(picture(texture, u, v))
+        tracker.begin(picture(TEXTURE, U, V))
         tracker.add(pixels)
-        motion, _ = tracker.track(picture(texture, u - 2.0, v), None, None, np.eye(4), False, known)
+        motion, _ = tracker.track(picture(TEXTURE, U - 2.0, V), None, None, np.eye(4), False, known)
         assert (motion is not None) == is_found
         assert np.isnan(tracker.pixels[:, 2]).all()
 
