@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.rectification import RGBD_BASELINE_M, RectifiedFrame, Rectifier, StereoCamera
@@ -92,6 +93,59 @@ def projection_by_point(camera: StereoCamera, points_cam: Array) -> Array:
     rows[:, 0, 2], rows[:, 1, 2] = -focal_px * x / z**2, -focal_px * y / z**2
     rows[:, 2, 2] = -focal_px * camera.baseline_m / z**2
     return rows
+
+
+@dataclass(frozen=True, slots=True)
+class Looks:
+    """M observations of points by known cameras: map_from_cam (M, 4, 4), landmark (M,), pixels (M, 3), sigmas_px (M, 2)."""
+
+    camera: StereoCamera
+    map_from_cam: Array
+    landmark: NDArray[np.int32]
+    pixels: Array
+    sigmas_px: Array
+
+    def seen(self, points_map: Array) -> Array:
+        """Return the points (M, 3) in the cameras, of points (N, 3), each at least 5 cm before its camera."""
+        cam_from_map = se3_inverse(self.map_from_cam)
+        seen = np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], points_map[self.landmark]) + cam_from_map[:, :3, 3]
+        seen[:, 2] = np.maximum(seen[:, 2], 0.05)
+        return np.asarray(seen)
+
+    def information(self, points_map: Array) -> Array:
+        """Return (N, 3, 3) of points (N, 3), in map axes: sum of J^T J."""
+        rows = projection_by_point(self.camera, self.seen(points_map))
+        rows[~np.isfinite(self.pixels[:, 2]), 2, 2] = 0.0
+        jacobian = (rows / self.sigmas_px[:, [0, 0, 1], None]) @ se3_inverse(self.map_from_cam)[:, :3, :3]
+        information = np.zeros((len(points_map), 3, 3))
+        np.add.at(information, self.landmark, jacobian.transpose(0, 2, 1) @ jacobian)
+        return information
+
+    def residuals(self, points_map: Array) -> tuple[Array, Array]:
+        """Return (M, 3) of u, v and disparity, NaN without a right match, and the points `seen` (M, 3)."""
+        seen = self.seen(points_map)
+        predicted, pixels = self.camera.pixel_from_point(seen), self.pixels
+        disparity = pixels[:, 0] - pixels[:, 2] - predicted[:, 0] + predicted[:, 2]
+        return np.column_stack([pixels[:, :2] - predicted[:, :2], disparity]), seen
+
+    def squared(self, points_map: Array) -> Array:
+        """Return (M,) squared residuals in sigmas."""
+        residual, _ = self.residuals(points_map)
+        return np.asarray(np.square(np.nan_to_num(residual / self.sigmas_px[:, [0, 0, 1]])).sum(axis=1))
+
+    def triangulated(self, points_map: Array) -> Array:
+        """Return points (N, 3) with the best fit to their observations: some steps of Gauss-Newton from points_map (N, 3)."""
+        points, cam_from_map = points_map.copy(), se3_inverse(self.map_from_cam)
+        for _ in range(4):
+            residual, seen = self.residuals(points)
+            weight = np.where(np.isfinite(residual), 1.0 / self.sigmas_px[:, [0, 0, 1]], 0.0)
+            jacobian = (projection_by_point(self.camera, seen) * weight[:, :, None]) @ cam_from_map[:, :3, :3]
+            hessian, pull = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
+            np.add.at(hessian, self.landmark, jacobian.transpose(0, 2, 1) @ jacobian)
+            np.add.at(pull, self.landmark, np.einsum("mij,mi->mj", jacobian, np.nan_to_num(residual) * weight))
+            step = np.linalg.solve(hessian + 1e-6 * np.eye(3), pull[:, :, None])[:, :, 0]
+            points += np.clip(step, -0.5, 0.5)
+        return points
 
 
 def frame_of_camera(frame: RectifiedFrame, number: int) -> RectifiedFrame | None:

@@ -18,10 +18,6 @@ _RELEASED_EVERY = 4096  # steps of a stage: they read far fewer features than a 
 Progress = Callable[[str, int, int], None]  # stage, done, total
 
 
-def no_progress(stage: str, done: int, total: int) -> None:
-    """Reports nothing."""
-
-
 class FrameParts(Protocol):
     """The frames of a recording by their number."""
 
@@ -66,7 +62,7 @@ class SurveyConfig:
 class SurveyTools:
     """Resources that do not change the result."""
 
-    progress: Progress = no_progress
+    progress: Progress = field(default=lambda *_: None)
     images: ImageStore = field(default_factory=ImageStore)
     executor: Executor = SERIAL
 

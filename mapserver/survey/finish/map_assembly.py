@@ -12,11 +12,11 @@ from scipy.spatial import cKDTree
 from fleetmap import core
 from fleetmap.features.matching import packed
 from fleetmap.features.patch_align import halvings
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.finish.frame_adjustment import PlacedFrames
-from mapserver.survey.rig import projection_by_point
+from mapserver.survey.rig import Looks
 from mapserver.survey.settings import CullSettings, SurveySettings
 from mapserver.survey.state import Keyframe, Landmarks, OdometryPass, RigImages, SurveyState, of_features
 from mapserver.survey.survey_map import SurveyMap
@@ -79,36 +79,10 @@ def point_sigmas_m(camera: StereoCamera, map_from_cam: Array, marks: Landmarks) 
     for start in range(0, len(weakest), _CHUNK):  # working memory is 0.5 kB per observation
         some = slice(start, min(start + _CHUNK, len(weakest)))
         rows = slice(*np.searchsorted(marks.obs_landmark, [some.start, some.stop]))
-        has_right, sigmas = np.isfinite(marks.obs_pixels[rows, 2]), marks.obs_sigma_px[rows]
         cameras, landmarks = map_from_cam[marks.obs_keyframe[rows]], marks.obs_landmark[rows] - start
-        information = point_information(camera, cameras, marks.points_map[some], landmarks, has_right, sigmas)
-        weakest[some] = np.linalg.eigvalsh(information)[:, 0]
+        looks = Looks(camera, cameras, landmarks, marks.obs_pixels[rows], marks.obs_sigma_px[rows])
+        weakest[some] = np.linalg.eigvalsh(looks.information(marks.points_map[some]))[:, 0]
     return np.asarray(1.0 / np.sqrt(np.maximum(weakest, 1e-6)))
-
-
-def point_information(
-    camera: StereoCamera,
-    map_from_cam: Array,
-    points_map: Array,
-    obs_landmark: NDArray[np.int32],
-    has_right: NDArray[np.bool_],
-    obs_sigma_px: Array,
-) -> Array:
-    """Return (N, 3, 3) information of M observations by known cameras map_from_cam (M, 4, 4) on N points, in map axes: sum of J^T J."""
-    rows = projection_by_point(camera, points_in_cameras(map_from_cam, points_map[obs_landmark]))
-    rows[~has_right, 2, 2] = 0.0
-    jacobian = (rows / obs_sigma_px[:, [0, 0, 1], None]) @ se3_inverse(map_from_cam)[:, :3, :3]
-    information = np.zeros((len(points_map), 3, 3))
-    np.add.at(information, obs_landmark, jacobian.transpose(0, 2, 1) @ jacobian)
-    return information
-
-
-def points_in_cameras(map_from_cam: Array, points_map: Array) -> Array:
-    """Return points (M, 3) as seen from map_from_cam (M, 4, 4), each at least 5 cm before its camera."""
-    cam_from_map = se3_inverse(map_from_cam)
-    seen = np.einsum("mij,mj->mi", cam_from_map[:, :3, :3], points_map) + cam_from_map[:, :3, 3]
-    seen[:, 2] = np.maximum(seen[:, 2], 0.05)
-    return np.asarray(seen)
 
 
 def cut_patches(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8]:

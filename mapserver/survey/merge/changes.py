@@ -13,6 +13,7 @@ from mapserver.survey.merge.guided_matching import Sightings
 from mapserver.survey.merge.joint_adjustment import JointSolution, free_observations
 from mapserver.survey.merge.landmark_persistence import Shift, shifts
 from mapserver.survey.merge.merge import Change
+from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999
 from mapserver.survey.settings import SessionSettings, SurveySettings
 from mapserver.survey.stages import Survey
 from mapserver.survey.state import Landmarks, RigImages
@@ -20,7 +21,6 @@ from mapserver.survey.state import Landmarks, RigImages
 _CELLS = COLUMNS * ROWS
 _MIN_IN_CELL = 3  # fewer confirmed landmarks do not prove a gap in the map
 _LACKING_SHARE = 0.6
-_KEYFRAME_MOVED = 22.458  # 0.999 of chi-square with 6 degrees of freedom
 _CLOCKS_BEGIN_NS = 946_684_800_000_000_000  # the year 2000: earlier stamps count from a start, not from 1970
 Mask = NDArray[np.bool_]
 
@@ -113,7 +113,7 @@ def _keyframes_moved(base: BaseMap, joint: JointSolution, settings: SessionSetti
     turns = joint.base_from_body[:, :3, :3] @ before[:, :3, :3].transpose(0, 2, 1)
     angle = np.arccos(np.clip((np.trace(turns, axis1=1, axis2=2) - 1) / 2, -1, 1))
     squared = (shift_m / settings.anchor_sigma_m) ** 2 + (angle / np.radians(settings.anchor_sigma_deg)) ** 2
-    return np.asarray(squared > _KEYFRAME_MOVED)
+    return np.asarray(squared > CHI2_6_0999)
 
 
 def _moved_points(

@@ -7,7 +7,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.features import patch_align
 from fleetmap.features.orb import SCALE_FACTOR
 from fleetmap.geometry import Array, se3_inverse, transform_points
@@ -58,18 +57,13 @@ class Sightings:
         return replace(self, **{name: getattr(self, name)[keep] for name in ("image", *Sighting._fields)})
 
 
-def session_relocalizer(base: BaseMap, vocabulary: Vocabulary, settings: SurveySettings) -> Relocalizer:
-    """Return the robots' relocalizer over the whole map at the archive's precision, with the survey's settings.
+def session_relocalization(settings: SurveySettings) -> RelocalizerSettings:
+    """Return settings of the robots' relocalizer for sessions, over the whole map at the archive's precision.
 
     It differs from a robot's in two ways. The view has all landmarks of the archive, not the chosen ones rounded
     to a tile's grid: matches become observations of the adjustment. And inliers, windows and sigmas are the survey's: a
     wrong join damages a map permanently, whereas a robot's next fix corrects a wrong one.
     """
-    return Relocalizer(base.view(vocabulary), base.camera, session_relocalization(settings))
-
-
-def session_relocalization(settings: SurveySettings) -> RelocalizerSettings:
-    """The relocalizer's settings for sessions."""
     sessions, pairs = settings.sessions, settings.pairs
     fix = FixSettings(
         min_inliers=sessions.min_inliers,

@@ -6,15 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array
 from fleetmap.pnp.pnp import GATE_SQUARED
 from fleetmap.relocalization.landmark_visibility import Rows
-from fleetmap.sensors.rectification import StereoCamera
-from mapserver.survey.finish.map_assembly import point_information, points_in_cameras
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.confirmation import EDGE_PX, WIDER_VIEW_RAD, due
 from mapserver.survey.merge.guided_matching import Sightings, keyframe_features
-from mapserver.survey.rig import projection_by_point
+from mapserver.survey.rig import Looks
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Keyframe
 
@@ -93,12 +91,12 @@ def shifts(base: BaseMap, map_from_cam: Array, sightings: Sightings, settings: S
     rows, counts, seen = rows[enough], counts[enough], sightings.only(enough[which])
     numbers = (np.cumsum(enough) - 1)[which][enough[which]].astype(np.int32)
     before = base.points_map[rows]
-    looks = _Looks(base.camera, map_from_cam[seen.image], numbers, seen.pixels, seen.sigmas_px)
+    looks = Looks(base.camera, map_from_cam[seen.image], numbers, seen.pixels, seen.sigmas_px)
     now = looks.triangulated(before)
     own = np.isin(base.map.obs_landmark, rows)
     old_numbers = np.searchsorted(rows, base.map.obs_landmark[own]).astype(np.int32)
     old_cameras = base.map_from_cam[base.map.obs_keyframe[own]]
-    known = _Looks(base.camera, old_cameras, old_numbers, base.obs_pixels[own], base.obs_sigma_px[own])
+    known = Looks(base.camera, old_cameras, old_numbers, base.obs_pixels[own], base.obs_sigma_px[own])
     slack = 1e-6 * np.eye(3)
     spread = np.linalg.inv(known.information(before) + slack) + np.linalg.inv(looks.information(now) + slack)
     spread += settings.sessions.still_m**2 * np.eye(3)
@@ -107,45 +105,3 @@ def shifts(base: BaseMap, map_from_cam: Array, sightings: Sightings, settings: S
     doubted = np.bincount(numbers, looks.squared(before) > _AGAINST, len(rows)) > _DOUBTED * counts
     settled = np.bincount(numbers, looks.squared(now) < GATE_SQUARED, len(rows)) >= _SETTLED * counts
     return Shift(rows, now, doubted & settled & (squared > settings.sessions.significance))
-
-
-@dataclass(frozen=True, slots=True)
-class _Looks:
-    """M observations of points by known cameras: map_from_cam (M, 4, 4), landmark (M,), pixels (M, 3), sigmas_px (M, 2)."""
-
-    camera: StereoCamera
-    map_from_cam: Array
-    landmark: NDArray[np.int32]
-    pixels: Array
-    sigmas_px: Array
-
-    def information(self, points_map: Array) -> Array:
-        """Return (R, 3, 3) of points (R, 3)."""
-        has_depth = np.isfinite(self.pixels[:, 2])
-        return point_information(self.camera, self.map_from_cam, points_map, self.landmark, has_depth, self.sigmas_px)
-
-    def residuals(self, points_map: Array) -> tuple[Array, Array]:
-        """Return (M, 3) of u, v and disparity, NaN without a right match, and the points seen (M, 3), at least 5 cm before a camera."""
-        seen = points_in_cameras(self.map_from_cam, points_map[self.landmark])
-        predicted, pixels = self.camera.pixel_from_point(seen), self.pixels
-        disparity = pixels[:, 0] - pixels[:, 2] - predicted[:, 0] + predicted[:, 2]
-        return np.column_stack([pixels[:, :2] - predicted[:, :2], disparity]), seen
-
-    def squared(self, points_map: Array) -> Array:
-        """Return (M,) squared residuals in sigmas."""
-        residual, _ = self.residuals(points_map)
-        return np.asarray(np.square(np.nan_to_num(residual / self.sigmas_px[:, [0, 0, 1]])).sum(axis=1))
-
-    def triangulated(self, points_map: Array) -> Array:
-        """Return points (R, 3) with the best fit to their observations: some steps of Gauss-Newton from points_map (R, 3)."""
-        points, cam_from_map = points_map.copy(), se3_inverse(self.map_from_cam)
-        for _ in range(4):
-            residual, seen = self.residuals(points)
-            weight = np.where(np.isfinite(residual), 1.0 / self.sigmas_px[:, [0, 0, 1]], 0.0)
-            jacobian = (projection_by_point(self.camera, seen) * weight[:, :, None]) @ cam_from_map[:, :3, :3]
-            hessian, pull = np.zeros((len(points), 3, 3)), np.zeros((len(points), 3))
-            np.add.at(hessian, self.landmark, jacobian.transpose(0, 2, 1) @ jacobian)
-            np.add.at(pull, self.landmark, np.einsum("mij,mi->mj", jacobian, np.nan_to_num(residual) * weight))
-            step = np.linalg.solve(hessian + 1e-6 * np.eye(3), pull[:, :, None])[:, :, 0]
-            points += np.clip(step, -0.5, 0.5)
-        return points

@@ -16,7 +16,12 @@ from mapserver.survey.loops.connected_components import find_groups
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import SurveyLimits, what_changes
 from mapserver.survey.merge.confirmation import firm_landmarks
-from mapserver.survey.merge.guided_matching import Sightings, keyframe_features, match_keyframe, session_relocalizer
+from mapserver.survey.merge.guided_matching import (
+    Sightings,
+    keyframe_features,
+    match_keyframe,
+    session_relocalization,
+)
 from mapserver.survey.merge.joint_adjustment import JointSolution, Measured, adjust_jointly, begun, grown
 from mapserver.survey.merge.landmark_persistence import count_landmarks, faded
 from mapserver.survey.merge.membership import (
@@ -230,7 +235,7 @@ def extend(
             "a survey by one camera without IMU has an unknown scale: it can begin a map, not join one; add an IMU or a camera"
         )
     base = BaseMap(base_map, state.rig.camera, state.rig.body_from_cam[0])
-    relocalizer = session_relocalizer(base, survey.vocabulary, settings)
+    relocalizer = Relocalizer(base.view(survey.vocabulary), base.camera, session_relocalization(settings))
     firm = firm_landmarks(len(base.points_map), base.map.obs_landmark)
     test = MembershipTest(relocalizer, firm, _session(survey, map_from_survey), settings.sessions)
     located = test.locate()

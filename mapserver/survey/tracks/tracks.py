@@ -35,11 +35,6 @@ class Tracks:
         starts = np.flatnonzero(np.diff(marks.obs_landmark, prepend=-1))
         return cls(numbers[marks.obs_keyframe, marks.obs_camera], marks.obs_feature.astype(np.int64), starts)
 
-    @classmethod
-    def none(cls) -> "Tracks":
-        """Return no tracks."""
-        return cls(*np.zeros((3, 0), np.int64))
-
 
 def tracks_of(pairs: list[PairMatch], known: Tracks | None = None) -> Tracks:
     """Group features connected by pairs, no image twice in a group; pairs with the most matches are joined first.
@@ -48,7 +43,7 @@ def tracks_of(pairs: list[PairMatch], known: Tracks | None = None) -> Tracks:
     Source: union-find, Tarjan 1975; tracks over unordered pairs, Moulon and Monasse 2012.
     """
     ordered = sorted(pairs, key=lambda p: (-len(p.features), p.i, p.j))
-    known = known or Tracks.none()
+    known = known or Tracks(*np.zeros((3, 0), np.int64))
     if not ordered and not len(known.starts):
         return known
     # Images have far fewer features than pairs have matches: each feature is a node, and links stay small.

@@ -70,11 +70,10 @@ def test_a_scaled_map_is_seen_by_its_cameras_as_before() -> None:
     survey = random_survey(np.random.default_rng(7))
     larger = replace(survey, scale_known=False).scaled(2.5)
     assert larger.scale_known
-    for before, after in ((survey, larger),):
-        for k in range(len(before.map_from_body)):
-            old = transform_points(se3_inverse(before.map_from_body[k] @ before.body_from_cam), before.points_map)
-            new = transform_points(se3_inverse(after.map_from_body[k] @ after.body_from_cam), after.points_map)
-            assert new == pytest.approx(2.5 * old, abs=1e-9)
+    for before, after in zip(survey.map_from_body, larger.map_from_body, strict=True):
+        old = transform_points(se3_inverse(before @ survey.body_from_cam), survey.points_map)
+        new = transform_points(se3_inverse(after @ larger.body_from_cam), larger.points_map)
+        assert new == pytest.approx(2.5 * old, abs=1e-9)
     assert larger.point_sigma_m == pytest.approx(2.5 * survey.point_sigma_m)
 
 

@@ -72,11 +72,3 @@ def test_a_part_that_was_turned_round_is_placed_as_it_is() -> None:
     np.testing.assert_allclose(graph.map_from_body, truth(), atol=0.01)
     np.testing.assert_allclose(graph.linearised_at, truth(), atol=0.01)
     assert graph.relative_cov(11, 0)[3:, 3:].max() < 0.1
-
-
-def test_groups_are_known_by_their_first_keyframe() -> None:
-    found = groups()
-    assert found.labels().tolist() == [0] * 6 + [6] * 6
-    found.join(11, 3)
-    found.grow(13)
-    assert found.labels().tolist() == [0] * 12 + [12]

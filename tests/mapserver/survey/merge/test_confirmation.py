@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.stats import beta
 
-from mapserver.survey.merge.confirmation import Confirmation, confirmation, firm_landmarks
+from mapserver.survey.merge.confirmation import Confirmation, confirmation
 
 RATE = 0.001
 CELL_M = 0.75
@@ -76,8 +76,3 @@ def test_a_landmark_looked_for_once_and_an_infirm_one_do_not_count() -> None:
     nothing = confirmation(points, [], everything, RATE)
     assert (nothing.cells, nothing.low, nothing.high) == (0, 0.0, 1.0)
     assert confirmation(points, [(rows, everything)] * 2, everything, RATE).cells == 1
-
-
-def test_firm_landmarks_are_those_of_four_keyframes() -> None:
-    observed = np.repeat(np.arange(4), [1, 3, 4, 9]).astype(np.int32)
-    assert firm_landmarks(5, observed).tolist() == [False, False, True, True, False]

@@ -21,6 +21,12 @@ from mapserver.survey.state import OdometryPass
 from support.worlds.corridor_scene import scene
 
 
+def passed(odom_from_body: Array, covariances: Array) -> OdometryPass:
+    """Odometry with an IMU, all of whose frames are keyframes."""
+    keyframes: Any = [SimpleNamespace(frame_index=k) for k in range(len(odom_from_body))]
+    return OdometryPass([], odom_from_body, covariances, np.ones(len(keyframes), bool), keyframes, inertial=True)
+
+
 def estimate(
     variance: float,
     change: Array | None = None,
@@ -41,11 +47,7 @@ def test_only_what_touches_the_dark_hangs_on_odometry_as_odometry_measured_it() 
     state = replace(state, landmarks=state.landmarks.keep_observations(~dark, 1))
     truth = state.map_from_body.copy()
     odom_from_body = se3_exp(np.array([0.3, 0.1, -0.2, 4.0, 2.0, 1.0])) @ truth
-    keyframes = [SimpleNamespace(frame_index=k) for k in range(8)]
-    guess = OdometryPass(
-        [], odom_from_body, np.arange(8)[:, None, None] * 1e-4 * np.eye(6), np.ones(8, bool), keyframes, inertial=True,
-        has_wheels=True,
-    )  # fmt: skip
+    guess = replace(passed(odom_from_body, np.arange(8)[:, None, None] * 1e-4 * np.eye(6)), has_wheels=True)
     state.map_from_body[3:5, 0, 3] += 7.0  # where an adjustment may have put them says nothing
     terms = blackout_factors(guess, state)
     assert [(t.i, t.j) for t in terms] == [(2, 3), (3, 4), (4, 5)]
@@ -67,23 +69,9 @@ def test_no_inertial_factor_spans_a_pause_which_odometry_bridges(pause_s: float,
     if is_pause:
         sampled_ns = sampled_ns[(sampled_ns <= stamps_ns[1]) | (sampled_ns >= stamps_ns[2])]
     imu = ImuSamples(sampled_ns, np.zeros((len(sampled_ns), 3)), np.tile([0.0, 0.0, 9.81], (len(sampled_ns), 1)))
-    motion = replace(
-        state.motion,
-        inertial=True,
-        imu=imu,
-        noise=ImuNoise(2e-4, 1e-5, 2e-3, 1e-4),
-        motions=np.zeros((4, 9)),
-    )
+    motion = replace(state.motion, inertial=True, imu=imu, noise=ImuNoise(2e-4, 1e-5, 2e-3, 1e-4))
     state = replace(state, stamps_ns=stamps_ns, motion=motion)
-    guess = OdometryPass(
-        [],
-        state.map_from_body,
-        np.tile(1e-4 * np.eye(6), (4, 1, 1)),
-        np.ones(4, bool),
-        [SimpleNamespace(frame_index=k) for k in range(4)],
-        inertial=True,
-        has_wheels=False,
-    )
+    guess = passed(state.map_from_body, np.tile(1e-4 * np.eye(6), (4, 1, 1)))
     inertial = bundle_problem(state, SurveySettings(), None).inertial
     assert [edge[:2] for edge in inertial.edges] == ([(0, 1), (2, 3)] if is_pause else [(0, 1), (1, 2), (2, 3)])
     assert [(term.i, term.j) for term in blackout_factors(guess, state)] == ([(1, 2)] if is_pause else [])
@@ -117,11 +105,10 @@ def test_what_a_filter_learns_of_earlier_places_is_no_doubt_of_the_way() -> None
     doubts, way_m = (0.01, 0.25, 0.1, 0.02), [0.0, 0.5, 1.0, 1.5]
     bend = [(estimate(d**2, x_m=x), 0.01) for d, x in zip(doubts, way_m, strict=True)]
     dark = [bend[0], (estimate(0.25**2, x_m=0.5, status=OdometryStatus.DEGRADED), 0.01), *bend[2:]]
-    keyframes: Any = [SimpleNamespace(frame_index=k) for k in range(4)]
     places = np.array([se3(np.eye(3), np.array([x, 0.0, 0.0])) for x in way_m])
     for seen, least_m, most_m in ((bend, 0.02, 0.05), (dark, 0.25, 0.3)):
-        known = OdometryPass([], places, chain(*seen), np.ones(4, bool), keyframes, inertial=True)
-        marginals = GraphMarginals(places, chain_edges(known, SimpleNamespace(map_from_body=places)))
+        edges = chain_edges(passed(places, chain(*seen)), SimpleNamespace(map_from_body=places))
+        marginals = GraphMarginals(places, edges)
         assert least_m < np.sqrt(marginals.relative_cov(0, 3)[3, 3]) < most_m
 
 
@@ -136,10 +123,7 @@ def test_edges_of_the_chain_add_up_to_what_odometry_does_not_know() -> None:
         covariances[k] = covariances[k - 1] + carry @ noise @ carry.T
         odom_from_body[k] = odom_from_body[k - 1] @ step
     about[:, 3:, :3] = [-skew(place) for place in odom_from_body[:, :3, 3]]
-    known = OdometryPass(
-        [], odom_from_body, about @ covariances @ about.transpose(0, 2, 1), np.ones(count, bool),
-        [SimpleNamespace(frame_index=k) for k in range(count)], inertial=True,
-    )  # fmt: skip
+    known = passed(odom_from_body, about @ covariances @ about.transpose(0, 2, 1))
     graph = GraphMarginals(odom_from_body, chain_edges(known, SimpleNamespace(map_from_body=odom_from_body)))
     carry = se3_adjoint(se3_inverse(odom_from_body[20]))
     expected = carry @ (covariances[-1] - covariances[20]) @ carry.T
