@@ -115,8 +115,7 @@ def retention(
     Versions of maps are removed by `gc`.
     """
     from fleetmap.mapformat.names import is_name
-    from mapserver.nightly.inbox import sites_of
-    from mapserver.nightly.retention import apply_retention
+    from mapserver.nightly.inbox import apply_retention, sites_of
 
     inboxes = [] if inbox is None else [inbox, *(inbox / site for site in sites_of(inbox))]
     with open_store(store) as maps, ExitStack() as locks:

@@ -16,7 +16,7 @@ import resource
 import shutil
 import signal
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import chain, count
@@ -27,6 +27,7 @@ from fleetmap.files import sync_path, write_atomically
 from fleetmap.log_lines import printable
 from fleetmap.mapformat.names import is_name
 from fleetmap.recordings import file_suffixes
+from mapserver.store import FleetRetention, MapStore
 from mapserver.store.files import check_no_link, make_folder
 
 DONE, HELD, BAD = "done", "held", "bad"
@@ -304,3 +305,19 @@ def remove_old(inbox: Path, days: float, now_ns: int, *, dry_run: bool = False) 
                         Path(f"{path}{_REASON}").unlink(missing_ok=True)
                     found += 1
     return found
+
+
+def apply_retention(
+    maps: MapStore, retention: FleetRetention, inboxes: Iterable[Path], *, dry_run: bool = False
+) -> dict[str, int]:
+    """Remove what is older than its period; return by name how much that is. StoreError on a disk error.
+
+    dry_run: remove nothing.
+    """
+    removed = maps.fleet.expired(retention)
+    if not dry_run:
+        maps.fleet.prune(retention)
+    removed["pictures of surveys"] = maps.remove_survey_pictures(retention.survey_picture_days, dry_run=dry_run)
+    days, now_ns = retention.recording_days, maps.now_ns()
+    removed["recordings of surveys"] = sum(remove_old(inbox, days, now_ns, dry_run=dry_run) for inbox in inboxes)
+    return removed

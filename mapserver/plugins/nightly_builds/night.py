@@ -24,7 +24,7 @@ from mapserver.drafting.draft import BuildOptions, BuildRequest, build_draft
 from mapserver.drafting.job_lock import INTERRUPTED, end_interrupted, held, logged, only_one
 from mapserver.library import settings_for
 from mapserver.nightly import inbox as boxes
-from mapserver.nightly.retention import apply_retention
+from mapserver.nightly.inbox import apply_retention
 from mapserver.plugins.nightly_builds.recordings import InboxRecording, identify, kept
 from mapserver.quality.gate import GateSettings
 from mapserver.store import Actor, FleetRetention, MapStore, VersionInfo
