@@ -56,17 +56,13 @@ def refine_matches(reference: Patches, current: Patches, warps: Array, settings:
     pyramid nearest to the scale at which it was found.
     """
     limits = settings.half_window_px, settings.max_shift_px, settings.min_correlation
-    return core.align_patches(
-        *_as_core(reference), *_as_core(current), np.ascontiguousarray(warps, np.float64), *limits
-    )
+    both = *_as_core(reference), *_as_core(current)
+    return core.align_patches(*both, np.ascontiguousarray(warps, np.float64), *limits)
 
 
 def _as_core(patches: Patches) -> tuple[Pyramid, Array, NDArray[np.int8]]:
-    return (
-        patches.pyramid,
-        np.ascontiguousarray(patches.pixels, np.float64),
-        np.ascontiguousarray(patches.octaves, np.int8),
-    )
+    pixels = np.ascontiguousarray(patches.pixels, np.float64)
+    return patches.pyramid, pixels, np.ascontiguousarray(patches.octaves, np.int8)
 
 
 def halvings(octaves: NDArray[np.int8]) -> NDArray[np.int64]:

@@ -95,10 +95,8 @@ def pnp_with_rotation(
     One correspondence proposes the translation. Needs depth in both images. Finds the pose among far more wrong matches
     than three points can; none below min_inliers.
     """
-    rotation = np.ascontiguousarray(cam_from_source_rotation)
-    return _result(
-        core.pnp_with_rotation(*_sightings(matches), threshold_px, min_inliers, rotation, rotation_sigma_rad)
-    )
+    known = np.ascontiguousarray(cam_from_source_rotation), rotation_sigma_rad
+    return _result(core.pnp_with_rotation(*_sightings(matches), threshold_px, min_inliers, *known))
 
 
 def _sightings(matches: Correspondences) -> tuple[Array, Array, Array, Array, tuple[float, float, tuple[int, int]]]:

@@ -292,9 +292,8 @@ def make_odometry(
 ) -> Odometry:
     """Create the odometry for a rectified camera: `MonocularOdometry` for a single one without a depth sensor; by_wheels: `WheelOdometry`
     if that has no IMU either, for a robot, whose map has the scale."""
-    kind = (
-        Odometry if camera.baseline_m else WheelOdometry if by_wheels and calibration.imu is None else MonocularOdometry
-    )
+    of_one_camera = WheelOdometry if by_wheels and calibration.imu is None else MonocularOdometry
+    kind = Odometry if camera.baseline_m else of_one_camera
     made = kind(calibration, camera, body_from_cam, imu_minus_cam_s, settings, stereo_settings, others)
     if isinstance(made, MonocularOdometry):
         made.vision.is_in_map = by_wheels
