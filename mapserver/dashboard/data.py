@@ -163,21 +163,17 @@ class MapData:
 
     def _underlay(self, site: str, version: int, kind: str) -> tuple[bytes, Box] | None:
         try:
-            return self._floor(site, version) if kind == "floor" else self._grid(site, version)
+            if kind == "grid":
+                tiles = known_grid(self.store.manifest(site, version), self.store.blob)
+                return grid_picture(occupancy(tiles, _GRID_HEIGHT_M)) if tiles else None
+            data, alignment = self.store.site_file(site, PLAN), self.store.alignment(site)
+            if data is None or alignment is None:
+                return None
+            box = box_of(self.plan(site, version))
+            return floor_picture(data, alignment, box), box
         except FleetmapError as error:
             _log.warning("the map of %s is shown without its %s: %s", site, kind, error)
             return None
-
-    def _floor(self, site: str, version: int) -> tuple[bytes, Box] | None:
-        data, alignment = self.store.site_file(site, PLAN), self.store.alignment(site)
-        if data is None or alignment is None:
-            return None
-        box = box_of(self.plan(site, version))
-        return floor_picture(data, alignment, box), box
-
-    def _grid(self, site: str, version: int) -> tuple[bytes, Box] | None:
-        tiles = known_grid(self.store.manifest(site, version), self.store.blob)
-        return grid_picture(occupancy(tiles, _GRID_HEIGHT_M)) if tiles else None
 
     def difference(self, site: str, before: int, after: int) -> Difference:
         """The difference between two versions."""

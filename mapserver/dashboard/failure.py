@@ -1,22 +1,202 @@
 """The page of one failure: why, and is it one or many? Its answer in a sentence, what the camera saw beside what the map expected, the
-seconds around it to step through, what else failed there, and the robot's whole report.
+seconds around it to step through and on the map, what else failed there, and the robot's whole report.
+
+Robots choose the stamps and places that they send: what lies far from the failure is left out.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from datetime import tzinfo
+from itertools import groupby, pairwise
 from math import hypot
 
-from fleetmap.messages import FailureReport
-from mapserver.dashboard import failure_story as story
+from fleetmap.failure_definition import is_blind, is_usable
+from fleetmap.failure_summary import FailureSummary, Moment
+from fleetmap.messages import Cause, FailureReport, Status
+from mapserver.api.moments import clock_text
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.failures import ADVICE, failure_marks, tone_of
 from mapserver.dashboard.fleet_health import MANY_FAILURES
 from mapserver.dashboard.live import words_of
 from mapserver.dashboard.map_layers import Layer, Line, Mark
-from mapserver.store import FailureFilter, FailureRow
+from mapserver.store import FailureDetail, FailureFilter, FailureRow, PictureRow
 
 _NEAR_M = 5.0
 _LISTED = 6
+_NEAR_NS = 60_000_000_000
+_JUMP_M, _JUMP_MPS = 0.3, 3.0  # beyond both an estimate was corrected: no robot drives so
+_FARTHEST_M = 1e5
+
+
+@dataclass(frozen=True, slots=True)
+class FailureClock:
+    """The robot's stamps by the clock of whoever looks. began_ns: the failure's beginning by the robot, happened_ns: by the server."""
+
+    began_ns: int
+    happened_ns: int
+    zone: tzinfo | None
+
+    def at(self, stamp_ns: int) -> str:
+        """The time of day, to a tenth of a second."""
+        return clock_text(self.happened_ns + stamp_ns - self.began_ns, self.zone)
+
+    def since(self, stamp_ns: int) -> str:
+        """How long before or after the beginning."""
+        off_s = (stamp_ns - self.began_ns) * 1e-9
+        return f"{abs(off_s):.1f} s {'after' if off_s >= 0 else 'before'} the beginning"
+
+
+@dataclass(frozen=True, slots=True)
+class BlindTime:
+    """When a robot had no position to rely upon. blind_s: all of it, in so many parts.
+
+    before_ns: the last moment before, found_ns: the first one with such a position behind; None where the recording does not have them.
+    """
+
+    since_ns: int
+    until_ns: int
+    blind_s: float
+    parts: int
+    before_ns: int | None
+    found_ns: int | None
+
+
+def moments_near(summary: FailureSummary | None, began_ns: int) -> list[Moment]:
+    """What the robot said within a minute of the beginning; nothing without a recording."""
+    return [] if summary is None else [each for each in summary.moments if abs(each.stamp_ns - began_ns) <= _NEAR_NS]
+
+
+def pictures_near(pictures: Sequence[PictureRow], began_ns: int) -> list[PictureRow]:
+    """The pictures of the recording within a minute of the beginning, the oldest first."""
+    near = [each for each in pictures if each.kind == "replay" and abs(each.stamp_ns - began_ns) <= _NEAR_NS]
+    return sorted(near, key=lambda each: each.stamp_ns)
+
+
+def blind_time(moments: Sequence[Moment], began_ns: int) -> BlindTime | None:
+    """The parts without a position to rely upon that end at or after the beginning, as one; None where there are none."""
+    without = [m.status == Status.INITIALISING or is_blind(m.status, _radius_m(m)) for m in moments]
+    parts, first = [], 0
+    for is_without, group in groupby(without):
+        end = first + len(list(group))
+        if is_without and moments[end - 1].stamp_ns >= began_ns:
+            parts.append((first, end))
+        first = end
+    if not parts:
+        return None
+    last = len(moments) - 1
+    times = [(moments[first].stamp_ns, moments[min(end, last)].stamp_ns) for first, end in parts]
+    begin, end = parts[0][0], parts[-1][1]
+    is_found = end <= last and is_usable(moments[end].status, _radius_m(moments[end]))
+    return BlindTime(
+        since_ns=times[0][0],
+        until_ns=times[-1][1],
+        blind_s=sum(until_ns - since_ns for since_ns, until_ns in times) * 1e-9,
+        parts=len(parts),
+        before_ns=moments[begin - 1].stamp_ns if begin else None,
+        found_ns=moments[end].stamp_ns if is_found else None,
+    )
+
+
+def _radius_m(moment: Moment) -> float:
+    return float("inf") if moment.radius_95_m is None else moment.radius_95_m
+
+
+def answer(detail: FailureDetail, moments: Sequence[Moment], clock: FailureClock) -> str:
+    """What happened, as one sentence's end: by the recording where it shows it, else by the report alone."""
+    row, report = detail.failure, detail.report
+    cause = row.cause.replace("_", " ") or "no cause known"
+    off = ""
+    if report.wrong_by_m is not None:
+        off = f"; its later fixes put it {report.wrong_by_m:.1f} m from where it believed to be"
+    blind = blind_time(moments, report.stamp_ns)
+    if blind is None:
+        return f"{cause}, {words_of(row.status)[0]} for {row.duration_s:.1f} s when it reported{off}"
+    ends = f"not found again until the recording ends at {clock.at(blind.until_ns)}"
+    if blind.found_ns is not None:
+        ends = f"found again after {(blind.found_ns - report.stamp_ns) * 1e-9:.1f} s"
+    # The images of a robot that is carried end with the last frame before; where it was put down shows when it is found.
+    seen_ns = max((each.stamp_ns for each in moments if each.stamp_ns < report.stamp_ns), default=None)
+    if row.cause == Cause.CARRIED and report.wrong_by_m is not None and seen_ns is not None:
+        until = f"between {clock.at(seen_ns)} and {clock.at(blind.found_ns)}" if blind.found_ns is not None else ""
+        return f"carried {report.wrong_by_m:.1f} m, by its own fixes, {until or f'after {clock.at(seen_ns)}'}, {ends}"
+    since = f"from {clock.at(blind.since_ns)} until {clock.at(blind.until_ns)}"
+    if blind.parts > 1:
+        since = f"for {blind.blind_s:.1f} s in {blind.parts} parts {since}"
+    elif blind.before_ns is None:
+        since = f"since before {clock.at(blind.since_ns)}"
+    return f"{cause}, no position to rely upon {since}, {ends}{off}"
+
+
+def first_looks(moments: Sequence[Moment], began_ns: int) -> dict[str, int]:
+    """Moments to look at first, by number: a second before the beginning, at it, and where the robot was found again."""
+    if not moments:
+        return {}
+    blind = blind_time(moments, began_ns)
+    found_ns = None if blind is None else blind.found_ns
+    wanted = {"A second before": began_ns - 10**9, "As it began": began_ns, "Found again": found_ns}
+    return {
+        name: min(range(len(moments)), key=lambda n: abs(moments[n].stamp_ns - stamp_ns))
+        for name, stamp_ns in wanted.items()
+        if stamp_ns is not None
+    }
+
+
+@dataclass(frozen=True, slots=True)
+class Instant:
+    """A moment as its page shows it. x, y, heading_rad: None without a pose; picture: number of the last one until then, -1 for none."""
+
+    clock: str
+    since: str
+    words: str
+    tone: str
+    x: float | None
+    y: float | None
+    heading_rad: float | None
+    picture: int
+    belief: str
+
+
+def instants(moments: Sequence[Moment], pictures: Sequence[PictureRow], clock: FailureClock) -> list[Instant]:
+    """All moments; pictures: the oldest first."""
+    found, picture = [], -1
+    for each in moments:
+        while picture + 1 < len(pictures) and pictures[picture + 1].stamp_ns <= each.stamp_ns:
+            picture += 1
+        status, tone = words_of(each.status)
+        words = ", ".join(filter(None, (status, each.cause.replace("_", " "))))
+        x, y = _place(each) or (None, None)
+        belief = "no position" if x is None else f"at {x:.2f}, {y:.2f} m"
+        belief += "" if each.radius_95_m is None else f", within {each.radius_95_m:.2f} m with 95 %"
+        times = clock.at(each.stamp_ns), clock.since(each.stamp_ns)
+        found.append(Instant(*times, words, tone, x, y, each.heading_rad, picture, belief))
+    return found
+
+
+def _place(moment: Moment) -> tuple[float, float] | None:
+    position_m = moment.position_map_m
+    if position_m is None or max(abs(value) for value in position_m) > _FARTHEST_M:
+        return None
+    return round(position_m[0], 3), round(position_m[1], 3)
+
+
+def believed_path(moments: Sequence[Moment], clock: FailureClock) -> list[Line]:
+    """Where the robot believed to be, in the colour of its state; where an estimate was corrected, a thin line says by how much."""
+    found: list[Line] = []
+    for last, each in pairwise(moments):
+        there, here = _place(last), _place(each)
+        if there is None or here is None:
+            continue
+        step_m, step_s = hypot(here[0] - there[0], here[1] - there[1]), (each.stamp_ns - last.stamp_ns) * 1e-9
+        if step_m > max(_JUMP_M, _JUMP_MPS * step_s):
+            words = f"its position was corrected by {step_m:.1f} m at {clock.at(each.stamp_ns)}"
+            found.append(Line([there, here], "quiet", words, 1.2))
+            continue
+        words, tone = words_of(each.status)
+        if found and found[-1].words == words and found[-1].points[-1] == there:
+            found[-1].points.append(here)
+        else:
+            found.append(Line([there, here], tone, words, 3.5))
+    return found
 
 
 def page(services: Services, context: PageContext, failure: str) -> dict[str, object]:
@@ -24,9 +204,9 @@ def page(services: Services, context: PageContext, failure: str) -> dict[str, ob
     detail = services.maps.store.fleet.failure(number(failure, "failure") or 0)
     row, report, began_ns = detail.failure, detail.report, detail.report.stamp_ns
     context = replace(context, site=row.site)  # whatever site the address names, or none
-    moments = story.moments_near(services.health.replay(row.number), began_ns)
-    clock = story.FailureClock(began_ns, row.happened_ns, context.zone)
-    recorded = story.pictures_near(detail.pictures, began_ns)
+    moments = moments_near(services.health.replay(row.number), began_ns)
+    clock = FailureClock(began_ns, row.happened_ns, context.zone)
+    recorded = pictures_near(detail.pictures, began_ns)
     seen = recorded or [picture for picture in detail.pictures if picture.kind == "frame"]
     pictures = [(picture.place, clock.at(picture.stamp_ns)) for picture in recorded]
     near, words = _nearby(services, row)
@@ -36,14 +216,14 @@ def page(services: Services, context: PageContext, failure: str) -> dict[str, ob
         "row": row,
         "report": report,
         "tone": tone_of(row),
-        "answer": story.answer(detail, moments, clock),
+        "answer": answer(detail, moments, clock),
         "advice": ADVICE.get(row.cause),
         "seen": min(seen, key=lambda picture: abs(picture.stamp_ns - began_ns), default=None),
         "clock": clock,
         "views": services.shown("failure", context, row, report),
-        "seconds": {"instants": story.instants(moments, recorded, clock), "pictures": pictures},
-        "steps": story.steps(moments, began_ns),
-        "scene": _scene(services, context, row, report, story.path(moments, clock)),
+        "seconds": {"instants": instants(moments, recorded, clock), "pictures": pictures},
+        "steps": first_looks(moments, began_ns),
+        "scene": _scene(services, context, row, report, believed_path(moments, clock)),
         "nearby": near[:_LISTED],
         "nearby_words": words,
         "nearby_pictures": services.maps.store.fleet.first_pictures(other.number for other in near[:_LISTED]),

@@ -131,7 +131,7 @@ class HealthData:
             {robot: kpis(counts) for (_, robot), counts in robots.items()},
             tuple(trial_of(row, find(self._store, row, self._canary, now_ns)) for row in trials),
             tuple(resurvey_list(self._store, site, self._resurvey, now_ns).tiles) if is_mapped else (),
-            tuple(self._area_trends(site, next_hour - WEEK_H, next_hour)),
+            tuple(self.area_trends(site, None, None)),
             has_areas,
             (next_hour - WEEK_H) * HOUR_NS,
             tuple(alert for alert in self._alerts(now_ns) if alert.site in {"", site}),
@@ -140,9 +140,7 @@ class HealthData:
     def area_trends(self, site: str, since_ns: int | None, until_ns: int | None) -> list[AreaTrend]:
         """Areas in whole hours of a time, or tiles where none is named, beside the 7 days before it; without a start its last 7 days."""
         end = hour_of(self._clock_ns() if until_ns is None else until_ns - 1) + 1
-        return self._area_trends(site, end - WEEK_H if since_ns is None else hour_of(since_ns), end)
-
-    def _area_trends(self, site: str, first: int, end: int) -> list[AreaTrend]:
+        first = end - WEEK_H if since_ns is None else hour_of(since_ns)
         axis = "area" if self._store.areas(site) else "tile"
         now, before = (
             {

@@ -13,10 +13,8 @@ from mapserver.fleet_statistics.kpis import HOUR_NS, TOO_MANY_PER_ROBOT_DAY, Cou
 from mapserver.store import MapStore
 
 _HEARD_WITHIN_S = 60.0
-_LEAST_FREE_SHARE, _LEAST_FREE_BYTES = (
-    0.1,
-    50_000_000_000,
-)  # of a large disk less than a tenth is enough for some nights
+# Of a large disk less than a tenth is enough for some nights.
+_LEAST_FREE_SHARE, _LEAST_FREE_BYTES = 0.1, 50_000_000_000
 _RATE_HOURS = 24
 _TOLD_NS = 24 * HOUR_NS  # duration of the alert for a rolled back version
 _LOST = {Status.LOST, Status.AMBIGUOUS, Status.INITIALISING}

@@ -13,15 +13,16 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_adjoint, se3_inverse
 from fleetmap.messages import Cause, Status
 from fleetmap.sensors.rectification import RectifiedFrame
-from mapserver.plugins.live_surveys.live_values import (
+from mapserver.plugins.live_surveys.message import (
     LiveEstimate,
     LiveLoops,
+    LivePart,
     LiveParts,
+    LiveRevisit,
     LiveRig,
     NewKeyframe,
     joined_imu,
 )
-from mapserver.plugins.live_surveys.message import LivePart, LiveRevisit
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import apply_result, bundle_problem
 from mapserver.survey.bundle.problem import MotionPrior

@@ -22,9 +22,8 @@ from mapserver.drafting.draft import BuildOptions
 from mapserver.drafting.survey_recordings import read_zones
 from mapserver.library import BuiltMap, build_map
 from mapserver.plugins.live_surveys.drives import Drive, DueFrame
-from mapserver.plugins.live_surveys.live_values import LiveEstimate, LiveRig
 from mapserver.plugins.live_surveys.mapping_process import MOST_PLACES, NO_SKETCH, MappingProcess, thinning
-from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, LiveSurveyState
+from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, LiveEstimate, LiveRig, LiveSurveyState
 from mapserver.plugins.live_surveys.tracking import LiveTracking, Tracked
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig

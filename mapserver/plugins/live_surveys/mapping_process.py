@@ -20,14 +20,16 @@ from fleetmap.errors import FleetmapError
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.plugins.live_surveys.live_map import LiveMap
-from mapserver.plugins.live_surveys.live_values import LiveEstimate, LiveRig, NewKeyframe
 from mapserver.plugins.live_surveys.message import (
     COVERAGE_CELL_M,
     MAX_ARRAY_BYTES,
     NO_PART,
+    LiveEstimate,
     LiveMissing,
     LivePart,
     LiveRevisit,
+    LiveRig,
+    NewKeyframe,
 )
 from mapserver.quality.directions import tile_directions
 from mapserver.survey.survey_inputs import SurveyConfig

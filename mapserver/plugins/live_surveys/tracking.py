@@ -10,7 +10,7 @@ from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample
-from mapserver.plugins.live_surveys.live_values import NewKeyframe, joined_imu
+from mapserver.plugins.live_surveys.message import NewKeyframe, joined_imu
 from mapserver.survey.odometry_pass import OdometryRun, TrackedFrame
 from mapserver.survey.pose_graph.odometry_factors import floor_of, step_covariance
 from mapserver.survey.settings import SurveySettings

@@ -14,7 +14,7 @@ from playwright.sync_api import Page, expect
 
 from fleetmap.failure_summary import Moment
 from fleetmap.messages import FailureReport
-from mapserver.dashboard import failure_story as story
+from mapserver.dashboard import failure as story
 from mapserver.dashboard import failures
 from mapserver.dashboard.console import PageContext
 from mapserver.fleet.fleet import Fleet
@@ -100,15 +100,15 @@ def test_moments_and_pictures_of_another_time_are_left_out() -> None:
     far = PictureRow(9, "replay", 1 << 61, 10)
     near = [PictureRow(n, "replay", BEGAN_NS + k * 10**8, 10) for n, k in enumerate((-50, -9, -2, 4, 19, 23))]
     assert story.pictures_near([far, *near[::-1]], BEGAN_NS) == near
-    assert story.steps(CARRIED, BEGAN_NS) == {"A second before": 40, "As it began": 50, "Found again": 69}
-    assert list(story.steps(CARRIED[:60], BEGAN_NS)) == ["A second before", "As it began"]
+    assert story.first_looks(CARRIED, BEGAN_NS) == {"A second before": 40, "As it began": 50, "Found again": 69}
+    assert list(story.first_looks(CARRIED[:60], BEGAN_NS)) == ["A second before", "As it began"]
 
 
 def test_the_path_is_broken_where_the_estimate_was_corrected() -> None:
-    lines = story.path(CARRIED, story.FailureClock(BEGAN_NS, AT_NS, None))
+    lines = story.believed_path(CARRIED, story.FailureClock(BEGAN_NS, AT_NS, None))
     assert [(line.tone, len(line.points)) for line in lines] == [("good", 50), ("good", 31)]
     at_once = (*CARRIED[:50], *CARRIED[69:])
-    lines = story.path(
+    lines = story.believed_path(
         tuple(msgspec.structs.replace(each, stamp_ns=BEGAN_NS + n * 10**8) for n, each in enumerate(at_once)),
         story.FailureClock(BEGAN_NS, AT_NS, None),
     )

@@ -15,7 +15,7 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, SensorSet
 from mapserver.config import survey_settings
 from mapserver.plugins.live_surveys.live_map import LiveMap
-from mapserver.plugins.live_surveys.live_values import LiveRig, NewKeyframe
+from mapserver.plugins.live_surveys.message import LiveRig, NewKeyframe
 from mapserver.plugins.live_surveys.tracking import LiveTracking
 from mapserver.survey.odometry_pass import SampleFeed
 from mapserver.survey.survey_inputs import SurveyConfig
