@@ -142,10 +142,10 @@ def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Itera
     with MapStore.open(folder) as store:
         fleet = Fleet(store)
         jpegs = [picture(f"{n}", 320) for n in range(20)]
-        harm = (Moment(-(1 << 62), "LOST", "<b>x</b>"), *CARRIED[40:60], Moment(1 << 61, "<i>", "", (1e300, 0.0, 0.0)))
+        harm = (Moment(-(1 << 62), "LOST", "<b>x</b>"), *CARRIED[40:60], Moment(1 << 61, "<i>", "", (1e11, 0.0, 0.0)))
         harm = (
             *harm[:1],
-            msgspec.structs.replace(harm[1], position_map_m=(1e300, -1e300, 0.0), cause="<b>y</b>"),
+            msgspec.structs.replace(harm[1], position_map_m=(1e11, -1e11, 0.0), cause="<b>y</b>"),
             *harm[2:],
         )
         for name, moments in (("tug-3", CARRIED), ("tug-4", harm)):
