@@ -176,14 +176,14 @@ def verify(
 ) -> None:
     """Check that a report was signed by this store and is unchanged; status 3 otherwise."""
     from fleetmap.errors import disk_errors
-    from mapserver.trust.documents import verify as verified
+    from mapserver.trust.signing import verify_files
 
     with disk_errors(f"{folder} cannot be read", "name the folder of a report", UsageError):
         signed = min(folder.glob("*.sig"), default=folder / "report.sig")
         signature = signed.read_bytes()
         files = {path.name: path.read_bytes() for path in folder.glob(f"{signed.stem}.*") if path != signed}
     with open_store(store, read_only=True) as maps:
-        typer.echo(f"signed on {verified(maps, signature, files)} by this store, and unchanged")
+        typer.echo(f"signed on {verify_files(maps, signature, files)} by this store, and unchanged")
 
 
 def _root_key(maps: "MapStore", path: Path | None) -> "Signer":

@@ -1,8 +1,10 @@
 """Signing of lists: after releases, at night, and every few hours, with the keys available to this account.
 
-Also the operations with the root key: the first lists, and replacement of keys.
+Also the operations with the root key: the first lists, and replacement of keys; and signatures of other files by the online key.
 """
 
+import hashlib
+import json
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,7 +14,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal, cast
 
 from fleetmap.bus.endpoints import is_loopback
-from fleetmap.errors import FleetmapError, StateError, UsageError, disk_errors
+from fleetmap.encoding import to_json
+from fleetmap.errors import FleetmapError, StateError, UntrustedError, UsageError, disk_errors
 from fleetmap.trust import AdmittedVersion, SiteList, site_role
 from fleetmap.trust.site_list import VersionState
 from mapserver.store import MapStore, VersionInfo
@@ -26,6 +29,7 @@ if TYPE_CHECKING:
     from mapserver.trust.repository import ListRepository
 
 _log = logging.getLogger(__name__)
+_FILES_TYPE = "application/vnd.fleetmap.files+json"
 
 
 def admitted_versions(rows: SiteReleases) -> tuple[AdmittedVersion, ...]:
@@ -317,3 +321,40 @@ def _update_site(repository: "ListRepository", rows: SiteReleases) -> int | None
     if number := lists.newest(role):
         _check_unchanged(rows.site, lists.site_list(rows.site, number), admitted)
     return repository.sign_site(rows.site, admitted, site_key)
+
+
+def sign_files(store: MapStore, files: Mapping[str, bytes]) -> bytes | None:
+    """Return the signed hashes of files; None without signed lists, or if the online key is elsewhere.
+
+    Source: Dead Simple Signing Envelope 1.0 (secure-systems-lab/dsse), by securesystemslib.
+    """
+    from securesystemslib.dsse import Envelope  # late: listing versions does not need it
+
+    signer = KeyFolder(store.folder / "keys").signer("online") if SignedLists(store.folder).are_there else None
+    if signer is None:
+        return None
+    hashes = {name: hashlib.sha256(data).hexdigest() for name, data in files.items()}
+    signed = _now(store).isoformat(timespec="seconds")
+    envelope = Envelope(to_json({"signed": signed, "sha256": hashes}), _FILES_TYPE, {})
+    envelope.sign(signer)
+    return to_json(envelope.to_dict(), indent=2) + b"\n"
+
+
+def verify_files(store: MapStore, signature: bytes, files: Mapping[str, bytes]) -> str:
+    """Return when the files were signed by the store's present online key; UntrustedError if they were not, or changed since."""
+    from securesystemslib.dsse import Envelope
+    from securesystemslib.exceptions import VerificationError
+
+    root = SignedLists(store.folder).read("root")
+    keys = [root.keys[keyid] for keyid in root.roles[TIMESTAMP].keyids]
+    try:
+        envelope = Envelope.from_dict(json.loads(signature))
+        envelope.verify(keys, 1)
+        told = json.loads(envelope.payload)
+        hashes, signed = dict(told["sha256"]), str(told["signed"])
+    except (VerificationError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise UntrustedError("signature", f"this is not of the store's online key ({error})") from error
+    for name in sorted({*hashes, *files}):
+        if hashes.get(name) != hashlib.sha256(files.get(name, b"")).hexdigest() or envelope.payload_type != _FILES_TYPE:
+            raise UntrustedError("signature", f"{name} is not the file that was signed on {signed}")
+    return signed

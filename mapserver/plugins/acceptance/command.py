@@ -60,7 +60,7 @@ def accept(
     from mapserver.plugins.acceptance.document import html_page, sections
     from mapserver.plugins.acceptance.pdf import pdf
     from mapserver.plugins.acceptance.verdict import compared
-    from mapserver.trust.documents import sign
+    from mapserver.trust.signing import sign_files
 
     if not options.out.is_dir():
         raise UsageError(f"--out {options.out}: the folder does not exist; make it first")
@@ -79,7 +79,7 @@ def accept(
             "acceptance.html": html_page(report, shown, picture).encode(),
             "acceptance.pdf": pdf(report, shown, picture),
         }
-        signature = sign(maps, files)
+        signature = sign_files(maps, files)
     for name, data in files.items():
         write_output(options.out / name, data)
     if signature is not None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from securesystemslib.signer import CryptoSigner
 
-from fleetmap.errors import StateError, StoreError, UsageError
+from fleetmap.errors import StateError, StoreError, UntrustedError, UsageError
 from fleetmap.messages import RobotHealth, WantedVersion
 from mapserver import releases
 from mapserver.api.metrics import Metrics
@@ -19,12 +19,13 @@ from mapserver.store import MapStore
 from mapserver.trust import KeyFolder, SignedLists, init_here, prepare_lists, signing, update_lists
 from mapserver.trust.keys import load_key, make_key, make_passphrase
 from mapserver.trust.repository import ListRepository
-from mapserver.trust.signing import check_base
+from mapserver.trust.signing import check_base, sign_files, verify_files
 from mapserver.trust.status import trust_status
 from support.storage.clock import Clock
 from support.storage.map_samples import publish_samples, save_sample_draft
 
 HOUR_NS = 3_600_000_000_000
+REPORT = {"acceptance.json": b"{}", "acceptance.html": b"<p>"}
 
 
 @pytest.fixture
@@ -365,3 +366,26 @@ def test_metrics_say_how_long_the_lists_last(store: MapStore, clock: Clock) -> N
     assert found["fleetmap_trust_faults"] == 3  # timestamp, snapshot, and the site's list
     (store.folder / "trust" / "timestamp.json").write_text("{")
     assert figures()["fleetmap_trust_faults"] == 1
+
+
+def test_signed_files_are_verified_and_changed_ones_refused(tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "a", create=True) as store, MapStore.open(tmp_path / "b", create=True) as other:
+        assert sign_files(store, REPORT) is None  # no lists yet
+        for each in (store, other):
+            init_here(each)
+        signature = sign_files(store, REPORT)
+        assert signature is not None
+        assert verify_files(store, signature, REPORT).startswith("20")
+        for files in (
+            REPORT | {"acceptance.json": b"{ }"},
+            {"acceptance.json": b"{}"},
+            REPORT | {"acceptance.pdf": b""},
+        ):
+            with pytest.raises(UntrustedError, match="is not the file that was signed"):
+                verify_files(store, signature, files)
+        for wrong in (sign_files(other, REPORT), b"[]", b"{", b"{}", signature.replace(b'"sig": "', b'"sig": "AAAA')):
+            assert wrong is not None
+            with pytest.raises(UntrustedError, match="online key"):
+                verify_files(store, wrong, REPORT)
+        (store.folder / "keys" / "online.pem").unlink()
+        assert sign_files(store, REPORT) is None
