@@ -40,14 +40,16 @@ def count_landmarks(
     base: BaseMap, keyframes: Sequence[Keyframe], map_from_cam: Array, sightings: Sightings
 ) -> LandmarkCounts:
     """Return counts over keyframes (K) at map_from_cam (K, 4, 4); those without a sighting do not count."""
-    expected = np.zeros(len(base.points_map), np.int64)
+    expected, seen = np.zeros((2, len(base.points_map)), np.int64)
     for k in np.flatnonzero(sightings.located).tolist():
         visible = base.visible(map_from_cam[k], -EDGE_PX, WIDER_VIEW_RAD)
         is_due = np.zeros(len(expected), bool)
         is_due[visible.rows[due(visible, keyframe_features(keyframes[k]).pixels)]] = True
-        is_due[sightings.rows[sightings.image == k]] = True
+        own = sightings.rows[sightings.image == k]
+        is_due[own] = True
         expected += is_due
-    return LandmarkCounts(expected, np.bincount(sightings.rows, minlength=len(expected)))
+        seen[own] += 1  # once, by however many features
+    return LandmarkCounts(expected, seen)
 
 
 def missed_since(base: BaseMap, counts: LandmarkCounts) -> NDArray[np.int64]:

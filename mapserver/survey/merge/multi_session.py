@@ -252,11 +252,9 @@ def extend(
     gone &= ~limits.freezes(base.points_map)
     change, moved_keyframes, moved_landmarks = what_changes(base, survey, posed, joint, gone, settings, limits)
     frozen, least = limits.freezes(change.map_from_cam[:, :3, 3]), settings.sessions.new_place_landmarks
-    result = replace(
-        merged(base, change, found, posed.images, least, frozen),
-        trajectory=_carried(survey.map.trajectory, survey, joint.map_from_body),
-        trajectory_estimated=survey.map.trajectory_estimated,
-    )
+    result, own = merged(base, change, found, posed.images, least, frozen), survey.map
+    trajectory = _carried(own.trajectory, survey, joint.map_from_body)
+    result = replace(result, trajectory=trajectory, trajectory_estimated=own.trajectory_estimated)
     fresh = int((change.added_rows < 0).sum())
     counts = Counts(
         fixes=test.tried,
