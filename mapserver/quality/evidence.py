@@ -59,8 +59,8 @@ def examine(
     frames = probes.frames
     # Those localised in either: a draft cannot lose positions unknown to robots, and with only those of the current version all its
     # chance localisations would count against the draft.
-    views = (draft,) if before is None else (before, draft)
-    placed = [p for p in probes.last_version if any(relocalized(view, p, p.map_from_cam) is not None for view in views)]
+    held = (draft,) if before is None else (before, draft)
+    placed = [p for p in probes.last_version if any(relocalized(view, p, p.map_from_cam) is not None for view in held)]
     return Evidence(
         held_out=compare(draft, before, probes.held_out, removed_ids),
         replayed=compare(draft, before, probes.replayed, removed_ids),

@@ -1,9 +1,10 @@
 """Starts before a marker in one of six identical aisles, and before one that was moved by two metres: at the estimator's level.
 
 `PYTHONPATH=tests python tests/benchmarks/robot/bench_markers.py [--starts N] [--seed N] [--only NAME...] [--out FILE.json]`.
-N starts (100) of each kind, spread over the drive. A marker of 0.2 m stands 0.8 to 2.2 m before the robot and is turned from it by up to 35
-degrees, in pictures that OpenCV paints and the plug-in searches, as long as it is seen. "moved": its list places it two metres off, in a
-direction of its own, in the identical aisles and in the same ones with signs at their ends; the robot drives on for ten seconds.
+N starts (100) of each kind, spread over the aisles of the drive. A marker of 0.2 m stands 0.8 to 2.2 m before the robot and is turned
+from it by up to 35 degrees, in pictures that OpenCV paints and the plug-in searches, as long as it is seen. "moved": its list places it two
+metres off, in a direction of its own, in the identical aisles and in the same ones with signs at their ends; the robot drives on for ten
+seconds.
 """
 
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
@@ -95,6 +96,13 @@ def start_at(site: Site, number: int, moved_m: float, duration_s: float, rng: np
     return start
 
 
+def in_aisles(site: Site, count: int) -> list[int]:
+    """Frames of the drive between racks, not in the turns between two aisles."""
+    layout, x_m = site.robot.session.world.layout, site.robot.map_from_body[30:-160, 0, 3]
+    inside = 30 + np.flatnonzero((layout.end_m < x_m) & (x_m < layout.bay_x_m(layout.bays)))
+    return [int(inside[k]) for k in np.linspace(0, len(inside) - 1, count).astype(int)]
+
+
 def main() -> None:
     """Print the figures; write them as JSON where asked."""
     arguments = parsed(__doc__, tuple(KINDS), starts=100, seed=31)
@@ -104,8 +112,7 @@ def main() -> None:
         if scenario not in sites:
             sites[scenario] = surveyed_site(scenario, arguments.seed)
         site, rng = sites[scenario], np.random.default_rng([arguments.seed, 2])
-        numbers = np.linspace(30, len(site.robot) - 160, arguments.starts).astype(int).tolist()
-        found = [start_at(site, number, moved_m, duration_s, rng) for number in numbers]
+        found = [start_at(site, number, moved_m, duration_s, rng) for number in in_aisles(site, arguments.starts)]
         times_s = [start.tracking_s for start in found]
         figures[name] = {
             "starts": len(found),

@@ -1,9 +1,10 @@
-"""Tiles as bytes: the documented layout, what is lost, what is refused."""
+"""Tiles as bytes: the documented layout, what is lost, what is refused. Codes keep what they promise and are stable."""
 
 import struct
 import time
 import tracemalloc
 from dataclasses import replace
+from itertools import permutations, product
 
 import numpy as np
 import pytest
@@ -12,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fleetmap.errors import MapFormatError
-from fleetmap.geometry import rotation_angle_rad, se3
+from fleetmap.geometry import rotation_angle_rad, rotation_from_quat_wxyz, se3, so3_exp
+from fleetmap.mapformat import tile_codec as quantise
 from fleetmap.mapformat.container import pack, unpack
 from fleetmap.mapformat.tile import Tile
 from fleetmap.mapformat.tile_codec import LANDMARK_BYTES, MAX_TILE_PLACES, decode_tile, encode_tile
@@ -171,3 +173,101 @@ def test_many_places_cannot_take_long() -> None:
     head = struct.pack("<iidiIII", 0, 0, 16.0, 0, 0, places, 0)
     with pytest.raises(MapFormatError, match="places"):
         decode_tile(pack(b"FMTL", 2, head + bytes(27 * places), level=1))
+
+
+# Map bytes from an attacker: never anything but the project's own errors, and little time and memory for the worst.
+
+_LIMIT = 16 << 20
+
+
+def steps_of_one(count: int) -> bytes:
+    """`count` increasing ids as differences in planes."""
+    return b"\1" * count + bytes(3 * count)
+
+
+def fullest_tile(kind: str) -> bytes:
+    """As much as the limits allow, in a few hundred bytes of zstd."""
+    if kind == "landmarks":
+        count = _LIMIT // 48 - 1
+        return struct.pack("<iidiIII", 0, 0, 16.0, 0, count, 0, 0) + steps_of_one(count) + bytes(44 * count)
+    places = MAX_TILE_PLACES
+    each = (_LIMIT // 4 - 7 * places - 8) // places if kind == "references" else 0
+    head = struct.pack("<iidiIII", 0, 0, 16.0, 0, 0, places, places * each)
+    counts = np.full(places, each, "<u4").view(np.uint8).reshape(-1, 4).T.tobytes()
+    return head + steps_of_one(places) + bytes(19 * places) + counts + steps_of_one(places * each)
+
+
+@pytest.mark.parametrize("kind", ["landmarks", "places", "references"])
+def test_the_fullest_tile_takes_little(kind: str) -> None:
+    data = pack(b"FMTL", 2, fullest_tile(kind), level=1)
+    assert len(data) < 2000
+    started_s = time.process_time()
+    decode_tile(data)
+    assert time.process_time() - started_s < 3  # a tenth of it, measured
+
+
+def test_the_fullest_tile_takes_little_memory() -> None:
+    data = pack(b"FMTL", 2, fullest_tile("landmarks"), level=1)
+    tracemalloc.start()
+    decode_tile(data)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 12 * _LIMIT
+
+
+def test_every_direction_code_is_stable_and_directions_are_good_to_their_step() -> None:
+    axis = np.arange(-42, 43)
+    codes = np.stack(np.meshgrid(axis, axis), -1).reshape(-1, 2).astype(np.int8)
+    first = quantise.direction_code(quantise.direction_value(codes))
+    assert np.array_equal(quantise.direction_code(quantise.direction_value(first)), first)
+    # Only codes on the folded edge have a second spelling.
+    changed = (first != codes).any(axis=1)
+    assert (np.abs(codes[changed].astype(int)).max(axis=1) == 42).all()
+    directions = np.random.default_rng(1).normal(size=(20_000, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    back = quantise.direction_value(quantise.direction_code(directions.astype(np.float32)))
+    cosines = np.clip((directions * back).sum(axis=1), -1, 1)
+    assert np.degrees(np.arccos(cosines)).max() < 3.0
+    assert np.allclose(np.linalg.norm(back, axis=1), 1, atol=1e-6)
+
+
+def _check_rotation(rotation: np.ndarray) -> None:
+    code = quantise.rotation_code(rotation)
+    back = quantise.rotation_values(np.array([code[0]], np.uint8), code[1][None])[0]
+    assert np.allclose(back, rotation_from_quat_wxyz(np.insert(code[1] / 32767, code[0], 1.0)), atol=1e-15)
+    assert rotation_angle_rad(rotation.T @ back) < 1e-4
+    again = quantise.rotation_code(back)
+    assert again[0] == code[0]
+    assert np.array_equal(again[1], code[1])
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_rotations_are_stable(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    _check_rotation(so3_exp(rng.normal(size=3) * rng.choice([1e-9, 1e-4, 1.0, 3.0])))
+
+
+def test_rotations_with_ties_are_stable() -> None:
+    # Quaternions whose largest components are equal, or nearly: there the choice of the largest is delicate.
+    for base in ((1, 1, 1, 1), (1, 1, 0, 0), (1, 1, 1, 0), (1, 1 - 1e-5, 0.3, 0), (1, 1 - 2e-5, 1 - 1e-5, 0.1)):
+        for order, signs in product(set(permutations(base)), product((1, -1), repeat=4)):
+            _check_rotation(rotation_from_quat_wxyz(np.array(order) * np.array(signs)))
+
+
+def test_log_codes_clip_and_are_within_half_a_step() -> None:
+    values = np.geomspace(0.11, 600, 500).astype(np.float32)
+    codes = quantise.log_code(values, 0.1, 20)
+    back = quantise.log_value(codes, 0.1, 20)
+    assert np.abs(np.log2(back / values)).max() <= 0.5 / 20 + 1e-6
+    assert np.array_equal(quantise.log_code(back, 0.1, 20), codes)
+    assert quantise.log_code(np.array([0.0, 1e9], np.float32), 0.1, 20).tolist() == [0, 255]
+
+
+def test_half_angles_clip_and_are_within_half_a_step() -> None:
+    angles = np.linspace(0, np.pi, 500).astype(np.float32)
+    codes = quantise.half_angle_code(angles)
+    back = quantise.half_angle_value(codes)
+    assert np.abs(back - angles).max() <= np.pi / 120 + 1e-6
+    assert np.array_equal(quantise.half_angle_code(back), codes)
+    assert quantise.half_angle_value(np.array([60, 255], np.uint8)).tolist() == [np.float32(np.pi)] * 2

@@ -7,7 +7,7 @@ import pytest
 from typer.testing import CliRunner
 
 from fleetmap.errors import GateRefusedError, RecordingError, SurveyError, UsageError
-from fleetmap.recordings import open_recording
+from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.recordings.sensor_subset import REDUCTIONS, named_sensor_set, reduced, sensor_set_of
 from fleetmap.sensors.samples import SensorSet
 from mapserver import releases
@@ -74,3 +74,23 @@ def test_the_gate_refuses_a_map_without_metres(tmp_path: Path) -> None:
         with pytest.raises(GateRefusedError, match="has a scale of its own"):
             releases.publish(maps, "lab", 1)
         assert releases.publish(maps, "lab", 2) == 2
+
+
+# --frames A:B:C means what Python's slices mean.
+
+SAMPLE = make_sample(5)
+
+
+@pytest.mark.parametrize("text", [":", "::", "0:3", "1:", ":4", "::2", "1::2", "-3:", ":-1", "0:100:3"])
+def test_pythons_slices(text: str, tmp_path: Path) -> None:
+    recording = open_recording(write_mcap(tmp_path / "r", SAMPLE))
+    wanted = list(range(5))[slice(*(int(p) if p else None for p in text.split(":")))]
+    assert FrameSelection.parse(text).apply(recording).tolist() == wanted
+    with pytest.raises(UsageError, match="selects none of the 5 frames"):
+        FrameSelection.parse("7:").apply(recording)
+
+
+@pytest.mark.parametrize("text", ["", "3", "a:b", "1:2:3:4", "::0", "::-1", "1.5:", "0,3"])
+def test_nonsense_is_a_usage_error_that_names_it(text: str) -> None:
+    with pytest.raises(UsageError, match="--frames"):
+        FrameSelection.parse(text)

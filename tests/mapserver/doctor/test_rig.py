@@ -10,17 +10,20 @@ import pytest
 from typer.testing import CliRunner
 
 from fleetmap.errors import RecordingError
-from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
 from fleetmap.recordings import OpenOptions, format_calibration, open_recording
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from fleetsim.recorder import Order, prepare
 from mapserver.cli import app
+from mapserver.doctor.camera_motion import motion_between
 from mapserver.doctor.findings import Finding, Verdict
 from mapserver.doctor.rig import check_mountings, check_rig, further_findings, judge_mounting, mounting_error
 from support.recordings.painted_room import FRAME_NS, Ride, frame_at, rig
 from support.recordings.rig_samples import write_rig
+from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, view
 
 REAR = se3(so3_exp(np.array([0.0, 0.0, np.pi])), np.array([-0.1, 0.0, 0.0]))  # body_from_turned
 HALF_DEGREE = np.radians(0.5)
@@ -187,3 +190,24 @@ def test_the_doctor_names_the_pair_whose_images_are_exchanged(tmp_path: Path) ->
     )
     assert isinstance(built.exception, RecordingError)
     assert "left and right of cam2 and cam3" in str(built.exception)
+
+
+# The camera's turn between two frames, by the images of one camera, where the essential matrix says little.
+
+SINGLE = replace(CAMERA, baseline_m=0.0)
+
+
+@pytest.mark.parametrize("way_m", [0.0, 0.002, 0.05])
+def test_one_camera_that_hardly_moves_does_not_turn_round(way_m: float) -> None:
+    turn = so3_exp(np.array([0.004, -0.01, 0.006]))
+    there = BODY_FROM_CAM @ se3(turn if way_m else np.eye(3), np.array([way_m, 0.0, 0.0]))
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        pictures = [
+            np.clip(view(place) + rng.normal(0.0, 2.0, (CAMERA.height_px, CAMERA.width_px)), 0, 255).astype(np.uint8)
+            for place in (BODY_FROM_CAM, there)
+        ]
+        before, after = (RectifiedFrame(stamp, picture, None, None) for stamp, picture in enumerate(pictures))
+        found, _ = motion_between(before, after, SINGLE)
+        expected = turn if way_m else np.eye(3)
+        assert np.linalg.norm(so3_log(expected.T @ found[:3, :3])) < 0.02

@@ -1,5 +1,6 @@
 """Intervals against scipy.stats and against chance itself; sums against their parts."""
 
+import runpy
 from dataclasses import fields
 from pathlib import Path
 
@@ -7,8 +8,19 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mapserver.fleet_statistics.kpis import COUNTER_COLUMNS, Counters, kpis, poisson_interval, rate, share
+from mapserver.fleet_statistics.kpis import (
+    COUNTER_COLUMNS,
+    Counters,
+    driven_words,
+    format_rate,
+    is_enough,
+    kpis,
+    poisson_interval,
+    rate,
+    share,
+)
 from mapserver.store.database import SqliteDatabase
+from support.fleet.contracts_documents import REPOSITORY
 
 
 @pytest.mark.parametrize("events", [0, 1, 2, 7, 40, 1000])
@@ -66,3 +78,24 @@ def test_every_sum_has_its_column(tmp_path: Path) -> None:
     made.close()
     assert tuple(kinds) == COUNTER_COLUMNS
     assert all((kinds[f.name] == "REAL") == (f.type in {float, "float"}) for f in fields(Counters))
+
+
+# Rates are told where enough was driven, counts everywhere.
+
+
+@pytest.mark.parametrize("failures", [0, 2, 1000])
+def test_no_rate_is_said_before_none_would_show_a_good_one(failures: int) -> None:
+    in_words = runpy.run_path(str(REPOSITORY / "examples" / "fleet_figures.py"))["in_words"]
+    for minutes, is_said in ((0, False), (5, False), (570, False), (580, True)):
+        found = rate(failures, minutes / 960)
+        assert {value is not None for value in (found.per_robot_day, found.low, found.high)} == {is_said}
+        assert is_enough(minutes / 960) == (format_rate(found) != "–") == is_said
+        words = in_words(kpis(Counters(failures=failures, driving_ms=60_000 * minutes)))
+        assert (f" {failures} failures, too little driving" in words) != is_said
+
+
+def test_rates_and_driving_as_text() -> None:
+    assert format_rate(rate(1, 50.0)) == "0.02 (0.00051 to 0.11)"
+    assert [driven_words(days) for days in (0.0, 0.5, 1.0, 37.4)] == [
+        "0 min of driving", "8.0 h of driving", "1 robot-days", "37 robot-days",
+    ]  # fmt: skip

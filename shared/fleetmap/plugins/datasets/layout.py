@@ -79,8 +79,8 @@ def rig_frames(
             "pass one that has all with --calibration FILE"
         )
     named = {number: (f"camera {number}", series) for number, series in enumerate(cameras)}
-    ordered, views = rig_views(calibration, named, log)
-    return ordered, SeriesFrames(FileReader(root, log.files), views)
+    ordered, paired = rig_views(calibration, named, log)
+    return ordered, SeriesFrames(FileReader(root, log.files), paired)
 
 
 @dataclass

@@ -1,5 +1,9 @@
 """Channels, read back by Foxglove's published schemas as another library has them."""
 
+import json
+from collections.abc import Iterator
+from typing import Any
+
 import cv2
 import numpy as np
 import pytest
@@ -8,8 +12,9 @@ from fleetmap.errors import UsageError
 from fleetmap.geometry import rotation_from_quat_wxyz, se3, so3_exp
 from fleetmap.messages import FailureReport, Placement
 from fleetmap.plugins.viewer_channels import channels, require_foxglove
-from fleetmap.plugins.viewer_channels.channels import RobotMark
+from fleetmap.plugins.viewer_channels.channels import CHANNELS, RobotMark
 from fleetmap.sensors.rectification import StereoCamera
+from support.fleet.contracts_documents import REPOSITORY
 from support.fleet.foxglove_schemas import decoded, matrix, xyz
 
 STAMP_NS = 1_700_000_000_123_456_789
@@ -108,3 +113,33 @@ def test_without_the_library_the_error_says_what_to_install(monkeypatch: pytest.
     monkeypatch.setitem(sys.modules, "foxglove", None)
     with pytest.raises(UsageError, match=r"--foxglove needs foxglove.*pip install '\.\[foxglove\]'"):
         require_foxglove("--foxglove")
+
+
+# The layout in `deploy/` shows channels that there are, and every panel stands in it.
+
+LAYOUT = json.loads((REPOSITORY / "deploy" / "foxglove-layout.json").read_text("utf-8"))
+
+
+def words(value: Any) -> Iterator[str]:
+    """All keys and strings."""
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield key
+            yield from words(item)
+    elif isinstance(value, list):
+        for item in value:
+            yield from words(item)
+    elif isinstance(value, str):
+        yield value
+
+
+def test_it_shows_every_channel_that_there_is() -> None:
+    assert {word for word in words(LAYOUT) if word.startswith("/")} == set(CHANNELS) - {"/tf"}, (
+        "frames are always drawn"
+    )
+
+
+def test_every_panel_stands_in_it_once() -> None:
+    tabs = [panel["tabs"] for name, panel in LAYOUT["configById"].items() if name.startswith("Tab!")]
+    placed = [word for word in words([LAYOUT["layout"], tabs]) if "!" in word]
+    assert sorted(placed) == sorted(LAYOUT["configById"])

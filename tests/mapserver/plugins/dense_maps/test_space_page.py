@@ -14,14 +14,25 @@ from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.geometry import Array, se3
 from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import CameraNote, FailureAck, Placement, decode_message, encode_message, robot_key
+from mapserver.fleet.fleet import Fleet
 from mapserver.plugins.dense_maps import space_points as points
 from mapserver.plugins.dense_maps.pages import robot_views
 from mapserver.plugins.dense_maps.space_points import space_bytes
 from mapserver.store import MapStore
-from support.fleet.dashboard_scene import ROBOTS, SITE, Served, failure, opened, serving, talking, wait_until
+from support.fleet.dashboard_scene import (
+    ROBOTS,
+    SITE,
+    Served,
+    failure,
+    fill_store,
+    opened,
+    serving,
+    talking,
+    wait_until,
+)
 from support.pages.browser import box_of
 from support.pages.whole_page import assert_whole
-from support.storage.dense_samples import save_session_pictures, save_surfel_draft, seen_wall
+from support.storage.dense_samples import save_session_pictures, save_surfel_draft, seen_wall, wall
 from support.storage.map_samples import random_tile, save_sample_draft
 from support.storage.room_sessions import session_at
 
@@ -215,3 +226,54 @@ def test_a_robot_that_told_its_camera_is_drawn_with_it(page: Page, served: Serve
 def test_a_version_that_is_not_there_is_named(page: Page, served: Served) -> None:
     opened(page, served, "space", version=99)
     expect(page.locator(".notice.bad")).to_contain_text("99")
+
+
+# The plan of what was moved between two versions, on the map page.
+
+
+def test_a_plan_says_what_was_moved_between_two_versions(page: Page, tmp_path: Path) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        before, after = (save_surfel_draft(store, seen_wall(with_board=board)) for board in (False, True))
+        bare = save_sample_draft(store)
+    with serving(tmp_path) as served:
+        address = f"{served.http}/dashboard/map?site=lab&before={before}&after="
+        page.goto(address + str(after))
+        plan = page.get_by_role("img", name=f"What stands otherwise in version {after} than in version {before}")
+        plan.scroll_into_view_if_needed()
+        expect(plan).to_have_js_property("complete", True)
+        assert plan.evaluate("image => image.naturalWidth") > 5
+        with page.expect_response("**/changes.geojson") as answered:
+            page.get_by_role("link", name="As GeoJSON").click()
+        assert [each["properties"]["change"] for each in answered.value.json()["features"]] == ["appeared"]
+        page.goto(address + str(bare))
+        expect(page.get_by_text("No plan of what was moved")).to_contain_text("surfel_map = true")
+
+
+# The expected view on the page of a failure, and the links to the page in three dimensions.
+
+
+def test_the_expected_view_stands_beside_the_picture(page: Page, tmp_path: Path) -> None:
+    fill_store(tmp_path)
+    with MapStore.open(tmp_path) as store:
+        save_surfel_draft(store, wall(), site="annex")  # which an address without a site means
+        version = save_surfel_draft(store, wall(), site=SITE)
+        optical = se3(np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]]), np.zeros(3))
+        camera = CameraNote(
+            size_px=(320, 240), focal_px=300.0, centre_px=(160.0, 120.0), base_from_cam=Placement.of(optical)
+        )
+        seen_by = {"camera": camera, "version": version, "map_from_base": Placement.of(np.eye(4))}
+        fleet = Fleet(store)
+        assert not fleet.take_failure(SITE, "tug-5", msgspec.structs.replace(failure("tug-5", "f5"), **seen_by)).refused
+        fleet.flush()
+    with serving(tmp_path) as served:
+        seen = opened(page, served, "failures/3")
+        expect(page.locator(".seen-expected img")).to_have_count(2)
+        wait_until(page, "document.querySelector('img[src*=expected]').naturalWidth === 320", within_s=90)
+        assert_whole(page)
+        page.get_by_role("link", name="3D view from there").click()
+        expect(page.get_by_role("heading", name=f"3D view of {SITE}")).to_be_attached()
+        assert seen.faults == []
+        opened(page, served, "failures/1")
+        expect(page.locator("main")).to_contain_text("No expected view: the report lacks the robot's camera")
+        opened(page, served, "map")
+        expect(page.get_by_role("link", name="3D view")).to_have_count(1)
