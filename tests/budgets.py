@@ -12,13 +12,12 @@ CODE = {".py", ".cpp", ".hpp", ".h", ".js", ".css", ".html", ".sh"}
 
 
 class Room(NamedTuple):
-    """Lines of a room, and the most that it may have: its budget, or what it had when it was last above it."""
+    """Lines of a room, and the most that it may have."""
 
     part: str
     name: str
     lines: int
     limit: int
-    ceiling: int
 
 
 def lines_by_file() -> dict[str, int]:
@@ -55,7 +54,7 @@ def rooms(budgets: dict[str, Any], lines: dict[str, int]) -> list[Room]:
     for part, entries in budgets.items():
         for name, entry in entries.items():
             count = sum(n for (p, _), n in counts.items() if p == part) if name == "total" else counts[part, name]
-            found.append(Room(part, name, count, entry["limit"], max(entry["limit"], entry.get("now", 0))))
+            found.append(Room(part, name, count, entry["limit"]))
     return found
 
 
@@ -65,6 +64,6 @@ def measured() -> list[Room]:
 
 
 if __name__ == "__main__":
-    print(f"{'room':40} {'lines':>7} {'budget':>7} {'over':>7}")
+    print(f"{'room':40} {'lines':>7} {'budget':>7}")
     for room in measured():
-        print(f"{room.name:40} {room.lines:7} {room.limit:7} {max(0, room.lines - room.limit):7}")
+        print(f"{room.name:40} {room.lines:7} {room.limit:7}")
