@@ -1,9 +1,12 @@
 """Landmarks through surveys: what moved is told from noise, what is missed fades as its own history says."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import numpy as np
 import pytest
 
-from mapserver.survey.merge.landmark_persistence import LandmarkCounts, faded, missed_since, shifts
+from mapserver.survey.merge.landmark_persistence import LandmarkCounts, count_landmarks, faded, missed_since, shifts
 from mapserver.survey.settings import SessionSettings, SurveySettings
 from mapserver.survey.survey_map import History
 from support.worlds.session_scene import session_scene
@@ -66,3 +69,14 @@ def test_a_landmark_that_is_hardly_ever_seen_may_be_missed_longer() -> None:
     counts = LandmarkCounts(np.full(n, 16), np.zeros(n, np.int64))
     assert faded(often.base, counts, SurveySettings()).all()
     assert not faded(rarely.base, counts, SurveySettings()).any()
+
+
+def test_two_features_of_a_picture_see_a_landmark_once() -> None:
+    """A history counts pictures."""
+    scene = session_scene(1)
+    once = scene.sightings(scene.base.points_map, 1)
+    blank: Any = SimpleNamespace(features=SimpleNamespace(pixels=np.zeros((0, 2))), disparities=np.zeros((0, 2)))
+    for seen in (once, once.only(np.repeat(np.arange(len(once.rows)), 2))):
+        counts = count_landmarks(scene.base, [blank] * len(seen.located), scene.map_from_cam, seen)
+        np.testing.assert_array_equal(counts.seen, np.bincount(once.rows, minlength=len(counts.seen)))
+        assert (counts.expected >= counts.seen).all()
