@@ -81,7 +81,7 @@ class Odometry:
             self._stereo_settings,
             first_frame=first_frame,
             first_id=first_id,
-            points_in_camera=self._points_in_camera,
+            points_in_camera=None if self._rig.camera.baseline_m else self._points_in_camera,
         )
 
     def handle_stereo(self, frame: RectifiedFrame) -> OdometryEstimate:

@@ -11,6 +11,7 @@ from benchmarks.common import estimator_loop
 from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.messages import Cause, Status
 from fleetmap.odometry.estimate import OdometryStatus
+from fleetmap.odometry.modes import InertialMode
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
@@ -142,6 +143,22 @@ def test_odometry_goes_on_with_the_other_pair_and_a_camera_comes_back(sensors: S
     front, rear = ([views[k] is not Cause.NONE for views in views_of] for k in (0, 1))
     assert np.flatnonzero(front).tolist() == [*range(40, 64)]
     assert np.flatnonzero(rear).tolist() == [*range(68, 90)]
+
+
+def test_a_pair_that_takes_over_from_a_single_camera_measures_its_own_depth() -> None:
+    """The front camera is covered once rest has shown gravity: the motion in the rear images needs the disparities there."""
+    pairs = rig_of_two(SensorSet.STEREO_INERTIAL)
+    rectifier = Rectifier(replace(pairs, cameras=(pairs.cameras[0], *pairs.cameras[2:])))
+    localizer = Localizer(rectifier.rig, LocalizerSettings())
+    with patch.object(InertialMode, "process", autospec=True, side_effect=InertialMode.process) as process:
+        for stamp_ns in range(0, 1_400_000_000, FRAME_NS):
+            frame = replace(with_noise(seen_at(stamp_ns), np.random.default_rng(stamp_ns)), right=None)
+            if stamp_ns > 1_200_000_000:
+                frame = spoilt(frame, "covered", is_rear=False, last=frame)
+            localizer.handle_imu(imu_between(stamp_ns - FRAME_NS, stamp_ns + IMU_NS))
+            localizer.handle_stereo(rectifier.rectify(frame))
+    assert localizer.perception.view == 1
+    assert all(call.args[2].information is not None for call in process.call_args_list[-3:])
 
 
 @pytest.mark.parametrize("front", ["covered pair", "single camera"])

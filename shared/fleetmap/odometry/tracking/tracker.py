@@ -123,7 +123,7 @@ class Tracker:
         is_predicted = guess is not None and rotation_sigma_rad is not None
         guess, before, points_cam = np.eye(4) if guess is None else guess, self._points.ids, None
         if self._points_in_camera is not None:
-            points_cam = self._points_in_camera(before)
+            points_cam = self._points_in_camera(before + self._first_id)
             points_cam[~(points_cam[:, 2] > 0.0)] = np.nan
         solved, share = self._step(frame, guess, is_predicted, points_cam)
         motion, information = solved or (None, None)
