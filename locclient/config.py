@@ -125,8 +125,7 @@ def with_common(given: dict[str, Any]) -> dict[str, Any]:
     completed = dict(given)
     for name in ("run", "replay"):
         section: dict[str, Any] = given.get(name, {})
-        left_out = {"store", "server"} if {"store", "server"} & set(section) else set()
-        keys = {"site", "store", "server"} - left_out
+        keys = {"site"} if {"store", "server"} & section.keys() else {"site", "store", "server"}
         completed[name] = {key: given[key] for key in keys if key in given} | section
     return completed
 

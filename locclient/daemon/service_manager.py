@@ -27,7 +27,13 @@ class ServiceManager:
     def alive(self, status: str) -> None:
         """Reset the watchdog; status: a line for `systemctl status` and `locclient status`."""
         self._tell(f"WATCHDOG=1\nSTATUS={status}")
-        self._write(status)
+        if self._folder is None:
+            return
+        with suppress(OSError):  # the robot continues, and readers find an old file
+            fresh = self._folder / f"{_FILE}.new"
+            # Monotonic clock, which is never set. Not rounded: rounded up, it would lie in the future.
+            fresh.write_text(f"{time.monotonic()!r} {status}\n", encoding="utf-8")
+            fresh.replace(self._folder / _FILE)
 
     def stopping(self) -> None:
         self._tell("STOPPING=1")
@@ -43,15 +49,6 @@ class ServiceManager:
             sender.setblocking(False)  # a manager that does not read must not block the robot
             sender.connect(self._address)
             sender.send(text.encode())
-
-    def _write(self, status: str) -> None:
-        if self._folder is None:
-            return
-        with suppress(OSError):  # the robot continues, and readers find an old file
-            fresh = self._folder / f"{_FILE}.new"
-            # Monotonic clock, which is never set. Not rounded: rounded up, it would lie in the future.
-            fresh.write_text(f"{time.monotonic()!r} {status}\n", encoding="utf-8")
-            fresh.replace(self._folder / _FILE)
 
 
 def runtime_folder() -> Path | None:

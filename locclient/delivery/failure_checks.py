@@ -4,14 +4,12 @@ ARRAYS lists every array by field name, or by class and field, with dtype, shape
 lengths shared by all arrays of one object.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from enum import Enum
 from itertools import pairwise
 from math import isfinite
 from typing import Any, NamedTuple
 
-import msgspec
 import numpy as np
 
 from fleetmap.config import Section
@@ -23,6 +21,7 @@ from locclient.localization.percept import QueryInput
 MAX_ROWS = 10_000  # of an array, and members of a list
 _MAX_INT, _MAX_SETTING, _MAX_SIDE_PX = 1 << 62, 1_000_000, 10_000
 _ANGLE_TOLERANCE, _COVARIANCE_TOLERANCE = 1e-3, 1e-6
+_MEMBERS = "__struct_fields__", "__dataclass_fields__", "_fields"  # of a struct, a dataclass, a named tuple
 _MAY_BE_INFINITE = ("imu_minus_cam_sigma_s", "scene_depth_m", "sigma_m")  # the last one of a ride
 
 
@@ -146,21 +145,21 @@ class _Walk:
                 if name.endswith("_share") and not 0 < member < 1:  # all of them are by default
                     raise _refused(at, f"{member}")
                 self.check(member, at)
-        elif isinstance(value, msgspec.Struct):
-            self._members(value, value.__struct_fields__, where)
-        elif is_dataclass(value):
-            self._members(value, [field.name for field in fields(value)], where)
-        elif hasattr(value, "_fields"):
-            self._members(value, value._fields, where)
+        elif names := next((getattr(value, kind) for kind in _MEMBERS if hasattr(value, kind)), None):
+            self._members(value, names, where)
         elif isinstance(value, Mapping | list | tuple):
             if len(value) > MAX_ROWS:
                 raise _refused(where, f"{len(value)} of them, at most {MAX_ROWS} are read")
             for place, each in enumerate(value.items() if isinstance(value, Mapping) else value):
                 self.check(each, f"{where}[{place}]")
-        else:
-            self._number(value, where)
+        elif not (
+            isinstance(value, bool | str | Enum | None)
+            or (isinstance(value, int) and abs(value) <= _MAX_INT)
+            or (isinstance(value, float) and (isfinite(value) or where.rpartition(".")[2] in _MAY_BE_INFINITE))
+        ):
+            raise _refused(where, f"{value!r:.80}")
 
-    def _members(self, value: Any, names: Sequence[str], where: str) -> None:
+    def _members(self, value: Any, names: Iterable[str], where: str) -> None:
         lengths: dict[str, int] = {}
         if isinstance(value, StereoCamera):
             self._camera = value
@@ -189,13 +188,3 @@ class _Walk:
             )
         if max(array.shape) > MAX_ROWS or not kind.is_good(array, self._camera):
             raise _refused(where, f"values that cannot be, of shape {array.shape}")
-
-    def _number(self, value: Any, where: str) -> None:
-        name = where.rpartition(".")[2]
-        if isinstance(value, bool | str | Enum | None):
-            return
-        if isinstance(value, int) and abs(value) <= _MAX_INT:
-            return
-        if isinstance(value, float) and (isfinite(value) or name in _MAY_BE_INFINITE):
-            return
-        raise _refused(where, f"{value!r:.80}")

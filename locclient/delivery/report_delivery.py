@@ -53,10 +53,9 @@ def deliver_replay_part(client: MapClient, outbox: Outbox, received_bytes: dict[
 
     received_bytes: bytes that the server has, by report id; kept by the caller between calls.
     """
-    waiting = outbox.waiting(1)
-    if not waiting:
+    replay = next(iter(outbox.waiting()), None)
+    if replay is None:
         return False
-    replay = waiting[0]
     offset = received_bytes.get(replay.id, 0)
     data = replay.payload[offset : offset + PART_BYTES]
     part = ReplayPart(id=replay.id, total_bytes=len(replay.payload), offset=offset, data=data)

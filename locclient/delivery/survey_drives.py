@@ -57,9 +57,8 @@ class SurveyDrives:
     def handle(self, bundle: SensorBundle, estimate: Estimate | None) -> None:
         """Take a bundle that the robot has localized; estimate: None without a frame."""
         if estimate is not None:
-            is_placed = estimate.status is Status.TRACKING and estimate.map_from_body is not None
-            place = estimate.map_from_body[:2, 3] if is_placed and estimate.map_from_body is not None else None
-            self._follow(place, estimate.stamp_ns)
+            map_from_body = estimate.map_from_body if estimate.status is Status.TRACKING else None
+            self._follow(None if map_from_body is None else map_from_body[:2, 3], estimate.stamp_ns)
         if self._area is None:
             return
         frame = bundle.frame

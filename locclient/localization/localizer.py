@@ -136,7 +136,12 @@ class Localizer:
             if (prior := source.prior(percept)) is not None:
                 tracker.take(prior)
         if frame is not None:
-            self._judge_cameras(percept, frame)
+            self._calibration.work()
+            percept.is_reversed = bool(self._calibration.contradiction) or (
+                self.perception.view == 0
+                and self._calibration.is_reversed(frame, is_localized=tracker.confirmed is not None)
+            )
+            percept.calibration = self._calibration.state
         result = self._query.step(percept, frame, is_riding=self._lift.is_riding)
         if frame is not None:
             finished = self._query.finished
@@ -148,14 +153,6 @@ class Localizer:
                 self._calibration.add(self._query.finished)
             percept.calibration = self._calibration.state
         return self._report(percept, result)
-
-    def _judge_cameras(self, percept: Percept, frame: RectifiedFrame) -> None:
-        self._calibration.work()
-        percept.is_reversed = bool(self._calibration.contradiction) or (
-            self.perception.view == 0
-            and self._calibration.is_reversed(frame, is_localized=self._tracker.confirmed is not None)
-        )
-        percept.calibration = self._calibration.state
 
     def _report(self, percept: Percept, result: QueryResult) -> Estimate:
         tracker = self._tracker

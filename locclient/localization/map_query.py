@@ -120,8 +120,7 @@ class MapQuery:
         if (is_urgent and not self._is_urgent) or odometry.after_gap:
             self._cancel()  # a frame before the break, or before the gap, says little of the robot's present pose
         if self._job is None and self._maps.by_floor:
-            is_due = is_urgent or self._is_due(odometry)
-            begins = percept.query is not None if frame is None else is_due
+            begins = percept.query is not None if frame is None else is_urgent or self._is_due(odometry)
             if begins:
                 is_at_once = self._is_sparse(odometry.stamp_ns) or odometry.after_gap
                 self._begin(percept, frame, is_urgent=is_urgent)
@@ -172,8 +171,7 @@ class MapQuery:
         self._is_urgent, self._slices = is_urgent, _MORE_SLICES if is_eager else few
         if not is_at_rest:
             self._failed_places[view].clear()
-        is_sparse = self._is_sparse(odometry.stamp_ns)
-        self._job = self._run(percept.query, frame, is_sparse=is_sparse)
+        self._job = self._run(percept.query, frame, is_sparse=self._is_sparse(odometry.stamp_ns))
 
     def _advance(self, *, is_at_once: bool) -> QueryResult:
         if self._job is None:

@@ -77,10 +77,8 @@ class Perception:
             image = replace(image, cause=self._images[number].judge_depth(odometry.scene_depth_m))
         self.stage_s = {"image_quality": judged_s - begun_s, "odometry": self._clock() - judged_s}
         causes = [image.cause if k == number else each.cause for k, each in enumerate(images)]
-        last, self.percept = (
-            self.percept,
-            Percept(odometry, image, self._motions(motions_from), view_causes=tuple(causes)),
-        )
+        last = self.percept
+        self.percept = Percept(odometry, image, self._motions(motions_from), view_causes=tuple(causes))
         if self.gauges:
             if self.odometry.refuses_imu or self.odometry.accelerometer.fault:
                 self.gauge.doubt()
@@ -122,9 +120,8 @@ class Perception:
                 return
 
     def _motions(self, frames: Iterable[int]) -> dict[int, Motion]:
-        found = {index: self.odometry.motion_since(index) for index in frames}
         return {
             index: Motion(*motion, self.odometry.will_forget(index))
-            for index, motion in found.items()
-            if motion is not None
+            for index in frames
+            if (motion := self.odometry.motion_since(index)) is not None
         }

@@ -240,11 +240,9 @@ class PoseTracker:
             self.prior.travelled_m += self.step_m
 
     def _tracked(self) -> list[PoseHypothesis]:
-        found = [
-            *self.candidates.tracked(),
-            *self._repeated.tracked(),
-            *([] if self.prior is None else self.prior.tracked()),
-        ]
+        found = self.candidates.tracked() + self._repeated.tracked()
+        if self.prior is not None:
+            found += self.prior.tracked()
         if self.confirmed is not None:
             found.append(self.confirmed)
         found.extend(each.frame for each in self._unmatched)

@@ -322,8 +322,7 @@ class MapClient(MapSource):
 
     def ack(self, version: int | None, *, stamp_ns: int, refused: str = "") -> None:
         """Report to the server the running version and, if it is not the wanted one, the reason."""
-        own = {"site": self.site, "robot": self.robot}
-        message = RobotAck(**own, stamp_ns=stamp_ns, version=version, refused=refused[:2000])
+        message = RobotAck(site=self.site, robot=self.robot, stamp_ns=stamp_ns, version=version, refused=refused[:2000])
         self.publish("ack", message)
 
     def deliver(self, name: str, payload: bytes) -> FailureAck:

@@ -161,8 +161,7 @@ class LocalMapSource(MapSource):
         """Return the verified bytes of an address; StoreError for missing ones, MapFormatError for damaged ones."""
         path = self._folder / blob_path(sha256)
         with disk_errors(f"{path} cannot be read", "the store is incomplete"):
-            data = path.read_bytes()
-        return verified(data, sha256)
+            return verified(path.read_bytes(), sha256)
 
 
 def address_of(wanted: WantedVersion) -> tuple[int, str]:

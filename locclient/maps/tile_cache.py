@@ -162,11 +162,10 @@ class TileCache:
         path = self._site_path(site) / "beside" / check_name(kind, "kind")
         try:
             return path.read_bytes()
-        except FileNotFoundError:
-            return None
         except OSError as error:
-            self._note(f"{path} cannot be read ({error.strerror}); it has to be fetched again")
-            return None
+            if not isinstance(error, FileNotFoundError):
+                self._note(f"{path} cannot be read ({error.strerror}); it has to be fetched again")
+        return None
 
     def room_bytes(self) -> int:
         """Return the free bytes beside the protected files."""
@@ -186,10 +185,9 @@ class TileCache:
             return msgspec.structs.replace(record, blobs=tuple(check_sha256(sha256) for sha256 in record.blobs))
         except OSError as error:
             self._note(f"{path} cannot be read ({error.strerror}); check the disk and whose file it is")
-            return None
         except (msgspec.MsgspecError, UnicodeDecodeError, MapFormatError) as error:
             self._note(f"{path} is damaged ({error}); the version has to be fetched again")
-            return None
+        return None
 
     def _used(self) -> set[str]:
         """Return the protected addresses."""

@@ -119,15 +119,12 @@ def replay(
         if options.realtime:
             time.sleep(max(0.0, (raw.stamp_ns - first_ns) * 1e-9 - (time.monotonic() - begun_s)))
         wall_s = time.monotonic()
-        bundle = SensorBundle(raw, imu, wheel, priors)
-        outcome = robot.handle(bundle)
-        if outcome is None:  # the view that it follows has no image in this frame
-            options.progress(number)
-            continue
+        outcome = robot.handle(SensorBundle(raw, imu, wheel, priors))
         wall_s = time.monotonic() - wall_s
-        _add(result, outcome, source.truth_map_from_body(number), wall_s, decode_s)
-        if options.export is not None:
-            options.export.handle(raw, outcome)
+        if outcome is not None:  # else the view that it follows has no image in this frame
+            _add(result, outcome, source.truth_map_from_body(number), wall_s, decode_s)
+            if options.export is not None:
+                options.export.handle(raw, outcome)
         options.progress(number)
     _note_the_whole(result, source, unread)
     return result

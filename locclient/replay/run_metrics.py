@@ -130,9 +130,7 @@ def status_share(frames: Frames) -> dict[str, float]:
 
 def silent_failures(frames: Frames) -> int | None:
     """Return the number of failures with status TRACKING and a wrong position; None without ground truth."""
-    if all(f.error_m is None for f in frames):
-        return None
-    return len(_episodes(frames, _is_silent, SILENT_S))
+    return None if all(f.error_m is None for f in frames) else len(_episodes(frames, _is_silent, SILENT_S))
 
 
 def position_failures(frames: Frames) -> int:

@@ -147,10 +147,8 @@ class Load:
     @property
     def overload(self) -> dict[Flag, str]:
         """Return the flag of a robot that is too slow for its frames, with its text; empty if it keeps up."""
-        if self.dropped_share <= _OVERLOADED_SHARE:
-            return {}
         words = f"{self.dropped_share:.0%} of the frames are dropped, this computer is too slow for them"
-        return {Flag.OVERLOADED: words}
+        return {Flag.OVERLOADED: words} if self.dropped_share > _OVERLOADED_SHARE else {}
 
 
 _OFF_SHARE, _OFF_MPS = 0.5, 0.3  # relative, and absolute for low speeds: slip of a tyre is far less

@@ -97,8 +97,7 @@ class CalibrationState(NamedTuple):
 
     def cov_bias(self, map_from_cam: Array, map_from_body: Array) -> Array:
         """Return the covariance (6, 6) that wrong parameters add to a pose: map axes, rotation first, about the body."""
-        if self.cov_bias_cam is None:
-            return np.zeros((6, 6))
+        assert self.cov_bias_cam is not None
         turn = turn_both(map_from_cam[:3, :3])
         return transport_cov(turn @ self.cov_bias_cam @ turn.T, map_from_body[:3, 3] - map_from_cam[:3, 3])
 

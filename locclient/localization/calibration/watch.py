@@ -98,7 +98,10 @@ class CalibrationWatch:
         fix, frame = query.fix, query.frame
         assert fix is not None
         matched = fix.matched
-        self._look_for_a_stand(query.odometry.stamp_ns, fix.map_from_cam[:3, 3])
+        stamp_ns, place_m = query.odometry.stamp_ns, fix.map_from_cam[:3, 3]
+        if self._stood_from is None or np.linalg.norm(place_m - self._stood_from[1]) > _STOOD_M:
+            self._stood_from = stamp_ns, place_m
+        self._has_stood |= (stamp_ns - self._stood_from[0]) * 1e-9 >= _STOOD_S
         is_first = query.is_confirmed and not self.has_confirmed
         if matched is None or not (is_first or self._is_new(fix.map_from_cam)):
             return
@@ -109,11 +112,8 @@ class CalibrationWatch:
             offsets = pair_offsets(frame, matched, fix.map_from_cam)
             seen = camera_view(_with_depth(matched, offsets[:, 0]), fix.map_from_cam, offsets[:, 1])
         information, score = np.zeros((COUNT + 2, COUNT + 2)), np.zeros(COUNT + 2)
-        ids = (
-            frozenset[int]()
-            if fix.matches is None
-            else frozenset(query.relocalizer.view.landmark_ids[fix.matches[:, 1]].tolist())
-        )
+        rows = slice(0) if fix.matches is None else fix.matches[:, 1]
+        ids = frozenset(query.relocalizer.view.landmark_ids[rows].tolist())
         if seen is not None:
             share = self._new_share(ids)
             information[:IMAGE, :IMAGE], score[:IMAGE] = share * seen.information, share * seen.score
@@ -141,11 +141,6 @@ class CalibrationWatch:
         moved_m = float(np.linalg.norm(map_from_cam[:3, 3] - last[:3, 3]))
         step_m = _STEP_M if len(self._looks) >= _FEW else _FIRST_STEP_M
         return moved_m > step_m or rotation_angle_rad(last[:3, :3].T @ map_from_cam[:3, :3]) > _STEP_RAD
-
-    def _look_for_a_stand(self, stamp_ns: int, place_m: Array) -> None:
-        if self._stood_from is None or np.linalg.norm(place_m - self._stood_from[1]) > _STOOD_M:
-            self._stood_from = stamp_ns, place_m
-        self._has_stood |= (stamp_ns - self._stood_from[0]) * 1e-9 >= _STOOD_S
 
     def _new_share(self, ids: frozenset[int]) -> float:
         """Return the share of landmarks that no look of the window has shown."""

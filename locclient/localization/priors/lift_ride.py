@@ -90,10 +90,7 @@ class LiftRide:
             return None
         confirmed, prior = tracker.confirmed, tracker.prior
         ridden = prior if prior is not None and prior.is_ride else None
-        if confirmed is not None:
-            places = [confirmed.now]
-        else:
-            places = [] if prior is None else prior.places()
+        places = [confirmed.now] if confirmed is not None else [] if prior is None else prior.places()
         lifts = frozenset[str]().union(*map(self._lifts_at, places))
         self.is_riding = ride.is_moving and (bool(lifts) or confirmed is None)
         if not lifts:

@@ -123,10 +123,8 @@ def _streams(source: Source, config: LocclientConfig, listen_s: float, rectifier
         yield Finding(OK if is_enough else FAIL, "imu", f"{imu_hz:.0f} Hz{hint}")
     if stamps and is_live:
         skew_s = (time.time_ns() - stamps[-1]) * 1e-9
-        is_off, text = (
-            abs(skew_s) > _SKEW_S + 1.0 / max(frame_hz, 1.0),
-            f"{1e3 * skew_s:.0f} ms behind the system's clock",
-        )
+        is_off = abs(skew_s) > _SKEW_S + 1.0 / max(frame_hz, 1.0)
+        text = f"{1e3 * skew_s:.0f} ms behind the system's clock"
         if is_off:
             text = f"frames are stamped {skew_s:.2f} s before now; let the driver stamp with the system's clock"
         yield Finding(WARN if is_off else OK, "stamps", text)

@@ -154,15 +154,14 @@ class FleetMaps:
         origins.check()
         self._cache, self._site, self._folder, self._origins = robot.cache, robot.site, robot.folder, origins
         self._needs_hash, self._check_admitted = robot.check_admitted is None, robot.check_admitted or (lambda _: None)
-        cache, site, folder = self._cache, self._site, self._folder
-        active = cache.active(site)
+        active = robot.cache.active(robot.site)
         try:
-            with disk_errors(f"{folder} cannot be used", "choose another cache"):
-                folder.mkdir(parents=True, exist_ok=True)
-                for leftover in folder.glob("*.fmex"):
+            with disk_errors(f"{robot.folder} cannot be used", "choose another cache"):
+                robot.folder.mkdir(parents=True, exist_ok=True)
+                for leftover in robot.folder.glob("*.fmex"):
                     leftover.unlink()
-            if active is not None and active not in cache.kept(site):
-                cache.keep(site, active.version, active.blobs)
+            if active is not None and active not in robot.cache.kept(robot.site):
+                robot.cache.keep(robot.site, active.version, active.blobs)
         except StoreError as error:
             _log.warning("maps of the fleet manager cannot be downloaded: %s", error)
 

@@ -110,8 +110,7 @@ class Localization:
         elif not self.is_aligned:
             hint = _NO_BUILDING
         else:
-            unknown = _STATUS_WORDS.get(estimate.status, "the robot has no reliable pose")
-            hint = _WORDS.get(estimate.cause) or unknown
+            hint = _WORDS.get(estimate.cause) or _STATUS_WORDS.get(estimate.status, "the robot has no reliable pose")
         said = "no images" if estimate is None else estimate.status
         return Error(
             error_type="LOCALIZATION_ERROR",
