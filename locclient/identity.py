@@ -71,8 +71,7 @@ class RobotIdentity:
 
     def is_renewal_due(self, now: datetime) -> bool:
         """Return True if the certificate is a month old, or was signed while the server's clock was ahead."""
-        left = self.certificate().ends - now
-        return not _LIFE - _RENEW_AFTER <= left <= _LIFE + timedelta(days=1)
+        return not _LIFE - _RENEW_AFTER <= (self.certificate().ends - now) <= _LIFE + timedelta(days=1)
 
     def renew(self, bus: Bus) -> None:
         """Replace key and certificate by new ones; open connections are not affected.

@@ -211,8 +211,7 @@ def _run(
                 console.print(f"note: {issue.what}: {issue.detail}".rstrip(": "))
             task = bar.add_task("replay", total=len(source))
             how = settings.localizer, playback.realtime, lambda _: bar.advance(task), export
-            options = ReplayOptions(*how, partial(image_priors_of, settings), address.robot)
-            result = play(source, maps, options, prior)
+            result = play(source, maps, ReplayOptions(*how, partial(image_priors_of, settings), address.robot), prior)
         report, more = result.report, dict[str, object]()
         if playback.starts:
             numbers, loaded = spread_starts(source, playback.starts), load_map(maps)[0]

@@ -145,7 +145,7 @@ class _Walk:
                 if name.endswith("_share") and not 0 < member < 1:  # all of them are by default
                     raise _refused(at, f"{member}")
                 self.check(member, at)
-        elif names := next((getattr(value, kind) for kind in _MEMBERS if hasattr(value, kind)), None):
+        elif (names := next((getattr(value, kind) for kind in _MEMBERS if hasattr(value, kind)), None)) is not None:
             self._members(value, names, where)
         elif isinstance(value, Mapping | list | tuple):
             if len(value) > MAX_ROWS:
@@ -170,8 +170,7 @@ class _Walk:
         for name in names:
             member, at = getattr(value, name), f"{where}.{name}".lstrip(".")
             if isinstance(member, np.ndarray):
-                kind = ARRAYS.get(f"{type(value).__name__}.{name}") or ARRAYS.get(name)
-                self._array(member, kind, at, lengths)
+                self._array(member, ARRAYS.get(f"{type(value).__name__}.{name}") or ARRAYS.get(name), at, lengths)
             else:
                 self.check(member, at)
 

@@ -158,8 +158,7 @@ def _with_depth(frame: RingFrame, profile: RobotProfile) -> Percept:
         camera, is_tried = profile.rig.mounted[query.view].camera, query.features.is_tried
         untried = np.ones(len(found), bool) if is_tried is None else ~is_tried
         left = found.pixels[untried]
-        disparities = stereo.disparities(shown, camera, left, profile.settings.stereo)[:, 0]
-        pixels[untried, 2] = left[:, 0] - disparities
+        pixels[untried, 2] = left[:, 0] - stereo.disparities(shown, camera, left, profile.settings.stereo)[:, 0]
     return replace(frame.percept, query=replace(query, features=FrameFeatures(found, pixels)))
 
 

@@ -116,8 +116,7 @@ class Outbox:
         Those delivered longer than a week ago are removed.
         """
         with self._transaction() as database:
-            old_ns = self._wall_ns() - _KEPT_NS
-            database.execute("DELETE FROM report WHERE delivered_ns BETWEEN 1 AND ?", (old_ns,))
+            database.execute("DELETE FROM report WHERE delivered_ns BETWEEN 1 AND ?", (self._wall_ns() - _KEPT_NS,))
             known = database.execute("SELECT value FROM count WHERE name = ?", (_RESTORED,)).fetchone()
             # Not "before": its clock may have been set back.
             if restored_ns in (0, None if known is None else known[0]):

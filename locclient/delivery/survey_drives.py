@@ -71,10 +71,9 @@ class SurveyDrives:
     def work(self) -> None:
         """Write what was recorded. A drive that the disk refuses is lost."""
         while self._queue:
-            taken = self._queue.popleft()
             try:
                 with disk_errors(f"{self._folder} cannot be written", "free some space"):
-                    self._write(taken)
+                    self._write(self._queue.popleft())
             except FleetmapError as error:
                 _log.warning("a drive for a survey is lost: %s", error)
                 self._close(is_kept=False)

@@ -138,8 +138,7 @@ def _of_confirmed(estimate: Estimate, tracker: PoseTracker, confirmed: PoseHypot
         status, cause = Status.TRACKING, Cause.NONE
     estimate = replace(estimate, status=status, cause=cause)
     if status is not Status.TRACKING and told:  # the robot may be at either
-        places = _published([confirmed, *elsewhere])
-        return replace(estimate, status=Status.AMBIGUOUS, hypotheses=places)
+        return replace(estimate, status=Status.AMBIGUOUS, hypotheses=_published([confirmed, *elsewhere]))
     return _with_pose(estimate, confirmed.now, settings)
 
 
@@ -155,8 +154,7 @@ def _with_pose(estimate: Estimate, place: Place, settings: TrackSettings) -> Est
     """
     if np.isnan(place.map_from_body).any() or np.isnan(place.cov_rot_trans).any():
         return estimate
-    covariance = place.cov_rot_trans + map_cov(settings)
-    return replace(estimate, **place._replace(cov_rot_trans=covariance)._asdict())
+    return replace(estimate, **place._replace(cov_rot_trans=place.cov_rot_trans + map_cov(settings))._asdict())
 
 
 def _published(hypotheses: Sequence[PoseHypothesis]) -> tuple[Hypothesis, ...]:

@@ -142,8 +142,7 @@ class HypothesisSet:
 
         def lead(one: PoseHypothesis, other: PoseHypothesis) -> float:
             (history, flags), (other_history, other_flags) = known[id(one)], known[id(other)]
-            told = one.told_log_odds - other.told_log_odds
-            return log_odds(history, other_history, flags, other_flags) + told
+            return log_odds(history, other_history, flags, other_flags) + (one.told_log_odds - other.told_log_odds)
 
         yield
         best = max(order[1:], key=lambda other: lead(other, order[0]))

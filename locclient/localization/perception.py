@@ -114,8 +114,7 @@ class Perception:
         for number, cause in enumerate(causes):
             may_lead = number == 0 or self._mounted[number].camera.baseline_m > 0
             if number != present and cause not in UNUSABLE and may_lead:
-                before = None if self._last_frame is None else self._last_frame.view(number)
-                self.odometry.follow(number, before)
+                self.odometry.follow(number, None if self._last_frame is None else self._last_frame.view(number))
                 self.view = number
                 return
 

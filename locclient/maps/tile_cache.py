@@ -115,8 +115,7 @@ class TileCache:
                 f"{missing[0]} first; {self._last_fault or 'fetch them again'}"
             )
         record = ActiveVersion(version, tuple(blobs))
-        path = self._site_path(site) / "active"
-        if record != self._active.get(site) and not self._write(path, to_json(record)):
+        if record != self._active.get(site) and not self._write(self._site_path(site) / "active", to_json(record)):
             raise StoreError(f"version {version} of {site} cannot be made active: {self._last_fault}")
         self._active[site] = record
         self._reserved.pop(site, None)

@@ -42,8 +42,7 @@ class TileLoader:
         cells = select_tiles(version.manifest, version.cells, bound, self.settings)
         if cells == version.cells:
             return None
-        missing = cells - version.tiles.keys() - version.refused.keys()
-        fetched = self._source.tiles(version.manifest, missing)
+        fetched = self._source.tiles(version.manifest, cells - version.tiles.keys() - version.refused.keys())
         version.refused.update(fetched.refused)
         version.tiles = {cell: tile for cell, tile in {**version.tiles, **fetched.tiles}.items() if cell in cells}
         if not version.tiles and version.refused:

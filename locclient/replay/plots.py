@@ -117,8 +117,7 @@ def _draw_plan(axes: "_Axes", plot: RunPlot, shares: Array, darkest: str) -> Non
     inside = ((landmarks > axes.data_low) & (landmarks < axes.data_high)).all(axis=1)
     for point in axes.pixels(landmarks[inside]):
         axes.dot(point, 1.0, _POINT)
-    truths = plot.truths_map_m[~np.isnan(plot.truths_map_m[:, 0]), :2]
-    axes.line(truths, _INK, 1)
+    axes.line(plot.truths_map_m[~np.isnan(plot.truths_map_m[:, 0]), :2], _INK, 1)
     places = axes.pixels(plot.positions_map_m[:, :2])
     good, known = np.array(localised(plot.frames), bool), ~np.isnan(places[:, 0])
     for k in np.flatnonzero(known):

@@ -109,12 +109,11 @@ class ReplayResult:
 
     def save_picture(self, path: str | Path) -> None:
         """Draw path, landmarks and errors into a PNG file; UsageError if it cannot be written."""
-        truths = _stacked([truth if self.truth_in_map else None for truth in self.truths], 4)
         plot = RunPlot(
             title=f"{self.manifest.site}, version {self.manifest.version}",
             frames=self.frames,
             positions_map_m=self.map_from_body[:, :3, 3],
-            truths_map_m=truths[:, :3, 3],
+            truths_map_m=_stacked([truth if self.truth_in_map else None for truth in self.truths], 4)[:, :3, 3],
             landmarks_map_m=np.concatenate([tile.points_map for tile in self.tiles.tiles.values()]),
         )
         save_picture(plot, Path(path))

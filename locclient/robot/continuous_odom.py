@@ -52,6 +52,5 @@ class ContinuousOdom:
         self._is_localized = True
         map_from_odom, cov_rot_trans = estimate.map_from_body @ se3_inverse(odom_from_body), estimate.cov_rot_trans
         if cov_rot_trans is not None:
-            lever_m = estimate.map_from_body[:3, :3] @ self._body_from_base[:3, 3]
-            cov_rot_trans = transport_cov(cov_rot_trans, lever_m)
+            cov_rot_trans = transport_cov(cov_rot_trans, estimate.map_from_body[:3, :3] @ self._body_from_base[:3, 3])
         return PublishedPose(odom_from_base, map_from_odom, cov_rot_trans=cov_rot_trans)

@@ -203,8 +203,7 @@ class WheelAgreement:
             return
         duration_s = (odometry.stamp_ns - last_ns) * 1e-9
         seen_mps = (self._base_from_body @ moved @ se3_inverse(self._base_from_body))[:2, 3] / duration_s
-        rolled_mps = np.mean([sample.velocity_base_mps[:2] for sample in wheel], axis=0)
-        self._compare(seen_mps, rolled_mps, duration_s)
+        self._compare(seen_mps, np.mean([sample.velocity_base_mps[:2] for sample in wheel], axis=0), duration_s)
 
     def handle_way(self, wheel: Sequence[WheelSample], way: SeenWay | None, base_from_cam: Array) -> None:
         """Add a frame of a robot whose images show the direction of its camera's way alone, which is as long as the wheels say.

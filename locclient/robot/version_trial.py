@@ -86,8 +86,7 @@ class VersionTrial:
         self._last_m = odom_from_body[:3, 3]
         if self._map_from_odom is None or estimate.map_from_body is None:
             return 0.0
-        predicted = self._map_from_odom @ odom_from_body
-        return float(np.linalg.norm(estimate.map_from_body[:3, 3] - predicted[:3, 3]))
+        return float(np.linalg.norm(estimate.map_from_body[:3, 3] - (self._map_from_odom @ odom_from_body)[:3, 3]))
 
 
 class VersionTrials:

@@ -239,8 +239,7 @@ def _predicted(view: _View, pair: tuple[StereoCamera, StereoCamera]) -> Array:
     left = pair[0].pixel_from_point(view.in_left)[:, :2]
     if not view.right_m.any():
         return np.column_stack([left, np.zeros_like(left)])
-    right = pair[1].pixel_from_point(view.in_left - view.right_m)[:, :2]
-    return np.column_stack([left, left - right])
+    return np.column_stack([left, left - pair[1].pixel_from_point(view.in_left - view.right_m)[:, :2]])
 
 
 def _projection_slopes(points: Array, camera: StereoCamera) -> Array:

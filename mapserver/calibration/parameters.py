@@ -104,8 +104,7 @@ def corrected_rig(rig: RigCalibration, axes: RigAxes, theta: Array) -> RigCalibr
     """Return `rig` with corrections theta of its first view: lenses, pair, mount, clocks. Theta (UNKNOWNS,) includes distortion."""
     left = _camera(rig.cameras[0], theta, 0)
     body_from_rect = axes.body_from_rect @ so3_exp(theta[INDEX[P.CAMERA_IMU_X] : INDEX[P.CAMERA_IMU_Z] + 1])
-    shift = theta[INDEX[P.CAMERA_POSITION_X] : INDEX[P.CAMERA_POSITION_Z] + 1]
-    place = rig.cameras[0].body_from_cam[:3, 3] + shift
+    place = rig.cameras[0].body_from_cam[:3, 3] + theta[INDEX[P.CAMERA_POSITION_X] : INDEX[P.CAMERA_POSITION_Z] + 1]
     cameras = [replace(left, body_from_cam=se3(body_from_rect @ axes.rect_from_cam[0], place))]
     if axes.baseline_m > 0:
         right_in_rect, apart = right_camera(axes, theta)

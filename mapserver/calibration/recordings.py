@@ -59,10 +59,8 @@ def estimate_calibration(
         follow = partial(followed, settings=fewer, tools=tools or SurveyTools())
     estimate, before = None, np.zeros(len(COLUMNS))
     for _ in range(_PASSES):
-        axes = RigAxes.of(rig, Rectifier(rig))
-        current = corrected_rig(rig, axes, before) if before.any() else rig
-        found = estimate_from([follow(each, current) for each in recordings])
-        estimate = continued_from(before, found)
+        current = corrected_rig(rig, RigAxes.of(rig, Rectifier(rig)), before) if before.any() else rig
+        estimate = continued_from(before, estimate_from([follow(each, current) for each in recordings]))
         after = estimate.corrections()
         moved = [p for p, change in zip(COLUMNS, after - before, strict=True) if abs(change) > p.anew_above]
         if not moved or is_enough(estimate, moved):
@@ -159,8 +157,7 @@ def _busiest(state: SurveyState) -> NDArray[np.bool_]:
     chosen = np.ones(count, bool)
     if count <= MOST_KEYFRAMES:
         return chosen
-    rotations = state.map_from_body[:, :3, :3]
-    turned = [rotation_angle_rad(a.T @ b) for a, b in pairwise(rotations)]
+    turned = [rotation_angle_rad(a.T @ b) for a, b in pairwise(state.map_from_body[:, :3, :3])]
     total = np.concatenate([[0.0], np.cumsum(turned)])
     starts = np.arange(count - MOST_KEYFRAMES + 1)
     best = int(np.argmax(total[starts + MOST_KEYFRAMES - 1] - total[starts]))

@@ -68,8 +68,7 @@ def measure_calibration(
     tools = SurveyTools(progress=lambda *_: on_frame(), executor=executor)
     try:
         focal_px = Rectifier(recording.calibration).camera.focal_px
-        enough = partial(_is_good, focal_px)
-        estimate = estimate_calibration([recording], SurveySettings(), tools, enough, follow)
+        estimate = estimate_calibration([recording], SurveySettings(), tools, partial(_is_good, focal_px), follow)
     except (RecordingError, SurveyError, np.linalg.LinAlgError) as error:
         return unknown_calibration(
             f"the frames could not be tracked: {error}", "record a drive in the light, with every frame"

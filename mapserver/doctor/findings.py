@@ -54,8 +54,7 @@ def not_judged(name: str, reason: str, missing: str) -> Finding:
 
 def worst(findings: Sequence[Finding]) -> Verdict:
     """Return the worst verdict; NOT_JUDGED for an empty list."""
-    order = list(Verdict)
-    return max((f.verdict for f in findings), key=order.index, default=Verdict.NOT_JUDGED)
+    return max((f.verdict for f in findings), key=list(Verdict).index, default=Verdict.NOT_JUDGED)
 
 
 def grouped(findings: Sequence[Finding]) -> list[tuple[list[Finding], str]]:

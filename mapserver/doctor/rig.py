@@ -189,8 +189,7 @@ def mounting_error(motions: Sequence[tuple[Array, Array]], repeated: Array | Non
 
 def _conjugated(motion: Array, error: Array, scale: float) -> Array:
     """Return the motion of the body that a view with this error of its mounting has seen."""
-    scaled = se3(motion[:3, :3], motion[:3, 3] * (1.0 + scale))
-    return np.asarray(error @ scaled @ se3_inverse(error))
+    return np.asarray(error @ se3(motion[:3, :3], motion[:3, 3] * (1.0 + scale)) @ se3_inverse(error))
 
 
 def _linearized(first: Array, other: Array) -> tuple[Array, Array]:

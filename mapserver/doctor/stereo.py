@@ -95,8 +95,7 @@ def epipolar_error(pairs: Sequence[StereoMatches], focal_px: float) -> Finding:
         return not_judged(name, f"{len(errors)} stereo matches are too few", _NEAR)
     magnitude = np.abs(errors)
     median, p90 = float(np.median(magnitude)), float(np.percentile(magnitude, 90))
-    columns = np.concatenate([p.columns_px for p in pairs])
-    roll, at_middle_px = np.polyfit(columns, errors, 1)
+    roll, at_middle_px = np.polyfit(np.concatenate([p.columns_px for p in pairs]), errors, 1)
     tilt_deg, roll_deg = np.degrees(np.arctan2(at_middle_px, focal_px)), np.degrees(np.arctan(roll))
     angles = f"the cameras look {tilt_deg:+.2f} degrees apart up and down and are rolled by {roll_deg:+.2f} degrees"
     words = f"rows differ by {median:.2f} px in the median, {p90:.2f} px at 90 %, {np.median(errors):+.2f} px with sign"

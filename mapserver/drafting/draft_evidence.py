@@ -118,8 +118,7 @@ def _read(
                 continue
             if (seen := frame_of_camera(frame, view)) is not None:
                 camera, body_from_cam = rectifier.mounted[view]
-                features = probe_features(seen, camera, orb)
-                found.append(ProbedFrame(number, camera, body_from_cam, features, view=view))
+                found.append(ProbedFrame(number, camera, body_from_cam, probe_features(seen, camera, orb), view=view))
     return found
 
 
@@ -142,8 +141,7 @@ class Before:
         evidence = maps.evidence(manifest.site, manifest.version)
         known = () if evidence is None else evidence.calibrations or ()
         judged = [RigEvidence(rig.rig, rig.judged) for rig in known if rig.judged]
-        tiles = [decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles]
-        return cls(manifest, survey, tiles, judged)
+        return cls(manifest, survey, [decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles], judged)
 
     def wanted_ids(self, survey_map: SurveyMap) -> NDArray[np.uint32]:
         """Return landmarks with priority in the budget: those on the robots, and those new in the map.

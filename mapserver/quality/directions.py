@@ -48,8 +48,7 @@ def tile_directions(places: Mapping[tuple[int, int], Array]) -> list[TileDirecti
             alone = mine & one_way & (sectors == sector)
             if alone.any() and np.linalg.norm(np.ptp(positions_map[alone, :2], axis=0)) >= _LEAST_M:
                 missing[HEADINGS[(sector + 4) % len(HEADINGS)]] = int(alone.sum())
-        by_heading = {HEADINGS[sector]: seen[sector] for sector in sorted(seen)}
-        found.append(TileDirections(tile, by_heading, missing))
+        found.append(TileDirections(tile, {HEADINGS[sector]: seen[sector] for sector in sorted(seen)}, missing))
     return found
 
 

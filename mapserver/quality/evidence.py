@@ -172,8 +172,7 @@ def trajectory_breaks(
     differs if its end is off by more than 0.15 m, 5 % of its length and three standard deviations of the odometry together.
     Those that begin within a metre of the previous one are one break.
     """
-    steps_m = np.linalg.norm(np.diff(odom_from_body[:, :3, 3], axis=0), axis=1)
-    along_m = np.concatenate([[0.0], np.cumsum(steps_m)])
+    along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(odom_from_body[:, :3, 3], axis=0), axis=1))])
     follows = tracked & (np.diff(stamps_ns, prepend=stamps_ns[:1]) < _CONTINUOUS_NS)
     lost = np.concatenate([[0], np.cumsum(~follows)])
     ends = np.searchsorted(along_m, along_m + _STRETCH_M)
@@ -188,6 +187,5 @@ def trajectory_breaks(
     gained = np.trace((covariances[ends] - covariances[starts])[:, 3:, 3:], axis1=1, axis2=2)
     allowed_m = _BREAK_M + _BREAK_SHARE * (along_m[ends] - along_m[starts]) + 3.0 * np.sqrt(np.maximum(gained, 0.0))
     torn = np.flatnonzero(off_m > allowed_m)
-    begun_m = along_m[starts[torn]]
-    breaks = int(len(torn) > 0) + int((np.diff(begun_m) > _APART_M).sum())
+    breaks = int(len(torn) > 0) + int((np.diff(along_m[starts[torn]]) > _APART_M).sum())
     return TrajectoryBreaks(len(starts), breaks, round(float(off_m.max()), 4))

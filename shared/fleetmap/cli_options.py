@@ -134,10 +134,9 @@ def file_type(settings: "type[Section]", commands: Commands) -> "type[Section]":
             options = [(option, toml_type(p) | None, None) for option, p in options_of(command).items()]
             kind = msgspec.defstruct("Options", options, bases=(Section,), frozen=True, kw_only=True)
         fields.append((f"{key}_", kind, kind()))
-    found: type[Section] = msgspec.defstruct(  # type: ignore[assignment]
+    return msgspec.defstruct(  # type: ignore[return-value]
         "File", fields, bases=(settings,), rename=names, frozen=True, kw_only=True
     )
-    return found
 
 
 def toml_type(parameter: inspect.Parameter) -> Any:

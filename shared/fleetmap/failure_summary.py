@@ -72,8 +72,7 @@ def decode_summary(data: bytes) -> FailureSummary:
     except (ValueError, RecursionError) as error:
         fault = f"the failure's summary cannot be read ({error})"
         raise RecordingError(f"{fault}; was it made by another fleetmap?") from error
-    stamps = [moment.stamp_ns for moment in summary.moments]
-    if any(later <= earlier for earlier, later in pairwise(stamps)):
+    if any(later <= earlier for earlier, later in pairwise([moment.stamp_ns for moment in summary.moments])):
         fault = "the moments of the failure's summary are not in the order of time"
         raise RecordingError(f"{fault}; was it made by a robot?")
     return summary

@@ -94,8 +94,7 @@ def se3_exp(rot_trans: Array) -> Array:
 def se3_log(target_from_source: Array) -> Array:
     """Tangent vector (6,), rotation first, of a transform (4, 4)."""
     rotvec = so3_log(target_from_source[:3, :3])
-    translation = np.linalg.solve(so3_left_jacobian(rotvec), target_from_source[:3, 3])
-    return np.concatenate([rotvec, translation])
+    return np.concatenate([rotvec, np.linalg.solve(so3_left_jacobian(rotvec), target_from_source[:3, 3])])
 
 
 def se3_adjoint(target_from_source: Array) -> Array:
@@ -180,8 +179,7 @@ def rotation_between_vectors(source: Array, target: Array) -> Array:
     if sine < 1e-12:
         if cosine > 0:
             return np.eye(3)
-        other = np.eye(3)[int(np.argmin(np.abs(a)))]
-        axis = np.cross(a, other)
+        axis = np.cross(a, np.eye(3)[int(np.argmin(np.abs(a)))])
         return so3_exp(np.pi * axis / np.linalg.norm(axis))
     return so3_exp(np.arctan2(sine, cosine) * axis / sine)
 

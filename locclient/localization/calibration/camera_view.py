@@ -42,8 +42,7 @@ def pair_offsets(frame: RectifiedFrame, matched: Correspondences, map_from_cam: 
     seen = np.flatnonzero(points_cam[:, 2] > _NEAREST_M)
     seen = seen[np.linspace(0, len(seen) - 1, min(len(seen), _ROW_POINTS)).astype(int)] if len(seen) else seen
     left = np.ascontiguousarray(matched.pixels[seen, :2])
-    lens = matched.camera.lens
-    predicted = left - np.column_stack([lens[3] / points_cam[seen, 2], np.zeros(len(seen))])
+    predicted = left - np.column_stack([matched.camera.lens[3] / points_cam[seen, 2], np.zeros(len(seen))])
     limits = _ROW_WINDOW_PX // 2, 1, _ROW_BACK_PX, -np.inf
     places, good = core.follow_pixels(frame.left, frame.right, left, np.ascontiguousarray(predicted), *limits)
     out[seen[good]] = places[good] - left[good] * [0.0, 1.0]

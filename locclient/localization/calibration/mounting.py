@@ -66,8 +66,7 @@ def tilt(fix: Fix, cam_from_body: Array, odometry: OdometryEstimate) -> tuple[Ar
     up_by_map, up_by_imu = map_from_body.T[:, 2], odometry.odom_from_body[:3, :3].T[:, 2]
     measured = np.cross(up_by_map, up_by_imu)[:2]
     variance = fix.cov_rot_trans[:2, :2].trace() / 2 + odometry.cov_rot_trans[:2, :2].trace() / 2 + _ACCEL_BIAS_RAD**2
-    jacobian = np.hstack([np.eye(2), map_from_body.T[:2, :2]])
-    return jacobian / np.sqrt(variance), measured / np.sqrt(variance)
+    return np.hstack([np.eye(2), map_from_body.T[:2, :2]]) / np.sqrt(variance), measured / np.sqrt(variance)
 
 
 def heading(before: BasePose, now: BasePose) -> tuple[float, float] | None:

@@ -178,8 +178,7 @@ class CalibrationWatch:
         if not np.isfinite(sigma):
             return []
         value = odometry.imu_minus_cam_s - self._imu_minus_cam_s
-        is_drifted = abs(value) > max(TIME_OFFSET.limit, DRIFT_SIGMAS * sigma)
-        return [Drift(TIME_OFFSET, value, sigma, 0.0, is_drifted)]
+        return [Drift(TIME_OFFSET, value, sigma, 0.0, abs(value) > max(TIME_OFFSET.limit, DRIFT_SIGMAS * sigma))]
 
     # --- judgement ----------------------------------------------------------------------------------------------------
 
@@ -204,8 +203,7 @@ class CalibrationWatch:
 
 def _with_depth(matched: Correspondences, right_px: Array) -> Correspondences:
     """Add columns of the right image where stereo matching, which searches the row only, found none."""
-    has_none = np.isnan(matched.pixels[:, 2])
-    columns = np.where(has_none, right_px, matched.pixels[:, 2])
+    columns = np.where(np.isnan(matched.pixels[:, 2]), right_px, matched.pixels[:, 2])
     return replace(matched, pixels=np.column_stack([matched.pixels[:, :2], columns]))
 
 

@@ -60,8 +60,7 @@ class MarkerPriors:
 
     def judge(self, estimate: Estimate) -> str:
         """Compare the frame's markers with its estimate; return a text that names those that stand elsewhere than listed."""
-        known = estimate.map_from_body is not None and estimate.status in {Status.TRACKING, Status.DEGRADED}
-        self._is_known = known
+        self._is_known = estimate.map_from_body is not None and estimate.status in {Status.TRACKING, Status.DEGRADED}
         if estimate.status is Status.TRACKING and estimate.is_at_home:
             assert estimate.map_from_body is not None and estimate.cov_rot_trans is not None
             claimed = Place(estimate.map_from_body, estimate.cov_rot_trans).of_point(se3_inverse(self._base_from_body))

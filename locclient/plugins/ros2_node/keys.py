@@ -107,10 +107,9 @@ def answer_attachment(question: bytes, source_ns: int) -> bytes:
 @cache
 def type_hash(type_name: str) -> str:
     """RIHS01 of a type in DEFINITIONS, without its prefix: SHA-256 of the type's description as canonical JSON."""
-    nested = sorted(_nested(type_name), key=_long)
     described = {
         "type_description": _description(type_name),
-        "referenced_type_descriptions": [_description(name) for name in nested],
+        "referenced_type_descriptions": [_description(name) for name in sorted(_nested(type_name), key=_long)],
     }
     return hashlib.sha256(json.dumps(described, separators=(", ", ": ")).encode()).hexdigest()
 

@@ -437,8 +437,7 @@ def decode_initial_pose(data: bytes, map_frame: str) -> PositionPrior:
             "an initial pose is not used: its covariance is not symmetric and positive; check its order"
         )
     said = np.diag(cov) > 0
-    unsaid = np.diag(np.where(said, 0.0, UNSAID_SIGMAS**2))
-    cov = np.where(np.outer(said, said), (cov + cov.T) / 2, 0.0) + unsaid
+    cov = np.where(np.outer(said, said), (cov + cov.T) / 2, 0.0) + np.diag(np.where(said, 0.0, UNSAID_SIGMAS**2))
     return PositionPrior(0, prior.map_from_base, cov, is_revisable=True)
 
 

@@ -92,8 +92,7 @@ class ActionBook:
         self.set(action, "FAILED", words)
         given = {each.key: str(each.value)[:_MOST_SIGNS] for each in action.action_parameters[:20]}
         shown = {"actionId": action.action_id} | given
-        topic = "map" if action.action_type in MAP_ACTIONS else "instant"
-        self.add_error(topic, error_type, words, shown, level)
+        self.add_error("map" if action.action_type in MAP_ACTIONS else "instant", error_type, words, shown, level)
 
     def accepted(self, action: Action) -> None:
         """End errors that last until an action of this kind is accepted."""

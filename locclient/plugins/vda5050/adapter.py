@@ -111,8 +111,7 @@ class FleetAdapter:
             known = self._visited_versions.keys() | ({self.map_id} if self._versions else set())
             for map_id in sorted(named - known)[:20]:
                 words = f"the order {message.order_id[:200]!r} names a map that is not on the robot: {map_id[:200]!r}"
-                references = {"orderId": message.order_id, "mapId": map_id}
-                self._book.add_error("order", "UNKNOWN_MAP_ID", words, references)
+                self._book.add_error("order", "UNKNOWN_MAP_ID", words, {"orderId": message.order_id, "mapId": map_id})
             self.changed.set()
 
     def robot_part(self, payload: bytes) -> None:

@@ -33,8 +33,7 @@ class RunExport:
     def begin(self, first_ns: int, loaded: LoadedMap, profile: RobotProfile, rectifier: Rectifier) -> None:
         """Write the map and the robot. Call once, before the first frame, with its stamp."""
         self._profile, self._rectifier = profile, rectifier
-        landmarks = np.concatenate([tile.points_map for tile in loaded.tiles.values()])
-        self._write(channels.points(first_ns, landmarks))
+        self._write(channels.points(first_ns, np.concatenate([tile.points_map for tile in loaded.tiles.values()])))
         self._write(channels.lens(first_ns, rectifier.camera))
 
     def handle(self, frame: CameraFrame, outcome: Outcome) -> None:

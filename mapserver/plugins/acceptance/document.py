@@ -83,8 +83,7 @@ def html_page(report: Report, shown: Sequence[Section], picture: bytes) -> str:
     """Return the report as one HTML file without links, light or dark as the screen is. picture: PNG."""
     template = rendering.TEMPLATES.from_string((Path(__file__).parent / "acceptance.html").read_text("utf-8"))
     style = (Path(rendering.__file__).parent / "static" / "style.css").read_text("utf-8")
-    encoded = b64encode(picture).decode()
-    return template.render(report=report, sections=shown, picture=encoded, style=Markup(style))
+    return template.render(report=report, sections=shown, picture=b64encode(picture).decode(), style=Markup(style))
 
 
 def _coverage(areas: Sequence[AreaFigures]) -> Section:
@@ -108,11 +107,10 @@ def _errors(report: Report, areas: Sequence[AreaFigures]) -> Section:
         rows.append((f"drive {drive.name}", share, str(drive.silent), _mm(quantiles[0]), _mm(quantiles[1])))
         if drive.docks_mm:
             rows.append((f"docks of {drive.name}", str(len(drive.docks_mm)), "", *_quantiles_mm(drive.docks_mm)))
-    references = [f"{drive.name}: against {drive.reference}." for drive in report.drives]
     words = [
         "Held-out frames one at a time in the tiles, from a prior at their own place; drives as a robot localises them, with odometry; "
         "docks: the estimate there against the dock's recorded place.",
-        *references,
+        *[f"{drive.name}: against {drive.reference}." for drive in report.drives],
     ]
     return Section("Error", words, header=("frames of", "localized", "wrong", "median", "p99"), rows=rows)
 

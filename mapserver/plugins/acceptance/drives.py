@@ -180,8 +180,7 @@ def examined(
         }
         errors_mm = None
         if off and reference.trajectory is not localised:
-            errors_m = [error_m for error_m, _ in off.values()]
-            quantiles = np.percentile(errors_m, [50, 95, 99, 100])
+            quantiles = np.percentile([error_m for error_m, _ in off.values()], [50, 95, 99, 100])
             named_m = zip(("median", "p95", "p99", "max"), quantiles.tolist(), strict=True)
             errors_mm = {name: round(1e3 * error_m, 2) for name, error_m in named_m}
         docks_mm = [
@@ -254,8 +253,7 @@ def _start(frames: list[StartFrame], reference: Trajectory) -> Start:
     ]
     if _silent_runs(wrong):
         return Start(place_m, "silent")
-    outcomes = {_TRACKING: "found", _AMBIGUOUS: "ambiguous"}
-    return Start(place_m, outcomes.get(frames[-1].status, "lost"))
+    return Start(place_m, {_TRACKING: "found", _AMBIGUOUS: "ambiguous"}.get(frames[-1].status, "lost"))
 
 
 def _pictures(recording: Recording, wanted: list[tuple[int, Array | None]], view: MapView) -> Iterator[Picture]:

@@ -177,8 +177,7 @@ def _verdicts(voxels: _Voxels, other: SeenSite) -> NDArray[np.uint8]:
         through[rows] += distance_m < near_m  # False for NaN, unknown pixels
         seen[rows] += (distance_m >= near_m) & (distance_m <= far_m)
     score = HIT * seen - through
-    verdicts = np.where(seen > 0, _SAME, _UNJUDGED)
-    return np.where(score <= -AGAINST, _CHANGED, verdicts).astype(np.uint8)
+    return np.where(score <= -AGAINST, _CHANGED, np.where(seen > 0, _SAME, _UNJUDGED)).astype(np.uint8)
 
 
 def _shown(points_map: Array, view: Array, tangent: float) -> NDArray[np.int64]:
@@ -198,5 +197,4 @@ def _joined(points_map: Array) -> list[NDArray[np.int64]]:
         (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(points_map), len(points_map))
     )
     count, labels = scipy.sparse.csgraph.connected_components(links, directed=False)
-    order = np.argsort(labels, kind="stable")
-    return np.split(order, np.cumsum(np.bincount(labels, minlength=count))[:-1])
+    return np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels, minlength=count))[:-1])

@@ -97,8 +97,7 @@ def changes(
     with open_store(store, read_only=True) as maps:
         found = SurfelChanges(maps).between(site, before, after)
     is_picture = file.suffix.lower() == ".png"
-    data = changes_png(found) if is_picture else to_json(changes_geojson(found))
-    write_output(file, data)
+    write_output(file, changes_png(found) if is_picture else to_json(changes_geojson(found)))
     x, y = found.corner_m
     said = ", ".join(
         f"{sum(patch.kind == kind for patch in found.patches)} patches {kind} ({found.area_m2(kind):.2f} m2)"
@@ -142,8 +141,7 @@ def refine(
         if opened.content_hash() not in {entry.sha256 for entry in manifest.recordings}:
             names = ", ".join(entry.name for entry in manifest.recordings)
             raise UsageError(f"{recording} is not of version {version} of site {site}, which was built from: {names}")
-        own_rig = len(manifest.recordings) == 1
-        images = looks_of(opened.view(0), decode_archive(archive), surfels, own_rig=own_rig)
+        images = looks_of(opened.view(0), decode_archive(archive), surfels, own_rig=len(manifest.recordings) == 1)
     done = refined_by(Splats.of(surfels), images, steps, np.random.default_rng(seed))
     said = (
         f"{done.held_out} held-out images: PSNR {done.before.psnr_db:.2f} dB before, {done.after.psnr_db:.2f} dB after, "

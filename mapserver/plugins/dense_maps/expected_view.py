@@ -69,8 +69,7 @@ def expected_view(surfels: Surfels, camera: CameraCalibration, map_from_cam: Arr
     colour *= lens_factor(np.minimum(squared, _MOST_SQUARED), np.array(surfels.falloff)) * brightness(
         surfels, map_from_cam
     )
-    picture = np.clip(np.round(filled(colour, unknown)), 0, 255).astype(np.uint8)
-    return ExpectedView(picture, depth_m, unknown)
+    return ExpectedView(np.clip(np.round(filled(colour, unknown)), 0, 255).astype(np.uint8), depth_m, unknown)
 
 
 def expected_depth(surfels: Surfels, camera: CameraCalibration, map_from_cam: Array, far_m: float) -> Image32:

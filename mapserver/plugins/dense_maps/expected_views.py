@@ -93,8 +93,7 @@ def failure_camera(report: FailureReport) -> tuple[int, Array, CameraCalibration
         raise UsageError("the report's camera is invalid; check the robot's calibration")
     if not np.isfinite(map_from_cam).all() or np.abs(map_from_cam[:3, 3]).max() > _FARTHEST_M:
         raise UsageError("the reported position is invalid; check the robot's calibration")
-    stereo = StereoCamera(camera.focal_px, *centre_px, 0.0, width_px, height_px)
-    return report.version, map_from_cam, pinhole(stereo)
+    return report.version, map_from_cam, pinhole(StereoCamera(camera.focal_px, *centre_px, 0.0, width_px, height_px))
 
 
 def is_camera(camera: CameraNote) -> bool:

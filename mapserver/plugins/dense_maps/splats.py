@@ -105,8 +105,7 @@ def bounds() -> tuple[Array, Array]:
     """Return the smallest and the largest parameters (3,)."""
     places = np.zeros((2, 3), np.float32)
     sigmas_m, greys = np.array([_LEAST_SIGMA_M, _MOST_SIGMA_M]), np.array([_LEAST_GREY, _MOST_GREY])
-    ends = Splats(places, places, sigmas_m, greys, np.array([LEAST_OPACITY, MOST_OPACITY]))
-    low, high = parameters_of(ends)
+    low, high = parameters_of(Splats(places, places, sigmas_m, greys, np.array([LEAST_OPACITY, MOST_OPACITY])))
     return low, high
 
 

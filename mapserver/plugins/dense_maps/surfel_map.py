@@ -263,5 +263,4 @@ def _normals(turned: NDArray[np.int8]) -> NDArray[np.float32]:
     height = 1.0 - np.abs(flat).sum(axis=1)
     folded = (1.0 - np.abs(flat[:, ::-1])) * np.where(flat >= 0, 1.0, -1.0)
     normals = np.column_stack([np.where(height[:, None] < 0, folded, flat), height])
-    length = np.linalg.norm(normals, axis=1, keepdims=True)
-    return np.asarray(normals / np.maximum(length, 1e-6), np.float32)
+    return np.asarray(normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-6), np.float32)

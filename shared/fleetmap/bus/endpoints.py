@@ -71,8 +71,7 @@ class TlsFiles:
     def fault(self) -> str:
         """Reason why these files cannot be used; empty if they can. Check first: zenoh closes the old session before it reads them."""
         try:
-            context = ssl.create_default_context(cafile=str(self.authority))
-            context.load_cert_chain(str(self.own))
+            ssl.create_default_context(cafile=str(self.authority)).load_cert_chain(str(self.own))
         except (OSError, ssl.SSLError) as error:
             return f"{self.own} or {self.authority} cannot be used ({error})"
         return ""

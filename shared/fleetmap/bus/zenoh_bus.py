@@ -156,8 +156,7 @@ class Bus:
         Robots reconnect by themselves; calls on other threads wait. Raises LinkError if that fails: the session
         stays as it is if a certificate cannot be used, and otherwise is closed until another attempt succeeds.
         """
-        fault = "" if self._tls is None else self._tls.fault()
-        if fault:
+        if self._tls is not None and (fault := self._tls.fault()):
             raise LinkError(f"{fault}; the bus stays as it is")
         with self._lock:
             if self._is_closed:

@@ -113,8 +113,7 @@ class Section(dict[str, Any]):
 
     def number(self, key: str, default: float) -> float:
         """One finite number."""
-        wrapped = Section({key: [self.get(key, default)]}, self.where)
-        return float(wrapped.numbers(key, 1)[0])
+        return float(Section({key: [self.get(key, default)]}, self.where).numbers(key, 1)[0])
 
     def matrix(self, key: str) -> Array:
         """(4, 4) rigid transform from nested rows, 16 numbers or EuRoC's {rows, cols, data}."""
@@ -183,8 +182,7 @@ def parse_calibration(text: str, where: str, folder: Path | None = None) -> Cali
         )
     for number, name in enumerate(names):
         if name != f"cam{number}":
-            there = f"there is {', '.join(names)[:80]}"
-            raise file.error(f"cam{number} is missing, {there}; number cameras from cam0")
+            raise file.error(f"cam{number} is missing, there is {', '.join(names)[:80]}; number cameras from cam0")
     noise = imu_noise(file)
     sections = [file.section(name) for name in names]
     is_mounted = any(key in sections[0] for key in _MOUNTINGS)
@@ -196,7 +194,10 @@ def parse_calibration(text: str, where: str, folder: Path | None = None) -> Cali
         )
     cameras: list[CameraCalibration] = []
     for section in sections:
-        cameras.append(_kalibr_camera(section, cameras[-1] if cameras else None))
+        previous = cameras[-1] if cameras else None
+        camera = camera_of(section, "distortion_coeffs", _body_from_cam(section, previous))
+        shift_s = section.number("timeshift_cam_imu", previous.imu_minus_cam_s if previous else 0.0)
+        cameras.append(check_camera(replace(camera, imu_minus_cam_s=shift_s), section.where))
     if cameras[0].has_depth:
         raise file.error(
             "cam0: has_depth is for cameras beside the rig's first view; number a stereo pair cam0 and cam1. A depth camera "
@@ -267,12 +268,6 @@ def _fault_of(matrix: Array) -> str:
     if scale > 0 and np.allclose(rotation @ rotation.T, scale**2 * np.eye(3), atol=2e-3 * scale**2):
         return f"its rotation is scaled by {scale:.4g}"
     return "the rows of its rotation are not of unit length and at right angles"
-
-
-def _kalibr_camera(values: Section, previous: CameraCalibration | None) -> CameraCalibration:
-    camera = camera_of(values, "distortion_coeffs", _body_from_cam(values, previous))
-    shift_s = values.number("timeshift_cam_imu", previous.imu_minus_cam_s if previous else 0.0)
-    return check_camera(replace(camera, imu_minus_cam_s=shift_s), values.where)
 
 
 def _ros_camera(values: Section) -> CameraCalibration:

@@ -216,8 +216,7 @@ def _accelerometer_prefers_degrees(imu: ImuSamples) -> bool:
     as_radians = gravity_direction_errors_rad(imu, 1.0)
     if len(as_radians) < 4 or np.median(as_radians) < np.radians(10):
         return False
-    as_degrees = gravity_direction_errors_rad(imu, np.pi / 180)
-    return bool(np.median(as_radians) > 4 * np.median(as_degrees))
+    return bool(np.median(as_radians) > 4 * np.median(gravity_direction_errors_rad(imu, np.pi / 180)))
 
 
 def gravity_direction_errors_rad(imu: ImuSamples, gyro_scale: float) -> Array:

@@ -83,10 +83,7 @@ def _tiff_size(data: bytes) -> tuple[int, int] | None:
 
 def _bmp_size(data: bytes) -> tuple[int, int]:
     (header_bytes,) = struct.unpack_from("<I", data, 14)
-    if header_bytes == 12:  # OS/2's first form
-        width, height = struct.unpack_from("<HH", data, 18)
-    else:
-        width, height = struct.unpack_from("<ii", data, 18)
+    width, height = struct.unpack_from("<HH" if header_bytes == 12 else "<ii", data, 18)  # 12: OS/2's first form
     return abs(width), abs(height)
 
 

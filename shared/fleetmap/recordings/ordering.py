@@ -92,10 +92,8 @@ def forward_only(stamps_ns: Stamps, what: str, log: ReadLog) -> NDArray[np.bool_
         steps, share = np.diff(stamps_ns), f"{dropped} of {len(kept)}"
         if (steps >= 0).all():
             first_ns = stamps_ns[np.flatnonzero(steps == 0)[0]]
-            what_is_wrong, detail = (
-                "stamps repeated",
-                f"are that of the one before and left out; the first is {first_ns}",
-            )
+            what_is_wrong = "stamps repeated"
+            detail = f"are that of the one before and left out; the first is {first_ns}"
             fault = (
                 f"{share} stamps repeat the one before, the first is {first_ns}; the driver stamps several alike, or rounds: "
                 "let it stamp each one when it is measured"

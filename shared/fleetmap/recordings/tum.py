@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.errors import RecordingError
+from fleetmap.errors import RecordingError, disk_errors
 from fleetmap.geometry import Array, quat_wxyz_from_rotation, rotation_from_quat_wxyz, se3
 from fleetmap.recordings.files import read_text
 from fleetmap.recordings.ordering import ReadLog, forward_only
@@ -53,10 +53,8 @@ def parse_tum(text: str, what: str = "trajectory", first_line: int = 1) -> Traje
 
 def write_tum(path: Path, trajectory: Trajectory) -> None:
     """Write `trajectory` as TUM text; RecordingError if the file cannot be written."""
-    try:
+    with disk_errors(f"{path} cannot be written", "check folder and space", RecordingError):
         path.write_text(format_tum(trajectory), encoding="ascii")
-    except OSError as error:
-        raise RecordingError(f"{path} cannot be written ({error.strerror}); check folder and space") from error
 
 
 def read_tum(path: Path) -> Trajectory:

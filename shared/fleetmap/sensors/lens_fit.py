@@ -74,9 +74,7 @@ def lens_of_frames(rig: RigCalibration, stamps_ns: Stamps, read: Callable[[int],
         if later >= len(stamps_ns) or stamps_ns[later] - stamps_ns[index] > _TOO_FAR_S * 1e9:
             continue
         before, after = read(int(index)), read(later)
-        if before is None or after is None:
-            continue
-        points = follow_points(before, after, rig.cameras[0].mask)
+        points = None if before is None or after is None else follow_points(before, after, rig.cameras[0].mask)
         if points is not None:
             pairs.append(points)
     return fit_lens(rig, pairs)
@@ -146,7 +144,7 @@ def _other_lenses(rig: RigCalibration) -> Iterator[tuple[str, RigCalibration]]:
     for factor, size in ((2.0, "half"), (0.5, "twice")):
         other = _scaled(rig, np.full(4, factor))
         words = f"this camera matrix times {factor:g}: it is of images of {size} the size"
-        if all(_is_possible(camera) for camera in other.cameras[:2]):
+        if all((c.intrinsics_px[2:] < [c.width_px, c.height_px]).all() for c in other.cameras[:2]):
             yield words, other
     zeros = np.zeros(4)
     if first.model == "radial-tangential":
@@ -172,10 +170,6 @@ def _with_lens(rig: RigCalibration, model: str, distortion: Array | None) -> Rig
         given = own if distortion is None else distortion
         cameras.append(replace(camera, model=model, intrinsics_px=intrinsics_px, distortion=given))
     return replace(rig, cameras=tuple(cameras))
-
-
-def _is_possible(camera: CameraCalibration) -> bool:
-    return bool((camera.intrinsics_px[2:] < [camera.width_px, camera.height_px]).all())
 
 
 def _smaller_errors_px2(rig: RigCalibration, pairs: Sequence[FollowedPoints], given: Array) -> Array | None:

@@ -64,12 +64,10 @@ def update_lists(folder: Path, site: str, root: bytes, ask: Callable[[str], byte
         updater.refresh()
         # python-tuf loads a role only with one of its targets; version 0 never exists.
         updater.get_targetinfo(manifest_target(site, 0))
-    except ExpiredMetadataError as error:
+    except (ExpiredMetadataError, DownloadHTTPError) as error:
         raise UntrustedError("freeze", error) from error
     except DownloadLengthMismatchError as error:
         raise UntrustedError("size", error) from error
-    except DownloadHTTPError as error:
-        raise UntrustedError("freeze", error) from error
     except DownloadError as error:
         raise fetcher.fault or UnreachableError(str(error)) from error
     except BadVersionNumberError as error:

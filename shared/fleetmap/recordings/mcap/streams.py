@@ -248,8 +248,7 @@ def _images(
         if not images:
             raise RecordingError(f"{why} (none of {damaged} {what} can be read)")
         log.note(f"{what} left out", f"{damaged} of {damaged + len(images)}; the first: {why}")
-    sent, logged = [image[1] for image in images], [image[2] for image in images]
-    stamps_ns, order = as_logged(sent, logged, what, log)
+    stamps_ns, order = as_logged([image[1] for image in images], [image[2] for image in images], what, log)
     kept = usual_size([size_px for *_, size_px in images], what, log)
     if usable is not None:
         kept &= usable

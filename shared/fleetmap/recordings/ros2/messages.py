@@ -110,8 +110,7 @@ def decode_imu(messages: Sequence[bytes]) -> tuple[Stamps, Array, Array, str]:
     table = np.frombuffer(b"".join(messages), np.uint8).reshape(len(messages), -1)
     seconds = np.ascontiguousarray(table[:, 4:8]).view(order + "i4")[:, 0].astype(np.int64)
     nanoseconds = np.ascontiguousarray(table[:, 8:12]).view(order + "u4")[:, 0].astype(np.int64)
-    doubles = np.ascontiguousarray(table[:, start : start + 8 * _IMU_DOUBLES])
-    values = doubles.view(order + "f8").astype(np.float64)
+    values = np.ascontiguousarray(table[:, start : start + 8 * _IMU_DOUBLES]).view(order + "f8").astype(np.float64)
     return seconds * 1_000_000_000 + nanoseconds, values[:, 13:16].copy(), values[:, 25:28].copy(), frame_id
 
 
