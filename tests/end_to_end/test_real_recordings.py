@@ -25,11 +25,8 @@ def test_v101_as_a_whole_refuses_no_revisit_of_its_own(tmp_path: Path) -> None:
     # A wall five metres away allows a second pose, 0.37 m aside: one of the twelve was there, and said 2 cm.
     with MapStore.open(tmp_path / "store") as store:
         evidence = store.evidence("s", 1)
-    assert evidence is not None
-    assert evidence.held_out is not None
     found = evidence.held_out.draft
     assert found.frames >= 10
-    assert found.p95_error_m is not None
     assert found.p95_error_m < 0.05
 
 

@@ -89,11 +89,7 @@ def test_two_robots_from_an_empty_folder(site: TlsSite) -> None:
 
 def test_the_same_thief_without_tls_is_heard(site: TlsSite) -> None:
     """The control: on an open bus he answers first, most of the time."""
-    with (
-        site.serving("tcp/127.0.0.1:0"),
-        Bus.connect(site.endpoint) as honest,
-        attacker(site.endpoint, None) as thief,
-    ):
+    with site.serving("tcp/127.0.0.1:0"), Bus.connect(site.endpoint) as honest, attacker(site.endpoint, None) as thief:
         assert eventually(lambda: wanted(honest, "r2") == 99, 20)
         thief.close()
 

@@ -51,7 +51,6 @@ def said(session: EstimatorSession, estimates: list[Estimate]) -> dict[float, Es
     """Estimates by seconds since the fault's begin; none of them TRACKING at the wrong place."""
     for estimate, truth in zip(estimates, session.map_from_body, strict=True):
         if estimate.status is Status.TRACKING:
-            assert estimate.map_from_body is not None
             assert np.linalg.norm(estimate.map_from_body[:3, 3] - truth[:3, 3]) < WRONG_M
     begin = session.session.frame_times_s[0]
     first_ns = session.stamps_ns[0]

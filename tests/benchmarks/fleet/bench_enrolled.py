@@ -14,9 +14,7 @@ from fleetmap.access import Holder
 from fleetmap.bus.endpoints import TlsFiles
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import UnreachableError
-from fleetmap.messages import (
-    robot_key,
-)
+from fleetmap.messages import robot_key
 from mapserver.serving.bus_access import BusGuard
 from mapserver.store import MapStore
 from mapserver.trust import init_here

@@ -62,7 +62,6 @@ def next_night(folder: Path, *, is_changed: bool) -> list[Tile]:
     rng, every = np.random.default_rng(1), round(1 / _CHANGED_SHARE)
     with MapStore.open(folder) as store:
         current = store.current(SITE)
-        assert current is not None
         entries = store.manifest(SITE, current.version).tiles
         tiles = [decode_tile(store.blob(entry.sha256)) for entry in entries]
     return [_changed(tile, rng) if is_changed and n % every == 0 else tile for n, tile in enumerate(tiles)]

@@ -16,17 +16,7 @@ from typing import Any
 
 from scipy.stats import beta
 
-from benchmarks.common.joining_sites import (
-    Drive,
-    Site,
-    SiteMap,
-    cut,
-    drive,
-    error_m,
-    length_m,
-    session,
-    site_map,
-)
+from benchmarks.common.joining_sites import Drive, Site, SiteMap, cut, drive, error_m, length_m, session, site_map
 from benchmarks.common.recorded_runs import parsed, write_results
 from fleetmap.geometry import Array
 from mapserver.survey.merge.membership import Membership, MembershipVerdict
@@ -125,10 +115,7 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
 def measured(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
     """A row for each session."""
     plain = [Site(_PLAIN[n % 3], options.seed + 100 + n) for n in range(options.true_sites)]
-    parts = {
-        "foreign": foreign(sites(options.sites, options.seed + 50)),
-        "true": true(plain),
-    }
+    parts = {"foreign": foreign(sites(options.sites, options.seed + 50)), "true": true(plain)}
     for part in options.only or PARTS:
         for row in parts[part]:
             yield row | {name: f"{row[name].scenario} {row[name].seed}" for name in ("map", "session")} | {"part": part}

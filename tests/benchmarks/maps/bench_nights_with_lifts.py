@@ -134,7 +134,6 @@ def ghosts(store: Path, version: int, recording: Path) -> dict[str, Any]:
     off_m = np.zeros(len(rows))
     for k in range(len(old.map_from_body), len(new.map_from_body)):
         place, own = truth.at(int(new.keyframe_stamps_ns[k])), keyframe == k
-        assert place is not None
         moved = place @ body_from_cam @ se3_inverse(new.map_from_body[k] @ new.body_from_cam)
         points = new.points_map[rows[own]]
         off_m[own] = np.linalg.norm(points @ moved[:3, :3].T + moved[:3, 3] - points, axis=1)

@@ -49,7 +49,6 @@ def published(store: Path) -> tuple[MapView, SurveyMap]:
     """The tiles as robots get them, and the archive."""
     with MapStore.open(store) as maps:
         manifest = maps.current(SITE)
-        assert manifest is not None
         manifest = maps.manifest(SITE, manifest.version)
         tiles = [decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles]
         archive = maps.archive(SITE, manifest.version)

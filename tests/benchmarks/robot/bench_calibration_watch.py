@@ -99,8 +99,6 @@ def outcome(fault: str, result: ReplayResult) -> Outcome:
     for estimate, truth in zip(estimates, result.truths, strict=True):
         if estimate.status is not Status.TRACKING or truth is None:
             continue
-        assert estimate.map_from_body is not None
-        assert estimate.cov_rot_trans is not None
         off = estimate.map_from_body[:3, 3] - truth[:3, 3]
         tracking_m.append(float(np.linalg.norm(off)))
         is_beyond = float(off @ np.linalg.solve(estimate.cov_rot_trans[3:, 3:], off)) > _BOUND

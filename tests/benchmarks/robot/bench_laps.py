@@ -43,7 +43,6 @@ def main() -> None:
         for number, imu in enumerate(source.imu_before_each()):
             raw = source.frame(number)
             outcome = robot.handle(SensorBundle(raw, imu, source.wheel_before(number), source.priors_before(number)))
-            assert outcome is not None
             tracking += outcome.estimate.status is Status.TRACKING
             minute = (raw.stamp_ns - int(laps_ns[0])) // 60_000_000_000
             if minute > len(resident):

@@ -79,17 +79,12 @@ def start_anywhere(path: Path, store: Path) -> dict[str, Any]:
 
 CASES: dict[str, Case] = {
     "euroc_v101_keyframes, held out": Case(
-        "euroc_v101_keyframes",
-        lambda path, store: drive(path, store, reverse=False),
+        "euroc_v101_keyframes", lambda path, store: drive(path, store, reverse=False)
     ),
     "euroc_mh01_start, held out, backwards": Case(
-        "euroc_mh01_start",
-        lambda path, store: drive(path, store, reverse=True),
+        "euroc_mh01_start", lambda path, store: drive(path, store, reverse=True)
     ),
-    "euroc_mh01_start, first fix from nothing": Case(
-        "euroc_mh01_start",
-        start_anywhere,
-    ),
+    "euroc_mh01_start, first fix from nothing": Case("euroc_mh01_start", start_anywhere),
 }
 
 

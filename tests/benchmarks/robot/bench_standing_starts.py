@@ -81,7 +81,6 @@ def start(session: Session, frames: Sequence[CameraFrame], loaded: LoadedMap) ->
             frame, session.imu.between(last_ns, until_ns), list(wheel_between(session.wheel, last_ns, until_ns))
         )
         last_ns, outcome = until_ns, robot.handle(bundle)
-        assert outcome is not None
         estimate, after_s = outcome.estimate, (frame.stamp_ns - frames[0].stamp_ns) * 1e-9
         if estimate.fix is not None and fix_s is None:
             seen_from_m = (estimate.fix.map_from_cam @ np.linalg.inv(rectifier.body_from_cam))[:3, 3]

@@ -36,7 +36,6 @@ def built(drive: Path, store: Path, calibration: Path, version: int) -> float:
         archive = maps.archive("hall", version)
         assert archive is not None
         truth, trajectory = recording.ground_truth, decode_archive(archive).trajectory
-        assert truth is not None
         pairs = [
             (truth.at(int(stamp_ns)), at)
             for stamp_ns, at in zip(trajectory.stamps_ns, trajectory.frame_from_body, strict=True)

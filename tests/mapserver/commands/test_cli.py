@@ -38,14 +38,10 @@ sys.argv = ["{package}", "--help"]
 {package}.cli.main()
 """
     paths = [str(REPOSITORY / part) for part in ("shared", "")]
-    done = subprocess.run(
-        [sys.executable, "-c", f"import sys; sys.path[:0] = {paths!r}\n{code}"],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "Usage" in done.stdout
-    assert done.stdout.splitlines()[-1] == "[]"
+    words = [sys.executable, "-c", f"import sys; sys.path[:0] = {paths!r}\n{code}"]
+    shown = subprocess.check_output(words, text=True)
+    assert "Usage" in shown
+    assert shown.splitlines()[-1] == "[]"
 
 
 def test_exit_statuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -76,10 +72,7 @@ def test_publishing_says_which_way_nobody_drove(capsys: pytest.CaptureFixture[st
     with MapStore.open(tmp_path / "store", create=True) as maps:
         tiles = [random_tile(np.random.default_rng(0), cell=(3, -1))]
         seen = Evidence(directions=[TileDirections((3, -1), {"E": 12}, {"W": 12})])
-        maps.save(
-            "lab",
-            DraftContent(tiles=tiles, vocabulary=b"words", details=draft_details(), archive=b"archive", evidence=seen),
-        )
+        maps.save("lab", DraftContent(tiles, b"words", draft_details(), archive=b"archive", evidence=seen))
     assert status("mapserver", "publish", "--site", "lab", "--store", tmp_path / "store") == 0
     assert "tile 3,-1: 12 places face E and none near them W" in capsys.readouterr().out
 

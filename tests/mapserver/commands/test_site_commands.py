@@ -120,10 +120,8 @@ def test_failures_and_figures_are_named_by_areas(run, site, tmp_path: Path) -> N
         fleet.take_failure("lab", "r1", placed_failure("f3", 90.0, 4.0))
         assert [row.where for row in store.fleet.failures(FailureFilter())] == [None, "gate", "aisle 5"]
         assert [row.failure_id for row in store.fleet.failures(FailureFilter(area="gate"))] == ["f2"]
-        assert {key: c.failures for (_, key), c in store.fleet.counters("lab", "area").items()} == {
-            "gate": 1,
-            "outside": 1,
-        }
+        counted = store.fleet.counters("lab", "area")
+        assert {key: c.failures for (_, key), c in counted.items()} == {"gate": 1, "outside": 1}
         text = Metrics(store, fleet).text().decode()
         assert 'fleetmap_area_failures_total{area="gate",site="lab"} 1.0' in text
     out = tmp_path / "failures.jsonl"
@@ -207,8 +205,7 @@ def test_the_gate_takes_its_limits_from_the_file(run, tmp_path: Path) -> None:
     strict = tmp_path / "strict.toml"
     strict.write_text("[gate]\nmin_landmarks_share = 1.5\n")
     where = ("--site", "lab", "--store", tmp_path / "store")
-    assert "number of landmarks is 1.00 of version 1's, below the limit of 1.5" in run(
-        "publish", *where, "--config", strict, status=4
-    )
+    refused = run("publish", *where, "--config", strict, status=4)
+    assert "number of landmarks is 1.00 of version 1's, below the limit of 1.5" in refused
     assert "refused" in run("inspect", *where, "--version", 2)
     assert "version 2 is current" in run("publish", *where)

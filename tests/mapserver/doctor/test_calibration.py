@@ -14,13 +14,7 @@ from mapserver.calibration import CalibrationEstimate, CalibrationParameter, Par
 from mapserver.calibration.motion_rows import CalibrationData
 from mapserver.calibration.parameters import COLUMNS
 from mapserver.doctor import Verdict
-from mapserver.doctor.calibration import (
-    MeasuredCalibration,
-    corrected,
-    findings_of,
-    in_words,
-    measure_calibration,
-)
+from mapserver.doctor.calibration import MeasuredCalibration, corrected, findings_of, in_words, measure_calibration
 from mapserver.drafting.admission import rig_evidence
 from mapserver.survey.executor import SERIAL
 from mapserver.survey.settings import SurveySettings

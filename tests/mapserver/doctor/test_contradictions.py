@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from fleetmap.geometry import Array
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings.sensor_subset import reduced
-from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet, WheelSample
 from mapserver.doctor import Verdict, camera_motion
 from mapserver.doctor.calibration import MeasuredCalibration
 from mapserver.doctor.images import fine_structure, fixed_pattern
@@ -62,23 +62,17 @@ def remembered(look: Callable[..., object], seen: dict[object, object]) -> Calla
 
 def imu(accel: Array | float = 1.0, gyro: Array | float = 1.0) -> Change:
     """Samples multiplied by matrices (3, 3) or numbers."""
-    by_accel, by_gyro = (
-        np.eye(3) * accel if np.ndim(accel) < 2 else accel,
-        np.eye(3) * gyro if np.ndim(gyro) < 2 else gyro,
-    )
+    by_accel, by_gyro = (np.eye(3) * by if np.ndim(by) < 2 else by for by in (accel, gyro))
     return lambda r: replace(
         r, imu=ImuSamples(r.imu.stamps_ns, r.imu.gyro_radps @ by_gyro.T, r.imu.accel_mps2 @ by_accel.T)
     )
 
 
 def wheels(speed: float = 1.0, yaw: float = 1.0) -> Change:
-    return lambda r: replace(
-        r,
-        wheel=tuple(
-            replace(s, velocity_base_mps=speed * s.velocity_base_mps, yaw_rate_radps=yaw * s.yaw_rate_radps)
-            for s in r.wheel
-        ),
-    )
+    def changed(s: WheelSample) -> WheelSample:
+        return replace(s, velocity_base_mps=speed * s.velocity_base_mps, yaw_rate_radps=yaw * s.yaw_rate_radps)
+
+    return lambda r: replace(r, wheel=tuple(map(changed, r.wheel)))
 
 
 def without_wheels(recording: Recording) -> Recording:
@@ -131,10 +125,7 @@ CASES = {
     "baseline a tenth without wheels": (longer(0.1, without_wheels), {"metric scale": "m by the accelerometer"}),
     "baseline ten times without IMU": (longer(10.0, without_imu), {"metric scale": "0.1 m by the wheels"}),
     "baseline in mm, alone": (longer(100.0, without_imu, without_wheels), {"metric scale": "a baseline of 20 m"}),
-    "baseline of a hundredth, alone": (
-        longer(0.01, without_imu, without_wheels),
-        {"metric scale": "a baseline of 0.002 m"},
-    ),
+    "a hundredth of it, alone": (longer(0.01, without_imu, without_wheels), {"metric scale": "baseline of 0.002 m"}),
 }
 
 
@@ -162,7 +153,12 @@ def rotated(message: Any) -> None:
     ("kind", "change", "name", "says"),
     [
         ("sensor_msgs/Imu", negated, "accelerometer axes", "has the wrong sign:"),
-        ("sensor_msgs/Image", rotated, "left and right", "images of both cameras are rotated by 180 degrees"),
+        (
+            "sensor_msgs/Image",
+            rotated,
+            "left and right",
+            "images of both cameras are rotated by 180 degrees: switch the driver's",
+        ),
     ],
 )
 def test_a_ros_1_bag_with_a_fault_is_named_alike(

@@ -60,24 +60,6 @@ def gyro_found(turns: CameraTurns, imu: ImuSamples) -> dict[str, Finding]:
     return {finding.name: finding for finding in gyro_check(turns, imu, 0.0)[0]}
 
 
-def with_imu(recording: Recording, change: Callable[[ImuSamples], ImuSamples]) -> Recording:
-    return replace(recording, imu=change(recording.imu))
-
-
-def swapped(frame: CameraFrame) -> CameraFrame:
-    assert frame.right is not None
-    return replace(frame, left=frame.right, right=frame.left)
-
-
-def rotated(frame: CameraFrame) -> CameraFrame:
-    return replace(frame, left=frame.left[::-1, ::-1].copy(), right=frame.right[::-1, ::-1].copy())
-
-
-def right_lower_by_3_px(frame: CameraFrame) -> CameraFrame:
-    assert frame.right is not None
-    return replace(frame, right=np.roll(frame.right, 3, axis=0))
-
-
 def test_a_good_recording_is_all_ok(good: Recording) -> None:
     findings = run_checks(good).findings
     bad = {f.name: f.verdict for f in findings if f.verdict is not Verdict.OK}
@@ -89,9 +71,7 @@ def test_a_good_recording_is_all_ok(good: Recording) -> None:
 @pytest.mark.parametrize(
     ("name", "change", "says"),
     [
-        ("left and right", swapped, "swapped"),
-        ("left and right", rotated, "the images of both cameras are rotated by 180 degrees: switch the driver's"),
-        ("epipolar error", right_lower_by_3_px, "calibrate the cameras again"),
+        ("epipolar error", lambda f: replace(f, right=np.roll(f.right, 3, axis=0)), "calibrate the cameras again"),
         ("sharpness", lambda f: replace(f, left=np.full_like(f.left, 90)), "check the lens"),
     ],
 )
@@ -155,10 +135,10 @@ def test_late_imu_stamps_are_measured(good: Recording, turns: CameraTurns, late_
 def test_a_calibrated_offset_is_not_a_fault(good: Recording, turns: CameraTurns) -> None:
     """imu_minus_cam_s: stamp of the IMU's clock minus stamp of the camera's clock at one moment."""
     late_s = 0.030
-    spoilt = with_imu(good, lambda imu: replace(imu, stamps_ns=imu.stamps_ns + round(late_s * 1e9)))
+    late = replace(good.imu, stamps_ns=good.imu.stamps_ns + round(late_s * 1e9))
     cameras = tuple(replace(camera, imu_minus_cam_s=late_s) for camera in good.calibration.cameras)
-    assert gyro_found(turns, spoilt.imu)["camera-imu time offset"].verdict is Verdict.FAIL, "the control"
-    calibrated = replace(spoilt, calibration=replace(good.calibration, cameras=cameras))
+    assert gyro_found(turns, late)["camera-imu time offset"].verdict is Verdict.FAIL, "the control"
+    calibrated = replace(good, imu=late, calibration=replace(good.calibration, cameras=cameras))
     assert found(calibrated)["camera-imu time offset"].verdict is Verdict.OK
 
 
@@ -217,12 +197,7 @@ HOURS = stamps(0.05) + np.where(np.arange(200) < 100, 0, 5 * 3600 * 10**9)
         (camera_checks(HOURS)[1], Verdict.FAIL, 18000.05, "5.0 s after the start; the recorder was paused"),
         (imu_checks(stamps(0.02))[0], Verdict.WARN, 50.0, "set the IMU to 200 Hz"),
         (imu_checks(np.delete(stamps(0.005), slice(50, 100)))[1], Verdict.FAIL, 0.255, "the driver's queue"),
-        (
-            stamp_order([DataIssue("imu: stamps not increasing", "3 of 9")]),
-            Verdict.FAIL,
-            1.0,
-            "3 of 9; check for a clock",
-        ),
+        (stamp_order([DataIssue("imu: stamps not increasing", "3 of 9")]), Verdict.FAIL, 1.0, "check for a clock"),
         (camera_imu_overlap(stamps(0.05), stamps(0.005), 0.0), Verdict.FAIL, 0.895, "of the frames have no IMU"),
         (camera_imu_overlap(stamps(0.05), stamps(0.005, 2000), 0.0), Verdict.OK, 0.0, "the IMU covers"),
     ],
@@ -324,7 +299,8 @@ def test_the_command_writes_json_and_ends_with_3_on_failure(tmp_path: Path) -> N
     (folder / "mav0/cam1/was").rename(folder / "mav0/cam0/data")
     assert run(str(folder), "--json", str(tmp_path / "bad.json")) == 3
     report = json.loads((tmp_path / "bad.json").read_text())
-    assert next(f["name"] for f in report["findings"] if f["verdict"] == "fail") == "left and right"
+    (swapped,) = (f for f in report["findings"] if f["name"] == "left and right")
+    assert swapped["verdict"] == "fail" and "swapped" in swapped["sentence"]
 
 
 @pytest.mark.parametrize(
@@ -332,9 +308,8 @@ def test_the_command_writes_json_and_ends_with_3_on_failure(tmp_path: Path) -> N
 )
 def test_no_false_alarm_on_real_recordings(name: str) -> None:
     findings = run_checks(open_recording(real_data(name))).findings
-    assert [
-        f for f in findings if f.verdict is Verdict.FAIL or (f.verdict is Verdict.WARN and f.name != "lost data")
-    ] == []
+    assert [f for f in findings if f.verdict is Verdict.FAIL] == []
+    assert {f.name for f in findings if f.verdict is Verdict.WARN} <= {"lost data"}
 
 
 def test_the_focal_length_is_not_doubted_for_the_lens() -> None:
@@ -363,10 +338,7 @@ def test_findings_in_one_line_and_those_that_lack_the_same_in_one_row() -> None:
     lacking = [not_judged(name, "0 inertial samples", "record an IMU") for name in ("imu rate", "gyro axes")]
     known = replace(not_judged("baseline", "+1 %", "record an IMU"), value=0.01)
     assert summary([good, good, *lacking], {"depth"}) == "2 ok, 2 not judged: good enough to build"
-    assert (
-        summary([good, *lacking], set())
-        == "1 ok, 2 not judged: nothing is known to be wrong, but most could not be judged"
-    )
+    assert summary([good, *lacking], set()).startswith("1 ok, 2 not judged: nothing is known to be wrong")
     assert "`mapserver build` refuses it: depth" in summary([good, bad], {"depth"})
     assert summary([good, bad], set()) == "1 ok, 1 fail: not good enough: depth"
     assert [([f.name for f in same], words) for same, words in grouped([good, *lacking, known])] == [

@@ -110,10 +110,9 @@ def with_turned(calibration: RigCalibration, numbers: tuple[int, ...], turn: Arr
     off = se3(so3_exp(turn), np.zeros(3))
     middle = se3(np.eye(3), np.mean([calibration.cameras[n].body_from_cam[:3, 3] for n in numbers], axis=0))
     turned = middle @ off @ se3_inverse(middle)
-    cameras = [
-        replace(c, body_from_cam=turned @ c.body_from_cam) if n in numbers else c
-        for n, c in enumerate(calibration.cameras)
-    ]
+    cameras = list(calibration.cameras)
+    for n in numbers:
+        cameras[n] = replace(cameras[n], body_from_cam=turned @ cameras[n].body_from_cam)
     return replace(calibration, cameras=tuple(cameras))
 
 
@@ -162,9 +161,8 @@ def test_a_straight_drive_does_not_turn_a_right_mounting(tmp_path: Path, seed: i
 def test_a_view_with_another_lens_is_named(recorded: Path, tmp_path: Path) -> None:
     calibration = ride()[0]
     wide = [replace(c, intrinsics_px=c.intrinsics_px * [0.5, 0.5, 1, 1]) for c in calibration.cameras[2:]]
-    (tmp_path / "cams.yaml").write_text(
-        format_calibration(replace(calibration, cameras=(*calibration.cameras[:2], *wide)))
-    )
+    other = replace(calibration, cameras=(*calibration.cameras[:2], *wide))
+    (tmp_path / "cams.yaml").write_text(format_calibration(other))
     with open_recording(recorded, OpenOptions(tmp_path / "cams.yaml")) as recording:
         few = recording.part(np.arange(0, len(recording), 8))
         found = {finding.name: finding for finding in further_findings(few)}
@@ -179,15 +177,14 @@ def test_the_doctor_names_the_pair_whose_images_are_exchanged(tmp_path: Path) ->
             (rear,) = frame.others
             assert rear is not None and rear.right is not None
             writer.write_frame(replace(frame, others=(replace(rear, left=rear.right, right=rear.left),)))
-    done = CliRunner().invoke(app, ["doctor", str(tmp_path / "ride.mcap"), "--json", "-"])
+    ride_file = str(tmp_path / "ride.mcap")
+    done = CliRunner().invoke(app, ["doctor", ride_file, "--json", "-"])
     assert done.exit_code == 3
     findings = {f["name"]: Finding(**f) for f in json.loads(done.stdout)["findings"]}
     assert findings["left and right"].verdict == "ok"
     assert findings["left and right of cam2 and cam3"].verdict == "fail"
     assert "camera rate of cam2 and cam3" in findings
-    built = CliRunner().invoke(
-        app, ["build", str(tmp_path / "ride.mcap"), "--site", "s", "--store", str(tmp_path / "s")]
-    )
+    built = CliRunner().invoke(app, ["build", ride_file, "--site", "s", "--store", str(tmp_path / "s")])
     assert isinstance(built.exception, RecordingError)
     assert "left and right of cam2 and cam3" in str(built.exception)
 
@@ -203,11 +200,9 @@ def test_one_camera_that_hardly_moves_does_not_turn_round(way_m: float) -> None:
     there = BODY_FROM_CAM @ se3(turn if way_m else np.eye(3), np.array([way_m, 0.0, 0.0]))
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        pictures = [
-            np.clip(view(place) + rng.normal(0.0, 2.0, (CAMERA.height_px, CAMERA.width_px)), 0, 255).astype(np.uint8)
-            for place in (BODY_FROM_CAM, there)
-        ]
-        before, after = (RectifiedFrame(stamp, picture, None, None) for stamp, picture in enumerate(pictures))
+        pictures = [view(place) for place in (BODY_FROM_CAM, there)]
+        noisy = [np.clip(each + rng.normal(0.0, 2.0, each.shape), 0, 255).astype(np.uint8) for each in pictures]
+        before, after = (RectifiedFrame(stamp, picture, None, None) for stamp, picture in enumerate(noisy))
         found, _ = motion_between(before, after, SINGLE)
         expected = turn if way_m else np.eye(3)
         assert np.linalg.norm(so3_log(expected.T @ found[:3, :3])) < 0.02

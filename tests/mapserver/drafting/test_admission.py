@@ -30,12 +30,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 def measured(parameter: P, value: float) -> MeasuredCalibration:
     """Everything known to a hundredth of its useful sigma, one parameter off."""
-    sigmas = np.array([0.01 * p.useful_sigma for p in COLUMNS])
-    parameters = tuple(
-        ParameterEstimate(p, value if p is parameter else 0.0, float(s), True)
-        for p, s in zip(COLUMNS, sigmas, strict=True)
-    )
-    found = CalibrationEstimate(parameters, np.diag(sigmas**2), 40, 4000)
+    rows = [ParameterEstimate(p, value * (p is parameter), 0.01 * p.useful_sigma, True) for p in COLUMNS]
+    found = CalibrationEstimate(tuple(rows), np.diag([row.sigma**2 for row in rows]), 40, 4000)
     return MeasuredCalibration(findings_of(found, 200.0), found)
 
 

@@ -52,11 +52,9 @@ def test_a_smaller_set_of_sensors_is_that_of_the_first_view(recorded: Path, tmp_
 
 def test_a_corrected_clock_is_that_of_all_views() -> None:
     whole = simulated("front-rear", SIZE_PX)[0]
-    first = replace(
-        whole, cameras=tuple(replace(c, imu_minus_cam_s=c.imu_minus_cam_s + 0.01) for c in whole.cameras[:2])
-    )
-    later = with_other_views(first, whole)
-    assert [c.imu_minus_cam_s for c in later.cameras] == [c.imu_minus_cam_s + 0.01 for c in whole.cameras]
+    later_s = whole.cameras[0].imu_minus_cam_s + 0.01
+    first = replace(whole, cameras=tuple(replace(c, imu_minus_cam_s=later_s) for c in whole.cameras[:2]))
+    assert [c.imu_minus_cam_s for c in with_other_views(first, whole).cameras] == [later_s] * 4
     assert with_other_views(first, replace(whole, cameras=whole.cameras[:2])) is first
 
 
@@ -112,9 +110,8 @@ def test_depth_of_another_view_is_read_as_disparities_of_the_first_baseline() ->
     np.testing.assert_allclose(np.median(rear.points_cam[seen, 2] / depth_m), 1.0, atol=0.01)
     scale = rectifier.camera.baseline_m / RGBD_BASELINE_M
     np.testing.assert_allclose(rear.disparities[seen, 1], scale * settings.stereo.depth_sigma_px)
-    np.testing.assert_array_equal(
-        rear.with_pyramid().measured_at(seen, pixels, settings.stereo), rear.disparities[seen]
-    )
+    again = rear.with_pyramid().measured_at(seen, pixels, settings.stereo)
+    np.testing.assert_array_equal(again, rear.disparities[seen])
 
 
 @pytest.mark.parametrize("recordings", [1, 2])
@@ -126,9 +123,8 @@ def test_all_views_of_a_frame_either_judge_a_draft_or_choose_its_landmarks(recor
         for view in (0, 1)
     ]
     session = JudgedSession(nothing, probed, nothing)
-    asked, judging = (
-        [(f.number, f.view) for f in part] for part in (session.asked(recordings), session.judging(recordings))
-    )
+    parts = session.asked(recordings), session.judging(recordings)
+    asked, judging = ([(f.number, f.view) for f in part] for part in parts)
     assert not {number for number, _ in asked} & {number for number, _ in judging}
     assert {view for _, view in judging} == {0, 1} and len(judging) == 2 * len({number for number, _ in judging})
     assert {0, 19} <= {number for number, _ in asked}

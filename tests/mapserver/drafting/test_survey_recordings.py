@@ -164,11 +164,9 @@ def test_nobody_holds_what_was_begun_once_its_loops_are_closed(
     del chain, parts, state
     monkeypatch.setattr(stages, "close_loops", lambda *_: (State(single), Loops()))
     monkeypatch.setattr(stages, "match_again", adjust)
-    config = SurveyConfig(SurveySettings(), default_vocabulary())
+    config, reading = SurveyConfig(SurveySettings(), default_vocabulary()), OpenRecordings(RecordingOptions(), tmp_path)
     with pytest.raises(SurveyError, match="let go of"):
-        survey_recording(
-            drive, admitted.pop(), OpenRecordings(RecordingOptions(), tmp_path), None, config, SurveyTools()
-        )
+        survey_recording(drive, admitted.pop(), reading, None, config, SurveyTools())
 
 
 def test_the_turn_within_each_pair_of_a_rig_is_told_and_judged() -> None:

@@ -36,9 +36,8 @@ def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
 
 
 def health(status: str, number: int = 1) -> RobotHealth:
-    return RobotHealth(
-        site="lab", robot="r1", stamp_ns=number * 10**9, version=1, status=status, metrics={"speed_mps": 1.0}
-    )
+    about = {"status": status, "metrics": {"speed_mps": 1.0}}
+    return RobotHealth(site="lab", robot="r1", stamp_ns=number * 10**9, version=1, **about)
 
 
 def test_what_holds_is_named_and_nothing_else(store: MapStore, clock: Clock) -> None:
@@ -111,9 +110,8 @@ def test_metrics_name_the_robots_that_are_lost_for_longest(store: MapStore, cloc
 
     def named() -> dict[str, float]:
         text = Metrics(store, fleet).text().decode()
-        return {
-            name: float(s) for name, s in re.findall(r'fleetmap_site_robot_lost_seconds{.*robot="(.*?)".*} (.*)', text)
-        }
+        rows = re.findall(r'fleetmap_site_robot_lost_seconds{.*robot="(.*?)".*} (.*)', text)
+        return {name: float(lost_s) for name, lost_s in rows}
 
     lost(clock, fleet, ["r1"], 4)
     assert named() == {}, "for less than five minutes"

@@ -1,7 +1,7 @@
 """What leaves the server about the fleet: the page, JSON lines, MCAP, the commands that write them."""
 
 import json
-from collections.abc import Iterator
+import time
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -10,52 +10,33 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
-from typer.testing import CliRunner
 
-from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
 from mapserver import releases
-from mapserver.cli import app
 from mapserver.dashboard.shift_page import html_page
+from mapserver.fleet.exports import failures_oldest_first, write_json_lines
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet_statistics.kpis import driven_words
 from mapserver.store import FailureFilter, MapStore
-from support.fleet.made_fleet import NS, Known, MadeRobot, drive
+from support.fleet.made_fleet import NS, Known, MadeRobot, drive, hear
 from support.storage.map_samples import publish_samples, save_sample_draft
 
 
-def run_made_site(folder: Path, *, start_ns: int, seconds: int = 200, cause: str = "dark") -> Known:
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Known]:
     """A store with what three robots said."""
-    clock = {"ns": start_ns}
-    known = Known()
+    folder, known = tmp_path_factory.mktemp("site"), Known()
+    clock = {"ns": time.time_ns() - 300 * NS}
     with MapStore.open(folder, create=True, clock_ns=lambda: clock["ns"]) as store:
         for seed in (1, 2):
             save_sample_draft(store, site="hall", seed=seed)
         releases.publish(store, "hall", 1)
         fleet = Fleet(store, clock_ns=lambda: clock["ns"])
         rng = np.random.default_rng(1)
-        robots = [
-            MadeRobot("hall", f"r{n}", rng, known, rate_per_robot_day=1500.0, suspected_share=0.2, cause=cause)
-            for n in range(3)
-        ]
-        for now_ns, robot, message in drive(robots, seconds, start_ns):
-            clock["ns"] = now_ns
-            if isinstance(message, RobotHealth):
-                fleet.take_health("hall", robot.name, message)
-            elif isinstance(message, PoseMessage):
-                fleet.take_pose("hall", robot.name, message)
-            elif isinstance(message, FailureReport):
-                fleet.take_failure("hall", robot.name, message)
-        fleet.flush()
+        about = {"rate_per_robot_day": 1500.0, "suspected_share": 0.2, "cause": "<b>dark & dusty</b>"}
+        robots = [MadeRobot("hall", f"r{n}", rng, known, **about) for n in range(3)]
+        hear(fleet, drive(robots, 200, clock["ns"]), lambda now_ns: clock.update(ns=now_ns))
         releases.start_canary(store, "hall", 2, 0.3)
-    return known
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path, Known]]:
-    import time
-
-    path = tmp_path_factory.mktemp("site")
-    yield path, run_made_site(path, start_ns=time.time_ns() - 300 * NS, cause="<b>dark & dusty</b>")
+    return folder, known
 
 
 class _Tags(HTMLParser):
@@ -81,8 +62,6 @@ class _Tags(HTMLParser):
 
 
 def test_the_page_stands_alone_and_shows_the_count(folder: tuple[Path, Known]) -> None:
-    import time
-
     path, known = folder
     with MapStore.open(path) as store:
         page = html_page(store, "hall", 24, time.time_ns())
@@ -106,52 +85,39 @@ def test_an_idle_site_has_a_page_too(tmp_path: Path) -> None:
     assert "not known" in page and "No failures were reported" in page
 
 
-def test_commands(folder: tuple[Path, Known], tmp_path: Path) -> None:
+def test_commands(run, folder: tuple[Path, Known], tmp_path: Path) -> None:
     path, known = folder
-    run = CliRunner()
-    count = known.reports
-    store = ["--store", str(path)]
-    done = run.invoke(app, ["fleet", "report", str(tmp_path / "shift.html"), "--site", "hall", *store])
-    assert done.exit_code == 0, done.output
+    where = ("--site", "hall", "--store", path)
+    run("fleet", "report", tmp_path / "shift.html", *where)
     assert "<!DOCTYPE html>" in (tmp_path / "shift.html").read_text()
-    done = run.invoke(app, ["fleet", "export", str(tmp_path / "failures.jsonl"), "--site", "hall", *store])
-    assert done.output == f"{count} failures\n"
-    done = run.invoke(app, ["fleet", "resurvey", "--site", "hall", *store, "--route", str(tmp_path / "route.csv")])
-    assert done.exit_code == 0, done.output
+    assert run("fleet", "export", tmp_path / "failures.jsonl", *where) == f"{known.reports} failures\n"
+    run("fleet", "resurvey", *where, "--route", tmp_path / "route.csv")
     assert (tmp_path / "route.csv").read_text().startswith("number,x_map_m")
-    done = run.invoke(app, ["fleet", "export", str(tmp_path / "failures.txt"), *store])
-    assert "--format" in str(done.exception)
+    assert "--format" in run("fleet", "export", tmp_path / "failures.txt", *where, status=2)
 
 
-def test_a_file_sets_options_of_grouped_commands(folder: tuple[Path, Known], tmp_path: Path) -> None:
+def test_a_file_sets_options_of_grouped_commands(run, folder: tuple[Path, Known], tmp_path: Path) -> None:
     settings = tmp_path / "fleet.toml"
     settings.write_text(f'[fleet.report]\nsite = "hall"\nstore = "{folder[0]}"\nhours = 5\n')
-    run = CliRunner()
-    for words in (["--config", str(settings), "fleet", "report"], ["fleet", "report", "--config", str(settings)]):
-        done = run.invoke(app, [*words, str(tmp_path / "x.html")])
-        assert done.exit_code == 0, done.output
+    for words in (["--config", settings, "fleet", "report"], ["fleet", "report", "--config", settings]):
+        run(*words, tmp_path / "x.html")
         assert "the last 5 h" in (tmp_path / "x.html").read_text()
 
 
-def test_a_canary_from_the_command_line(tmp_path: Path) -> None:
+def test_a_canary_from_the_command_line(run, tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store:
         publish_samples(store, 1)
         save_sample_draft(store, seed=3)
-    done = CliRunner().invoke(
-        app, ["promote", "2", "--site", "lab", "--store", str(tmp_path), "--canary", "5%", "--reason", "new racks"]
-    )
-    assert "0.05 of the robots run version 2, the others stay on 1" in done.output
+    promote = ("promote", 2, "--site", "lab", "--store", tmp_path, "--canary")
+    assert "0.05 of the robots run version 2, the others stay on 1" in run(*promote, "5%", "--reason", "new racks")
     with MapStore.open(tmp_path) as store:
         (row,) = store.canaries("lab", running=True)
         assert (row.version, row.base_version, row.share, row.reason) == (2, 1, 0.05, "new racks")
     for wrong in ("500%", "some", "0"):
-        done = CliRunner().invoke(app, ["promote", "2", "--site", "lab", "--store", str(tmp_path), "--canary", wrong])
-        assert "between 0 and 1" in str(done.exception)
+        assert "between 0 and 1" in run(*promote, wrong, status=2)
 
 
 def test_json_lines_hold_every_failure_in_order(folder: tuple[Path, Known], tmp_path: Path) -> None:
-    from mapserver.fleet.exports import write_json_lines
-
     with MapStore.open(folder[0]) as store:
         count = write_json_lines(store, FailureFilter(), tmp_path / "out.jsonl")
         rows = {row.number: row for row in store.fleet.failures(FailureFilter())}
@@ -167,7 +133,6 @@ def test_json_lines_hold_every_failure_in_order(folder: tuple[Path, Known], tmp_
 def test_mcap_holds_the_channels_of_viewers(folder: tuple[Path, Known], tmp_path: Path) -> None:
     pytest.importorskip("mapserver.plugins.viewer_files")
     from fleetmap.plugins.viewer_channels.channels import CHANNELS
-    from mapserver.fleet.exports import failures_oldest_first
     from mapserver.plugins.viewer_files.failures import write_mcap
 
     path = tmp_path / "out.mcap"

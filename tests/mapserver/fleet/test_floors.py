@@ -5,6 +5,7 @@ from urllib.request import urlopen
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from fleetmap.access import Access, Holder
 from fleetmap.encoding import to_json
@@ -29,6 +30,11 @@ from support.drawn_areas import geojson
 from support.fleet.dashboard_scene import serving
 from support.room_site import run
 from support.storage.map_samples import save_sample_draft
+
+HERE = BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0)
+TOWER = Building(
+    name="tower", floors=tuple(FloorEntry(site=f"hall-{n}", level=f"L{n}", height_m=4.0 * n) for n in (1, 2))
+)
 
 
 def areas(lift: str, frame: str = "map") -> bytes:
@@ -56,7 +62,6 @@ def test_one_command_makes_floors_that_robots_get_signed(house: Path) -> None:
     assert said.splitlines() == ["tower:", "  L2  hall-2  4.5 m  lifts: A", "  L1  hall-1  0 m  lifts: A"]
     with MapStore.open(house) as store:
         building = store.building("hall-1")
-        assert building is not None
         assert [floor.level for floor in building.floors] == ["L1", "L2"]
         (first, second) = (admitted_versions(store.releases(site))[-1].about.files for site in ("hall-1", "hall-2"))
         assert first[FLOORS] == second[FLOORS]
@@ -96,12 +101,11 @@ def test_a_building_has_a_name_of_one_line(house: Path, name: str) -> None:
 
 
 def test_a_site_is_a_floor_of_one_building_and_leaves_it(house: Path) -> None:
-    one, two = (FloorEntry(site=f"hall-{n}", level=f"L{n}", height_m=4.0 * n) for n in (1, 2))
     with MapStore.open(house) as store:
-        keep_building(store, Building(name="tower", floors=(one, two)), NOBODY)
+        keep_building(store, TOWER, NOBODY)
         with pytest.raises(UsageError, match="is a floor of 'tower'; `mapserver building remove tower`"):
-            keep_building(store, Building(name="annex", floors=(one, two)), NOBODY)
-        low, high = floors_of(store, Building(name="tower", floors=(one, two)))
+            keep_building(store, replace(TOWER, name="annex"), NOBODY)
+        low, high = floors_of(store, TOWER)
         assert high.building_from_map[:3, 3].tolist() == [10.0, 0.0, 8.0]
         assert low.lifts_at(np.array([2.0, 2.0]), 0.0) == {"A"}
         assert not low.lifts_at(np.array([3.4, 2.0]), 0.3)
@@ -112,9 +116,8 @@ def test_a_site_is_a_floor_of_one_building_and_leaves_it(house: Path) -> None:
 
 
 def test_the_page_of_maps_leads_to_the_other_floors(house: Path) -> None:
-    floors = tuple(FloorEntry(site=f"hall-{n}", level=f"L{n}", height_m=4.0 * n) for n in (1, 2))
     with MapStore.open(house) as store:
-        keep_building(store, Building(name="tower", floors=floors), NOBODY)
+        keep_building(store, TOWER, NOBODY)
     with serving(house) as served, urlopen(f"{served.http}/dashboard/map?site=hall-1") as answer:
         text = answer.read().decode()
     assert '<p id="floors">tower: <a href="/dashboard/map?site=hall-2">L2</a> · <strong>L1</strong></p>' in text
@@ -124,7 +127,6 @@ def test_lifts_drawn_in_the_building_come_back_in_the_map(house: Path) -> None:
     with MapStore.open(house) as store:
         keep_areas(store, "hall-2", areas("B", "building"), "", NOBODY)
         alignment = store.alignment("hall-2")
-        assert alignment is not None
         ((ring,),) = read_lifts(store.site_file("hall-2", AREAS), alignment.frame)["B"]
     assert ring[0].tolist() == [-9.0, 1.0]
 
@@ -134,7 +136,7 @@ def test_files_that_are_no_building(data: bytes) -> None:
     with pytest.raises(MapFormatError):
         read_building(data)
     with pytest.raises(MapFormatError):
-        read_lifts(data or b"{", BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0)) and read_building(data)
+        read_lifts(data or b"{", HERE) and read_building(data)
 
 
 def test_a_robot_may_fetch_the_maps_of_its_other_floors_and_report_nothing_there() -> None:
@@ -144,8 +146,7 @@ def test_a_robot_may_fetch_the_maps_of_its_other_floors_and_report_nothing_there
 
 
 def test_a_floor_without_a_lift_has_none() -> None:
-    floor = Floor(FloorEntry(site="a", level="L1", height_m=0.0), BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0))
-    assert not floor.lifts_at(np.zeros(2), 100.0)
+    assert not Floor(TOWER.floors[0], HERE).lifts_at(np.zeros(2), 100.0)
 
 
 @pytest.mark.parametrize("ring", ["[]", "[[0.0,0.0]]", "[[],[],[],[]]"])
@@ -153,4 +154,4 @@ def test_a_lift_without_an_outline_is_refused(ring: str) -> None:
     """A robot that measured its distance from it would stop."""
     data = f'{{"features":[{{"geometry":{{"type":"Polygon","coordinates":[{ring}]}},"properties":{{"lift":"A"}}}}]}}'
     with pytest.raises(MapFormatError, match="outline"):
-        read_lifts(data.encode(), BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0))
+        read_lifts(data.encode(), HERE)

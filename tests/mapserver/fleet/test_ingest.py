@@ -7,24 +7,24 @@ from itertools import pairwise
 from pathlib import Path
 from statistics import fmean
 
-import msgspec
 import numpy as np
 import pytest
 from msgspec.structs import replace as replace_struct
 
 from fleetmap.errors import LinkError, StoreError, UnknownOutcomeError
-from fleetmap.messages import FailureReport, PoseMessage, RobotHealth
+from fleetmap.messages import FailureReport, RobotHealth
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.ingest import IngestSettings
 from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, kpis
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
-from mapserver.store import FailureFilter, FleetRetention, MapStore
-from support.fleet.made_fleet import NS, SPEED_MPS, Known, MadeRobot, drive
+from mapserver.store import FailureFilter, FleetBatch, FleetRetention, MapStore
+from support.fleet.made_fleet import NS, SPEED_MPS, Known, MadeRobot, drive, hear
 from support.storage.map_samples import publish_samples
 
 START_NS = 490_000 * HOUR_NS + 1700 * NS  # an hour ends in the middle
+LOST = RobotHealth(site="lab", robot="r0", stamp_ns=1, version=1, status="LOST")
 
 
 @dataclass
@@ -36,18 +36,7 @@ class Site:
 
     def run(self, robots: list[MadeRobot], seconds: int, start_ns: int = START_NS) -> list[FailureReport]:
         """Everything that they say is taken; the failures among it."""
-        reports = []
-        for now_ns, robot, message in drive(robots, seconds, start_ns):
-            self.set_ns(now_ns)
-            if isinstance(message, RobotHealth):
-                self.fleet.take_health(robot.site, robot.name, message)
-            elif isinstance(message, PoseMessage):
-                self.fleet.take_pose(robot.site, robot.name, message)
-            else:
-                assert self.fleet.take_failure(robot.site, robot.name, message).refused == ""
-                reports.append(message)
-        self.fleet.flush()
-        return reports
+        return hear(self.fleet, drive(robots, seconds, start_ns), self.set_ns)
 
 
 @pytest.fixture
@@ -66,8 +55,7 @@ def made(site: Site, count: int, **options: object) -> list[MadeRobot]:
 
 def test_a_clock_that_is_set_back_freezes_no_robot(site: Site) -> None:
     """A year ahead, then right: what is silent is soon known, what reports is traced, and who is lost is lost since now."""
-    year = 365 * 24 * HOUR_NS
-    health = RobotHealth(site="lab", robot="r1", stamp_ns=1, version=1, status="LOST")
+    year, health = 365 * 24 * HOUR_NS, replace_struct(LOST, robot="r1")
     site.set_ns(START_NS + year)
     for robot in ("r1", "r2"):
         site.fleet.take_health("lab", robot, replace_struct(health, robot=robot))
@@ -154,10 +142,8 @@ def test_a_robot_that_is_lost_for_long_fails_in_every_window(site: Site, first: 
     for second in range(1200):
         now_ns = START_NS + (1900 - 600 + second) * NS
         site.set_ns(now_ns)
-        about = {"speed_mps": 1.0, "radius_95_m": 5.0}
-        health = RobotHealth(
-            site="lab", robot="r0", stamp_ns=now_ns, wall_ns=now_ns, version=1, status=status[second < 5], metrics=about
-        )
+        about = {"status": status[second < 5], "metrics": {"speed_mps": 1.0, "radius_95_m": 5.0}}
+        health = replace_struct(LOST, stamp_ns=now_ns, wall_ns=now_ns, **about)
         site.fleet.take_health("lab", "r0", health)
     site.fleet.flush()
 
@@ -171,13 +157,8 @@ def test_a_robot_that_is_lost_for_long_fails_in_every_window(site: Site, first: 
     assert kpis(after).failures_running == 1
     assert kpis(after).localised_share_of_all == 0.0
     assert kpis(window()).availability == pytest.approx(0.0, abs=0.01)
-    assert (
-        HealthData(site.store, CanarySettings(), ResurveySettings(), lambda: now_ns, lambda _: ())
-        .site("lab")
-        .robots["r0"]
-        .failures.events
-        == 1
-    )
+    shown = HealthData(site.store, CanarySettings(), ResurveySettings(), lambda: now_ns, lambda _: ()).site("lab")
+    assert shown.robots["r0"].failures.events == 1
 
 
 def test_what_comes_again_is_counted_once(site: Site) -> None:
@@ -186,10 +167,7 @@ def test_what_comes_again_is_counted_once(site: Site) -> None:
     before = site.store.fleet.counters("lab", "robot")
     for report in reports * 2:
         assert site.fleet.take_failure("lab", report.robot, report).id == report.id
-    health = RobotHealth(
-        site="lab", robot="r0", stamp_ns=START_NS + 120 * NS, wall_ns=START_NS, version=1, status="LOST"
-    )
-    site.fleet.take_health("lab", "r0", health)
+    site.fleet.take_health("lab", "r0", replace_struct(LOST, stamp_ns=START_NS + 120 * NS, wall_ns=START_NS))
     site.fleet.flush()
     assert site.store.fleet.counters("lab", "robot") == before
     rows = site.store.fleet.failures(FailureFilter())
@@ -211,7 +189,7 @@ def test_counts_come_again_unless_the_store_may_have_them(
 
     for second in range(4):
         site.set_ns(START_NS + (121 + second) * NS)
-        health = RobotHealth(site="lab", robot="r0", stamp_ns=(500 + second) * NS, version=1, status="TRACKING")
+        health = replace_struct(LOST, stamp_ns=(500 + second) * NS, status="TRACKING")
         site.fleet.take_health("lab", "r0", health)
     with monkeypatch.context() as patch:
         patch.setattr(type(site.store.fleet), "add", cut)
@@ -239,10 +217,10 @@ def test_failures_happen_when_the_servers_clock_says(site: Site) -> None:
 def test_what_cannot_be_is_refused_for_good(site: Site) -> None:
     (report, *_) = site.run(made(site, 1, rate_per_robot_day=5000.0), 100)
     wrong = [
-        msgspec.structs.replace(report, robot="r7"),
-        msgspec.structs.replace(report, id="x", wall_ns=1 << 63),
-        msgspec.structs.replace(report, id="x", duration_s=float("nan")),
-        msgspec.structs.replace(report, id="x", site="nowhere"),
+        replace_struct(report, robot="r7"),
+        replace_struct(report, id="x", wall_ns=1 << 63),
+        replace_struct(report, id="x", duration_s=float("nan")),
+        replace_struct(report, id="x", site="nowhere"),
     ]
     count = len(site.store.fleet.failures(FailureFilter()))
     for message in wrong:
@@ -250,19 +228,14 @@ def test_what_cannot_be_is_refused_for_good(site: Site) -> None:
         assert site.fleet.take_failure(sender, "r0", message).refused
     assert len(site.store.fleet.failures(FailureFilter())) == count
     with pytest.raises(LinkError, match="check its clock"):
-        site.fleet.take_health(
-            "lab", "r0", RobotHealth(site="lab", robot="r0", stamp_ns=1 << 63, version=1, status="LOST")
-        )
+        site.fleet.take_health("lab", "r0", replace_struct(LOST, stamp_ns=1 << 63))
 
 
 def test_names_that_robots_make_up_do_not_make_keys(site: Site) -> None:
     (report, *_) = site.run(made(site, 1, rate_per_robot_day=5000.0), 100)
     for number in range(200):
-        site.fleet.take_failure(
-            "lab",
-            "r0",
-            msgspec.structs.replace(report, id=f"n{number}", cause=f"c{number}", version=5 + number, tile=(number, 9)),
-        )
+        about = {"id": f"n{number}", "cause": f"c{number}", "version": 5 + number, "tile": (number, 9)}
+        site.fleet.take_failure("lab", "r0", replace_struct(report, **about))
     for axis, most in (("cause", 66), ("version", 2), ("tile", 3)):
         assert len(site.store.fleet.counters("lab", axis)) <= most, axis
 
@@ -327,8 +300,6 @@ def test_old_and_many_things_go(site: Site) -> None:
 
 def test_sums_of_a_month_are_small(site: Site, tmp_path: Path) -> None:
     """30 days of 300 robots below 500 MB: measured on a tenth of the robots for a tenth of the hours, which is a hundredth."""
-    from mapserver.store import FleetBatch
-
     counts = Counters(*range(10**6, 10**6 + len(Counters.__slots__)))
     before = _size(tmp_path)
     for hour in range(72):

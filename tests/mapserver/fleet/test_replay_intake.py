@@ -144,9 +144,8 @@ def test_a_recording_without_a_report_and_one_too_large_are_refused(server: Serv
 
 
 def test_uploads_and_rates_are_bounded(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        replay_intake, "run_bounded", lambda *_: ProcessResult(1, "", "no recording", has_network=False)
-    )
+    ended = ProcessResult(1, "", "no recording", has_network=False)
+    monkeypatch.setattr(replay_intake, "run_bounded", lambda *_: ended)
     for number in range(replay_intake.MAX_UPLOADS + 1):
         server.report("f1", robot=f"r{number}")
         part = encode_message(ReplayPart(id="f1", total_bytes=1000, offset=0, data=b"x"))

@@ -79,9 +79,8 @@ def test_what_is_asked_for_leads_the_list_until_it_is_done(store: MapStore, tmp_
     assert store.survey_requests(SITE) == [made]
     end_request(store, SITE, made.id, ADA)
     assert (listed(), store.survey_requests(SITE)) == ([], [])
-    assert [(event.kind, event.actor) for event in store.events(SITE)[-2:]] == [
-        (f"survey request {made.id}", "ada")
-    ] * 2
+    told = [(event.kind, event.actor) for event in store.events(SITE)[-2:]]
+    assert told == [(f"survey request {made.id}", "ada")] * 2
     with pytest.raises(UsageError, match="may be closed already"):
         end_request(store, SITE, made.id, ADA)
 
@@ -104,16 +103,14 @@ def test_a_published_survey_of_it_ends_it(store: MapStore) -> None:
 
 def test_what_a_build_covers_is_where_its_new_recordings_drove(store: MapStore) -> None:
     survey = random_survey(np.random.default_rng(2), keyframes=46)  # along x from -20 m to 25 m
-    asked = [
-        ask_for_survey(store, SITE, [(x, -9.0), (x + 10, -9.0), (x + 10, 9.0), (x, 9.0)], ADA) for x in (-15.0, 10.0)
-    ]
+    boxes = ([(x, -9.0), (x + 10, -9.0), (x + 10, 9.0), (x, 9.0)] for x in (-15.0, 10.0))
+    asked = [ask_for_survey(store, SITE, box, ADA) for box in boxes]
     way = survey.trajectory
 
     def covered(*spans: tuple[int, int, int]) -> dict[str, float]:
         parts = [Trajectory(way.stamps_ns[a:b] + since_ns, way.frame_from_body[a:b]) for a, b, since_ns in spans]
-        whole = Trajectory(
-            np.concatenate([part.stamps_ns for part in parts]), np.concatenate([part.frame_from_body for part in parts])
-        )
+        names = ("stamps_ns", "frame_from_body")
+        whole = Trajectory(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
         joined = MergedMap(replace(survey, trajectory=whole), (), tuple(parts), ())
         return covered_requests(store, SITE, joined)
 
@@ -122,9 +119,8 @@ def test_what_a_build_covers_is_where_its_new_recordings_drove(store: MapStore) 
     assert covered((0, 20, 0)) == {first: 1.0}
     assert covered((30, 36, 0))[second] == pytest.approx(0.6, abs=0.21)
     before_ns, after_ns = asked[0].asked_ns - 3600 * 10**9, asked[0].asked_ns + 3600 * 10**9
-    assert covered((0, 20, before_ns), (30, 46, after_ns)) == {second: 1.0}, (
-        "what was recorded before it counts for nothing"
-    )
+    # What was recorded before it counts for nothing.
+    assert covered((0, 20, before_ns), (30, 46, after_ns)) == {second: 1.0}
 
 
 @pytest.mark.parametrize(
@@ -165,9 +161,8 @@ def test_over_http(tmp_path: Path) -> None:
         found = server.client.get(path).json()
         assert [request["id"] for request in found["requests"]] == [made["id"]]
         assert found["tiles"][0]["tile"] == "0,0"
-        check_problem(
-            server.client.post(f"{path}/requests", json=asked | {"corners_map_m": [[1, 1]]}), 422, "corners_map_m"
-        )
+        wrong = asked | {"corners_map_m": [[1, 1]]}
+        check_problem(server.client.post(f"{path}/requests", json=wrong), 422, "corners_map_m")
         check_problem(server.client.post(f"{path}/requests/00000000/end", json={"actor": "ada"}), 404, "may be closed")
         assert server.client.post(f"{path}/requests/{made['id']}/end", json={"actor": "ada"}).json() == {"status": "ok"}
         assert server.client.get(path).json()["requests"] == []

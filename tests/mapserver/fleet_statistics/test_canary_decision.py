@@ -54,10 +54,8 @@ def test_a_harmless_version_is_rarely_taken_back_however_often_it_is_looked_at()
     runs, looks = 250, 60
     for _ in range(runs):
         ours, theirs = np.cumsum(rng.poisson(0.1 * 1.5 * 0.6, looks)), np.cumsum(rng.poisson(2.0 * 0.6, looks))
-        evidence = [
-            evidence_of_harm(rate(int(a), 0.1 * n), rate(int(b), 2.0 * n), 1.5)
-            for n, (a, b) in enumerate(zip(ours, theirs, strict=True), start=1)
-        ]
+        pairs = enumerate(zip(ours, theirs, strict=True), start=1)
+        evidence = [evidence_of_harm(rate(int(a), 0.1 * n), rate(int(b), 2.0 * n), 1.5) for n, (a, b) in pairs]
         alarms += max(evidence) >= 1 / ALPHA
     assert alarms / runs <= ALPHA * 1.5
 

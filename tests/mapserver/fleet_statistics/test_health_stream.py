@@ -14,9 +14,8 @@ NS = 1_000_000_000
 
 
 def health(second: float, status: str = "TRACKING", *, wall_ns: int | None = None, **metrics: Any) -> RobotHealth:
-    return RobotHealth(
-        site="lab", robot="r1", stamp_ns=round(second * NS), wall_ns=wall_ns, version=1, status=status, metrics=metrics
-    )
+    about = {"wall_ns": wall_ns, "status": status, "metrics": metrics}
+    return RobotHealth(site="lab", robot="r1", stamp_ns=round(second * NS), version=1, **about)
 
 
 def total(reports: list[RobotHealth], stream: HealthStream | None = None) -> Counters:
@@ -154,9 +153,8 @@ def test_nonsense_counts_nothing() -> None:
 
 
 def test_docks_and_innovations() -> None:
-    found = total(
-        [health(0, fix_innovation=30.0, fix_innovation_m=0.2), health(1, dock_error_m=0.5), health(2, dock_error_m=0.1)]
-    )
+    fix = health(0, fix_innovation=30.0, fix_innovation_m=0.2)
+    found = total([fix, health(1, dock_error_m=0.5), health(2, dock_error_m=0.1)])
     assert (found.innovations, found.exceeded, found.innovation_m_sum) == (1, 1, 0.2)
     assert (found.docks, found.docks_wrong) == (2, 1)
 

@@ -62,11 +62,8 @@ def test_what_is_not_known_is_none_not_zero() -> None:
 
 
 def test_silent_failures_are_estimates_apart() -> None:
-    found = kpis(
-        Counters(
-            driving_ms=57_600_000, failures=2, suspected=3, docks=10, docks_wrong=1, blind_seen=4, blind_failures=1
-        )
-    )
+    rest = {"docks": 10, "docks_wrong": 1, "blind_seen": 4, "blind_failures": 1}
+    found = kpis(Counters(driving_ms=57_600_000, failures=2, suspected=3, **rest))
     assert (found.failures.events, found.silent_estimated.events) == (5, 4), "two reported, three seen in the statuses"
     assert found.docks_wrong.share == 0.1
     assert found.unreported_blindness == 3

@@ -25,9 +25,8 @@ SETTINGS = ResurveySettings()
 
 
 def counts(failures: int = 0, hours: float = 10.0, expected: int = 0, seen: int = 0) -> Counters:
-    return Counters(
-        failures=failures, driving_ms=round(hours * 3.6e6), landmarks_expected=expected, landmarks_seen=seen
-    )
+    landmarks = {"landmarks_expected": expected, "landmarks_seen": seen}
+    return Counters(failures=failures, driving_ms=round(hours * 3.6e6), **landmarks)
 
 
 @pytest.mark.parametrize(
@@ -37,11 +36,7 @@ def counts(failures: int = 0, hours: float = 10.0, expected: int = 0, seen: int 
         (counts(2), counts(0, 70.0), ""),  # too few to say
         (counts(4), counts(20, 70.0), ""),  # as before
         (counts(9), Counters(), "elsewhere on the site"),  # no before
-        (
-            counts(0, expected=9000, seen=4000),
-            counts(0, 70.0, 90_000, 63_000),
-            "44% of the landmarks are found, 70% before",
-        ),
+        (counts(0, expected=9000, seen=4000), counts(0, 70.0, 90_000, 63_000), "44% of the landmarks are found, 70%"),
         (counts(0, expected=9000, seen=5700), counts(0, 70.0, 90_000, 63_000), ""),
         (counts(0, expected=90, seen=0), counts(0, 70.0, 90_000, 63_000), ""),
     ],

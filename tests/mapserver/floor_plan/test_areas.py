@@ -98,12 +98,7 @@ def test_areas_of_the_building_come_into_the_map() -> None:
         (collection(feature("a\nb", box(0, 0, 1, 1))), "printable"),
         (collection(feature("outside", box(0, 0, 1, 1))), "is not 'outside'"),
         (collection(feature(5, box(0, 0, 1, 1))), "Expected `str`"),
-        (
-            collection(
-                {"type": "Feature", "geometry": {"type": "Point", "coordinates": [0, 0]}, "properties": {"name": "a"}}
-            ),
-            "Point",
-        ),
+        (collection(feature("a") | {"geometry": {"type": "Point", "coordinates": [0, 0]}}), "Point"),
         (collection(*(feature(f"a{n}", box(0, 0, 1, 1)) for n in range(2001))), "2001 features"),
         (collection(feature("a", [[n, (n % 2) + (n > 0)] for n in range(2001)] + [[0, 0]])), "the limit is 2000"),
         (b" " * (9 << 20), "more than"),
@@ -139,10 +134,9 @@ def test_what_two_polygons_of_an_area_share_is_inside(turned: int) -> None:
         assert (cells[22:38, 22:38] == 0).all(), "but for cells at its edge the hole is free"
         points = np.c_[x.ravel(), y.ravel(), np.full(x.size, 7.0)]
         np.testing.assert_array_equal(AreaCorrections(areas.areas, areas.areas).is_due(points), inside.ravel())
-        lifts = read_lifts(json.dumps(areas.geojson("hall")).encode(), BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0))
-        floor = Floor(
-            FloorEntry(site="hall", level="0", height_m=0.0), BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0), lifts
-        )
+        here = BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0)
+        lifts = read_lifts(json.dumps(areas.geojson("hall")).encode(), here)
+        floor = Floor(FloorEntry(site="hall", level="0", height_m=0.0), here, lifts)
         assert floor.lifts_at(np.array([2.5, 0.5]), 0.0) == floor.lifts_at(np.array([3.5, 2.0]), 0.0) == {"A"}
         assert not floor.lifts_at(np.array([1.5, 1.5]), 0.3)
         assert len({area.name: area for area in areas.areas}["keep"].outlines) == 4

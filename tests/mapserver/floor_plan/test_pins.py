@@ -20,9 +20,8 @@ def pins_at(points_map: np.ndarray, clicked_m: np.ndarray | float = 0.0, *, mirr
     right_up_m = building(points_map) + clicked_m
     px = right_up_m / METRES_PER_PX
     px = px * (-1, 1) if mirrored else px
-    return [
-        Pin(f"p{n}", tuple(a), tuple(b)) for n, (a, b) in enumerate(zip(px.tolist(), points_map.tolist(), strict=True))
-    ]
+    pairs = zip(px.tolist(), points_map.tolist(), strict=True)
+    return [Pin(f"p{n}", tuple(a), tuple(b)) for n, (a, b) in enumerate(pairs)]
 
 
 def errors(fit: Fit, metres_per_px: float) -> tuple[float, float]:

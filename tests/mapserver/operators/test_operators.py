@@ -12,23 +12,17 @@ from mapserver.operators.operators import IDLE_S, LIFE_S, TRIES, TRY_EVERY_S, Op
 from mapserver.serving.http_connections import binding_fault
 from mapserver.store import Actor, MapStore
 from support.fleet.quick_passwords import use_quick_passwords
+from support.storage.clock import Clock
 
 PASSWORD = "ada has a long password"
 ADMIN = Actor("root")
+NS = 10**9
 DUMMY = module._dummy.__wrapped__  # as it is, without its cache
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.s = 1_800_000_000.0
-
-    def __call__(self) -> int:
-        return int(self.s * 1e9)
 
 
 @pytest.fixture
 def clock() -> Clock:
-    return Clock()
+    return Clock(1_800_000_000 * NS)
 
 
 @pytest.fixture(autouse=True)
@@ -52,11 +46,11 @@ def test_a_clock_that_was_ahead_leaves_neither_long_sessions_nor_lost_tokens(
     operators: Operators, clock: Clock
 ) -> None:
     token = operators.make_token("ci", ["read"], 90, ADMIN)
-    clock.s += 365 * 86_400
+    clock.now_ns += 365 * 86_400 * NS
     session = operators.sign_in("ada", PASSWORD, "10.0.0.1").session
     assert operators.identify(session, "", "") is not None
     assert operators.identify("", f"Bearer {token}", "") is None
-    clock.s -= 365 * 86_400
+    clock.now_ns -= 365 * 86_400 * NS
     assert operators.identify(session, "", "") is None
     assert operators.identify("", f"Bearer {token}", "") is not None
     assert operators.sign_in("ada", PASSWORD, "10.0.0.1").session, "nor are people kept out"
@@ -66,7 +60,7 @@ def test_a_first_operator_is_noticed_though_the_clock_was_set_back(tmp_path: Pat
     with MapStore.open(tmp_path / "new", create=True, clock_ns=clock) as store:
         serving = Operators(store)
         assert not serving.is_sign_in_on
-        clock.s -= 3600
+        clock.now_ns -= 3600 * NS
         Operators(store).add("ada", "admin", PASSWORD, ADMIN)
         assert serving.is_sign_in_on
 
@@ -81,16 +75,16 @@ def test_a_session_names_its_operator_and_ends(operators: Operators, clock: Cloc
     assert operators.identify(session, "", "") is None
 
     idle = operators.sign_in("ada", PASSWORD, "").session
-    clock.s += IDLE_S - 1
+    clock.now_ns += (IDLE_S - 1) * NS
     assert operators.identify(idle, "", "", uses=False)
-    clock.s += 2
+    clock.now_ns += 2 * NS
     assert operators.identify(idle, "", "") is None
 
     used = operators.sign_in("ada", PASSWORD, "").session
     for _ in range(LIFE_S // 1800):
         assert operators.identify(used, "", "")
-        clock.s += 1800
-    clock.s += 1
+        clock.now_ns += 1800 * NS
+    clock.now_ns += 1 * NS
     assert operators.identify(used, "", "") is None
 
 
@@ -115,7 +109,7 @@ def test_a_token_has_its_scopes_and_an_end(operators: Operators, clock: Clock) -
     assert who.actor().operator == "token of prometheus"
     assert operators.identify("", "Bearer guessed", "") is operators.identify("", token, "") is None
     assert operators.sign_in("prometheus", "", "").refusal, "a program has no password, not even an empty one"
-    clock.s += 90 * 86_400
+    clock.now_ns += 90 * 86_400 * NS
     assert operators.identify("", f"Bearer {token}", "") is None
 
 
@@ -124,7 +118,7 @@ def test_guesses_are_few_and_say_nothing(operators: Operators, clock: Clock) -> 
     assert [answer.retry_s for answer in answers] == [0] * TRIES + [TRY_EVERY_S] * 3
     assert operators.sign_in("ada", PASSWORD, "10.0.0.66").retry_s, "not even the right one"
     assert operators.sign_in("ada", PASSWORD, "10.0.0.1").session, "somebody else is not locked out"
-    clock.s += TRY_EVERY_S
+    clock.now_ns += TRY_EVERY_S * NS
     assert operators.sign_in("ada", PASSWORD, "10.0.0.66").session
     refused = {operators.sign_in(name, "guess", "10.0.0.7").refusal for name in ("ada", "nobody")}
     assert refused == {"Wrong name or password."}
@@ -152,10 +146,8 @@ def test_an_unknown_name_takes_as_long(operators: Operators, monkeypatch: pytest
 
 def test_many_at_once_do_not_wait_for_ever(operators: Operators) -> None:
     answers: list[module.SignIn] = []
-    threads = [
-        threading.Thread(target=lambda n=n: answers.append(operators.sign_in(f"nobody-{n}", "x", "")))
-        for n in range(12)
-    ]
+    guess = lambda n: answers.append(operators.sign_in(f"nobody-{n}", "x", ""))  # noqa: E731
+    threads = [threading.Thread(target=guess, args=(n,)) for n in range(12)]
     with operators._verifying:  # four wait for their turn
         for thread in threads:
             thread.start()
@@ -172,7 +164,7 @@ def test_a_flood_of_refusals_does_not_fill_the_log(operators: Operators, clock: 
     for n in range(500):
         operators.note("refused", f"number {n}", Actor("eve"))
     assert 60 <= len(lines(operators)) <= 65
-    clock.s += 61
+    clock.now_ns += 61 * NS
     operators.note("refused", "the last", Actor("eve"))
     assert lines(operators)[-1] == "refused: the last (and 440 lines left out)"
 
@@ -182,7 +174,7 @@ def test_sign_in_is_on_from_the_first_name_to_the_end_of_days(tmp_path: Path, cl
         operators = Operators(store)
         assert not operators.is_sign_in_on
         operators.make_token("ci", ["read"], 1, ADMIN)
-        clock.s += 2
+        clock.now_ns += 2 * NS
         assert operators.is_sign_in_on
         store.operators.disable("ci", ADMIN)
         assert Operators(store).is_sign_in_on

@@ -8,20 +8,17 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import GateRefusedError, StateError, UsageError
-from fleetmap.messages import FailureReport, PoseMessage, RobotHealth, WantedVersion, decode_message, robot_key
+from fleetmap.messages import WantedVersion, decode_message, robot_key
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from mapserver import releases
 from mapserver.fleet.canary_controller import find, review
 from mapserver.fleet.fleet import Fleet
-from mapserver.fleet_statistics.canary_decision import (
-    CanarySettings,
-    number_of,
-)
+from mapserver.fleet_statistics.canary_decision import CanarySettings, number_of
 from mapserver.releases import release
 from mapserver.serving.bus_service import BusService
 from mapserver.store import Actor, DraftContent, MapStore, Retention
-from support.fleet.made_fleet import NS, Known, MadeRobot, drive
+from support.fleet.made_fleet import NS, Known, MadeRobot, Message, drive, hear
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import draft_details, publish_samples, random_tile, save_sample_draft
 
@@ -49,17 +46,13 @@ class World:
 
     def run(self, seconds: int, factor_on: dict[int, float]) -> None:
         """Seconds of driving; factor_on: how much more often robots fail on a version."""
-        for now_ns, robot, message in drive(self.robots, seconds, self.clock["ns"]):
-            self.clock["ns"] = now_ns
-            robot.rate_factor = factor_on.get(robot.version, 1.0)
-            if isinstance(message, RobotHealth):
-                self.fleet.take_health("lab", robot.name, message)
-            elif isinstance(message, PoseMessage):
-                self.fleet.take_pose("lab", robot.name, message)
-            else:
-                assert isinstance(message, FailureReport)
-                self.fleet.take_failure("lab", robot.name, message)
-        self.fleet.flush()
+
+        def said() -> Iterator[tuple[int, MadeRobot, Message]]:
+            for now_ns, robot, message in drive(self.robots, seconds, self.clock["ns"]):
+                robot.rate_factor = factor_on.get(robot.version, 1.0)
+                yield now_ns, robot, message
+
+        hear(self.fleet, said(), lambda now_ns: self.clock.update(ns=now_ns))
 
 
 @pytest.fixture

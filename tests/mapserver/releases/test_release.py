@@ -42,11 +42,8 @@ def test_rollback_goes_back_step_by_step_and_promote_forth(store: MapStore, tmp_
     assert states(store) == {1: "published", 2: "retired", 3: "current"}
     assert releases.roll_back(store, "lab") == 1
     logged = [(event.kind, event.version, event.actor, event.reason) for event in store.events("lab")]
-    assert logged[6:9] == [
-        ("rolled_back", 2, "ada", "a test"),
-        ("rolled_back", 1, "", ""),
-        ("promoted", 3, "ada", "a test"),
-    ]
+    by = "ada", "a test"
+    assert logged[6:9] == [("rolled_back", 2, *by), ("rolled_back", 1, "", ""), ("promoted", 3, *by)]
     save_sample_draft(store, seed=9)
     with pytest.raises(StateError, match="is a draft"):
         releases.promote(store, "lab", 4)
@@ -75,11 +72,8 @@ def test_the_gate_compares_with_the_current_version(store: MapStore) -> None:
     (refused,) = store.verdicts("lab", 2)
     assert (refused.accepted, refused.forced, len(refused.reasons)) == (False, False, 1)
     assert releases.publish(store, "lab", actor=ADA, force=True) == 2
-    assert [(event.kind, event.actor) for event in store.events("lab")][-3:] == [
-        ("refused", "ada"),
-        ("forced", "ada"),
-        ("published", "ada"),
-    ]
+    told = [(event.kind, event.actor) for event in store.events("lab")]
+    assert told[-3:] == [("refused", "ada"), ("forced", "ada"), ("published", "ada")]
     save_sample_draft(store, seed=4)
     assert releases.publish(store, "lab", gate=GateSettings(max_bytes_share=100)) == 3
 
@@ -93,10 +87,7 @@ def test_a_person_trusts_a_calibration_that_nothing_judged_and_the_version_carri
     """A refused draft is refused in another store, too; the choice travels with the version, and is no second user's word."""
     report = {EVIDENCE_KEY: msgspec.to_builtins(STRAIGHT)}
     tiles = [random_tile(np.random.default_rng(3), cell=(0, 0))]
-    store.save(
-        "lab",
-        DraftContent(tiles=tiles, vocabulary=b"w", details=draft_details(**report), archive=b"a", evidence=STRAIGHT),
-    )
+    store.save("lab", DraftContent(tiles, b"w", draft_details(**report), archive=b"a", evidence=STRAIGHT))
     command = f"mapserver publish --site lab --store {store.folder} --version 1 --trust-calibration --reason"
     store.export_version("lab", 1, tmp_path / "refused.fmex", archive=False)
     with MapStore.open(tmp_path / "other", create=True) as other:
@@ -125,19 +116,15 @@ def test_a_person_trusts_a_calibration_that_nothing_judged_and_the_version_carri
 
 
 def test_an_import_with_damaged_evidence_is_refused(store: MapStore, tmp_path: Path) -> None:
-    for number, (key, words) in enumerate(
-        ((EVIDENCE_KEY, "report.evidence"), (TRUSTED_KEY, "trusted_calibrations")), 1
+    tiles = [random_tile(np.random.default_rng(3), cell=(0, 0))]
+    trusted = msgspec.structs.replace(draft_details(), configuration={TRUSTED_KEY: [{"rig": 4}]})
+    for details, words in (
+        (draft_details(**{EVIDENCE_KEY: {"calibrations": 3}}), "report.evidence.*damaged"),
+        (trusted, "trusted_calibrations.*damaged"),
     ):
-        details = draft_details(**{EVIDENCE_KEY: {"calibrations": 3}} if key == EVIDENCE_KEY else {})
-        if key == TRUSTED_KEY:
-            details = msgspec.structs.replace(details, configuration={TRUSTED_KEY: [{"rig": 4}]})
-        tiles = [random_tile(np.random.default_rng(3), cell=(0, 0))]
-        store.save("lab", DraftContent(tiles=tiles, vocabulary=b"w", details=details))
-        store.export_version("lab", number, tmp_path / "bad.fmex")
-        with (
-            MapStore.open(tmp_path / "other", create=True) as other,
-            pytest.raises(MapFormatError, match=f"{words}.*damaged"),
-        ):
+        version = store.save("lab", DraftContent(tiles=tiles, vocabulary=b"w", details=details)).version
+        store.export_version("lab", version, tmp_path / "bad.fmex")
+        with MapStore.open(tmp_path / "other", create=True) as other, pytest.raises(MapFormatError, match=words):
             other.import_version(tmp_path / "bad.fmex")
 
 

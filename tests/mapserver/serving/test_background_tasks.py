@@ -42,12 +42,8 @@ def test_one_that_fails_stops_no_other(caplog: pytest.LogCaptureFixture) -> None
         done.append("broken")
         raise ZeroDivisionError
 
-    chores = [
-        BackgroundTask("a", 0.01, refuse),
-        BackgroundTask("b", 0.01, break_down),
-        BackgroundTask("c", 60.0, lambda: done.append("c")),
-    ]
-    run_for(chores, 1.0)
+    third = BackgroundTask("c", 60.0, lambda: done.append("c"))
+    run_for([BackgroundTask("a", 0.01, refuse), BackgroundTask("b", 0.01, break_down), third], 1.0)
     assert done.count("refused") >= 2 and done.count("broken") >= 2
     assert done.count("c") == 1
     assert "a failed: the disk is full" in caplog.text

@@ -117,9 +117,8 @@ def test_what_was_signed_while_the_clock_was_ahead_counts_once_it_is_right(regis
     """A certificate begins with its authority; a session, bundle or old certificate of the future lives no longer for it."""
     made = register.authorities.make_own("r1.1", "robot")
     assert load_pem_x509_certificate(made).not_valid_before_utc <= datetime.now(UTC) - timedelta(minutes=10)
-    entry = EnrolledRobot(
-        site="lab", robot="r1", mark="2", mark_before="1", key="", enrolled_ns=0, renewed_ns=400 * DAY_NS
-    )
+    marks = {"mark": "2", "mark_before": "1"}
+    entry = EnrolledRobot(site="lab", robot="r1", key="", enrolled_ns=0, renewed_ns=400 * DAY_NS, **marks)
     assert {holder.purpose for holder in entry.holders(35 * DAY_NS) if holder.certificate == "r1.1"} == {Purpose.ENROL}
 
 
@@ -213,10 +212,8 @@ def test_a_renewed_certificate_ends_within_a_day_and_its_robot_goes_on(tmp_path:
 
         def renewed(old: bytes) -> bytes:
             key = enrolment.new_key()
-            answer = decode_message(
-                register.renew("lab", "r1", enrolment.renewal_request(old, key)), enrolment.RenewalAnswer
-            )
-            return key + answer.certificate.encode()
+            answer = register.renew("lab", "r1", enrolment.renewal_request(old, key))
+            return key + decode_message(answer, enrolment.RenewalAnswer).certificate.encode()
 
         own, stolen = tmp_path / "own.pem", tmp_path / "stolen.pem"
         own.write_bytes(renewed(bundle))

@@ -61,10 +61,8 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 
 def health(robot: str, status: str = "TRACKING", words: str = "") -> bytes:
-    metrics = {"words": words} if words else {}
-    return msgspec.msgpack.encode(
-        RobotHealth(site="lab", robot=robot, stamp_ns=time.time_ns(), version=1, status=status, metrics=metrics)
-    )
+    about = {"status": status, "metrics": {"words": words} if words else {}}
+    return msgspec.msgpack.encode(RobotHealth(site="lab", robot=robot, stamp_ns=time.time_ns(), version=1, **about))
 
 
 @pytest.mark.parametrize("kind", ["puts", "large strings", "acks", "no messages", "questions", "failures", "maps"])
@@ -109,10 +107,8 @@ def test_a_flood_of_reports_delays_nobody(served: Served, kind: str) -> None:
                 begun_s = time.monotonic()
                 decode_message(bus.get(robot_key("lab", calm, "wanted"), timeout_s=5.0), WantedVersion)
                 report = msgspec.structs.replace(FAILURE, robot=calm, id=f"{kind.replace(' ', '-')}-{len(waits)}")
-                ack = decode_message(
-                    bus.get(robot_key("lab", calm, "failures"), encode_message(report), timeout_s=5.0), FailureAck
-                )
-                assert ack.refused == ""
+                answer = bus.get(robot_key("lab", calm, "failures"), encode_message(report), timeout_s=5.0)
+                assert decode_message(answer, FailureAck).refused == ""
                 decode_message(bus.get(robot_key("lab", calm, "manifests/1"), timeout_s=5.0), Part)
                 waits.append(time.monotonic() - begun_s)
                 time.sleep(max(0.4, SECONDS / 40))
@@ -125,9 +121,8 @@ def test_a_flood_of_reports_delays_nobody(served: Served, kind: str) -> None:
     assert sent[0] > 100
     assert sorted(waits)[-2] < 1.0, "one may meet another test; a flood that delays anybody delays more than one"
     assert more_mb < 50
-    assert more_disk_mb < (50 if kind == "failures" else 10), (
-        "60 failures with their pictures, in the database and in its log"
-    )
+    # 60 failures with their pictures, in the database and in its log.
+    assert more_disk_mb < (50 if kind == "failures" else 10)
 
 
 def test_a_flood_of_failures_is_taken_slowly_and_refused_for_none(served: Served) -> None:

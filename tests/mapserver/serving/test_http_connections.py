@@ -52,10 +52,8 @@ class Door:
 
     def __init__(self, listener: BoundedListener, **tls: Any) -> None:
         self.listener, self.port = listener, listener.getsockname()[1]
-        config = uvicorn.Config(
-            application, http="h11", loop="asyncio", log_config=None, log_level="error", lifespan="off", **tls
-        )
-        self.server = uvicorn.Server(config)
+        quiet = {"log_config": None, "log_level": "error", "lifespan": "off"}
+        self.server = uvicorn.Server(uvicorn.Config(application, http="h11", loop="asyncio", **quiet, **tls))
         self.thread = threading.Thread(target=lambda: asyncio.run(self._run()))
         self.thread.start()
 

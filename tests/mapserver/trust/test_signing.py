@@ -54,7 +54,6 @@ def told(store: MapStore, version: int) -> int | None:
 
 def states(store: MapStore) -> dict[int, str]:
     found = SignedLists(store.folder).served("lab")
-    assert found is not None
     return {entry.about.version: entry.about.state for entry in found.admitted}
 
 
@@ -73,7 +72,6 @@ def test_every_release_is_signed_at_once(store: MapStore) -> None:
     assert states(store) == {1: "previous", 2: "current"}
     found = SignedLists(store.folder).served("lab")
     info = store.version("lab", 2)
-    assert found is not None
     assert found.state("current").length == info.manifest_bytes
     assert found.state("current").about.vocabulary == info.vocabulary_sha256
 
@@ -252,7 +250,6 @@ def test_beyond_loopback_a_store_must_be_signed_first(tmp_path: Path, clock: Clo
 def test_a_new_site_is_signed_for_by_itself_where_the_root_is_here(store: MapStore) -> None:
     publish_samples(store, 1, first=5, site="yard")
     found = SignedLists(store.folder).served("yard")
-    assert found is not None
     assert found.state("current").about.version == 1
     assert len(trust_status(store).risks) == 3
 
@@ -332,21 +329,15 @@ def test_what_else_lies_in_the_folder_of_lists(store: MapStore, tmp_path: Path) 
     os.mkfifo(folder / "78.root.json")
     assert lists.file("lab", "78.root.json") == b"", "a pipe would stop the server"
     (folder / "77.root.json").unlink()
-    assert any("trust" in fault and "symbolic link" in fault for fault in verify_with_link(store, tmp_path))
-
-
-def verify_with_link(store: MapStore, tmp_path: Path) -> list[str]:
-    (store.folder / "trust" / "9.snapshot.json").symlink_to(tmp_path / "secret")
-    return store.verify().faults
+    (folder / "9.snapshot.json").symlink_to(tmp_path / "secret")
+    assert any("trust" in fault and "symbolic link" in fault for fault in store.verify().faults)
 
 
 def test_metrics_say_how_long_the_lists_last(store: MapStore, clock: Clock) -> None:
     fleet = Fleet(store, clock_ns=clock)
     for robot, hours in (("r1", 0.5), ("r2", 31.0), ("r3", None)):
-        health = RobotHealth(
-            site="lab", robot=robot, stamp_ns=1, version=1, status="TRACKING", metrics={"map_word_hours": hours}
-        )
-        fleet.take_health("lab", robot, health)
+        about = {"status": "TRACKING", "metrics": {"map_word_hours": hours}}
+        fleet.take_health("lab", robot, RobotHealth(site="lab", robot=robot, stamp_ns=1, version=1, **about))
 
     def figures() -> dict[str, float]:
         lines = Metrics(store, fleet).text().decode().splitlines()
@@ -354,11 +345,8 @@ def test_metrics_say_how_long_the_lists_last(store: MapStore, clock: Clock) -> N
 
     found = figures()
     assert found['fleetmap_site_map_word_hours_max{site="lab"}'] == 31.0
-    days = {
-        role: found[f'fleetmap_trust_days_left{{role="{role}"}}']
-        for role in ("root", "targets", "timestamp", "site-lab")
-    }
-    assert days == {"root": 730.0, "targets": 365.0, "timestamp": 1.0, "site-lab": 14.0}
+    for role, days in (("root", 730.0), ("targets", 365.0), ("timestamp", 1.0), ("site-lab", 14.0)):
+        assert found[f'fleetmap_trust_days_left{{role="{role}"}}'] == days
     assert found["fleetmap_trust_faults"] == 0
     clock.now_ns += 8 * 24 * HOUR_NS
     found = figures()
@@ -384,7 +372,6 @@ def test_signed_files_are_verified_and_changed_ones_refused(tmp_path: Path) -> N
             with pytest.raises(UntrustedError, match="is not the file that was signed"):
                 verify_files(store, signature, files)
         for wrong in (sign_files(other, REPORT), b"[]", b"{", b"{}", signature.replace(b'"sig": "', b'"sig": "AAAA')):
-            assert wrong is not None
             with pytest.raises(UntrustedError, match="online key"):
                 verify_files(store, wrong, REPORT)
         (store.folder / "keys" / "online.pem").unlink()

@@ -1,12 +1,13 @@
 """Synthetic robots that report like real ones, with known failures: for tests and benchmarks of statistics."""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from fleetmap.messages import FailureReport, FixNote, Placement, PoseMessage, RobotHealth, Thumbnail
+from mapserver.fleet.fleet import Fleet
 
 BLIND_STEPS = 4  # seconds without a place after a failure begins; its report comes when they are over
 GOOD_STEPS = 8
@@ -144,3 +145,21 @@ def drive(robots: list[MadeRobot], seconds: int, start_ns: int) -> Iterator[tupl
         for robot in robots:
             for message in robot.second(now_ns):
                 yield now_ns, robot, message
+
+
+def hear(
+    fleet: Fleet, said: Iterable[tuple[int, MadeRobot, Message]], set_ns: Callable[[int], object]
+) -> list[FailureReport]:
+    """The server takes all of it, its clock set to each moment; the failures among it."""
+    reports = []
+    for now_ns, robot, message in said:
+        set_ns(now_ns)
+        if isinstance(message, RobotHealth):
+            fleet.take_health(robot.site, robot.name, message)
+        elif isinstance(message, PoseMessage):
+            fleet.take_pose(robot.site, robot.name, message)
+        else:
+            assert fleet.take_failure(robot.site, robot.name, message).refused == ""
+            reports.append(message)
+    fleet.flush()
+    return reports

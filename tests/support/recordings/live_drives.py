@@ -4,9 +4,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import Self
+from typing import NamedTuple, Self
 
-from fleetmap.geometry import Array
+import numpy as np
+
+from fleetmap.geometry import Array, se3_inverse
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import CameraFrame, SensorSet
@@ -28,13 +30,8 @@ class MappingHere:
     made: "MappingHere"
 
     def __init__(self, config: SurveyConfig, rig: LiveRig) -> None:
-        self._map, self.sketch, self.behind, self.failed, self.longest_lag_s = (
-            LiveMap(config, rig),
-            NO_SKETCH,
-            0,
-            "",
-            0.0,
-        )
+        self.map, self.sketch = LiveMap(config, rig), NO_SKETCH
+        self.behind, self.failed, self.longest_lag_s = 0, "", 0.0
         self.after: dict[int, MapSketch] = {}  # by frame
         MappingHere.made = self
 
@@ -46,8 +43,8 @@ class MappingHere:
 
     def put(self, frame: RectifiedFrame, keyframe: NewKeyframe) -> None:
         """One more keyframe."""
-        self._map.add(frame, keyframe)
-        self.sketch = self.after[keyframe.number] = sketch_of(self._map)
+        self.map.add(frame, keyframe)
+        self.sketch = self.after[keyframe.number] = sketch_of(self.map)
 
     def finish(self) -> None:
         """Nothing waits."""
@@ -55,7 +52,21 @@ class MappingHere:
     @property
     def map_from_body(self) -> Array:
         """(K, 4, 4) of the keyframes."""
-        return self._map.map_from_body
+        return self.map.map_from_body
+
+
+class Laid(NamedTuple):
+    """truth_from_map (4, 4) that lays the first pose upon the truth, and error_m (K,) of all poses then."""
+
+    truth_from_map: Array
+    error_m: Array
+
+
+def laid_on_truth(map_from_body: Array, sample: Sample, frames: list[int]) -> Laid:
+    """Poses of these frames against the truth of their recording."""
+    truth = np.array(sample.world_from_body)[frames]
+    truth_from_map = truth[0] @ se3_inverse(map_from_body[0])
+    return Laid(truth_from_map, np.linalg.norm((truth_from_map @ map_from_body - truth)[:, :3, 3], axis=1))
 
 
 @contextmanager

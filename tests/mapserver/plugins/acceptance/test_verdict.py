@@ -1,6 +1,8 @@
 """Sites that must fail are told so in the first line, by the figures of maps and frames without pictures; and what a change made better."""
 
 import copy
+from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +46,7 @@ HALVES = Areas.of([Area(name, ((box,),)) for name, box in (
 
 
 def both(first: Aisle, second: Aisle) -> Aisle:
-    return Aisle(
-        *(
-            np.concatenate(pair)
-            for pair in zip(*((a.points_map, a.descriptors, a.reaches_m) for a in (first, second)), strict=True)
-        )
-    )
+    return Aisle(*(np.concatenate([getattr(a, f.name) for a in (first, second)]) for f in fields(Aisle)))
 
 
 def report(seen: Aisle, surveyed: Array, driven: Array, *, dark: str = "") -> Report:
@@ -74,9 +71,8 @@ def report(seen: Aisle, surveyed: Array, driven: Array, *, dark: str = "") -> Re
         pictures.append(Picture(probe, grey, error_m, False, rungs))
         outcome = "lost" if fix is None else "ambiguous" if aliases(view, probe) else "found"
         starts.append(Start(place[:2, 3], outcome))
-    figures = DriveFigures(
-        "drive", "00", len(driven), 0.01, "ground truth", False, 1.0, 0, 0, None, [20.0], CALIBRATION, []
-    )
+    known = "ground truth", False, 1.0, 0, 0, None, [20.0], CALIBRATION, []
+    figures = DriveFigures("drive", "00", len(driven), 0.01, *known)
     ride = Drive(figures, starts, pictures, driven[:, :2, 3])
     return Report(
         site="hall", version=3, manifest_sha256="ab" * 32, created="2026-11-28", promises=[], areas=areas_of(view, where, [ride]),
@@ -116,10 +112,7 @@ def test_a_site_surveyed_in_one_direction_is_told_so(good: Report) -> None:
     one_way = report(DIFFERENT, np.concatenate([ONE, TWO, TWO[::-1] @ BACK]), DRIVEN)
     found = verdict(one_way)
     assert not found.is_accepted
-    assert (
-        found.verdict
-        == "NOT ACCEPTED: hall, version 3: aisle 1 was surveyed in one direction only, nobody drove it facing W."
-    )
+    assert "aisle 1 was surveyed in one direction only, nobody drove it facing W" in found.verdict
     assert found.survey_again[0].startswith("aisle 1: drive it facing W")
     assert verdict(one_way, ONE_WAY).is_accepted
     assert "if robots drive every aisle as it was surveyed" in verdict(one_way, ONE_WAY).verdict
@@ -139,49 +132,32 @@ def test_two_identical_aisles_are_told_so() -> None:
 
 def test_a_dark_aisle_is_told_so(good: Report) -> None:
     found = verdict(report(DIFFERENT, BOTH_WAYS, DRIVEN, dark="aisle 2"))
-    assert found.verdict.startswith(
-        "NOT ACCEPTED: hall, version 3: aisle 2 is too dark (grey level 5 of 255): 0 of 8 frames get a fix"
-    )
+    assert "aisle 2 is too dark (grey level 5 of 255): 0 of 8 frames get a fix" in found.verdict
     assert "aisle 2: survey it with more light" in found.survey_again
     change = compared(found, verdict(good))
     assert "aisle 2: 0 of 8 frames localized, 8 of 8 before" in change.worse
     assert not any(words.startswith("aisle 1") for words in (*change.better, *change.worse))
 
 
-def test_what_a_site_with_half_its_light_needs_is_said(good: Report) -> None:
-    dim = copy.deepcopy(good)
-    dim.areas[1].darkness["1"] = Count(0, 8)
-    assert "aisle 2 is nearly too dark: with half its light 0 of 8 frames get a fix" in verdict(dim).verdict
+DOUBTED = RigEvidence("rig", [], {}, {"pair geometry": "0.3 degrees off"})
 
 
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"silent": 1}, "1 silent failures while driving"),
-        ({"localised_share": 0.3}, "30 % of drive drive is localized"),
+        (lambda r: r.areas[1].darkness.update({"1": Count(0, 8)}), "aisle 2 is nearly too dark: with half its light 0"),
+        (lambda r: setattr(r.drives[0], "silent", 1), "1 silent failures while driving"),
+        (lambda r: setattr(r.drives[0], "localised_share", 0.3), "30 % of drive drive is localized"),
+        (lambda r: setattr(r.areas[0].starts, "silent", 1), "aisle 1: 1 starts without a guess are silently wrong"),
+        (lambda r: setattr(r, "calibrations", [DOUBTED]), "rig is in doubt: pair geometry: 0.3 degrees off"),
+        (lambda r: r.areas.pop(), "only 8 frames at a known place judge it, 12 are needed"),
+        (lambda r: setattr(r.areas[0], "frames", Count(1, 4)), ""),  # the share may well be a half
     ],
 )
-def test_a_drive_that_fails_is_a_reason(good: Report, change: dict[str, float], words: str) -> None:
-    worse = msgspec.structs.replace(good, drives=[msgspec.structs.replace(good.drives[0], **change)])
-    assert words in verdict(worse).verdict
-
-
-def test_a_silent_start_a_doubted_calibration_and_too_few_frames_are_reasons(good: Report) -> None:
-    bad = copy.deepcopy(good)
-    bad.areas[0].starts.silent += 1
-    assert "aisle 1: 1 starts without a guess are silently wrong" in verdict(bad).verdict
-    doubted = msgspec.structs.replace(
-        good, calibrations=[RigEvidence("rig", [], {}, {"pair geometry": "0.3 degrees off"})]
-    )
-    assert "the calibration rig is in doubt: pair geometry: 0.3 degrees off" in verdict(doubted).verdict
-    few = msgspec.structs.replace(good, areas=[area for area in copy.deepcopy(good.areas) if area.name == "aisle 1"])
-    assert "only 8 frames at a known place judge it, 12 are needed" in verdict(few).verdict
-
-
-def test_a_few_misses_are_chance_and_no_reason(good: Report) -> None:
-    few = copy.deepcopy(good)
-    few.areas[0].frames = Count(1, 4)
-    assert verdict(few).is_accepted  # the share may well be a half
+def test_what_is_a_reason_by_itself(good: Report, change: Callable[[Report], object], words: str) -> None:
+    change(changed := copy.deepcopy(good))
+    assert words in verdict(changed).verdict
+    assert verdict(changed).is_accepted == (not words)
 
 
 def test_many_areas_of_few_tries_are_judged_together(good: Report) -> None:
@@ -205,11 +181,6 @@ def test_what_was_not_tried_is_not_accepted(good: Report) -> None:
     assert "unknown place: 1 starts without a guess are silently wrong" in verdict(bad).verdict
 
 
-def test_equal_reports_differ_in_nothing(good: Report) -> None:
-    found = compared(verdict(good), verdict(good))
-    assert (found.better, found.worse) == ([], [])
-
-
 def test_a_larger_error_is_worse_and_chance_is_not(good: Report) -> None:
     blunt, shuffled = copy.deepcopy(good), copy.deepcopy(good)
     for area in blunt.areas:
@@ -218,6 +189,8 @@ def test_a_larger_error_is_worse_and_chance_is_not(good: Report) -> None:
         area.errors_mm = [1.05 * error for error in area.errors_mm]
     assert any(words.startswith("all areas: median error") for words in compared(verdict(blunt), verdict(good)).worse)
     assert compared(verdict(shuffled), verdict(good)).worse == []
+    same = compared(verdict(good), verdict(good))
+    assert (same.better, same.worse) == ([], [])
 
 
 def test_documents_begin_with_the_verdict_and_are_the_same_each_time(good: Report) -> None:
@@ -287,10 +260,8 @@ def test_ladders_are_the_same_each_time_and_leave_depth_alone() -> None:
     for kind, levels in (("darkness", STOPS), ("blur", BLUR_PX)):
         one, two = (list(ladders(frame, 7)[kind]) for _ in range(2))
         assert [level for level, _ in one] == list(levels)
-        assert all(
-            np.array_equal(a.left, b.left) and a.depth_m is frame.depth_m
-            for (_, a), (_, b) in zip(one, two, strict=True)
-        )
+        for (_, a), (_, b) in zip(one, two, strict=True):
+            assert np.array_equal(a.left, b.left) and a.depth_m is frame.depth_m
 
 
 def test_the_darkest_level_divides_pictures_with_a_fix_from_those_without() -> None:

@@ -23,27 +23,23 @@ from mapserver.plugins.alert_messages import Webhook, check_address
 from mapserver.store import MapStore
 from support.fleet.nav2_client import eventually
 from support.fleet.webhook_receiver import receiver
-from support.storage.clock import Clock
+
+NOW_NS = 1_900_000_000_000_000_000
 
 
 @pytest.fixture
-def clock() -> Clock:
-    return Clock(1_900_000_000_000_000_000)
-
-
-@pytest.fixture
-def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
-    with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as opened:
+def store(tmp_path: Path) -> Iterator[MapStore]:
+    with MapStore.open(tmp_path / "store", create=True) as opened:
         yield opened
 
 
-def test_it_is_told_once_and_once_more_when_it_is_over(clock: Clock, tmp_path: Path) -> None:
-    held = [Alert("FleetmapRobotLost", "lab", "r1", clock(), "r1 of lab has had no known position for 5 min")]
+def test_it_is_told_once_and_once_more_when_it_is_over(tmp_path: Path) -> None:
+    held = [Alert("FleetmapRobotLost", "lab", "r1", NOW_NS, "r1 of lab has had no known position for 5 min")]
     (tmp_path / "token").write_text("secret\n")
     with receiver() as (address, got):
         sender = Webhook(AlertSettings(webhook=address, token_file=str(tmp_path / "token")))
         for active in (held, held, held, [], [], []):
-            sender.tell(active, clock())
+            sender.tell(active, NOW_NS)
         assert eventually(lambda: len(got) == 2)
         sender.close()
     assert {headers["Authorization"] for headers, _ in got} == {"Bearer secret"}

@@ -92,7 +92,9 @@ def test_old_snapshots_go_with_what_they_alone_name(store: MapStore, clock: Cloc
     assert verify(target).faults == []
 
 
-def test_garbage_that_is_collected_meanwhile_is_no_fault(store: MapStore, tmp_path: Path, clock: Clock) -> None:
+def test_garbage_that_is_collected_meanwhile_is_no_fault(
+    store: MapStore, tmp_path: Path, clock: Clock, target: BackupTarget
+) -> None:
     save_sample_draft(store, seed=7)
     clock.now_ns += 40 * DAY_NS
 
@@ -100,26 +102,27 @@ def test_garbage_that_is_collected_meanwhile_is_no_fault(store: MapStore, tmp_pa
         if done == 1:
             store.collect_garbage(Retention(keep_drafts=0, keep_days=0.0))
 
-    target = BackupTarget(str(tmp_path / "backups"), create=True)
     report = back_up(store, target, progress=collect)
     assert report.missing == ()
     assert target.read()[1].versions == 2
     restore(target, tmp_path / "new", ADA)
 
 
-def test_a_blob_that_the_store_lost_is_named_and_the_rest_is_kept(store: MapStore, tmp_path: Path) -> None:
+def test_a_blob_that_the_store_lost_is_named_and_the_rest_is_kept(
+    store: MapStore, tmp_path: Path, target: BackupTarget
+) -> None:
     lost, damaged = (tile.sha256 for tile in store.manifest("lab", 2).tiles[:2])
     (store.folder / blob_path(lost)).unlink()
     (store.folder / blob_path(damaged)).write_bytes(b"other")
-    target = BackupTarget(str(tmp_path / "backups"), create=True)
     report = back_up(store, target)
     assert set(report.missing) == {lost, damaged}
     assert len(verify(target).faults) == 2
     assert restore(target, tmp_path / "new", ADA).missing == report.missing
 
 
-def test_a_backup_heals_what_the_store_loses_later(store: MapStore, tmp_path: Path, clock: Clock) -> None:
-    target = BackupTarget(str(tmp_path / "backups"), create=True)
+def test_a_backup_heals_what_the_store_loses_later(
+    store: MapStore, tmp_path: Path, clock: Clock, target: BackupTarget
+) -> None:
     back_up(store, target)
     (store.folder / blob_path(store.manifest("lab", 2).tiles[0].sha256)).unlink()
     clock.now_ns += DAY_NS
@@ -200,8 +203,9 @@ def test_a_hostile_target_writes_nowhere_else(store: MapStore, tmp_path: Path, t
         assert {path.name for path in tmp_path.iterdir()} <= {"backups", "store", "new"}
 
 
-def test_a_clock_that_was_ahead_hides_no_later_snapshot(store: MapStore, tmp_path: Path, clock: Clock) -> None:
-    target = BackupTarget(str(tmp_path / "backups"), create=True)
+def test_a_clock_that_was_ahead_hides_no_later_snapshot(
+    store: MapStore, tmp_path: Path, clock: Clock, target: BackupTarget
+) -> None:
     clock.now_ns += 400 * DAY_NS
     back_up(store, target, keep=1)
     clock.now_ns -= 400 * DAY_NS
@@ -212,9 +216,8 @@ def test_a_clock_that_was_ahead_hides_no_later_snapshot(store: MapStore, tmp_pat
 
 
 def test_a_target_that_fails_is_not_a_store_that_lost_something(
-    store: MapStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: MapStore, target: BackupTarget, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    target = BackupTarget(str(tmp_path / "backups"), create=True)
     back_up(store, target, keep=1)
     before = target.snapshots()
     save_sample_draft(store, seed=7)
@@ -232,9 +235,8 @@ def test_a_target_that_fails_is_not_a_store_that_lost_something(
 
 
 def test_a_folder_with_something_in_it_stays_as_it_is(
-    store: MapStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    store: MapStore, tmp_path: Path, target: BackupTarget, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    target = BackupTarget(str(tmp_path / "backups"), create=True)
     back_up(store, target)
     disk = tmp_path / "disk"  # a new file system
     (disk / "lost+found").mkdir(parents=True)

@@ -36,10 +36,8 @@ class Server:
 
     def __init__(self, folder: Path, hub: MemoryHub, clock: Clock) -> None:
         self.folder, self.hub, self.clock = folder / "store", hub, clock
-        self.target, self.identity = (
-            BackupTarget(str(folder / "backups"), create=True),
-            pyrage.x25519.Identity.generate(),
-        )
+        self.target = BackupTarget(str(folder / "backups"), create=True)
+        self.identity = pyrage.x25519.Identity.generate()
 
     def start(self) -> None:
         self.stack = ExitStack()

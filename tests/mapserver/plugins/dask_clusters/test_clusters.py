@@ -24,6 +24,8 @@ from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs, SurveyToo
 from mapserver.tiles.tiling import tiles_from_survey
 from support.recordings.recording_samples import calibration, make_sample
 
+IN_THREADS = {"threads_per_worker": 1, "processes": False}
+
 
 def surveyed_by(worker: Executor) -> tuple[bytes, ...]:
     """Archive and tiles of a small survey."""
@@ -39,7 +41,7 @@ def surveyed_by(worker: Executor) -> tuple[bytes, ...]:
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Client]:
     with (
-        LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as there,
+        LocalCluster(n_workers=1, dashboard_address=None, **IN_THREADS) as there,
         Client(there) as client,
     ):
         yield client
@@ -67,14 +69,7 @@ def tls_cluster(workers: int) -> Iterator[LocalCluster]:
     }
     with (
         dask.config.set({f"distributed.comm.tls.{name}": value for name, value in config.items()}),
-        LocalCluster(
-            n_workers=workers,
-            threads_per_worker=1,
-            processes=False,
-            dashboard_address=":0",
-            protocol="tls",
-            security=made,
-        ) as there,
+        LocalCluster(n_workers=workers, dashboard_address=":0", protocol="tls", security=made, **IN_THREADS) as there,
     ):
         yield there
 

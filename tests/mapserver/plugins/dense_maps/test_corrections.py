@@ -41,10 +41,8 @@ def test_surfels_and_pictures() -> None:
     old, new = (SurfelTiles({(0, 0): encode_tile((0, 0), surfels(places, grey))}) for grey in (3, 9))
     corrections = Corrected(AreaCorrections([area(NEVER_USE, (0, 8), (4, 16)), area(FREEZE, (8, 0), (16, 4))]))
     found = corrections.surfels(new, old).surfels((0, 0))
-    at = {
-        tuple(place): int(grey)
-        for place, grey in zip(np.floor(found.points_map[:, :2]).tolist(), found.greys, strict=True)
-    }
+    places = map(tuple, np.floor(found.points_map[:, :2]).tolist())
+    at = dict(zip(places, found.greys.tolist(), strict=True))
     assert len(at) == len(found) == 256 - 32
     assert {grey for (x, y), grey in at.items() if x >= 8 and y < 4} == {3}
     assert {grey for (x, y), grey in at.items() if not (x >= 8 and y < 4)} == {9}

@@ -1,5 +1,7 @@
 """Views drawn by the core against a slow reference, and of scenes whose view can be said."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,12 +13,11 @@ from mapserver.plugins.dense_maps.surfel_map import Surfels
 from support.storage.dense_samples import wall
 
 PINHOLE = CameraCalibration("radial-tangential", 64, 48, np.array([60.0, 60.0, 31.5, 23.5]), np.zeros(0), np.eye(4))
-BENT = CameraCalibration(
-    "radial-tangential", 64, 48, np.array([60.0, 58.0, 30.0, 24.0]), np.array([-0.2, 0.05, 1e-3, -1e-3]), np.eye(4)
+BENT = replace(
+    PINHOLE, intrinsics_px=np.array([60.0, 58.0, 30.0, 24.0]), distortion=np.array([-0.2, 0.05, 1e-3, -1e-3])
 )
-FISHEYE = CameraCalibration(
-    "equidistant", 64, 48, np.array([24.0, 24.0, 31.5, 23.5]), np.array([-0.01, 0.002, 0.0, 0.0]), np.eye(4)
-)
+AT_24_PX, WIDE = np.array([24.0, 24.0, 31.5, 23.5]), np.array([-0.01, 0.002, 0.0, 0.0])
+FISHEYE = CameraCalibration("equidistant", 64, 48, AT_24_PX, WIDE, np.eye(4))
 OPTICAL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 FORWARD = se3(OPTICAL, np.zeros(3))
 MIN_PIXELS, THICK_EDGES, THICK_PER_M = 0.75, 3.0, 100.0  # as surfels.cpp has them

@@ -92,13 +92,8 @@ def wall_views(
         with np.errstate(divide="ignore"):
             depth = np.minimum(np.where(down > 0, HEIGHT_M / down, np.inf), 9.0 - x)
         to_wall = wall_x_m - x
-        hits = (
-            wall
-            & (to_wall > 0)
-            & (HEIGHT_M - down * to_wall > 0)
-            & (HEIGHT_M - down * to_wall < 1.2)
-            & (np.abs(across * to_wall) < 2)
-        )
+        height_m = HEIGHT_M - down * to_wall
+        hits = wall & (to_wall > 0) & (height_m > 0) & (height_m < 1.2) & (np.abs(across * to_wall) < 2)
         depth = np.where(hits, np.minimum(depth, to_wall), depth)
         disparity = np.where(np.isfinite(depth), lens.focal_px * lens.baseline_m / depth, np.nan).astype(np.float32)
         map_from_cam = se3(OPTICAL, np.array([x, 0.02, 5.0 + HEIGHT_M]))
@@ -155,12 +150,8 @@ def test_nothing_is_free_beside_the_edge_of_a_thing() -> None:
     views = SessionViews()
     for _ in range(8):
         disparity[:, 296:304] = px / 5.0  # an edge that lies 4 px within the post
-        views.add(
-            (disparity, nearest_around(disparity, REACH_PX), 0.3),
-            lens,
-            se3(OPTICAL, np.array([0.0, 0.0, HEIGHT_M])),
-            HEIGHT_M,
-        )
+        view = disparity, nearest_around(disparity, REACH_PX), 0.3
+        views.add(view, lens, se3(OPTICAL, np.array([0.0, 0.0, HEIGHT_M])), HEIGHT_M)
     grid = occupancy(updated(views), 0.8)
     left_m = (319.5 - 302) * 2.0 / 420.0
     assert cell(grid, 1.5, left_m * 0.75) == 0

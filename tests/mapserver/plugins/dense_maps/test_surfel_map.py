@@ -6,6 +6,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from fleetmap.errors import MapFormatError, NewerFormatError, StateError
 from mapserver import releases
@@ -41,11 +42,8 @@ def test_a_version_keeps_them_and_gives_those_that_are_near(tmp_path: Path) -> N
         found = surfels_of(manifest, store.blob)
         near = surfels_of(manifest, store.blob, (1.0, 1.0, 2.0))
     assert (len(found), found.falloff) == (len(surfels), surfels.falloff)
-    order, wanted = (np.lexsort(s.points_map[:, ::-1].round(2).T) for s in (found, surfels))
-    gap = np.linalg.norm(
-        found.points_map[order][:, None, :2] - surfels.points_map[wanted][None, :50, :2], axis=2
-    ).argmin(axis=0)
-    picked, meant = found[order[gap]], surfels[wanted[:50]]
+    meant = surfels[:50]
+    picked = found[cKDTree(found.points_map).query(meant.points_map)[1]]
     np.testing.assert_allclose(picked.points_map, meant.points_map, atol=6e-4)
     assert (picked.normals * meant.normals).sum(axis=1).min() > np.cos(np.radians(1.0))
     np.testing.assert_array_equal(picked.levels, meant.levels)
@@ -93,24 +91,21 @@ def test_what_is_not_there_or_damaged_is_told(tmp_path: Path) -> None:
             surfels_of(bare, store.blob)
         manifest = store.manifest("lab", save_surfel_draft(store, wall()))
         blobs = encode_surfels(wall())
-    said = msgspec.structs.replace(manifest, report={"surfels": {"without": {"ride": "one camera measures no depth"}}})
-    with pytest.raises(StateError, match="ride: one camera"):
-        surfels_of(said, {}.__getitem__)
-    with pytest.raises(MapFormatError, match="surfels"):
-        surfels_of(msgspec.structs.replace(manifest, report={"surfels": {"sha256": "x"}}), {}.__getitem__)
-    index = manifest.report["surfels"]["sha256"]
-    with pytest.raises(MapFormatError, match="index of surfels"):
-        surfels_of(manifest, lambda _: b"{}[")
-    newer = blobs[0].replace(b'"format_version":1', b'"format_version":2')
-    with pytest.raises(NewerFormatError, match="format 2"):
-        surfels_of(manifest, lambda _: newer)
-    with pytest.raises(NewerFormatError, match="format 2"):
-        surfels_of(
-            manifest, lambda sha: blobs[0] if sha == index else blobs[1][:4] + struct.pack("<H", 2) + blobs[1][6:]
-        )
-    first = msgspec.json.decode(blobs[0])["tiles"][0]["sha256"]
-    swapped = {index: blobs[0], first: blobs[2]}
-    with pytest.raises(MapFormatError, match="is at the place of"):
-        surfels_of(manifest, lambda sha: swapped.get(sha, blobs[1]))
-    with pytest.raises(MapFormatError, match="surfel tile"):
-        surfels_of(manifest, lambda sha: blobs[0] if sha == index else blobs[1][:40])
+    for said, kind, words in (
+        ({"without": {"ride": "one camera measures no depth"}}, StateError, "ride: one camera"),
+        ({"sha256": "x"}, MapFormatError, "surfels"),
+    ):
+        with pytest.raises(kind, match=words):
+            surfels_of(msgspec.structs.replace(manifest, report={"surfels": said}), {}.__getitem__)
+    first, second = (tile["sha256"] for tile in msgspec.json.decode(blobs[0])["tiles"][:2])
+    newer_tile = blobs[1][:4] + struct.pack("<H", 2) + blobs[1][6:]
+    for index, tiles, kind, words in (
+        (b"{}[", {}, MapFormatError, "index of surfels"),
+        (blobs[0].replace(b'"format_version":1', b'"format_version":2'), {}, NewerFormatError, "format 2"),
+        (blobs[0], {first: newer_tile}, NewerFormatError, "format 2"),
+        (blobs[0], {first: blobs[2], second: blobs[1]}, MapFormatError, "is at the place of"),
+        (blobs[0], {first: blobs[1][:40]}, MapFormatError, "surfel tile"),
+    ):
+        known = {manifest.report["surfels"]["sha256"]: index, first: blobs[1], second: blobs[2]} | tiles
+        with pytest.raises(kind, match=words):
+            surfels_of(manifest, known.__getitem__)

@@ -8,10 +8,7 @@ from fleetmap.errors import MapFormatError, NewerFormatError, StateError
 from fleetmap.geometry import se3, so3_exp
 from fleetmap.mapformat.names import sha256_hex
 from fleetmap.sensors.rectification import RectifiedFrame
-from mapserver.plugins.dense_maps.survey_pictures import (
-    kept_pictures,
-    nearest_pictures,
-)
+from mapserver.plugins.dense_maps.survey_pictures import kept_pictures, nearest_pictures
 from mapserver.store import MapStore
 from mapserver.store.survey_pictures import PICTURES_KEY, PictureIndex, SurveyPicture, pictures_of
 from support.storage.dense_samples import save_session_pictures
@@ -57,9 +54,8 @@ def test_those_that_look_elsewhere_come_last() -> None:
     ahead, back = (index_of(kept_pictures([along(9.0, yaw=yaw)], (), {}.__getitem__, 7)[0]) for yaw in (0.0, np.pi))
     place, looks = np.array([4.0, 0.0, 0.5]), np.array(back[0].looks_map)
     found = nearest_pictures((*ahead, *back), place, looks)
-    assert [one for one, _ in found[:4]] == sorted(
-        back, key=lambda one: np.linalg.norm(np.subtract(one.place_map_m, place))
-    )
+    by_distance = sorted(back, key=lambda one: np.linalg.norm(np.subtract(one.place_map_m, place)))
+    assert [one for one, _ in found[:4]] == by_distance
     assert found[0][1] < 1.5
 
 

@@ -1,6 +1,7 @@
 """Pictures of a room become surfels that show it again; what moved is not among them, and a later drive takes over."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -90,9 +91,7 @@ def test_exposures_of_views_and_drives_are_evened_out_and_shown_again() -> None:
         for number, factor in enumerate(factors):
             seen = session.survey.odometry.keyframes[number]
             left = np.clip(seen.frame.left * factor, 0, 255).astype(np.uint8)
-            session.survey.odometry.keyframes[number] = Seen(
-                RectifiedFrame(number, left, None, seen.frame.disparity_px), number
-            )
+            session.survey.odometry.keyframes[number] = Seen(replace(seen.frame, left=left), number)
         return session
 
     factors = np.exp(np.cumsum(rng.normal(0, 0.05, 12))) * 0.7

@@ -46,10 +46,8 @@ def test_one_walks_along_the_survey(page: Page, served: Served) -> None:
     assert (ahead[1], ahead[2]) == pytest.approx((start[1], 0.0), abs=0.03)
     for _ in range(12):
         page.keyboard.press("ArrowLeft")
-    wait_until(
-        page,
-        "Math.abs(Math.abs(document.querySelector('.site-map').marks().find(m => m.name === 'you').heading_rad) - Math.PI) < 0.01",
-    )
+    you = "document.querySelector('.site-map').marks().find(m => m.name === 'you')"
+    wait_until(page, f"Math.abs(Math.abs({you}.heading_rad) - Math.PI) < 0.01")
     page.keyboard.press("w")
     assert stood(page, 1)[0] == start[0], "who looks back walks back"
     page.get_by_role("button", name="Turn right").click()

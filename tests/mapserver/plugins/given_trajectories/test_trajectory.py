@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from fleetmap.errors import FleetmapError, RecordingError, UsageError
-from fleetmap.geometry import Array, quat_wxyz_from_rotation, se3, se3_exp, se3_inverse, so3_exp
+from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings.sensor_subset import reduced
 from fleetmap.recordings.tum import write_tum
@@ -63,6 +64,12 @@ def drifted(sample: Sample) -> Array:
     return np.array([OTHER_FROM_MAP @ true @ se3_exp(d) for true, d in zip(sample.world_from_body, drift, strict=True)])
 
 
+def pose_rows(poses: Array, *, scalar_first: bool = False) -> Array:
+    """(F, 7) positions and quaternions."""
+    quats = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=scalar_first)
+    return np.hstack([poses[:, :3, 3], quats])
+
+
 def written(
     file: Path,
     other_from_body: Array,
@@ -76,12 +83,9 @@ def written(
     """A text file of poses of the body, brought into another system's convention."""
     other_from_it = other_from_body @ BODY_FROM_CAM0 if camera else other_from_body.copy()
     other_from_it[:, :3, 3] *= scale
-    rows = []
-    for stamp, matrix in zip(stamps, se3_inverse(other_from_it) if inverse else other_from_it, strict=True):
-        w, x, y, z = quat_wxyz_from_rotation(matrix[:3, :3])
-        quat = (x, y, z, w) if order == "xyzw" else (w, x, y, z)
-        rows.append(" ".join([stamp, *(f"{value:.9f}" for value in (*matrix[:3, 3], *quat))]))
-    file.write_text("\n".join(rows) + "\n")
+    rows = pose_rows(se3_inverse(other_from_it) if inverse else other_from_it, scalar_first=order == "wxyz")
+    lines = [" ".join([stamp, *(f"{value:.9f}" for value in row)]) for stamp, row in zip(stamps, rows, strict=True)]
+    file.write_text("\n".join(lines) + "\n")
     return file
 
 
@@ -184,11 +188,7 @@ def test_kitti_and_droid_are_read(sample: Sample, recording: Path, tmp_path: Pat
     map_from_cam = drifted(sample) @ BODY_FROM_CAM0
     np.savetxt(tmp_path / "p.txt", map_from_cam[:, :3].reshape(-1, 12))
     assert off_m(given(recording, GivenTrajectory(tmp_path / "p.txt")), sample) < 0.02
-    rows = []
-    for cam_from_map in se3_inverse(map_from_cam):
-        w, x, y, z = quat_wxyz_from_rotation(cam_from_map[:3, :3])
-        rows.append([*cam_from_map[:3, 3], x, y, z, w])
-    np.save(tmp_path / "poses.npy", np.array(rows, np.float32)[::2])
+    np.save(tmp_path / "poses.npy", pose_rows(se3_inverse(map_from_cam))[::2].astype(np.float32))
     np.save(tmp_path / "tstamps.npy", np.arange(0, FRAMES, 2, np.float64))
     found = given(recording, GivenTrajectory(tmp_path))
     assert "(DROID): poses of the camera" in found.words

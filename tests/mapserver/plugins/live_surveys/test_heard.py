@@ -64,7 +64,6 @@ def test_the_newest_state_of_a_site_is_kept(world: World, surveys: LiveSurveys) 
     for frames in (10, 20):
         world.robot_bus.publish(live_key("hall"), encode_message(state(frames=frames)))
     found = surveys.of("hall")
-    assert found is not None
     assert found.state.frames == 20
     np.testing.assert_allclose(found.state.path(), [[0, 0, 1], [1, 0.5, 0]])
     assert surveys.of("lab") is None
@@ -97,12 +96,10 @@ def test_silence_is_seen_only_of_surveys_that_should_speak() -> None:
     surveys.take(state())
     now_s = SILENT_S + 1
     found = surveys.of("hall")
-    assert found is not None
     assert found.is_silent
     surveys.take(state(phase="adjusting"))
     now_s += 60
     found = surveys.of("hall")
-    assert found is not None
     assert not found.is_silent
 
 
@@ -111,7 +108,6 @@ def test_a_state_that_is_told_again_keeps_its_number() -> None:
     for site, phase in (("hall", "tracking"), ("hall", "tracking"), ("yard", "tracking"), ("hall", "adjusting")):
         surveys.take(state(site, phase=phase))
         found = surveys.of(site)
-        assert found is not None
         numbers.append(found.number)
     assert numbers == [1, 1, 2, 3]
 

@@ -11,7 +11,6 @@ from playwright.sync_api import Page, expect
 from rich.console import Console
 
 from fleetmap.bus.zenoh_bus import Bus
-from fleetmap.geometry import Array, se3_inverse
 from fleetmap.messages import EstimateMessage, Placement, encode_message
 from fleetmap.sensors.samples import SensorSet
 from mapserver.config import survey_settings
@@ -22,7 +21,7 @@ from mapserver.plugins.live_surveys.message import LiveMissing, LivePart, LiveRe
 from mapserver.store import MapStore
 from support.fleet.dashboard_scene import Served, serving, wait_until, watch
 from support.recordings.kidnapped_ride import APART_FRAMES, kidnapped
-from support.recordings.live_drives import MappingHere, played
+from support.recordings.live_drives import MappingHere, laid_on_truth, played
 from support.recordings.recording_samples import write_mcap
 
 STATE = LiveSurveyState(
@@ -122,7 +121,6 @@ class Drive:
             patch.setattr(live_survey, "MappingProcess", MappingHere)
             request = LiveRequest("lab", store / "maps", SETTINGS, options)
             built = run_live(request, drive, self._hear, lambda: False, Console(quiet=True)).built
-        assert built is not None
         (self.survey,) = (surveyed.survey for surveyed in built.built.surveyed)
         self.trajectory, self.mapping = built.trajectory, MappingHere.made
 
@@ -133,13 +131,6 @@ class Drive:
 @pytest.fixture(scope="module")
 def whole(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Drive:
     return Drive(recording, "::", tmp_path_factory.mktemp("whole"))
-
-
-def laid_on_truth(map_from_body: Array, frames: list[int]) -> Array:
-    """(K,) metres from the truth, the first one laid upon it."""
-    truth = np.array(kidnapped().world_from_body)[frames]
-    laid = truth[0] @ se3_inverse(map_from_body[0]) @ map_from_body
-    return np.asarray(np.linalg.norm(laid[:, :3, 3] - truth[:, :3, 3], axis=1))
 
 
 def test_it_goes_on_as_another_part_until_a_sure_revisit_joins_it(whole: Drive) -> None:
@@ -153,8 +144,8 @@ def test_it_goes_on_as_another_part_until_a_sure_revisit_joins_it(whole: Drive) 
     assert [first.is_map, second.is_map] == [True, False]
     assert (whole.mapping.sketch.part == 0).sum() == joined[0].keyframes
     frames, lit = list(after), np.flatnonzero(whole.mapping.sketch.part == 0).tolist()
-    error_m = laid_on_truth(whole.mapping.map_from_body[lit], [frames[k] for k in lit])
-    assert np.quantile(error_m, 0.9) < 0.1
+    laid = laid_on_truth(whole.mapping.map_from_body[lit], kidnapped(), [frames[k] for k in lit])
+    assert np.quantile(laid.error_m, 0.9) < 0.1
 
 
 def test_the_draft_has_the_parts_that_were_joined(whole: Drive) -> None:
@@ -162,7 +153,7 @@ def test_the_draft_has_the_parts_that_were_joined(whole: Drive) -> None:
     assert (kept.start_s, kept.end_s) == (0.0, pytest.approx(14, abs=1))
     inside = np.flatnonzero(whole.survey.map.trajectory_estimated).tolist()
     assert {20, 90, 140} <= set(inside)
-    assert laid_on_truth(whole.trajectory.frame_from_body[inside], inside).max() < 0.05
+    assert laid_on_truth(whole.trajectory.frame_from_body[inside], kidnapped(), inside).error_m.max() < 0.05
 
 
 def test_the_draft_names_the_parts_that_nothing_joined(recording: Path, tmp_path: Path) -> None:

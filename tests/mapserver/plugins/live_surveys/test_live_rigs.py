@@ -7,12 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 from click.testing import Result
 from rich.console import Console
 from typer.testing import CliRunner
 
 import mapserver
 from fleetmap.errors import FleetmapError, LinkError, RecordingError, UsageError
+from fleetmap.geometry import transform_points
 from fleetmap.recordings import OpenOptions, Topics, open_recording
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from fleetmap.sources.intake import Intake
@@ -25,9 +27,10 @@ from mapserver.plugins.live_surveys.drives import RecordedDrive, SensorDrive
 from mapserver.plugins.live_surveys.live_survey import LiveRequest, run_live
 from mapserver.plugins.live_surveys.message import LiveSurveyState
 from mapserver.store import MapStore
-from support.recordings.live_drives import MappingHere, write_rgbd
+from support.recordings.live_drives import MappingHere, laid_on_truth, write_rgbd
 from support.recordings.recording_samples import calibration, kalibr_text, write_mcap
 from support.worlds import robot_world
+from support.worlds.box_room import ROOM_M
 
 METRIC = [SensorSet.STEREO_INERTIAL, SensorSet.STEREO, SensorSet.RGBD, SensorSet.MONO_INERTIAL]
 KINDS = [*METRIC, SensorSet.MONO]
@@ -93,10 +96,16 @@ def test_live_and_build_take_one_configuration_file(
     file, recording = configured(tmp_path, site, kind), site.recording(kind)
     done = run("live", recording, "--config", file)
     assert done.exit_code == 0, done.exception
-    found = MappingHere.made.sketch
+    made = MappingHere.made
+    if kind in METRIC:
+        laid = laid_on_truth(made.map_from_body, robot_world.cycle(), list(made.after))
+        print("ERR", kind, laid.error_m.max())
+        points = transform_points(laid.truth_from_map, made.map.points_map())
+        off_m = np.abs(points[:, None] - ROOM_M).min(axis=(1, 2))
+        print("OFF", kind, len(points), np.median(off_m), np.quantile(off_m, 0.9))
+    found = made.sketch
     assert found.keyframes > 8
     assert [part.is_map for part in found.parts] == [True]
-    assert found.estimate is not None
     assert found.estimate.status == "TRACKING"
     assert ("scale: unknown" in done.stderr) is (kind is SensorSet.MONO)
     assert run("build", recording, "--config", file).exit_code == 0
@@ -108,11 +117,7 @@ def test_live_and_build_take_one_configuration_file(
     assert by_live.use is kind
 
 
-def driven(
-    site: Site,
-    drive: RecordedDrive | SensorDrive,
-    kind: SensorSet,
-) -> list[LiveSurveyState]:
+def driven(site: Site, drive: RecordedDrive | SensorDrive, kind: SensorSet) -> list[LiveSurveyState]:
     told: list[LiveSurveyState] = []
     request = LiveRequest("lab", site.store, survey_settings(None, kind))
     try:
@@ -133,15 +138,9 @@ def test_what_a_build_would_refuse_is_refused_before_the_drive(
     monkeypatch.setattr(live_survey, "MappingProcess", not_begun)
     config = configured(tmp_path, site, SensorSet.STEREO)
     other = tmp_path / "other.yaml"
-    text = kalibr_text()
-    first = text.index("T_cn_cnm1")
-    row = text.index(
-        "  - ", text.index("  - ", first) + 1
-    )  # of the second row: the right camera looks down by a degree
-    end = text.index("\n", row)
-    other.write_text(
-        f"{text[:row]}  - [0.0, 0.99985, -0.01745, 0.0]\n  - [0.0, 0.01745, 0.99985, 0.0]{text[text.index(chr(10), end + 1) :]}"
-    )
+    rig = yaml.safe_load(kalibr_text())  # of which the right camera looks down by a degree
+    rig["cam1"]["T_cn_cnm1"][1:3] = [[0.0, 0.99985, -0.01745, 0.0], [0.0, 0.01745, 0.99985, 0.0]]
+    other.write_text(yaml.safe_dump(rig))
     blind = write_rgbd(tmp_path / "blind.mcap", replace(robot_world.cycle(), stamps_ns=robot_world.cycle().stamps_ns[:9],
         left=robot_world.cycle().left[:9], world_from_body=robot_world.cycle().world_from_body[:9]), has_depth=False)  # fmt: skip
     cases: list[tuple[tuple[object, ...], type[Exception], str]] = [
@@ -232,12 +231,8 @@ def test_sensors_by_the_same_file_are_built_with_their_topics(site: Site, tmp_pa
     done = run("live", "--config", file)
     assert done.exit_code == 0, done.exception
     ((path, _, name, options),) = builds
-    assert (path, name, options.frames, options.settings) == (
-        record,
-        "lab",
-        "::",
-        survey_settings(file, SensorSet.RGBD),
-    )
+    assert (path, name, options.frames) == (record, "lab", "::")
+    assert options.settings == survey_settings(file, SensorSet.RGBD)
     kept, indices = options.opened(record)
     with kept:
         assert (kept.sensor_set, len(indices)) == (SensorSet.RGBD, len(robot_world.cycle().stamps_ns))

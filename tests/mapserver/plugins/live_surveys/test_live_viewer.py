@@ -51,13 +51,10 @@ def test_the_map_grows_before_the_viewers_eyes(tmp_path: Path) -> None:
         picture = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_GRAYSCALE)
         lens = viewer.wait_for("/camera/calibration")[0][1]
         assert picture.shape == (lens.height, lens.width)
-        dots: list = []
+        count, dots = 0, []
         while not dots:
-            dots = (
-                viewer.wait_for("/camera/matches", len(viewer.messages.get("/camera/matches", [])) + 1)[-1][1]
-                .points[0]
-                .points
-            )
+            count += 1
+            dots = viewer.wait_for("/camera/matches", count)[-1][1].points[0].points
         assert all(0 <= dot.x < lens.width and 0 <= dot.y < lens.height for dot in dots)
         path = viewer.wait_for("/survey/path")[-1][1]
         while len(path.poses) < 2:

@@ -52,12 +52,10 @@ def survey(stretch: float, last_m: float = 10.0) -> tuple[Any, Trajectory]:
 
 def known() -> MarkerList:
     """In a frame of its own."""
-    moved = {
-        number: se3(so3_exp(np.array([0.1, 0.2, 2.0])), np.array([5.0, 1, 2])) @ at for number, at in THERE.items()
-    }
-    return MarkerList(
-        markers=tuple(Marker(id=n, size_m=SIZE_M, map_from_marker=Placement.of(at)) for n, at in moved.items())
-    )
+    motion = se3(so3_exp(np.array([0.1, 0.2, 2.0])), np.array([5.0, 1, 2]))
+    moved = {number: motion @ at for number, at in THERE.items()}
+    rows = [Marker(id=n, size_m=SIZE_M, map_from_marker=Placement.of(at)) for n, at in moved.items()]
+    return MarkerList(markers=tuple(rows))
 
 
 def test_markers_are_where_they_stand() -> None:

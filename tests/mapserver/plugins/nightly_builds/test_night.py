@@ -22,14 +22,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from fleetmap.errors import (
-    BusyError,
-    GateRefusedError,
-    RecordingError,
-    StoreError,
-    SurveyError,
-    UsageError,
-)
+from fleetmap.errors import BusyError, GateRefusedError, RecordingError, StoreError, SurveyError, UsageError
 from fleetmap.mapformat.manifest import RecordingEntry
 from fleetmap.recordings import OpenOptions, open_recording
 from fleetmap.sensors.samples import SensorSet
@@ -140,7 +133,6 @@ def test_a_night_removes_what_is_older_than_its_period(hall: Path) -> None:
     assert run_night(order, GateSettings(), Console(file=io.StringIO())) == "site hall: nothing new"
     assert names(hall / "inbox/done") == []
     last = last_report(hall / "store", "hall")
-    assert last is not None
     assert last["expired"] == {"recordings of surveys": 2}
 
 
@@ -182,7 +174,6 @@ def test_each_recording_goes_where_it_belongs_with_its_reason(hall: Path) -> Non
     assert "too dark; when it was read: cam1: images missing: 1 of" in reason
     assert (hall / "inbox/notes.txt").is_file()
     report = last_report(hall / "store", "hall")
-    assert report is not None
     assert {r["name"]: r["fate"] for r in report["recordings"]} == {
         "monday": "done", "tuesday": "done", "lost one": "held", "dark one": "bad", "empty": "bad",
     }  # fmt: skip
@@ -221,7 +212,6 @@ def test_a_refused_night_keeps_the_last_version_and_holds_its_recordings(
     assert states(hall) == [("current", ["monday", "tuesday"]), ("draft", ["wednesday"])]
     assert names(hall / "inbox/held") == ["wednesday", "wednesday.reason.txt"]
     report = last_report(hall / "store", "hall")
-    assert report is not None
     assert report["state"] == "failed"
     assert "number of landmarks" in report["message"]
     assert "version 1 stays current" in report["message"]
@@ -395,7 +385,6 @@ def test_nothing_waits_without_a_word(hall: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(os, "replace", only_others)
     assert "2 done, 0 held, 0 bad" in spend(hall)
     report = last_report(hall / "store", "hall")
-    assert report is not None
     told = {waiting["name"]: waiting["reason"] for waiting in report["waiting"]}
     assert "changed while it was read" in told["changing"]
     assert "Operation not permitted" in told["x.mcap"]
@@ -596,7 +585,6 @@ def test_a_draft_that_a_killed_night_left_is_published_without_building_again(
     monkeypatch.setattr(night, "build_draft", lambda *_: pytest.fail("built again"))
     assert "version 1 published" in spend(hall)
     report = last_report(hall / "store", "hall")
-    assert report is not None
     assert report["resumes"] == [1]
     with MapStore.open(hall / "store") as maps:
         assert "was interrupted; job 2 goes on" in maps.job(1).message

@@ -40,12 +40,8 @@ def test_two_nights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with MapStore.open(tmp_path / "store") as maps:
         first, second = (maps.evidence("lab", version) for version in (1, 2))
         verdict, trusted = maps.verdicts("lab", 2)[-1], [maps.trusted(info) for info in maps.versions("lab")]
-    assert first is not None
-    assert first.held_out is not None
     assert (first.held_out.before, first.replayed, first.last_version) == (None, None, None)
-    assert second is not None
     for compared in (second.held_out, second.replayed, second.last_version):
-        assert compared is not None
         assert compared.before is not None
         assert compared.draft.frames >= 12
         assert compared.draft.localised_share > 0.9

@@ -11,16 +11,7 @@ from evo.core.trajectory import PosePath3D
 from typer.testing import CliRunner
 
 from fleetmap.errors import RecordingError, SurveyError
-from fleetmap.geometry import (
-    Array,
-    align_points,
-    interpolate_se3,
-    rotation_angle_rad,
-    se3,
-    se3_exp,
-    se3_inverse,
-    so3_exp,
-)
+from fleetmap.geometry import align_points, interpolate_se3, rotation_angle_rad, se3, se3_exp, se3_inverse, so3_exp
 from fleetmap.recordings.tum import format_stamp, write_tum
 from fleetmap.sensors.samples import Trajectory
 from mapserver.cli import app
@@ -63,9 +54,8 @@ def _path(trajectory: Trajectory) -> PosePath3D:
 
 def test_a_straight_drive_does_not_leave_the_turn_about_it_open() -> None:
     rng = np.random.default_rng(5)
-    truth = Trajectory(
-        np.arange(60) * 50_000_000, np.array([se3(np.eye(3), np.array([0.1 * k, 0.0, 0.0])) for k in range(60)])
-    )
+    places = [se3(np.eye(3), np.array([0.1 * k, 0.0, 0.0])) for k in range(60)]
+    truth = Trajectory(np.arange(60) * 50_000_000, np.array(places))
     noisy = np.array([t @ se3_exp(rng.normal(0.0, 0.002, 6)) for t in truth.frame_from_body])
     estimate_from_truth = se3_exp(np.array([0.4, -1.0, 2.0, 5.0, -7.0, 1.0]))
     found = truth_from_estimate(Trajectory(truth.stamps_ns, estimate_from_truth @ noisy), truth) @ estimate_from_truth
@@ -250,7 +240,7 @@ def test_the_command_prints_it(tmp_path: Path) -> None:
     write_tum(tmp_path / "e.tum", estimate)
     write_tum(tmp_path / "t.tum", truth)
     (tmp_path / "c.csv").write_text("\n".join(csv_lines(covariances)))
-    again: Array = read_covariances(tmp_path / "c.csv").covs_rot_trans
+    again = read_covariances(tmp_path / "c.csv").covs_rot_trans
     np.testing.assert_allclose(again, covariances.covs_rot_trans, rtol=1e-7, atol=1e-11)
     e, t, c = (str(tmp_path / name) for name in names)
     given = ["evaluate", e, "--ground-truth", t, "--covariances", c, "--frames", str(2 * COUNT), "--json"]
