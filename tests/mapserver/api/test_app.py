@@ -115,12 +115,8 @@ def test_problems(server: Server) -> None:
 
 def test_archives_drafts_and_other_kinds_are_not_served(server: Server) -> None:
     info = server.store.version("lab", 1)
-    for sha256 in (
-        info.archive_sha256,
-        info.manifest_sha256,
-        info.vocabulary_sha256,
-        server.store.manifest("lab", 2).tiles[0].sha256,
-    ):
+    draft = server.store.manifest("lab", 2).tiles[0].sha256
+    for sha256 in (info.archive_sha256, info.manifest_sha256, info.vocabulary_sha256, draft):
         check_problem(server.client.get(f"/v1/tiles/{sha256}"), 404, "no published tile")
 
 
@@ -169,9 +165,8 @@ def test_the_server_says_how_it_is(server: Server, monkeypatch: pytest.MonkeyPat
     assert not server.fleet.take_failure("lab", "r1", failure).refused
     found = server.client.get("/v1/server").json()
     used = found["store"]
-    assert used["maps_bytes"] == sum(
-        path.stat().st_size for path in (server.folder / "blobs").rglob("*") if path.is_file()
-    )
+    blobs = (path for path in (server.folder / "blobs").rglob("*") if path.is_file())
+    assert used["maps_bytes"] == sum(path.stat().st_size for path in blobs)
     assert (used["pictures_bytes"], used["recordings_bytes"]) == (len(jpeg), 0)
     database = sum(path.stat().st_size for path in server.folder.glob("store.sqlite3*"))
     assert used["database_bytes"] == database - len(jpeg)
@@ -186,9 +181,8 @@ def test_the_server_says_how_it_is(server: Server, monkeypatch: pytest.MonkeyPat
     server.fleet.storage_fault = "no space left on device"
     monkeypatch.setattr(server.store._blobs, "total_bytes", lambda: 1 / 0)
     again = server.client.get("/v1/server").json()
-    assert (again["storage_fault"], again["store"]) == ("no space left on device", used), (
-        "files are counted now and then"
-    )
+    assert again["storage_fault"] == "no space left on device"
+    assert again["store"] == used, "files are counted now and then"
 
 
 def test_alerts_come_in_pages(server: Server) -> None:
@@ -271,11 +265,9 @@ def test_an_operator_publishes_promotes_and_rolls_back(server: Server) -> None:
     assert server.store.current("lab").version == 1
     assert post("/v1/sites/lab/rollback", json=ADA).json()["version"] == 2
     events = server.client.get("/v1/sites/lab/events").json()["events"]
-    assert [(event["kind"], event["version"], event["actor"], event["reason"]) for event in events[-3:]] == [
-        ("published", 2, "ada", "aisle 3"),
-        ("promoted", 1, "ada", "aisle 3"),
-        ("rolled_back", 2, "ada", "aisle 3"),
-    ]
+    told = [(event["kind"], event["version"]) for event in events[-3:]]
+    assert told == [("published", 2), ("promoted", 1), ("rolled_back", 2)]
+    assert {(event["actor"], event["reason"]) for event in events[-3:]} == {("ada", "aisle 3")}
     check_problem(post("/v1/sites/lab/versions/1/publish", json=ADA), 409, "only a draft")
     check_problem(post("/v1/sites/lab/versions/9/promote", json=ADA), 404, "no version 9")
     check_problem(post("/v1/sites/lab/rollback", json={}), 422, "actor")

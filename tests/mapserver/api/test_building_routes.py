@@ -198,9 +198,7 @@ def test_a_map_is_aligned_with_a_plan_as_by_the_command(server: Server) -> None:
     assert estimated["off_m"] == kept.json()["off_m"]
     assert (estimated["metres_per_unit"], estimated["is_checked"]) == (pytest.approx(0.05), True)
     assert kept.json() == server.client.get(ALIGNMENT).json()
-    shown = CliRunner().invoke(
-        app, ["align", "--show", "--json", "--site", "lab", "--store", str(server.folder)], catch_exceptions=False
-    )
+    shown = CliRunner().invoke(app, ["align", "--show", "--json", "--site", "lab", "--store", str(server.folder)])
     assert json.loads(shown.output) == kept.json()
     assert kept.json()["metres_per_unit"] == pytest.approx(0.05)
     assert server.store.site_file("lab", "plan") == picture

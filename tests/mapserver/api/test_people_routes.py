@@ -47,10 +47,8 @@ def named(server: Server) -> dict[str, dict[str, str]]:
     """A session of each role, as headers."""
     operators = Operators(server.store)
     secrets = {name: operators.add(name, role, None, Actor("root")) for name, role in ROLES.items()}
-    return {
-        name: {"Cookie": f"fleetmap={operators.sign_in(name, secret, name).session}"}
-        for name, secret in secrets.items()
-    }
+    sessions = {name: operators.sign_in(name, secret, name).session for name, secret in secrets.items()}
+    return {name: {"Cookie": f"fleetmap={session}"} for name, session in sessions.items()}
 
 
 def token(server: Server, *scopes: str, name: str = "program") -> dict[str, str]:
@@ -74,30 +72,15 @@ def test_each_address_asks_for_its_right(server: Server, named: dict[str, dict[s
     assert {row["name"]: row["is_disabled"] for row in client.get("/v1/operators", headers=named["ada"]).json()["operators"]} == {
         "ada": False, "bob": False, "ci": False, "olga": True, "program": False, "vic": False,
     }  # fmt: skip
-    assert (
-        client.get("/v1/sites/lab/enrolled", headers=named["ada"]).json()["robots"] == server.store.robots("lab") == []
-    )
+    enrolled = client.get("/v1/sites/lab/enrolled", headers=named["ada"]).json()["robots"]
+    assert enrolled == server.store.robots("lab") == []
 
 
 def test_no_other_form_of_an_address_needs_less(server: Server, named: dict[str, dict[str, str]]) -> None:
-    for path in (
-        "operators",
-        "tokens",
-        "sites/lab/enrolled",
-        "sites/lab/enrolled/r1/revoke",
-        "sites/lab/robots/r1/remove",
-    ):
-        for form in (
-            "/v1/{}/",
-            "/v1//{}",
-            "//v1/{}",
-            "/v1/./{}",
-            "/V1/{}",
-            "/v1/{}%0A",
-            "/v1/{}%2F",
-            "/v1/{}?x=1",
-            "http://127.0.0.1/v1/{}",
-        ):
+    robots = ("sites/lab/enrolled", "sites/lab/enrolled/r1/revoke", "sites/lab/robots/r1/remove")
+    forms = "/v1/{}/ /v1//{} //v1/{} /v1/./{} /V1/{} /v1/{}%0A /v1/{}%2F /v1/{}?x=1 http://127.0.0.1/v1/{}"
+    for path in ("operators", "tokens", *robots):
+        for form in forms.split():
             for method in ("GET", "POST", "HEAD"):
                 answer = server.client.request(method, form.format(path), headers=named["olga"], follow_redirects=True)
                 assert answer.status_code in (403, 404, 405), (method, form, path)
@@ -119,9 +102,8 @@ def test_the_first_operator_is_an_admin(server: Server) -> None:
 def test_the_last_admin_stays(server: Server, named: dict[str, dict[str, str]]) -> None:
     client, ada = server.client, named["ada"]
     check_problem(client.post("/v1/operators/ada/disable", json={}, headers=ada), 409, "ada is the last admin")
-    check_problem(
-        client.post("/v1/operators/ada/role", json={"role": "viewer"}, headers=ada), 409, "add another one first"
-    )
+    lower = client.post("/v1/operators/ada/role", json={"role": "viewer"}, headers=ada)
+    check_problem(lower, 409, "add another one first")
     assert client.get("/v1/operators", headers=ada).status_code == 200
     assert client.post("/v1/operators/vic/role", json={"role": "admin"}, headers=ada).status_code == 200
     assert client.post("/v1/operators/ada/disable", json={}, headers=ada).status_code == 200
@@ -196,9 +178,8 @@ def test_secrets_are_in_one_answer_alone(
     caplog.set_level("DEBUG")
     password = client.post("/v1/operators/olga/password", json=WHY, headers=ada)
     made = client.post("/v1/tokens", json={"name": "olga", "scopes": ["read"], "days": 30} | WHY, headers=ada)
-    bundle = client.post(
-        "/v1/sites/lab/enrolled", json={"robot": "r2", "endpoint": "tls/maps.example:7447"} | WHY, headers=ada
-    )
+    asked = {"robot": "r2", "endpoint": "tls/maps.example:7447"} | WHY
+    bundle = client.post("/v1/sites/lab/enrolled", json=asked, headers=ada)
     assert {answer.headers["cache-control"] for answer in (password, made, bundle)} == {"no-store"}
     assert client.get("/v1/sites", headers={"Authorization": f"Bearer {made.json()['secret']}"}).status_code == 200
     assert Operators(server.store).sign_in("olga", password.json()["secret"], "").session
@@ -206,10 +187,8 @@ def test_secrets_are_in_one_answer_alone(
     robot = enrolment.decode_bundle(bundle.content)
     assert (robot.site, robot.robot, robot.endpoint) == ("lab", "r2", "tls/maps.example:7447")
     secrets = [password.json()["secret"], made.json()["secret"], robot.own, ada["Cookie"].partition("=")[2]]
-    told = [
-        client.get(path, headers=ada).text
-        for path in ("/v1/operators", "/v1/sites/lab/enrolled", "/v1/sites/lab/events")
-    ]
+    paths = ("/v1/operators", "/v1/sites/lab/enrolled", "/v1/sites/lab/events")
+    told = [client.get(path, headers=ada).text for path in paths]
     kept = [path.read_bytes().decode("latin-1") for path in tmp_path.rglob("*") if path.is_file()]
     for secret in secrets:
         assert not [text for text in (*told, *kept, caplog.text, str(server.store.audit_lines())) if secret in text]
@@ -224,11 +203,8 @@ def test_a_bundle_names_the_endpoint_of_the_server(server: Server, named: dict[s
     RobotRegister(server.store).renew("lab", "r2", enrolment.renewal_request(bundle.own.encode(), enrolment.new_key()))
     (row,) = server.client.get("/v1/sites/lab/enrolled", headers=named["ada"]).json()["robots"]
     assert (row["robot"], row["is_used"], row["state"]) == ("r2", True, "certificate for 365 days")
-    check_problem(
-        server.client.post("/v1/sites/lab/enrolled", json={"robot": "r2"}, headers=named["ada"]),
-        409,
-        "robots revoke r2",
-    )
+    again = server.client.post("/v1/sites/lab/enrolled", json={"robot": "r2"}, headers=named["ada"])
+    check_problem(again, 409, "robots revoke r2")
 
 
 def test_without_certificates_the_next_step_is_told(tmp_path: Path) -> None:
@@ -245,9 +221,8 @@ def test_without_operators_other_machines_manage_nobody(server: Server) -> None:
             check_problem(stranger.get(path), 403, "only the server's own machine")
         for path, body, _ in ACTS:
             check_problem(stranger.post(path, json=body | {"actor": "eve", "role": "admin"}), 403, "operators add NAME")
-    proxied = server.client.post(
-        "/v1/operators", json=ACTS[0][1] | {"actor": "eve"}, headers={"X-Forwarded-For": "10.0.0.9"}
-    )
+    headers = {"X-Forwarded-For": "10.0.0.9"}
+    proxied = server.client.post("/v1/operators", json=ACTS[0][1] | {"actor": "eve"}, headers=headers)
     check_problem(proxied, 403, "only the server's own machine")
     assert server.client.get("/v1/operators").json()["operators"] == []
 

@@ -49,9 +49,8 @@ def asking(server: Server, address: str, later_s: float = 0.0) -> Iterator[TestC
         clock.s += later_s
         await inner(scope, receive, send)
 
-    with TestClient(
-        ProxiedPeople(late, proxy), "http://127.0.0.1", client=(address, 50000), follow_redirects=False
-    ) as client:
+    people = ProxiedPeople(late, proxy)
+    with TestClient(people, "http://127.0.0.1", client=(address, 50000), follow_redirects=False) as client:
         yield client
 
 

@@ -27,6 +27,7 @@ from support.fleet.dashboard_scene import (
     talking,
     wait_until,
 )
+from support.pages.browser import box_of
 from support.pages.whole_page import assert_whole
 
 PAGES = {
@@ -138,9 +139,8 @@ def test_marks_are_read_and_opened_with_the_pointer(page: Page, served: Served) 
     seen = opened(page, served, "")
     for _ in range(3):  # until no other robot is within the pointer's reach
         page.get_by_role("button", name="Zoom in").click()
-    middle = page.evaluate(
-        "(box => [box.x + box.width / 2, box.y + box.height / 2])(document.querySelector('.site-map').getBoundingClientRect())"
-    )
+    box = box_of(page.locator(".site-map"))
+    middle = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
     shown = {mark["name"]: mark for mark in marks(page)}
     name = min(shown, key=lambda name: sum(abs(a - b) for a, b in zip(shown[name]["page"], middle, strict=True)))
     x, y = shown[name]["page"]
@@ -186,9 +186,8 @@ def test_a_new_failure_appears_by_itself(page: Page, served: Served) -> None:
     seen = opened(page, served, "failures", robot="tug-12")
     expect(page.get_by_role("status")).to_have_text("No failures match.")
     with Bus.connect(served.zenoh) as bus:
-        answer = bus.get(
-            robot_key(SITE, "tug-12", "failures"), encode_message(failure("tug-12", "live", cause="glare"))
-        )
+        report = encode_message(failure("tug-12", "live", cause="glare"))
+        answer = bus.get(robot_key(SITE, "tug-12", "failures"), report)
         assert not decode_message(answer, FailureAck).refused
     expect(listed(page)).to_contain_text("glare")
     assert [mark["tone"] for mark in marks(page)] == ["bad"]

@@ -2,6 +2,7 @@
 
 import base64
 import math
+import time
 from dataclasses import replace
 from datetime import UTC
 from io import BytesIO
@@ -96,9 +97,8 @@ def test_the_map_page_names_the_way_that_nobody_drove(store: MapStore) -> None:
     plan = MapData(store, GateSettings(), 0.05).plan(SITE, 2)
     assert {tuple(found.missing) for found in plan.directions} == {("W",)}
     told = one_way(plan, Areas())
-    assert [words.partition(", surveyed facing E: ")[0] for words in told] == [
-        f"tile {found.tile[0]},{found.tile[1]}" for found in plan.directions
-    ]
+    tiles = [f"tile {found.tile[0]},{found.tile[1]}" for found in plan.directions]
+    assert [words.partition(", surveyed facing E: ")[0] for words in told] == tiles
     both = replace(plan, directions=tuple(msgspec.structs.replace(found, missing={}) for found in plan.directions))
     assert one_way(both, Areas()) == []
 
@@ -153,9 +153,8 @@ def test_the_floor_plan_lies_under_the_map_as_it_was_aligned(store: MapStore, mo
     drawing[40:50, 100:110] = 0  # 5 m from the left edge, 2.25 m below the upper one
     picture, packed = Image.fromarray(drawing), BytesIO()
     if mode != "L":
-        picture = Image.merge("LA", (Image.fromarray(np.zeros_like(drawing)), Image.fromarray(255 - drawing))).convert(
-            "RGBA" if mode == "P" else mode
-        )
+        inked = Image.fromarray(np.zeros_like(drawing)), Image.fromarray(255 - drawing)
+        picture = Image.merge("LA", inked).convert("RGBA" if mode == "P" else mode)
     (picture.quantize() if mode == "P" else picture).save(packed, "PNG")
     frame = BuildingFrame(x_m=9.0, y_m=-8.0, yaw_rad=np.pi / 2)
     alignment = Alignment(frame=frame, metres_per_unit=0.05, method="pins", plan="hall.png")
@@ -219,12 +218,7 @@ def test_traces_become_stretches_of_one_state_and_curves_that_break() -> None:
     rows = [traced(10 * n, "TRACKING", frame_ms=10.0 + n) for n in range(4)]
     rows += [traced(33, "LOST", flags="dark"), traced(43, "LOST", flags="dark"), traced(300, "TRACKING", frame_ms=26.0)]
     told = [(s.status, s.flags, s.since_ns // 10**9, s.until_ns // 10**9) for s in stretches(rows, 320_000_000_000)]
-    assert told == [
-        ("TRACKING", "", 0, 33),
-        ("LOST", "dark", 33, 54),
-        ("", "", 54, 300),
-        ("TRACKING", "", 300, 320),
-    ]
+    assert told == [("TRACKING", "", 0, 33), ("LOST", "dark", 33, 54), ("", "", 54, 300), ("TRACKING", "", 300, 320)]
     assert stretches([], 10) == []
     assert curve(rows, "frame_ms", (0, 450_000_000_000)) == (11.5, 26.0, "M0.0 60h100.0M600.0 10h100.0")
     assert curve(rows, "exposure", (0, 450_000_000_000)) is None
@@ -236,9 +230,8 @@ def test_the_way_of_a_robot_has_gaps_where_it_was_silent() -> None:
     parts = stretches(rows, 350_000_000_000)
     drawn = [(line.tone, line.points[0][0] - 1.0, line.points[-1][0] - 1.0) for line in way(rows, parts)]
     assert drawn == [("good", 0, 10), ("good", 311, 312), ("good", 330, 340), ("bad", 10, 20), ("bad", 300, 310)]
-    assert way([replace(traced(n, "TRACKING"), x_map_m=0.1) for n in range(9)], parts) == [], (
-        "who stands does not drive"
-    )
+    standing = [replace(traced(n, "TRACKING"), x_map_m=0.1) for n in range(9)]
+    assert way(standing, parts) == []
 
 
 def test_a_robot_that_wavers_is_drawn_in_few_parts() -> None:
@@ -290,17 +283,14 @@ def test_the_trend_says_only_what_the_counts_can_tell(day: Counters, week: Count
 
 def test_chance_alone_seldom_makes_a_trend() -> None:
     rng = np.random.default_rng(0)
-    told = [
-        trend_words(counts(int(rng.poisson(6)), 10), counts(int(rng.poisson(42)), 70))
-        != "no clear change from the week before"
-        for _ in range(1000)
-    ]
-    assert np.mean(told) <= 0.05 + 3 * math.sqrt(0.05 * 0.95 / 1000)
+    pairs = zip(rng.poisson(6, 1000).tolist(), rng.poisson(42, 1000).tolist(), strict=True)
+    told = [trend_words(counts(day, 10), counts(week, 70)) for day, week in pairs]
+    assert np.mean([words != "no clear change from the week before" for words in told]) <= 0.05 + 3 * math.sqrt(
+        0.05 * 0.95 / 1000
+    )
 
 
 def test_health_of_a_site(store: MapStore) -> None:
-    import time
-
     health = HealthData(store, CanarySettings(), ResurveySettings(), time.time_ns, lambda _: ())
     found = health.site(SITE)
     assert (found.day.failures.events, found.day.silent_estimated.events) == (1, 1)

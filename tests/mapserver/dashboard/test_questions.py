@@ -164,9 +164,8 @@ def test_what_failed_in_aisle_2_today(operator: Operator) -> None:
 
 def test_questions_that_a_page_answers(operator: Operator) -> None:
     with MapStore.open(operator.served.folder) as store:
-        store.tell_progress(
-            store.begin_job(SITE, "build"), {"stage": "matching", "done": 30, "total": 120, "stage_s": 60.0}
-        )
+        progress = {"stage": "matching", "done": 30, "total": 120, "stage_s": 60.0}
+        store.tell_progress(store.begin_job(SITE, "build"), progress)
         ask_for_survey(store, SITE, [(20.0, 2.0), (30.0, 2.0), (30.0, 9.0)], Actor("bob", "new racks"))
         trial = releases.start_canary(store, SITE, 1, 0.2)
         store.update_job(store.begin_job(SITE, "nightly"), "failed", "it was interrupted", {"waiting": []})

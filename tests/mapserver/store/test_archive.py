@@ -30,7 +30,6 @@ def test_round_trip_is_exact_and_deterministic() -> None:
     np.testing.assert_array_equal(back.trajectory.stamps_ns, survey.trajectory.stamps_ns)
     np.testing.assert_array_equal(back.trajectory.frame_from_body, survey.trajectory.frame_from_body)
     assert back.points_map.flags.writeable
-    assert back.history is not None
     np.testing.assert_array_equal(back.history.keyframe_ids, np.arange(6))
     assert back.history.is_place.all()
     assert (back.history.next_keyframe_id, back.history.next_landmark_id) == (6, survey.landmark_ids.max() + 1)

@@ -180,7 +180,7 @@ def test_pictures_that_do_not_change_at_all_are_mapped() -> None:
     mapping = MappingHere(SurveyConfig(SETTINGS, default_vocabulary()), LiveRig(CAMERA, BODY_FROM_CAM))
     still, step = np.zeros(3), np.diag([1e-4] * 6)
     for number in range(3):
-        frame = replace(stereo_frame(50_000_000), stamp_ns=number)
+        frame = replace(stereo_frame(50_000_000), stamp_ns=50_000_000 * (number + 1))
         mapping.put(frame, NewKeyframe(number, np.eye(4), np.eye(3), step if number else None, still, still, still))
     assert len(mapping.map.points_map()) > 100
     np.testing.assert_allclose(mapping.map_from_body[:, :3, 3], 0.0, atol=0.01)

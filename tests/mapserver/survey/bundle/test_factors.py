@@ -23,7 +23,6 @@ PATIENT = BundleSettings(max_iterations=60, relative_cost_tolerance=1e-12)
 def _unknowing(scene: Scene, *, seed: int) -> BundleProblem:
     """0.3 m and 2 degrees off, velocities off, biases unknown and preintegrated as zero."""
     problem = disturbed(scene.problem, seed=seed, rot_rad=0.02, trans_m=0.17, points_m=0.2)
-    assert problem.inertial is not None
     velocities = scene.velocities_map_mps
     velocities = velocities + np.random.default_rng(seed).normal(size=velocities.shape) * 0.3
     inertial = replace(problem.inertial, motions=np.pad(velocities, ((0, 0), (0, 6))))
@@ -49,13 +48,11 @@ def test_sparse_frames_converge_to_the_truth(step_s: float, dense_unknowns: int)
         result = optimize(problem, settings)
         problem = continued(problem, result)
         inertial = problem.inertial
-        assert inertial is not None
         inertial.edges = [
             (i, j, preintegrate(_imu(scene), e.start_ns, e.end_ns, *np.split(inertial.motions[i, 3:], 2), NOISE))
             for i, j, e in inertial.edges
         ]
     np.testing.assert_allclose(result.map_from_body, scene.problem.map_from_body, atol=2e-3)
-    assert result.motions is not None
     np.testing.assert_allclose(result.motions[:, 3:6], np.tile(GYRO_BIAS, (12, 1)), atol=2e-4)
     np.testing.assert_allclose(result.motions[:, 6:], np.tile(ACCEL_BIAS, (12, 1)), atol=2e-2)
     np.testing.assert_allclose(result.motions[:, :3], scene.velocities_map_mps, atol=1e-2)
@@ -71,7 +68,6 @@ def test_gravity_decides_roll_and_pitch() -> None:
     origin = scene.problem.map_from_body[0, :3, 3]
     tilted_from_map = se3(tilt, origin - tilt @ origin)
     problem = scene.problem
-    assert problem.inertial is not None
     tilted = replace(
         problem,
         gauge="yaw_position",
@@ -93,7 +89,6 @@ def test_held_motion_stays() -> None:
     assert problem.inertial is not None
     held = np.array([True, False, False, False, False, False])
     result = optimize(replace(problem, inertial=replace(problem.inertial, fixed=held)), PATIENT)
-    assert result.motions is not None
     is_unchanged = result.motions[:, :3] == scene.velocities_map_mps
     assert is_unchanged[0].all() and not is_unchanged[1:].any()
 

@@ -210,11 +210,7 @@ def test_two_places_that_exclude_each_other_are_ambiguous() -> None:
 
 @pytest.mark.parametrize(
     ("sigma_m", "only_words", "verdict"),
-    [
-        (1.4, [], LoopVerdict.AMBIGUOUS),
-        (0.5, [], LoopVerdict.ACCEPTED),
-        (1.4, range(10, 14), LoopVerdict.ACCEPTED),
-    ],
+    [(1.4, [], LoopVerdict.AMBIGUOUS), (0.5, [], LoopVerdict.ACCEPTED), (1.4, range(10, 14), LoopVerdict.ACCEPTED)],
 )
 def test_where_the_site_repeats_a_first_visit_is_not_taken_for_a_return(
     sigma_m: float, only_words: Sequence[int], verdict: LoopVerdict
@@ -345,6 +341,5 @@ def test_an_error_that_all_disparities_share_moves_a_loop_as_its_covariance_says
     new[:, 2] -= error_px
     nearer = camera.point_from_pixel(old[:, :2], old[:, 0] - old[:, 2])
     found = refine_pnp(Correspondences(camera, nearer, new, np.ones((60, 2))), new_from_old)
-    assert found is not None
     moved = se3_log(found.cam_from_source @ se3_inverse(new_from_old))
     np.testing.assert_allclose(moved, error_px * by_disparity(points, new_from_old, camera), rtol=0.05, atol=2e-5)

@@ -13,11 +13,7 @@ from mapserver.survey.keyframes.keyframes import make_keyframe
 from mapserver.survey.rig import rig_of
 from mapserver.survey.settings import PairSettings, SurveySettings
 from mapserver.survey.state import Keyframe, RigImages
-from mapserver.survey.tracks.matching import (
-    NearPlaces,
-    PairFinder,
-    fixed_allowance_m,
-)
+from mapserver.survey.tracks.matching import NearPlaces, PairFinder, fixed_allowance_m
 from mapserver.survey.tracks.pairs import PairTask, view_overlap
 from support.recordings.recording_samples import calibration
 from support.worlds.box_room import out_and_back, stereo_pair
