@@ -88,9 +88,8 @@ def _is_troubled(robot: LiveRobot) -> bool:
 def _troubles(robot: LiveRobot) -> list[str]:
     """What is wrong beside the state."""
     found = [f"refuses a version: {robot.refused}"] if robot.refused else []
-    found += (
-        ["is there twice: has another robot its name, or was its certificate copied?"] if robot.status.is_copied else []
-    )
+    if robot.status.is_copied:
+        found.append("is there twice: has another robot its name, or was its certificate copied?")
     found += [dropped_words(robot.metrics)] if Flag.OVERLOADED in robot.flags else []
     if robot.is_behind and robot.status.wanted_version is not None:
         found.append(f"runs version {robot.status.version or 'none'}, should run {robot.status.wanted_version}")
@@ -110,11 +109,10 @@ def since_words(context: PageContext, robot: LiveRobot) -> tuple[str, str]:
     """For how long it is in its state or was not heard, and since which moment; empty where that is not known."""
     if robot.tone == "quiet":
         return age(robot.status.seconds_since), ""
-    if robot.status.state_since_ns is None:
+    since_ns = robot.status.state_since_ns
+    if since_ns is None:
         return "", ""
-    return age(max(0.0, time.time() - robot.status.state_since_ns / 1e9)), context.moment(
-        robot.status.state_since_ns
-    ) or ""
+    return age(max(0.0, time.time() - since_ns / 1e9)), context.moment(since_ns) or ""
 
 
 def _robot(context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Areas) -> dict[str, object]:

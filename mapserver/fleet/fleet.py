@@ -50,7 +50,6 @@ _SOONEST_NS, _TWO_REPORT = 700_000_000, 20
 _USUAL = IngestSettings()
 _log = logging.getLogger(__name__)
 _MAX_KEPT = 100
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,6 +17,7 @@ from pathlib import Path
 from tempfile import TemporaryFile
 
 from fleetmap.errors import FleetmapError, StateError, StoreError, disk_errors
+from fleetmap.hooks import plugins
 from mapserver.store import JobInfo, MapStore
 
 SETTLE_S = 5.0  # an operator who starts a run now has just copied something
@@ -92,6 +93,8 @@ class NightRuns:
         return next((job for job in self._store.jobs(site, limit=1) if job.kind == "nightly"), None)
 
     def _started(self, site: str, errors: int) -> "subprocess.Popen[bytes]":
+        if "nightly" not in plugins("mapserver.commands"):
+            raise StateError("a build needs a plug-in that is not installed: entry point nightly of mapserver.commands")
         config = [] if self._config is None else ["--config", str(self._config)]
         folders = ["--inbox", str(self.inbox / site), "--store", str(self._store.folder)]
         command = [sys.executable, "-m", "mapserver.end_with_server", *config, "nightly", "--site", site, *folders]

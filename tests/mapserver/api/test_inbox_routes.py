@@ -3,15 +3,11 @@
 import errno
 import os
 import re
-import subprocess
-import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from urllib.parse import quote
 
 import anyio
-import psutil
 import pytest
 from starlette.types import Message
 
@@ -21,7 +17,6 @@ from mapserver.drafting.job_lock import log_path
 from mapserver.nightly.inbox import put_away
 from mapserver.nightly.upload import MOST_BYTES, remove_unfinished
 from mapserver.serving import night_runs
-from mapserver.store import MapStore
 from support.fleet.served_api import Server, check_problem, raw_put, served_api
 
 INBOX = "/v1/sites/lab/inbox"
@@ -238,25 +233,10 @@ def test_a_build_is_in_the_log_before_it_begins(server: Server, lab: Path, monke
     assert known == ["build_started"]
 
 
-def test_a_build_ends_with_its_killed_server(tmp_path: Path) -> None:
-    killed = """
-import os, signal, sys
-from pathlib import Path
-from mapserver.serving.night_runs import NightRuns
-from mapserver.store import MapStore
-
-folder = Path(sys.argv[1])
-(folder / "inbox/lab").mkdir(parents=True)
-with MapStore.open(folder / "store", create=True) as store:
-    print(NightRuns(store, folder / "inbox")._started("lab", 2).pid, flush=True)
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
-    server = subprocess.run([sys.executable, "-c", killed, str(tmp_path)], stdout=subprocess.PIPE, check=False)
-    build = int(server.stdout)
-    while psutil.pid_exists(build) and psutil.Process(build).status() != psutil.STATUS_ZOMBIE:
-        time.sleep(0.1)
-    with MapStore.open(tmp_path / "store") as store:
-        assert [job.state for job in store.jobs("lab")] in ([], ["failed"], ["running"]), "it did not come to its end"
+def test_a_build_without_its_plugin_names_it(server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lab.mkdir()
+    monkeypatch.setattr(night_runs, "plugins", lambda _: {})
+    check_problem(server.client.post("/v1/sites/lab/build", json=ADA), 409, "entry point nightly")
 
 
 def test_a_server_without_an_inbox_says_how_to_get_one(tmp_path: Path) -> None:

@@ -9,6 +9,8 @@ import os
 import re
 import signal
 import socket
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -19,6 +21,7 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import psutil
 import pytest
 from rich.console import Console
 
@@ -610,3 +613,24 @@ def test_the_command_says_how_it_ended(
 def test_its_report_is_documented() -> None:
     documented = {code_words(row[0])[0] for row in rows(section("docs/reports.md", "Nightly"))}
     assert documented == NightReport.__dataclass_fields__.keys() | {"state", "message"}
+
+
+def test_a_build_ends_with_its_killed_server(tmp_path: Path) -> None:
+    killed = """
+import os, signal, sys
+from pathlib import Path
+from mapserver.serving.night_runs import NightRuns
+from mapserver.store import MapStore
+
+folder = Path(sys.argv[1])
+(folder / "inbox/lab").mkdir(parents=True)
+with MapStore.open(folder / "store", create=True) as store:
+    print(NightRuns(store, folder / "inbox")._started("lab", 2).pid, flush=True)
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+    server = subprocess.run([sys.executable, "-c", killed, str(tmp_path)], stdout=subprocess.PIPE, check=False)
+    build = int(server.stdout)
+    while psutil.pid_exists(build) and psutil.Process(build).status() != psutil.STATUS_ZOMBIE:
+        time.sleep(0.1)
+    with MapStore.open(tmp_path / "store") as store:
+        assert [job.state for job in store.jobs("lab")] in ([], ["failed"], ["running"]), "it did not come to its end"
