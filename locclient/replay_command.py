@@ -128,13 +128,12 @@ def replay(
     """
     from fleetmap.recordings.failure_recording import is_failure_recording
 
-    settings = settings_of(context)
     if is_failure_recording(recording):
         _replay_failure(recording, map_options, playback, files, version)
         return
     address = map_options.address(version)
     files.check()
-    _run(recording, address, map_options, playback, files, settings)
+    _run(recording, address, map_options, playback, files, settings_of(context))
 
 
 def _replay_failure(

@@ -158,10 +158,9 @@ def wheel_edges(data: CalibrationData, state: MotionState, offset_s: float, scal
             way += share * dt_s * so3_exp(turn * at) @ base_from_body[:3, :3].T @ sample.velocity_base_mps
             variance += (share * dt_s * sample.sigma_mps) ** 2
         # the base moves by R v; the body also by the rotation of the lever between them
-        lever = base_in_body - so3_exp(turn) @ base_in_body
         sigma = np.array([scale * np.sqrt(variance), _SLIP_MPS * dt_s, _SLIP_MPS * dt_s])
         turned = base_from_body[:3, :3] @ so3_exp(-0.5 * turn)
-        edges.append(WheelEdge(k, way, lever, turned / sigma[:, None]))
+        edges.append(WheelEdge(k, way, base_in_body - so3_exp(turn) @ base_in_body, turned / sigma[:, None]))
     return edges
 
 

@@ -142,9 +142,8 @@ def _windows(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> lis
             continue
         places, rotations = [np.zeros(3)], [np.eye(3)]
         for k in range(first, end):
-            turn = so3_exp(turns.rates_body_radps[k] * (ends_s[k] - starts_s[k]))
             places.append(places[-1] + rotations[-1] @ turns.ways_m[k])
-            rotations.append(rotations[-1] @ turn)
+            rotations.append(rotations[-1] @ so3_exp(turns.rates_body_radps[k] * (ends_s[k] - starts_s[k])))
         at_s = np.append(starts_s[first:end], ends_s[end - 1])
         for k in range(0, end - first - 2 * steps + 1, steps):
             t0, t1, t2 = at_s[[k, k + steps, k + 2 * steps]]

@@ -67,11 +67,10 @@ class AreaCorrections:
             _of(self.areas, kind) for kind in (CorrectionKind.FREEZE, CorrectionKind.NEVER_USE, CorrectionKind.FORGET)
         )
         since = [(p, area.correction.since_ns or 0) for area in forget if area.correction for p in area.polygons]
-        limits = SurveyLimits(_polygons(frozen), _polygons(unused), tuple(since))
         start = base
         if base is not None and (gone := self._is_gone(base.points_map)).any():
             start = kept(base, ~gone)
-        merger = MapMerger(start, settings, limits)
+        merger = MapMerger(start, settings, SurveyLimits(_polygons(frozen), _polygons(unused), tuple(since)))
         for done in surveyed:
             merger.add(Session(done.survey, done.map_from_survey))
         found = merger.finish()

@@ -221,10 +221,9 @@ def examine_draft(
 ) -> Evidence:
     """Return the findings of probes in the tiles as stored; `sessions` are the map's recordings."""
     held_out = [probe for session in sessions for probe in session.probes(session.judging(len(sessions)))]
-    last = [] if before is None else probes_of_map(before.survey, PROBES)
     stored = [decode_tile(encode_tile(tile)) for tile in drafted.tiles]
     drafted = drafted._replace(tiles=stored)
-    probes = Probes(held_out, replayed, last)
+    probes = Probes(held_out, replayed, [] if before is None else probes_of_map(before.survey, PROBES))
     current = None if before is None else DraftMap(before.tiles, drafted.vocabulary, before.survey.camera).view()
     draft = drafted.view()
     tasks: list[Callable[[], Any]] = [

@@ -34,9 +34,8 @@ def agrees(prior: PositionPrior, confirmed: Place, base_from_body: Array) -> boo
     map_from_base = confirmed.map_from_body @ se3_inverse(base_from_body)
     off_m = map_from_base[:2, 3] - prior.map_from_base[:2, 3]
     covariance = _WIDER * prior.cov_rot_trans + confirmed.cov_rot_trans
-    cov_m2 = covariance[3:5, 3:5] + _SIGMA_M**2 * np.eye(2)
     turn_rad = so3_log(prior.map_from_base[:3, :3].T @ map_from_base[:3, :3])[2]
-    is_near = off_m @ np.linalg.solve(cov_m2, off_m) < _CHI2_999
+    is_near = off_m @ np.linalg.solve(covariance[3:5, 3:5] + _SIGMA_M**2 * np.eye(2), off_m) < _CHI2_999
     return bool(is_near and abs(turn_rad) < _BOUND_SIGMAS * np.sqrt(covariance[2, 2]))
 
 
@@ -93,9 +92,8 @@ class Prior:
     @classmethod
     def at(cls, known: PoseHypothesis, base_from_body: Array, settings: TrackSettings, **how: Any) -> "Prior":
         """Return a pose at a frame of the odometry as a prior. how: arguments of the constructor."""
-        base = known.start.of_point(se3_inverse(base_from_body))
         since = PoseHypothesis(known.frame_index, known.stamp_ns, ORIGIN, ORIGIN)
-        return cls(base, since, known, base_from_body, settings, **how)
+        return cls(known.start.of_point(se3_inverse(base_from_body)), since, known, base_from_body, settings, **how)
 
     @property
     def names_floor(self) -> bool:

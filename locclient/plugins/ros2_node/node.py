@@ -88,9 +88,8 @@ class Ros2Node:
             except ValueError as error:
                 raise RecordingError(f"{endpoint.name}: invalid {type_name} request ({error})") from error
 
-        key = self._layout.key(endpoint.name, type_name)
         echo = lambda question: answer_attachment(question, time.time_ns())  # noqa: E731
-        self._declared.callback(self._bus.queryable(key, reply, echo).close)
+        self._declared.callback(self._bus.queryable(self._layout.key(endpoint.name, type_name), reply, echo).close)
         self._show(endpoint)
 
     def close(self) -> None:

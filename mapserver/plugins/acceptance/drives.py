@@ -215,7 +215,6 @@ def _reference(
     """Return the best known poses: ground truth in the map's frame, the version's own survey, or the localized frames themselves."""
     entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(selected))
     known = None if version.built is None else version.built.trajectory_of(entry)
-    free = np.ones(len(selected), bool) if known is None else known[1]
     source, trajectory = "its own replay", localised
     if version.truth_in_map and recording.ground_truth is not None:
         source, trajectory = "ground truth", recording.ground_truth
@@ -223,7 +222,7 @@ def _reference(
         source = f"the survey of version {version.manifest.version}"
         trajectory = Trajectory(recording.frame_stamps_ns[selected], known[0])
     is_surveyed = any(entry.sha256 == each.sha256 for each in version.manifest.recordings)
-    return Reference(source, trajectory, free), is_surveyed
+    return Reference(source, trajectory, np.ones(len(selected), bool) if known is None else known[1]), is_surveyed
 
 
 def _off(map_from_body: Array, truth: Array) -> tuple[float, float]:

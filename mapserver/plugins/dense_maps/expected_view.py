@@ -42,10 +42,9 @@ def pinhole(camera: StereoCamera) -> CameraCalibration:
 def resized(camera: CameraCalibration, width_px: int) -> CameraCalibration:
     """Return the same lens with smaller or larger pixels; pixel (0, 0) keeps its corner."""
     scale = width_px / camera.width_px
-    height_px = round(camera.height_px * scale)
     fx, fy, cx, cy = camera.intrinsics_px
     intrinsics = np.array([fx * scale, fy * scale, (cx + 0.5) * scale - 0.5, (cy + 0.5) * scale - 0.5])
-    return replace(camera, width_px=width_px, height_px=height_px, intrinsics_px=intrinsics)
+    return replace(camera, width_px=width_px, height_px=round(camera.height_px * scale), intrinsics_px=intrinsics)
 
 
 def expected_view(surfels: Surfels, camera: CameraCalibration, map_from_cam: Array) -> ExpectedView:

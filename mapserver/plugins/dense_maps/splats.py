@@ -124,9 +124,8 @@ def draw(splats: Splats, parameters: Array, camera: CameraCalibration, map_from_
     chosen = parameters[flat.numbers]
     own = flat.shapes * np.exp(2 * chosen[:, SIZE])[:, None]
     blurred = own + BLUR_PX2 * np.array([1.0, 0.0, 1.0])
-    shrunk = np.sqrt(np.maximum(_determinant(own), 0.0) / _determinant(blurred))
     opacities = 1.0 / (1.0 + np.exp(-chosen[:, OPACITY]))
-    peaks = shrunk * opacities
+    peaks = np.sqrt(np.maximum(_determinant(own), 0.0) / _determinant(blurred)) * opacities
     reaches_px = np.sqrt(2 * np.log(np.maximum(peaks / LEAST_ALPHA, 1.0)))[:, None] * np.sqrt(blurred[:, [0, 2]])
     size_px = np.array([camera.width_px, camera.height_px])
     is_seen = (peaks >= LEAST_ALPHA) & (
@@ -159,7 +158,6 @@ def _projected(splats: Splats, camera: CameraCalibration, cam_from_map: Array) -
     numbers = numbers[np.argsort(depths[numbers], kind="stable")]
     x, y, z = points[numbers].T
     normals = splats.normals[numbers] @ cam_from_map[:3, :3].T
-    pixels = np.column_stack([fx * x / z + cx, fy * y / z + cy])
     across, down = fx / z, fy / z  # the derivative's rows: across (1, 0, -x / z) and down (0, 1, -y / z)
     along_u, along_v = across * (normals[:, 0] - normals[:, 2] * x / z), down * (normals[:, 1] - normals[:, 2] * y / z)
     flattened = 1.0 - THICKNESS**2
@@ -170,4 +168,4 @@ def _projected(splats: Splats, camera: CameraCalibration, cam_from_map: Array) -
             down**2 * (1 + (y / z) ** 2) - flattened * along_v**2,
         ]
     )
-    return _Flat(numbers, pixels, shapes)
+    return _Flat(numbers, np.column_stack([fx * x / z + cx, fy * y / z + cy]), shapes)

@@ -58,9 +58,8 @@ def kept_pictures(
     found = (found + [one for one in before if not _is_among(one.place_map_m, one.looks_map, found)])[:MOST]
     if not found:
         return [], None
-    addresses = sorted({one.sha256 for one in found})
     index = to_json(PictureIndex(pictures=tuple(found)), order="deterministic")
-    blobs = [index, *(data.get(sha256) or blob(sha256) for sha256 in addresses)]
+    blobs = [index, *(data.get(sha256) or blob(sha256) for sha256 in sorted({one.sha256 for one in found}))]
     return blobs, PicturesReport(sha256=sha256_hex(index), bytes=sum(map(len, blobs)), pictures=len(found))
 
 

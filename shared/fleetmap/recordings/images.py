@@ -279,9 +279,7 @@ def depth_image(depth_m: NDArray[np.float32]) -> StoredImage:
 
 def file_kind(data: bytes) -> str:
     """`jpeg`, `png` or `other`, by the first bytes."""
-    if data.startswith(_JPEG_START):
-        return "jpeg"
-    return "png" if data.startswith(_PNG_START) else "other"
+    return "jpeg" if data.startswith(_JPEG_START) else "png" if data.startswith(_PNG_START) else "other"
 
 
 def is_cut(head: bytes, tail: bytes) -> bool:

@@ -131,9 +131,8 @@ class RigCalibration:
 
 def hidden_pixels(mask: tuple[Polygon, ...], size_px: tuple[int, int]) -> NDArray[np.bool_]:
     """(H, W) True inside a mask's polygons or on their edges, for an image of a width and a height."""
-    hidden = np.zeros(size_px[::-1], np.uint8)
     outlines = [np.rint(np.array(polygon) * 2**_SUB_PX).astype(np.int32) for polygon in mask]
-    return np.asarray(cv2.fillPoly(hidden, outlines, (1,), shift=_SUB_PX), bool)
+    return np.asarray(cv2.fillPoly(np.zeros(size_px[::-1], np.uint8), outlines, (1,), shift=_SUB_PX), bool)
 
 
 def _set_numbers(record: object, kind: type[int] | type[float], *names: str) -> None:

@@ -57,9 +57,8 @@ def decode_image(data: bytes, where: str) -> StoredImage:
 
 def encode_image(stamp_ns: int, frame_id: str, image: StoredImage) -> bytes:
     """sensor_msgs/Image of an image stored in rows."""
-    size = image.height_px, image.width_px
     form = image.encoding, image.big_endian, image.step_bytes
-    return pack("sensor_msgs/Image", stamp_ns, frame_id, *size, *form, image.data)
+    return pack("sensor_msgs/Image", stamp_ns, frame_id, image.height_px, image.width_px, *form, image.data)
 
 
 def decode_compressed_image(data: bytes, where: str) -> StoredImage:
