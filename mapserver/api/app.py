@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from http import HTTPMethod
 from typing import Any
 
@@ -24,15 +24,7 @@ from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import StateError
 from fleetmap.mapformat.manifest import MANIFEST_FORMAT
 from fleetmap.mapformat.tile_codec import TILE_FORMAT
-from mapserver.api import (
-    building_routes,
-    fleet_routes,
-    inbox_routes,
-    people_routes,
-    problems,
-    version_routes,
-    views,
-)
+from mapserver.api import building_routes, fleet_routes, inbox_routes, people_routes, problems, version_routes, views
 from mapserver.api import parameters as p
 from mapserver.api.guard import Guard, Sender
 from mapserver.api.metrics import CONTENT_TYPE, Metrics
@@ -81,7 +73,7 @@ def create_app(
         app.include_router(routes.router)
     for install in route_hooks().values():
         install(app, store, partial(version_routes.offered_file, store))
-    _describe(app)
+    app.openapi = cache(partial(_described, app))  # type: ignore[method-assign]  # made at the first request
     return app
 
 
@@ -185,18 +177,8 @@ def _exact(value: Any) -> Any:
     return [_exact(item) for item in value] if isinstance(value, list) else value
 
 
-def _describe(app: FastAPI) -> None:
-    """Install the OpenAPI document in `app`; it is built at the first request."""
-
-    def document() -> dict[str, Any]:
-        if app.openapi_schema is None:
-            app.openapi_schema = _described(app)
-        return app.openapi_schema
-
-    app.openapi = document  # type: ignore[method-assign]
-
-
 def _described(app: FastAPI) -> dict[str, Any]:
+    """The OpenAPI document."""
     found = get_openapi(title=app.title, version=app.version, description=app.description, routes=app.routes)
     schemas = found["components"]["schemas"]
     for name in ("HTTPValidationError", "ValidationError"):

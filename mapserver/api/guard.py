@@ -181,13 +181,8 @@ class Guard:
     def _is_ours(self, host: str) -> bool:
         try:
             name = (urlsplit(f"//{host}").hostname or "").removesuffix(".")
-        except ValueError:
-            return False
-        if name == "localhost" or name in self._settings.names:
-            return True
-        try:
             # An address cannot be redirected by DNS: a page under it comes from this server.
-            return bool(ip_address(name))
+            return name == "localhost" or name in self._settings.names or bool(ip_address(name))
         except ValueError:
             return False
 

@@ -215,10 +215,7 @@ class SurveyAct(Act):
     """Author and reason of a survey request; corners of its polygon in metres of `map`, the first not repeated at the end."""
 
     model_config = _body(actor="ada", reason="racks were moved", corners_map_m=[[0, 0], [4, 0], [4, 3]])
-    corners_map_m: Annotated[
-        list[tuple[Decimal, Decimal]],
-        Field(min_length=3, max_length=MOST_CORNERS),
-    ]
+    corners_map_m: Annotated[list[tuple[Decimal, Decimal]], Field(min_length=3, max_length=MOST_CORNERS)]
 
 
 class RoleAct(Act):

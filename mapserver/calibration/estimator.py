@@ -16,13 +16,7 @@ from mapserver.calibration.image_rows import Fixed, Measured, Observations, imag
 from mapserver.calibration.motion_rows import CalibrationData, MotionState, body_rates, inertial_edges, wheel_edges
 from mapserver.calibration.parameters import COLUMNS, INDEX, UNKNOWNS, CalibrationParameter
 from mapserver.survey.bundle.bundle_adjustment import solver_of
-from mapserver.survey.bundle.problem import (
-    BundleProblem,
-    ImageRows,
-    InertialTerms,
-    MotionPrior,
-    SelfCalibration,
-)
+from mapserver.survey.bundle.problem import BundleProblem, ImageRows, InertialTerms, MotionPrior, SelfCalibration
 from mapserver.survey.rig import Rig
 from mapserver.survey.settings import BundleSettings
 from mapserver.survey.state import PriorTerm

@@ -157,10 +157,9 @@ class Console:
     ) -> None:
         """Adds a page. fill: what its template needs beside `context`, of the services, it and the parts of `path` in braces; may block.
 
-        A FleetmapError becomes a notice within the frame. link: title and icon by which all pages link to it; under: the
-        page that leads to it. knows: query parameters
-        beside the site. under_way: sites that the page knows though the store has no version of them. of_site: False for a page that
-        shows the same whatever site its address names.
+        A FleetmapError becomes a notice within the frame. link: title and icon by which all pages link to it; under: the page that
+        leads to it. knows: query parameters beside the site. under_way: sites that the page knows though the store has no version of
+        them. of_site: False for a page that shows the same whatever site its address names.
         """
         if link is not None:
             self.links[path] = link

@@ -30,8 +30,6 @@ _log = logging.getLogger(__name__)
 T = TypeVar("T")
 _GRID_HEIGHT_M = 1.1  # as the API's grid without a height
 JOBS_SHOWN = 100
-
-
 Span = tuple[int | None, int | None]
 """From when and until before when, nanoseconds since 1970; None: without an end."""
 EVER: Span = (None, None)

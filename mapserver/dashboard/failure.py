@@ -105,9 +105,8 @@ def answer(detail: FailureDetail, moments: Sequence[Moment], clock: FailureClock
     """What happened, as one sentence's end: by the recording where it shows it, else by the report alone."""
     row, report = detail.failure, detail.report
     cause = row.cause.replace("_", " ") or "no cause known"
-    off = ""
-    if report.wrong_by_m is not None:
-        off = f"; its later fixes put it {report.wrong_by_m:.1f} m from where it believed to be"
+    wrong_m = report.wrong_by_m
+    off = "" if wrong_m is None else f"; its later fixes put it {wrong_m:.1f} m from where it believed to be"
     blind = blind_time(moments, report.stamp_ns)
     if blind is None:
         return f"{cause}, {words_of(row.status)[0]} for {row.duration_s:.1f} s when it reported{off}"
@@ -116,9 +115,9 @@ def answer(detail: FailureDetail, moments: Sequence[Moment], clock: FailureClock
         ends = f"found again after {(blind.found_ns - report.stamp_ns) * 1e-9:.1f} s"
     # The images of a robot that is carried end with the last frame before; where it was put down shows when it is found.
     seen_ns = max((each.stamp_ns for each in moments if each.stamp_ns < report.stamp_ns), default=None)
-    if row.cause == Cause.CARRIED and report.wrong_by_m is not None and seen_ns is not None:
+    if row.cause == Cause.CARRIED and wrong_m is not None and seen_ns is not None:
         until = f"between {clock.at(seen_ns)} and {clock.at(blind.found_ns)}" if blind.found_ns is not None else ""
-        return f"carried {report.wrong_by_m:.1f} m, by its own fixes, {until or f'after {clock.at(seen_ns)}'}, {ends}"
+        return f"carried {wrong_m:.1f} m, by its own fixes, {until or f'after {clock.at(seen_ns)}'}, {ends}"
     since = f"from {clock.at(blind.since_ns)} until {clock.at(blind.until_ns)}"
     if blind.parts > 1:
         since = f"for {blind.blind_s:.1f} s in {blind.parts} parts {since}"
@@ -141,24 +140,13 @@ def first_looks(moments: Sequence[Moment], began_ns: int) -> dict[str, int]:
     }
 
 
-@dataclass(frozen=True, slots=True)
-class Instant:
-    """A moment as its page shows it. x, y, heading_rad: None without a pose; picture: number of the last one until then, -1 for none."""
+def instants(moments: Sequence[Moment], pictures: Sequence[PictureRow], clock: FailureClock) -> list[dict[str, object]]:
+    """All moments as the page shows them; pictures: the oldest first.
 
-    clock: str
-    since: str
-    words: str
-    tone: str
-    x: float | None
-    y: float | None
-    heading_rad: float | None
-    picture: int
-    belief: str
-
-
-def instants(moments: Sequence[Moment], pictures: Sequence[PictureRow], clock: FailureClock) -> list[Instant]:
-    """All moments; pictures: the oldest first."""
-    found, picture = [], -1
+    x, y, heading_rad: None without a pose; picture: number of the last one until then, -1 for none.
+    """
+    found: list[dict[str, object]] = []
+    picture = -1
     for each in moments:
         while picture + 1 < len(pictures) and pictures[picture + 1].stamp_ns <= each.stamp_ns:
             picture += 1
@@ -167,8 +155,9 @@ def instants(moments: Sequence[Moment], pictures: Sequence[PictureRow], clock: F
         x, y = _place(each) or (None, None)
         belief = "no position" if x is None else f"at {x:.2f}, {y:.2f} m"
         belief += "" if each.radius_95_m is None else f", within {each.radius_95_m:.2f} m with 95 %"
-        times = clock.at(each.stamp_ns), clock.since(each.stamp_ns)
-        found.append(Instant(*times, words, tone, x, y, each.heading_rad, picture, belief))
+        pose = {"x": x, "y": y, "heading_rad": each.heading_rad, "belief": belief}
+        times = {"clock": clock.at(each.stamp_ns), "since": clock.since(each.stamp_ns)}
+        found.append({**times, "words": words, "tone": tone, "picture": picture, **pose})
     return found
 
 

@@ -76,8 +76,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         chosen["version"] = str(version)  # 07 is 7
     since_ns, until_ns = context.time_range()
     in_time = FailureFilter(site=context.site, since_ns=since_ns, until_ns=until_ns)
-    named = {axis: value for axis, value in chosen.items() if axis != "version"}
-    wanted = replace(in_time, version=version, **named)  # type: ignore[arg-type]  # texts, all of them
+    wanted = replace(in_time, **{**chosen, "version": version})  # type: ignore[arg-type]  # the others are texts
     before, kept_failures = number(context.query.get("before"), "failure"), services.maps.store.fleet
     rows = kept_failures.failures(in_time, limit=MANY_FAILURES)
     matching = [row for row in rows if _fits(row, chosen)]

@@ -17,16 +17,7 @@ from fleetmap.errors import FleetmapError, StateError
 from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.guard import SIGN_IN, SIGN_OUT, STYLE, GuardSettings, address_of, set_session
 from mapserver.api.parameters import ApiSettings
-from mapserver.dashboard import (
-    administration,
-    failure,
-    failures,
-    map_page,
-    overview,
-    robot,
-    robots,
-    survey_jobs,
-)
+from mapserver.dashboard import administration, failure, failures, map_page, overview, robot, robots, survey_jobs
 from mapserver.dashboard.console import PATH, Console, Services
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
@@ -74,7 +65,9 @@ def install_dashboard(
     _install_pages(console)
     for install in part_hooks().values():
         install(Host(store, fleet, settings, app, console, hear))
-    _install_administration(console)
+    link = _link("Administration")  # behind those of the parts
+    console.page("administration", "administration.html", administration.page, link=link, of_site=False)
+    console.page("administration/people", "people.html", administration.people, of_site=False)
     console.nothing_else()
     _install_files(pages, services)
     app.mount(PATH, pages)
@@ -100,22 +93,10 @@ def _install_pages(console: Console) -> None:
     console.page("robots/{robot}", "robot.html", robot.page, knows=span)
     console.stream("robots/{robot}/now", robot.now)
     console.page("map", "map.html", map_page.page, link=_link("Map"), knows=("version", "before", "after", *span))
-    console.page(
-        "failures",
-        "failures.html",
-        failures.page,
-        link=_link("Failures"),
-        knows=(*failures.AXES, *span, "before", "sort"),
-    )
+    asked = (*failures.AXES, *span, "before", "sort")
+    console.page("failures", "failures.html", failures.page, link=_link("Failures"), knows=asked)
     console.page("failures/{failure}", "failure.html", failure.page, of_site=False)
     console.page("surveys", "surveys.html", survey_jobs.page, link=_link("Surveys"), knows=("job", *span))
-
-
-def _install_administration(console: Console) -> None:
-    console.page(
-        "administration", "administration.html", administration.page, link=_link("Administration"), of_site=False
-    )
-    console.page("administration/people", "people.html", administration.people, of_site=False)
 
 
 def _install_files(pages: FastAPI, services: Services) -> None:

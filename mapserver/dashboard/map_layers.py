@@ -143,22 +143,20 @@ def coverage(plan: Plan) -> list[Square]:
     """Tiles, the fuller the darker."""
     most = max((tile.landmarks for tile in plan.tiles), default=1) or 1
     return [
-        square(
-            plan, (t.x, t.y), "tile", f"tile {t.x},{t.y}: {t.landmarks} landmarks", full=round(t.landmarks / most, 3)
-        )
+        square(plan, (t.x, t.y), "tile", f"{t.landmarks} landmarks", full=round(t.landmarks / most, 3))
         for t in plan.tiles
     ]
 
 
 def squares(plan: Plan, kinds: Mapping[tuple[int, int], str]) -> list[Square]:
     """Tiles by what became of them: added, changed or removed."""
-    return [square(plan, place, kind, f"tile {place[0]},{place[1]}: {kind}") for place, kind in sorted(kinds.items())]
+    return [square(plan, place, kind, kind) for place, kind in sorted(kinds.items())]
 
 
 def square(plan: Plan, place: tuple[int, int], tone: str, words: str, *, full: float = 1.0) -> Square:
-    """A tile's square."""
+    """A tile's square; words: what is said of the tile."""
     (x, y), size = place, plan.tile_size_m
-    return Square((x * size, y * size, (x + 1) * size, (y + 1) * size), tone, words, full)
+    return Square((x * size, y * size, (x + 1) * size, (y + 1) * size), tone, f"tile {x},{y}: {words}", full)
 
 
 def directions(plan: Plan) -> list[Mark]:

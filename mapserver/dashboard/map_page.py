@@ -83,9 +83,8 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     changes, compares = _changes(maps, context, rows, before, after or shown), "after" in context.query
     forgets, now_ns = _waiting(maps, site), time.time_ns()
     lately = maps.store.events(site, (now_ns - _COURSES_NS, now_ns))
-    drawn = [
-        ring.round(2).tolist() for area in forgets for ring in area.outlines
-    ]  # requests of their own, which hide nothing
+    # Areas that wait are requests of their own, which hide nothing.
+    drawn = [ring.round(2).tolist() for area in forgets for ring in area.outlines]
     others = [one for one in requests if one.corners_map_m not in drawn]
     asked_for = [Outline([[(x, y) for x, y in one.corners_map_m]], f"survey {one.id}") for one in others]
     over = [
@@ -299,20 +298,18 @@ def _facts(maps: MapData, info: VersionInfo, plan: Plan) -> list[tuple[str, obje
         if isinstance(report.get(name), int | float)
     ]
     is_shipped = shipped_vocabulary(info.vocabulary_sha256) is not None  # then every robot has it
+    recordings = ", ".join(f"{entry.name} ({entry.frames} frames)" for entry in manifest.recordings)
     pairs += [
         ("Built on", f"version {info.parent}" if info.parent else "nothing: it is the first"),
         ("For robots", f"{info.landmarks} landmarks and {plan.places} places"),
         ("Area with tiles", f"{len(plan.tiles) * plan.tile_size_m**2:.0f} m² in {info.tiles} tiles"),
         ("Download for a robot", size(info.map_bytes + (0 if is_shipped else info.vocabulary_bytes))),
-    ]
-    findings = report.get("findings")
-    recordings = ", ".join(f"{entry.name} ({entry.frames} frames)" for entry in manifest.recordings)
-    pairs += [
         ("Recordings", recordings),
         *(("Calibration", choice.sentence) for choice in trusted_calibrations(manifest)),
     ]
-    said = findings.items() if isinstance(findings, dict) else ()
-    return pairs + [(f"Doctor: {name}", "; ".join(words) or "no findings") for name, words in said]
+    findings = report.get("findings")
+    said = findings if isinstance(findings, dict) else {}
+    return pairs + [(f"Doctor: {name}", "; ".join(words) or "no findings") for name, words in said.items()]
 
 
 def one_way(plan: Plan, areas: Areas) -> list[str]:

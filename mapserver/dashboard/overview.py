@@ -16,7 +16,7 @@ from mapserver.dashboard.map_page import verdict_words
 from mapserver.dashboard.rendering import age, begun, share
 from mapserver.fleet.alerts import dropped_words
 from mapserver.fleet_statistics.area_trend import trend_sentence
-from mapserver.fleet_statistics.kpis import Rate, figure
+from mapserver.fleet_statistics.kpis import figure
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.floor_plan.areas import OUTSIDE, Areas
 
@@ -190,6 +190,8 @@ def trends(services: Services, context: PageContext) -> dict[str, object]:
         Figure("Time with a usable position", share(day.availability) or "–", f"of the {when}"),
     ]
     cameras = fleet_parts.cameras((robot.name, robot.calibration) for robot in live.robots)
+    names = [*(f"-{n} d" for n in range(len(health.days) - 1, 0, -1)), "24 h"]
+    bars = [fleet_parts.rate_bar(*day) for day in zip(names, health.days, strict=True)]
     return {
         "tried": fleet_parts.trials_shown(health.trials, context.moment),
         "kpis": figures,
@@ -199,15 +201,8 @@ def trends(services: Services, context: PageContext) -> dict[str, object]:
         "has_areas": health.has_areas,
         "outside": OUTSIDE,
         "kept": {"since": context.written(span_ns[0] or health.week_since_ns), "until": context.query.get("until")},
-        "days": _bars(health.days),
+        "days": Bars("Failures per robot-day", bars),
         "cameras": cameras,
         "parameters": {name: words for name, words in PARAMETERS.items() if any(name in told for _, told in cameras)},
         "concerns": health.resurvey,
     }
-
-
-def _bars(days: tuple[Rate, ...]) -> Bars:
-    """Failures per robot-day of the last days."""
-    last = len(days) - 1
-    names = ["24 h" if n == last else f"-{last - n} d" for n in range(len(days))]
-    return Bars("Failures per robot-day", [fleet_parts.rate_bar(*day) for day in zip(names, days, strict=True)])

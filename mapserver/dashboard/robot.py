@@ -13,7 +13,7 @@ from mapserver.dashboard.failures import failure_marks, tone_of
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN
 from mapserver.dashboard.live import ORDER, SILENT, LiveRobot, words_of
 from mapserver.dashboard.map_layers import Layer, Line
-from mapserver.dashboard.rendering import age
+from mapserver.dashboard.overview import since_words
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.store import FailureFilter, TraceRow
 
@@ -139,46 +139,35 @@ def curve(rows: Sequence[TraceRow], name: str, shown: Range) -> tuple[float, flo
 
 def page(services: Services, context: PageContext, robot: str) -> dict[str, object]:
     """What the template needs. UsageError for an unknown robot."""
-    found = services.robots.look(context.site).robot(robot)
-    if found is None:
+    live = services.robots.look(context.site).robot(robot)
+    if live is None:
         raise UsageError(f"site {context.site} never heard of a robot {robot[:40]!r}; the page Robots lists them")
-    return _page(services, context, found)
-
-
-def now(services: Services, context: PageContext, robot: str) -> dict[str, object]:
-    """What changes from second to second."""
-    found = services.robots.look(context.site).robot(robot)
-    if found is not None:
-        return _now(services, context, found)
-    return {"line": {"tone": "quiet", "words": "It is not known any more.", "exact": ""}, "facts": [], "marks": []}
-
-
-def _page(services: Services, context: PageContext, robot: LiveRobot) -> dict[str, object]:
     (since_ns, end_ns), now_ns = context.time_range(), time.time_ns()
     until_ns = min(now_ns, end_ns or now_ns)
     since_ns = until_ns - _USUAL_NS if since_ns is None else min(since_ns, until_ns - 1)
     span_ns = until_ns - since_ns
-    rows = sorted(services.health.trace(context.site, robot.name, since_ns, until_ns), key=lambda row: row.heard_ns)
+    rows = sorted(services.health.trace(context.site, robot, since_ns, until_ns), key=lambda row: row.heard_ns)
     parts = stretches(rows, until_ns)
     shown = band(parts, span_ns // _BAND_PARTS)
-    wanted = FailureFilter(site=context.site, robot=robot.name, until_ns=end_ns)
+    wanted = FailureFilter(site=context.site, robot=robot, until_ns=end_ns)
     failures = services.maps.store.fleet.failures(wanted, limit=FAILURES_SHOWN)
     within = [row for row in failures if row.happened_ns >= since_ns]
     curves = [(words, form, curve(rows, name, (since_ns, until_ns))) for words, name, form in _CURVES]
-    version = robot.status.version or services.maps.current_version(context.site)
+    version = live.status.version or services.maps.current_version(context.site)
     drawn = None
     if version is not None and services.maps.has_version(context.site, version):
         trail = way(rows, shown, services.settings.ingest.trace_every_s)
         layers = [
             Layer("Way", trail),
             Layer("Failures", failure_marks(context, within)),
-            Layer("Robots", robot.marks()),
+            Layer("Robots", live.marks()),
+            Layer("Chosen place"),
         ]
-        places = [place for line in trail for place in line.points] + ([] if robot.place_m is None else [robot.place_m])
-        drawn = scene_of(services, context, version, [*layers, Layer("Chosen place")], places_m=places)
+        places = [place for line in trail for place in line.points] + ([] if live.place_m is None else [live.place_m])
+        drawn = scene_of(services, context, version, layers, places_m=places)
     return {
-        "robot": robot.name,
-        "now": _now(services, context, robot),
+        "robot": robot,
+        "now": now(services, context, robot),
         "scene": drawn,
         "version": version,
         "at": lambda ns: round(100 * (ns - since_ns) / span_ns, 3),
@@ -194,21 +183,21 @@ def _page(services: Services, context: PageContext, robot: LiveRobot) -> dict[st
     }
 
 
-def _now(services: Services, context: PageContext, robot: LiveRobot) -> dict[str, object]:
-    where = robot.where(services.maps.store.areas(context.site))
-    state, exact = robot.words.capitalize(), ""
-    if robot.tone == "quiet":
-        state += f", last heard {age(robot.status.seconds_since)} ago"
-    elif robot.status.state_since_ns is not None:
-        state += f" for {age(max(0.0, time.time() - robot.status.state_since_ns / 1e9))}"
-        exact = f"since {context.moment(robot.status.state_since_ns)}"
-    flags = f" It reports: {', '.join(robot.flags)}.".replace("_", " ") if robot.flags else ""
+def now(services: Services, context: PageContext, robot: str) -> dict[str, object]:
+    """What changes from second to second."""
+    live = services.robots.look(context.site).robot(robot)
+    if live is None:
+        return {"line": {"tone": "quiet", "words": "It is not known any more.", "exact": ""}, "facts": [], "marks": []}
+    where = live.where(services.maps.store.areas(context.site))
+    state, (since, exact) = live.words.capitalize(), since_words(context, live)
+    if live.tone == "quiet":
+        state += f", last heard {since} ago"
+    elif since:
+        state += f" for {since}"
+    flags = f" It reports: {', '.join(live.flags)}.".replace("_", " ") if live.flags else ""
     words = f"{', '.join(filter(None, [state, where]))}.{flags}"
-    return {
-        "line": {"tone": robot.tone, "words": words, "exact": exact},
-        "facts": _facts(robot),
-        "marks": robot.marks(),
-    }
+    line = {"tone": live.tone, "words": words, "exact": exact and f"since {exact}"}
+    return {"line": line, "facts": _facts(live), "marks": live.marks()}
 
 
 def _facts(robot: LiveRobot) -> list[tuple[str, str]]:

@@ -121,18 +121,16 @@ def _loops(services: Services, context: PageContext, build: dict[str, Any]) -> d
     for loop in reversed(found):  # accepted ones on top
         tone, words = _told(loop)
         ends = [loop.start_map_m, loop.end_map_m]
-        items.append(Line(ends, tone, words))
-        items += [Mark(*end, tone, "circle", words) for end in ends if loop.is_accepted]
+        items += [Line(ends, tone, words), *(Mark(*end, tone, "circle", words) for end in ends if loop.is_accepted)]
     refused = [(loop, *_told(loop)) for loop in found if not loop.is_accepted]
     drawn = None if not found or version is None else scene_of(services, context, version, [Layer("Loops", items)])
-    reasons = Counter(loop.reason or words for loop, _, words in refused).most_common()
     return {
         "scene": drawn,
         "version": version,
         "counts": build.get("loops"),
         "loops": found,
         "refused": refused,
-        "reasons": reasons,
+        "reasons": Counter(loop.reason or words for loop, _, words in refused).most_common(),
     }
 
 

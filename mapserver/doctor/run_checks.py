@@ -19,14 +19,7 @@ from mapserver.doctor.camera_motion import CameraTurns, body_motion
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
 from mapserver.doctor.gyro_images import AXES, GyroFit, gyro_check, turn_upside_down
 from mapserver.doctor.metres import ImageMetres, WheelFit, fit_wheels, judge_metres
-from mapserver.doctor.stereo import (
-    ROTATE_BACK,
-    SWAPPED,
-    StereoMatches,
-    epipolar_error,
-    match_stereo,
-    swapped_cameras,
-)
+from mapserver.doctor.stereo import ROTATE_BACK, SWAPPED, StereoMatches, epipolar_error, match_stereo, swapped_cameras
 from mapserver.survey.executor import SERIAL, Executor
 
 _PAIRS = (SensorSet.STEREO, SensorSet.STEREO_INERTIAL)

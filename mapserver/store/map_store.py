@@ -21,15 +21,7 @@ from typing import Any, Self
 import msgspec
 
 from fleetmap.encoding import to_json, to_plain
-from fleetmap.errors import (
-    BusyError,
-    ChangedError,
-    MapFormatError,
-    StateError,
-    StoreError,
-    UsageError,
-    disk_errors,
-)
+from fleetmap.errors import BusyError, ChangedError, MapFormatError, StateError, StoreError, UsageError, disk_errors
 from fleetmap.files import sync_path, write_atomically
 from fleetmap.mapformat.building import AREAS, BUILDING_KEY
 from fleetmap.mapformat.manifest import BlobEntry, Manifest, TileEntry, decode_manifest, encode_manifest

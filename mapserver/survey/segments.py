@@ -17,15 +17,7 @@ from mapserver.survey.keyframes.keyframes import set_aside
 from mapserver.survey.odometry_pass import initial_state
 from mapserver.survey.pose_graph.odometry_factors import blackout_factors, carried, edge_covariance
 from mapserver.survey.settings import SegmentSettings, SurveySettings
-from mapserver.survey.state import (
-    Cut,
-    FrameTracks,
-    ImageStore,
-    Keyframe,
-    Landmarks,
-    OdometryPass,
-    SurveyState,
-)
+from mapserver.survey.state import Cut, FrameTracks, ImageStore, Keyframe, Landmarks, OdometryPass, SurveyState
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyInputs, SurveyTools
 
 _MARGIN_NS = 1_000_000_000  # of IMU and wheels after the last frame

@@ -11,11 +11,7 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from mapserver.survey.bundle.bundle_adjustment import optimize
-from mapserver.survey.bundle.bundle_rounds import (
-    apply_result,
-    bundle_problem,
-    bundle_rounds,
-)
+from mapserver.survey.bundle.bundle_rounds import apply_result, bundle_problem, bundle_rounds
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Indices, Landmarks, RigImages, SurveyState, image_numbers, of_features
 from mapserver.survey.tracks.tracks import Tracks

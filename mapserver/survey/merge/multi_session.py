@@ -16,12 +16,7 @@ from mapserver.survey.loops.connected_components import find_groups
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.changes import SurveyLimits, what_changes
 from mapserver.survey.merge.confirmation import firm_landmarks
-from mapserver.survey.merge.guided_matching import (
-    Sightings,
-    keyframe_features,
-    match_keyframe,
-    session_relocalization,
-)
+from mapserver.survey.merge.guided_matching import Sightings, keyframe_features, match_keyframe, session_relocalization
 from mapserver.survey.merge.joint_adjustment import JointSolution, Measured, adjust_jointly, begun, grown
 from mapserver.survey.merge.landmark_persistence import count_landmarks, faded
 from mapserver.survey.merge.membership import (
