@@ -12,7 +12,7 @@ VAGUE = re.compile(r"^(.*_)?(poses?|transforms?|extrinsics?)$|^T$|^T_|_T$")
 # Functions act on poses and messages of that name; only one that is nothing but the word returns a matrix.
 VAGUE_FUNCTION = re.compile(r"^_?(poses?|transforms?|extrinsics?|T)$")
 ALLOWED = {
-    "mapserver/fleet/fleet.py": {"last_pose"},  # the last PoseMessage as plain values, not a matrix
+    "mapserver/fleet/fleet.py": {"last_pose"}  # the last PoseMessage as plain values, not a matrix
 }
 # Products are checked where both names say one of the project's own frames; others may be the same by another name.
 KNOWN = {"map", "survey", "odom", "body", "base", "cam"}

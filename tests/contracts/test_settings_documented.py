@@ -13,11 +13,7 @@ from mapserver.config import MapserverConfig
 from support.fleet.contracts_documents import REPOSITORY
 
 # The simulator has no configuration file: its sections are values in its code.
-PACKAGES = {
-    "shared/fleetmap": "fleetmap",
-    "mapserver": "mapserver",
-    "locclient": "locclient",
-}
+PACKAGES = {"shared/fleetmap": "fleetmap", "mapserver": "mapserver", "locclient": "locclient"}
 PROGRAMS: dict[str, tuple[Section, Tiers]] = {
     "mapserver": (MapserverConfig(), MAPSERVER_TIERS),
     "locclient": with_plugins(),

@@ -202,7 +202,6 @@ def refusals(name: str) -> str:
         for path, value in leaves(plain.args[place], argument):
             for fault, wrong in faults(value):
                 call = call_of(name, seed)
-                assert call is not None
                 changed = replaced(call.args[place], argument, path, wrong)
                 if is_refused(partial(call.func, *call.args[:place], changed, *call.args[place + 1 :])):
                     found[fault].append(path)

@@ -75,7 +75,6 @@ def test_kalibrs_chain_and_topics(tmp_path: Path) -> None:
     for ours, wanted in zip(found.calibration.cameras, calibration().cameras, strict=True):
         np.testing.assert_allclose(ours.body_from_cam, wanted.body_from_cam, atol=1e-12)
     assert [camera.imu_minus_cam_s for camera in found.calibration.cameras] == [0.0125, 0.0125]
-    assert found.calibration.imu is not None
     assert found.calibration.imu.gyro_noise_radps_rthz == 1e-4
     np.testing.assert_array_equal(found.calibration.base_from_body, se3(np.eye(3), np.array([0.2, 0, 0.3])))
     assert (found.topics["cam1"], found.topics["imu0"]) == ("/cam1/image_raw", "/imu")
@@ -91,7 +90,6 @@ def test_the_real_chain_agrees_with_itself() -> None:
     chained = parse_calibration(without, "without").calibration
     np.testing.assert_allclose(chained.cameras[1].body_from_cam, both.cameras[1].body_from_cam, atol=1e-6)
     assert both.cameras[0].model == "equidistant"
-    assert both.imu is not None
     assert both.imu.gyro_noise_radps_rthz == pytest.approx(0.00016)
 
 
@@ -175,11 +173,7 @@ def test_lenses_of_every_layout(
 ) -> None:
     """A camera as Kalibr, EuRoC and ROS's camera_calibration write it; one coefficient more that is zero changes nothing."""
     matrix = {"rows": 3, "cols": 3, "data": [400.0, 0, 310, 0, 410, 230, 0, 0, 1]}
-    values: dict[str, Any] = {
-        "camera_model": "pinhole",
-        "intrinsics": [400.0, 410, 310, 230],
-        "resolution": [640, 480],
-    }
+    values: dict[str, Any] = {"camera_model": "pinhole", "intrinsics": [400.0, 410, 310, 230], "resolution": [640, 480]}
     key = "distortion_coeffs" if layout == "kalibr" else "distortion_coefficients"
     given: Any = coefficients
     if layout == "ros":
@@ -199,7 +193,6 @@ def test_lenses_of_every_layout(
             read(file)
         return
     camera = read(file)
-    assert coefficients is not None
     assert camera.distortion.tolist() == coefficients[:kept]
     assert camera.intrinsics_px.tolist() == [400, 410, 310, 230]
 
@@ -247,7 +240,6 @@ def test_the_chains_of_open_vins(tmp_path: Path) -> None:
     found = read_calibration(open_vins(tmp_path))
     np.testing.assert_allclose(found.cameras[0].body_from_cam, MOUNTED, atol=1e-12)
     assert Rectifier(found).camera.baseline_m == pytest.approx(0.11)
-    assert found.imu is not None
     assert found.imu.gyro_noise_radps_rthz == pytest.approx(1.7e-4)
 
 

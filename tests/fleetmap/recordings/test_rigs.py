@@ -265,7 +265,6 @@ def test_a_robot_and_its_recordings_pair_by_mounting(tmp_path: Path) -> None:
     live, complete = pytest.importorskip("locclient.plugins.ros2_node.source").RigFrames(calibration), []
     for frame in map(store_frame, frames):
         (rear,) = frame.others
-        assert rear is not None
         for number, image in ((1, rear.left), (3, rear.right), (0, frame.left), (2, frame.right)):
             assert image is not None
             complete += live.add(number, frame.stamp_ns, image)

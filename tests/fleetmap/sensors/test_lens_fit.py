@@ -58,7 +58,6 @@ def followed(model: str, *, turns: bool, has_depth: bool = False) -> list[Follow
 @pytest.mark.parametrize("model", list(LENSES))
 def test_the_right_lens_is_not_doubted(model: str, turns: bool, has_depth: bool) -> None:
     fit = fit_lens(rig(model), followed(model, turns=turns, has_depth=has_depth))
-    assert fit is not None
     assert not fit.is_doubtful, fit
 
 
@@ -78,7 +77,6 @@ def test_the_right_lens_is_not_doubted(model: str, turns: bool, has_depth: bool)
 )
 def test_a_wrong_lens_is_named(model: str, given: RigCalibration, turns: bool, says: str) -> None:
     fit = fit_lens(given, followed(model, turns=turns))
-    assert fit is not None
     assert fit.ratio > 2.5
     words = fit.words(given.cameras[0])
     assert says in words
@@ -109,7 +107,6 @@ def test_a_fisheye_that_sees_190_degrees(factor: float) -> None:
         good = ((np.array(seen_px) > 0) & (np.array(seen_px) < 511)).all(axis=(0, 2))
         pairs.append(FollowedPoints(seen_px[0][good], seen_px[1][good], None, seen_px[2][good]))
     fit = fit_lens(fisheye(factor * 155.0), pairs)
-    assert fit is not None
     assert fit.is_doubtful == (factor != 1.0)
 
 

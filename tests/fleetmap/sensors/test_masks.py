@@ -65,7 +65,6 @@ def test_odometry_does_not_follow_the_robots_own_body() -> None:
 def test_no_descriptor_and_no_corner_touches_the_body() -> None:
     rectifier = Rectifier(masked())
     frame, clearance_px = rectifier.rectify(frame_with_body(FRAME_NS)), rectifier.camera.clearance_px
-    assert clearance_px is not None
     features, everywhere = (extract(frame.left, OrbSettings(count=300), each) for each in (clearance_px, None))
     room_px = clearance_px[tuple(np.rint(features.pixels).astype(int).T[::-1])]
     assert (room_px > 14.0 * SCALE_FACTOR**features.octaves).all()
@@ -87,7 +86,6 @@ def test_points_end_at_the_body() -> None:
     assert clearance_px is not None
     for k in range(1, 20):
         estimate = odometry.handle_stereo(rectifier.rectify(frame_with_body(k * FRAME_NS)))
-        assert estimate.track_pixels is not None
         at = np.rint(estimate.track_pixels[:, :2]).astype(int).T[::-1]
         assert (clearance_px[tuple(at)] > 5).all()
 
@@ -95,12 +93,10 @@ def test_points_end_at_the_body() -> None:
 def test_checks_of_a_recording_look_beside_the_body() -> None:
     frames = [frame_with_body(k * FRAME_NS) for k in (1, 4)]
     points = follow_points(*frames, masked().cameras[0].mask)
-    assert points is not None
     assert not hidden_pixels((BODY,), SIZE_PX)[tuple(np.rint(points.left).astype(int).T[::-1])].any()
     rectifier = Rectifier(masked())
     found, _ = motion_between(*(rectifier.rectify(frame) for frame in frames), rectifier.camera)  # type: ignore[misc]
     before, after = (analytic_motion(k * FRAME_NS * 1e-9).map_from_body @ BODY_FROM_CAM for k in (1, 4))
-    assert found is not None
     assert np.linalg.norm((found - np.linalg.inv(before) @ after)[:3, 3]) < 0.02
 
 
@@ -132,7 +128,6 @@ def test_landmarks_behind_the_body_are_not_missed() -> None:
     away = (-points / distances[:, None]).astype(np.float32)
     reach, words = distances.astype(np.float32), rng.integers(0, 2**63, (count, 4)).astype(np.uint64)
     pixels = camera.pixel_from_point(points)
-    assert camera.clearance_px is not None
     shown = camera.clearance_px[tuple(np.rint(at).astype(int).T[::-1])] > 15
     seen = pixels[shown], pixels[shown, :2].copy(), np.zeros(shown.sum(), np.int8), words[shown]
 
@@ -143,7 +138,6 @@ def test_landmarks_behind_the_body_are_not_missed() -> None:
             *(1.0, SCALE_FACTOR, FixSettings(), StereoSettings(), 0.35, REFINEMENT, clearance_px),
         )
         found = finder.by_projection(seen, None, np.eye(4), 12.0)
-        assert found is not None
         return len(found[8]), int(found[9].sum())
 
     (all_of_them, found), (beside, same) = expected(None), expected(camera.clearance_px)

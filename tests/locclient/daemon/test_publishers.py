@@ -19,10 +19,8 @@ def test_messagepack_holds_both_transforms() -> None:
     assert list(told) == ["fleetmap/hall/robots/r1/estimate"]
     first, second = (decode_message(payload, EstimateMessage) for payload in told["fleetmap/hall/robots/r1/estimate"])
     assert (first.stamp_ns, first.status, first.map_version) == (5 * 10**9, "TRACKING", 3)
-    assert first.map_from_odom is not None
     map_from_base = first.map_from_odom.target_from_source @ first.odom_from_base.target_from_source
     np.testing.assert_allclose(map_from_base, tracked.map_from_body @ se3_inverse(BASE_FROM_BODY), atol=1e-12)
-    assert first.cov_rot_trans is not None
     assert first.cov_rot_trans[35] == pytest.approx(0.01 + 0.2**2 * 1e-4), "of the base, 0.2 m aside"
     assert (first.cause, second.cause) == ("", "dark")
     assert (second.map_from_odom, second.cov_rot_trans, len(second.hypotheses)) == (None, None, 2)

@@ -181,7 +181,6 @@ def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(world:
     assert delivered_while_away == [0]
     waiting = [report.id for report in parts.outbox.waiting(10)]
     world.hub.reachable = True
-    assert parts.server is not None
     last = ServerSync(parts.server.client, parts.outbox, retry_s=600.0)  # the next start delivers what was not yet
     last.step()
     assert len(world.table) == len(set(world.table)) == 1
@@ -238,7 +237,6 @@ def test_the_recording_of_a_failure_at_the_end_has_arrived(
     robot = Robot(robot_world.rectifier(), robot_world.SETTINGS, robot_world.TRIAL, keeps_replay=True)
     bundles = list(robot_world.bundles(110, dark=range(60, 110)))
     plain = world.parts(ScriptedSource(bundles, ready=lambda: robot.running is not None), robot, Listener())
-    assert plain.server is not None
     spool = plain.server.replays = Outbox(world.folder / "replays", max_bytes=10**8)
     made = Runtime(replace(plain, replays=ReplayQueue(spool, plain.profile)), ServiceManager(""))
 
@@ -264,7 +262,6 @@ def test_a_new_version_is_taken_while_driving(world: World) -> None:
     robot, listener = robot_world.new_robot(), Listener(grid_height_m=0.3)
     source = ScriptedSource(list(robot_world.bundles(200)), ready=lambda: robot.running is not None)
     parts = world.parts(source, robot, listener)
-    assert parts.server is not None
     parts.server.client.takes_grids = True
 
     def publish() -> None:
@@ -284,10 +281,8 @@ def test_a_new_version_is_taken_while_driving(world: World) -> None:
     (first, none, why), (second, grid, _) = listener.grids
     assert (first, none, second) == (1, None, 2)
     assert "version 1 of site room has no grid" in why
-    assert grid is not None
     assert ((grid.cells == 100).sum(), (grid.cells == 0).sum()) == (400, 800)
     active = parts.server.client.active()
-    assert active is not None
     assert active.version == 2
     assert world.fleet.robots("room")[0].version == 2
 

@@ -23,10 +23,7 @@ def picture(number: int) -> Image:
 
 def frame(number: int, left: Image | None = None, right: Image | None = None) -> RectifiedFrame:
     return RectifiedFrame(
-        number,
-        picture(2 * number) if left is None else left,
-        picture(2 * number + 1) if right is None else right,
-        None,
+        number, picture(2 * number) if left is None else left, picture(2 * number + 1) if right is None else right, None
     )
 
 

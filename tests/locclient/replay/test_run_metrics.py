@@ -228,7 +228,6 @@ def test_errors_against_a_truth_in_another_frame_are_aligned() -> None:
     run = result(truths, frames)
     run.estimates[50].map_from_body[:3, 3] += 3.0  # while it is lost
     found = run.aligned_error_m()
-    assert found is not None
     assert found["frames"] == 70
     assert [found[name] for name in ("median", "max", "scale")] == pytest.approx([0.01, 0.01, 1.0], abs=1e-3)
     assert "another frame" in run.alignment_note()
@@ -238,7 +237,6 @@ def test_errors_against_a_truth_in_another_frame_are_aligned() -> None:
 def test_a_truth_of_another_scale_shows_and_one_of_few_frames_is_no_truth() -> None:
     frames = sequence((10.0, GOOD))
     twice = result([np.eye(4)] * 100, frames, scale=2.0).aligned_error_m()
-    assert twice is not None
     assert twice["scale"] == pytest.approx(2.0, abs=0.01)
     assert twice["median"] > 0.1
     few = result([np.eye(4)] * 2 + [None] * 98, frames)

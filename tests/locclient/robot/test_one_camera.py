@@ -33,7 +33,6 @@ def driven(store: MapStore, *, imu: bool, wheels: float, first: int = 0, frames:
     robot.use(robot_world.loaded(store))
     outcomes, last_ns = list[Outcome](), 0
     for number, bundle in list(enumerate(robot_world.bundles(first + frames)))[first:]:
-        assert bundle.frame is not None
         rolled = list[WheelSample]()
         if wheels and last_ns:
             moved = se3_log(

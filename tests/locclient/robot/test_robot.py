@@ -53,14 +53,12 @@ def test_a_robot_knows_where_its_map_lies_in_the_building(store: MapStore) -> No
     for one in (loaded, replace(loaded, manifest=aligned), loaded):
         robot.use(one)
         outcome = robot.handle(next(iter(robot_world.bundles(1))))
-        assert outcome is not None
         found.append(outcome.published.building_from_map)
     assert found[0] is found[2] is None
     robot.use(replace(loaded, manifest=aligned))
     for frame_of_site in (BuildingFrame(x_m=9.0, y_m=8.0, yaw_rad=0.0), None):  # aligned anew, and that forgotten
         robot.align(frame_of_site)
         outcome = robot.handle(next(iter(robot_world.bundles(1))))
-        assert outcome is not None
         found.append(outcome.published.building_from_map)
     assert found[3][:2, 3].tolist() == [9.0, 8.0]
     np.testing.assert_array_equal(found[4], found[1])
@@ -81,7 +79,6 @@ def test_a_version_that_slipped_is_refused_and_the_place_kept(store: MapStore) -
     assert [(change.change, change.wanted.version) for change in changes] == [(Change.REFUSED, 2)]
     assert "of version 2 0 fixes and 2 that contradict it" in changes[0].reason
     assert "version 1 gives fixes" in changes[0].reason
-    assert robot.running is not None
     assert robot.running.version == 1
     assert max(errors) < 0.1
 
@@ -136,14 +133,12 @@ def ride(
     for number, bundle in enumerate(bundles):
         priors = [PositionPrior(0, told, covariance, is_revisable)] if number == GIVEN else []
         outcome = robot.handle(replace(bundle, priors=priors))
-        assert outcome is not None
         estimates.append(outcome.estimate)
     assert estimates[GIVEN - 1].status is Status.TRACKING
     return estimates
 
 
 def off_m(estimate: Estimate, number: int) -> float:
-    assert estimate.map_from_body is not None
     return float(np.linalg.norm(estimate.map_from_body[:2, 3] - robot_world.truth(number)[:2, 3]))
 
 
@@ -185,7 +180,6 @@ def test_a_robot_that_forgets_claims_nothing_until_it_finds_itself(tmp_path: Pat
     estimates = []
     for number, bundle in enumerate(robot_world.bundles(FRAMES, dark=range(GIVEN, GIVEN + 5))):
         outcome = robot.handle(replace(bundle, forget=forget and number == GIVEN))
-        assert outcome is not None
         estimates.append(outcome.estimate)
     assert all((one.map_from_body is None) == forget for one in estimates[GIVEN : GIVEN + 5])
     assert (estimates[GIVEN].status is Status.INITIALISING) == forget

@@ -17,8 +17,6 @@ _HEADING = re.compile(r"^#{1,6} .*$", re.MULTILINE)
 def generate_docs() -> Any:
     """The module docs/generate.py, which is in no package."""
     spec = importlib.util.spec_from_file_location("generate_docs", REPOSITORY / "docs/generate.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -102,7 +102,6 @@ class MadeRobot:
         return "LOST" if self._blind > 0 else "TRACKING"
 
     def _report(self, now_ns: int) -> FailureReport:
-        assert self._begun is not None
         begun_ns, _, kind = self._begun
         self._begun = None
         self._failures += 1

@@ -7,9 +7,7 @@ from pathlib import Path
 
 from fleetmap.mapformat.tile import Tile
 from fleetmap.mapformat.tile_codec import decode_tile
-from fleetmap.messages import (
-    WantedVersion,
-)
+from fleetmap.messages import WantedVersion
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from mapserver import releases

@@ -107,7 +107,6 @@ async def _pump(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> N
 
 
 def wait_until_ready(process: subprocess.Popen[str]) -> None:
-    assert process.stdout is not None
     lines = [process.stdout.readline().strip() for _ in range(3)]
     assert lines[2] == "ready", lines
 

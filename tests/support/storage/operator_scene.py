@@ -17,16 +17,7 @@ from mapserver.store import Actor, DraftContent, MapStore
 from mapserver.store.fleet_queries import FleetBatch
 from mapserver.store.rows import TraceRow
 from support.drawn_areas import geojson
-from support.fleet.dashboard_scene import (
-    AISLE_M,
-    LENGTH_M,
-    SITE,
-    WIDTH_M,
-    build_report,
-    failure,
-    hall_tiles,
-    picture,
-)
+from support.fleet.dashboard_scene import AISLE_M, LENGTH_M, SITE, WIDTH_M, build_report, failure, hall_tiles, picture
 from support.fleet.failed_robot import send_replay, small_file
 from support.storage.map_samples import draft_details
 

@@ -225,10 +225,4 @@ def run(
             waiting.append((scenario, mode, found))
     seconds = time.monotonic() - started_s
     total = sum(sum(counts.values()) for counts in tries.values())
-    return {
-        "points": total,
-        "is_complete": not waiting,
-        "seconds": round(seconds, 1),
-        "tries": tries,
-        "wrong": wrong,
-    }
+    return {"points": total, "is_complete": not waiting, "seconds": round(seconds, 1), "tries": tries, "wrong": wrong}

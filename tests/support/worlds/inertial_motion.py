@@ -53,9 +53,7 @@ def sample_motion(
     stamps = np.round(np.arange(round(duration_s * rate_hz) + 1) * 1e9 / rate_hz).astype(np.int64)
     gyro, accel = np.array([_felt(int(s)) for s in stamps]).transpose(1, 0, 2)
     return ImuSamples(
-        stamps,
-        gyro + (0 if gyro_bias is None else gyro_bias),
-        accel + (0 if accel_bias is None else accel_bias),
+        stamps, gyro + (0 if gyro_bias is None else gyro_bias), accel + (0 if accel_bias is None else accel_bias)
     )
 
 

@@ -107,7 +107,6 @@ def test_the_start_finds_scale_gravity_and_speed(unit_m: float) -> None:
     imu = noisy_imu(rng, 6.0, IMU, GYRO_BIAS, ACCEL_BIAS)
     times_s = np.arange(0.5, 4.5, 0.2)
     found = mono_inertial_initialization(vision(times_s, unit_m, rng), imu, IMU, BODY_FROM_CAM, OdometrySettings())
-    assert found is not None
     assert found.metres_per_unit == pytest.approx(unit_m, rel=0.04)  # noise of the places hides some of the way
     assert abs(found.metres_per_unit / unit_m - 1) < 4 * found.scale_sigma_share
     true = analytic_motion(float(times_s[-1]))

@@ -98,7 +98,6 @@ def test_euroc_imu_that_is_not_the_body(tmp_path: Path) -> None:
     recording = open_recording(folder)
     imu_from_cam = recording.calibration.cameras[0].body_from_cam
     np.testing.assert_allclose(imu_from_cam, se3_inverse(euroc_from_imu) @ BODY_FROM_CAM0, atol=1e-12)
-    assert recording.ground_truth is not None
     np.testing.assert_allclose(
         recording.ground_truth.frame_from_body[0], SAMPLE.world_from_body[0] @ euroc_from_imu, atol=1e-9
     )
@@ -179,7 +178,6 @@ def test_tumvis_export_in_eurocs_layout(tmp_path: Path) -> None:
     recording = open_recording(folder)
     assert recording.sensor_set is SensorSet.STEREO_INERTIAL
     np.testing.assert_allclose(recording.calibration.cameras[0].body_from_cam, BODY_FROM_CAM0, atol=1e-12)
-    assert recording.ground_truth is not None
     assert len(recording.ground_truth) == 4
 
 
@@ -190,7 +188,6 @@ def test_seven_scenes_depth_is_registered_to_colour(tmp_path: Path) -> None:
     assert recording.sensor_set is SensorSet.RGBD
     assert recording.frame_stamps_ns.tolist() == [round(i * 5 * 1e9 / 30) for i in range(4)]
     depth = recording.read_frame(0).depth_m
-    assert depth is not None
     assert set(np.unique(depth)) == {np.float32(0), np.float32(2), np.float32(5)}
     middle = depth[HEIGHT // 2]
     left_2m, left_5m = (525 / 640 * WIDTH * 0.025 / z for z in (2, 5))
@@ -214,7 +211,6 @@ def test_seven_scenes_with_a_depth_camera_beside_the_colour_camera(tmp_path: Pat
     (tmp_path / "rig.yaml").write_text(f"cam0: {{{lens}}}\ncam1: {{{lens}, T_cn_cnm1: {rows}}}\n")
     recording = open_recording(folder, OpenOptions(calibration_file=tmp_path / "rig.yaml"))
     depth = recording.read_frame(0).depth_m
-    assert depth is not None
     near = np.flatnonzero(depth[HEIGHT // 2] == 2)
     far = np.flatnonzero(depth[HEIGHT // 2] == 5)
     assert near[-1] == pytest.approx(WIDTH // 2 - 1 + 300 * 0.05 / 2, abs=1)

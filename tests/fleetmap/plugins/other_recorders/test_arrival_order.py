@@ -45,9 +45,7 @@ def parts(folder: Path, storage: StoragePlugin) -> Path:
         lambda folder: write_rosbag1(folder / "a.bag", shuffled(40), publishers=2),
         # the recorder's clock was set back by 0.1 s, the sensors' was not
         lambda folder: write_foreign(
-            folder / "a.mcap",
-            MESSAGES,
-            log_delay_ns=lambda stamp_ns: -100_000_000 * (stamp_ns > SAMPLE.stamps_ns[2]),
+            folder / "a.mcap", MESSAGES, log_delay_ns=lambda stamp_ns: -100_000_000 * (stamp_ns > SAMPLE.stamps_ns[2])
         ),
     ],
     ids=["neighbours", "backwards", "publishers", "both", "sqlite parts", "mcap parts", "ros1", "recorder's clock"],

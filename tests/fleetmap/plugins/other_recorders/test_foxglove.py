@@ -113,7 +113,6 @@ def test_everything_is_read(tmp_path: Path) -> None:
         camera = recording.calibration.cameras[0]
         assert camera.intrinsics_px[0] == FOCAL
         np.testing.assert_allclose(camera.body_from_cam, BODY_FROM_CAM0, atol=1e-12)
-        assert recording.ground_truth is not None
         np.testing.assert_allclose(recording.ground_truth.frame_from_body[3], SAMPLE.world_from_body[3], atol=1e-12)
 
 

@@ -211,7 +211,6 @@ def test_depth_beside_colour(tmp_path: Path, encoding: str) -> None:
     )
     assert recording.sensor_set is SensorSet.RGBD
     depth = recording.read_frame(0).depth_m
-    assert depth is not None
     np.testing.assert_array_equal(depth, np.where(depth_mm == 2500, np.float32(2.5), np.float32(0)))
 
 

@@ -61,7 +61,6 @@ def test_all_that_is_written_is_read(tmp_path: Path) -> None:
         (prior,) = recording.priors
         np.testing.assert_allclose(prior.map_from_base, PRIOR.map_from_base, atol=1e-12)
         np.testing.assert_array_equal(prior.cov_rot_trans, PRIOR.cov_rot_trans)
-        assert recording.ground_truth is not None
         np.testing.assert_allclose(recording.ground_truth.frame_from_body, TRUTH.frame_from_body, atol=1e-12)
 
 
@@ -102,7 +101,6 @@ def decoded(path: Path) -> Iterator[tuple[str, str, Any]]:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         assert reader.get_header().profile == "ros2"
         for schema, channel, _, message in reader.iter_decoded_messages():
-            assert schema is not None
             assert (schema.encoding, channel.message_encoding) == ("ros2msg", "cdr")
             yield channel.topic, schema.name, message
 

@@ -24,7 +24,6 @@ def view_of(parameters: Array, seed: int) -> tuple[CameraView, Array]:
     """The view from where PnP places the camera, as a fix does, and that place's error in metres."""
     matched, map_from_cam, rows = seen_with(parameters, seed)
     found = refine_pnp(matched, se3_inverse(map_from_cam))
-    assert found is not None
     placed = se3_inverse(found.cam_from_source)
     view = camera_view(matched, placed, rows)
     assert view is not None
@@ -124,8 +123,6 @@ def test_a_step_against_the_wheels_shows_a_turned_camera() -> None:
         believed = [end._replace(map_from_base=end.map_from_base @ turned) for end in (before, now)]
         right = mounting.heading(before, now)
         wrong = mounting.heading(*believed)
-        assert right is not None
-        assert wrong is not None
         assert abs(right[0]) < 1e-3
         assert abs(wrong[0] - error_rad) < 1e-3
         assert 0.004 < wrong[1] < (0.01 if way[2] == by_wheels[2] else 0.04)
@@ -134,7 +131,6 @@ def test_a_step_against_the_wheels_shows_a_turned_camera() -> None:
 def test_a_turn_that_the_wheels_do_not_tell_may_have_come_at_one_end() -> None:
     for x_m, y_m in ((1.0, 0.0), (np.cos(0.12), np.sin(0.12))):
         found = mounting.heading(base_at(0, 0, 0), base_at(x_m, y_m, 0.12, (1.0, 0.0, 0.0)))
-        assert found is not None
         assert abs(found[0]) < 2 * found[1]
 
 
@@ -170,7 +166,6 @@ def test_the_height_above_the_floor() -> None:
     points = landmarks(np.random.default_rng(0), 60)
     lifted = base_at(0, 0, 0.3)._replace(map_from_base=se3(np.eye(3), np.array([0.0, 0, 0.07])))
     found = mounting.height(lifted, points)
-    assert found is not None
     assert abs(found[0] - 0.07) < 0.015
     assert mounting.height(lifted, landmarks(np.random.default_rng(0), 0)) is None  # no floor to be seen
     assert mounting.height(lifted, np.zeros((0, 3))) is None

@@ -178,7 +178,6 @@ class World:
         odometry = replace(one.odometry, odom_from_body=visual, stamp_ns=BEGUN_NS + at_ms * MS)
         place = truth(at_ms) @ BASE_FROM_BODY
         one = replace(one, stamp_ns=BEGUN_NS + at_ms * MS, map_from_body=place, odometry=odometry, **changes)
-        assert self.localizer is not None
         self.localizer.publish(one, self.odom.handle(one), BASE_FROM_BODY)
 
     def close(self) -> None:
@@ -245,7 +244,6 @@ def heard(world: World) -> tuple[int, str]:
     handle = world.bus.subscribe(
         RmwZenohKeys(0).key("/diagnostics", "diagnostic_msgs/DiagnosticArray"), lambda _, data: told.append(data)
     )
-    assert world.localizer is not None
     world.localizer.alive(False)
     handle.close()
     status = STORE.deserialize_cdr(told[-1], "diagnostic_msgs/msg/DiagnosticArray").status[0]

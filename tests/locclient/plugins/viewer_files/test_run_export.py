@@ -84,10 +84,7 @@ def test_the_mcap_file_holds_the_same(room: tuple[Path, Path], tmp_path: Path) -
 
 @pytest.mark.parametrize(
     ("given", "said"),
-    [
-        (["--mcap", "run.txt"], "must end in .mcap"),
-        (["--mcap", "run.mcap"], "pip install '.[foxglove]'"),
-    ],
+    [(["--mcap", "run.txt"], "must end in .mcap"), (["--mcap", "run.mcap"], "pip install '.[foxglove]'")],
 )
 def test_wrong_orders_are_told_before_the_work(
     room: tuple[Path, Path], given: list[str], said: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
