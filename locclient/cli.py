@@ -77,12 +77,7 @@ def status(
     typer.echo(last_status(folder or runtime_folder() or Path("/run/fleetmap")))
 
 
-COMMANDS: Commands = {
-    "enrol": enrol,
-    "replay": replay,
-    "run": run,
-    "status": status,
-}
+COMMANDS: Commands = {"enrol": enrol, "replay": replay, "run": run, "status": status}
 
 
 def locclient(version: Version = False) -> None:

@@ -83,13 +83,20 @@ def resurvey(
     config: ConfigFile = None,
 ) -> None:
     """List the tiles to resurvey with reasons, requested tiles first; --route writes a route through them."""
+    import json as json_text
+
     from mapserver.fleet.resurvey_list import resurvey_list
+    from mapserver.fleet_statistics.resurvey_decision import route_csv, route_geojson
 
     settings = settings_of(context).resurvey
     with open_store(store, read_only=True) as maps:
         found = resurvey_list(maps, site, settings, time.time_ns())
     if route is not None:
-        _write_route(found, route)
+        if route.suffix == ".csv":
+            text = route_csv(found.route)
+        else:
+            text = json_text.dumps(route_geojson(found.site, found.version or 0, found.route), indent=1) + "\n"
+        write_output(route, text.encode())
     print_result(found, _words(found), json=json)
 
 
@@ -99,18 +106,6 @@ def _words(found: "ResurveyList") -> Iterator[str]:
         corners = f"{len(asked.corners_map_m)} corners"
         yield f"request {asked.id} of {asked.actor or 'unnamed'}: {corners}, {asked.reason or '-'}"
     yield f"{len(found.tiles)} tiles to survey again, {len(found.route)} waypoints"
-
-
-def _write_route(found: "ResurveyList", path: Path) -> None:
-    import json as json_text
-
-    from mapserver.fleet_statistics.resurvey_decision import route_csv, route_geojson
-
-    if path.suffix == ".csv":
-        text = route_csv(found.route)
-    else:
-        text = json_text.dumps(route_geojson(found.site, found.version or 0, found.route), indent=1) + "\n"
-    write_output(path, text.encode())
 
 
 def replay(

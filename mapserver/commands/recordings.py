@@ -73,8 +73,7 @@ def _print(source: "Recording", findings: "list[Finding]") -> None:
     table = Table()
     for column in ("check", "verdict", "finding"):
         table.add_column(column, overflow="fold")
-    order = list(Verdict)
-    for same, sentence in sorted(grouped(findings), key=lambda group: -order.index(group[0][0].verdict)):
+    for same, sentence in sorted(grouped(findings), key=lambda group: -list(Verdict).index(group[0][0].verdict)):
         verdict = same[0].verdict
         words = sentence.removeprefix(f"{Verdict.NOT_JUDGED}: ")
         table.add_row(", ".join(finding.name for finding in same), Text(verdict, colours[verdict]), words)

@@ -90,9 +90,8 @@ class HttpOptions:
             raise UsageError(fault)
         if certificate is not None:
             certificate.warn(frozenset(given))
-        names = {host.lower(), *given} | (certificate.names() if certificate else frozenset())
         return GuardSettings(
-            names=frozenset(names),
+            names=frozenset({host.lower(), *given} | (certificate.names() if certificate else frozenset())),
             operators=Operators(store),
             must_sign_in=proxy is not None or (not fault and not is_loopback_name(host)),
             warning=(_NO_TLS if has_operators else _INSECURE) if fault else warning,

@@ -62,11 +62,7 @@ def run_bounded(command: list[str], limits: ProcessLimits, what: str) -> Process
     prefix = without_network()
     with TemporaryFile() as output, TemporaryFile() as errors:
         process = subprocess.Popen(
-            [*prefix, *command],
-            stdin=subprocess.DEVNULL,
-            stdout=output,
-            stderr=errors,
-            start_new_session=True,
+            [*prefix, *command], stdin=subprocess.DEVNULL, stdout=output, stderr=errors, start_new_session=True
         )
         try:
             limits.apply(process.pid)  # not between fork and exec, where another thread's lock is never released

@@ -17,7 +17,7 @@ import numpy as np
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, StateError, UsageError
 from fleetmap.geometry import Array
-from fleetmap.mapformat.building import ALIGNMENT, AREAS, FLOORS, Building, Floor, FloorEntry, read_building, read_lifts
+from fleetmap.mapformat.building import ALIGNMENT, AREAS, FLOORS, Building, Floor, read_building, read_lifts
 from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment, map_corners_m
 from mapserver.floor_plan.areas import MAX_REASON, Area, Areas, Correction, CorrectionKind, read_areas
 from mapserver.floor_plan.masks import check_masks_on_map
@@ -66,8 +66,7 @@ def correct_area(store: MapStore, site: str, name: str, kind: CorrectionKind | N
         )
     correction = None if kind is None else Correction(kind, _one_line(actor.reason))
     changed = [replace(area, correction=correction) if area.name == name else area for area in areas.areas]
-    data = to_json(Areas.of(changed).geojson(site))
-    return replace_areas(store, site, data, actor, tag=store.areas_tag(site))
+    return replace_areas(store, site, to_json(Areas.of(changed).geojson(site)), actor, tag=store.areas_tag(site))
 
 
 def undo_areas(store: MapStore, site: str, actor: Actor) -> Areas:
@@ -281,14 +280,11 @@ def buildings(store: MapStore) -> list[Building]:
 
 def floors_of(store: MapStore, building: Building) -> list[Floor]:
     """Return the floors with their poses and lifts; one whose alignment was removed is left out."""
-
-    def floor(entry: FloorEntry) -> Floor | None:
-        alignment = store.alignment(entry.site)
-        if alignment is None:
-            return None
-        return Floor(entry, alignment.frame, read_lifts(store.site_file(entry.site, AREAS), alignment.frame))
-
-    return [found for entry in building.floors if (found := floor(entry)) is not None]
+    return [
+        Floor(entry, alignment.frame, read_lifts(store.site_file(entry.site, AREAS), alignment.frame))
+        for entry in building.floors
+        if (alignment := store.alignment(entry.site)) is not None
+    ]
 
 
 def single_lifts(floors: Sequence[Floor]) -> list[str]:

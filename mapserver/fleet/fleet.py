@@ -173,9 +173,8 @@ class Fleet:
     def take_ack(self, site: str, robot: str, ack: RobotAck) -> None:
         """Store an acknowledgement; raises LinkError for one in another robot's name."""
         _check_sender(site, robot, ack)
-        now_ns = self._clock_ns()
         with self._lock:
-            entry = self._entry(site, robot, now_ns, ack.version)
+            entry = self._entry(site, robot, self._clock_ns(), ack.version)
             entry.report["ack"] = to_plain(ack)
             report, version = dict(entry.report), entry.version
         with self._storing():
@@ -205,9 +204,8 @@ class Fleet:
             self._ingest.take_health(health, entry.last_estimate, now_ns, dict(entry.report), entry.version)
 
     def take_pose(self, site: str, robot: str, message: PoseMessage) -> None:
-        now_ns = self._clock_ns()
         with self._lock:
-            self._entry(site, robot, now_ns, message.map_version).last_estimate = message
+            self._entry(site, robot, self._clock_ns(), message.map_version).last_estimate = message
             self._ingest.take_pose(site, robot, message)
 
     def take_failure(self, site: str, robot: str, report: FailureReport) -> FailureAck:

@@ -38,8 +38,7 @@ class ResurveyList:
 def resurvey_list(store: MapStore, site: str, settings: ResurveySettings, now_ns: int) -> ResurveyList:
     """Return the list as of now; raises UsageError for an unknown site."""
     current = store.current(site)
-    now_hour = hour_of(now_ns)
-    recent_hour = now_hour - round(settings.recent_days * 24)
+    recent_hour = hour_of(now_ns) - round(settings.recent_days * 24)
     before_hour = recent_hour - round(settings.before_days * 24)
     recent, before = (
         {

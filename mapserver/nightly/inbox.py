@@ -295,8 +295,7 @@ def remove_old(inbox: Path, days: float, now_ns: int, *, dry_run: bool = False) 
     found = 0
     for folder in (inbox / where for where in (DONE, HELD, BAD)):
         with disk_errors(f"old recordings of {folder} cannot be removed", "check the rights of the inbox"):
-            paths = sorted(folder.iterdir()) if folder.is_dir() and not folder.is_symlink() else []
-            for path in paths:
+            for path in sorted(folder.iterdir()) if folder.is_dir() and not folder.is_symlink() else []:
                 with suppress(FileNotFoundError):  # removed by somebody else meanwhile
                     if path.name.endswith(_REASON) or path.lstat().st_ctime_ns >= now_ns - days * _DAY_S * 1e9:
                         continue

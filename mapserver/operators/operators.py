@@ -122,11 +122,8 @@ class Operators:
         if stored is None or not is_right:
             self.note("sign-in refused", "wrong name or password", who)
             return SignIn(refusal="Wrong name or password.")
-        return self._begin(Actor(name, "", name, address))
-
-    def _begin(self, who: Actor) -> SignIn:
         session = secrets.token_urlsafe(32)
-        self._store.operators.begin_session(_digest(session), who.name, who)
+        self._store.operators.begin_session(_digest(session), name, Actor(name, "", name, address))
         now_ns = self._now_ns()
         self._store.operators.remove_ended(
             begun_before_ns=now_ns - LIFE_S * 10**9, used_before_ns=now_ns - IDLE_S * 10**9

@@ -97,8 +97,7 @@ class BusService:
         """
         changed, known = [], set()
         for info in self._store.sites():
-            versions = self._fleet.wanted_versions(info.site)
-            for robot, newest in versions.items():
+            for robot, newest in self._fleet.wanted_versions(info.site).items():
                 wanted = self._lists.admitted_or_current(newest)
                 key, address = (info.site, robot), wanted.manifest_sha256
                 known.add(key)

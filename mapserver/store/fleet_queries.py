@@ -168,8 +168,7 @@ class FleetQueries:
                 id=rows[0].failure_id, stamp_ns=at_ns, wall_ns=at_ns, calibration=words[:2000], **known
             )
         query = "SELECT place, kind, stamp_ns, length(jpeg) bytes FROM failure_pictures WHERE number = ? ORDER BY place"
-        pictures = self._database.rows(PictureRow, query, (number,))
-        return FailureDetail(rows[0], report, pictures)
+        return FailureDetail(rows[0], report, self._database.rows(PictureRow, query, (number,)))
 
     def failure_number(self, site: str, robot: str, failure_id: str) -> int | None:
         """Return the number of a robot's report, None if not stored."""

@@ -93,8 +93,7 @@ class OperatorQueries:
     def remove_ended(self, *, begun_before_ns: int, used_before_ns: int) -> None:
         """Remove sessions that are too old, and tokens that ended long ago, but not those ended only by a clock far ahead."""
         with self._database.write(durable=False) as change:
-            old = (begun_before_ns, used_before_ns)
-            change.execute("DELETE FROM sessions WHERE begun_ns < ? OR used_ns < ?", old)
+            change.execute("DELETE FROM sessions WHERE begun_ns < ? OR used_ns < ?", (begun_before_ns, used_before_ns))
             change.execute("DELETE FROM tokens WHERE ends_ns < ?", (self._database.now_ns() - _TOKENS_KEPT_NS,))
 
     def token(self, sha256: str) -> TokenRow | None:

@@ -76,8 +76,7 @@ class StoreQueries:
     def versions(self, site: str, *, after: int = 0, limit: int | None = None) -> list[VersionInfo]:
         """Return versions of a site, oldest first, after number `after`."""
         self._check_site(site)
-        wanted = {"site": site, "version >": after}
-        return self._database.select(VersionInfo, "versions", wanted, "version", limit)
+        return self._database.select(VersionInfo, "versions", {"site": site, "version >": after}, "version", limit)
 
     def version(self, site: str, version: int) -> VersionInfo:
         """Return one version; UsageError if it does not exist."""

@@ -16,11 +16,10 @@ class Release:
     def set_state(self, version: int, state: str) -> None:
         """Set a version published, current or retired, with the time of the first and of the last."""
         self.has_new_current |= state == "current"
-        retired_ns = self._now_ns if state == "retired" else None
         self._change.execute(
             """UPDATE versions SET state = ?, published_ns = coalesce(published_ns, ?), retired_ns = ?
                WHERE site = ? AND version = ?""",
-            (state, self._now_ns, retired_ns, self._site, version),
+            (state, self._now_ns, self._now_ns if state == "retired" else None, self._site, version),
         )
 
     def make_current(self, version: int) -> None:

@@ -54,8 +54,7 @@ def collect(database: Database, blobs: Blobs, retention: Retention, actor: Actor
     garbage = Garbage()
     with nullcontext() if actor is None else database.write() as change:
         for site in database.column("SELECT site FROM sites ORDER BY site"):
-            rows = site_releases(database, site)
-            retired, removed = _planned(database, rows, retention)
+            retired, removed = _planned(database, site_releases(database, site), retention)
             garbage.retired += [(site, version) for version in retired]
             garbage.removed += [(site, version) for version in removed]
             if change is None or actor is None:

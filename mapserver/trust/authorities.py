@@ -195,14 +195,13 @@ def _load(path: Path, passphrase: str | None) -> ec.EllipticCurvePrivateKey:
 
 
 def _builder(name: str, issuer: x509.Name, key: ec.EllipticCurvePublicKey, days: float) -> x509.CertificateBuilder:
-    now = datetime.now(UTC)
     return (
         x509.CertificateBuilder()
         .subject_name(_name(name))
         .issuer_name(issuer)
         .public_key(key)
         .serial_number(x509.random_serial_number())
-        .not_valid_after(now + timedelta(days=days))
+        .not_valid_after(datetime.now(UTC) + timedelta(days=days))
     )
 
 

@@ -158,8 +158,7 @@ class RobotRegister:
         check_name(site, "site")
         _ = self.tls
         authorities, lists = self.authorities, SignedLists(self.store.folder)
-        host = endpoint.partition("/")[2].rpartition(":")[0].strip("[]")
-        if host not in authorities.hosts:
+        if endpoint.partition("/")[2].rpartition(":")[0].strip("[]") not in authorities.hosts:
             raise StateError(
                 f"robots would refuse the server at {endpoint}: its certificate names {', '.join(authorities.hosts)}; name one of "
                 "them, or make another certificate: `mapserver trust rotate server --host ...`"

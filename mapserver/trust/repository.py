@@ -184,8 +184,7 @@ class ListRepository:
             metadata.sign(signer, append=True)
         for judge in judges:
             _check(judge, role, metadata)
-        number = metadata.signed.version
-        path = self.lists.path(role, number)
+        path = self.lists.path(role, metadata.signed.version)
         with disk_errors(f"{path} cannot be written", "free some space, and run the command again"):
             make_folder(path.parent)
             write_atomically(path, [metadata.to_bytes(_COMPACT)])

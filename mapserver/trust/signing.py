@@ -199,8 +199,7 @@ def rotate_root(store: MapStore, root_key: "Signer", folder: Path | None = None)
 @contextmanager
 def _changing(store: MapStore, root_key: "Signer", words: str) -> Iterator["ListRepository"]:
     """Yield the lists for one change, checked before it; afterwards `words` are logged, and the server signs resulting lists."""
-    lists = SignedLists(store.folder)
-    if not lists.are_there:
+    if not SignedLists(store.folder).are_there:
         raise StateError(f"{store.folder} has no signed lists; `mapserver trust init` makes them")
     with _held(store) as repository:
         repository.check_root_key(root_key)
@@ -312,8 +311,7 @@ def _update_site(repository: "ListRepository", rows: SiteReleases) -> int | None
         root_key = keys.signer("root")
         if root_key is None:
             return None
-        signer = keys.signer(role) or keys.make(role)
-        repository.delegate(rows.site, signer.public_key, root_key)
+        repository.delegate(rows.site, (keys.signer(role) or keys.make(role)).public_key, root_key)
     site_key = keys.signer(role)
     if site_key is None:
         return None

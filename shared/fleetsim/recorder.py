@@ -119,8 +119,7 @@ def drive(run: Run, kind: RobotKind, layout: Layout, rng: np.random.Generator) -
     """The run's motion; UsageError if it comes too near to an obstacle."""
     pieces = [RouteMotion(route, kind.limits, kind.body_height_m, kind.shake, rng) for route in run.routes]
     motion: Motion = pieces[0] if len(pieces) == 1 else CarriedMotion(pieces)
-    positions = motion.map_from_body(sample_times(motion.duration_s, 20.0))[:, :2, 3]
-    check_clear(positions, layout, kind.clearance_m)
+    check_clear(motion.map_from_body(sample_times(motion.duration_s, 20.0))[:, :2, 3], layout, kind.clearance_m)
     return motion
 
 

@@ -91,8 +91,7 @@ class LiveMap:
 
     def points_map(self) -> Array:
         """(N, 3) landmarks, each moved with the keyframe that saw it first."""
-        placed = self.map_from_body
-        parts = [p @ t[:3, :3].T + t[:3, 3] for p, t in zip(self._points_body, placed, strict=True)]
+        parts = [p @ t[:3, :3].T + t[:3, 3] for p, t in zip(self._points_body, self.map_from_body, strict=True)]
         return np.concatenate([np.zeros((0, 3)), *parts])
 
     def loops(self) -> LiveLoops:
@@ -114,8 +113,7 @@ class LiveMap:
             for _, r in sorted(best.items())[-_NEWEST:]
         )
         accepted = [(r.i, r.j) for r in found.records if r.verdict is LoopVerdict.ACCEPTED]
-        ends = np.array(accepted, np.int64).reshape(-1, 2)
-        return LiveLoops(ends, refused, newest)
+        return LiveLoops(np.array(accepted, np.int64).reshape(-1, 2), refused, newest)
 
     def _loops(self) -> Loops:
         """All candidates so far, and the loops accepted by the pose graph."""
@@ -183,8 +181,7 @@ class LiveMap:
             self._level = self._upright()
             self._map_from_body = new.frame_from_body[None].copy()
             return
-        before = self._news[-2]
-        motion = se3_inverse(before.frame_from_body) @ new.frame_from_body
+        motion = se3_inverse(self._news[-2].frame_from_body) @ new.frame_from_body
         assert new.step_cov is not None
         self._walked_m2.append(self._walked_m2[-1] + float(np.trace(new.step_cov[3:, 3:])))
         self._chain_from_body.append(self._chain_from_body[-1] @ motion)
@@ -341,8 +338,7 @@ class LiveMap:
                 joins.append((pair.i, pair.j))
         before = np.flatnonzero(self._seeing[:first])
         sigmas_m = grown_sigma(np.array([new.variance_m2 for new in self._news]))
-        since = int(before[-1]) if len(before) else 0
-        joins += bridges(self._seeing, sigmas_m, self._settings.join_sigma_m, since)
+        joins += bridges(self._seeing, sigmas_m, self._settings.join_sigma_m, int(before[-1]) if len(before) else 0)
         for a, b in joins:
             self._parts.join(a, b)
             self._joined.join(a, b)
@@ -358,9 +354,8 @@ class LiveMap:
         marginals = GraphMarginals(self._map_from_body, [*known, *learned])
         self._marginals = marginals
         if self._closer is None:
-            measures_scale = not rig.scale_known
             self._closer = LoopCloser(
-                posed, self._options, marginals, matched, self._joined, measures_scale=measures_scale
+                posed, self._options, marginals, matched, self._joined, measures_scale=not rig.scale_known
             )
             self._closer.close(0)
         else:

@@ -257,8 +257,7 @@ class _Survey:
         """Return the estimate in the robots' form: of the base, with the odometry's continuous frame as `odom`."""
         if found is None:
             return None
-        base_from_body = self._drive.calibration.base_from_body
-        body_from_base = se3_inverse(base_from_body)
+        body_from_base = se3_inverse(self._drive.calibration.base_from_body)
         odom_from_body, placed, cov = found.keyframe.frame_from_body, found.map_from_body, found.cov_rot_trans
         if placed is not None and cov is not None:
             lever = np.eye(6)

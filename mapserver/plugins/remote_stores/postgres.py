@@ -94,10 +94,9 @@ class PostgresDatabase(Database):
             raise UsageError(
                 f"{self._name}: metadata can be in PostgreSQL alone; write the URL like postgresql://user@host/name"
             )
-        password = os.environ.get("PGPASSWORD") if parts.password is None else unquote(parts.password)
         self._login = {
             "user": unquote(parts.username or os.environ.get("PGUSER", "postgres")),
-            "password": password,
+            "password": os.environ.get("PGPASSWORD") if parts.password is None else unquote(parts.password),
             "host": parts.hostname,
             "port": port,
             "database": unquote(parts.path.lstrip("/")) or None,

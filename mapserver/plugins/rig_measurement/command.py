@@ -122,8 +122,7 @@ def _from_guess(recordings: list[Path], out: Path | None, guess: str, config: Pa
         )
     with TemporaryDirectory() as folder, _shown() as tools:
         first = Path(folder) / "guess.yaml"
-        rig = first_rig(int(known[1]), int(known[2]), baseline_m)
-        first.write_text(format_calibration(rig), encoding="utf-8")
+        first.write_text(format_calibration(first_rig(int(known[1]), int(known[2]), baseline_m)), encoding="utf-8")
         with open_recording(recordings[0], OpenOptions(first, topics)) as recording:
             found = calibration_from_guess(
                 _sound(recording.view(0)), survey_settings(config, recording.sensor_set), tools

@@ -69,8 +69,7 @@ class Vocabulary:
 
     def branches(self, descriptors: Descriptors) -> NDArray[np.int32]:
         """(N, 2) numbers of the two children of the root nearest to each descriptor (N, 32); 0 without children."""
-        children = self.centres[1 : 1 + int(self.child_count[0])]
-        return core.two_nearest(packed(descriptors), children)
+        return core.two_nearest(packed(descriptors), self.centres[1 : 1 + int(self.child_count[0])])
 
     def bow_vector(self, words: WordIds) -> BowVector:
         """The tf-idf vector of a place's words (N,), L1-normalised. Source: Galvez-Lopez and Tardos 2012 (DBoW2)."""

@@ -85,10 +85,8 @@ def rotation_code(rotation: Array) -> tuple[int, NDArray[np.int16]]:
 
 def rotation_values(indices: NDArray[np.uint8], ratios: NDArray[np.int16]) -> Array:
     """(K, 3, 3) rotations of `rotation_code`'s codes (K,) and (K, 3)."""
-    count = len(indices)
-    quats = np.ones((count, 4))
-    others = np.arange(4)[None] != indices[:, None]
-    quats[others] = (ratios.astype(np.float64) / _RATIO).ravel()
+    quats = np.ones((len(indices), 4))
+    quats[np.arange(4)[None] != indices[:, None]] = (ratios.astype(np.float64) / _RATIO).ravel()
     w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -160,8 +158,7 @@ def encode_tile(tile: Tile) -> bytes:
         low, high = tile.points_map[:, 2].min(), tile.points_map[:, 2].max()
         raise MapFormatError(f"{tile.name}: heights from {low} to {high} m do not fit in 24 bits; remove the outliers")
     references = sum(len(ids) for ids in tile.place_landmark_ids)
-    counts = (len(tile), len(tile.place_ids), references)
-    head = _HEAD.pack(tile.tile_x, tile.tile_y, tile.size_m, z_base, *counts)
+    head = _HEAD.pack(tile.tile_x, tile.tile_y, tile.size_m, z_base, len(tile), len(tile.place_ids), references)
     steps = (tile.points_map[:, :2] - tile.origin_m) / (tile.size_m / _SIDE_STEPS)
     plane_codes = np.clip(np.round(steps), 0, _SIDE_STEPS - 1).astype(np.uint32)
     parts = [

@@ -122,8 +122,7 @@ class ExportReader:
 
     def data(self, number: int) -> bytes:
         """Read the bytes of a blob; raises MapFormatError if they are damaged."""
-        blob = self.head.blobs[number]
-        return verified(b"".join(self.chunks(number)), blob.sha256)
+        return verified(b"".join(self.chunks(number)), self.head.blobs[number].sha256)
 
     def chunks(self, number: int) -> Iterator[bytes]:
         """Read the bytes of a blob in pieces, unverified."""

@@ -61,7 +61,11 @@ class AccelerometerCheck:
         if self.fault:
             return
         if earlier_from_body is None or not self._run or stamp_ns - self._run[-1][0] > _LONGEST_NS:
-            self._begin_run(stamp_ns)
+            # Evidence on axes and bias stays; the up direction in the axes of this frame is unknown.
+            self._run = [(stamp_ns, np.zeros(3), np.eye(3))]
+            up, others = self._normal[12:15], np.linalg.pinv(self._normal[12:15, 12:15], hermitian=True)
+            self._normal = self._normal - up.T @ others @ up
+            self._normal[12:15], self._normal[:, 12:15] = 0.0, 0.0
             return
         _, place, rotation = self._run[-1]
         moved = place + rotation @ earlier_from_body[:3, 3], rotation @ earlier_from_body[:3, :3]
@@ -73,13 +77,6 @@ class AccelerometerCheck:
         self._add(middle, imu)
         del self._run[:middle]
         self._judge(imu, on_wheels)
-
-    def _begin_run(self, stamp_ns: int) -> None:
-        """Start a run: evidence on axes and bias stays; the up direction in the axes of this frame is unknown."""
-        self._run = [(stamp_ns, np.zeros(3), np.eye(3))]
-        up, others = self._normal[12:15], np.linalg.pinv(self._normal[12:15, 12:15], hermitian=True)
-        self._normal = self._normal - up.T @ others @ up
-        self._normal[12:15], self._normal[:, 12:15] = 0.0, 0.0
 
     def _add(self, middle: int, imu: ImuSamples) -> None:
         (t0, p0, _), (t1, p1, _), (t2, p2, _) = self._run[0], self._run[middle], self._run[-1]

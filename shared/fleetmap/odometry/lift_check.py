@@ -66,8 +66,7 @@ class LiftCheck:
         if stamp_ns - self._wheel.stamp_ns > WINDOW_NS or earlier_from_body is None:
             self._steps.clear()
             return False
-        up_body = odom_from_body[2, :3]
-        up = self._base_from_body[:3, :3] @ up_body
+        up = self._base_from_body[:3, :3] @ odom_from_body[2, :3]
         step_m = (self._base_from_body @ earlier_from_body @ self._body_from_base)[:3, 3]
         climb_m, rolling = float(up @ step_m), [*wheel, self._wheel]
         speed_mps = max(length(sample.velocity_base_mps) for sample in rolling)
@@ -76,11 +75,9 @@ class LiftCheck:
         self._steps.append(_Step(stamp_ns, climb_m, (step_m - climb_m * up)[:2], rolled_m, is_rolling))
         while stamp_ns - self._steps[0].stamp_ns > WINDOW_NS:
             self._steps.popleft()
-        return self._climbs(climb_sigma_mps) or self._is_tilted(up, speed_mps) or self._is_moved(speed_mps)
-
-    def _climbs(self, sigma_mps: float) -> bool:
         climb_m, rolled_m = sum(s.climb_m for s in self._steps), sum(s.rolled_m for s in self._steps)
-        return abs(climb_m) > _CLIMB_M + _CLIMB_SHARE * rolled_m + _SIGMAS * sigma_mps * WINDOW_NS * 1e-9
+        climbs = abs(climb_m) > _CLIMB_M + _CLIMB_SHARE * rolled_m + _SIGMAS * climb_sigma_mps * WINDOW_NS * 1e-9
+        return climbs or self._is_tilted(up, speed_mps) or self._is_moved(speed_mps)
 
     def _is_tilted(self, up: Array, speed_mps: float) -> bool:
         is_tilted = self._floor_up is not None and bool(self._floor_up @ up < _TILT)

@@ -637,10 +637,8 @@ class InertialMode(WindowMode):
         window, since = samples.between(still[0], now_ns), samples.between(still[1], now_ns)
         if len(window) < 20 or not len(since) or not is_steady(window, self._rig.settings.start):
             return
-        duration_s = (now_ns - still[1]) * 1e-9
-        sigma_radps = self._imu.noise.gyro_noise_radps_rthz / np.sqrt(duration_s)
-        mean_radps = since.gyro_radps.mean(axis=0)
-        if self.window.filter.correct_by_rest(mean_radps, float(sigma_radps), _GATE_6) <= _GATE_6:
+        sigma_radps = self._imu.noise.gyro_noise_radps_rthz / np.sqrt((now_ns - still[1]) * 1e-9)
+        if self.window.filter.correct_by_rest(since.gyro_radps.mean(axis=0), float(sigma_radps), _GATE_6) <= _GATE_6:
             self._measured_ns = now_ns
 
     def _begin_again(self, frame_index: int, tracked: Tracked) -> Step:

@@ -120,14 +120,13 @@ class MapView:
 
     def fix_finder(self, camera: StereoCamera, settings: RelocalizerSettings) -> core.FixFinder:
         """Create the finder of fixes of a camera in this map."""
-        counts = [len(rows) for rows in self.place_rows]
         return core.FixFinder(
             self.cones,
             self.sigmas_m,
             packed(self.descriptors),
             self.map_from_cam,
             self._shown,
-            np.cumsum([0, *counts]),
+            np.cumsum([0, *map(len, self.place_rows)]),
             pinhole_of(camera),
             camera.focal_px / self._survey_focal_px,
             SCALE_FACTOR,
@@ -140,8 +139,7 @@ class MapView:
 
     def neighbourhood(self, place: int) -> Rows:
         """Rows of all landmarks of places near one place with a similar viewing direction."""
-        map_from_place = self.map_from_cam[place]
-        near = places_around(self.map_from_cam, map_from_place, _NEIGHBOURHOOD_M, _NEIGHBOURHOOD_COSINE)
+        near = places_around(self.map_from_cam, self.map_from_cam[place], _NEIGHBOURHOOD_M, _NEIGHBOURHOOD_COSINE)
         return np.unique(self._shown[near[self._place_of_shown]])
 
 
@@ -149,8 +147,7 @@ def _rows_of(ids: NDArray[np.uint32], landmark_ids: NDArray[np.uint32], order: R
     """Rows of landmark ids, `order` sorts all of them; ids in unloaded tiles are left out."""
     if not len(order):
         return np.zeros(0, np.int64)
-    at = np.searchsorted(landmark_ids, ids, sorter=order)
-    rows = order[np.minimum(at, len(order) - 1)]
+    rows = order[np.minimum(np.searchsorted(landmark_ids, ids, sorter=order), len(order) - 1)]
     return np.asarray(rows[landmark_ids[rows] == ids], np.int64)
 
 

@@ -158,8 +158,7 @@ class CarriedMotion:
         """As RouteMotion.rates of the piece in force."""
         gyro = self._pick(times_s, lambda motion, local_s: motion.rates(local_s)[0])
         force = self._pick(times_s, lambda motion, local_s: motion.rates(local_s)[1])
-        up_body = self.map_from_body(times_s)[:, 2, :3]
-        return gyro, force + self._height(times_s, 2)[:, None] * up_body
+        return gyro, force + self._height(times_s, 2)[:, None] * self.map_from_body(times_s)[:, 2, :3]
 
     def velocity_body(self, times_s: Array) -> Array:
         """As RouteMotion.velocity_body of the piece in force, as measured by wheels, without the lift."""
@@ -168,8 +167,7 @@ class CarriedMotion:
     def _local(self, times_s: Array) -> tuple[NDArray[np.int64], Array]:
         """(N,) the piece in force, and the time since the robot stood on the ground, which is negative before."""
         piece = np.minimum(np.searchsorted(self._ends_s, times_s, side="right"), len(self._motions) - 1)
-        starts_s = np.concatenate([[0.0], self._ends_s[:-1] + LIFT_S])
-        return piece, times_s - starts_s[piece]
+        return piece, times_s - np.concatenate([[0.0], self._ends_s[:-1] + LIFT_S])[piece]
 
     def _height(self, times_s: Array, derivative: int) -> Array:
         """(N,) above the ground, or a derivative; the fifth-order curve that begins and ends at rest."""

@@ -57,8 +57,7 @@ def _corner_arc(before: Array, corner: Array, after: Array, radius_m: float) -> 
         raise UsageError(f"the route doubles back on itself at {corner.round(2).tolist()}; give it a loop to turn in")
     reach = min(radius_m / np.tan(angle / 2), 0.49 * back_m, 0.49 * ahead_m)
     radius = reach * np.tan(angle / 2)
-    bisector = (back + ahead) / np.linalg.norm(back + ahead)
-    centre = corner + bisector * np.hypot(reach, radius)
+    centre = corner + ((back + ahead) / np.linalg.norm(back + ahead)) * np.hypot(reach, radius)
     start, end = corner + back * reach - centre, corner + ahead * reach - centre
     sweep = float(np.arctan2(start[0] * end[1] - start[1] * end[0], start @ end))
     angles = np.linspace(0.0, sweep, max(4, int(abs(sweep) * radius / STEP_M)))
@@ -100,8 +99,7 @@ def time_path(route: Route, limits: Limits) -> TimedPath:
     # A wait would lengthen the step before it, which would be driven slowly: a second sample holds the position.
     times = np.cumsum(durations)
     held = np.array(sorted(stops), np.int64)
-    waits = np.array([stops[int(index)] for index in held], np.float64)
-    times_held = np.insert(times, held, times[held] - waits)
+    times_held = np.insert(times, held, times[held] - np.array([stops[int(index)] for index in held], np.float64))
     points_held, yaw_held = np.insert(points, held, points[held], axis=0), np.insert(yaw, held, yaw[held])
     whole = np.concatenate([[0.0], times_held, [times_held[-1] + route.rest_s]])
     return TimedPath(whole, np.pad(points_held, ((1, 1), (0, 0)), "edge"), np.pad(yaw_held, 1, "edge"))

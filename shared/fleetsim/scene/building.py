@@ -115,8 +115,7 @@ class HallMaker:
         top, middle_x, middle_y = layout.ceiling_m, (x_min + x_max) / 2, (y_min + y_max) / 2
         length, width = x_max - x_min, y_max - y_min
         scramble = self._scramble(column, row, 10)
-        roof = Surface(textures.dark, scramble=scramble)
-        builder.add_quad((x_min, y_min, top), (length, 0, 0), (0, width, 0), roof)
+        builder.add_quad((x_min, y_min, top), (length, 0, 0), (0, width, 0), Surface(textures.dark, scramble=scramble))
         beam = Surface(textures.grey, 0.8, scramble + 1)
         for x in (x_min + length / 4, x_max - length / 4):
             builder.add_box((x, middle_y, top - 0.25), (0.1, width / 2, 0.2), beam, sides="xXz")
@@ -142,8 +141,7 @@ class HallMaker:
         for x, group in self._lamp_places(column, row):
             lamp = Surface(textures.lamp, material=MATERIAL_LAMP, emission=9.0, group=group)
             builder.add_box((x, y, z - 0.75), (0.75, 0.12, 0.05), lamp, sides="z", is_solid=False)
-            housing = Surface(textures.grey)
-            builder.add_box((x, y, z - 0.74), (0.77, 0.14, 0.06), housing, sides="xXyY", is_solid=False)
+            builder.add_box((x, y, z - 0.74), (0.77, 0.14, 0.06), Surface(textures.grey), sides="xXyY", is_solid=False)
 
     def _has_dock(self, column: int, row: int) -> bool:
         return column == 0 and row % 2 == 0

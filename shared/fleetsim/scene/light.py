@@ -75,8 +75,7 @@ class AutoExposure:
 
     def choose(self, lamps: LampField, groups: Array, places_map: Array, forward_map: Array) -> Exposure:
         """Exposure for recent camera places (N, 3) that looked along forward_map (N, 3)."""
-        reaches = (1.0, 3.0, 6.0)
-        ahead = np.concatenate([places_map + reach * forward_map for reach in reaches])
+        ahead = np.concatenate([places_map + reach * forward_map for reach in (1.0, 3.0, 6.0)])
         seen = np.mean([lamps.floor_light(groups, float(x), float(y)) for x, y, _ in ahead])
         wanted_s = self.target_grey / (GREY_PER_MS * 1e3 * max(_MEAN_REFLECTANCE * float(seen), 1e-4))
         time_s = float(np.clip(wanted_s, self.shortest_s, self.longest_s))

@@ -86,8 +86,7 @@ class Mover:
         lengths = np.hypot(legs[:, 0], legs[:, 1])
         along = (self.start_m + self.speed_mps * t_s) % max(float(lengths.sum()), 1e-9)
         leg = min(int(np.searchsorted(np.cumsum(lengths), along, side="right")), len(legs) - 1)
-        share = (along - float(lengths[:leg].sum())) / max(float(lengths[leg]), 1e-9)
-        x, y = self._path[leg] + share * legs[leg]
+        x, y = self._path[leg] + ((along - float(lengths[:leg].sum())) / max(float(lengths[leg]), 1e-9)) * legs[leg]
         return float(x), float(y), float(np.arctan2(legs[leg, 1], legs[leg, 0]))
 
 
@@ -124,7 +123,6 @@ def add_movers(builder: FaceBuilder, movers: tuple[AnyMover, ...], textures: Tex
 
 def mover_light(faces: Faces, movers: tuple[AnyMover, ...], floor_light: list[float], t_s: float) -> Array:
     """Light samples of the movers' faces: the ground's light at each one's place, by side."""
-    boxes_of = [len(MOVER_KINDS[mover.kind].parts(t_s)) for mover in movers]
-    of_box = np.repeat(np.array(floor_light), boxes_of)
+    of_box = np.repeat(np.array(floor_light), [len(MOVER_KINDS[mover.kind].parts(t_s)) for mover in movers])
     per_face = 0.8 * of_box[faces.owners[:, 0]] * SIDE_LIGHT[faces.owners[:, 1]]
     return np.repeat(per_face, faces.numbers[:, 4] * faces.numbers[:, 5])

@@ -54,8 +54,7 @@ class RackMaker:
         y, half = layout.row_y_m(row), layout.rack_depth_m / 2
         inner = bay if 0 < bay < layout.bays else 0
         scramble = self._scramble(_TAG_RACK, row, 900 + is_far_end + 2 * inner)
-        guard = Surface(textures.hazard, scramble=scramble)
-        builder.add_box((x, y, 0.25), (0.06, half, 0.25), guard, sides=NO_BOTTOM)
+        builder.add_box((x, y, 0.25), (0.06, half, 0.25), Surface(textures.hazard, scramble=scramble), sides=NO_BOTTOM)
         if layout.has_landmarks:
             side, plate = 0.275, x + (0.095 if is_far_end else -0.095)
             sign = 1.0 if is_far_end else -1.0
@@ -82,8 +81,7 @@ class RackMaker:
                     break
                 half = (0.15, sku.width_m / 2, sku.height_m / 2)
                 surface = Surface(sku.sides("xX"), rng.uniform(0.8, 1.2), int(rng.integers(0, 1 << 24)))
-                centre = (x_m - 0.2, y + half[1], base_m + half[2])
-                builder.add_box(centre, half, surface, yaw_rad=rng.normal(0, 0.03))
+                builder.add_box((x_m - 0.2, y + half[1], base_m + half[2]), half, surface, yaw_rad=rng.normal(0, 0.03))
                 y += sku.width_m + rng.uniform(0.05, 0.4)
 
     def add_parked_pallet(self, builder: FaceBuilder, number: int, x_m: float, y_m: float) -> None:
@@ -145,8 +143,7 @@ class RackMaker:
             return
         x, y = layout.bay_x_m(slot.bay) + 0.06, layout.row_y_m(slot.row)
         base = layout.shelf_heights_m[slot.level]
-        above = slot.level + 1 < layout.levels
-        ceiling = layout.shelf_heights_m[slot.level + 1] - 0.2 if above else base + 1.25
+        ceiling = layout.shelf_heights_m[slot.level + 1] - 0.2 if slot.level + 1 < layout.levels else base + 1.25
         if rng.random() < 0.55:
             for number in range(2):
                 pallet = Surface(textures.wood, scramble=int(rng.integers(0, 1 << 24)))
@@ -175,8 +172,7 @@ class RackMaker:
         centre_x = x + sku.width_m / 2 + jitter
         centre_y = y + toward_aisle * (self._layout.rack_depth_m / 2 - setback - half_depth)
         centre, half = (centre_x, centre_y, bottom + sku.height_m / 2), (sku.width_m / 2, half_depth, sku.height_m / 2)
-        sides = sku.sides("Y" if row % 2 else "y")
-        surface = Surface(sides, rng.uniform(0.8, 1.2), int(rng.integers(0, 1 << 24)))
+        surface = Surface(sku.sides("Y" if row % 2 else "y"), rng.uniform(0.8, 1.2), int(rng.integers(0, 1 << 24)))
         builder.add_box(centre, half, surface, yaw_rad=yaw)
         if rng.random() < 0.5:
             side, reach = 0.12, half_depth + 0.003

@@ -67,8 +67,7 @@ def measure_wheels(
     velocity, (gyro, _) = motion.velocity_body(times), motion.rates(times)
     forward = velocity[:, 0] - gyro[:, 1] * height_m
     speed_scale, yaw_scale = 1.0 + rng.normal(0.0, 1.0, 2) * (errors.speed_scale, errors.yaw_scale)
-    standing = np.abs(forward) < 1e-3
-    noise = rng.standard_normal((len(times), 2)) * np.where(standing[:, None], 0.0, 1.0)
+    noise = rng.standard_normal((len(times), 2)) * np.where((np.abs(forward) < 1e-3)[:, None], 0.0, 1.0)
     speeds = forward * speed_scale + noise[:, 0] * errors.noise_mps
     turns = gyro[:, 2] * yaw_scale + noise[:, 1] * errors.noise_radps
     sigma_mps = float(np.hypot(errors.noise_mps, errors.speed_scale))

@@ -124,8 +124,7 @@ def nominal_calibration(kind: RobotKind) -> RigCalibration:
     rotation = np.array([[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]) @ _BODY_FROM_OPTICAL
     cameras = list[CameraCalibration]()
     height_m = kind.camera_height_m - kind.body_height_m
-    front = ViewMount(0.0, kind.camera_forward_m, 0.0, kind.baseline_m)
-    for view in (front, *chosen("rig", kind.rig, RIGS)):
+    for view in (ViewMount(0.0, kind.camera_forward_m, 0.0, kind.baseline_m), *chosen("rig", kind.rig, RIGS)):
         middle = np.array([view.forward_m, view.left_m, height_m])
         turn = so3_exp(np.array([0.0, 0.0, view.yaw_rad])) if view.yaw_rad else np.eye(3)
         for side in (0.5, -0.5) if view.baseline_m else (0.0,):
@@ -133,8 +132,7 @@ def nominal_calibration(kind: RobotKind) -> RigCalibration:
             lens = model, kind.width_px, kind.height_px, intrinsics, np.array(distortion)
             camera = CameraCalibration(*lens, se3(turn @ rotation, place), has_depth=view.has_depth)
             cameras.append(check_camera(camera, f"cam{len(cameras)}"))
-    base_from_body = se3(np.eye(3), np.array([0.0, 0.0, kind.body_height_m]))
-    return RigCalibration(tuple(cameras), kind.imu.noise, base_from_body)
+    return RigCalibration(tuple(cameras), kind.imu.noise, se3(np.eye(3), np.array([0.0, 0.0, kind.body_height_m])))
 
 
 def true_calibration(kind: RobotKind, rng: np.random.Generator) -> RigCalibration:
@@ -143,7 +141,6 @@ def true_calibration(kind: RobotKind, rng: np.random.Generator) -> RigCalibratio
     cameras = []
     for camera in nominal.cameras:
         turn, shift = (direction / np.linalg.norm(direction) for direction in rng.standard_normal((2, 3)))
-        error = se3(so3_exp(turn * hidden.turn_rad), shift * hidden.shift_m)
-        body_from_cam: Array = camera.body_from_cam @ error
+        body_from_cam: Array = camera.body_from_cam @ se3(so3_exp(turn * hidden.turn_rad), shift * hidden.shift_m)
         cameras.append(replace(camera, body_from_cam=body_from_cam, imu_minus_cam_s=hidden.imu_minus_cam_s))
     return RigCalibration(tuple(cameras), nominal.imu, nominal.base_from_body)

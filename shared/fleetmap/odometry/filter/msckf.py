@@ -40,8 +40,7 @@ class InvariantFilter(core.Filter):
             np.array([camera.lens for camera, _ in cameras]),
             np.array([body_from_cam for _, body_from_cam in cameras]),
         )
-        covariances = nav_covariance, true_error_cov
-        super().__init__(*state.copy().arrays, *covariances, *rig, settings, quantile, GRAVITY_MPS2)
+        super().__init__(*state.copy().arrays, nav_covariance, true_error_cov, *rig, settings, quantile, GRAVITY_MPS2)
 
     @property
     def state(self) -> NavState:

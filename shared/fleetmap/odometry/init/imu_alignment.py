@@ -120,8 +120,7 @@ def _gyro_bias_step(motion: VisualMotion, imu: ImuSamples, noise: ImuNoise, gyro
     hessian, gradient = np.zeros((3, 3)), np.zeros(3)
     for k, (start_ns, end_ns) in enumerate(pairwise(motion.stamps_ns)):
         term = preintegrate(imu, start_ns, end_ns, gyro_bias, np.zeros(3), noise)
-        seen = motion.rotations[k].T @ motion.rotations[k + 1]
-        error = so3_log(term.delta_rotation.T @ seen)
+        error = so3_log(term.delta_rotation.T @ (motion.rotations[k].T @ motion.rotations[k + 1]))
         hessian += term.d_rotation_d_gyro.T @ term.d_rotation_d_gyro
         gradient += term.d_rotation_d_gyro.T @ error
     return np.asarray(np.linalg.solve(hessian + 1e-12 * np.eye(3), gradient))

@@ -60,8 +60,7 @@ def _steady_state(window: ImuSamples, stamp_ns: int, settings: FilterSettings) -
     rotation = rotation_between_vectors(force, np.array([0.0, 0.0, 1.0]))
     state = NavState(rotation=rotation, gyro_bias_radps=window.gyro_radps.mean(axis=0))
     # the accelerometer's bias along gravity shows in its size; across gravity it hides in the tilt
-    up_body = force / np.linalg.norm(force)
-    state.accel_bias_mps2 = 0.5 * (np.linalg.norm(force) - GRAVITY_MPS2) * up_body
+    state.accel_bias_mps2 = 0.5 * (np.linalg.norm(force) - GRAVITY_MPS2) * (force / np.linalg.norm(force))
     velocity, gyro, accel = (
         sigma**2
         for sigma in (

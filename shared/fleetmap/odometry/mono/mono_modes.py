@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.features.settings import StereoSettings
-from fleetmap.geometry import Array, se3, se3_inverse, transform_points
+from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log, transform_points
+from fleetmap.inertial import preintegrate
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.filter.msckf import InvariantFilter
 from fleetmap.odometry.filter.nav_state import InitialState, NavState
@@ -18,12 +19,12 @@ from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.init.imu_alignment import mono_inertial_initialization
 from fleetmap.odometry.init.static_initialization import static_initialization
 from fleetmap.odometry.modes import ImuInputs, InertialMode, Mode, StartingMode, Step, VisualMode, WindowMode
-from fleetmap.odometry.mono.map_start import MapStart, knows_direction, knows_speed
 from fleetmap.odometry.mono.mono_vo import VisualEstimate, VisualOdometry
 from fleetmap.odometry.mono.wheel_mode import SeenWay, WheelMode
 from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.odometry_checks import is_image_still
-from fleetmap.odometry.settings import OdometrySettings
+from fleetmap.odometry.sensor_buffer import IMU_GAP_NS
+from fleetmap.odometry.settings import FilterSettings, OdometrySettings
 from fleetmap.odometry.tracking.tracker import Tracked
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame, StereoCamera
@@ -34,6 +35,8 @@ _STILL_SIGMA_MPS = 0.02
 _FAR_M = 200.0  # points beyond it lie on almost parallel rays and carry no information on the scene's depth
 _UNSCALED_FRAMES = 2400  # kept for new poses once the IMU has determined the scale
 _SIGHTINGS = 12  # of one track that are kept to place its point
+_ANY_SPEED_MPS = 10.0  # sigma, of a robot that has one fix
+_MOVES_3, _GATE_6 = 16.266, 22.458  # 0.999 of chi-square with 3 and 6 degrees of freedom
 Ids = NDArray[np.int64]
 
 
@@ -170,7 +173,12 @@ class MonocularMode(Mode):
         self._detect_standstill(frame_index, tracked)
         visual = self._visual = self.visual_odometry.add(frame_index, tracked.ids, tracked.pixels[:, :2])
         if self.imu is not None:
-            self._keep_unscaled(frame_index, visual)
+            if visual.lost:
+                self._unscaled.clear()
+            revised = dict(visual.revised)
+            kept = [f._replace(vision_from_cam=revised.get(f.frame_index, f.vision_from_cam)) for f in self._unscaled]
+            kept.append(_UnscaledFrame(frame_index, self.stamp_ns, visual.vision_from_cam))
+            self._unscaled = kept[-_UNSCALED_FRAMES:]
             found = self._metric_start(self.imu, visual)
             if found is not None:
                 return self._go_metric(frame_index, tracked, self.imu, *found)
@@ -195,20 +203,11 @@ class MonocularMode(Mode):
     def _body(self, vision_from_cam: Array) -> Array:
         return np.asarray(self._rig.body_from_cam @ vision_from_cam @ self._rig.cam_from_body)
 
-    def _keep_unscaled(self, frame_index: int, visual: VisualEstimate) -> None:
-        if visual.lost:
-            self._unscaled.clear()
-        revised = dict(visual.revised)
-        kept = [f._replace(vision_from_cam=revised.get(f.frame_index, f.vision_from_cam)) for f in self._unscaled]
-        kept.append(_UnscaledFrame(frame_index, self.stamp_ns, visual.vision_from_cam))
-        self._unscaled = kept[-_UNSCALED_FRAMES:]
-
     def _detect_standstill(self, frame_index: int, tracked: Tracked) -> None:
         """Track since when the image stands still."""
         self._frame_index = frame_index
-        still_px = self._rig.settings.monocular.still_px
-        still = is_image_still(*self._newest_pixels, tracked.ids, tracked.pixels, still_px)
-        if not still:
+        limit_px = self._rig.settings.monocular.still_px
+        if not is_image_still(*self._newest_pixels, tracked.ids, tracked.pixels, limit_px):
             self._still_since_ns, self._still_from = None, frame_index
         elif self._still_since_ns is None:
             self._still_since_ns = self.stamp_ns
@@ -279,6 +278,93 @@ class MonocularMode(Mode):
         return Step(mode, revised=tuple(revised))
 
 
+def _knows_speed(covariance: Array, settings: FilterSettings) -> bool:
+    """Return True if the speed, by the covariance of a state, is as certain as those of other starts."""
+    return bool(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1] <= settings.initial_velocity_sigma_mps**2)
+
+
+def _knows_direction(start: InitialState) -> bool:
+    """Return True if a state is certainly in motion: before, its images cannot place points, whose distance its step measures."""
+    velocity_mps = start.state.velocity_mps
+    return bool(velocity_mps @ np.linalg.solve(start.covariance[3:6, 3:6], velocity_mps) > _MOVES_3)
+
+
+class MapStart:
+    """Scale, speed and gravity of one camera with an IMU, by its fixes in a map: its metres and vertical in place of a second camera.
+
+    Inertial navigation by fixes alone. The first fix gives the pose, the second the speed, each further one is tested.
+
+    Sources: Groves 2013, section 14.1 (loosely coupled integration); Barrau and Bonnabel 2017 (the error).
+    """
+
+    def __init__(self, rig: OdometryRig, imu: ImuInputs) -> None:
+        self._rig, self._imu = rig, imu
+        self._start: InitialState | None = None
+        self._tested = 0  # fixes that agreed with those before
+
+    def handle(self, stamp_ns: int, map_from_body: Array, cov_rot_trans: Array, *, needed: int) -> InitialState | None:
+        """Return the state at a fix, map_from_body (4, 4), in axes of the map; None until `needed` fixes agree and show the speed.
+
+        stamp_ns: on the IMU's clock, whose samples must be known until then. cov_rot_trans (6, 6) includes the error of the map.
+        """
+        samples, before = self._imu.samples.imu, self._start
+        if before is None or core.longest_gap_ns(samples.stamps_ns, before.stamp_ns, stamp_ns) > IMU_GAP_NS:
+            self._begin(stamp_ns, map_from_body, cov_rot_trans)
+            return None
+        if not self._tested:
+            before = self._with_gyro_bias(before, stamp_ns, map_from_body)
+        moved = InvariantFilter(before.state, before.covariance, self._rig.settings.filter, self._rig.mounted)
+        moved.propagate(samples, before.stamp_ns, stamp_ns, self._imu.weighing_noise)
+        state, covariance = moved.state, moved.covariance[:15, :15]
+        # right-invariant errors: a rotation from the left turns the position about the origin of the map
+        shown = np.zeros((6, 15))
+        shown[:3, :3] = shown[3:, 6:9] = np.eye(3)
+        shown[3:, :3] = -skew(state.position_m)
+        off = np.concatenate(
+            [so3_log(map_from_body[:3, :3] @ state.rotation.T), map_from_body[:3, 3] - state.position_m]
+        )
+        of_off = shown @ covariance @ shown.T + cov_rot_trans
+        if off @ np.linalg.solve(of_off, off) > _GATE_6:
+            self._begin(stamp_ns, map_from_body, cov_rot_trans)
+            return None
+        gain = np.linalg.solve(of_off, shown @ covariance).T
+        error, rest = gain @ off, np.eye(15) - gain @ shown
+        turn = so3_exp(error[:3])
+        state = NavState(
+            turn @ state.rotation,
+            turn @ state.velocity_mps + error[3:6],
+            turn @ state.position_m + error[6:9],
+            state.gyro_bias_radps + error[9:12],
+            state.accel_bias_mps2 + error[12:],
+        )
+        self._start = InitialState(state, rest @ covariance @ rest.T + gain @ cov_rot_trans @ gain.T, stamp_ns)
+        self._tested += 1
+        is_known = self._tested + 1 >= needed and _knows_speed(self._start.covariance, self._rig.settings.filter)
+        return self._start if is_known else None
+
+    def _begin(self, stamp_ns: int, map_from_body: Array, cov_rot_trans: Array) -> None:
+        """Begin at a fix, of any speed and with the biases that sensors may have."""
+        settings, position_m = self._rig.settings, map_from_body[:3, 3]
+        jacobian = np.zeros((15, 6))
+        jacobian[:3, :3] = jacobian[6:9, 3:] = np.eye(3)
+        jacobian[6:9, :3] = skew(position_m)
+        gyro, accel = settings.start.steady_gyro_mean_radps, settings.filter.initial_accel_bias_sigma_mps2
+        own = np.diag(np.square(np.repeat([0.0, _ANY_SPEED_MPS, 0.0, gyro, accel], 3)))
+        state = NavState(rotation=map_from_body[:3, :3], position_m=position_m)
+        self._start = InitialState(state, own + jacobian @ cov_rot_trans @ jacobian.T, stamp_ns)
+        self._tested = 0
+
+    def _with_gyro_bias(self, start: InitialState, stamp_ns: int, map_from_body: Array) -> InitialState:
+        """Return the first state with the gyro's bias that explains the turn until the second fix, about which errors are small."""
+        bias, seen = np.zeros(3), start.state.rotation.T @ map_from_body[:3, :3]
+        for _ in range(3):
+            term = preintegrate(
+                self._imu.samples.imu, start.stamp_ns, stamp_ns, bias, np.zeros(3), self._imu.weighing_noise
+            )
+            bias = bias + np.linalg.lstsq(term.d_rotation_d_gyro, so3_log(term.delta_rotation.T @ seen), rcond=None)[0]
+        return replace(start, state=replace(start.state, gyro_bias_radps=bias))
+
+
 def make_odometry(
     calibration: RigCalibration,
     camera: StereoCamera,
@@ -310,7 +396,7 @@ class MonocularOdometry(Odometry):
         """Return the estimate at `frame`, which has one image in spite of the name and must be newer than any before."""
         mode, blind, settings = self._mode, self._blind, self._rig.settings.filter
         # the IMU was abandoned, or its filter diverged, or no fix came any more
-        if isinstance(mode, VisualMode) or (blind is not None and not knows_speed(blind.filter.covariance, settings)):
+        if isinstance(mode, VisualMode) or (blind is not None and not _knows_speed(blind.filter.covariance, settings)):
             self.vision.resume(mode)
             self._mode = self.vision
         change, self._new_odom_from_old_odom = self._new_odom_from_old_odom, None
@@ -335,7 +421,7 @@ class MonocularOdometry(Odometry):
             return
         window = MonocularWindow(self._rig, start.state, start.covariance, start.stamp_ns)
         window.filter = InvariantFilter(start.state, start.covariance, self._rig.settings.filter, self._rig.mounted)
-        window.is_blind = not knows_direction(start)
+        window.is_blind = not _knows_direction(start)
         ids, pixels, self._mode = last.track_ids, last.track_pixels, InertialMode(window, imu)
         assert pixels is not None
         if at.frame_index < last.frame_index:

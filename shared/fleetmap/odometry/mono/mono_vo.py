@@ -94,7 +94,10 @@ class VisualOdometry:
         self._place_new(frame)
         if self._is_new(frame):
             self._map.keyframes.append(frame)
-            self._grow()
+            self._adjust(held=2)
+            self._map.keyframes = self._map.keyframes[-self._settings.window_views :]
+            seen = {i for v in self._map.keyframes for i in v.ids.tolist()}
+            self._map.points = {i: p for i, p in self._map.points.items() if i in seen}
             frame = self._map.keyframes[-1]
         return self._advance(frame, cov)
 
@@ -103,8 +106,7 @@ class VisualOdometry:
         self._step = se3_inverse(self._last) @ vision_from_cam
         length = float(np.linalg.norm(self._step[:3, 3]))
         rotation = np.kron(np.eye(2), vision_from_cam[:3, :3])
-        share = self._settings.drift_share
-        grown = np.diag([1e-7] * 3 + [(share * length) ** 2 + 1e-9] * 3)
+        grown = np.diag([1e-7] * 3 + [(self._settings.drift_share * length) ** 2 + 1e-9] * 3)
         self._covariance = self._covariance + grown + 0.1 * rotation @ (_CORRELATION**2 * cov) @ rotation.T
         self._last = vision_from_cam
         known = [self._map.points[i] for i in self._map.keyframes[-1].ids.tolist() if i in self._map.points]
@@ -206,8 +208,7 @@ class VisualOdometry:
             return None
         points = np.array([self._map.points[i] for i in frame.ids[rows].tolist()])
         measured = np.column_stack([frame.pixels[rows], np.full(len(rows), np.nan)])
-        sigmas = np.full((len(rows), 2), s.sigma_px)
-        matches = Correspondences(self._camera, points, measured, sigmas)
+        matches = Correspondences(self._camera, points, measured, np.full((len(rows), 2), s.sigma_px))
         found = refine_pnp(matches, se3_inverse(frame.vision_from_cam))
         if found is None or found.inliers.sum() < max(s.min_points, 0.6 * len(rows)):
             again = ransac_pnp(matches, threshold_px=s.max_error_px, min_inliers=s.min_points, seed=len(rows))
@@ -223,28 +224,19 @@ class VisualOdometry:
         wanted_px = s.view_parallax_px * (0.4 if known < 0.5 * len(frame.ids) else 1.0)
         return bool(np.median(np.linalg.norm(last.pixels[a] - frame.pixels[b], axis=1)) > wanted_px)
 
-    def _grow(self) -> None:
-        """Adjust the window and forget keyframes and points that left it."""
-        self._adjust(held=2)
-        self._map.keyframes = self._map.keyframes[-self._settings.window_views :]
-        seen = {i for v in self._map.keyframes for i in v.ids.tolist()}
-        self._map.points = {i: p for i, p in self._map.points.items() if i in seen}
-
     def _place_new(self, frame: Frame) -> None:
         """Triangulate every track whose parallax since its first observation is large enough."""
         points, first_seen = self._map.points, self._map.first_seen
         wanted = np.array([i not in points for i in frame.ids.tolist()], bool)
         for track_id, pixel in zip(frame.ids[wanted].tolist(), frame.pixels[wanted], strict=True):
             first_seen.setdefault(track_id, (frame.vision_from_cam, pixel))
-        alive = set(frame.ids.tolist())
-        for gone in [i for i in first_seen if i not in alive]:
+        for gone in first_seen.keys() - set(frame.ids.tolist()):
             del first_seen[gone]
         if not wanted.any():
             return
         ids, now = frame.ids[wanted], frame.pixels[wanted]
         first = np.array([first_seen[i][0] for i in ids.tolist()])
-        before = np.array([first_seen[i][1] for i in ids.tolist()])
-        found = self._between(first, before, frame.vision_from_cam, now)
+        found = self._between(first, np.array([first_seen[i][1] for i in ids.tolist()]), frame.vision_from_cam, now)
         for track_id, point in zip(ids.tolist(), found, strict=True):
             if np.isfinite(point[0]):
                 points[track_id] = point
