@@ -124,6 +124,11 @@ class ObservationHistory:
         newest = expected & (~expected + np.uint64(1))  # the lowest bit
         self._keep(np.sort(np.argsort(newest, kind="stable")[:_MAX_LANDMARKS]))
 
+    def counts(self, looks: int) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+        """Return the number of these looks (bits) in which each landmark was expected (L,) and found (L,)."""
+        mask = np.uint64(looks)
+        return np.bitwise_count(self.expected & mask), np.bitwise_count(self.found & mask)
+
     def redefine_odom(self, new_odom_from_old_odom: Array) -> None:
         self.points_odom = transform_points(new_odom_from_old_odom, self.points_odom)
 
@@ -158,7 +163,7 @@ def _support(looks: int, one: tuple[ObservationHistory, Flags], other: tuple[Obs
     """Return the log odds of the blocks that support the first hypothesis in these looks; each with its excluded landmarks."""
     sides = []
     for history, excluded in (one, other):
-        expected, found = (np.bitwise_count(of & np.uint64(looks)) for of in (history.expected, history.found))
+        expected, found = history.counts(looks)
         sides.append((history.points_odom, _LOG_LIKELIHOODS[expected, found], excluded | (expected == 0)))
     strongest = core.block_log_odds(sides[0], sides[1], _LATTICES, _MODEL, _BLOCK_M, _MAX_BLOCKS)
     return float(np.clip(strongest, 0.0, _MAX_BLOCK_LOG_ODDS).sum())

@@ -3,6 +3,7 @@
 import logging
 from collections import deque
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -32,6 +33,13 @@ _UNKNOWN = BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0)  # of a floor whose file
 _log = logging.getLogger(__name__)
 
 
+class BuildingChange(NamedTuple):
+    """The building as of `Localizer.handle_building`, all of it, and new versions of the other floors."""
+
+    building: dict[str, Floor]
+    maps: list[LoadedMap]
+
+
 class BuildingMaps:
     """`refresh` reads the record of the robot's own site, and the other sites by their own signed lists; changes wait in `changes`.
 
@@ -48,8 +56,7 @@ class BuildingMaps:
         self._grids: dict[str, OccupancyGrid | str] = {}  # or why there is none
         self._made_of = b""  # the record and the files of the floors
         self._faults: dict[str, str] = {}
-        # The building as of `Localizer.handle_building`, all of it, and new versions of the other floors.
-        self.changes: deque[tuple[dict[str, Floor], list[LoadedMap]]] = deque()
+        self.changes: deque[BuildingChange] = deque()
 
     def refresh(self, *, asks: bool = True) -> None:
         """Read everything anew; asks: False reads the disk alone. UnreachableError without an answer of a server; all else is logged."""
@@ -88,7 +95,7 @@ class BuildingMaps:
             self._sources = {site: source for site, source in self._sources.items() if site in floors}
             held = {site: wanted for site, wanted in self.held.items() if site in floors}
             self.held = held | {loaded.wanted.site: loaded.wanted for loaded in maps}
-            self.changes.append((floors, maps))
+            self.changes.append(BuildingChange(floors, maps))
         return None
 
     def grid(self, site: str) -> OccupancyGrid:
