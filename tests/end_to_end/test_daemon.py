@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fleetmap.bus.endpoints import with_free_port
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
 from fleetmap.recordings.calibration_files import format_calibration
@@ -164,18 +165,16 @@ def test_nav2_starts_it_asks_it_and_stops_it(tmp_path: Path) -> None:
     pytest.importorskip("locclient.plugins.ros2_node")
     with MapStore.open(tmp_path / "store", create=True) as store:
         robot_world.save(store)
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    endpoint = with_free_port("tcp/127.0.0.1:0")
     path = tmp_path / "robot.toml"
     path.write_text(
         f'[run]\nstore = "{tmp_path}/store"\nsite = "room"\nrobot = "r1"\noutbox = "{tmp_path}/spool.sqlite3"\n'
         f'[source]\nkind = "recording"\nrecording = "{write_walk(tmp_path / "walk", 280, range(0))}"\nspeed = 0.4\n'
-        f'[output]\nformat = "ros2"\nendpoint = "tcp/127.0.0.1:{port}"\nautostart = false\n'
+        f'[output]\nformat = "ros2"\nendpoint = "{endpoint}"\nautostart = false\n'
     )
     posed, node = "geometry_msgs/msg/PoseWithCovarianceStamped", "fleetmap_localizer"
     with (
-        rmw_router(port) as endpoint,
+        rmw_router(endpoint),
         closing(LifecycleManager(endpoint, node)) as manager,
         closing(LifecycleManager(endpoint, node)) as navigator,
         daemon(path, tmp_path / "notify") as process,

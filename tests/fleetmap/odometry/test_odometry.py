@@ -1,6 +1,6 @@
 """The odometry on pictures of a painted room, with exact truth."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from itertools import pairwise
 from typing import Any
@@ -36,8 +36,10 @@ FRAME_NS = 50_000_000
 
 
 def run(
-    frames: Iterable[RectifiedFrame], imu: ImuNoise | None, filtering: FilterSettings | None = None
-) -> tuple[Odometry, list[OdometryEstimate]]:
+    frames: Iterable[RectifiedFrame], imu: ImuNoise | None, filtering: FilterSettings | None = None,
+    before: Callable[[Odometry, RectifiedFrame], None] = lambda *_: None,
+) -> tuple[Odometry, list[OdometryEstimate]]:  # fmt: skip
+    """before: something done before each frame."""
     settings = OdometrySettings(filter=filtering or FilterSettings())
     odometry = Odometry(rig(imu), CAMERA, BODY_FROM_CAM, 0.0, settings)
     samples = noisy_imu(
@@ -47,6 +49,7 @@ def run(
     for frame in frames:
         odometry.handle_imu(samples.between(fed_ns, frame.stamp_ns + 1))
         fed_ns = frame.stamp_ns + 1
+        before(odometry, frame)
         estimates.append(odometry.handle_stereo(frame))
     return odometry, estimates
 
@@ -155,12 +158,6 @@ def test_the_motion_since_a_frame_is_known_although_it_was_dropped_with_the_next
         assert (np.abs(off) < 5.0 * sigmas + 1e-3).all()
         dropped += number > 1 and odometry.will_forget(number - 1)
     assert dropped > 10
-
-
-def test_the_same_samples_give_the_same_bits(visual: tuple[Odometry, list[OdometryEstimate]]) -> None:
-    _, again = run((stereo_frame(k * FRAME_NS) for k in range(1, 16)), None)
-    for a, b in zip(visual[1], again, strict=False):
-        np.testing.assert_array_equal(a.odom_from_body, b.odom_from_body)
 
 
 def test_darkness_is_said_and_the_covariance_grows() -> None:
@@ -435,26 +432,21 @@ def test_wheels_of_a_rig_without_imu_are_not_collected() -> None:
 @pytest.mark.parametrize("broken", ["clocks", "velocity"])
 def test_a_filter_that_leaves_the_pictures_begins_again(broken: str) -> None:
     """By sight alone for a while, then by the IMU; `odom` goes on, and says that it is less sure."""
-    odometry = Odometry(rig(IMU), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
-    samples = noisy_imu(
-        np.random.default_rng(1), 6.5, IMU, np.array([0.01, -0.02, 0.015]), np.array([0.03, -0.02, 0.04])
-    )
-    said, fed_ns = [], 0
-    for k in range(1, 100):
-        frame = stereo_frame(k * FRAME_NS)
-        odometry.handle_imu(samples.between(fed_ns, frame.stamp_ns + 1))
-        fed_ns = frame.stamp_ns + 1
-        if k == 40:
-            mode = odometry._mode
-            assert isinstance(mode, InertialMode)
-            if broken == "clocks":
-                mode.window.filter.imu_minus_cam_s = 0.09
-            else:  # by a blow that no noise covers
-                state, blow = mode.window.filter.state, np.array([0.0, 0.0, 14e3 + 9.81])
-                force, rate = state.rotation.T @ blow + state.accel_bias_mps2, state.gyro_bias_radps
-                blown = np.array([0, 1_000_000]), np.tile(rate, (2, 1)), np.tile(force, (2, 1))
-                mode.window.filter.predict_inertial(*blown, 0, 1_000_000, (0.0,) * 4, (0.0,) * 4)
-        said.append(odometry.handle_stereo(frame))
+
+    def spoil(odometry: Odometry, frame: RectifiedFrame) -> None:
+        if frame.stamp_ns != 40 * FRAME_NS:
+            return
+        mode = odometry._mode
+        assert isinstance(mode, InertialMode)
+        if broken == "clocks":
+            mode.window.filter.imu_minus_cam_s = 0.09
+        else:  # by a blow that no noise covers
+            state, blow = mode.window.filter.state, np.array([0.0, 0.0, 14e3 + 9.81])
+            force, rate = state.rotation.T @ blow + state.accel_bias_mps2, state.gyro_bias_radps
+            blown = np.array([0, 1_000_000]), np.tile(rate, (2, 1)), np.tile(force, (2, 1))
+            mode.window.filter.predict_inertial(*blown, 0, 1_000_000, (0.0,) * 4, (0.0,) * 4)
+
+    _, said = run((stereo_frame(k * FRAME_NS) for k in range(1, 100)), IMU, before=spoil)
     assert said[38].inertial
     began = [n for n, estimate in enumerate(said) if estimate.new_odom_from_old_odom is not None and n > 38]
     assert 39 <= began[0] <= 42

@@ -469,14 +469,3 @@ def test_a_clock_set_back_revives_nothing(publisher: ListPublisher, robot: ListR
     (robot.folder / "clock").unlink()  # the control: without what it remembers the replay is believed
     robot.start()
     assert robot.refused() == ""
-
-
-def test_it_says_how_old_the_last_word_is(publisher: ListPublisher, robot: ListReader) -> None:
-    assert robot.trust.word_hours is None
-    assert robot.refused() == ""
-    assert robot.trust.word_hours == pytest.approx(0.0, abs=0.01)
-    publisher.files.clear()
-    robot.ahead_s = 31 * 3600.0
-    robot.start()
-    assert robot.refused() != ""
-    assert robot.trust.word_hours == pytest.approx(31.0, abs=0.01)

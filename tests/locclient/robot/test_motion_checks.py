@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleetmap.geometry import Array, rotation_angle_rad, se3, se3_inverse, so3_exp
+from fleetmap.geometry import rotation_angle_rad, se3, se3_inverse, so3_exp
 from fleetmap.messages import Cause, Flag, Status
 from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.sensors.rectification import Rectifier
@@ -123,12 +123,10 @@ def test_odometry_that_begins_anew_is_no_way() -> None:
     watch, change = DockCheck(np.eye(4)), se3(np.eye(3), np.array([50.0, 0.0, 0.0]))
     assert arrived(watch, 1.0, 0.0, dock(1.0, 0.1)) == pytest.approx(0.1)
     said = at(1.1, 0.0)
-    redefined = replace(said.odometry, odom_from_body=_moved(change, said), new_odom_from_old_odom=change)
+    redefined = replace(
+        said.odometry, odom_from_body=change @ said.odometry.odom_from_body, new_odom_from_old_odom=change
+    )
     assert watch.handle([dock(1.1, 0.1)], replace(said, odometry=redefined)) is None
-
-
-def _moved(change: Array, said: Estimate) -> Array:
-    return np.asarray(change @ said.odometry.odom_from_body)
 
 
 def drive(

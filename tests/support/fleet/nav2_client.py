@@ -60,16 +60,15 @@ def _config(entries: dict[str, Any]) -> zenoh.Config:
 
 
 @contextmanager
-def rmw_router(port: int) -> Iterator[str]:
-    """As rmw_zenohd with its default configuration, on loopback."""
-    endpoint = f"tcp/127.0.0.1:{port}"
+def rmw_router(endpoint: str) -> Iterator[None]:
+    """As rmw_zenohd with its default configuration."""
     entries = {
         "mode": "router",
         "listen/endpoints": [endpoint],
         "scouting/gossip/autoconnect": {"router": [], "peer": []},
     }
     with zenoh.open(_config(entries)):
-        yield endpoint
+        yield
 
 
 class RosProgram:

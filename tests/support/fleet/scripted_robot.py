@@ -14,7 +14,7 @@ from fleetmap.messages import Status
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes
 from fleetmap.relocalization.relocalizer import Fix
-from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
+from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration
 from fleetmap.sensors.rectification import MountedCamera, MountedRig, RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization import localizer as module
@@ -89,13 +89,29 @@ class ScriptedRelocalizer:
         return seen
 
     def near(self, seen: list[Fix], map_from_cam: Array, cov_rot_trans: Array, _: object = ()) -> Fix | None:
-        reach_m = 0.3 + 3 * np.sqrt(np.trace(cov_rot_trans[3:, 3:]))
-        close = [f for f in seen if np.linalg.norm(f.map_from_cam[:3, 3] - map_from_cam[:3, 3]) < reach_m]
-        return close[0] if close else None
+        return first_near(seen, map_from_cam, cov_rot_trans)
 
     def anywhere(self, seen: list[Fix], *_: object) -> Generator[None, None, list[Fix]]:
         yield
         return list(seen)
+
+
+def first_near(fixes: list[Fix], map_from_cam: Array, cov_rot_trans: Array) -> Fix | None:
+    """The first fix that a prediction with this covariance may be."""
+    reach_m = 0.3 + 3 * np.sqrt(np.trace(cov_rot_trans[3:, 3:]))
+    close = (f for f in fixes if np.linalg.norm(f.map_from_cam[:3, 3] - map_from_cam[:3, 3]) < reach_m)
+    return next(close, None)
+
+
+def scripted_localizer(odometry: ScriptedOdometry, track: dict[str, Any], imu: ImuNoise | None = None) -> Localizer:
+    """With a pair of cameras, and this odometry in place of its own."""
+    focal = np.array([400, 400, 320, 240.0])
+    lens = CameraCalibration("radial-tangential", 640, 480, focal, np.zeros(4), BODY_FROM_CAM)
+    mounted = MountedCamera(StereoCamera(400.0, 320.0, 240.0, 0.1, 640, 480), BODY_FROM_CAM)
+    settings = LocalizerSettings(track=TrackSettings(**track))
+    localizer = Localizer(MountedRig(RigCalibration((lens,), imu), (mounted,)), settings)
+    localizer.perception.odometry = odometry  # type: ignore[assignment]
+    return localizer
 
 
 class Robot:
@@ -105,15 +121,8 @@ class Robot:
         self.relocalizer = ScriptedRelocalizer()
         monkeypatch.setattr(module, "MapView", lambda *_: None)
         monkeypatch.setattr(module, "Relocalizer", lambda *_: self.relocalizer)
-        focal = np.array([400, 400, 320, 240.0])
-        lens = CameraCalibration("radial-tangential", 640, 480, focal, np.zeros(4), BODY_FROM_CAM)
-        camera = StereoCamera(400.0, 320.0, 240.0, 0.1, 640, 480)
-        settings = LocalizerSettings(track=TrackSettings(**track))
-        self.localizer = Localizer(
-            MountedRig(RigCalibration((lens,)), (MountedCamera(camera, BODY_FROM_CAM),)), settings
-        )
         self.odometry = ScriptedOdometry()
-        self.localizer.perception.odometry = self.odometry
+        self.localizer = scripted_localizer(self.odometry, track)
         self.frames = 0
         self.inliers = 40
         self.landmark_recall = 1.0

@@ -15,6 +15,8 @@ from typing import Any
 import jsonschema_rs
 import pytest
 
+from fleetmap.bus.endpoints import with_free_port
+
 SCHEMAS = Path(__file__).resolve().parents[4] / "shared" / "data" / "conformance" / "vda5050"
 PATIENCE_S = 60.0
 
@@ -34,9 +36,7 @@ def mosquitto(folder: Path) -> Iterator[int]:
     program = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
     if program is None:
         pytest.skip("mosquitto is not installed (apt-get install mosquitto): VDA 5050 is NOT tested over a broker")
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
+    port = int(with_free_port("tcp/127.0.0.1:0").rpartition(":")[2])
     config = folder / "mosquitto.conf"
     config.write_text(f"listener {port} 127.0.0.1\nallow_anonymous true\npersistence false\nuser root\n")
     with subprocess.Popen([program, "-c", str(config)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as broker:

@@ -14,6 +14,7 @@ import sys
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -222,12 +223,13 @@ _P, _I, _L = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64
 _OPEN = ctypes.CFUNCTYPE(_I, _P, _P, _P, _I, _P)
 _DELETE = ctypes.CFUNCTYPE(_I, _P, ctypes.c_char_p, _I)
 _ACCESS = ctypes.CFUNCTYPE(_I, _P, ctypes.c_char_p, _I, _P)
-_CLOSE = ctypes.CFUNCTYPE(_I, _P)
-_READ = ctypes.CFUNCTYPE(_I, _P, _P, _I, _L)
-_TRUNCATE = ctypes.CFUNCTYPE(_I, _P, _L)
-_SYNC = ctypes.CFUNCTYPE(_I, _P, _I)
-_SIZE = ctypes.CFUNCTYPE(_I, _P, _P)
-_MAP = ctypes.CFUNCTYPE(_I, _P, _I, _I, _I, _P)
+_METHODS = {
+    name: ctypes.CFUNCTYPE(_I, _P, *arguments)
+    for name, arguments in {
+        "close": (), "read": (_P, _I, _L), "write": (_P, _I, _L), "truncate": (_L,), "sync": (_I,), "size": (_P,),
+        "map": (_I, _I, _I, _P),
+    }.items()
+}  # fmt: skip
 _OPEN_CREATE, _JOURNALS = 0x4, 0x800 | 0x4000 | 0x80000
 _SQLITE_FULL = 13
 _SQLITE_ERRORS = {
@@ -307,56 +309,36 @@ def _opening(disk: Disk, real: Any) -> Any:
 
 
 def _watched(disk: Disk, unix: _Methods, files: dict[int, list[Any]]) -> _Methods:
-    real_close, real_read, real_write = _CLOSE(unix.close), _READ(unix.read), _READ(unix.write)
-    real_truncate, real_sync, real_size = _TRUNCATE(unix.truncate), _SYNC(unix.sync), _SIZE(unix.size)
-    real_map = _MAP(unix.map) if unix.map else None  # files without locks have none
-
-    def close(file: int) -> int:
-        files.pop(file, None)
-        return int(real_close(file))
-
-    def read(file: int, data: int, count: int, offset: int) -> int:
-        return _code(disk, "read") or int(real_read(file, data, count, offset))
-
-    def write(file: int, data: int, count: int, offset: int) -> int:
-        code = _code(disk, "write")
-        if code < 0:
-            real_write(file, data, count // 2, offset)
-            os._exit(_KILLED)
-        if code:
-            return code
-        disk.note("write", files[file][0], offset, ctypes.string_at(data, count))
-        return int(real_write(file, data, count, offset))
-
-    def truncate(file: int, size: int) -> int:
-        if code := _code(disk, "truncate"):
-            return code
-        disk.note("truncate", files[file][0], size)
-        return int(real_truncate(file, size))
-
-    def sync(file: int, flags: int) -> int:
-        if code := _code(disk, "sync"):
-            return code
-        disk.note("sync", files[file][0])
-        if files[file][1]:  # as the unix VFS does at a journal's first sync
-            disk.note("sync_folder", folder_of(files[file][0]))
-            files[file][1] = False
-        return int(real_sync(file, flags))
-
-    def size(file: int, found: int) -> int:
-        return _code(disk, "size") or int(real_size(file, found))
-
-    def map_(file: int, region: int, count: int, extend: int, found: int) -> int:
-        assert real_map is not None
-        return _code(disk, "map") or int(real_map(file, region, count, extend, found))
-
     ours = _Methods.from_buffer_copy(unix)
-    ours.close, ours.read, ours.write = _pointer(_CLOSE(close)), _pointer(_READ(read)), _pointer(_READ(write))
-    ours.truncate, ours.sync = _pointer(_TRUNCATE(truncate)), _pointer(_SYNC(sync))
-    ours.size = _pointer(_SIZE(size))
-    if real_map is not None:
-        ours.map = _pointer(_MAP(map_))
+    for name, kind in _METHODS.items():
+        if real := getattr(unix, name):  # files without locks have no map
+            setattr(ours, name, _pointer(kind(partial(_call_method, disk, files, name, kind(real)))))
     return ours
+
+
+def _call_method(disk: Disk, files: dict[int, list[Any]], name: str, real: Any, file: int, *arguments: int) -> int:
+    if name == "close":
+        files.pop(file, None)
+        return int(real(file))
+    code = _code(disk, name)
+    if code < 0:
+        data, count, offset = arguments
+        real(file, data, count // 2, offset)
+        os._exit(_KILLED)
+    if code:
+        return code
+    path, is_folder_due = files[file]
+    if name == "write":
+        data, count, offset = arguments
+        disk.note(name, path, offset, ctypes.string_at(data, count))
+    elif name == "truncate":
+        disk.note(name, path, *arguments)
+    elif name == "sync":
+        disk.note(name, path)
+        if is_folder_due:  # as the unix VFS does at a journal's first sync
+            disk.note("sync_folder", folder_of(path))
+            files[file][1] = False
+    return int(real(file, *arguments))
 
 
 def _deleting(disk: Disk, real: Any) -> Any:

@@ -135,22 +135,19 @@ def plain_residuals(problem: BundleProblem, pose_step: Array, motion_step: Array
             parts.append([((u - u_right) - (pixel[0] - pixel[2])) / sigma[1]])
     for term in problem.relative:
         i_from_j = se3_inverse(map_from_body[term.i]) @ map_from_body[term.j]
-        off = np.concatenate(
-            [so3_log(i_from_j[:3, :3] @ term.i_from_j[:3, :3].T), i_from_j[:3, 3] - term.i_from_j[:3, 3]]
-        )
-        parts.append(np.linalg.cholesky(term.information).T @ off)
-    for prior in problem.priors:
-        prior_body = map_from_body[prior.k]
-        off = np.concatenate(
-            [
-                so3_log(prior_body[:3, :3] @ prior.map_from_body[:3, :3].T),
-                prior_body[:3, 3] - prior.map_from_body[:3, 3],
-            ]
-        )
-        parts.append(np.linalg.cholesky(prior.information).T @ off)
+        parts.append(np.linalg.cholesky(term.information).T @ _apart(i_from_j, term.i_from_j))
+    parts += [
+        np.linalg.cholesky(prior.information).T @ _apart(map_from_body[prior.k], prior.map_from_body)
+        for prior in problem.priors
+    ]
     if problem.inertial is not None:
         parts += _inertial_residuals(problem.inertial, map_from_body, motion_step)
     return np.concatenate([np.ravel(p) for p in parts])
+
+
+def _apart(found: Array, wanted: Array) -> Array:
+    """(6,) turn and shift between two transforms with the same axes."""
+    return np.concatenate([so3_log(found[:3, :3] @ wanted[:3, :3].T), found[:3, 3] - wanted[:3, 3]])
 
 
 def _inertial_residuals(inertial: InertialTerms, map_from_body: Array, motion_step: Array) -> list[Array]:

@@ -14,14 +14,12 @@ from fleetmap.messages import Status
 from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.relocalization.map_view import CovisibleLandmarks
 from fleetmap.relocalization.relocalizer import Fix
-from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration
-from fleetmap.sensors.rectification import MountedCamera, MountedRig, RectifiedFrame, StereoCamera
+from fleetmap.sensors.calibration import ImuNoise
+from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, WheelSample
 from locclient.localization import localizer as module
 from locclient.localization.estimate import Estimate
-from locclient.localization.localizer import Localizer
-from locclient.localization.settings import LocalizerSettings, TrackSettings
-from support.fleet.scripted_robot import BODY_FROM_CAM, ScriptedOdometry
+from support.fleet.scripted_robot import BODY_FROM_CAM, ScriptedOdometry, first_near, scripted_localizer
 
 FRAME_S, IMU_HZ, SPEED_MPS = 0.2, 100, 0.6
 STOREY_M = 4.0
@@ -67,13 +65,7 @@ class Relocalizer:
         return list(seen[self.floor]) if self.rng.random() < share else []
 
     def near(self, seen: dict[str, list[Fix]], map_from_cam: Array, cov: Array, _: object = ()) -> Fix | None:
-        reach_m = 0.3 + 3 * np.sqrt(np.trace(cov[3:, 3:]))
-        close = [
-            f
-            for f in self._found(seen, SEEN_SHARE)
-            if np.linalg.norm(f.map_from_cam[:3, 3] - map_from_cam[:3, 3]) < reach_m
-        ]
-        return close[0] if close else None
+        return first_near(self._found(seen, SEEN_SHARE), map_from_cam, cov)
 
     def anywhere(
         self,
@@ -113,17 +105,8 @@ class LiftWorld:
         self.fixes: dict[str, list[Fix]] = {key: [] for key in self.keys}
         self.monkeypatch.setattr(module, "MapView", lambda tiles, *_: tiles[0])
         self.monkeypatch.setattr(module, "Relocalizer", lambda floor, *_: Relocalizer(floor, self.fixes, self.rng))
-        focal = np.array([400, 400, 320, 240.0])
-        lens = CameraCalibration("radial-tangential", 640, 480, focal, np.zeros(4), BODY_FROM_CAM)
-        imu = NOISE if self.has_imu else None
-        camera, settings = (
-            StereoCamera(400.0, 320.0, 240.0, 0.1, 640, 480),
-            LocalizerSettings(track=TrackSettings(**self.track)),
-        )
-        self.localizer = Localizer(
-            MountedRig(RigCalibration((lens,), imu), (MountedCamera(camera, BODY_FROM_CAM),)), settings
-        )
-        self.odometry = self.localizer.perception.odometry = Odometry()  # type: ignore[assignment]
+        self.odometry = Odometry()
+        self.localizer = scripted_localizer(self.odometry, self.track, NOISE if self.has_imu else None)
         # Each map has its own origin and heading in the building.
         frames = [BuildingFrame(x_m=5.0 * n, y_m=-2.0 * n, yaw_rad=0.4 * n) for n in range(self.floors)]
         self.map_from_plan = [se3_inverse(frame.building_from_map) for frame in frames]

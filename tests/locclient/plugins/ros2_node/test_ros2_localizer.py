@@ -1,6 +1,5 @@
 """The localizer as nav2 sees it, over zenoh on loopback, in the configuration of rmw_zenoh, and estimates on its topics."""
 
-import socket
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -8,6 +7,7 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+from fleetmap.bus.endpoints import with_free_port
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3, se3_inverse, so3_exp
@@ -43,12 +43,6 @@ POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 INITIAL = (0.25, 0.25, 0.0, 0.0, 0.0, 0.0685)  # as RViz sends it
 
 
-def free_port() -> int:
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
-
-
 @dataclass
 class Robot:
     """A localizer, its intake, and what opens programs of the same ROS 2."""
@@ -69,7 +63,8 @@ class Robot:
 def robot(request: pytest.FixtureRequest) -> Iterator[Robot]:
     settings = {"format": "ros2", "autostart": False} | getattr(request, "param", {})
     programs: list[LifecycleManager] = []
-    with rmw_router(free_port()) as endpoint, Bus.connect(endpoint, is_ros=True) as bus:
+    endpoint = with_free_port("tcp/127.0.0.1:0")
+    with rmw_router(endpoint), Bus.connect(endpoint, is_ros=True) as bus:
         intake = Intake(frames=2, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
         inputs = (bus, "hall", "r1", calibration(), intake)
         localizer = OUTPUT.open(OutputSection(**settings), *inputs)

@@ -66,6 +66,10 @@ def test_topics_of_a_driver_become_moments(buses: tuple[Bus, Bus]) -> None:
         sent += 1
         driver.publish(RmwZenohKeys(7).key(topic, type_name), payload, attachment=attachment(sent, sent, GID))
 
+    def send_prior(frame: str) -> None:
+        prior = PositionPrior(start_ns, np.eye(4), np.eye(6))
+        send("/prior", "geometry_msgs/PoseWithCovarianceStamped", encode_prior(prior, frame))
+
     source = Ros2Source(robot, RmwZenohKeys(7), TOPICS, calibration())
     handles = source.subscribe(queue)
     deadline = time.monotonic() + 20
@@ -76,30 +80,16 @@ def test_topics_of_a_driver_become_moments(buses: tuple[Bus, Bus]) -> None:
     for number in range(4):
         stamp_ns = start_ns + number * 50_000_000
         send(TOPICS.right, "sensor_msgs/Image", encode_image(stamp_ns + 1_000_000, "r", grey_image(RIGHT)))
-        send(
-            TOPICS.left + "/compressed",
-            "sensor_msgs/CompressedImage",
-            encode_compressed_image(stamp_ns, "l", png_image(LEFT), "png"),
-        )
+        left = encode_compressed_image(stamp_ns, "l", png_image(LEFT), "png")
+        send(TOPICS.left + "/compressed", "sensor_msgs/CompressedImage", left)
         send(TOPICS.imu, "sensor_msgs/Imu", encode_imu(stamp_ns, "imu", np.array([1.0, 2, 3]), np.array([0, 0, 9.8])))
-        send(
-            "/odom",
-            "nav_msgs/Odometry",
-            encode_odometry(WheelSample(stamp_ns, np.ones(3), 0.1, 0.1, 0.1), "odom", "base"),
-        )
-    send(
-        "/prior",
-        "geometry_msgs/PoseWithCovarianceStamped",
-        encode_prior(PositionPrior(start_ns, np.eye(4), np.eye(6)), "map"),
-    )
+        wheel = WheelSample(stamp_ns, np.ones(3), 0.1, 0.1, 0.1)
+        send("/odom", "nav_msgs/Odometry", encode_odometry(wheel, "odom", "base"))
+    send_prior("map")
     send(TOPICS.imu, "sensor_msgs/Imu", b"nonsense")
     while queue.counts.unreadable < 1 and time.monotonic() < deadline:  # topics keep no order among each other
         time.sleep(0.01)
-    send(
-        "/prior",
-        "geometry_msgs/PoseWithCovarianceStamped",
-        encode_prior(PositionPrior(start_ns, np.eye(4), np.eye(6)), "odom"),
-    )
+    send_prior("odom")
     while (queue.counts.frames < 4 or queue.counts.unreadable < 2) and time.monotonic() < deadline:
         time.sleep(0.01)
     moments = [queue.take(1.0) for _ in range(4)]
@@ -156,9 +146,9 @@ def test_one_camera_needs_no_right_image(has_depth: bool) -> None:
         rig = replace(calibration(), cameras=calibration().cameras[:1])
         source = Ros2Source(MemoryBus(hub), RmwZenohKeys(7), TOPICS, rig, has_depth=has_depth)
         source.subscribe(queue)
-        for topic, image in (("left", grey_image(LEFT)), ("right", grey_image(RIGHT)), ("depth", depth_image(depth_m))):
-            name = {"left": TOPICS.left, "right": TOPICS.right, "depth": TOPICS.depth}[topic]
-            driver.publish(RmwZenohKeys(7).key(name, "sensor_msgs/Image"), encode_image(50, "cam0", image))
+        images = {TOPICS.left: grey_image(LEFT), TOPICS.right: grey_image(RIGHT), TOPICS.depth: depth_image(depth_m)}
+        for topic, image in images.items():
+            driver.publish(RmwZenohKeys(7).key(topic, "sensor_msgs/Image"), encode_image(50, "cam0", image))
         queue.put_imu(ImuSamples(np.array([10**9]), np.zeros((1, 3)), np.zeros((1, 3))))
         found = queue.take(1.0).frame
     assert isinstance(found, StoredFrame)
@@ -193,9 +183,17 @@ def sent(frames: RigFrames, index: int, numbers: tuple[int, ...]) -> list[Stored
     return [done for n in numbers for done in frames.add(n, stamp_ns + LATE_NS * (n > 1), IMAGE)]
 
 
+def black_in_front(frames: list[StoredFrame]) -> list[StoredFrame]:
+    return [frame for frame in frames if not decode_grey(frame.left).any()]
+
+
+def driven(frames: RigFrames, indices: range, *numbers: int) -> list[StoredFrame]:
+    return [frame for index in indices for frame in sent(frames, index, numbers or (0, 1, 2, 3))]
+
+
 def test_each_frame_has_the_rear_pairs_images_although_they_come_later() -> None:
     frames = RigFrames(rig())
-    done = [frame for k in range(6) for frame in sent(frames, k, (0, 1, 2, 3))]
+    done = driven(frames, range(6))
     assert [frame.stamp_ns for frame in done] == [1_000_000_000 + k * PERIOD_NS for k in range(6)]
     later = [None if f.others[0] is None else f.others[0].stamp_ns - f.stamp_ns for f in done]
     assert later == [None, *[LATE_NS] * 5]  # of the first nobody knew that another view sends
@@ -203,8 +201,7 @@ def test_each_frame_has_the_rear_pairs_images_although_they_come_later() -> None
 
 def test_a_rear_pair_that_is_dead_delays_one_frame_and_comes_back() -> None:
     frames = RigFrames(rig())
-    for k in range(3):
-        sent(frames, k, (0, 1, 2, 3))
+    driven(frames, range(3))
     counts = [len(sent(frames, k, (0, 1))) for k in range(3, 7)]
     assert counts == [0, 2, 1, 1]
     done = sent(frames, 7, (0, 1, 2, 3)) + sent(frames, 8, (0, 1, 2, 3))
@@ -213,26 +210,21 @@ def test_a_rear_pair_that_is_dead_delays_one_frame_and_comes_back() -> None:
 
 def test_while_the_pair_in_front_is_dead_the_rear_pair_carries_on() -> None:
     frames = RigFrames(rig())
-    for k in range(3):
-        sent(frames, k, (0, 1, 2, 3))
+    driven(frames, range(3))
     # It is dead for who hears nothing of it for half a second.
-    done = [frame for k in range(3, 20) for frame in sent(frames, k, (2, 3))]
-    black = [frame for frame in done if not decode_grey(frame.left).any()]
+    done = driven(frames, range(3, 20), 2, 3)
+    black = black_in_front(done)
     assert len(black) == 20 - 13 and all(frame.others[0] is not None for frame in black)
-    back = [frame for k in range(20, 24) for frame in sent(frames, k, (0, 1, 2, 3))]
-    assert all(decode_grey(frame.left).any() for frame in back)
+    back = driven(frames, range(20, 24))
+    assert not black_in_front(back)
     stamps = [frame.stamp_ns for frame in (*done, *back)]
     assert stamps == sorted(set(stamps))
 
 
-def black_in_front(frames: list[StoredFrame]) -> list[bool]:
-    return [not decode_grey(frame.left).any() for frame in frames]
-
-
 def test_a_front_that_never_sends_does_not_keep_the_rear_from_it() -> None:
     frames = RigFrames(rig())
-    done = [frame for k in range(20) for frame in sent(frames, k, (2, 3))]
-    assert len(done) == 20 - 11 and all(black_in_front(done))
+    done = driven(frames, range(20), 2, 3)
+    assert len(done) == 20 - 11 and black_in_front(done) == done
     assert all(frame.others[0] is not None for frame in done)
 
 
@@ -250,7 +242,7 @@ def test_of_two_views_beside_a_dead_one_the_first_gives_the_stamps() -> None:
     for k in range(3):
         at(k, 0, 1, 2, 3)
     done = [frame for k in range(3, 24) for frame in at(k, 2, 3)]
-    black = [frame for frame in done if not decode_grey(frame.left).any()]
+    black = black_in_front(done)
     assert len(black) == 24 - 13
     assert all(each is not None for frame in black[1:] for each in frame.others)
     done += [frame for k in range(24, 28) for frame in at(k, 0, 1, 3)]  # now the first of them dies
@@ -268,7 +260,7 @@ def test_a_rear_pair_with_another_clock_does_not_blind_the_front() -> None:
         for number in range(4):
             done += frames.add(number, stamp_ns + 3600 * 10**9 * (number > 1), IMAGE)
     assert [frame.stamp_ns for frame in done] == [1_000_000_000 + k * PERIOD_NS for k in range(40)]
-    assert not any(black_in_front(done)) and not any(frame.others[0] for frame in done)
+    assert not black_in_front(done) and not any(frame.others[0] for frame in done)
 
 
 def test_images_of_half_the_rate_belong_to_every_second_frame_and_delay_no_other() -> None:
@@ -284,9 +276,8 @@ def test_images_of_half_the_rate_belong_to_every_second_frame_and_delay_no_other
 
 def test_a_clock_that_is_set_back_begins_anew() -> None:
     frames = RigFrames(rig())
-    for k in range(100, 110):
-        sent(frames, k, (0, 1, 2, 3))
-    done = [frame for k in range(10) for frame in sent(frames, k, (0, 1, 2, 3))]
+    driven(frames, range(100, 110))
+    done = driven(frames, range(10))
     assert [frame.others[0] is not None for frame in done[-8:]] == [True] * 8
 
 

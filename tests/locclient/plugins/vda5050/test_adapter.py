@@ -52,6 +52,17 @@ def seen(
     return Localization(last, position, is_localized, is_silent=False)
 
 
+def frame(
+    placed: PublishedPose, status: Status = Status.TRACKING, cause: Cause = Cause.NONE, *, sigma_m: float = 0.01,
+    version: int = 1, floor: str = "",
+) -> Any:  # fmt: skip
+    """What the robot makes of a frame."""
+    estimate = SimpleNamespace(
+        status=status, cause=cause, stamp_ns=7, cov_rot_trans=np.eye(6) * sigma_m**2, map_version=version, floor=floor
+    )
+    return SimpleNamespace(estimate=estimate, published=placed, speed_mps=0.0)
+
+
 class FakeMaps:
     """Versions without bytes."""
 
@@ -130,17 +141,8 @@ def test_a_robot_that_is_not_localized_says_why(status: Status, cause: Cause) ->
 @pytest.mark.parametrize(("sigma_m", "is_localized"), [(0.1, True), (2.0, False)])
 def test_a_position_beyond_the_lost_radius_is_none(sigma_m: float, is_localized: bool) -> None:
     """The check of the calibration widens covariances of estimates that keep their status."""
-    estimate = SimpleNamespace(
-        status=Status.DEGRADED,
-        cause=Cause.CALIBRATION,
-        stamp_ns=7,
-        cov_rot_trans=np.eye(6) * sigma_m**2,
-        map_version=1,
-        floor="",
-    )
-    outcome = SimpleNamespace(estimate=estimate, published=PublishedPose(np.eye(4), np.eye(4)), speed_mps=0.0)
-    adapter = Adapter()
-    adapter.after_frame(outcome, frozenset({1}))  # type: ignore[arg-type]
+    placed, adapter = PublishedPose(np.eye(4), np.eye(4)), Adapter()
+    adapter.after_frame(frame(placed, Status.DEGRADED, Cause.CALIBRATION, sigma_m=sigma_m), frozenset({1}))
     assert adapter.said()["mobileRobotPosition"]["localized"] is is_localized
     assert ("LOCALIZATION_ERROR" in adapter.error_types()) is not is_localized
 
@@ -151,36 +153,14 @@ def test_each_floor_has_its_map_id() -> None:
     for number, site in enumerate(("", "hall-2")):
         entry = FloorEntry(site=site or "hall", level=f"L{number}", height_m=4.0 * number)
         floors[site] = Floor(entry, BuildingFrame(x_m=10.0 * number, y_m=0.0, yaw_rad=0.0))
-    estimate = SimpleNamespace(
-        status=Status.TRACKING,
-        cause=Cause.NONE,
-        stamp_ns=7,
-        cov_rot_trans=np.eye(6) * 1e-4,
-        map_version=5,
-        floor="hall-2",
-    )
     placed = PublishedPose(np.eye(4), np.eye(4), floors["hall-2"].building_from_map)
-    outcome = SimpleNamespace(estimate=estimate, published=placed, speed_mps=0.0)
-    adapter.after_frame(outcome, frozenset({1}), floors, {"hall-2": 5})  # type: ignore[arg-type]
+    adapter.after_frame(frame(placed, version=5, floor="hall-2"), frozenset({1}), floors, {"hall-2": 5})
     state = adapter.said()
     assert (state["mobileRobotPosition"]["mapId"], state["mobileRobotPosition"]["x"]) == ("hall-2", 10.0)
     assert {"mapId": "hall-2", "mapVersion": "5", "mapStatus": "ENABLED"} in state["maps"]
-    nodes = [
-        {
-            "nodeId": "n",
-            "sequenceId": 0,
-            "released": True,
-            "nodePosition": {"x": 0.0, "y": 0.0, "mapId": "hall-2"},
-            "actions": [],
-        }
-    ]
-    order = {**HEADER, "orderId": "o", "orderUpdateId": 0, "nodes": nodes, "edges": []}
-    adapter.order(json.dumps(order).encode())
+    adapter.order(_order("hall-2"))
     assert "UNKNOWN_MAP_ID" not in adapter.error_types()
-    adapter.order(_order("yard").replace(b'"x": 0', b'"theta": null, "mapDescription": null, "x": 0'))
-    assert "UNKNOWN_MAP_ID" in adapter.error_types()
-    estimate.status = Status.LOST
-    adapter.after_frame(outcome, frozenset({1}), floors, {"hall-2": 5})  # type: ignore[arg-type]
+    adapter.after_frame(frame(placed, Status.LOST, version=5, floor="hall-2"), frozenset({1}), floors, {"hall-2": 5})
     given = {"x": 12.0, "y": 1.0, "theta": 0.0, "lastNodeId": "n"}
     assert adapter.ask("initializePosition", "a", mapId="hall-2", **given)["actionStatus"] == "RUNNING"
     (prior,) = adapter.priors
@@ -198,16 +178,11 @@ def test_each_floor_has_its_map_id() -> None:
 def test_positions_are_in_the_building_where_that_is_asked_for() -> None:
     adapter = Adapter(frame="building")
     building_from_map = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.array([10.0, -20.0, 0.0]))
-    estimate = SimpleNamespace(
-        status=Status.TRACKING, cause=Cause.NONE, stamp_ns=7, cov_rot_trans=np.eye(6) * 1e-4, map_version=1, floor=""
-    )
     map_from_odom = se3(np.eye(3), np.array([3.0, 1.0, 0.0]))
     given = {"x": 9.0, "y": -17.0, "theta": np.pi / 2, "mapId": "hall", "lastNodeId": "n"}
 
-    def drive(known: np.ndarray | None) -> dict[str, Any]:
-        placed = PublishedPose(np.eye(4), map_from_odom, known)
-        outcome = SimpleNamespace(estimate=estimate, published=placed, speed_mps=0.0)
-        adapter.after_frame(outcome, frozenset({1}))  # type: ignore[arg-type]
+    def drive(known: np.ndarray | None, status: Status = Status.TRACKING) -> dict[str, Any]:
+        adapter.after_frame(frame(PublishedPose(np.eye(4), map_from_odom, known), status), frozenset({1}))
         return adapter.said()
 
     unknown = drive(None)
@@ -218,8 +193,7 @@ def test_positions_are_in_the_building_where_that_is_asked_for() -> None:
     place = drive(building_from_map)["mobileRobotPosition"]
     assert (place["x"], place["y"], place["theta"]) == pytest.approx((9.0, -17.0, np.pi / 2))
     assert place["localized"] is True
-    estimate.status = Status.DEGRADED
-    drive(building_from_map)
+    drive(building_from_map, Status.DEGRADED)
     adapter.ask("initializePosition", "b", **given)
     np.testing.assert_allclose(adapter.priors[-1].map_from_base, map_from_odom, atol=1e-12)
 
