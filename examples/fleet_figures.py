@@ -9,8 +9,9 @@ import time
 
 from fleetmap import FleetmapError
 from mapserver import open_store
-from mapserver.fleet.shift_summary import summarise
-from mapserver.fleet_statistics.kpis import Kpis
+from mapserver.fleet.resurvey_list import resurvey_list
+from mapserver.fleet_statistics.kpis import Counters, Kpis, hour_of, kpis
+from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 
 
 def in_words(figures: Kpis) -> str:
@@ -28,13 +29,20 @@ def in_words(figures: Kpis) -> str:
 
 def main(store: str, site: str, hours: str = "24") -> None:
     """Print the tables, the worst robots and versions first."""
+    now_ns = time.time_ns()
+    since = hour_of(now_ns) + 1 - int(hours)
     with open_store(store) as maps:
-        summary = summarise(maps, site, int(hours), time.time_ns())
-    print(f"{site}, version {summary.current_version}, last {hours} h: {in_words(summary.total)}")
-    for title, rows in (("robot", summary.robots), ("version", summary.versions), ("cause", summary.causes)):
-        for key, figures in rows:
-            print(f"{title:8} {key or '-':16} {in_words(figures)}")
-    for tile in summary.resurvey.tiles:
+        current = maps.current(site)
+        axes = ("site", "robot", "version", "cause")
+        found = {axis: maps.fleet.counters(site, axis, since_hour=since) for axis in axes}
+        again = resurvey_list(maps, site, ResurveySettings(), now_ns)
+    total = kpis(found.pop("site").get((site, ""), Counters()))
+    print(f"{site}, version {current and current.version}, last {hours} h: {in_words(total)}")
+    for axis, counters in found.items():
+        rows = [(key, kpis(counts)) for (_, key), counts in counters.items()]
+        for key, figures in sorted(rows, key=lambda row: (-row[1].failures.events, row[0])):
+            print(f"{axis:8} {key or '-':16} {in_words(figures)}")
+    for tile in again.tiles:
         print(f"survey again: tile {tile.tile}, {'; '.join(tile.reasons)}")
 
 

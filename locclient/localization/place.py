@@ -82,7 +82,7 @@ class Place(NamedTuple):
         turn = turn_both(self.map_from_body[:3, :3])
         lever_m = self.map_from_body[:3, :3] @ way.position_m
         covariance = transport_cov(self.cov_rot_trans, lever_m) + turn @ way.cov_rot_trans @ turn.T
-        return Place(self.map_from_body @ way.map_from_body, covariance, self.floor)
+        return Place(self.map_from_body @ way[0], covariance, self.floor)
 
     def before(self, way: "Place") -> "Place":
         """Return the place from which the way led here, the inverse of `at_end_of`."""

@@ -155,9 +155,9 @@ def instants(moments: Sequence[Moment], pictures: Sequence[PictureRow], clock: F
         x, y = _place(each) or (None, None)
         belief = "no position" if x is None else f"at {x:.2f}, {y:.2f} m"
         belief += "" if each.radius_95_m is None else f", within {each.radius_95_m:.2f} m with 95 %"
-        pose = {"x": x, "y": y, "heading_rad": each.heading_rad, "belief": belief}
+        place = {"x": x, "y": y, "heading_rad": each.heading_rad, "belief": belief}
         times = {"clock": clock.at(each.stamp_ns), "since": clock.since(each.stamp_ns)}
-        found.append({**times, "words": words, "tone": tone, "picture": picture, **pose})
+        found.append({**times, "words": words, "tone": tone, "picture": picture, **place})
     return found
 
 

@@ -127,7 +127,7 @@ class StartPoses(Protocol):
     def seen(self, recording: Recording, indices: NDArray[np.int64]) -> tuple[Recording, NDArray[np.int64]]:
         """Return the recording with what the system measured beside poses, and which of the selected frames (F,) can be used."""
 
-    def poses(self, recording: Recording, indices: NDArray[np.int64]) -> GivenPoses:
+    def poses_of(self, recording: Recording, indices: NDArray[np.int64]) -> GivenPoses:
         """Return the poses of the selected frames (F,); an error if they do not fit the recording."""
 
 
@@ -353,7 +353,7 @@ def _admission(
             console.print(f"{recording.name}: {remark}", markup=False)
         if reading.trajectory is None:
             return Admission(result, begun=None if begun is None else begun.chain_of(result.rig))
-        given = reading.trajectory.poses(replace(first, calibration=result.rig), indices)
+        given = reading.trajectory.poses_of(replace(first, calibration=result.rig), indices)
         console.print(f"{recording.name}: {given.words}", markup=False)
         return Admission(result, given)
 

@@ -67,7 +67,7 @@ class OtherTrajectory:
                 f"--trajectory-scale {self.scale}: invalid; give the metres in the file's unit of length, above 0"
             )
 
-    def poses(self, recording: Recording, indices: NDArray[np.int64]) -> GivenPoses:
+    def poses_of(self, recording: Recording, indices: NDArray[np.int64]) -> GivenPoses:
         """Return the poses of the selected frames (F,).
 
         Frames without poses get them from fleetmap's odometry between those with poses. UsageError for a single camera with unknown

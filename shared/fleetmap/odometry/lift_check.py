@@ -66,7 +66,8 @@ class LiftCheck:
         if stamp_ns - self._wheel.stamp_ns > WINDOW_NS or earlier_from_body is None:
             self._steps.clear()
             return False
-        up = self._base_from_body[:3, :3] @ odom_from_body[2, :3]
+        up_body = odom_from_body[2, :3]
+        up = self._base_from_body[:3, :3] @ up_body
         step_m = (self._base_from_body @ earlier_from_body @ self._body_from_base)[:3, 3]
         climb_m, rolling = float(up @ step_m), [*wheel, self._wheel]
         speed_mps = max(length(sample.velocity_base_mps) for sample in rolling)

@@ -24,8 +24,8 @@ STEP = se3(so3_exp(np.array([0.0, 0.0, 0.1])), np.array([0.07, 0.0, 0.0]))
 
 
 def odometry(frame: int) -> OdometryEstimate:
-    pose = np.linalg.matrix_power(STEP, frame), 1e-8 * np.eye(6)
-    return OdometryEstimate(frame, frame, *pose, OdometryStatus.TRACKING, inertial=True, previous_from_body=STEP)
+    place = np.linalg.matrix_power(STEP, frame), 1e-8 * np.eye(6)
+    return OdometryEstimate(frame, frame, *place, OdometryStatus.TRACKING, inertial=True, previous_from_body=STEP)
 
 
 def test_the_frame_of_a_long_search_moves_once_with_each_frame() -> None:

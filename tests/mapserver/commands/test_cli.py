@@ -72,7 +72,10 @@ def test_publishing_says_which_way_nobody_drove(capsys: pytest.CaptureFixture[st
     with MapStore.open(tmp_path / "store", create=True) as maps:
         tiles = [random_tile(np.random.default_rng(0), cell=(3, -1))]
         seen = Evidence(directions=[TileDirections((3, -1), {"E": 12}, {"W": 12})])
-        maps.save("lab", DraftContent(tiles, b"words", draft_details(), archive=b"archive", evidence=seen))
+        maps.save(
+            "lab",
+            DraftContent(tiles=tiles, vocabulary=b"words", details=draft_details(), archive=b"archive", evidence=seen),
+        )
     assert status("mapserver", "publish", "--site", "lab", "--store", tmp_path / "store") == 0
     assert "tile 3,-1: 12 places face E and none near them W" in capsys.readouterr().out
 

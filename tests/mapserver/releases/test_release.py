@@ -87,7 +87,10 @@ def test_a_person_trusts_a_calibration_that_nothing_judged_and_the_version_carri
     """A refused draft is refused in another store, too; the choice travels with the version, and is no second user's word."""
     report = {EVIDENCE_KEY: msgspec.to_builtins(STRAIGHT)}
     tiles = [random_tile(np.random.default_rng(3), cell=(0, 0))]
-    store.save("lab", DraftContent(tiles, b"w", draft_details(**report), archive=b"a", evidence=STRAIGHT))
+    store.save(
+        "lab",
+        DraftContent(tiles=tiles, vocabulary=b"w", details=draft_details(**report), archive=b"a", evidence=STRAIGHT),
+    )
     command = f"mapserver publish --site lab --store {store.folder} --version 1 --trust-calibration --reason"
     store.export_version("lab", 1, tmp_path / "refused.fmex", archive=False)
     with MapStore.open(tmp_path / "other", create=True) as other:

@@ -125,12 +125,12 @@ def _ground_truth(colour: ImageSeries, depth_from_body: Array, log: ReadLog) -> 
     files = [image.with_name(image.name.partition(".")[0] + ".pose.txt") for image in colour.sources]
     stamped = [(stamp_ns, file) for stamp_ns, file in zip(colour.stamps_ns, files, strict=True) if file.is_file()]
     log.files += [file for _, file in stamped]
-    rigid = [(stamp_ns, pose) for stamp_ns, file in stamped if (pose := _rigid(file)) is not None]
+    rigid = [(stamp_ns, matrix) for stamp_ns, file in stamped if (matrix := _rigid(file)) is not None]
     if lost := len(stamped) - len(rigid):
         log.note("ground truth: no rigid transform", f"{lost} of {len(stamped)} files left out")
     if not rigid:
         return None
-    return Trajectory(np.array([ns for ns, _ in rigid]), np.stack([pose @ depth_from_body for _, pose in rigid]))
+    return Trajectory(np.array([ns for ns, _ in rigid]), np.stack([matrix @ depth_from_body for _, matrix in rigid]))
 
 
 def _rigid(file: Path) -> Array | None:

@@ -84,7 +84,7 @@ def calibration_of_messages(
     has_imu = body_from_cam0 is not None
     body_from_first = np.eye(4) if body_from_cam0 is None else body_from_cam0
     posed = zip(cameras, cam0_from_cams, strict=True)
-    placed = [_camera(info, body_from_first @ pose, where) for info, pose in posed if pose is not None]
+    placed = [_camera(info, body_from_first @ mount, where) for info, mount in posed if mount is not None]
     body_frame = imu_frame if has_imu and imu_frame else cameras[0].frame
     bases = (_target_from_source(links, name, body_frame) for name in _BASE_FRAMES)
     base_from_body = next((base for base in bases if base is not None), None)

@@ -262,7 +262,7 @@ def _calibration(
             log.note("camera not mounted", f"{side}: {what}; its images are not used")
     for words in frames_not_optical(cameras, links):
         log.note("camera frame not optical", words)
-    mounted = tuple(side for side, pose in zip(sides, cam0_from_cams, strict=True) if pose is not None)
+    mounted = tuple(side for side, mount in zip(sides, cam0_from_cams, strict=True) if mount is not None)
     calibration = calibration_of_messages(cameras, cam0_from_cams, links, imu_frame, str(container.path))
     if len(mounted) > 1:
         marked = zip(calibration.cameras, mounted, strict=True)

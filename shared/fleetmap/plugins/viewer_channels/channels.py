@@ -139,8 +139,8 @@ def path(stamp_ns: int, positions_m: Array, topic: str = "/path", frame: str = M
     step = max(1, math.ceil(len(positions_m) / _MAX_PATH))
     level = fox.Quaternion(w=1.0)
     kept = positions_m[::-1][::step][::-1].tolist()
-    poses = [fox.Pose(position=fox.Vector3(x=x, y=y, z=z), orientation=level) for x, y, z in kept]
-    return _stamped(topic, stamp_ns, frame_id=frame, poses=poses)
+    placed = [fox.Pose(position=fox.Vector3(x=x, y=y, z=z), orientation=level) for x, y, z in kept]
+    return _stamped(topic, stamp_ns, frame_id=frame, poses=placed)
 
 
 def links(stamp_ns: int, given: Iterable[tuple[str, str, Array]]) -> ChannelMessage:

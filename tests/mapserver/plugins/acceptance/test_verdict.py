@@ -81,6 +81,10 @@ def report(seen: Aisle, surveyed: Array, driven: Array, *, dark: str = "") -> Re
     )  # fmt: skip
 
 
+def change_drive(report: Report, **values: float) -> None:
+    report.drives[0] = msgspec.structs.replace(report.drives[0], **values)
+
+
 def verdict(found: Report, *promises: str) -> Report:
     return judged(msgspec.structs.replace(found, promises=list(promises)), GateSettings(), None, [])
 
@@ -146,8 +150,8 @@ DOUBTED = RigEvidence("rig", [], {}, {"pair geometry": "0.3 degrees off"})
     ("change", "words"),
     [
         (lambda r: r.areas[1].darkness.update({"1": Count(0, 8)}), "aisle 2 is nearly too dark: with half its light 0"),
-        (lambda r: setattr(r.drives[0], "silent", 1), "1 silent failures while driving"),
-        (lambda r: setattr(r.drives[0], "localised_share", 0.3), "30 % of drive drive is localized"),
+        (lambda r: change_drive(r, silent=1), "1 silent failures while driving"),
+        (lambda r: change_drive(r, localised_share=0.3), "30 % of drive drive is localized"),
         (lambda r: setattr(r.areas[0].starts, "silent", 1), "aisle 1: 1 starts without a guess are silently wrong"),
         (lambda r: setattr(r, "calibrations", [DOUBTED]), "rig is in doubt: pair geometry: 0.3 degrees off"),
         (lambda r: r.areas.pop(), "only 8 frames at a known place judge it, 12 are needed"),

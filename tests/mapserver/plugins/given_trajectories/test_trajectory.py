@@ -64,10 +64,10 @@ def drifted(sample: Sample) -> Array:
     return np.array([OTHER_FROM_MAP @ true @ se3_exp(d) for true, d in zip(sample.world_from_body, drift, strict=True)])
 
 
-def pose_rows(poses: Array, *, scalar_first: bool = False) -> Array:
+def pose_rows(map_from_body: Array, *, scalar_first: bool = False) -> Array:
     """(F, 7) positions and quaternions."""
-    quats = Rotation.from_matrix(poses[:, :3, :3]).as_quat(scalar_first=scalar_first)
-    return np.hstack([poses[:, :3, 3], quats])
+    quats = Rotation.from_matrix(map_from_body[:, :3, :3]).as_quat(scalar_first=scalar_first)
+    return np.hstack([map_from_body[:, :3, 3], quats])
 
 
 def written(
@@ -95,7 +95,7 @@ def in_seconds(sample: Sample) -> list[str]:
 
 def given(recording: Path, other: GivenTrajectory, use: SensorSet | None = None, frames: int = FRAMES) -> GivenPoses:
     with open_recording(recording) as opened:
-        return other.poses(reduced(opened, use), np.arange(frames))
+        return other.poses_of(reduced(opened, use), np.arange(frames))
 
 
 def off_m(found: GivenPoses, sample: Sample) -> float:

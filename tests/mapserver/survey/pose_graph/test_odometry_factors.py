@@ -36,8 +36,8 @@ def estimate(
     status: OdometryStatus = OdometryStatus.TRACKING,
 ) -> Any:
     """An odometry's estimate at x_m; its covariance is the unit matrix times `variance`."""
-    pose = se3(np.eye(3), np.array([x_m, 0.0, 0.0])), variance * np.eye(6)
-    return OdometryEstimate(0, 0, *pose, status, inertial=inertial, new_odom_from_old_odom=change)
+    place = se3(np.eye(3), np.array([x_m, 0.0, 0.0])), variance * np.eye(6)
+    return OdometryEstimate(0, 0, *place, status, inertial=inertial, new_odom_from_old_odom=change)
 
 
 def test_only_what_touches_the_dark_hangs_on_odometry_as_odometry_measured_it() -> None:
