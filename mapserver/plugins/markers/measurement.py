@@ -17,7 +17,7 @@ from fleetmap.sensors.samples import Trajectory
 
 _MIN_RAYS, _MIN_ANGLE_RAD = 4, 0.1  # that meet in a marker, and between the outer ones
 _LEAST_SIGMA_M = 0.005
-_LEAST_CELL_PX = 3.0  # of the pattern: of a smaller one, the cells beside a corner draw it away
+_FARTHEST_M = 8.0
 
 _Seen = tuple[Array, Array]  # map_from_cam (4, 4), corners (4, 2)
 
@@ -28,7 +28,6 @@ def measure_markers(recording: Recording, trajectory: Trajectory, size_m: float,
     RecordingError if there are none.
     """
     rectifier, detector = Rectifier(recording.calibration), detector_of(dictionary)
-    least_px = _LEAST_CELL_PX * (detector.getDictionary().markerSize + 2)
     seen: dict[int, list[_Seen]] = defaultdict(list)
     for number, stamp_ns in enumerate(recording.frame_stamps_ns.tolist()):
         map_from_body = trajectory.at(stamp_ns)
@@ -36,13 +35,12 @@ def measure_markers(recording: Recording, trajectory: Trajectory, size_m: float,
             continue
         image = rectifier.rectify(recording.read_frame(number)).left
         for marker, corners in corners_of(image, detector).items():
-            if np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=1).min() >= least_px:
-                seen[marker].append((map_from_body @ rectifier.body_from_cam, corners))
+            seen[marker].append((map_from_body @ rectifier.body_from_cam, corners))
     placed = (_placed(number, looks, size_m, rectifier.camera) for number, looks in sorted(seen.items()))
     found = tuple(marker for marker in placed if marker is not None)
     if not found:
         raise RecordingError(
-            f"{recording.name}: no marker of {dictionary} was seen near by from several sides ({len(seen)} were near); drive past them"
+            f"{recording.name}: no marker of {dictionary} was seen from several sides ({len(seen)} were seen at all); drive past them"
         )
     return MarkerList(markers=found, dictionary=dictionary)
 
@@ -50,6 +48,7 @@ def measure_markers(recording: Recording, trajectory: Trajectory, size_m: float,
 def _placed(number: int, looks: list[_Seen], size_m: float, camera: StereoCamera) -> Marker | None:
     """Return a marker where the rays through its middle meet, which has the map's scale; None if they are too few or too parallel."""
     near = [(*look, *poses_of(look[1], size_m, camera)[0]) for look in looks]
+    near = [look for look in near if look[2][2, 3] < _FARTHEST_M]
     if len(near) < _MIN_RAYS:
         return None
     origins = np.array([there[:3, 3] for there, *_ in near])
