@@ -5,6 +5,7 @@
 #   make test                  all tests but the long ones
 #   make test-all              every test: with browser walks, fault sweeps, real recordings, nights and drills
 #   make test-ci               make test, and those of the long tests that CI runs (tests/tiers.toml)
+#   make ros2-env              install ROS 2 for the tests with it, into .ros2 (Python 3.11; 190 MB, a minute)
 #   make sanitize              what computes, with a core that ends at a read beside an array or an undefined result (needs g++)
 #   make check                 format, lint, types, import contracts
 #   make docs                  write the tables of docs/command_line.md and docs/settings.md anew
@@ -34,7 +35,7 @@ INPUTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help core demo demo-recording test test-ci test-all sanitizers sanitize check docs bench acceptance study clean
+.PHONY: help core demo demo-recording test test-ci test-all ros2-env sanitizers sanitize check docs bench acceptance study clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
@@ -65,6 +66,13 @@ test-ci: core
 test-all: core
 	@$(COMPILE) tests
 	$(RUN_TESTS)
+
+# ROS itself, for tests of what speaks with it; they are skipped without.
+ROS2 := tests/support/ros2
+ros2-env: .ros2/.complete
+
+.ros2/.complete: $(ROS2)/environment.sh $(ROS2)/requirements.txt $(wildcard $(ROS2)/interfaces/* $(ROS2)/interfaces/*/*/*) | $(DEV_STAMP)
+	@$(ROS2)/environment.sh
 
 check: $(DEV_STAMP)
 	$(BIN)/ruff format --check .
@@ -108,7 +116,7 @@ study: core
 	PYTHONPATH=tests $(BIN)/python -m studies.$(NAME)
 
 clean:
-	rm -rf $(VENV) shared/fleetmap/_core.*.so out dist build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(VENV) .ros2 shared/fleetmap/_core.*.so out dist build .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:
