@@ -1,8 +1,6 @@
 """The tree of frames that a real tf2 composes of what the driver and the localizer publish, against the true drive."""
 
-import ast
 import random
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -10,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 
 from fleetmap.errors import UsageError
 from fleetmap.geometry import (
@@ -24,7 +21,6 @@ from fleetmap.geometry import (
 )
 from fleetmap.sensors.source_settings import Topics
 from fleetmap.sources.intake import Intake
-from locclient.config import read_config
 from locclient.daemon.publishers import output_of
 from locclient.localization.estimate import Estimate
 from locclient.outputs import OutputSection, Publisher
@@ -32,7 +28,6 @@ from locclient.plugins.ros2_node.driver_odometry import Missing, PoseHistory
 from locclient.plugins.ros2_node.keys import RmwZenohKeys
 from locclient.plugins.ros2_node.localizer import OUTPUT
 from locclient.robot.continuous_odom import ContinuousOdom
-from support.fleet.contracts_documents import REPOSITORY
 from support.fleet.estimates import estimate
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.fleet.nav2_client import typestore
@@ -354,42 +349,3 @@ def test_the_covariance_is_that_of_the_base() -> None:
     np.testing.assert_allclose(
         np.cov(np.array(drawn).T) / np.outer(scale, scale), sent / np.outer(scale, scale), atol=0.06
     )
-
-
-def test_the_shipped_example_has_one_publisher_of_map() -> None:
-    folder = REPOSITORY / "deploy/ros2"
-    config, _ = read_config(folder / "locclient.toml", {})
-    params = yaml.safe_load((folder / "nav2_params.yaml").read_text())
-    assert params["lifecycle_manager_localization"]["ros__parameters"]["node_names"] == [config.output.node]
-    assert (config.output.map_topic, config.output.autostart) == ("map", False)
-    launch = ast.parse((folder / "localization.launch.py").read_text())
-    (node,) = (call for call in ast.walk(launch) if isinstance(call, ast.Call) and ast.unparse(call.func) == "Node")
-    given = {keyword.arg: ast.unparse(keyword.value).strip("'") for keyword in node.keywords}
-    assert given["package"] == "nav2_lifecycle_manager" and given["name"] in params
-    assert "map_server" not in params and "nav2_map_server" not in ast.unparse(launch)
-
-
-# Declared by nav2's nodes with these types; rclcpp ends a node whose parameter has another, also 4 for 4.0.
-NAV2_TYPES = {
-    "autostart": bool, "bond_timeout": float, "node_names": list, "global_frame": str, "robot_base_frame": str, "odom_topic": str,
-    "transform_tolerance": float,
-}  # fmt: skip
-
-
-def test_the_shipped_parameters_follow_the_rules_of_rcl() -> None:
-    """rcl_yaml_param_parser: below the names of a node stands ros__parameters, below that scalars or lists of one type; no aliases."""
-    text = (REPOSITORY / "deploy/ros2/nav2_params.yaml").read_text()
-    assert not any(isinstance(token, yaml.AliasToken | yaml.AnchorToken | yaml.TagToken) for token in yaml.scan(text))
-    waiting, seen = list(yaml.safe_load(text).items()), set()
-    while waiting:
-        node, content = waiting.pop()
-        assert re.fullmatch(r"[a-z]\w*", node) and isinstance(content, dict), node
-        if "ros__parameters" not in content:
-            waiting += content.items()
-            continue
-        assert list(content) == ["ros__parameters"], node
-        for name, value in content["ros__parameters"].items():
-            assert type(value) is NAV2_TYPES[name], f"{node}: {name}"
-            assert not isinstance(value, list) or {type(one) for one in value} == {str}
-            seen.add(name)
-    assert seen == set(NAV2_TYPES)

@@ -1,0 +1,1 @@
+"""Starts the localization client of fleetmap from ROS 2."""

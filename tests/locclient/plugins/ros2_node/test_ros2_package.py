@@ -1,0 +1,112 @@
+"""The package `fleetmap_ros`: built by colcon, its parameters read by ROS, its launch files loaded.
+
+ROS's own launch is in no wheel: stand-ins for its actions are called, and what they were called with is checked.
+"""
+
+import json
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
+
+import pytest
+import yaml
+
+from locclient.config import read_config
+from support.fleet.contracts_documents import REPOSITORY
+from support.ros2.environment import needs_ros, ros_environment, ros_program
+
+PACKAGE = REPOSITORY / "deploy/ros2/fleetmap_ros"
+PARAMETERS = PACKAGE / "config/nav2_params.yaml"
+# Declared by nav2's nodes with these types; rclcpp ends a node whose parameter has another, also 4 for 4.0.
+NAV2_TYPES = {
+    "autostart": bool, "bond_timeout": float, "node_names": list, "global_frame": str, "robot_base_frame": str, "odom_topic": str,
+    "transform_tolerance": float,
+}  # fmt: skip
+# What rcl makes of the file `sys.argv[1]` for nodes, NAMESPACE/NAME.
+READER = """
+import json, sys, rclpy
+rclpy.init(args=["--ros-args", "--params-file", sys.argv[1]])
+for full in sys.argv[2:]:
+    namespace, _, name = full.rpartition("/")
+    node = rclpy.create_node(name, namespace=namespace, automatically_declare_parameters_from_overrides=True)
+    print(json.dumps({name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()}))
+"""
+
+
+@needs_ros
+def test_colcon_builds_a_program_that_leaves_arguments_of_ros_to_rclpy(tmp_path: Path) -> None:
+    build = [sys.executable, "-m", "colcon", "build", "--base-paths", str(PACKAGE)]
+    subprocess.run(build, cwd=tmp_path, env=ros_environment(), check=True, capture_output=True)
+    built = tmp_path / "install/fleetmap_ros"
+    for folder in ("config", "launch", "rviz"):
+        installed = [path.name for path in sorted((built / "share/fleetmap_ros" / folder).iterdir())]
+        assert installed == [path.name for path in sorted((PACKAGE / folder).iterdir())]
+    words = [built / "lib/fleetmap_ros/localizer", "--config", "no.toml", "--ros-args", "-r", "__ns:=/r1"]
+    command = ["sh", "-c", '. install/setup.sh && exec "$0" "$@"', *map(str, words)]
+    path = f"{Path(sys.executable).parent}:/usr/bin:/bin"
+    environment = ros_environment() | {"PATH": path}
+    ended = subprocess.run(command, cwd=tmp_path, env=environment, check=False, capture_output=True, text=True)
+    assert "no.toml" in ended.stderr
+    assert "ros-args" not in ended.stderr
+
+
+def launched(name: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, MagicMock]:
+    """The stand-ins for launch's actions, by name, after a launch file was loaded and described."""
+    modules = {
+        "ament_index_python.packages": ["get_package_share_directory"],
+        "launch": ["LaunchDescription"],
+        "launch.actions": ["DeclareLaunchArgument", "IncludeLaunchDescription"],
+        "launch.conditions": ["IfCondition"],
+        "launch.launch_description_sources": ["PythonLaunchDescriptionSource"],
+        "launch.substitutions": ["LaunchConfiguration"],
+        "launch_ros.actions": ["Node"],
+        "launch_ros.parameter_descriptions": ["ParameterValue"],
+    }
+    actions = {action: MagicMock() for names in modules.values() for action in names}
+    actions["get_package_share_directory"].side_effect = {"fleetmap_ros": str(PACKAGE), "nav2_bringup": "/nav2"}.get
+    actions["PythonLaunchDescriptionSource"].side_effect = Path
+    for module, names in modules.items():
+        monkeypatch.setitem(sys.modules, module.partition(".")[0], MagicMock())
+        monkeypatch.setitem(sys.modules, module, MagicMock(**{action: actions[action] for action in names}))
+    runpy.run_path(str(PACKAGE / "launch" / name))["generate_launch_description"]()
+    return actions
+
+
+def arguments(actions: dict[str, MagicMock]) -> dict[str, str]:
+    return {call.args[0]: call.kwargs["default_value"] for call in actions["DeclareLaunchArgument"].call_args_list}
+
+
+def test_launch_files_name_what_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    alone, with_nav2 = (launched(name, monkeypatch) for name in ("localization.launch.py", "nav2.launch.py"))
+    for actions in (alone, with_nav2):
+        declared = arguments(actions)
+        assert {call.args[0] for call in actions["LaunchConfiguration"].call_args_list} == set(declared)
+        assert all(Path(value).exists() for value in declared.values() if "/" in value)
+    localizer, rviz = (call.kwargs for call in alone["Node"].call_args_list)
+    assert f'"{localizer["executable"]} = ' in (PACKAGE / "setup.py").read_text()
+    assert Path(rviz["arguments"][1]).exists()
+    (manager,) = (call.kwargs for call in with_nav2["Node"].call_args_list)
+    parameters = yaml.safe_load(PARAMETERS.read_text())
+    config, _ = read_config(PACKAGE / "config/locclient.toml", {})
+    assert parameters[manager["name"]]["ros__parameters"]["node_names"] == [config.output.node]
+    ours, nav2 = (call for call in with_nav2["IncludeLaunchDescription"].call_args_list)
+    assert set(dict(ours.kwargs["launch_arguments"])) <= set(arguments(alone))
+    assert ours.args[0].exists() and nav2.args[0] == Path("/nav2/launch/navigation_launch.py")
+    # One publisher of /map: the node, not nav2's map_server.
+    assert config.output.map_topic == "map" and "map_server" not in parameters
+
+
+@needs_ros
+def test_ros_reads_the_parameters_with_the_types_that_nav2_declares() -> None:
+    nodes = []
+    for name, content in yaml.safe_load(PARAMETERS.read_text()).items():
+        nodes += [f"/{name}"] if "ros__parameters" in content else [f"/{name}/{inner}" for inner in content]
+    with ros_program("-c", READER, str(PARAMETERS), *nodes) as reader:
+        read: list[dict[str, Any]] = [json.loads(line) for line in reader.communicate(timeout=60)[0].splitlines()]
+    of_every_node = {"use_sim_time", "start_type_description_service"}
+    types = [{name: type(value) for name, value in values.items() if name not in of_every_node} for values in read]
+    assert len(types) == len(nodes) and all(types)
+    assert {name: kind for of_node in types for name, kind in of_node.items()} == NAV2_TYPES
