@@ -4,7 +4,6 @@ import signal
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from ipaddress import ip_address
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -180,15 +179,13 @@ def viewer_address(text: str, *, insecure: bool) -> tuple[str, int]:
 
     Raises UsageError for an invalid address, and for one that other machines can reach unless allowed: viewers do not sign in.
     """
+    from fleetmap.bus.endpoints import is_loopback
+
     host, _, port = text.rpartition(":")
     host = host.strip("[]") or _LOOPBACK
     if not (port.isascii() and port.isdecimal()) or int(port) > 65535:
         raise UsageError(f"--foxglove {text!r}: write it like 8765 or {_LOOPBACK}:8765")
-    try:
-        is_local = host == "localhost" or ip_address(host).is_loopback
-    except ValueError:
-        is_local = False
-    if not (is_local or insecure):
+    if not (insecure or is_loopback(f"tcp/{host}:{port}")):
         raise UsageError(
             f"--foxglove {text}: viewers do not sign in, and other machines could see everything; leave {host} out and come "
             "through ssh -L, or pass --insecure on a network that only you can reach"

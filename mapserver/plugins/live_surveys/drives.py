@@ -2,10 +2,11 @@
 
 import threading
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Generator
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,30 +43,28 @@ class DueFrame(NamedTuple):
     due_s: float | None
 
 
-class Drive(Protocol):
+class Drive(ABC):
     """A survey's frames in time, at `speed` times the rate of their stamps. dropped: frames that arrived too fast."""
 
-    name: str
-    calibration: RigCalibration
-    has_depth: bool
-    rectifier: Rectifier
-    speed: float
-
-    @property
-    def dropped(self) -> int:
-        """Number of dropped frames so far."""
+    def __init__(self, name: str, calibration: RigCalibration, *, has_depth: bool, speed: float) -> None:
+        self.name, self.calibration, self.has_depth, self.speed = name, calibration, has_depth, speed
+        self.rectifier = Rectifier(calibration, has_depth=has_depth)
+        self.dropped = 0
 
     def check(self) -> list[str]:
         """Return shortcomings as text; RecordingError for what a build would refuse, as far as known before the drive."""
+        return []
 
+    @abstractmethod
     def frames(self) -> Generator[DueFrame | None, None, None]:
         """Yield each frame when it is due; None from time to time while waiting."""
 
+    @abstractmethod
     def finish(self, count: int, options: BuildOptions) -> tuple[Path, BuildOptions]:
         """Return the recording, and the build options that select the `count` used frames."""
 
 
-class RecordedDrive:
+class RecordedDrive(Drive):
     """A recording, played at `speed` times its own rate; 0 for as fast as its frames are processed."""
 
     def __init__(self, path: Path, recording: Recording, indices: NDArray[np.int64], given: str, speed: float) -> None:
@@ -73,15 +72,9 @@ class RecordedDrive:
         if not (np.isfinite(speed) and speed >= 0):
             raise UsageError(f"--speed {speed}: give 1 for the recording's own speed, 0 for as fast as it goes")
         recording = recording.view(0)
-        self.name, self.calibration = recording.name, recording.calibration
-        self.has_depth = recording.sensor_set is SensorSet.RGBD
-        self.rectifier = Rectifier(recording.calibration, has_depth=self.has_depth)
-        self._path, self._recording, self._indices, self._given, self.speed = path, recording, indices, given, speed
-
-    @property
-    def dropped(self) -> int:
-        """See Drive: it waits for its consumer."""
-        return 0
+        has_depth = recording.sensor_set is SensorSet.RGBD
+        super().__init__(recording.name, recording.calibration, has_depth=has_depth, speed=speed)
+        self._path, self._recording, self._indices, self._given = path, recording, indices, given
 
     def check(self) -> list[str]:
         refuse_hopeless(self._recording)
@@ -111,34 +104,23 @@ class RecordedDrive:
         return self.rectifier.rectify(self._recording.read_frame(index))
 
 
-class SensorDrive:
-    """The sensors of a robot. Every sample is recorded; after a crash the file is complete except for the last second."""
+class SensorDrive(Drive):
+    """The sensors of a robot, judged by their data. Every sample is recorded; after a crash the file lacks at most the last second."""
 
     def __init__(self, source: Source, path: Path, topics: Topics) -> None:
         """path: of the MCAP file to write; UsageError if it exists."""
         if path.suffix != ".mcap" or path.exists():
             raise UsageError(f"--record {path}: name a new file that ends in .mcap")
-        self.name, self.calibration, self.has_depth = path.stem, source.calibration, source.has_depth
-        self.rectifier = Rectifier(source.calibration, has_depth=source.has_depth)
+        super().__init__(path.stem, source.calibration, has_depth=source.has_depth, speed=1.0)
         self._source, self._path, self._topics = source, path, topics
         self._ended, self._recorded_frames = threading.Event(), 0
         self._fault: Exception | None = None
-        self.speed = 1.0
         self._intake = Intake(
             frames=_QUEUE,
             imu_minus_cam_s=self.rectifier.imu_minus_cam_s,
             has_imu=source.calibration.imu is not None,
             imu_wait_s=_IMU_WAIT_S,
         )
-
-    @property
-    def dropped(self) -> int:
-        """See Drive."""
-        return self._intake.counts.frames_dropped
-
-    def check(self) -> list[str]:
-        """See Drive: sensors are judged by their data."""
-        return []
 
     def frames(self) -> Generator[DueFrame | None, None, None]:
         """See Drive; RecordingError if the sensors fail, naming the recording up to there."""
@@ -148,8 +130,8 @@ class SensorDrive:
         begun_s = time.monotonic()
         try:
             while not self._intake.exhausted:
-                bundle = self._take()
-                due_s = time.monotonic()
+                bundle, due_s = self._take(), time.monotonic()
+                self.dropped = self._intake.counts.frames_dropped
                 frame = None if bundle.frame is None else self._recorded(writer, bundle)
                 yield None if frame is None else DueFrame(frame, bundle.imu, bundle.wheel, due_s)
                 if due_s - begun_s > _SILENCE_S:

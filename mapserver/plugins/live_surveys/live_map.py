@@ -4,24 +4,29 @@ Operators see it during a survey. The finished map is made by a build of the who
 poses after loop closure, and adjusts everything together.
 """
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_adjoint, se3_inverse
-from fleetmap.messages import Cause, Status
+from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_adjoint, se3_inverse, skew
+from fleetmap.messages import Cause, EstimateMessage, Placement, Status, covariance_entries
 from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.plugins.live_surveys.message import (
-    LiveEstimate,
-    LiveLoops,
+    MOST_PLACES,
+    NO_PART,
+    LiveMissing,
     LivePart,
     LiveParts,
     LiveRevisit,
     LiveRig,
+    MapSketch,
     NewKeyframe,
     joined_imu,
+    packed,
+    thinning,
 )
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import apply_result, bundle_problem
@@ -94,15 +99,15 @@ class LiveMap:
         parts = [p @ t[:3, :3].T + t[:3, 3] for p, t in zip(self._points_body, self.map_from_body, strict=True)]
         return np.concatenate([np.zeros((0, 3)), *parts])
 
-    def loops(self) -> LiveLoops:
-        """Outcome of revisits."""
-        found, refused, best = self._loops(), dict[str, int](), dict[int, LoopRecord]()
+    def sketch(self, cells: Array, missing: list[LiveMissing]) -> MapSketch:
+        """Return the displayed data of the map; no array exceeds the limit of a message. cells, missing: of the drive, as in it."""
+        found, refused, best = self._loops(), Counter[str](), dict[int, LoopRecord]()
         for record in found.records:
             if record.verdict is not LoopVerdict.ACCEPTED:
-                refused[record.verdict.value] = refused.get(record.verdict.value, 0) + 1 + len(record.also)
+                refused[record.verdict.value] += 1 + len(record.also)
             if record.inliers > (best[record.i].inliers if record.i in best else 0):
                 best[record.i] = record
-        newest = tuple(
+        newest = [
             LiveRevisit(
                 at_s=self._seconds(r.i),
                 seen_s=self._seconds(r.j),
@@ -111,9 +116,24 @@ class LiveMap:
                 matches=r.inliers,
             )
             for _, r in sorted(best.items())[-_NEWEST:]
-        )
+        ]
         accepted = [(r.i, r.j) for r in found.records if r.verdict is LoopVerdict.ACCEPTED]
-        return LiveLoops(np.array(accepted, np.int64).reshape(-1, 2), refused, newest)
+        places_m, parts = self.map_from_body[:, :2, 3], self.parts()
+        numbers = np.where((parts.labels < 0) | (parts.labels >= NO_PART), NO_PART, parts.labels).astype(np.uint8)
+        return MapSketch(
+            keyframes=len(self),
+            path_m=packed(places_m),
+            part=numbers[thinning(len(numbers), MOST_PLACES)].tobytes(),
+            parts=parts.spans[:NO_PART],
+            landmarks_m=packed(self.points_map()[:, :2]),
+            loops_m=packed(places_m[np.array(accepted, np.int64).reshape(-1, 2)].reshape(-1, 4)),
+            loops=len(accepted),
+            refused=dict(refused),
+            revisits=newest,
+            cells=packed(cells),
+            missing=missing,
+            estimate=self._estimate(parts),
+        )
 
     def _loops(self) -> Loops:
         """All candidates so far, and the loops accepted by the pose graph."""
@@ -139,26 +159,39 @@ class LiveMap:
         ]
         return LiveParts(labels, spans)
 
-    def estimate(self) -> LiveEstimate | None:
-        """Return the pose of the newest keyframe in the growing map, relative to its first one; LOST while in another part."""
+    def _estimate(self, parts: LiveParts) -> EstimateMessage | None:
+        """Return the pose of the base at the newest keyframe in the growing map, relative to its first one, in the robots' form with
+        odometry's continuous frame as `odom`; LOST while in another part. None for a single keyframe."""
+        newest, placed, cov = len(self) - 1, None, None
         if len(self) < _BELONGING:
             return None
-        parts, newest = self.parts(), len(self) - 1
         label = int(parts.labels[newest])
         span = parts.spans[label] if label >= 0 else None
+        body_from_base, odom_from_body = se3_inverse(self._rig.base_from_body), self._news[newest].frame_from_body
         if span is not None and not span.is_map:
-            return LiveEstimate(self._news[-1], Status.LOST, Cause.NO_MATCH, None, None)
-        if not parts.spans:
-            return LiveEstimate(self._news[-1], Status.INITIALISING, Cause.NONE, None, None)
-        is_sure = span is not None and bool(self._seeing[newest])
-        kept = next(n for n, each in enumerate(parts.spans) if each.is_map)
-        first, placed = int(np.flatnonzero(parts.labels == kept)[0]), self.map_from_body[newest]
-        cov = np.zeros((6, 6))
-        if self._marginals is not None and first != newest:
-            turn = np.kron(np.eye(2), placed[:3, :3])
-            cov = turn @ self._marginals.relative_cov(newest, first) @ turn.T
-        status = (Status.TRACKING, Cause.NONE) if is_sure else (Status.DEGRADED, Cause.ODOMETRY)
-        return LiveEstimate(self._news[-1], *status, placed, np.asarray(cov))
+            status = Status.LOST, Cause.NO_MATCH
+        elif not parts.spans:
+            status = Status.INITIALISING, Cause.NONE
+        else:
+            is_sure = span is not None and bool(self._seeing[newest])
+            status = (Status.TRACKING, Cause.NONE) if is_sure else (Status.DEGRADED, Cause.ODOMETRY)
+            kept = next(n for n, each in enumerate(parts.spans) if each.is_map)
+            first, placed = int(np.flatnonzero(parts.labels == kept)[0]), self.map_from_body[newest]
+            cov, lever = np.zeros((6, 6)), np.eye(6)
+            if self._marginals is not None and first != newest:
+                turn = np.kron(np.eye(2), placed[:3, :3])
+                cov = np.asarray(turn @ self._marginals.relative_cov(newest, first) @ turn.T)
+            lever[3:, :3] = -skew(placed[:3, :3] @ body_from_base[:3, 3])
+            cov = lever @ cov @ lever.T
+        return EstimateMessage(
+            stamp_ns=self._keyframes[newest].stamp_ns,
+            status=status[0].value,
+            cause=status[1].value,
+            map_version=None,
+            odom_from_base=Placement.of(odom_from_body @ body_from_base),
+            map_from_odom=None if placed is None else Placement.of(placed @ se3_inverse(odom_from_body)),
+            cov_rot_trans=None if cov is None else covariance_entries(cov),
+        )
 
     def _seconds(self, k: int) -> float:
         return round((self._keyframes[k].stamp_ns - self._keyframes[0].stamp_ns) * 1e-9, 3)

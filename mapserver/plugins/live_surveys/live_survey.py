@@ -10,20 +10,19 @@ from typing import NamedTuple
 
 import cv2
 import numpy as np
+from msgspec import structs
 from rich.console import Console
 
 from fleetmap.bow.shipped_vocabulary import default_vocabulary
 from fleetmap.errors import FleetmapError
-from fleetmap.geometry import se3_inverse, skew
-from fleetmap.messages import EstimateMessage, Placement, covariance_entries
 from fleetmap.recordings.images import jpeg_image
 from fleetmap.sensors.samples import Image
 from mapserver.drafting.draft import BuildOptions
 from mapserver.drafting.survey_recordings import read_zones
 from mapserver.library import BuiltMap, build_map
 from mapserver.plugins.live_surveys.drives import Drive, DueFrame
-from mapserver.plugins.live_surveys.mapping_process import MOST_PLACES, NO_SKETCH, MappingProcess, thinning
-from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, LiveEstimate, LiveRig, LiveSurveyState
+from mapserver.plugins.live_surveys.mapping_process import NO_SKETCH, MappingProcess
+from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, MOST_PLACES, LiveRig, LiveSurveyState, thinning
 from mapserver.plugins.live_surveys.tracking import LiveTracking, Tracked
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig
@@ -130,6 +129,7 @@ class _Survey:
         self._rig = LiveRig(
             rectifier.camera,
             rectifier.body_from_cam,
+            drive.calibration.base_from_body,
             imu,
             rectifier.imu_minus_cam_s,
             drive.has_depth,
@@ -213,30 +213,20 @@ class _Survey:
     def say(self, phase: str, *, version: int | None = None, words: str = "") -> None:
         figures, sketch = self.figures(), self._sketch
         qualities = np.array(self._qualities[: sketch.keyframes])[thinning(sketch.keyframes, MOST_PLACES)]
+        mapped = structs.asdict(sketch) | {"keyframes": figures.keyframes}
         self._tell(
             LiveSurveyState(
+                **mapped,
                 site=self._request.site,
                 recording=self._drive.name[:200],
                 stamp_ns=self._stamps_ns[-1] if self._stamps_ns else 0,
                 phase=phase,
                 seconds=round(figures.seconds, 3),
                 frames=figures.frames,
-                keyframes=figures.keyframes,
                 behind=self._behind,
                 latency_ms=None if figures.latency_ms is None else figures.latency_ms[1],
                 late_frames=figures.late_frames,
-                path_m=sketch.path_m.astype("<f4").tobytes(),
                 quality=np.round(255 * np.clip(qualities, 0, 1)).astype(np.uint8).tobytes(),
-                part=sketch.part.tobytes(),
-                parts=list(sketch.parts),
-                landmarks_m=sketch.landmarks_m.astype("<f4").tobytes(),
-                loops_m=sketch.loops_m.astype("<f4").tobytes(),
-                loops=sketch.loops,
-                refused=dict(sketch.refused),
-                revisits=list(sketch.revisits),
-                cells=sketch.cells.astype("<f4").tobytes(),
-                missing=list(sketch.missing),
-                estimate=self._estimate(sketch.estimate),
                 scale_known=self._scale_known,
                 picture=self._picture(),
                 version=version,
@@ -252,26 +242,6 @@ class _Survey:
         small = cv2.resize(self._seen, (width, height), interpolation=cv2.INTER_AREA)
         data = jpeg_image(np.asarray(small, np.uint8), _PICTURE_QUALITY).data
         return data if len(data) <= MAX_ARRAY_BYTES else b""
-
-    def _estimate(self, found: LiveEstimate | None) -> EstimateMessage | None:
-        """Return the estimate in the robots' form: of the base, with the odometry's continuous frame as `odom`."""
-        if found is None:
-            return None
-        body_from_base = se3_inverse(self._drive.calibration.base_from_body)
-        odom_from_body, placed, cov = found.keyframe.frame_from_body, found.map_from_body, found.cov_rot_trans
-        if placed is not None and cov is not None:
-            lever = np.eye(6)
-            lever[3:, :3] = -skew(placed[:3, :3] @ body_from_base[:3, 3])
-            cov = lever @ cov @ lever.T
-        return EstimateMessage(
-            stamp_ns=self._stamps_ns[found.keyframe.number],
-            status=found.status.value,
-            cause=found.cause.value,
-            map_version=None,
-            odom_from_base=Placement.of(odom_from_body @ body_from_base),
-            map_from_odom=None if placed is None else Placement.of(placed @ se3_inverse(odom_from_body)),
-            cov_rot_trans=None if cov is None else covariance_entries(cov),
-        )
 
 
 @contextmanager

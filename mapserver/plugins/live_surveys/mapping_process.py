@@ -8,13 +8,11 @@ import signal
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
 from multiprocessing.connection import Connection
-from typing import NamedTuple, Self
+from typing import Self
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import Array
@@ -23,12 +21,9 @@ from mapserver.plugins.live_surveys.live_map import LiveMap
 from mapserver.plugins.live_surveys.message import (
     COVERAGE_CELL_M,
     MAX_ARRAY_BYTES,
-    NO_PART,
-    LiveEstimate,
     LiveMissing,
-    LivePart,
-    LiveRevisit,
     LiveRig,
+    MapSketch,
     NewKeyframe,
 )
 from mapserver.quality.directions import tile_directions
@@ -36,7 +31,6 @@ from mapserver.survey.survey_inputs import SurveyConfig
 
 _READY_WITHIN_S = 60.0  # time to import the survey on a busy machine
 _STOP_WITHIN_S = 120.0  # for the keyframes in the queue
-MOST_PLACES = MAX_ARRAY_BYTES // 8  # x and y as float32
 _LOOK_EVERY_S = 2.0  # period of the coverage check
 _MAX_WAITING = 256  # pictures of keyframes, 0.6 MB each
 _SHOW_WITHIN_S = 0.5  # display period of a lagging map; otherwise it is shown after every keyframe
@@ -45,27 +39,7 @@ _MOST_MISSING = 64
 _NICENESS = 5  # lower priority than tracking
 
 
-class MapSketch(NamedTuple):
-    """The map after some keyframes: their places (K, 2) and each one's part number, landmarks (N, 2) thinned evenly, accepted
-    loops (L, 4), numbers of refused candidates by verdict, and the latest ones. parts: connected parts. estimate: of the
-    newest keyframe. cells and missing: coverage and gaps of the drive, updated periodically; see LiveSurveyState.
-    """
-
-    keyframes: int = 0
-    path_m: Array = np.zeros((0, 2))
-    part: NDArray[np.uint8] = np.zeros(0, np.uint8)
-    parts: Sequence[LivePart] = ()
-    landmarks_m: Array = np.zeros((0, 2))
-    loops_m: Array = np.zeros((0, 4))
-    loops: int = 0
-    refused: Mapping[str, int] = {}
-    revisits: Sequence[LiveRevisit] = ()
-    estimate: LiveEstimate | None = None
-    cells: Array = np.zeros((0, 3))
-    missing: Sequence[LiveMissing] = ()
-
-
-NO_SKETCH = MapSketch()
+NO_SKETCH = MapSketch(keyframes=0)
 _Item = tuple[RectifiedFrame, NewKeyframe]
 
 
@@ -176,7 +150,7 @@ def _map(pipe: Connection) -> None:
     cv2.setNumThreads(1)  # the other core is tracking's
     config, rig = pipe.recv()
     gc.freeze()
-    growing, quality, looked_s, shown_s = LiveMap(config, rig), None, 0.0, 0.0
+    growing, quality, looked_s, shown_s = LiveMap(config, rig), (np.zeros((0, 3)), list[LiveMissing]()), 0.0, 0.0
     try:
         pipe.send("ready")
         while (item := pipe.recv()) is not None:
@@ -186,9 +160,9 @@ def _map(pipe: Connection) -> None:
                 continue
             if now_s - looked_s >= _LOOK_EVERY_S:
                 looked_s, quality = now_s, _quality(growing, rig)
-            pipe.send(sketch_of(growing, quality))
+            pipe.send(growing.sketch(*quality))
             shown_s = time.monotonic()
-        pipe.send(sketch_of(growing, _quality(growing, rig)))
+        pipe.send(growing.sketch(*_quality(growing, rig)))
         pipe.send(None)
     except (EOFError, OSError):  # the survey was killed
         pass
@@ -201,38 +175,6 @@ def _quality(growing: LiveMap, rig: LiveRig) -> tuple[Array, list[LiveMissing]]:
     largest = np.bincount(labels[labels >= 0]).argmax() if (labels >= 0).any() else 0
     cells = covered_cells(growing.points_map(), MAX_ARRAY_BYTES // 12)
     return cells, missing_directions(growing.map_from_body[labels == largest] @ rig.body_from_cam)
-
-
-def sketch_of(growing: LiveMap, quality: tuple[Array, list[LiveMissing]] | None = None) -> MapSketch:
-    """Return the displayed data of a growing map; no array exceeds the limit of a message."""
-    placed, found, parts = growing.map_from_body, growing.loops(), growing.parts()
-    numbers = np.where((parts.labels < 0) | (parts.labels >= NO_PART), NO_PART, parts.labels).astype(np.uint8)
-    ends = placed[found.believed][:, :, :2, 3].reshape(-1, 4)
-    return MapSketch(
-        len(growing),
-        thinned(placed[:, :2, 3], 2),
-        numbers[thinning(len(numbers), MOST_PLACES)],
-        parts.spans[:NO_PART],
-        thinned(growing.points_map()[:, :2], 2),
-        thinned(ends, 4),
-        len(ends),
-        found.refused,
-        found.newest,
-        growing.estimate(),
-        *(quality or (NO_SKETCH.cells, NO_SKETCH.missing)),
-    )
-
-
-def thinned(rows: Array, columns: int) -> Array:
-    """Return rows that fit a message as float32, spread evenly; the last one is included."""
-    most = MAX_ARRAY_BYTES // (4 * columns)
-    return rows[thinning(len(rows), most)]
-
-
-def thinning(count: int, most: int) -> NDArray[np.int64]:
-    """Return at most `most` of `count` numbers, evenly, the last one included."""
-    step = max(1, -(-count // most))
-    return np.arange(count - 1, -1, -step)[::-1].astype(np.int64)
 
 
 def missing_directions(map_from_cam: Array) -> list[LiveMissing]:

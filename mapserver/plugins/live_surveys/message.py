@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import LinkError
 from fleetmap.geometry import Array
-from fleetmap.messages import Cause, EstimateMessage, Name, Status, Text, Version
+from fleetmap.messages import EstimateMessage, Name, Text, Version
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
 
 MAX_ARRAY_BYTES = 64 << 10
+MOST_PLACES = MAX_ARRAY_BYTES // 8  # x and y as float32
 NO_PART = 255
 COVERAGE_CELL_M = 5.0
 _Bytes = Annotated[bytes, msgspec.Meta(max_length=MAX_ARRAY_BYTES)]
@@ -49,32 +50,21 @@ class LiveMissing(msgspec.Struct, frozen=True, kw_only=True):
     places: int
 
 
-class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
-    """State of a running survey at the frame at stamp_ns; coordinates are metres in its own upright frame.
+COLUMNS = {"path_m": 2, "landmarks_m": 2, "loops_m": 4, "cells": 3}
+"""Arrays of a survey's map, as little-endian float32."""
 
-    phase: `tracking`, `adjusting` while the finished map is made, `stored` as draft `version`, or `failed`, with the reason in `words`.
-    seconds: of the recording so far. behind: keyframes waiting for mapping. latency_ms: 99th percentile of the processing time of a
-    frame, None unless frames were played in real time; late_frames: those that took longer than the time to the next one.
-    path_m (N, 2) and landmarks_m (M, 2), loops_m (L, 4) from and to: little-endian float32, thinned evenly. quality (N,): bytes, 0 where
-    tracking was lost, 255 where all points agreed. part (N,): bytes, the number in `parts`, NO_PART if too little was seen to belong
-    to any. More than one part: tracking was lost, and no certain revisit has joined them yet. loops, refused: how many, and of which
-    verdict; revisits: the newest ones. cells (T, 3): x and y of squares of COVERAGE_CELL_M that are covered, and their landmarks.
-    estimate: pose of the newest keyframe in this map, with odometry's frame as `odom`.
-    scale_known: False for one camera: the growing map has an arbitrary unit, even with an IMU. picture: JPEG of the newest keyframe.
+
+class MapSketch(msgspec.Struct, frozen=True, kw_only=True):
+    """The growing map after some keyframes; coordinates are metres in its own upright frame.
+
+    path_m (N, 2) and landmarks_m (M, 2), loops_m (L, 4) from and to: thinned evenly. part (N,): bytes, the number in `parts`, NO_PART if
+    too little was seen to belong to any. More than one part: tracking was lost, and no certain revisit has joined them yet. loops,
+    refused: how many, and of which verdict; revisits: the newest ones. cells (T, 3): x and y of squares of COVERAGE_CELL_M that are
+    covered, and their landmarks. estimate: pose of the newest keyframe in this map, with odometry's frame as `odom`.
     """
 
-    site: Name
-    recording: Text
-    stamp_ns: int
-    phase: Name
-    seconds: float
-    frames: int
     keyframes: int
-    behind: int = 0
-    latency_ms: float | None = None
-    late_frames: int = 0
     path_m: _Bytes = b""
-    quality: _Bytes = b""
     part: _Bytes = b""
     parts: Annotated[list[LivePart], msgspec.Meta(max_length=NO_PART)] = []
     landmarks_m: _Bytes = b""
@@ -85,6 +75,56 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
     cells: _Bytes = b""
     missing: Annotated[list[LiveMissing], msgspec.Meta(max_length=64)] = []
     estimate: EstimateMessage | None = None
+
+    def rows(self, name: str) -> Array:
+        """Return an array of COLUMNS; raises LinkError for invalid bytes."""
+        data, columns = getattr(self, name), COLUMNS[name]
+        if len(data) % (4 * columns):
+            raise LinkError(
+                f"{name} of {len(data)} bytes is not an array of {columns} columns; does the sender run the same fleetmap?"
+            )
+        rows = np.frombuffer(data, "<f4").astype(np.float64).reshape(-1, columns)
+        if not np.isfinite(rows).all():
+            raise LinkError(f"{name} holds a number that is not finite; check the survey's log")
+        return rows
+
+    def part_numbers(self) -> NDArray[np.uint8]:
+        """(N,) part numbers along the path, NO_PART if none were sent; raises LinkError for a wrong size or an invalid part number."""
+        if not self.part:
+            return np.full(len(self.path_m) // 8, NO_PART, np.uint8)
+        numbers = np.frombuffer(self.part, np.uint8)
+        self._check_length(len(numbers), "part numbers")
+        wrong = numbers[(numbers != NO_PART) & (numbers >= len(self.parts))]
+        if len(wrong):
+            raise LinkError(f"invalid part {wrong[0]} of {len(self.parts)}; does the sender run the same fleetmap?")
+        return numbers
+
+    def _check_length(self, count: int, what: str) -> None:
+        places = len(self.path_m) // 8
+        if places != count:
+            raise LinkError(f"a survey of {places} places has {count} {what}; does the sender run the same fleetmap?")
+
+
+class LiveSurveyState(MapSketch, frozen=True, kw_only=True):
+    """State of a running survey at the frame at stamp_ns, with its map, which may lack the newest keyframes.
+
+    phase: `tracking`, `adjusting` while the finished map is made, `stored` as draft `version`, or `failed`, with the reason in `words`.
+    seconds: of the recording so far. behind: keyframes waiting for mapping. latency_ms: 99th percentile of the processing time of a
+    frame, None unless frames were played in real time; late_frames: those that took longer than the time to the next one.
+    quality (N,): bytes along the path, 0 where tracking was lost, 255 where all points agreed. scale_known: False for one camera: the
+    growing map has an arbitrary unit, even with an IMU. picture: JPEG of the newest keyframe.
+    """
+
+    site: Name
+    recording: Text
+    stamp_ns: int
+    phase: Name
+    seconds: float
+    frames: int
+    behind: int = 0
+    latency_ms: float | None = None
+    late_frames: int = 0
+    quality: _Bytes = b""
     scale_known: bool = True
     picture: _Bytes = b""
     version: Version | None = None
@@ -92,48 +132,21 @@ class LiveSurveyState(msgspec.Struct, frozen=True, kw_only=True):
 
     def path(self) -> Array:
         """(N, 3) x, y and quality from 0 to 1; raises LinkError if their sizes differ."""
-        places, quality = _rows(self.path_m, 2, "path_m"), np.frombuffer(self.quality, np.uint8)
-        _check_length(len(places), len(quality), "qualities")
+        places, quality = self.rows("path_m"), np.frombuffer(self.quality, np.uint8)
+        self._check_length(len(quality), "qualities")
         return np.column_stack([places, quality / 255.0])
 
-    def part_numbers(self) -> NDArray[np.uint8]:
-        """(N,) part numbers along the path, NO_PART if none were sent; raises LinkError for a wrong size or an invalid part number."""
-        if not self.part:
-            return np.full(len(self.path_m) // 8, NO_PART, np.uint8)
-        numbers = np.frombuffer(self.part, np.uint8)
-        _check_length(len(self.path_m) // 8, len(numbers), "part numbers")
-        wrong = numbers[(numbers != NO_PART) & (numbers >= len(self.parts))]
-        if len(wrong):
-            raise LinkError(f"invalid part {wrong[0]} of {len(self.parts)}; does the sender run the same fleetmap?")
-        return numbers
 
-    def landmarks(self) -> Array:
-        """(M, 2); raises LinkError for invalid bytes."""
-        return _rows(self.landmarks_m, 2, "landmarks_m")
-
-    def loop_lines(self) -> Array:
-        """(L, 4) x and y from and to; raises LinkError for invalid bytes."""
-        return _rows(self.loops_m, 4, "loops_m")
-
-    def covered(self) -> Array:
-        """(T, 3); raises LinkError for invalid bytes."""
-        return _rows(self.cells, 3, "cells")
+def thinning(count: int, most: int) -> NDArray[np.int64]:
+    """Return at most `most` of `count` numbers, evenly, the last one included."""
+    step = max(1, -(-count // most))
+    return np.arange(count - 1, -1, -step)[::-1].astype(np.int64)
 
 
-def _check_length(places: int, count: int, what: str) -> None:
-    if places != count:
-        raise LinkError(f"a survey of {places} places has {count} {what}; does the sender run the same fleetmap?")
-
-
-def _rows(data: bytes, columns: int, name: str) -> Array:
-    if len(data) % (4 * columns):
-        raise LinkError(
-            f"{name} of {len(data)} bytes is not an array of {columns} columns; does the sender run the same fleetmap?"
-        )
-    rows = np.frombuffer(data, "<f4").astype(np.float64).reshape(-1, columns)
-    if not np.isfinite(rows).all():
-        raise LinkError(f"{name} holds a number that is not finite; check the survey's log")
-    return rows
+def packed(rows: Array) -> bytes:
+    """Return rows as float32 that fit a message, spread evenly; the last one is included."""
+    kept = rows[thinning(len(rows), MAX_ARRAY_BYTES // (4 * rows.shape[1]))]
+    return kept.astype("<f4").tobytes()
 
 
 def live_key(site: str) -> str:
@@ -143,10 +156,12 @@ def live_key(site: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class LiveRig:
-    """Sensors of the survey: the rectified camera, its mount on the body, the IMU's noise (None if absent) and its clock."""
+    """Sensors of the survey: the rectified camera, its mount on the body, the IMU's noise (None if absent) and its clock; the body's pose
+    on the base."""
 
     camera: StereoCamera
     body_from_cam: Array
+    base_from_body: Array = field(default_factory=lambda: np.eye(4))
     imu_noise: ImuNoise | None = None
     imu_minus_cam_s: float = 0.0
     is_depth_camera: bool = False
@@ -172,28 +187,6 @@ class NewKeyframe:
     inertial: bool = False
     imu: ImuSamples = field(default_factory=ImuSamples.empty)
     variance_m2: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class LiveLoops:
-    """Loops so far: ends (L, 2) of accepted ones, keyframe numbers; numbers of refused candidates by reason.
-
-    newest: for each of the latest keyframes that matched an old one, its best match, accepted or not.
-    """
-
-    believed: NDArray[np.int64]
-    refused: dict[str, int]
-    newest: tuple[LiveRevisit, ...] = ()
-
-
-class LiveEstimate(NamedTuple):
-    """Pose of the newest keyframe: map_from_body (4, 4) and its covariance (6, 6), map axes, rotation first; None while unknown."""
-
-    keyframe: NewKeyframe
-    status: Status
-    cause: Cause
-    map_from_body: Array | None
-    cov_rot_trans: Array | None
 
 
 class LiveParts(NamedTuple):

@@ -20,7 +20,7 @@ from mapserver.dashboard.live import words_of
 from mapserver.dashboard.loops import VERDICTS
 from mapserver.dashboard.map_layers import Dots, Layer, Line, Mark, Square, trail
 from mapserver.dashboard.rendering import TEMPLATES
-from mapserver.plugins.live_surveys.message import COVERAGE_CELL_M, LiveSurveyState, live_key
+from mapserver.plugins.live_surveys.message import COLUMNS, COVERAGE_CELL_M, LiveSurveyState, live_key
 
 _FOLDER = Path(__file__).parent
 _MARGIN_M = 4.0
@@ -67,7 +67,7 @@ class LiveSurveys:
 
     def take(self, state: LiveSurveyState) -> None:
         """Store a state; LinkError for invalid arrays, which are not stored."""
-        state.path(), state.part_numbers(), state.landmarks(), state.loop_lines(), state.covered()
+        state.path(), state.part_numbers(), *map(state.rows, COLUMNS)
         with self._lock:
             before = self._states.pop(state.site, None)
             is_new = before is None or before[0] != state
@@ -141,7 +141,7 @@ def page(surveys: LiveSurveys, _: Services, context: PageContext) -> dict[str, o
 
 def _figures(state: LiveSurveyState) -> list[tuple[str, str, str]]:
     """Names, values and remarks."""
-    way, covered = state.path(), state.covered()
+    way, covered = state.path(), state.rows("cells")
     way_m = float(np.linalg.norm(np.diff(way[:, :2], axis=0), axis=1).sum()) if len(way) > 1 else 0.0
     answered = "as fast as it goes" if state.latency_ms is None else f"{state.latency_ms:.0f} ms"
     late = f"{state.late_frames} of {state.frames} frames later than the next one"
@@ -183,15 +183,16 @@ def _hue(number: int) -> int:
 
 def _layers(state: LiveSurveyState) -> list[Layer]:
     """Landmarks, revisits and the path, coloured by how well it was tracked."""
-    way, marks = state.path(), state.landmarks()
+    way, marks = state.path(), state.rows("landmarks_m")
     if len(way):
         low, high = way[:, :2].min(axis=0) - _BEYOND_M, way[:, :2].max(axis=0) + _BEYOND_M
         marks = marks[((marks > low) & (marks < high)).all(axis=1)][:: max(1, len(marks) // _SHOWN_LANDMARKS)]
     return [
-        Layer("Covered", _covered(state.covered())),
+        Layer("Covered", _covered(state.rows("cells"))),
         Layer("Landmarks", [Dots(np.round(marks, 2).ravel().tolist())] if len(marks) else []),
         Layer(
-            "Revisits", [Line([(a, b), (c, d)], "accent", "revisit", 1) for a, b, c, d in state.loop_lines().tolist()]
+            "Revisits",
+            [Line([(a, b), (c, d)], "accent", "revisit", 1) for a, b, c, d in state.rows("loops_m").tolist()],
         ),
         Layer("Way", [*_part_trails(way, state), *trail(way)]),
         Layer("Now", _now(state, way)),

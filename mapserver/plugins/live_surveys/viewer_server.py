@@ -6,7 +6,7 @@ Its websocket server sends messages to subscribed viewers and never waits for on
 import logging
 import threading
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Self
 
 import foxglove
@@ -25,6 +25,7 @@ from fleetmap.plugins.viewer_channels.channels import (
     CHANNELS,
     ODOM,
     SURVEY,
+    ChannelMessage,
     RobotMark,
     Shown,
     encoding_of,
@@ -40,7 +41,7 @@ _log = logging.getLogger(__name__)
 _IMAGE_EVERY_NS = 200_000_000
 
 
-class FoxgloveServer:
+class FoxgloveServer(ServerListener):
     """Encodes and sends in a thread of its own; methods may be called from any thread. Use it in `with`.
 
     A new viewer gets the last message of each topic. dropped: number of messages that arrived too fast to be encoded.
@@ -65,7 +66,7 @@ class FoxgloveServer:
                 name=name,
                 host=host,
                 port=port,
-                server_listener=_Listener(self),
+                server_listener=self,
                 message_backlog_size=_BACKLOG,
                 context=self._context,
             )
@@ -102,9 +103,9 @@ class FoxgloveServer:
                 waiting.append(shown)
         self._wake.set()
 
-    def subscribed(self, topic: str) -> None:
-        """Handle a viewer's subscription to a topic."""
-        self._subscribed.append(topic)
+    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
+        """See ServerListener: the library calls it from its own threads."""
+        self._subscribed.append(channel.topic)
         self._wake.set()
 
     def _serve(self) -> None:
@@ -137,27 +138,33 @@ class FoxgloveServer:
             channel.log(message.data, log_time=max(0, message.stamp_ns))
 
 
-class _Listener(ServerListener):
-    """Callbacks of the library, called from its own threads."""
-
-    def __init__(self, server: FoxgloveServer) -> None:
-        self._server = server
-
-    def on_subscribe(self, client: Client, channel: ChannelView) -> None:
-        """See the library's ServerListener."""
-        self._server.subscribed(channel.topic)
-
-
 class LiveViewer:
-    """Passes data to the server, which encodes it, so that no frame is delayed."""
+    """Passes a running survey, seen from above in a separate frame `survey`, to the server, which encodes it: no frame is delayed."""
 
     def __init__(self, server: FoxgloveServer, drive: Drive) -> None:
-        base_from_cam = drive.calibration.base_from_body @ drive.rectifier.body_from_cam
-        self._server, self._survey, self._camera = server, SurveyChannels(base_from_cam), drive.rectifier.camera
-        self._image_ns = -(2**62)
+        self._base_from_cam = drive.calibration.base_from_body @ drive.rectifier.body_from_cam
+        self._server, self._camera = server, drive.rectifier.camera
+        self._image_ns, self._status = -(2**62), ("", "")
 
     def tell(self, state: LiveSurveyState) -> None:
-        self._server.show(self._survey.shown(state))
+        """Show the next state, with a log line if its status changed."""
+        stamp_ns, estimate = state.stamp_ns, state.estimate
+
+        def drawn(topic: str, draw: Callable[..., ChannelMessage], rows: Callable[[], Array]) -> Shown:
+            return Shown(topic, stamp_ns, lambda: draw(stamp_ns, rows(), topic, SURVEY))
+
+        shown = [
+            drawn("/survey/landmarks", channels.points, lambda: _from_above(state.rows("landmarks_m"))),
+            drawn("/survey/path", channels.path, lambda: _from_above(state.rows("path_m"))),
+            drawn("/survey/revisits", channels.lines, lambda: state.rows("loops_m")),
+        ]
+        status = (state.phase, state.words) if estimate is None else (estimate.status, estimate.cause)
+        if status != self._status:
+            self._status = status
+            shown.append(Shown("/log", stamp_ns, lambda: channels.status_log(stamp_ns, state.recording, *status)))
+        if estimate is not None:
+            shown += self._placed(estimate, state.recording)
+        self._server.show(shown)
 
     def see(self, tracked: Tracked) -> None:
         """Receive a tracked frame: some are shown, with the points of the odometry."""
@@ -176,48 +183,9 @@ class LiveViewer:
             shown.append(Shown("/camera/matches", stamp_ns, lambda: channels.matches(stamp_ns, kept)))
         self._server.show(shown)
 
-
-class SurveyChannels:
-    """Running surveys, seen from above, in a separate frame `survey`."""
-
-    def __init__(self, base_from_cam: Array | None = None) -> None:
-        """base_from_cam (4, 4): mounting of the camera, if known."""
-        self._base_from_cam = base_from_cam
-        self._status = ("", "")
-
-    def shown(self, state: LiveSurveyState) -> list[Shown]:
-        """Messages of the next state, with a log line if its status changed."""
-        stamp_ns, estimate = state.stamp_ns, state.estimate
-        found = [
-            Shown(
-                "/survey/landmarks",
-                stamp_ns,
-                lambda: channels.points(stamp_ns, _from_above(state.landmarks()), "/survey/landmarks", SURVEY),
-            ),
-            Shown(
-                "/survey/path",
-                stamp_ns,
-                lambda: channels.path(stamp_ns, _from_above(state.path()), "/survey/path", SURVEY),
-            ),
-            Shown(
-                "/survey/revisits",
-                stamp_ns,
-                lambda: channels.lines(stamp_ns, state.loop_lines(), "/survey/revisits", SURVEY),
-            ),
-        ]
-        status = (state.phase, state.words) if estimate is None else (estimate.status, estimate.cause)
-        if status != self._status:
-            self._status = status
-            found.append(Shown("/log", stamp_ns, lambda: channels.status_log(stamp_ns, state.recording, *status)))
-        if estimate is not None:
-            found += self._placed(estimate, state.recording)
-        return found
-
     def _placed(self, estimate: EstimateMessage, name: str) -> list[Shown]:
         odom_from_base, stamp_ns = estimate.odom_from_base.target_from_source, estimate.stamp_ns
-        joined, marks = [(ODOM, BASE, odom_from_base)], list[RobotMark]()
-        if self._base_from_cam is not None:
-            joined.append((BASE, CAMERA, self._base_from_cam))
+        joined, marks = [(ODOM, BASE, odom_from_base), (BASE, CAMERA, self._base_from_cam)], list[RobotMark]()
         if estimate.map_from_odom is not None:
             map_from_odom = estimate.map_from_odom.target_from_source
             joined.append((SURVEY, ODOM, map_from_odom))

@@ -15,8 +15,8 @@ from fleetmap.sensors.samples import CameraFrame, SensorSet
 from mapserver.drafting.survey_recordings import RecordingOptions
 from mapserver.plugins.live_surveys.drives import RecordedDrive
 from mapserver.plugins.live_surveys.live_map import LiveMap
-from mapserver.plugins.live_surveys.mapping_process import NO_SKETCH, MapSketch, sketch_of
-from mapserver.plugins.live_surveys.message import LiveRig, NewKeyframe
+from mapserver.plugins.live_surveys.mapping_process import NO_SKETCH
+from mapserver.plugins.live_surveys.message import LiveRig, MapSketch, NewKeyframe
 from mapserver.survey.survey_inputs import SurveyConfig
 from support.recordings.recording_samples import BODY_FROM_CAM0, Sample, calibration
 from support.worlds.box_room import depth_of
@@ -44,7 +44,7 @@ class MappingHere:
     def put(self, frame: RectifiedFrame, keyframe: NewKeyframe) -> None:
         """One more keyframe."""
         self.map.add(frame, keyframe)
-        self.sketch = self.after[keyframe.number] = sketch_of(self.map)
+        self.sketch = self.after[keyframe.number] = self.map.sketch(np.zeros((0, 3)), [])
 
     def finish(self) -> None:
         """Nothing waits."""

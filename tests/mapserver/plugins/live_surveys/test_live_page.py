@@ -142,8 +142,8 @@ def test_it_goes_on_as_another_part_until_a_sure_revisit_joins_it(whole: Drive) 
     assert first.end_s < 4.0
     assert second.start_s > 7.0
     assert [first.is_map, second.is_map] == [True, False]
-    assert (whole.mapping.sketch.part == 0).sum() == joined[0].keyframes
-    frames, lit = list(after), np.flatnonzero(whole.mapping.sketch.part == 0).tolist()
+    assert (whole.mapping.sketch.part_numbers() == 0).sum() == joined[0].keyframes
+    frames, lit = list(after), np.flatnonzero(whole.mapping.sketch.part_numbers() == 0).tolist()
     laid = laid_on_truth(whole.mapping.map_from_body[lit], kidnapped(), [frames[k] for k in lit])
     assert np.quantile(laid.error_m, 0.9) < 0.1
 

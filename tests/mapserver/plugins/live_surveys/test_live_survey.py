@@ -25,8 +25,8 @@ from mapserver.library import build_map
 from mapserver.plugins.live_surveys import live_survey
 from mapserver.plugins.live_surveys.drives import SensorDrive
 from mapserver.plugins.live_surveys.live_survey import LiveRequest, LiveResult, run_live
-from mapserver.plugins.live_surveys.mapping_process import MappingProcess, thinned, thinning
-from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, LiveRig, LiveSurveyState, NewKeyframe
+from mapserver.plugins.live_surveys.mapping_process import MappingProcess
+from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, LiveRig, LiveSurveyState, NewKeyframe, packed
 from mapserver.store import MapStore
 from mapserver.survey.survey_inputs import SurveyConfig
 from support.recordings.live_drives import MappingHere, played
@@ -36,6 +36,7 @@ from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, stereo_frame
 FRAMES = 24
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
 QUIET = Console(quiet=True)
+Finished = tuple[LiveResult, list[LiveSurveyState], Path]
 
 
 @pytest.fixture(scope="module")
@@ -44,9 +45,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def finished(
-    recording: Path, tmp_path_factory: pytest.TempPathFactory
-) -> tuple[LiveResult, list[LiveSurveyState], Path]:
+def finished(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Finished:
     """A whole drive at its own speed, all that was told of it, and its store."""
     store, told = tmp_path_factory.mktemp("store") / "maps", list[LiveSurveyState]()
     with played(recording) as drive:
@@ -54,9 +53,7 @@ def finished(
     return result, told, store
 
 
-def test_every_frame_is_tracked_and_every_keyframe_mapped(
-    finished: tuple[LiveResult, list[LiveSurveyState], Path],
-) -> None:
+def test_every_frame_is_tracked_and_every_keyframe_mapped(finished: Finished) -> None:
     result, told, _ = finished
     figures = result.figures
     assert (figures.frames, figures.mapping_failed) == (FRAMES, "")
@@ -66,15 +63,13 @@ def test_every_frame_is_tracked_and_every_keyframe_mapped(
     assert len(last.path()) == last.keyframes == figures.keyframes > 2
     assert last.behind == 0
     assert last.estimate.status == "TRACKING"
-    assert last.covered()[:, 2].sum() > 100
+    assert last.rows("cells")[:, 2].sum() > 100
     assert (last.path()[:, 2] > 0.5).all()
-    assert len(last.landmarks()) > 100
+    assert len(last.rows("landmarks_m")) > 100
     assert max(cv2.imdecode(np.frombuffer(last.picture, np.uint8), cv2.IMREAD_GRAYSCALE).shape) == 320
 
 
-def test_its_phases_are_told_in_order_and_end_with_the_draft(
-    finished: tuple[LiveResult, list[LiveSurveyState], Path],
-) -> None:
+def test_its_phases_are_told_in_order_and_end_with_the_draft(finished: Finished) -> None:
     result, told, _ = finished
     phases = list(dict.fromkeys(state.phase for state in told))
     assert phases[-2:] == ["adjusting", "stored"]
@@ -82,9 +77,7 @@ def test_its_phases_are_told_in_order_and_end_with_the_draft(
     assert "live: 24 frames" in result.figures.words()
 
 
-def test_the_draft_is_what_a_build_makes_of_the_recording(
-    finished: tuple[LiveResult, list[LiveSurveyState], Path], recording: Path, tmp_path: Path
-) -> None:
+def test_the_draft_is_what_a_build_makes_of_the_recording(finished: Finished, recording: Path, tmp_path: Path) -> None:
     result, _, store = finished
     built = build_map(recording, tmp_path / "maps", "lab", BuildOptions(settings=SETTINGS))
     assert result.built.trajectory.frame_from_body.tobytes() == built.trajectory.frame_from_body.tobytes()
@@ -220,12 +213,12 @@ def test_a_process_that_dies_before_it_has_read_its_orders_is_not_waited_for() -
 
 def test_thinned_rows_fit_a_message_and_keep_the_last() -> None:
     rows = np.arange(100_000.0).reshape(-1, 2)
-    kept = thinned(rows, 2)
+    kept = np.frombuffer(packed(rows), "<f4").reshape(-1, 2)
     assert 4 * kept.size <= MAX_ARRAY_BYTES
     assert kept[-1].tolist() == rows[-1].tolist()
     assert len({*np.diff(kept[:, 0])}) == 1
-    assert thinning(3, 10).tolist() == [0, 1, 2]
-    assert thinning(0, 10).tolist() == []
+    assert packed(rows[:3]) == rows[:3].astype("<f4").tobytes()
+    assert packed(rows[:0]) == b""
     full = bytes(MAX_ARRAY_BYTES)
     state = LiveSurveyState(
         site="s" * 64, recording="r", stamp_ns=1, phase="tracking", seconds=1.0, frames=1, keyframes=1,

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from fleetmap.plugins.viewer_channels import channels
 from fleetmap.plugins.viewer_channels.channels import ChannelMessage, Shown
 from mapserver.plugins.live_surveys.command import viewer_address
 from mapserver.plugins.live_surveys.message import LiveSurveyState
-from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer, SurveyChannels
+from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer, LiveViewer
 from support.fleet.foxglove_client import FoxgloveClient
 from support.fleet.foxglove_schemas import decoded, matrix
 
@@ -170,8 +171,12 @@ def test_surveys_are_shown_in_their_own_frame_or_in_the_map() -> None:
         "path_m": np.array([[0, 1], [2, 3]], "<f4").tobytes(), "quality": b"\xff\xff", "landmarks_m": np.array([[4, 5]], "<f4").tobytes(),
         "loops_m": np.array([[0, 1, 2, 3]], "<f4").tobytes(),
     }  # fmt: skip
-    told = SurveyChannels(np.eye(4))
-    first = {shown.topic: decoded(shown.make()) for shown in told.shown(LiveSurveyState(**plain, estimate=estimate))}
+    told: list[list[Shown]] = []
+    rig = SimpleNamespace(base_from_body=np.eye(4), body_from_cam=np.eye(4), camera=None)
+    viewer = LiveViewer(SimpleNamespace(show=told.append), SimpleNamespace(calibration=rig, rectifier=rig))
+    for at in (estimate, estimate, None):
+        viewer.tell(LiveSurveyState(**plain, estimate=at))
+    first = {shown.topic: decoded(shown.make()) for shown in told[0]}
     assert set(first) == {"/survey/landmarks", "/survey/path", "/survey/revisits", "/survey/robot", "/log", "/tf"}
     np.testing.assert_array_equal(np.frombuffer(first["/survey/landmarks"].data, "<f4"), [4, 5, 0])
     assert [(p.position.x, p.position.y) for p in first["/survey/path"].poses] == [(0, 1), (2, 3)]
@@ -180,10 +185,8 @@ def test_surveys_are_shown_in_their_own_frame_or_in_the_map() -> None:
     np.testing.assert_allclose(matrix(first["/survey/robot"].entities[0].arrows[0].pose), TURNED @ TURNED, atol=1e-12)
     links = {(link.parent_frame_id, link.child_frame_id) for link in first["/tf"].transforms}
     assert links == {("survey", "odom"), ("odom", "base_link"), ("base_link", "camera")}
-    again = [shown.topic for shown in told.shown(LiveSurveyState(**plain, estimate=estimate))]
-    assert "/log" not in again, "its status is the same"
-    lost = told.shown(LiveSurveyState(**plain))
-    assert {shown.topic for shown in lost} == {"/survey/landmarks", "/survey/path", "/survey/revisits", "/log"}
+    assert "/log" not in {shown.topic for shown in told[1]}, "its status is the same"
+    assert {shown.topic for shown in told[2]} == {"/survey/landmarks", "/survey/path", "/survey/revisits", "/log"}
 
 
 def test_addresses() -> None:
