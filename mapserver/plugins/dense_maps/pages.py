@@ -87,7 +87,8 @@ def _space_page(services: Services, context: PageContext) -> dict[str, object]:
     if version is None:
         raise StateError(f"site {site} has no published version; publish one, or name a draft")
     camera = maps.store.manifest(site, version).camera  # a version that is not there is named here
-    lacks, no_pictures = _lacks_surfels(maps.store, site, version), _lacks_pictures(maps.store, site, version)
+    lacks = _lacks_surfels(maps.store, site, version)
+    no_pictures = _fault(lambda: maps.store.survey_pictures(site, version))
     # As far as a job that is kept tells them
     loops = loops_of_version((job.report for job in maps.store.jobs(site, limit=JOBS_SHOWN)), version)
     cameras = robot_views(services.health.cameras(site))
@@ -132,29 +133,20 @@ def _start(context: PageContext) -> tuple[float, float] | None:
 def robot_views(cameras: Mapping[str, CameraNote]) -> dict[str, list[float]]:
     """By robot the tangents of the angles to the left, right, upper and lower edge in the camera's axes (x right, y down), and the upper
     three rows of base_from_cam, row by row. Robots that tell what no camera is, or one that is not on the robot, are left out."""
-    found = {robot: _view(camera) for robot, camera in cameras.items()}
-    return {robot: view for robot, view in found.items() if view is not None}
-
-
-def _view(camera: CameraNote) -> list[float] | None:
-    if not is_camera(camera):
-        return None
-    base_from_cam = camera.base_from_cam.target_from_source
-    if not np.isfinite(base_from_cam).all() or np.abs(base_from_cam[:3, 3]).max() > _FARTHEST_M:
-        return None
-    (width_px, height_px), (x_px, y_px), focal_px = camera.size_px, camera.centre_px, camera.focal_px
-    edges_px = -x_px, width_px - x_px, -y_px, height_px - y_px
-    return [*(round(edge / focal_px, 4) for edge in edges_px), *base_from_cam[:3].ravel().round(4).tolist()]
+    found = {}
+    for robot, camera in cameras.items():
+        base_from_cam = camera.base_from_cam.target_from_source
+        if is_camera(camera) and np.isfinite(base_from_cam).all() and np.abs(base_from_cam[:3, 3]).max() <= _FARTHEST_M:
+            (width_px, height_px), (x_px, y_px), focal_px = camera.size_px, camera.centre_px, camera.focal_px
+            edges_px = -x_px, width_px - x_px, -y_px, height_px - y_px
+            tangents = [round(edge / focal_px, 4) for edge in edges_px]
+            found[robot] = [*tangents, *base_from_cam[:3].ravel().round(4).tolist()]
+    return found
 
 
 def _lacks_surfels(store: MapStore, site: str, version: int) -> str | None:
     """Why a version has no map that renders."""
     return _fault(lambda: index_address(store.manifest(site, version)))
-
-
-def _lacks_pictures(store: MapStore, site: str, version: int) -> str | None:
-    """Why a version keeps no pictures of its surveys."""
-    return _fault(lambda: store.survey_pictures(site, version))
 
 
 def _fault(read: Callable[[], object]) -> str | None:

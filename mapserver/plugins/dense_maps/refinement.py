@@ -1,6 +1,6 @@
 """Colours, sizes and opacities of splats, refined by gradient descent on a survey's images. Positions and normals stay fixed."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -16,7 +16,7 @@ from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import SensorSet
 from mapserver.plugins.dense_maps.expected_view import brightness, pinhole, resized
 from mapserver.plugins.dense_maps.exposure import lens_factor
-from mapserver.plugins.dense_maps.splats import Renderer, Splats, bounds, draw, parameters_of, with_parameters
+from mapserver.plugins.dense_maps.splats import LEAST, MOST, Splats, draw, parameters_of, with_parameters
 from mapserver.plugins.dense_maps.surfel_map import Surfels
 from mapserver.quality.probes import spread
 from mapserver.survey.survey_map import SurveyMap
@@ -117,26 +117,16 @@ def looks_of(recording: Recording, survey: SurveyMap, surfels: Surfels, *, own_r
     return Views([look(*pair) for pair in learned], [look(*pair) for pair in held])
 
 
-def refine(
-    splats: Splats,
-    images: Views,
-    steps: int,
-    rng: np.random.Generator,
-    renderer: Renderer = draw,
-    progress: Callable[[int], None] = lambda _: None,
-) -> Refined:
+def refine(splats: Splats, images: Views, steps: int, rng: np.random.Generator) -> Refined:
     """Run `steps` steps of Adam, each with one view, on its visible splats. The same seed gives the same splats.
 
     Source of the loss: Charbonnier et al. 1994; of not updating unseen splats: Mallick et al. 2024, Taming 3DGS.
     """
     parameters, (learned, held_out) = parameters_of(splats), images
-    known = [
-        1.0 - renderer(splats, parameters, look.camera, look.map_from_cam).through > _MIN_KNOWN for look in held_out
-    ]
+    known = [1.0 - draw(splats, parameters, look.camera, look.map_from_cam).through > _MIN_KNOWN for look in held_out]
     if not any(where.any() for where in known):
         raise StateError("the held-out images show no surfels; choose the recording of this version")
-    before = _likeness(splats, parameters, held_out, known, renderer)
-    low, high = bounds()
+    before = _likeness(splats, parameters, held_out, known)
     mean, square, seen = np.zeros_like(parameters), np.zeros_like(parameters), np.zeros(len(parameters))
     order, masks = list[int](), dict[int, NDArray[np.bool_]]()
     for step in range(steps):
@@ -144,7 +134,7 @@ def refine(
             order = rng.permutation(len(learned)).tolist()
         number = order.pop()
         look = learned[number]
-        drawn = renderer(splats, parameters, look.camera, look.map_from_cam)
+        drawn = draw(splats, parameters, look.camera, look.map_from_cam)
         # The initially covered pixels of a view stay fixed, so that no splat can leave a picture to reduce its loss.
         where = masks.setdefault(number, 1.0 - drawn.through > _MIN_KNOWN)
         off = np.where(where, look.gain * drawn.picture - look.picture / 255.0, 0.0)
@@ -157,20 +147,17 @@ def refine(
         whole_square = square[numbers] / (1 - _DECAYS[1] ** counts)
         rates = _RATES * 0.1 ** (step / steps)
         moved = parameters[numbers] - rates * whole_mean / (np.sqrt(whole_square) + _LITTLE)
-        parameters[numbers] = np.clip(moved, low, high)
-        progress(step + 1)
-    after = _likeness(splats, parameters, held_out, known, renderer)
+        parameters[numbers] = np.clip(moved, LEAST, MOST)
+    after = _likeness(splats, parameters, held_out, known)
     return Refined(with_parameters(splats, parameters), before, after, len(learned), len(held_out))
 
 
-def _likeness(
-    splats: Splats, parameters: Array, looks: Sequence[Look], known: Sequence[NDArray[np.bool_]], renderer: Renderer
-) -> Likeness:
+def _likeness(splats: Splats, parameters: Array, looks: Sequence[Look], known: Sequence[NDArray[np.bool_]]) -> Likeness:
     rows = []
     for look, where in zip(looks, known, strict=True):
         if not where.any():
             continue
-        shown = look.gain * renderer(splats, parameters, look.camera, look.map_from_cam).picture
+        shown = look.gain * draw(splats, parameters, look.camera, look.map_from_cam).picture
         grey = np.clip(np.round(255 * shown), 0, 255).astype(np.uint8)
         psnr_db = 10 * np.log10(255.0**2 / ((grey.astype(np.float64) - look.picture) ** 2)[where].mean())
         rows.append((psnr_db, _ssim(grey, look.picture, where), where.mean()))

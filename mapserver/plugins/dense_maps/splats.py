@@ -64,9 +64,7 @@ def splat_ply(splats: Splats) -> bytes:
 LEAST_ALPHA = core.SPLAT_LEAST_ALPHA
 BLUR_PX2 = 0.3  # variance of a pixel, as in the viewers
 NEAR_M, FAR_M = 0.1, 40.0
-LEAST_OPACITY, MOST_OPACITY = 0.01, 0.985
-_LEAST_GREY, _MOST_GREY = 0.0, 255.0
-_LEAST_SIGMA_M, _MOST_SIGMA_M = 1e-3, 1.0
+_OPACITIES, _GREYS, _SIGMAS_M = (0.01, 0.985), (0.0, 255.0), (1e-3, 1.0)  # the least and the most
 _BEYOND = 1.3  # in half widths of the picture: limit of the position used to linearise the projection
 GREY, SIZE, OPACITY = range(3)
 
@@ -84,14 +82,10 @@ class Drawn:
     backward: Callable[[Array], tuple[NDArray[np.int64], Array]]
 
 
-Renderer = Callable[[Splats, Array, CameraCalibration, Array], Drawn]
-"""From splats (only positions and normals are used), parameters (N, 3), a camera without distortion and map_from_cam (4, 4)."""
-
-
 def parameters_of(splats: Splats) -> Array:
     """Return (N, 3) grey of 0 to 1, logarithm of the standard deviation in metres, logit of the opacity."""
-    opacities = np.clip(splats.opacities, LEAST_OPACITY, MOST_OPACITY)
-    sigmas_m = np.clip(splats.sigmas_m, _LEAST_SIGMA_M, _MOST_SIGMA_M)
+    opacities = np.clip(splats.opacities, *_OPACITIES)
+    sigmas_m = np.clip(splats.sigmas_m, *_SIGMAS_M)
     return np.column_stack([splats.greys / 255.0, np.log(sigmas_m), np.log(opacities / (1 - opacities))])
 
 
@@ -101,12 +95,9 @@ def with_parameters(splats: Splats, parameters: Array) -> Splats:
     return replace(splats, greys=255.0 * parameters[:, GREY], sigmas_m=np.exp(parameters[:, SIZE]), opacities=opacities)
 
 
-def bounds() -> tuple[Array, Array]:
-    """Return the smallest and the largest parameters (3,)."""
-    places = np.zeros((2, 3), np.float32)
-    sigmas_m, greys = np.array([_LEAST_SIGMA_M, _MOST_SIGMA_M]), np.array([_LEAST_GREY, _MOST_GREY])
-    low, high = parameters_of(Splats(places, places, sigmas_m, greys, np.array([LEAST_OPACITY, MOST_OPACITY])))
-    return low, high
+_PLACES = np.zeros((2, 3), np.float32)
+LEAST, MOST = parameters_of(Splats(_PLACES, _PLACES, *map(np.array, (_SIGMAS_M, _GREYS, _OPACITIES))))
+"""The smallest and the largest parameters (3,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,7 +110,10 @@ class _Flat:
 
 
 def draw(splats: Splats, parameters: Array, camera: CameraCalibration, map_from_cam: Array) -> Drawn:
-    """Render on the CPU. Both sides of a splat are visible. A splat smaller than a pixel is more transparent in proportion."""
+    """Render splats, of which only positions and normals are used, with parameters (N, 3), by a camera without distortion, on the CPU.
+
+    Both sides of a splat are visible. A splat smaller than a pixel is more transparent in proportion.
+    """
     flat = _projected(splats, camera, se3_inverse(map_from_cam))
     chosen = parameters[flat.numbers]
     own = flat.shapes * np.exp(2 * chosen[:, SIZE])[:, None]
