@@ -57,8 +57,7 @@ def accept(
     The first line is the verdict. Status 1 if the site is not accepted.
     """
     from fleetmap.encoding import to_json
-    from mapserver.plugins.acceptance.document import html_page, sections
-    from mapserver.plugins.acceptance.pdf import pdf
+    from mapserver.plugins.acceptance.document import html_page, pdf, sections
     from mapserver.plugins.acceptance.verdict import compared
     from mapserver.trust.signing import sign_files
 

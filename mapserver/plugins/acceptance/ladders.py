@@ -1,6 +1,6 @@
 """Ladders of light and sharpness: a site's own pictures, made darker and more blurred step by step. Pure."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
 import cv2
@@ -46,18 +46,14 @@ def blurred(image: Image, length_px: int) -> Image:
 def ladders(frame: CameraFrame, seed: int) -> dict[str, Iterator[tuple[int, CameraFrame]]]:
     """Return by the kind of ladder its rungs, the easiest first, with the frame at each. Depth images stay as they are."""
 
-    def dark() -> Iterator[tuple[int, CameraFrame]]:
-        for stops in STOPS:
-            rng = np.random.default_rng([seed, stops])
-            right = None if frame.right is None else darker(frame.right, stops, rng)
-            yield stops, replace(frame, left=darker(frame.left, stops, rng), right=right)
+    def rungs(levels: Sequence[int], spoil: Callable[..., Image]) -> Iterator[tuple[int, CameraFrame]]:
+        for level in levels:
+            rng = np.random.default_rng([seed, level])
+            right = None if frame.right is None else spoil(frame.right, level, rng)
+            yield level, replace(frame, left=spoil(frame.left, level, rng), right=right)
 
-    def blur() -> Iterator[tuple[int, CameraFrame]]:
-        for length_px in BLUR_PX:
-            right = None if frame.right is None else blurred(frame.right, length_px)
-            yield length_px, replace(frame, left=blurred(frame.left, length_px), right=right)
-
-    return {"darkness": dark(), "blur": blur()}
+    smeared = rungs(BLUR_PX, lambda image, length_px, _: blurred(image, length_px))
+    return {"darkness": rungs(STOPS, darker), "blur": smeared}
 
 
 def darkest_grey(levels: Array, is_fixed: NDArray[np.bool_]) -> float | None:

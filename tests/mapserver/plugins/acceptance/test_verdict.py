@@ -15,7 +15,7 @@ from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.sensors.samples import CameraFrame
 from mapserver.floor_plan.areas import Area, Areas
 from mapserver.plugins.acceptance.command import _before
-from mapserver.plugins.acceptance.document import drawn, html_page, sections
+from mapserver.plugins.acceptance.document import drawn, html_page, pdf, sections
 from mapserver.plugins.acceptance.drives import Drive, Picture, Start
 from mapserver.plugins.acceptance.examine import area_name, areas_of, similar
 from mapserver.plugins.acceptance.figures import (
@@ -28,7 +28,6 @@ from mapserver.plugins.acceptance.figures import (
     StartCounts,
 )
 from mapserver.plugins.acceptance.ladders import BLUR_PX, STOPS, blurred, darker, darkest_grey, ladders, noise_sigma
-from mapserver.plugins.acceptance.pdf import pdf
 from mapserver.plugins.acceptance.verdict import KNOWN_STARTS, ONE_WAY, compared, judged
 from mapserver.quality.figures import Evidence, RigEvidence, SurveyedViews
 from mapserver.quality.gate import GateSettings
