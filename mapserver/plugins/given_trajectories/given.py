@@ -82,7 +82,8 @@ class OtherTrajectory:
         written = read_poses(self.file)
         stamps_ns = recording.frame_stamps_ns[indices]
         other_trajectory = Trajectory(stamps_on_clock(written, recording, indices, self), written.map_from_it)
-        known = covered(other_trajectory.stamps_ns, stamps_ns)
+        poses = [pose_at(other_trajectory, int(stamp)) for stamp in stamps_ns]
+        known = np.array([pose is not None for pose in poses])
         if known.sum() <= LEAST_STRETCHES:
             raise _foreign_stamps(written, recording, self)
         check_span(stamps_ns, known, recording, self)
@@ -91,8 +92,7 @@ class OtherTrajectory:
         followed = _followed(recording, indices, whole=whole)
         shown = Reference(followed, stretches(followed, known), recording.calibration.cameras[0].body_from_cam)
         found, words = _judged(other_trajectory, f"{self.file.name} ({written.kind})", shown, recording, self)
-        at_frames = np.tile(np.eye(4), (len(stamps_ns), 1, 1))
-        at_frames[known] = [pose_at(other_trajectory, int(stamp)) for stamp in stamps_ns[known]]
+        at_frames = np.array([np.eye(4) if pose is None else pose for pose in poses])
         at_frames[:, :3, 3] *= found.in_metres
         at_frames = at_frames @ se3_inverse(shown.body_from(found.reading))
         if not known.all():
@@ -178,21 +178,13 @@ class Judgement:
         return 1.0 if abs(np.log(self.scale)) <= self.scale_within else self.scale
 
 
-def covered(stamps: Stamps, at_ns: Stamps) -> NDArray[np.bool_]:
-    """Return which stamps (F,) have a pose, or near ones on either side: those at which `pose_at` finds one."""
-    ordered = np.sort(stamps)
-    after = np.searchsorted(ordered, at_ns)
-    before_ns, after_ns = ordered[np.maximum(after - 1, 0)], ordered[np.minimum(after, len(ordered) - 1)]
-    between = (before_ns <= at_ns) & (at_ns <= after_ns) & (after_ns - before_ns <= GAP_NS)
-    return np.asarray(between | (np.minimum(np.abs(at_ns - before_ns), np.abs(at_ns - after_ns)) <= NEAR_NS))
-
-
-def pose_at(as_read: Trajectory, stamp_ns: int) -> Array:
-    """Return (4, 4) interpolated, or that of the nearest stamp: stamps may be rounded."""
+def pose_at(as_read: Trajectory, stamp_ns: int) -> Array | None:
+    """Return (4, 4) interpolated, or that of the nearest stamp if it is near, since stamps may be rounded; None without either."""
     found = as_read.at(stamp_ns, GAP_NS)
-    return np.asarray(
-        as_read.frame_from_body[np.argmin(np.abs(as_read.stamps_ns - stamp_ns))] if found is None else found
-    )
+    nearest = int(np.argmin(np.abs(as_read.stamps_ns - stamp_ns)))
+    if found is None and abs(int(as_read.stamps_ns[nearest]) - stamp_ns) <= NEAR_NS:
+        return np.asarray(as_read.frame_from_body[nearest])
+    return found
 
 
 def read_as(trajectory: Trajectory, reading: PoseReading) -> Trajectory:
@@ -226,7 +218,8 @@ def stretches(followed: OwnMotion, known: NDArray[np.bool_]) -> NDArray[np.int64
 def judge(as_read: Trajectory, reading: PoseReading, shown: Reference, scale: float | None) -> Judgement:
     """Judge the reading with poses `as_read`, over stretches; scale: metres in the unit of length if known."""
     followed, pairs = shown.followed, shown.pairs
-    ends = np.array([pose_at(as_read, int(followed.stamps_ns[k])) for k in pairs.ravel()]).reshape(-1, 2, 4, 4)
+    ends: Array = np.array([pose_at(as_read, int(stamp)) for stamp in followed.stamps_ns[pairs.ravel()]], np.float64)
+    ends = ends.reshape(-1, 2, 4, 4)
     moved = se3_inverse(ends[:, 0]) @ ends[:, 1]
     seen_ends = followed.frame_from_body[pairs] @ shown.body_from(reading)
     seen = se3_inverse(seen_ends[:, 0]) @ seen_ends[:, 1]

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 from msgspec import structs
 from scipy.optimize import least_squares
-from scipy.sparse import lil_matrix
+from scipy.sparse import csr_matrix
 
 from fleetmap.errors import RecordingError
 from fleetmap.features.matching import hamming_knn2
@@ -218,7 +218,7 @@ class _EpipolarProblem:
             start,
             loss="soft_l1",
             f_scale=_ROBUST_PX,
-            jac_sparsity=self._pattern(len(start)),
+            jac_sparsity=self._pattern(),
             max_nfev=_MOST_EVALUATIONS,
             x_scale="jac",
         )
@@ -257,21 +257,14 @@ class _EpipolarProblem:
         _, turn, way, _ = cv2.recoverPose(essential, match[:, 2:], match[:, :2], matrix)
         return np.concatenate([so3_log(np.asarray(turn, np.float64)), way.ravel()])
 
-    def _pattern(self, unknowns: int) -> lil_matrix:
+    def _pattern(self) -> csr_matrix:
         """Return the sparsity: which residual depends on which unknown."""
         counts = [len(match) for match in self.matches.motions]
-        seen = len(self.matches.pair)
-        pattern = lil_matrix((seen + sum(counts) + _LENS - 1 + len(counts), unknowns), dtype=int)
-        pattern[:seen, :_LENS] = 1
-        pattern[seen:, :3] = 1
-        usual = seen + sum(counts)
-        pattern[usual : usual + _LENS - 1, :_LENS] = 1
-        for n, count in enumerate(counts):
-            own = slice(_LENS + _MOTION * n, _LENS + _MOTION * (n + 1))
-            pattern[seen : seen + count, own] = 1
-            pattern[usual + _LENS - 1 + n, own] = 1
-            seen += count
-        return pattern
+        rows, numbers = [len(self.matches.pair), sum(counts), _LENS - 1, len(counts)], np.arange(len(counts))
+        of_rig = np.repeat([_LENS, 3, _LENS, 0], rows)[:, None]  # a motion of the left camera shows its lens alone
+        motion = np.r_[np.full(rows[0], -1), np.repeat(numbers, counts), np.full(rows[2], -1), numbers][:, None]
+        columns = np.arange(_LENS + _MOTION * len(counts))
+        return csr_matrix((columns < of_rig) | ((columns >= _LENS) & ((columns - _LENS) // _MOTION == motion)))
 
 
 def _sampson(first: Array, second: Array, rotation: Array, direction: Array) -> Array:

@@ -23,14 +23,14 @@ class StampedCovariances:
     covs_rot_trans: Array
 
 
-def parse_covariances(text: str, what: str = "covariances") -> StampedCovariances:
-    """Parse the covariances of a trajectory: lines of a stamp and the 21 numbers of the upper triangle, rotation first.
+def read_covariances(path: Path) -> StampedCovariances:
+    """Read the covariances of a trajectory: lines of a stamp and the 21 numbers of the upper triangle, rotation first.
 
-    Raises RecordingError, naming `what` and the line, for anything but 22 finite numbers of a positive definite matrix, or
-    stamps that do not rise.
+    Raises RecordingError, naming the file and the line, for anything but 22 finite numbers of a positive definite matrix, stamps that do
+    not rise, or a file that cannot be read.
     """
     stamps, covariances = [], []
-    for line in stamped_lines(text, what):
+    for line in stamped_lines(read_text(path, "covariances as CSV are expected"), str(path)):
         if len(line.values) != len(_ROWS) or not np.isfinite(line.values).all():
             raise RecordingError(f"{line.where}: {len(line.values)} numbers after the stamp, 21 finite ones are needed")
         covariance = np.zeros((6, 6))
@@ -40,11 +40,6 @@ def parse_covariances(text: str, what: str = "covariances") -> StampedCovariance
         stamps.append(line.stamp_ns)
         covariances.append(covariance)
     return StampedCovariances(np.array(stamps, np.int64), np.array(covariances).reshape(-1, 6, 6))
-
-
-def read_covariances(path: Path) -> StampedCovariances:
-    """Read the covariances in the file at `path`; RecordingError as `parse_covariances`, and if it cannot be read."""
-    return parse_covariances(read_text(path, "covariances as CSV are expected"), str(path))
 
 
 _MAX_SHIFT_S = 0.05

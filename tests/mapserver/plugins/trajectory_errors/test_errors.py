@@ -22,7 +22,6 @@ from mapserver.plugins.trajectory_errors.errors import (
     best_clock_shift,
     consistency,
     drift,
-    parse_covariances,
     read_covariances,
     relative_trajectory_error,
     unaligned_errors,
@@ -228,10 +227,11 @@ def test_stamps_without_a_covariance_are_left_out() -> None:
         (lambda line: line + "\n" + line, "does not rise"),
     ],
 )
-def test_bad_lines_are_named(change: Callable[[str], str], says: str) -> None:
+def test_bad_lines_are_named(tmp_path: Path, change: Callable[[str], str], says: str) -> None:
     line = csv_lines(StampedCovariances(np.array([5], np.int64), np.eye(6)[None]))[1]
-    with pytest.raises(RecordingError, match=rf"line \d.*{says}"):
-        parse_covariances(change(line), "c.csv")
+    (tmp_path / "c.csv").write_text(change(line))
+    with pytest.raises(RecordingError, match=rf"c.csv.*line \d.*{says}"):
+        read_covariances(tmp_path / "c.csv")
 
 
 def test_the_command_prints_it(tmp_path: Path) -> None:
