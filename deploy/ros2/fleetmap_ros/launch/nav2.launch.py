@@ -17,10 +17,10 @@ NAV2 = Path(get_package_share_directory("nav2_bringup"))
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Arguments: config, a file of locclient's settings; params_file, nav2's parameters; rviz."""
+    """Arguments: config, a file of locclient's settings; params_file, the parameters of nav2's navigation; rviz."""
     arguments = {
         "config": str(SHARE / "config/locclient.toml"),
-        "params_file": str(SHARE / "config/nav2_params.yaml"),
+        "params_file": str(NAV2 / "params/nav2_params.yaml"),
         "rviz": "false",
     }
     localization = IncludeLaunchDescription(
@@ -35,7 +35,7 @@ def generate_launch_description() -> LaunchDescription:
         package="nav2_lifecycle_manager",
         executable="lifecycle_manager",
         name="lifecycle_manager_localization",
-        parameters=[LaunchConfiguration("params_file")],
+        parameters=[str(SHARE / "config/nav2_params.yaml")],
     )
     navigation = IncludeLaunchDescription(
         PythonLaunchDescriptionSource(str(NAV2 / "launch/navigation_launch.py")),

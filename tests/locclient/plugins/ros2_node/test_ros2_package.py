@@ -19,6 +19,7 @@ from support.fleet.contracts_documents import REPOSITORY
 from support.ros2.environment import needs_ros, ros_environment, ros_program
 
 PACKAGE = REPOSITORY / "deploy/ros2/fleetmap_ros"
+NAV2 = Path("/nav2_bringup")  # whose files ROS has
 PARAMETERS = PACKAGE / "config/nav2_params.yaml"
 # Declared by nav2's nodes with these types; rclcpp ends a node whose parameter has another, also 4 for 4.0.
 NAV2_TYPES = {
@@ -66,7 +67,7 @@ def launched(name: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, MagicMock]
         "launch_ros.parameter_descriptions": ["ParameterValue"],
     }
     actions = {action: MagicMock() for names in modules.values() for action in names}
-    actions["get_package_share_directory"].side_effect = {"fleetmap_ros": str(PACKAGE), "nav2_bringup": "/nav2"}.get
+    actions["get_package_share_directory"].side_effect = {"fleetmap_ros": str(PACKAGE), "nav2_bringup": str(NAV2)}.get
     actions["PythonLaunchDescriptionSource"].side_effect = Path
     for module, names in modules.items():
         monkeypatch.setitem(sys.modules, module.partition(".")[0], MagicMock())
@@ -84,17 +85,19 @@ def test_launch_files_name_what_there_is(monkeypatch: pytest.MonkeyPatch) -> Non
     for actions in (alone, with_nav2):
         declared = arguments(actions)
         assert {call.args[0] for call in actions["LaunchConfiguration"].call_args_list} == set(declared)
-        assert all(Path(value).exists() for value in declared.values() if "/" in value)
+        files = [Path(value) for value in declared.values() if "/" in value]
+        assert all(path.exists() or path.is_relative_to(NAV2) for path in files)
     localizer, rviz = (call.kwargs for call in alone["Node"].call_args_list)
     assert f'"{localizer["executable"]} = ' in (PACKAGE / "setup.py").read_text()
     assert Path(rviz["arguments"][1]).exists()
     (manager,) = (call.kwargs for call in with_nav2["Node"].call_args_list)
+    assert manager["parameters"] == [str(PARAMETERS)]
     parameters = yaml.safe_load(PARAMETERS.read_text())
     config, _ = read_config(PACKAGE / "config/locclient.toml", {})
     assert parameters[manager["name"]]["ros__parameters"]["node_names"] == [config.output.node]
     ours, nav2 = (call for call in with_nav2["IncludeLaunchDescription"].call_args_list)
     assert set(dict(ours.kwargs["launch_arguments"])) <= set(arguments(alone))
-    assert ours.args[0].exists() and nav2.args[0] == Path("/nav2/launch/navigation_launch.py")
+    assert ours.args[0].exists() and nav2.args[0] == NAV2 / "launch/navigation_launch.py"
     # One publisher of /map: the node, not nav2's map_server.
     assert config.output.map_topic == "map" and "map_server" not in parameters
 
