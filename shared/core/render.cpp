@@ -60,7 +60,7 @@ struct Textures {
 constexpr int kMostLevels = 12;  // that are read
 
 // One instant of an exposure: samples per pixel side, shift of the samples in pixels, weight in the picture, most taps of a texture's
-// filter, reflectance of the floor seen from above, whether depth and faces are filled. Shadows (M, 3): x, y, 1 / radius^2 of soft
+// filter, reflectance of the floor seen from above, whether depth is filled. Shadows (M, 3): x, y, 1 / radius^2 of soft
 // contact shadows on the floor.
 struct Instant {
   int samples;
@@ -72,11 +72,10 @@ struct Instant {
   size_t shadow_count;
 };
 
-// A picture in the making (H, W): radiance, depth along the optical axis, 0 for nothing, face of each pixel, -1 for nothing.
+// A picture in the making (H, W): radiance, and depth along the optical axis, 0 for nothing.
 struct Canvas {
   Picture<double> radiance;
   float* depth_m;
-  int32_t* faces;
 };
 
 using Lit = std::tuple<Array<double, -1, 9>, Array<double, -1, 6>, Array<int32_t, -1, 6>, Array<float, -1>, Reals>;
@@ -130,8 +129,7 @@ class ScenePainter {
   // Adds an instant's weighted picture to the canvas, which is of the rays' size, or of the plane's. cam_from_map: rotation.
   void add(const Lit& lit, const Chunks& chunks, const Atlas& atlas, const Mat3& cam_from_map, const Vec3& centre_map, int samples,
            std::tuple<double, double> shift, double weight, int most_taps, double reflectance, const Points& shadows, bool wants_truth,
-           const MutableArray<double, -1, -1>& radiance, const MutableArray<float, -1, -1>& depth_m,
-           const MutableArray<int32_t, -1, -1>& faces);
+           const MutableArray<double, -1, -1>& radiance, const MutableArray<float, -1, -1>& depth_m);
 
  private:
   struct Polygon {  // of a visible face: (u', v', 1/z) = h (x/z, y/z, 1), u = u' z; its outline in pixels, clipped
@@ -376,12 +374,9 @@ double sample(const Textures& textures, int32_t texture, double x, double y, con
   int taps = 1;
   double extent = longer;
   if (longer > 1.0 && most_taps > 1 && longer > 2.9 * shorter) {
-    taps = 2;
-    if (most_taps > 2 && longer > 6.3 * std::max(shorter, 1.0)) {
-      taps = 3;
-      if (most_taps > 3 && longer > 12.0 * std::max(shorter, 1.0)) taps = 4;
-    }
-    extent = std::max(shorter, longer * (taps == 2 ? 0.25 : taps == 3 ? 1.0 / 9.0 : 0.0625));
+    const double across = std::max(shorter, 1.0);
+    taps = std::min(most_taps, 2 + (longer > 6.3 * across) + (longer > 12.0 * across));
+    extent = std::max(shorter, longer * (1.0 / (taps * taps)));
   }
   extent *= 0.8 * area;
   int level = 0;
@@ -498,24 +493,17 @@ void ScenePainter::shade_image(const Surfaces& surfaces, const Textures& texture
     for (ptrdiff_t x = 0; x < columns_; ++x) {
       // The polygons of the pixel's samples: number of samples of each, and the sums of their positions.
       int32_t seen[kMostSamples];
-      int hits[kMostSamples], count = 1;
+      int hits[kMostSamples], count = 0;
       double sum_x[kMostSamples], sum_y[kMostSamples];
       const int32_t* const corner = owner + (y * columns_ * samples + x) * samples;
       const auto at = [&](int i, int j) { return corner[i * columns_ * samples + j]; };
-      seen[0] = at(0, 0), hits[0] = samples * samples, sum_x[0] = sum_y[0] = 0.5 * (samples - 1) * hits[0];
-      bool is_uniform = true;
       for (int i = 0; i < samples; ++i)
-        for (int j = 0; j < samples; ++j) is_uniform &= at(i, j) == seen[0];
-      if (!is_uniform) {
-        count = 0;
-        for (int i = 0; i < samples; ++i)
-          for (int j = 0; j < samples; ++j) {
-            int n = 0;
-            while (n < count && seen[n] != at(i, j)) ++n;
-            if (n == count) seen[n] = at(i, j), hits[n] = 0, sum_x[n] = sum_y[n] = 0.0, ++count;
-            ++hits[n], sum_x[n] += j, sum_y[n] += i;
-          }
-      }
+        for (int j = 0; j < samples; ++j) {
+          int n = 0;
+          while (n < count && seen[n] != at(i, j)) ++n;
+          if (n == count) seen[n] = at(i, j), hits[n] = 0, sum_x[n] = sum_y[n] = 0.0, ++count;
+          ++hits[n], sum_x[n] += j, sum_y[n] += i;
+        }
       double total = 0.0;
       for (int n = 0; n < count; ++n) {
         if (seen[n] < 0) continue;
@@ -560,12 +548,9 @@ void ScenePainter::shade_image(const Surfaces& surfaces, const Textures& texture
           }
         }
         total += value * hits[n];
-        if (instant.wants_truth && n == 0) {
-          canvas.depth_m[y * columns_ + x] = float(1.0 / w);
-          canvas.faces[y * columns_ + x] = polygon.face;
-        }
+        if (instant.wants_truth && n == 0) canvas.depth_m[y * columns_ + x] = float(1.0 / w);
       }
-      if (instant.wants_truth && seen[0] < 0) canvas.depth_m[y * columns_ + x] = 0.0f, canvas.faces[y * columns_ + x] = -1;
+      if (instant.wants_truth && seen[0] < 0) canvas.depth_m[y * columns_ + x] = 0.0f;
       canvas.radiance.row(y)[x] += instant.weight * total * step * step;
     }
 }
@@ -573,11 +558,10 @@ void ScenePainter::shade_image(const Surfaces& surfaces, const Textures& texture
 void ScenePainter::add(const Lit& lit, const Chunks& chunks, const Atlas& atlas, const Mat3& cam_from_map, const Vec3& centre_map,
                        int samples, std::tuple<double, double> shift, double weight, int most_taps, double reflectance,
                        const Points& shadows, bool wants_truth, const MutableArray<double, -1, -1>& radiance,
-                       const MutableArray<float, -1, -1>& depth_m, const MutableArray<int32_t, -1, -1>& faces) {
+                       const MutableArray<float, -1, -1>& depth_m) {
   if (samples < 1 || samples > 4) throw nb::value_error("samples: 1 to 4");
   const auto is_picture = [&](const auto& array) { return array.shape(0) == size_t(rows_) && array.shape(1) == size_t(columns_); };
-  if (!is_picture(radiance) || !is_picture(depth_m) || !is_picture(faces))
-    throw nb::value_error("radiance, depth_m, faces: of the picture's size");
+  if (!is_picture(radiance) || !is_picture(depth_m)) throw nb::value_error("radiance, depth_m: of the picture's size");
   const Textures textures = textures_of(atlas);
   const Surfaces surfaces = surfaces_of(lit, chunks, int64_t(std::get<1>(atlas).shape(0)));
   const auto [shift_x, shift_y] = shift;
@@ -588,7 +572,7 @@ void ScenePainter::add(const Lit& lit, const Chunks& chunks, const Atlas& atlas,
   mirrored_.polygons.clear();
   if (reflectance > 0.0 && first_row < plane_.height) project(surfaces, cam_from_map, centre_map, true, mirrored_.polygons);
   paint(mirrored_, 1, 0.0, 0.0, std::max<ptrdiff_t>(0, first_row - 6));  // all of one sample per pixel
-  shade_image(surfaces, textures, through_lens(samples), centre_map[2], instant, {radiance, depth_m.data(), faces.data()});
+  shade_image(surfaces, textures, through_lens(samples), centre_map[2], instant, {radiance, depth_m.data()});
 }
 
 // An image (H, W) of gain * vignetting * radiance plus noise, clipped: shot noise of variance `shot` * value, read noise of this
@@ -627,8 +611,7 @@ void bind_render(nb::module_& module) {
   nb::class_<Shared<ScenePainter>>(module, "ScenePainter")
       .def(nb::init<const Array<double, 6>&, const Array<float, -1, -1, 4>&>(), "plane"_a, "rays"_a)
       .def("add", in_turn<PythonLock::kReleased>(&ScenePainter::add), "faces"_a, "chunks"_a, "textures"_a, "cam_from_map"_a, "centre_map"_a,
-           "samples"_a, "shift_px"_a, "weight"_a, "most_taps"_a, "reflectance"_a, "shadows"_a, "wants_truth"_a, "radiance"_a, "depth_m"_a,
-           "face_of"_a);
+           "samples"_a, "shift_px"_a, "weight"_a, "most_taps"_a, "reflectance"_a, "shadows"_a, "wants_truth"_a, "radiance"_a, "depth_m"_a);
   module.def("develop", &develop, "radiance"_a, "gain"_a, "shot"_a, "read"_a, "normals"_a, "key"_a, "vignetting"_a);
 }
 

@@ -1029,7 +1029,6 @@ class ScenePainter:
         wants_truth: bool,
         radiance: _Reals,
         depth_m: _Floats,
-        face_of: _Numbers,
     ) -> None:
         """Add an instant to an image (H, W): faces as of `Faces` with light and strengths of groups; textures as of `Atlas`."""
 

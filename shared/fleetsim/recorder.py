@@ -21,8 +21,7 @@ from fleetsim.choices import chosen
 from fleetsim.imaging.pipelines import IMAGE_PIPELINES, process_frame
 from fleetsim.motion.body_motion import CarriedMotion, Motion, RouteMotion
 from fleetsim.motion.routes import check_clear
-from fleetsim.render.painter import Look
-from fleetsim.render.renderer import RenderOptions, StereoRenderer
+from fleetsim.render.renderer import RigRenderer
 from fleetsim.scenarios import SCENARIOS, Run
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.light import LIGHT_STATES
@@ -71,7 +70,7 @@ class Session:
     world: World
     nominal: RigCalibration
     true: RigCalibration
-    renderer: StereoRenderer
+    renderer: RigRenderer
     motion: Motion
     frame_times_s: tuple[float, ...]
     imu: ImuSamples
@@ -84,16 +83,15 @@ class Session:
         pipeline = IMAGE_PIPELINES[self.order.camera_pipeline]
 
         def made(time_s: float, stamp_ns: int) -> CameraFrame:
-            shot = self.renderer.shoot(time_s)
-            cameras = [self.nominal.cameras[numbers[0]] for numbers in self.nominal.views[1:]]
-            others = list[CameraFrame]()
-            for images, depth_m, camera in zip(shot.others, shot.other_depths_m, cameras, strict=True):
-                rng = np.random.default_rng([self.order.seed, stamp_ns, len(others)])
-                measured_m = measure_depth(depth_m, camera, rng) if camera.has_depth else None
-                others.append(CameraFrame(stamp_ns, images[0], images[1] if images[1:] else None, measured_m))
-            return process_frame(
-                CameraFrame(stamp_ns, shot.left, shot.right, others=tuple(others)), pipeline, self.order.seed
-            )
+            shots, frames = self.renderer.shoot(time_s), list[CameraFrame]()
+            for first, *second in self.nominal.views:
+                camera, measured_m = self.nominal.cameras[first], None
+                if camera.has_depth:
+                    rng = np.random.default_rng([self.order.seed, stamp_ns, len(frames) - 1])
+                    measured_m = measure_depth(shots[first].depth_m, camera, rng)
+                right = shots[second[0]].image if second else None
+                frames.append(CameraFrame(stamp_ns, shots[first].image, right, measured_m))
+            return process_frame(replace(frames[0], others=tuple(frames[1:])), pipeline, self.order.seed)
 
         moments = iter(zip(self.frame_times_s, self.frame_stamps_ns(), strict=True))
         with ThreadPoolExecutor(1, thread_name_prefix="shutter") as shutter:
@@ -136,13 +134,15 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
         kind = replace(kind, width_px=order.size_px[0], height_px=order.size_px[1])
     nominal, true = nominal_calibration(kind), true_calibration(kind, _generator(order, name, "mounting"))
     motion = drive(run, kind, scenario.layout, _generator(order, name, "motion"))
-    plan = FaultPlan((*run.faults, *order.faults))
+    plan, key = FaultPlan((*run.faults, *order.faults)), zlib.crc32(name.encode())
+    light, movers, has_blur = order.light, scenario.movers, not run.is_sharp
     every_time = [float(t) for t in sample_times(motion.duration_s, run.rate_hz)]
     times = [t for t in every_time if not plan.has("frames-dropped", t)][: order.frames]
     end_s = times[-1] + 0.1 if times else motion.duration_s
     world = World(scenario.layout, seed=order.seed, day=order.day, workers=workers)
-    look = Look(has_blur=not run.is_sharp)
-    options = RenderOptions(order.light, look, scenario.movers, plan, zlib.crc32(name.encode()))
+    renderer = RigRenderer(
+        world, true, motion, light=light, movers=movers, faults=plan.faults, key=key, has_blur=has_blur
+    )
     wheel = measure_wheels(motion, kind.body_height_m, kind.wheels, _generator(order, name, "wheels"))
     priors = measure_priors(motion, nominal.base_from_body, run.zone_period_s, _generator(order, name, "priors"))
     last_ns = int(stamps_from_s(np.array([end_s]))[0])
@@ -154,7 +154,7 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
         world=world,
         nominal=nominal,
         true=true,
-        renderer=StereoRenderer(world, true, motion, options),
+        renderer=renderer,
         motion=motion,
         frame_times_s=tuple(times),
         imu=plan.spoil_imu(measure_imu(motion, kind.imu, _generator(order, name, "imu"))).between(0, last_ns),
@@ -178,23 +178,14 @@ def write_session(session: Session, writer: McapRecordingWriter, on_frame: Calla
     start_ns = 0
     for done, frame in enumerate(session.frames(), start=1):
         write_between(start_ns, frame.stamp_ns)
-        writer.write_frame(frame)
+        writer.write_frame(_png_frame(frame))
         on_frame(done)
         start_ns = frame.stamp_ns
     write_between(start_ns, 1 << 62)
 
 
-class _PngWriter(McapRecordingWriter):
-    """Stores images as PNG: half the size of raw ones, lossless."""
-
-    def write_frame(self, frame: CameraFrame | StoredFrame) -> None:
-        """Write one frame; already encoded images stay unchanged."""
-        if isinstance(frame, CameraFrame):
-            frame = _png_frame(frame)
-        super().write_frame(frame)
-
-
 def _png_frame(frame: CameraFrame) -> StoredFrame:
+    """Images as PNG: half the size of raw ones, lossless."""
     right = None if frame.right is None else png_image(frame.right)
     others = tuple(None if other is None else _png_frame(other) for other in frame.others)
     depth = None if frame.depth_m is None else png_image(np.rint(frame.depth_m * 1000.0).astype(np.uint16))
@@ -216,7 +207,7 @@ def record_order(order: Order, out: Path) -> str:
         task = progress.add_task(f"recording {order.scenario}", total=count)
         name = f"{order.scenario}-{order.robot or 'first'}-seed{order.seed}-day{order.day}-{order.light}"
         try:
-            with _PngWriter(out, session.nominal, name=name) as writer:
+            with McapRecordingWriter(out, session.nominal, name=name) as writer:
                 write_session(session, writer, lambda done: progress.update(task, completed=done))
         finally:
             session.renderer.close()

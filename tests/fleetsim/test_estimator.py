@@ -32,7 +32,7 @@ def test_landmarks_lie_where_the_painter_sees_surfaces() -> None:
     try:
         estimator = EstimatorSession(session)
         frame = 40
-        shot, seen = session.renderer.shoot(session.frame_times_s[frame]), estimator.sighting(frame)
+        (shot, _), seen = session.renderer.shoot(session.frame_times_s[frame]), estimator.sighting(frame)
     finally:
         session.renderer.close()
     column, row = np.rint(seen.pixels[:, :2]).astype(int).T
@@ -161,7 +161,7 @@ def test_a_person_hides_what_the_painter_no_longer_shows() -> None:
     session, alone = prepare(order), _session(CLIP)
     try:
         crowded, frame = EstimatorSession(session), 30
-        shot = session.renderer.shoot(session.frame_times_s[frame])
+        shot, _ = session.renderer.shoot(session.frame_times_s[frame])
     finally:
         session.renderer.close()
     before, seen, without = alone.sighting(frame), crowded.sighting(frame), _session(order).sighting(10)

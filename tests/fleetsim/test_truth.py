@@ -12,8 +12,8 @@ from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetsim.motion.body_motion import RouteMotion
 from fleetsim.motion.routes import Route
 from fleetsim.render.optics import make_optics
-from fleetsim.render.painter import Look, Painter
-from fleetsim.render.renderer import RenderOptions, StereoRenderer
+from fleetsim.render.painter import Painter
+from fleetsim.render.renderer import RigRenderer
 from fleetsim.scene.light import Exposure
 from fleetsim.sensors.robots import ROBOTS, nominal_calibration
 from support.worlds.simulated_views import map_from_cam, small_world
@@ -22,14 +22,14 @@ Array = NDArray[np.float64]
 MOMENTS_S = (3.0, 6.0, 9.5, 12.0, 14.0)
 
 
-def _renderer(lens: str, *, has_blur: bool) -> tuple[RigCalibration, StereoRenderer]:
+def _renderer(lens: str, *, has_blur: bool) -> tuple[RigCalibration, RigRenderer]:
     world = small_world()
     y = world.layout.aisle_y_m(0), world.layout.aisle_y_m(1)
     route = Route(((2.7, y[0]), (20.0, y[0]), (20.0, y[1]), (12.0, y[1])))
     kind = replace(ROBOTS["surveyor"], lens=lens)
     motion = RouteMotion(route, kind.limits, kind.body_height_m, kind.shake, np.random.default_rng(0))
     rig = nominal_calibration(kind)
-    return rig, StereoRenderer(world, rig, motion, RenderOptions(look=Look(has_blur=has_blur)))
+    return rig, RigRenderer(world, rig, motion, has_blur=has_blur)
 
 
 def _track(
@@ -58,14 +58,14 @@ def test_tracks_lie_where_truth_says(lens: str, has_blur: bool) -> None:
     left, right = rig.cameras
     epipolar_px, temporal_px, stereo_px = [], [], []
     for moment_s in MOMENTS_S:
-        shot, later = renderer.shoot(moment_s), renderer.shoot(moment_s + 0.05)
-        corners = cv2.goodFeaturesToTrack(shot.left, 300, 0.01, 12)
+        (shot, beside), (later, _) = renderer.shoot(moment_s), renderer.shoot(moment_s + 0.05)
+        corners = cv2.goodFeaturesToTrack(shot.image, 300, 0.01, 12)
         pixels = corners[:, 0].astype(np.float64)
         rays = left.ray_from_pixel(pixels)
         column, row = np.rint(pixels).astype(int).T
         points_left = rays / rays[:, 2:] * shot.depth_m[row, column].astype(np.float64)[:, None]
 
-        seen, kept = _track(shot.left, shot.right, corners)
+        seen, kept = _track(shot.image, beside.image, corners)
         rays_right = right.ray_from_pixel(seen)
         rise = rays[:, 1] / rays[:, 2] - rays_right[:, 1] / rays_right[:, 2]
         epipolar_px.append(np.median(np.abs(rise[kept])) * left.intrinsics_px[0])
@@ -73,7 +73,7 @@ def test_tracks_lie_where_truth_says(lens: str, has_blur: bool) -> None:
         expected = right.pixel_from_ray(transform_points(right_from_left, points_left))
         stereo_px.append(np.median(np.linalg.norm(expected - seen, axis=1)[kept]))
 
-        seen, kept = _track(shot.left, later.left, corners)
+        seen, kept = _track(shot.image, later.image, corners)
         later_from_left = se3_inverse(renderer.path(0)(moment_s + 0.05)) @ renderer.path(0)(moment_s)
         expected = left.pixel_from_ray(transform_points(later_from_left, points_left))
         temporal_px.append(np.median(np.linalg.norm(expected - seen, axis=1)[kept]))
@@ -102,7 +102,7 @@ def test_a_fisheye_shows_what_pinholes_show_there(yaw: float, pitch: float) -> N
     seen = []
     for camera, map_from_own in ((fisheye, placed), (pinhole, placed @ turn)):
         optics = make_optics(camera)
-        shot = Painter(world, optics, Look(has_noise=False), 0).shoot(
+        shot = Painter(world, optics, 0, has_noise=False).shoot(
             scene, np.ones(3), lambda _, held=map_from_own: held, 0.0, exposure, 1
         )
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -140,7 +140,7 @@ NUMBER, SINGLES = np.zeros(1, np.int32), np.ones((5, 3), np.float32)
 CONES, WORDS = (np.ones((5, 3)), SINGLES, SINGLES[:, 0].copy(), SINGLES[:, 0].copy()), np.zeros((5, 4), np.uint64)
 QUADS, SIXES, FACES = np.ones((0, 9)), np.zeros((0, 6)), np.zeros((0, 6), np.int32)
 TEXTURES = np.zeros(1 << 18, np.uint8), np.zeros((1, 14), np.int32), np.zeros((1, 1), np.int32), np.zeros(2, np.int32)
-PICTURE = np.zeros((4, 4)), np.zeros((4, 4), np.float32), np.zeros((4, 4), np.int32)
+PICTURE = np.zeros((4, 4)), np.zeros((4, 4), np.float32)
 # Arguments that hold together where those from signatures do not, of the object that a method belongs to.
 GIVEN: dict[str, Callable[[Any], tuple[object, ...]]] = {
     "BlockCholesky.factorise": lambda pattern: (np.ones(pattern.size),),

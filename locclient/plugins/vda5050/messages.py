@@ -180,4 +180,4 @@ def decode(payload: bytes, kind: type[T]) -> T:
 def timestamp(wall_ns: int) -> str:
     """Format a time as the standard requires."""
     moment = datetime.fromtimestamp(wall_ns // 1_000_000 / 1000, UTC)
-    return moment.strftime("%Y-%m-%dT%H:%M:%S.") + f"{moment.microsecond // 1000:03d}Z"
+    return moment.replace(tzinfo=None).isoformat(timespec="milliseconds") + "Z"

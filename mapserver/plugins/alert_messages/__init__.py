@@ -164,10 +164,8 @@ def _token(path: Path) -> str:
 
 
 def _cut(connection: http.client.HTTPConnection) -> None:
-    sock = connection.sock
-    if sock is not None:
-        with suppress(OSError):
-            sock.shutdown(socket.SHUT_RDWR)
+    with suppress(OSError, AttributeError):  # it was closed meanwhile, and has no socket
+        connection.sock.shutdown(socket.SHUT_RDWR)
 
 
 def _moment(stamp_ns: int) -> str:

@@ -56,9 +56,7 @@ def _write_report(options: NightlyOptions) -> None:
     from fleetmap.encoding import to_json
     from mapserver.plugins.nightly_builds.night import last_report
 
-    report = options.report
-    content = None if report is None else last_report(options.store, options.site)
-    if report is None or content is None:
+    if options.report is None or (content := last_report(options.store, options.site)) is None:
         return
-    with disk_errors(f"{report} cannot be written", "the store's jobs hold the same report"):
-        report.write_bytes(to_json(content, indent=2) + b"\n")
+    with disk_errors(f"{options.report} cannot be written", "the store's jobs hold the same report"):
+        options.report.write_bytes(to_json(content, indent=2) + b"\n")

@@ -1,6 +1,8 @@
-"""What a night asks of the recordings in an inbox: their hashes, read with limits, and those that it kept."""
+"""What a night asks of the recordings in an inbox: their hashes, read with limits, and those that it kept.
 
-import json
+As a program with the arguments RECORDING CALIBRATION TOPICS it prints what `read` returns.
+"""
+
 import os
 import sys
 from contextlib import suppress
@@ -8,16 +10,19 @@ from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
 
+import msgspec
+
 from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, RecordingError, StoreError, disk_errors
-from fleetmap.recordings import OpenOptions
+from fleetmap.recordings import OpenOptions, open_recording
+from fleetmap.sensors.source_settings import Topics
 from mapserver.fleet.bounded_process import ProcessLimits, run_bounded
 from mapserver.nightly.inbox import DONE, HASH_SIGNS, HELD, names, parts, why_unreadable
-from mapserver.plugins.nightly_builds import reading
 
 # Time limit to read one: this, and 1 s for each 4 MiB on the disk; sparse files do not raise it
 _READ_S, _SLOWEST_BYTES_PER_S = 600, 4 << 20
 _LEAST_MEMORY_BYTES, _OPEN_FILES = 4 << 30, 1024
+_MOST_ISSUES = 5
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,20 +55,29 @@ def identify(path: Path, options: OpenOptions) -> InboxRecording | str | None:
 
 
 def _read(path: Path, options: OpenOptions, seconds: float) -> tuple[str, str]:
-    """Return the result of `reading.read`, in a process of its own. StoreError if this machine cannot start one."""
+    """Return the result of `read`, in a process of its own. StoreError if this machine cannot start one."""
     limits = ProcessLimits(_most_memory_bytes(), ceil(seconds), seconds, open_files=_OPEN_FILES)
     given = [str(path), str(options.calibration_file or ""), to_json(options.topics).decode()]
     try:
         with disk_errors("no process can be started", "see memory and disk of this machine"):
-            ended = run_bounded([sys.executable, "-m", reading.__name__, *given], limits, f"the reading of {path}")
+            ended = run_bounded([sys.executable, "-m", __name__, *given], limits, f"the reading of {path}")
     except StoreError:
         raise
     except FleetmapError as error:
         return "", str(error)
     if ended.status:
         return "", f"{path} cannot be read: {ended.errors.strip().rpartition(chr(10))[2][:500]}"
-    sha256, words = json.loads(ended.output)
-    return sha256, words
+    return msgspec.json.decode(ended.output, type=tuple[str, str])
+
+
+def read(path: Path, options: OpenOptions) -> tuple[str, str]:
+    """Return a recording's hash and its issues as text; an empty hash and the reason if it cannot be read."""
+    try:
+        with open_recording(path, options) as recording:
+            issues = [f"{issue.what}: {issue.detail}".rstrip(": ") for issue in recording.issues[:_MOST_ISSUES]]
+            return recording.content_hash(), "; ".join(issues)
+    except Exception as error:  # a library's, of an untrusted file
+        return "", why_unreadable(path, error)
 
 
 def _state(path: Path) -> tuple[object, float]:
@@ -87,3 +101,9 @@ def kept(inbox: Path, sha256s: list[str]) -> list[Path]:
                     pass
                 found.setdefault(name[:HASH_SIGNS], inbox / where / name)
     return [found[sha256[:HASH_SIGNS]] for sha256 in sha256s if sha256[:HASH_SIGNS] in found]
+
+
+if __name__ == "__main__":
+    _calibration = Path(sys.argv[2]) if sys.argv[2] else None
+    _options = OpenOptions(_calibration, msgspec.json.decode(sys.argv[3], type=Topics))
+    print(to_json(read(Path(sys.argv[1]), _options)).decode())

@@ -82,13 +82,8 @@ class PostgresDatabase(Database):
             parts, port = urlsplit(""), 0
         if not parts.scheme or not parts.hostname:
             raise UsageError("the database's URL is invalid; write it like postgresql://user@host/name")
-        who = (
-            ""
-            if parts.username is None
-            else f"{parts.username}@"
-            if parts.password is None
-            else f"{parts.username}:***@"
-        )
+        hidden = "" if parts.password is None else ":***"
+        who = "" if parts.username is None else f"{parts.username}{hidden}@"
         self._name = f"{parts.scheme}://{who}{parts.netloc.rpartition('@')[2]}{parts.path}"
         if parts.scheme != "postgresql":
             raise UsageError(

@@ -5,7 +5,7 @@ Euler angles are safe here: a ground robot never pitches anywhere near 90 degree
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,55 +19,23 @@ DEGREE = 5
 def _segment_matrix() -> Array:
     """(6, 6) M: on one knot interval the spline is [1 u .. u^5] M c of its six control points, 0 <= u < 1.
 
-    Built from the recursion of the cardinal B-spline (de Boor, A Practical Guide to Splines, chapter 10), piece by
-    piece.
+    Built from the recursion of the cardinal B-spline (de Boor, A Practical Guide to Splines, chapter 10): a row is a
+    piece of it, with the coefficients of its powers.
     """
-    pieces = [np.array([1.0])]
+    pieces = np.ones((1, 1))
     for degree in range(1, DEGREE + 1):
-        nothing = np.zeros(degree)
-        raised = []
-        for number in range(degree + 1):
-            rising = pieces[number] if number < degree else nothing
-            falling = pieces[number - 1] if number > 0 else nothing
-            shifted = np.zeros(degree + 1)
-            shifted[:-1] += number * rising + (degree + 1 - number) * falling
-            shifted[1:] += rising - falling
-            raised.append(shifted / degree)
-        pieces = raised
-    return np.stack(pieces[::-1], axis=1)
+        number = np.arange(degree + 1)[:, None]
+        rising, falling = np.pad(pieces, ((0, 1), (0, 0))), np.pad(pieces, ((1, 0), (0, 0)))
+        pieces = np.pad(number * rising + (degree + 1 - number) * falling, ((0, 0), (0, 1)))
+        pieces[:, 1:] += rising - falling
+        pieces /= degree
+    return np.ascontiguousarray(pieces[::-1].T)
 
 
 _MATRIX = _segment_matrix()
-
-
-class UniformSpline(NamedTuple):
-    """Approximating spline: control point k (D,) belongs to start_s + k knot_s.
-
-    No overshoot, four continuous derivatives.
-    """
-
-    start_s: float
-    knot_s: float
-    control: Array
-
-    def at(self, times_s: Array, derivative: int = 0) -> Array:
-        """(N, D) values, or the given derivative per s^derivative, at times (N,), clamped to where all six control points exist."""
-        reach_s = (DEGREE - 1) / 2 * self.knot_s
-        last_s = self.start_s + (len(self.control) - 1) * self.knot_s - reach_s
-        position = (np.clip(times_s, self.start_s + reach_s, last_s) - self.start_s) / self.knot_s + (DEGREE + 1) / 2
-        segment = np.clip(np.floor(position).astype(np.int64), DEGREE, len(self.control) - 1)
-        u = position - segment
-        powers = np.zeros((len(u), DEGREE + 1))
-        for exponent in range(derivative, DEGREE + 1):
-            factor = np.prod(np.arange(exponent - derivative + 1, exponent + 1)) if derivative else 1.0
-            powers[:, exponent] = factor * u ** (exponent - derivative)
-        weights = powers @ _MATRIX / self.knot_s**derivative
-        window = self.control[segment[:, None] - DEGREE + np.arange(DEGREE + 1)]
-        return np.asarray(np.einsum("nk,nkd->nd", weights, window))
-
-
 GRAVITY_MPS2 = 9.80665
-KNOT_S = 0.1
+_KNOT_S = 0.1
+_START_S = -6 * _KNOT_S  # of the first control point
 _SQUAT_RAD_PER_MPS2, _LEAN_S = 0.006, 0.004
 
 
@@ -102,10 +70,10 @@ class RouteMotion:
     def __init__(self, route: Route, limits: Limits, height_m: float, shake: Shake, rng: np.random.Generator) -> None:
         path = time_path(route, limits)
         self.duration_s = float(path.times_s[-1])  # from the first to the last moment of rest
-        self._spline = UniformSpline(-6 * KNOT_S, KNOT_S, _control_points(path, height_m, shake, rng))
+        self._control = _control_points(path, height_m, shake, rng)
 
     def map_from_body(self, times_s: Array) -> Array:
-        values = self._spline.at(times_s)
+        values = self._at(times_s)
         stacked = np.zeros((len(values), 4, 4))
         stacked[:, :3, :3] = rotation_from_yaw_pitch_roll(values[:, 3:])
         stacked[:, :3, 3] = values[:, :3]
@@ -114,7 +82,7 @@ class RouteMotion:
 
     def rates(self, times_s: Array) -> tuple[Array, Array]:
         """Angular rate and specific force, (N, 3) each, body axes, in closed form. Source: ZYX Euler kinematics."""
-        values, first, second = (self._spline.at(times_s, order) for order in range(3))
+        values, first, second = (self._at(times_s, order) for order in range(3))
         pitch, roll = values[:, 4], values[:, 5]
         d_yaw, d_pitch, d_roll = first[:, 3], first[:, 4], first[:, 5]
         gyro = np.stack(
@@ -130,8 +98,24 @@ class RouteMotion:
         return gyro, np.einsum("nji,nj->ni", rotation, force_map)
 
     def velocity_body(self, times_s: Array) -> Array:
-        rotation = rotation_from_yaw_pitch_roll(self._spline.at(times_s)[:, 3:])
-        return np.asarray(np.einsum("nji,nj->ni", rotation, self._spline.at(times_s, 1)[:, :3]))
+        rotation = rotation_from_yaw_pitch_roll(self._at(times_s)[:, 3:])
+        return np.asarray(np.einsum("nji,nj->ni", rotation, self._at(times_s, 1)[:, :3]))
+
+    def _at(self, times_s: Array, derivative: int = 0) -> Array:
+        """(N, 6) values of the approximating spline, or the given derivative per s^derivative, at times (N,), clamped to where all six
+        control points exist. No overshoot, four continuous derivatives."""
+        control, reach_s = self._control, (DEGREE - 1) / 2 * _KNOT_S
+        last_s = _START_S + (len(control) - 1) * _KNOT_S - reach_s
+        position = (np.clip(times_s, _START_S + reach_s, last_s) - _START_S) / _KNOT_S + (DEGREE + 1) / 2
+        segment = np.clip(np.floor(position).astype(np.int64), DEGREE, len(control) - 1)
+        u = position - segment
+        powers = np.zeros((len(u), DEGREE + 1))
+        for exponent in range(derivative, DEGREE + 1):
+            factor = np.prod(np.arange(exponent - derivative + 1, exponent + 1)) if derivative else 1.0
+            powers[:, exponent] = factor * u ** (exponent - derivative)
+        weights = powers @ _MATRIX / _KNOT_S**derivative
+        window = control[segment[:, None] - DEGREE + np.arange(DEGREE + 1)]
+        return np.asarray(np.einsum("nk,nkd->nd", weights, window))
 
 
 LIFT_M, LIFT_S = 0.5, 1.0
@@ -193,18 +177,18 @@ class CarriedMotion:
 
 
 def _control_points(path: TimedPath, height_m: float, shake: Shake, rng: np.random.Generator) -> Array:
-    """(K, 6) each KNOT_S from 6 knots before the start: the path, ground ripple with speed, squat, lean."""
-    moments = np.arange(-6, int(np.ceil(path.times_s[-1] / KNOT_S)) + 7) * KNOT_S
+    """(K, 6) each _KNOT_S from 6 knots before the start: the path, ground ripple with speed, squat, lean."""
+    moments = np.arange(-6, int(np.ceil(path.times_s[-1] / _KNOT_S)) + 7) * _KNOT_S
     control = np.zeros((len(moments), 6))
     for column, source in ((0, path.points_map[:, 0]), (1, path.points_map[:, 1]), (3, path.yaw_rad)):
         control[:, column] = np.interp(moments, path.times_s, source)
-    velocity = np.gradient(control[:, :2], KNOT_S, axis=0)
+    velocity = np.gradient(control[:, :2], _KNOT_S, axis=0)
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
     ripple = rng.standard_normal((len(moments), 3)) * np.clip(speed / 1.5, 0.0, 1.0)[:, None]
-    accel = np.convolve(np.pad(np.gradient(speed, KNOT_S), 2, "edge"), np.ones(5) / 5, "valid")
+    accel = np.convolve(np.pad(np.gradient(speed, _KNOT_S), 2, "edge"), np.ones(5) / 5, "valid")
     control[:, 2] = height_m + shake.heave_m * ripple[:, 0]
     control[:, 4] = -_SQUAT_RAD_PER_MPS2 * accel + shake.tilt_rad * ripple[:, 1]
-    control[:, 5] = _LEAN_S * speed * np.gradient(control[:, 3], KNOT_S) + shake.tilt_rad * ripple[:, 2]
+    control[:, 5] = _LEAN_S * speed * np.gradient(control[:, 3], _KNOT_S) + shake.tilt_rad * ripple[:, 2]
     return control
 
 

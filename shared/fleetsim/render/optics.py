@@ -36,8 +36,6 @@ class Optics:
     vignetting (H, W): cos^3 of the angle to the axis (a fast lens loses less than cos^4); of half the angle for a fisheye with more planes.
     """
 
-    height_px: int
-    width_px: int
     planes: tuple[Plane, ...]
     vignetting: NDArray[np.float32]
 
@@ -51,9 +49,11 @@ def make_optics(camera: CameraCalibration) -> Optics:
         pinhole = np.array([fx, fy, cx, cy, width, height])
         squared = ((u - cx) / fx) ** 2 + ((v - cy) / fy) ** 2
         plane = Plane(np.eye(3), pinhole, np.zeros((0, 0, 4), np.float32))
-        return Optics(height, width, (plane,), _vignetting(squared))
+        return Optics((plane,), _vignetting(squared))
     step = _DIFFERENCE_PX
-    around = [_rays(camera, u + du, v + dv) for du, dv in ((0, 0), (step, 0), (-step, 0), (0, step), (0, -step))]
+    shifts = (0, 0), (step, 0), (-step, 0), (0, step), (0, -step)
+    pixels = (np.stack([u + du, v + dv], axis=-1).reshape(-1, 2) for du, dv in shifts)
+    around = [camera.ray_from_pixel(shifted).reshape(height, width, 3) for shifted in pixels]
     front, unseen = _tangents(around, np.eye(3))
     if unseen.all():
         raise CalibrationError(
@@ -62,7 +62,7 @@ def make_optics(camera: CameraCalibration) -> Optics:
     if not (unseen & np.isfinite(around).all((0, 3))).any():
         front[unseen] = 1e6
         vignetting = _vignetting(front[..., 0] ** 2 + front[..., 1] ** 2)
-        return Optics(height, width, (_plane(camera, np.eye(3), front, unseen),), vignetting)
+        return Optics((_plane(camera, np.eye(3), front, unseen),), vignetting)
     nearest = np.argmax(np.stack([around[0] @ turn[:, 2] for turn in _TURNS]), axis=0)
     planes = []
     for number, turn in enumerate(_TURNS):
@@ -71,11 +71,7 @@ def make_optics(camera: CameraCalibration) -> Optics:
         if not unseen.all():
             planes.append(_plane(camera, turn, tangents, unseen))
     half = np.nan_to_num(2.0 / (1.0 + around[0][..., 2]), nan=1e6)
-    return Optics(height, width, tuple(planes), _vignetting(half - 1.0))
-
-
-def _rays(camera: CameraCalibration, u: Array, v: Array) -> Array:
-    return camera.ray_from_pixel(np.stack([u.ravel(), v.ravel()], axis=1)).reshape(*u.shape, 3)
+    return Optics(tuple(planes), _vignetting(half - 1.0))
 
 
 def _tangents(around: list[Array], cam_from_plane: Array) -> tuple[Array, NDArray[np.bool_]]:

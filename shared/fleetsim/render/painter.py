@@ -1,7 +1,6 @@
 """One camera's painter: from a scene and the camera's way through the exposure to a picture and its exact depth."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -16,56 +15,43 @@ from fleetsim.scene.movers import AnyMover, add_movers, mover_light
 from fleetsim.scene.world import Scene, World
 
 Path = Callable[[float], Array]  # t_s -> map_from_cam
+# One of an exposure: samples per pixel side, their shift in pixels, weight in the picture.
+_Instant = tuple[int, tuple[float, float], float]
+_Canvas = tuple[Array, NDArray[np.float32]]  # a picture in the making (H, W): radiance, depth
 _ELECTRONS_PER_GREY, _READ_ELECTRONS, _AFTER_GAIN_GREY = 39.0, 5.0, 0.5
 _BLUR_STEP_PX, _MOST_SUBFRAMES, _NEAR_THINGS_M = 1.2, 8, 1.5
 _R2_SEQUENCE = np.array([0.7548776662, 0.5698402910])
 _NOISE_TABLE = 1 << 18
+_SHARP_SAMPLES = 2  # per pixel side, for the edges of sharp pictures
+_MOST_TAPS = 4
+_REFLECTANCE = 0.06  # of the ground seen from above
 
 
-@dataclass(frozen=True, slots=True)
-class Look:
-    """Quality of the pictures.
-
-    samples: per pixel side, for sharp pictures' edges. reflectance: of the ground seen from above.
-    """
-
-    samples: int = 2
-    most_taps: int = 4
-    reflectance: float = 0.06
-    has_noise: bool = True
-    has_blur: bool = True
-
-
-@dataclass(frozen=True, slots=True)
-class Shot:
+class Shot(NamedTuple):
     """A picture with its truth at mid exposure.
 
-    depth_m (H, W): along the optical axis, 0 for nothing; faces (H, W): -1 for nothing. Of a fisheye on several planes, of that in front.
+    depth_m (H, W): along the optical axis, 0 for nothing. Of a fisheye on several planes, of that in front.
     """
 
     image: Image
     depth_m: NDArray[np.float32]
-    faces: NDArray[np.int32]
-    subframes: int
-
-
-class _Instant(NamedTuple):
-    """One instant of an exposure: samples per pixel side, shift of the samples in pixels, weight in the picture."""
-
-    samples: int
-    shift_px: tuple[float, float]
-    weight: float
-    wants_truth: bool
 
 
 class Painter:
     """Holds one camera's buffers; not for several threads."""
 
     def __init__(
-        self, world: World, optics: Optics, look: Look, number: int, movers: tuple[AnyMover, ...] = ()
+        self,
+        world: World,
+        optics: Optics,
+        number: int,
+        movers: tuple[AnyMover, ...] = (),
+        *,
+        has_blur: bool = True,
+        has_noise: bool = True,
     ) -> None:
-        self._world, self._optics, self._look, self._number = world, optics, look, number
-        self._movers = movers
+        self._world, self._optics, self._number, self._movers = world, optics, number, movers
+        self._has_blur, self._has_noise = has_blur, has_noise
         self._scene: Scene | None = None
         self._groups = np.zeros(3)
         self._scenes = [core.ScenePainter(plane.pinhole, plane.rays) for plane in optics.planes]
@@ -74,27 +60,26 @@ class Painter:
     def shoot(self, scene: Scene, groups: Array, path: Path, t_s: float, exposure: Exposure, noise_key: int) -> Shot:
         """The picture whose exposure is centred at t; `groups` are the strengths of the lamp groups."""
         self._prepare(scene, groups, t_s)
-        height, width = self._optics.height_px, self._optics.width_px
-        shape = (height, width)
-        canvas = _Canvas(np.zeros(shape), np.zeros(shape, np.float32), np.full(shape, -1, np.int32))
-        count = self.subframes(path, t_s, exposure) if self._look.has_blur else 1
-        samples = self._look.samples if count == 1 else 1
+        shape = self._optics.vignetting.shape
+        radiance, depth_m = np.zeros(shape), np.zeros(shape, np.float32)
+        count = self._subframes(path, t_s, exposure) if self._has_blur else 1
+        samples = _SHARP_SAMPLES if count == 1 else 1
         for number in range(count):
             moment = t_s + ((number + 0.5) / count - 0.5) * exposure.time_s
             # Sub-pixel shifts of a low-discrepancy sequence smooth the edges of blurred pictures at no cost.
             shift = (0.5 + _R2_SEQUENCE * (number + 0.5)) % 1.0 - 0.5 if count > 1 else np.zeros(2)
-            instant = _Instant(samples, (float(shift[0]), float(shift[1])), 1.0 / count, number == count // 2)
-            self._add(canvas, instant, path(moment), moment)
+            instant = samples, (float(shift[0]), float(shift[1])), 1.0 / count
+            self._add((radiance, depth_m), instant, path(moment), moment, wants_truth=number == count // 2)
         shot, read = 0.0, 0.0
-        if self._look.has_noise:
+        if self._has_noise:
             shot = exposure.gain / _ELECTRONS_PER_GREY
             read = float(np.hypot(_AFTER_GAIN_GREY, exposure.gain * _READ_ELECTRONS / _ELECTRONS_PER_GREY))
         noise = (shot, read, self._normals, noise_key * 2 + self._number)
         grey_per_radiance = GREY_PER_MS * 1e3 * exposure.time_s * exposure.gain
-        image = core.develop(canvas.radiance, grey_per_radiance, *noise, self._optics.vignetting)
-        return Shot(image, canvas.depth_m, canvas.faces, count)
+        image = core.develop(radiance, grey_per_radiance, *noise, self._optics.vignetting)
+        return Shot(image, depth_m)
 
-    def subframes(self, path: Path, t_s: float, exposure: Exposure) -> int:
+    def _subframes(self, path: Path, t_s: float, exposure: Exposure) -> int:
         """Number of pictures to average so that a thing 1.5 m away moves at most 1.2 px from one to the next."""
         before, after = path(t_s - exposure.time_s / 2), path(t_s + exposure.time_s / 2)
         turned = float(np.linalg.norm(before[:3, :3].T @ after[:3, :3] - np.eye(3))) / np.sqrt(2.0)
@@ -114,7 +99,7 @@ class Painter:
             self._quads = np.concatenate([scene.quads, moving.quads])
             self._values = np.concatenate([scene.values, moving.values])
             self._numbers = np.concatenate([scene.numbers, numbers])
-            last = len(scene)
+            last = len(scene.quads)
             self._ranges = np.concatenate([scene.ranges, np.array([[last, last + len(moving)]], np.int32)])
             self._bounds = np.concatenate([scene.bounds_m, np.array([[-1e5, -1e5, -1e5, 1e5, 1e5, 1e5]])])
             mixed = groups.astype(np.float32) @ scene.light + np.float32(self._world.lamps.ambient(groups))
@@ -125,7 +110,7 @@ class Painter:
             floor_light = [self._world.lamps.floor_light(groups, x, y) for x, y, _ in places]
             self._light[scene.light.shape[1] :] = mover_light(self._mover_faces, self._movers, floor_light, t_s)
 
-    def _add(self, canvas: "_Canvas", instant: _Instant, map_from_cam: Array, t_s: float) -> None:
+    def _add(self, canvas: _Canvas, instant: _Instant, map_from_cam: Array, t_s: float, *, wants_truth: bool) -> None:
         shadows = np.zeros((0, 3))  # of the movers, which stand at their places at time t now
         if self._movers:
             builder = self._world.builder()
@@ -135,18 +120,9 @@ class Painter:
         centre, world, atlas = np.ascontiguousarray(map_from_cam[:3, 3]), self._world, self._world.textures.atlas
         faces = (self._quads, self._values, self._numbers, self._light, self._groups)
         textures = (atlas.texels, atlas.table, world.decals, world.floor_numbers)
-        chunks = (self._ranges, self._bounds)
-        look = (self._look.most_taps, self._look.reflectance, shadows)
+        chunks, look = (self._ranges, self._bounds), (_MOST_TAPS, _REFLECTANCE, shadows)
         for number, (plane, painter) in enumerate(zip(self._optics.planes, self._scenes, strict=True)):
             plane_from_map = np.ascontiguousarray(plane.cam_from_plane.T @ cam_from_map)
             # The truth is that of the plane in front: depths of the others are along other axes
-            wanted = instant.wants_truth and number == 0
-            painter.add(faces, chunks, textures, plane_from_map, centre, *instant[:3], *look, wanted, *canvas)
-
-
-class _Canvas(NamedTuple):
-    """A picture in the making (H, W): radiance, depth along the optical axis, face of each pixel (-1 for nothing)."""
-
-    radiance: Array
-    depth_m: NDArray[np.float32]
-    faces: NDArray[np.int32]
+            wanted = wants_truth and number == 0
+            painter.add(faces, chunks, textures, plane_from_map, centre, *instant, *look, wanted, *canvas)

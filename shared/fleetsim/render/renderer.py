@@ -1,66 +1,51 @@
-"""The stereo pair's renderer: one thread per camera, exposure, image faults."""
+"""A rig's renderer: one thread per camera, exposure, image faults."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import Image
 from fleetsim.motion.body_motion import Motion
 from fleetsim.render.optics import make_optics
-from fleetsim.render.painter import Look, Painter, Shot
-from fleetsim.scene.light import LIGHT_STATES, AutoExposure, Exposure
+from fleetsim.render.painter import Painter, Shot
+from fleetsim.scene.light import LIGHT_STATES, Exposure, auto_exposure
 from fleetsim.scene.movers import AnyMover, Apparition
 from fleetsim.scene.stock import mix
 from fleetsim.scene.world import World
-from fleetsim.sensors.faults import OVER_EXPOSURE, FaultPlan
+from fleetsim.sensors.faults import OVER_EXPOSURE, Fault, FaultPlan
 
 _PERSON_AHEAD_M = 0.8
 
 
-@dataclass(frozen=True, slots=True)
-class StereoShot:
-    """A recorded pair, and the ground truth of the left image. others: images of the rig's other views, of a pair or a single camera;
-    other_depths_m: of their first ones, exact."""
-
-    left: Image
-    right: Image
-    depth_m: NDArray[np.float32]
-    faces: NDArray[np.int32]
-    exposure: Exposure
-    subframes: int
-    others: tuple[tuple[Image, ...], ...] = ()
-    other_depths_m: tuple[NDArray[np.float32], ...] = ()
-
-
-@dataclass(frozen=True, slots=True)
-class RenderOptions:
-    """Light and movers of the scene, quality and faults of the pictures; `key` chooses the noise."""
-
-    light: str = "day"
-    look: Look = field(default_factory=Look)
-    movers: tuple[AnyMover, ...] = ()
-    faults: FaultPlan = field(default_factory=FaultPlan)
-    key: int = 0
-
-
-class StereoRenderer:
+class RigRenderer:
     """Renders the images of a rig moving through a world. Its threads, one a camera, end with `close`."""
 
-    def __init__(self, world: World, rig: RigCalibration, motion: Motion, options: RenderOptions) -> None:
+    def __init__(
+        self,
+        world: World,
+        rig: RigCalibration,
+        motion: Motion,
+        *,
+        light: str = "day",
+        movers: tuple[AnyMover, ...] = (),
+        faults: tuple[Fault, ...] = (),
+        key: int = 0,
+        has_blur: bool = True,
+    ) -> None:
+        """light, movers: of the scene. faults, has_blur: of the pictures; `key` chooses their noise."""
         self._world, self._rig, self._motion = world, rig, motion
-        self._groups, self._key, self.faults = np.array(LIGHT_STATES[options.light]), options.key, options.faults
+        self._groups, self._key, self.movers = np.array(LIGHT_STATES[light]), key, movers
+        self.faults = FaultPlan(faults)
         self.imu_minus_cam_s = rig.cameras[0].imu_minus_cam_s
-        self._exposure = AutoExposure()
-        self.movers = options.movers
-        if any(fault.name == "person-in-front" for fault in self.faults.faults):
-            self.movers = (*self.movers, Apparition("person", self._person_in_front))
-        optics = [make_optics(camera) for camera in rig.cameras]
-        self._painters = [Painter(world, each, options.look, number, self.movers) for number, each in enumerate(optics)]
+        if any(fault.name == "person-in-front" for fault in faults):
+            self.movers = (*movers, Apparition("person", self._person_in_front))
+        self._painters = [
+            Painter(world, make_optics(camera), number, self.movers, has_blur=has_blur)
+            for number, camera in enumerate(rig.cameras)
+        ]
         self._workers = ThreadPoolExecutor(len(self._painters))
         self._last_right: Image | None = None
 
@@ -78,13 +63,13 @@ class StereoRenderer:
         moments = np.maximum(t_s - 0.25 * np.arange(5), 0.0)
         map_from_cam = self._motion.map_from_body(moments) @ self._rig.cameras[0].body_from_cam
         places, forward = map_from_cam[:, :3, 3], map_from_cam[:, :3, 2]
-        chosen = self._exposure.choose(self._world.lamps, self._groups, places, forward)
+        chosen = auto_exposure(self._world.lamps, self._groups, places, forward)
         if self.faults.has("over-exposure", t_s):
             return Exposure(chosen.time_s, chosen.gain * OVER_EXPOSURE)
         return chosen
 
-    def shoot(self, t_s: float) -> StereoShot:
-        """The pair whose exposure is centred at t."""
+    def shoot(self, t_s: float) -> list[Shot]:
+        """Every camera's picture, whose exposure is centred at t."""
         place = self._motion.map_from_body(np.array([t_s]))[0][:3, 3]
         scene = self._world.scene_around(float(place[0]), float(place[1]))
         exposure = self.exposure(t_s)
@@ -95,15 +80,11 @@ class StereoRenderer:
         def shoot_one(camera: int) -> Shot:
             return self._painters[camera].shoot(scene, groups, self.path(camera), t_s, exposure, noise_key)
 
-        left, right, *beside = self._workers.map(shoot_one, range(len(self._painters)))
-        right_image = right.image
+        shots = list(self._workers.map(shoot_one, range(len(self._painters))))
         if self.faults.has("camera-frozen", t_s) and self._last_right is not None:
-            right_image = self._last_right
-        self._last_right = right_image
-        views = [[beside[number - 2] for number in numbers] for numbers in self._rig.views[1:]]
-        others = tuple(tuple(shot.image for shot in shots) for shots in views)
-        depths_m = tuple(first.depth_m for first, *_ in views)
-        return StereoShot(left.image, right_image, left.depth_m, left.faces, exposure, left.subframes, others, depths_m)
+            shots[1] = shots[1]._replace(image=self._last_right)
+        self._last_right = shots[1].image
+        return shots
 
     def _person_in_front(self, t_s: float) -> tuple[float, float, float] | None:
         if not self.faults.has("person-in-front", t_s):

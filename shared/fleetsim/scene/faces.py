@@ -113,51 +113,42 @@ class FaceBuilder:
     def finish(self) -> Faces:
         """All faces: those of the boxes by side, then the single ones."""
         boxes = np.array(self._boxes, np.float64).reshape(-1, 21)
-        numbers = boxes[:, 10:].astype(np.int64)
-        box_of, side_of = np.nonzero((numbers[:, 6:7] >> np.arange(6)) & 1)
-        from_boxes = _quads_of_boxes(boxes, box_of, side_of)
-        singles, single_values, single_numbers = np.split(
-            np.array(self._quads, np.float64).reshape(-1, 17), [9, 13], axis=1
-        )
-        single_numbers = single_numbers.astype(np.int64)
-        quads = np.concatenate([from_boxes, singles])
-        texture = np.concatenate([numbers[box_of, side_of], single_numbers[:, 0]])
-        material = np.concatenate([numbers[box_of, 7], single_numbers[:, 1]])
-        group = np.concatenate([numbers[box_of, 8], single_numbers[:, 2]])
-        scramble = np.concatenate([numbers[box_of, 9] * 6 + side_of, single_numbers[:, 3]])
+        box_of, side_of = np.nonzero((boxes[:, 16:17].astype(np.int64) >> np.arange(6)) & 1)
+        box, no_offset = boxes[box_of], np.full((len(box_of), 2), -1.0)
+        numbers = box[np.arange(len(box)), 10 + side_of], box[:, 17:19], box[:, 19] * 6 + side_of
+        sides = np.column_stack([_quads_of_boxes(box, side_of), box[:, 8:10], no_offset, *numbers])
+        rows = np.concatenate([sides, np.array(self._quads, np.float64).reshape(-1, 17)])
+        quads, (tint, emission), fixed = np.ascontiguousarray(rows[:, :9]), rows[:, 9:11].T, rows[:, 11:13]
+        texture, material, group, scramble = rows[:, 13:].T.astype(np.int64)
         # Whole texels in 0..1023, well mixed. Source: the finaliser of splitmix64.
         mixed = scramble.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
         mixed = (mixed ^ (mixed >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
         mixed = (mixed ^ (mixed >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
         mixed ^= mixed >> np.uint64(31)
         offsets = np.stack([mixed & np.uint64(1023), (mixed >> np.uint64(20)) & np.uint64(1023)], axis=1)
-        fixed = np.concatenate([np.full((len(box_of), 2), -1.0), single_values[:, 2:]])
         offsets = np.where(fixed >= 0, fixed, offsets.astype(np.float64))
-        tint = np.concatenate([boxes[box_of, 8], single_values[:, 0]])
-        emission = np.concatenate([boxes[box_of, 9], single_values[:, 1]])
         lengths = np.stack([np.linalg.norm(quads[:, 3:6], axis=1), np.linalg.norm(quads[:, 6:9], axis=1)], axis=1)
         scale = lengths / TEXEL_M
         fills = np.isin(texture, np.array(sorted(self.stretched), np.int64))
         scale[fills] = 2.0 ** self.texture_sizes[texture[fills]]
         samples = np.clip(np.ceil(lengths / LIGHT_GRID_M), 1, 90).astype(np.int64) + 1
         first = np.concatenate([[0], np.cumsum(samples.prod(axis=1))])
-        solid = numbers[box_of, 10] > 0
-        solid_rank = np.cumsum(numbers[:, 10]) - 1
+        is_solid = boxes[:, 20] > 0
         owners = np.full((len(quads), 2), -1, np.int32)
-        owners[: len(box_of), 0] = np.where(solid, solid_rank[box_of], -1)
-        owners[: len(box_of), 1] = side_of
+        owners[: len(box), 0] = np.where(is_solid, np.cumsum(is_solid) - 1, -1)[box_of]
+        owners[: len(box), 1] = side_of
         return Faces(
             quads=quads,
             values=np.column_stack([scale, tint, offsets, emission]),
             numbers=np.column_stack([material, texture, group, first[:-1], samples]).astype(np.int32),
             owners=owners,
-            boxes=np.ascontiguousarray(boxes[numbers[:, 10] > 0, :8]),
+            boxes=np.ascontiguousarray(boxes[is_solid, :8]),
             light_samples=int(first[-1]),
         )
 
 
-def _quads_of_boxes(boxes: Array, box_of: NDArray[np.int64], side_of: NDArray[np.int64]) -> Array:
-    half, cosine, sine = boxes[box_of, 3:6], boxes[box_of, 6], boxes[box_of, 7]
+def _quads_of_boxes(box: Array, side_of: NDArray[np.int64]) -> Array:
+    half, cosine, sine = box[:, 3:6], box[:, 6], box[:, 7]
     local = _FACTORS[side_of] * half[:, None, :]
     turned = np.stack(
         [
@@ -167,5 +158,5 @@ def _quads_of_boxes(boxes: Array, box_of: NDArray[np.int64], side_of: NDArray[np
         ],
         axis=-1,
     )
-    turned[:, 0] += boxes[box_of, :3]
+    turned[:, 0] += box[:, :3]
     return turned.reshape(-1, 9)

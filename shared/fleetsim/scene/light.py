@@ -13,6 +13,7 @@ LAMP_REACH_M = 14.0
 GREY_PER_MS = 70.0  # grey levels per unit radiance and millisecond of exposure at gain 1
 _AMBIENT_SHARE = 0.9  # of the unshadowed mean light on the ground
 _MEAN_REFLECTANCE = 0.32
+_TARGET_GREY, _EXPOSURES_S, _MOST_GAIN = 95.0, (0.0004, 0.010), 12.0  # of the automatic exposure
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,22 +62,13 @@ def _floor_integral(height_m: float) -> float:
     return float((_received(squared[inside], np.full(int(inside.sum()), height_m)) * ring).sum())
 
 
-@dataclass(frozen=True, slots=True)
-class AutoExposure:
-    """Exposure from the light on the ground ahead over the last second.
+def auto_exposure(lamps: LampField, groups: Array, places_map: Array, forward_map: Array) -> Exposure:
+    """Exposure from the light on the ground ahead, for recent camera places (N, 3) that looked along forward_map (N, 3).
 
     Stateless, so pictures can be made in any order.
     """
-
-    target_grey: float = 95.0
-    longest_s: float = 0.010
-    shortest_s: float = 0.0004
-    most_gain: float = 12.0
-
-    def choose(self, lamps: LampField, groups: Array, places_map: Array, forward_map: Array) -> Exposure:
-        """Exposure for recent camera places (N, 3) that looked along forward_map (N, 3)."""
-        ahead = np.concatenate([places_map + reach * forward_map for reach in (1.0, 3.0, 6.0)])
-        seen = np.mean([lamps.floor_light(groups, float(x), float(y)) for x, y, _ in ahead])
-        wanted_s = self.target_grey / (GREY_PER_MS * 1e3 * max(_MEAN_REFLECTANCE * float(seen), 1e-4))
-        time_s = float(np.clip(wanted_s, self.shortest_s, self.longest_s))
-        return Exposure(time_s, float(np.clip(wanted_s / time_s, 1.0, self.most_gain)))
+    ahead = np.concatenate([places_map + reach * forward_map for reach in (1.0, 3.0, 6.0)])
+    seen = np.mean([lamps.floor_light(groups, float(x), float(y)) for x, y, _ in ahead])
+    wanted_s = _TARGET_GREY / (GREY_PER_MS * 1e3 * max(_MEAN_REFLECTANCE * float(seen), 1e-4))
+    time_s = float(np.clip(wanted_s, *_EXPOSURES_S))
+    return Exposure(time_s, float(np.clip(wanted_s / time_s, 1.0, _MOST_GAIN)))

@@ -1,7 +1,7 @@
 """People, forklifts and robots that move through the hall, as groups of boxes."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -75,18 +75,15 @@ class Mover:
     stations_map: tuple[tuple[float, float], ...]
     speed_mps: float
     start_m: float = 0.0
-    _path: Array = field(init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "_path", np.array([*self.stations_map, self.stations_map[0]]))
 
     def place(self, t_s: float) -> tuple[float, float, float]:
         """x, y, yaw in map at t."""
-        legs = np.diff(self._path, axis=0)
+        path = np.array([*self.stations_map, self.stations_map[0]])
+        legs = np.diff(path, axis=0)
         lengths = np.hypot(legs[:, 0], legs[:, 1])
         along = (self.start_m + self.speed_mps * t_s) % max(float(lengths.sum()), 1e-9)
         leg = min(int(np.searchsorted(np.cumsum(lengths), along, side="right")), len(legs) - 1)
-        x, y = self._path[leg] + ((along - float(lengths[:leg].sum())) / max(float(lengths[leg]), 1e-9)) * legs[leg]
+        x, y = path[leg] + ((along - float(lengths[:leg].sum())) / max(float(lengths[leg]), 1e-9)) * legs[leg]
         return float(x), float(y), float(np.arctan2(legs[leg, 1], legs[leg, 0]))
 
 

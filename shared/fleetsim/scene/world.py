@@ -29,13 +29,8 @@ _MOST_BAKED_CHUNKS, _MOST_BUILT_CHUNKS, _MOST_SCENES = 128, 256, 3
 _DECAL_CELLS = 64
 
 
-@dataclass(frozen=True, slots=True)
-class LitFaces:
-    """Faces with their baked light: light (groups, samples), before lamps are weighted."""
-
-    faces: Faces
-    light: NDArray[np.float32]
-    bounds_m: Array
+LitFaces = tuple[Faces, NDArray[np.float32]]
+"""Faces with their baked light (groups, samples), before lamps are weighted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,10 +46,6 @@ class Scene:
     light: NDArray[np.float32]
     ranges: NDArray[np.int32]
     bounds_m: Array
-    parts: tuple[Faces, ...]
-
-    def __len__(self) -> int:
-        return len(self.quads)
 
 
 class World:
@@ -156,22 +147,21 @@ class World:
         list(self._workers.map(bake, starts, ends) if self._workers else map(bake, starts, ends))
         if is_plain:
             light *= _PLAIN_LIGHT
-        return LitFaces(faces, light, faces.bounds_m())
+        return faces, light
 
     def _assemble(self, centre: tuple[int, int]) -> Scene:
         near = set(self._neighbours(centre, NEAR_COLUMNS, NEAR_ROWS))
-        parts = [self._lit(key) if key in near else self._plain(key) for key in self._keys]
-        counts = np.array([len(part.faces) for part in parts])
-        samples = np.array([part.faces.light_samples for part in parts])
+        parts, lights = zip(*(self._lit(key) if key in near else self._plain(key) for key in self._keys), strict=True)
+        counts = np.array([len(part) for part in parts])
+        samples = np.array([part.light_samples for part in parts])
         ends, first_sample = np.cumsum(counts), np.concatenate([[0], np.cumsum(samples)[:-1]])
-        numbers = np.concatenate([part.faces.numbers for part in parts])
+        numbers = np.concatenate([part.numbers for part in parts])
         numbers[:, 3] += np.repeat(first_sample, counts).astype(np.int32)
         return Scene(
-            quads=np.concatenate([part.faces.quads for part in parts]),
-            values=np.concatenate([part.faces.values for part in parts]),
+            quads=np.concatenate([part.quads for part in parts]),
+            values=np.concatenate([part.values for part in parts]),
             numbers=numbers,
-            light=np.concatenate([part.light for part in parts], axis=1),
+            light=np.concatenate(lights, axis=1),
             ranges=np.stack([ends - counts, ends], axis=1).astype(np.int32),
-            bounds_m=np.stack([part.bounds_m for part in parts]),
-            parts=tuple(part.faces for part in parts),
+            bounds_m=np.stack([part.bounds_m() for part in parts]),
         )

@@ -73,9 +73,5 @@ class Textures:
         self.atlas = atlas
 
 
-@lru_cache(maxsize=4)
-def paint_textures(
-    seed: int, aisles: int, *, are_aisles_identical: bool = False, markers: tuple[int, ...] = ()
-) -> Textures:
-    """Every texture of a site with `aisles` aisles, painted once for all days and robots of the site; read-only."""
-    return Textures(seed, aisles, are_aisles_identical=are_aisles_identical, markers=markers)
+paint_textures = lru_cache(maxsize=4)(Textures)
+"""Every texture of a site with `aisles` aisles, painted once for all days and robots of the site; read-only."""

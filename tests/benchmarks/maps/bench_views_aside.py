@@ -30,8 +30,7 @@ from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from fleetsim.motion.routes import check_clear
 from fleetsim.recorder import Order, prepare
-from fleetsim.render.painter import Look
-from fleetsim.render.renderer import RenderOptions, StereoRenderer
+from fleetsim.render.renderer import RigRenderer
 from mapserver.quality.probes import Probe, probe_features, relocalized
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
@@ -79,11 +78,11 @@ def rendered(scenario: str, seed: int | None, survey: SurveyMap) -> Iterator[tup
             numbers.append(k)
             places.append(place)
     motion, rectifier = Standing(np.stack(places), _DWELL_S), Rectifier(session.nominal)
-    renderer = StereoRenderer(session.world, session.true, motion, RenderOptions(look=Look(has_blur=False), key=1))
+    renderer = RigRenderer(session.world, session.true, motion, key=1, has_blur=False)
     try:
         for number, (k, place) in enumerate(zip(numbers, places, strict=True)):
-            shot = renderer.shoot(_DWELL_S * (number + 0.5))
-            frame = rectifier.rectify(CameraFrame(number, shot.left, shot.right))
+            left, right = renderer.shoot(_DWELL_S * (number + 0.5))
+            frame = rectifier.rectify(CameraFrame(number, left.image, right.image))
             features = probe_features(frame, rectifier.camera, OrbSettings())
             yield k, Probe(rectifier.camera, features, place @ rectifier.body_from_cam)
     finally:

@@ -7,7 +7,7 @@ import numpy as np
 from fleetmap.geometry import Array
 from fleetsim.motion.body_motion import GRAVITY_MPS2
 from fleetsim.recorder import Session
-from fleetsim.render.renderer import RenderOptions, StereoRenderer
+from fleetsim.render.renderer import RigRenderer
 from fleetsim.scenarios import SCENARIOS
 from fleetsim.sensors.measurements import measure_imu, measure_wheels, sample_times
 
@@ -49,7 +49,7 @@ def standing(drive: Session, time_s: float, number: int, duration_s: float, rate
     return replace(
         drive,
         motion=motion,
-        renderer=StereoRenderer(drive.world, drive.true, motion, RenderOptions(order.light, key=number)),
+        renderer=RigRenderer(drive.world, drive.true, motion, light=order.light, key=number),
         frame_times_s=tuple(float(t) for t in sample_times(duration_s, rate_hz)),
         imu=measure_imu(motion, kind.imu, rng),
         wheel=measure_wheels(motion, kind.body_height_m, kind.wheels, rng),

@@ -33,8 +33,8 @@ def views_from_truth(session: Session, before: Tiles) -> SessionViews:
     """What the cameras see from where they really are; before: the grid until then."""
     rectifier, seen = Rectifier(session.nominal), []
     for t in session.frame_times_s[::_EVERY]:
-        shot = session.renderer.shoot(t)
-        frame = rectifier.rectify(CameraFrame(int(t * 1e9), shot.left, shot.right))
+        left, right = session.renderer.shoot(t)
+        frame = rectifier.rectify(CameraFrame(int(t * 1e9), left.image, right.image))
         place = session.motion.map_from_body(np.array([t]))[0] @ rectifier.body_from_cam
         seen.append((dense_disparity(frame, rectifier.camera, StereoSettings()), place))
     few = seen[:: max(1, len(seen) // 15)]

@@ -43,8 +43,8 @@ def features() -> list[NDArray[np.uint8]]:
         session = prepare(order)
         rectifier, times = Rectifier(session.nominal), session.frame_times_s
         for number in np.unique(np.linspace(0, len(times) - 1, PICTURES).round().astype(int)):
-            shot = session.renderer.shoot(times[number])
-            frame = rectifier.rectify(CameraFrame(0, shot.left, shot.right))
+            left, right = session.renderer.shoot(times[number])
+            frame = rectifier.rectify(CameraFrame(0, left.image, right.image))
             found.append(detect(frame.left, OrbSettings()).descriptors)
         session.renderer.close()
         print(f"{order.scenario} seed {order.seed}: {len(found)} pictures so far", flush=True)

@@ -133,12 +133,12 @@ def test_json_lines_hold_every_failure_in_order(folder: tuple[Path, Known], tmp_
 def test_mcap_holds_the_channels_of_viewers(folder: tuple[Path, Known], tmp_path: Path) -> None:
     pytest.importorskip("mapserver.plugins.viewer_files")
     from fleetmap.plugins.viewer_channels.channels import CHANNELS
-    from mapserver.plugins.viewer_files.failures import write_mcap
+    from mapserver.plugins.viewer_files import write_failures
 
     path = tmp_path / "out.mcap"
     with MapStore.open(folder[0]) as store:
         found = list(failures_oldest_first(store, FailureFilter(site="hall")))
-        assert write_mcap(store, FailureFilter(site="hall"), path) == len(found)
+        assert write_failures(store, FailureFilter(site="hall"), path) == len(found)
         landmarks = store.manifest("hall", 1).landmarks
     seen: dict[str, list[Any]] = {}
     with path.open("rb") as file:

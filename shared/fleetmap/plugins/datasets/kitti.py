@@ -77,8 +77,8 @@ def _raw_camera(file: Path, number: str, size_px: tuple[int, int]) -> CameraCali
     rows = dict(line.split(":", 1) for line in _calibration_lines(file) if ":" in line)
 
     def numbers(name: str, count: int) -> Array:
-        values = _floats(rows.get(f"{name}_{number}", ""))
-        if values is None or len(values) != count or not np.isfinite(values).all():
+        values = _numbers(rows.get(f"{name}_{number}", ""))
+        if len(values) != count or not np.isfinite(values).all():
             raise CalibrationError(f"{file}: {name}_{number} are not {count} numbers; copy the file again")
         return values
 
@@ -97,11 +97,8 @@ def _calibration_lines(file: Path) -> list[str]:
     return layout.read_table(file).splitlines()
 
 
-def _floats(words: str) -> Array | None:
-    try:
-        return np.array([float(word) for word in words.split()])
-    except ValueError:
-        return None
+def _numbers(words: str) -> Array:
+    return np.array([layout.number_or_nan(word) for word in words.split()])
 
 
 def open_kitti(path: Path, options: OpenOptions) -> Recording:
@@ -154,8 +151,8 @@ def _calibration(file: Path, size_px: tuple[int, int], numbers: tuple[int, int])
     rows: dict[int, Array] = {}
     for line in _calibration_lines(file):
         label, colon, words = line.partition(":") if ":" in line else ("", "", line)
-        values = _floats(words)
-        if values is None:
+        values = _numbers(words)
+        if np.isnan(values).any():
             raise CalibrationError(f"{file}: {line[:60]!r} are not twelve numbers")
         if len(values) == 12 and (not colon or re.fullmatch(r"P\d{1,3}", label)):
             rows[int(label[1:]) if colon else len(rows)] = values.reshape(3, 4)

@@ -217,7 +217,7 @@ def _whole_ns(word: str, where: str) -> int:
     """RecordingError for a number with a decimal point or exponent, naming its likely unit; ValueError for other text."""
     if word.isdecimal():
         return int(word)
-    value = _float(word)
+    value = number_or_nan(word)
     if word.lstrip("+-").isdecimal() or not np.isfinite(value):
         raise ValueError(f"stamp {word[:40]!r}")
     names = {1e17: "nanoseconds that a program rounded", 1e14: "microseconds", 1e11: "milliseconds", 0.0: "seconds"}
@@ -225,7 +225,7 @@ def _whole_ns(word: str, where: str) -> int:
     raise wrong_unit(f"{where}:", unit, f"{word[:40]} is not a whole number", "write all digits of the nanoseconds")
 
 
-def _float(word: str) -> float:
+def number_or_nan(word: str) -> float:
     """The number in a word; NaN if it is none."""
     try:
         return float(word)
@@ -322,7 +322,7 @@ def read_numbers(path: Path, widths: Sequence[int], log: ReadLog | None = None) 
     expected = " or ".join(str(width) for width in widths)
     bad = list[str]()
     for where, line in lines_of(read_table(path), path):
-        row = [_float(word) for word in line.partition("#")[0].replace(",", " ").split()]
+        row = [number_or_nan(word) for word in line.partition("#")[0].replace(",", " ").split()]
         if len(row) not in widths or not np.isfinite(row).all():
             bad.append(f"{where}: {line[:60]!r} are not {expected} finite numbers; copy the recording again")
             row = []

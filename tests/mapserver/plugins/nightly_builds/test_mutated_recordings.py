@@ -19,7 +19,7 @@ from rosbags.rosbag2 import CompressionMode
 from fleetmap.errors import FleetmapError
 from fleetmap.recordings import OpenOptions
 from mapserver.fleet.replay_judge import judged
-from mapserver.plugins.nightly_builds.reading import read
+from mapserver.plugins.nightly_builds.recordings import read
 from support.fleet.failed_robot import small_file
 from support.recordings.bag_samples import write_rosbag1, write_rosbag2
 from support.recordings.mcap_samples import foreign_messages

@@ -35,10 +35,9 @@ from mapserver.drafting.draft import BuildOptions, BuildRequest, Draft
 from mapserver.drafting.survey_recordings import OpenRecordings, RecordingOptions, admit_recordings, survey_all
 from mapserver.nightly import inbox as boxes
 from mapserver.nightly.inbox import arrivals
-from mapserver.plugins.nightly_builds import night, reading, recordings
+from mapserver.plugins.nightly_builds import night, recordings
 from mapserver.plugins.nightly_builds.night import NightReport, NightRequest, last_report, run_night
-from mapserver.plugins.nightly_builds.reading import read
-from mapserver.plugins.nightly_builds.recordings import InboxRecording, identify
+from mapserver.plugins.nightly_builds.recordings import InboxRecording, identify, read
 from mapserver.quality.gate import GateSettings
 from mapserver.store import DraftContent, FleetRetention, MapStore
 from mapserver.survey.settings import SurveySettings
@@ -376,7 +375,7 @@ def test_nothing_waits_without_a_word(hall: Path, monkeypatch: pytest.MonkeyPatc
             (path / "mav0/late").write_bytes(b"late")
         return read(path, *more)
 
-    monkeypatch.setattr(reading, "open_recording", while_it_is_copied)
+    monkeypatch.setattr(recordings, "open_recording", while_it_is_copied)
     monkeypatch.setattr(night, "_MOST_A_NIGHT", 4)
     replace = os.replace
 
@@ -444,7 +443,7 @@ def test_what_ended_two_nights_is_set_aside_by_the_third_and_nothing_beside_it(
             killed(path)
         return built(request, settings, unusable)
 
-    monkeypatch.setattr(*((reading, "open_recording", reads) if where == "read" else (night, "build_draft", builds)))
+    monkeypatch.setattr(*((recordings, "open_recording", reads) if where == "read" else (night, "build_draft", builds)))
     for _ in range({"broken": 0, "joined": 3}.get(where, 2)):
         assert in_child(lambda: spend(hall), Disk("/nowhere"), hall / "told")[0] == -signal.SIGKILL
         assert (hall / "inbox/fatal").is_dir()
