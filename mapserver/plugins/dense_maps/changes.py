@@ -192,9 +192,7 @@ def _joined(points_map: Array) -> list[NDArray[np.int64]]:
     """Return rows of points connected by steps of up to a voxel's diagonal."""
     if not len(points_map):
         return []
-    pairs = scipy.spatial.cKDTree(points_map).query_pairs(1.8 * _VOXEL_M, output_type="ndarray")
-    links = scipy.sparse.coo_array(
-        (np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), (len(points_map), len(points_map))
-    )
+    tree = scipy.spatial.cKDTree(points_map)
+    links = tree.sparse_distance_matrix(tree, 1.8 * _VOXEL_M, output_type="coo_matrix")
     count, labels = scipy.sparse.csgraph.connected_components(links, directed=False)
     return np.split(np.argsort(labels, kind="stable"), np.cumsum(np.bincount(labels, minlength=count))[:-1])

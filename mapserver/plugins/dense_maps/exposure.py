@@ -31,10 +31,6 @@ class Exposure:
     logs: Array
     falloff: Array
 
-    def factor(self, view: int, squared: Array) -> Array:
-        """Return (N,) factors of a view's pixels relative to the mean view's axis."""
-        return np.asarray(np.exp(self.logs[view]) * lens_factor(squared, self.falloff))
-
 
 def squared_tangent(pixels: NDArray[np.float32], camera: StereoCamera) -> Array:
     """Return (N,) squared tangents of the angle to the axis, of pixels (N, 2)."""

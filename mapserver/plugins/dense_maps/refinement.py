@@ -42,11 +42,10 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class Likeness:
-    """Means over held-out images, on initially covered pixels; known: their share."""
+    """Means over held-out images, on initially covered pixels."""
 
     psnr_db: float
     ssim: float
-    known: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,7 +159,7 @@ def _likeness(splats: Splats, parameters: Array, looks: Sequence[Look], known: S
         shown = look.gain * draw(splats, parameters, look.camera, look.map_from_cam).picture
         grey = np.clip(np.round(255 * shown), 0, 255).astype(np.uint8)
         psnr_db = 10 * np.log10(255.0**2 / ((grey.astype(np.float64) - look.picture) ** 2)[where].mean())
-        rows.append((psnr_db, _ssim(grey, look.picture, where), where.mean()))
+        rows.append((psnr_db, _ssim(grey, look.picture, where)))
     return Likeness(*np.mean(rows, axis=0).tolist())
 
 
