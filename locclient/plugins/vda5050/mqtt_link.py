@@ -55,7 +55,15 @@ class MqttLink:
         self._client = self._new_client()
 
     def start(self) -> None:
-        self._connect()
+        from paho.mqtt.packettypes import PacketTypes
+        from paho.mqtt.properties import Properties
+
+        more: dict[str, Any] = {}
+        if self._dialect.major != "v2":
+            limits = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
+            limits.MaximumPacketSize = _MAX_PACKET_BYTES  # the broker keeps larger ones back
+            more = {"clean_start": True, "properties": limits}
+        self._client.connect_async(self._broker.host, self._broker.port, _KEEPALIVE_S, **more)
         self._client.loop_start()
         self._thread.start()
 
@@ -113,19 +121,8 @@ class MqttLink:
         client.on_message = self._on_message
         return client
 
-    def _connect(self) -> None:
-        from paho.mqtt.packettypes import PacketTypes
-        from paho.mqtt.properties import Properties
-
-        more: dict[str, Any] = {}
-        if self._dialect.major != "v2":
-            limits = Properties(PacketTypes.CONNECT)  # type: ignore[no-untyped-call]
-            limits.MaximumPacketSize = _MAX_PACKET_BYTES  # the broker keeps larger ones back
-            more = {"clean_start": True, "properties": limits}
-        self._set_will()
-        self._client.connect_async(self._broker.host, self._broker.port, _KEEPALIVE_S, **more)
-
     def _set_will(self) -> None:
+        """As each connection begins, the first one too."""
         will = self._encoded("connection", {"connectionState": "CONNECTION_BROKEN"}, self._sent["connection"] + 1)
         self._client.will_set(f"{self._prefix}/connection", will, qos=1, retain=True)
 

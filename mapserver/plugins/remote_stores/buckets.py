@@ -7,27 +7,10 @@ from urllib.parse import urlsplit
 
 import obstore
 from obstore.exceptions import BaseError
-from obstore.store import ObjectStore, from_url
+from obstore.store import from_url
 
 from fleetmap.errors import StoreError, UsageError
 from mapserver.store.blobs import Listed, Objects
-
-
-def open_objects(url: str) -> ObjectStore:
-    """Return the object store under a URL; nothing is sent yet.
-
-    Raises StoreError for one that cannot be opened, UsageError for one with a user, password or query: messages show URLs.
-    """
-    with object_errors("the object store's URL is invalid"):
-        parts = urlsplit(url)
-    has_user = parts.username is not None and not parts.scheme.startswith("abfs")  # which names the container so
-    if has_user or parts.password is not None or parts.query or parts.fragment:
-        raise UsageError(
-            f"{parts.scheme}://{parts.hostname}: write the URL like s3://bucket/prefix; the credentials belong into AWS_ACCESS_KEY_ID and "
-            "AWS_SECRET_ACCESS_KEY (or those of its kind), the server's address into AWS_ENDPOINT_URL"
-        )
-    with object_errors(url):
-        return from_url(url, client_options={"allow_http": True})
 
 
 @contextmanager
@@ -41,13 +24,23 @@ def object_errors(where: str) -> Iterator[None]:
 
 
 class BucketObjects(Objects):
-    """Objects under a URL. Each appears once it is complete."""
+    """Objects under a URL. Each appears once it is complete; opening sends nothing."""
 
     is_folder = False
 
     def __init__(self, url: str) -> None:
+        """StoreError for a URL that cannot be opened, UsageError for a user, password or query in it: messages show URLs."""
         self.place = url.rstrip("/")
-        self._store = open_objects(self.place)
+        with object_errors("the object store's URL is invalid"):
+            parts = urlsplit(self.place)
+        has_user = parts.username is not None and not parts.scheme.startswith("abfs")  # which names the container so
+        if has_user or parts.password is not None or parts.query or parts.fragment:
+            raise UsageError(
+                f"{parts.scheme}://{parts.hostname}: write the URL like s3://bucket/prefix; the credentials belong into AWS_ACCESS_KEY_ID "
+                "and AWS_SECRET_ACCESS_KEY (or those of its kind), the server's address into AWS_ENDPOINT_URL"
+            )
+        with object_errors(self.place):
+            self._store = from_url(self.place, client_options={"allow_http": True})
 
     def put(self, path: str, chunks: Iterable[bytes], *, is_new: bool = False) -> None:
         with object_errors(self.place):

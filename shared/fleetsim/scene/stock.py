@@ -36,11 +36,8 @@ def mix(*values: int) -> int:
 
 def last_restock_day(layout: Layout, seed: int, day: int, slot: Slot) -> int:
     """The last day up to `day` on which the slot was restocked; 0 if it was not."""
-    number = slot.number(layout)
-    for candidate in range(day, 0, -1):
-        if mix(seed, _TAG_RESTOCK, number, candidate) < layout.restock_per_day * 2.0**64:
-            return candidate
-    return 0
+    number, least = slot.number(layout), layout.restock_per_day * 2.0**64
+    return next((past for past in range(day, 0, -1) if mix(seed, _TAG_RESTOCK, number, past) < least), 0)
 
 
 def slot_generator(layout: Layout, seed: int, day: int, slot: Slot) -> np.random.Generator:
