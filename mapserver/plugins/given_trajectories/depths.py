@@ -8,14 +8,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.errors import RecordingError, UsageError
+from fleetmap.errors import RecordingError
 from fleetmap.geometry import AnyArray, Array
-from fleetmap.recordings import Recording
 from fleetmap.recordings.recording import WrappedFrames
 from fleetmap.sensors.calibration import CameraCalibration
-from fleetmap.sensors.samples import CameraFrame, DataIssue, ImuSamples, SensorSet
-from mapserver.plugins.given_trajectories.formats import array_in, read_poses
-from mapserver.plugins.given_trajectories.given import NEAR_NS, OtherTrajectory, check_span, stamps_on_clock
+from fleetmap.sensors.samples import CameraFrame
+from mapserver.plugins.given_trajectories.formats import array_in
 
 _MOST_SIDE = 8192
 _EDGE_RATIO = 1.25  # between neighbouring depths: depths between them belong to neither surface
@@ -23,7 +21,7 @@ _ASPECT_WITHIN = 0.1  # cropping to multiples of 8 px and rounding of sizes stay
 _NETWORK_STEP = 8  # px between the network's cells, in whose unit DROID writes intrinsics
 
 
-def _check(file: Path, count: int, camera: CameraCalibration) -> None:
+def check_depths(file: Path, count: int, camera: CameraCalibration) -> None:
     """Raise RecordingError unless the file holds one image of inverse depths per pose, each of the camera's shape."""
     inverse = array_in(file)
     if (
@@ -119,50 +117,3 @@ class DepthFrames(WrappedFrames):
             found = pinhole[:2] * rays[:, :2] / rays[:, 2:] + pinhole[2:]
         seen = (rays[:, 2] > 0) & np.isfinite(found).all(axis=1)
         return np.where(seen[:, None], found, -9.0).T.reshape(2, *size).astype(np.float32)
-
-
-class GivenTrajectory(OtherTrajectory):
-    """The file as `StartPoses` of a build, with the depths beside it."""
-
-    def seen(self, recording: Recording, indices: NDArray[np.int64]) -> tuple[Recording, NDArray[np.int64]]:
-        """Return a single camera's recording with depth from `disps.npy` beside DROID's poses, and the selected frames that have a depth.
-
-        Unchanged if there is no such file or the recording needs none. UsageError without a scale, which one camera cannot
-        observe. RecordingError for a file that does not match these poses and this camera.
-        """
-        if recording.sensor_set not in (SensorSet.MONO, SensorSet.MONO_INERTIAL):
-            return recording, indices
-        file = (self.file if self.file.is_dir() else self.file.parent) / "disps.npy"
-        if not (self.file.is_dir() or self.file.suffix == ".npy") or not file.exists():
-            return recording, indices
-        if self.scale is None:
-            raise UsageError(
-                f"{file} holds depths of one camera, which cannot show their unit; set its metres with --trajectory-scale"
-            )
-        written, camera = read_poses(self.file), recording.calibration.cameras[0]
-        _check(file, len(written.map_from_it), camera)
-        # The frame at each stamp, -1 if absent
-        stamps, frame_stamps_ns = stamps_on_clock(written, recording, indices, self), recording.frame_stamps_ns
-        after = np.minimum(np.searchsorted(frame_stamps_ns, stamps), len(frame_stamps_ns) - 1)
-        before = np.maximum(after - 1, 0)
-        off_ns = np.abs(frame_stamps_ns[[before, after]] - stamps)
-        frame_of_row = np.where(off_ns.min(axis=0) > NEAR_NS, -1, np.where(off_ns[0] < off_ns[1], before, after))
-        if (frame_of_row >= 0).mean() <= 0.5:
-            raise RecordingError(
-                f"{self.file} belongs to another recording: most of its stamps match no frame; pass the recording's own"
-            )
-        row_of_frame = np.full(len(recording), -1)
-        row_of_frame[frame_of_row[frame_of_row >= 0]] = np.flatnonzero(frame_of_row >= 0)
-        has_depth = row_of_frame[indices] >= 0
-        check_span(recording.frame_stamps_ns[indices], has_depth, recording, self)
-        words = f"{int((~has_depth).sum())} of {len(indices)} frames have none in {file.name} and are left out"
-        unused = "; the IMU is not used" if len(recording.imu) else ""
-        seen = replace(
-            recording,
-            sensor_set=SensorSet.RGBD,
-            calibration=replace(recording.calibration, cameras=(camera,), imu=None),
-            imu=ImuSamples.empty(),
-            frames=DepthFrames(recording.frames, file, row_of_frame, camera, self.scale),
-            issues=(*recording.issues, DataIssue("depth of another system", words + unused)),
-        )
-        return seen, indices[has_depth]

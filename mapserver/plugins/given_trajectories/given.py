@@ -4,7 +4,7 @@ Correct poses move as the recording does. Poses of another convention rotate abo
 direction, or are unrelated; their errors are then as large as the motion itself. Ground truth is not used.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 
@@ -25,8 +25,9 @@ from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.recordings import Recording
 from fleetmap.recordings.tum import format_stamp
 from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sensors.samples import SensorSet, Stamps, Trajectory
+from fleetmap.sensors.samples import DataIssue, ImuSamples, SensorSet, Stamps, Trajectory
 from mapserver.drafting.survey_recordings import GivenPoses
+from mapserver.plugins.given_trajectories.depths import DepthFrames, check_depths
 from mapserver.plugins.given_trajectories.formats import WrittenPoses, read_poses
 from mapserver.survey.odometry_pass import OdometryRun, SampleFeed
 from mapserver.survey.settings import SurveySettings
@@ -48,8 +49,8 @@ _MARGIN_NS = 1_000_000_000
 
 
 @dataclass(frozen=True)
-class OtherTrajectory:
-    """A file of another system's poses: TUM or KITTI text, DROID-SLAM's `poses.npy` or its folder.
+class GivenTrajectory:
+    """A file of another system's poses as `StartPoses` of a build: TUM or KITTI text, DROID-SLAM's `poses.npy` or its folder.
 
     frame: camera (the left one) or body. scale: metres in its unit of length, None if the recording shows it.
     """
@@ -66,6 +67,49 @@ class OtherTrajectory:
             raise UsageError(
                 f"--trajectory-scale {self.scale}: invalid; give the metres in the file's unit of length, above 0"
             )
+
+    def seen(self, recording: Recording, indices: NDArray[np.int64]) -> tuple[Recording, NDArray[np.int64]]:
+        """Return a single camera's recording with depth from `disps.npy` beside DROID's poses, and the selected frames that have a depth.
+
+        Unchanged if there is no such file or the recording needs none. UsageError without a scale, which one camera cannot
+        observe. RecordingError for a file that does not match these poses and this camera.
+        """
+        if recording.sensor_set not in (SensorSet.MONO, SensorSet.MONO_INERTIAL):
+            return recording, indices
+        file = (self.file if self.file.is_dir() else self.file.parent) / "disps.npy"
+        if not (self.file.is_dir() or self.file.suffix == ".npy") or not file.exists():
+            return recording, indices
+        if self.scale is None:
+            raise UsageError(
+                f"{file} holds depths of one camera, which cannot show their unit; set its metres with --trajectory-scale"
+            )
+        written, camera = read_poses(self.file), recording.calibration.cameras[0]
+        check_depths(file, len(written.map_from_it), camera)
+        # The frame at each stamp, -1 if absent
+        stamps, frame_stamps_ns = stamps_on_clock(written, recording, indices, self), recording.frame_stamps_ns
+        after = np.minimum(np.searchsorted(frame_stamps_ns, stamps), len(frame_stamps_ns) - 1)
+        before = np.maximum(after - 1, 0)
+        off_ns = np.abs(frame_stamps_ns[[before, after]] - stamps)
+        frame_of_row = np.where(off_ns.min(axis=0) > NEAR_NS, -1, np.where(off_ns[0] < off_ns[1], before, after))
+        if (frame_of_row >= 0).mean() <= 0.5:
+            raise RecordingError(
+                f"{self.file} belongs to another recording: most of its stamps match no frame; pass the recording's own"
+            )
+        row_of_frame = np.full(len(recording), -1)
+        row_of_frame[frame_of_row[frame_of_row >= 0]] = np.flatnonzero(frame_of_row >= 0)
+        has_depth = row_of_frame[indices] >= 0
+        _check_span(recording.frame_stamps_ns[indices], has_depth, recording, self)
+        words = f"{int((~has_depth).sum())} of {len(indices)} frames have none in {file.name} and are left out"
+        unused = "; the IMU is not used" if len(recording.imu) else ""
+        seen = replace(
+            recording,
+            sensor_set=SensorSet.RGBD,
+            calibration=replace(recording.calibration, cameras=(camera,), imu=None),
+            imu=ImuSamples.empty(),
+            frames=DepthFrames(recording.frames, file, row_of_frame, camera, self.scale),
+            issues=(*recording.issues, DataIssue("depth of another system", words + unused)),
+        )
+        return seen, indices[has_depth]
 
     def poses_of(self, recording: Recording, indices: NDArray[np.int64]) -> GivenPoses:
         """Return the poses of the selected frames (F,).
@@ -86,7 +130,7 @@ class OtherTrajectory:
         known = np.array([pose is not None for pose in poses])
         if known.sum() <= LEAST_STRETCHES:
             raise _foreign_stamps(written, recording, self)
-        check_span(stamps_ns, known, recording, self)
+        _check_span(stamps_ns, known, recording, self)
         is_sparse = known.sum() < 2 or np.median(np.diff(stamps_ns[known])) > GAP_NS
         whole = is_sparse or len(stamps_ns) <= _WINDOWS * _WINDOW_FRAMES
         followed = _followed(recording, indices, whole=whole)
@@ -277,7 +321,7 @@ def _angles(rotations: Array) -> Array:
 
 
 def stamps_on_clock(
-    rows: WrittenPoses, recording: Recording, indices: NDArray[np.int64], other: OtherTrajectory
+    rows: WrittenPoses, recording: Recording, indices: NDArray[np.int64], other: GivenTrajectory
 ) -> Stamps:
     """Return (N,) nanoseconds on the recording's clock, of stamps in seconds of that clock or since the first frame, or frame numbers.
 
@@ -312,7 +356,7 @@ def stamps_on_clock(
     raise _foreign_stamps(rows, recording, other)
 
 
-def _foreign_stamps(rows: WrittenPoses, recording: Recording, other: OtherTrajectory) -> RecordingError:
+def _foreign_stamps(rows: WrittenPoses, recording: Recording, other: GivenTrajectory) -> RecordingError:
     stamps_ns, clock = rows.stamps_ns, recording.frame_stamps_ns
     written, frames = (
         "no stamps" if some is None else " to ".join(format_stamp(int(stamp)) for stamp in (some.min(), some.max()))
@@ -348,7 +392,7 @@ def _followed(recording: Recording, indices: NDArray[np.int64], *, whole: bool) 
 
 
 def _judged(
-    trajectory: Trajectory, name: str, shown: Reference, recording: Recording, other: OtherTrajectory
+    trajectory: Trajectory, name: str, shown: Reference, recording: Recording, other: GivenTrajectory
 ) -> tuple[Judgement, str]:
     """Return the poses in the named convention, and text on how well they fit.
 
@@ -382,7 +426,7 @@ def _judged(
     return found, f"{words}: off our own odometry by {found.figures} in the median of {count} stretches"
 
 
-def check_span(stamps_ns: Stamps, is_placed: NDArray[np.bool_], recording: Recording, other: OtherTrajectory) -> None:
+def _check_span(stamps_ns: Stamps, is_placed: NDArray[np.bool_], recording: Recording, other: GivenTrajectory) -> None:
     """Raise UsageError if the frames (F,) with poses span less than half of the time of all."""
     times = stamps_ns[is_placed]
     if len(times) < 2 or np.ptp(times) < _LEAST_SPAN * np.ptp(stamps_ns):
@@ -393,7 +437,7 @@ def check_span(stamps_ns: Stamps, is_placed: NDArray[np.bool_], recording: Recor
         )
 
 
-def _bridged(at_frames: Array, is_placed: NDArray[np.bool_], followed: OwnMotion, other: OtherTrajectory) -> Array:
+def _bridged(at_frames: Array, is_placed: NDArray[np.bool_], followed: OwnMotion, other: GivenTrajectory) -> Array:
     """Return the poses (F, 4, 4); missing ones follow odometry from the previous pose, adjusted to arrive at the next one."""
     out, own, seconds = at_frames.copy(), followed.frame_from_body, followed.stamps_ns * 1e-9
     numbers = np.flatnonzero(is_placed)

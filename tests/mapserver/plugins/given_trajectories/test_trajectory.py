@@ -20,9 +20,8 @@ from mapserver import BuildOptions, build_map
 from mapserver.drafting.survey_recordings import GivenPoses
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.plugins.given_trajectories import given as given_module
-from mapserver.plugins.given_trajectories.depths import GivenTrajectory
 from mapserver.plugins.given_trajectories.formats import WrittenPoses
-from mapserver.plugins.given_trajectories.given import OwnMotion, fitted_scale, stamps_on_clock
+from mapserver.plugins.given_trajectories.given import GivenTrajectory, OwnMotion, fitted_scale, stamps_on_clock
 from mapserver.survey.given_poses import poses_as_odometry
 from mapserver.survey.state import OdometryPass
 from support.recordings.recording_samples import BODY_FROM_CAM0, START_NS, Sample, write_mcap

@@ -14,7 +14,8 @@ from fleetmap.sensors.calibration import CameraCalibration
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from mapserver import BuildOptions, build_map
 from mapserver.drafting.survey_recordings import OpenRecordings, RecordingOptions
-from mapserver.plugins.given_trajectories.depths import DepthFrames, GivenTrajectory
+from mapserver.plugins.given_trajectories.depths import DepthFrames
+from mapserver.plugins.given_trajectories.given import GivenTrajectory
 from support.recordings.recording_samples import BODY_FROM_CAM0, HEIGHT, WIDTH, Sample, write_mcap
 from support.worlds.box_room import out_and_back, points_seen, ride_sample
 
