@@ -18,10 +18,11 @@ from mapserver.drafting.draft_evidence import Before
 from mapserver.drafting.survey_recordings import RecordingSurvey, map_trajectories
 from mapserver.floor_plan.areas import Area, Areas, CorrectionKind, read_areas
 from mapserver.floor_plan.survey_requests import COVERED_SHARE, near_drives
-from mapserver.survey.merge.changes import Mask, SurveyLimits, is_before
+from mapserver.survey.merge.changes import SurveyLimits, is_before
 from mapserver.survey.merge.merge import kept
 from mapserver.survey.merge.multi_session import MapMerger, MergedMap, Session
 from mapserver.survey.settings import SurveySettings
+from mapserver.survey.state import Mask
 from mapserver.survey.survey_map import SurveyMap
 
 CORRECTIONS_KEY = "corrections"

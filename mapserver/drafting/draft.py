@@ -59,8 +59,7 @@ from mapserver.store.archive import decode_archive, encode_archive
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.merge.multi_session import MergedMap
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
-from mapserver.survey.zones import Zones
+from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools, Zones
 from mapserver.tiles.tiling import TILE_SIZE_M
 from mapserver.trust.signing import check_base
 

@@ -49,8 +49,7 @@ from mapserver.survey.merge.multi_session import MergedMap, chained
 from mapserver.survey.odometry_pass import LEAD_NS, parts_between_lifts
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import Survey, begin_survey, finish_survey, survey
-from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools
-from mapserver.survey.zones import Zones, zones_of
+from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools, Zones, zones_of
 
 _log = logging.getLogger(__name__)
 

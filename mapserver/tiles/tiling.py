@@ -8,8 +8,7 @@ from numpy.typing import NDArray
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array
 from fleetmap.mapformat.tile import Tile
-from mapserver.survey.finish.landmark_visibility import viewing_cones
-from mapserver.survey.survey_map import SurveyMap, history_of
+from mapserver.survey.survey_map import SurveyMap, history_of, viewing_cones
 
 TILE_SIZE_M = 16.0
 MAX_PLACE_LANDMARKS = 300

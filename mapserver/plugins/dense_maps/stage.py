@@ -24,7 +24,7 @@ from mapserver.plugins.dense_maps.survey_grid import GridGrower, Grower, grow
 from mapserver.plugins.dense_maps.survey_pictures import kept_pictures
 from mapserver.plugins.dense_maps.survey_surfels import SurfelGrower
 from mapserver.store.survey_pictures import PICTURES_KEY, SurveyPicture
-from mapserver.survey.merge.changes import Mask
+from mapserver.survey.state import Mask
 
 _Place = tuple[int, int]
 _CENTRES_M = (np.stack(np.meshgrid(*[np.arange(TILE_CELLS)] * 2), axis=-1).reshape(-1, 2) + 0.5) * CELL_M  # row by row

@@ -5,11 +5,9 @@ import numpy as np
 from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat.tile import Tile
-from fleetmap.relocalization.landmark_visibility import VisibleLandmarks, visible_landmarks
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import StereoCamera
-from mapserver.survey.finish.landmark_visibility import viewing_cones
-from mapserver.survey.survey_map import SurveyMap, history_of
+from mapserver.survey.survey_map import SurveyMap, history_of, viewing_cones
 
 
 class BaseMap:
@@ -34,10 +32,6 @@ class BaseMap:
         self.references = np.full(len(self.points_map), -1)
         seen, first = np.unique(survey_map.obs_landmark, return_index=True)
         self.references[seen] = first
-
-    def visible(self, map_from_cam: Array, margin_px: float, max_view_angle_rad: float) -> VisibleLandmarks:
-        """Return the landmarks visible to a camera at this pose, in its image widened by margin_px."""
-        return visible_landmarks(self.cones, map_from_cam, self.camera, margin_px, max_view_angle_rad)
 
     def view(self, vocabulary: Vocabulary) -> MapView:
         """Return the whole map in the robots' form, but with all landmarks and keyframes at the archive's precision, not in tiles."""
@@ -72,8 +66,3 @@ def with_baseline(pixels: Array, sigmas_px: Array, ratio: float) -> tuple[Array,
     """Return the observations of a pair with a baseline larger by `ratio`: disparities are scaled."""
     disparity = (pixels[:, 0] - pixels[:, 2]) * ratio
     return np.column_stack([pixels[:, :2], pixels[:, 0] - disparity]), np.asarray(sigmas_px * [1.0, abs(ratio)])
-
-
-def as_recorded(base: BaseMap, pixels: Array, sigmas_px: Array) -> tuple[Array, Array]:
-    """Convert observations (M, 3), (M, 2) of BaseMap's camera to the camera that made the map."""
-    return with_baseline(pixels, sigmas_px, 1.0 / base.baseline_ratio)

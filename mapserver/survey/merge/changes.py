@@ -3,7 +3,6 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, Rings, inside_any, se3_inverse
 from fleetmap.relocalization.landmark_visibility import COLUMNS, ROWS, Rows, image_cells
@@ -16,13 +15,12 @@ from mapserver.survey.merge.merge import Change
 from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999
 from mapserver.survey.settings import SessionSettings, SurveySettings
 from mapserver.survey.stages import Survey
-from mapserver.survey.state import Landmarks, RigImages
+from mapserver.survey.state import Landmarks, Mask, RigImages
 
 _CELLS = COLUMNS * ROWS
 _MIN_IN_CELL = 3  # fewer confirmed landmarks do not prove a gap in the map
 _LACKING_SHARE = 0.6
 _CLOCKS_BEGIN_NS = 946_684_800_000_000_000  # the year 2000: earlier stamps count from a start, not from 1970
-Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from fleetmap.pnp.pnp import GATE_SQUARED
-from fleetmap.relocalization.landmark_visibility import Rows
+from fleetmap.relocalization.landmark_visibility import Rows, visible_landmarks
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.confirmation import EDGE_PX, WIDER_VIEW_RAD, due
 from mapserver.survey.merge.guided_matching import Sightings, keyframe_features
@@ -42,7 +42,7 @@ def count_landmarks(
     """Return counts over keyframes (K) at map_from_cam (K, 4, 4); those without a sighting do not count."""
     expected, seen = np.zeros((2, len(base.points_map)), np.int64)
     for k in np.flatnonzero(sightings.located).tolist():
-        visible = base.visible(map_from_cam[k], -EDGE_PX, WIDER_VIEW_RAD)
+        visible = visible_landmarks(base.cones, map_from_cam[k], base.camera, -EDGE_PX, WIDER_VIEW_RAD)
         is_due = np.zeros(len(expected), bool)
         is_due[visible.rows[due(visible, keyframe_features(keyframes[k]).pixels)]] = True
         own = sightings.rows[sightings.image == k]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from fleetmap.geometry import AnyArray, Array, se3_inverse
 from fleetmap.relocalization.landmark_visibility import Rows
 from mapserver.survey.finish.map_assembly import cut_patches, medoid_descriptors, point_sigmas_m
-from mapserver.survey.merge.base_map import BaseMap, as_recorded
+from mapserver.survey.merge.base_map import BaseMap, with_baseline
 from mapserver.survey.merge.landmark_persistence import LandmarkCounts, missed_since
 from mapserver.survey.state import Keyframe, Landmarks
 from mapserver.survey.survey_map import History, SurveyMap, history_of
@@ -53,7 +53,8 @@ def merged(
     new_used = np.flatnonzero(per_keyframe)
     new_number = np.full(len(keyframes), -1)
     new_number[new_used] = len(old.map_from_body) + np.arange(len(new_used))
-    pixels, sigmas = as_recorded(base, added.obs_pixels, added.obs_sigma_px)
+    # As the camera that made the map would see them.
+    pixels, sigmas = with_baseline(added.obs_pixels, added.obs_sigma_px, 1.0 / base.baseline_ratio)
     rows, is_new = change.added_rows, change.added_rows < 0
     ids = np.where(is_new, whole.next_landmark_id + np.cumsum(is_new) - 1, base.map.landmark_ids[rows])
     descriptors = medoid_descriptors(added, keyframes)

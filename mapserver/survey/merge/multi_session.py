@@ -139,7 +139,10 @@ class MapMerger:
             raise ValueError("no session to begin a map with")
         order = sorted(self._found)
         trajectories, estimated = tuple(map(self._trajectory, order)), tuple(self._found[n][1] for n in order)
-        joined_map = with_trajectories(self._current, trajectories, estimated) if order else self._current
+        joined_map = self._current
+        if order:
+            frames, are_estimated = chained(trajectories, trajectories), np.concatenate(estimated)
+            joined_map = replace(joined_map, trajectory=frames, trajectory_estimated=are_estimated)
         outcomes = tuple(self._outcomes[n] for n in sorted(self._outcomes))
         return MergedMap(joined_map, outcomes, trajectories, estimated)
 
@@ -183,15 +186,6 @@ def _begun(session: Session, settings: SurveySettings) -> tuple[SurveyMap, Measu
         survey_map = survey_map.transformed(session.map_from_survey)
         state = state.transformed(session.map_from_survey)
     return survey_map, begun(state, survey_map, session.survey.landmarks_in_map, settings)
-
-
-def with_trajectories(
-    survey_map: SurveyMap, trajectories: Sequence[Trajectory], estimated: Sequence[Mask]
-) -> SurveyMap:
-    """Return the map with the frames of all sessions, concatenated."""
-    return replace(
-        survey_map, trajectory=chained(trajectories, trajectories), trajectory_estimated=np.concatenate(estimated)
-    )
 
 
 def chained(trajectories: Sequence[Trajectory], clocks: Sequence[Trajectory]) -> Trajectory:

@@ -1,6 +1,5 @@
 """Odometry between neighbouring keyframes, as factors of an adjustment and as edges of a pose graph. Pure."""
 
-from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -46,7 +45,7 @@ def odometry_factors(odometry: OdometryPass, map_from_body: Array) -> list[Relat
     """
     return [
         _factor(k, se3_inverse(map_from_body[k]) @ map_from_body[k + 1], 25.0 * edge_covariance(odometry, a, b))
-        for k, a, b in _neighbours(odometry)
+        for k, (a, b) in enumerate(pairwise(odometry.keyframe_frames))
     ]
 
 
@@ -58,7 +57,7 @@ def blackout_factors(odometry: OdometryPass, state: SurveyState) -> list[Relativ
     seen = np.bincount(state.landmarks.obs_keyframe, minlength=len(state.stamps_ns))
     stamps_ns = (state.stamps_ns + int(state.motion.imu_minus_cam_s * 1e9)).tolist()
     factors = []
-    for k, a, b in _neighbours(odometry):
+    for k, (a, b) in enumerate(pairwise(odometry.keyframe_frames)):
         is_blind = odometry.has_wheels and min(seen[k], seen[k + 1]) < MIN_SEEN
         if is_blind or is_pause(state.motion.imu.stamps_ns, stamps_ns[k], stamps_ns[k + 1]):
             i_from_j = se3_inverse(odometry.odom_from_body[a]) @ odometry.odom_from_body[b]
@@ -68,18 +67,11 @@ def blackout_factors(odometry: OdometryPass, state: SurveyState) -> list[Relativ
 
 def chain_edges(odometry: OdometryPass, state: SurveyState) -> list[PoseEdge]:
     """Return edges between neighbours with their adjusted motion and the covariance of the odometry."""
-    least = floor_of(inertial=odometry.inertial)
-    edges = []
-    for k, a, b in _neighbours(odometry):
+    least, edges = floor_of(inertial=odometry.inertial), []
+    for k, (a, b) in enumerate(pairwise(odometry.keyframe_frames)):
         i_from_j = se3_inverse(state.map_from_body[k]) @ state.map_from_body[k + 1]
         edges.append(PoseEdge(k, k + 1, i_from_j, edge_covariance(odometry, a, b, least), is_loop=False))
     return edges
-
-
-def _neighbours(odometry: OdometryPass) -> Iterator[tuple[int, int, int]]:
-    """Yield number of each keyframe but the last, its frame and that of the next one."""
-    for k, (a, b) in enumerate(pairwise(odometry.keyframe_frames)):
-        yield k, a, b
 
 
 def _factor(k: int, i_from_j: Array, covariance: Array) -> RelativeTerm:

@@ -78,7 +78,8 @@ class PairFinder:
         for number, ((i, j, predicted), match) in enumerate(zip(predictions, found, strict=True)):
             if match is not None:
                 most_m = allowed_m(int(self._keyframe[i]), int(self._keyframe[j]))
-                if _agrees(match.j_from_i, predicted.j_from_i, most_m):
+                off = se3_inverse(predicted.j_from_i) @ match.j_from_i
+                if np.linalg.norm(off[:3, 3]) <= most_m and rotation_angle_rad(off[:3, :3]) < np.radians(10.0):
                     matches.append(match)
             progress(number)
         return matches
@@ -102,11 +103,6 @@ class NearPlaces:
         near = [own[tree.query_ball_point(place_m, max(reach_m, most_m))] for own, tree, most_m in self._trees]
         found = np.sort(np.concatenate(near))
         return found[: np.searchsorted(found, until)]
-
-
-def _agrees(measured: Array, predicted: Array, allowed_m: float) -> bool:
-    off = se3_inverse(predicted) @ measured
-    return bool(np.linalg.norm(off[:3, 3]) <= allowed_m and rotation_angle_rad(off[:3, :3]) < np.radians(10.0))
 
 
 def drift_allowance_m(covariances: NDArray[np.float64], positions_m: Array) -> Callable[[int, int], float]:

@@ -14,7 +14,6 @@ from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.settings import PairSettings
 from mapserver.survey.state import Keyframe
 
-Indices = NDArray[np.int64]
 _SCALES = 1.2 ** np.minimum(np.arange(128), 4).astype(np.float64)  # pixel scale of an octave
 _PROJECTED_SHARE = 0.4  # of the matches near their prediction: fewer, and the prediction was wrong
 

@@ -7,7 +7,7 @@ import pytest
 
 from fleetmap.geometry import Array, rotation_angle_rad, se3, se3_exp, se3_inverse, so3_exp
 from mapserver.survey.finish.frame_adjustment import frame_trajectory
-from mapserver.survey.zones import Zones
+from mapserver.survey.survey_inputs import Zones
 
 FRAME_NS = 50_000_000
 

@@ -23,8 +23,7 @@ from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.rig import rig_of
 from mapserver.survey.settings import LoopSettings, SurveySettings
 from mapserver.survey.state import Keyframe, RigImages
-from mapserver.survey.survey_inputs import SurveyConfig
-from mapserver.survey.zones import Zones
+from mapserver.survey.survey_inputs import SurveyConfig, Zones
 from support.recordings.recording_samples import calibration
 from support.worlds.box_room import out_and_back, stereo_pair
 from support.worlds.vocabulary_training import train_vocabulary

@@ -1,5 +1,6 @@
 """Parts of joining: stamps of several recordings on one clock, and keyframes that are enough for what they show."""
 
+from dataclasses import make_dataclass
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +11,7 @@ from fleetmap.geometry import se3, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples, Trajectory
 from mapserver.survey.merge import multi_session
-from mapserver.survey.merge.base_map import BaseMap, as_recorded
+from mapserver.survey.merge.base_map import BaseMap, with_baseline
 from mapserver.survey.merge.changes import fewer_keyframes, known_well
 from mapserver.survey.merge.membership import Membership, MembershipVerdict
 from mapserver.survey.merge.multi_session import MapMerger, Session, chained
@@ -65,7 +66,7 @@ def test_observations_of_another_baseline_come_back_as_they_were() -> None:
     k, n = base.map.obs_keyframe[row], base.map.obs_landmark[row]
     point_cam = se3_inverse(base.map_from_cam[k]) @ np.append(base.points_map[n], 1.0)
     assert np.abs(base.obs_pixels[row] - wide.pixel_from_point(point_cam[None, :3])[0]).max() < 6.0  # noise, times 2.5
-    pixels, sigmas = as_recorded(base, base.obs_pixels, base.obs_sigma_px)
+    pixels, sigmas = with_baseline(base.obs_pixels, base.obs_sigma_px, 1.0 / base.baseline_ratio)
     np.testing.assert_allclose(pixels, base.map.obs_pixels)
     np.testing.assert_allclose(sigmas, base.map.obs_sigma_px)
 
@@ -107,9 +108,12 @@ class Sites:
         return SimpleNamespace(map=grown, measured=None, counts=None, evidence=evidence)
 
 
+MadeUpMap: Any = make_dataclass("MadeUpMap", ["letters", "trajectory", "trajectory_estimated"])
+
+
 def made_up_map(letters: str) -> Any:
     drive = trajectory(10.0 * ord(letters[-1]), 4)
-    return SimpleNamespace(letters=letters, trajectory=drive, trajectory_estimated=np.ones(4, bool))
+    return MadeUpMap(letters, drive, np.ones(4, bool))
 
 
 @pytest.mark.parametrize(
@@ -127,7 +131,6 @@ def test_sessions_join_when_what_they_need_is_there(
     sites = Sites(needs)
     monkeypatch.setattr(multi_session, "extend", sites.extend)
     monkeypatch.setattr(multi_session, "_begun", lambda session, _: (session.survey.map, None))
-    monkeypatch.setattr(multi_session, "with_trajectories", lambda found, *_: found)
     joining = MapMerger(None, SurveySettings())
     for letter in sessions:
         survey: Any = SimpleNamespace(name=letter, map=made_up_map(letter))
