@@ -88,7 +88,7 @@ class Arguments:
             "whole": self.integer,
             "real": self.real,
             "some": lambda: bool(self.rng.random() < 0.5),
-            "several": lambda *parts: parts,
+            "several": lambda *parts: tuple(None if self.malice and self.is_odd() else part for part in parts),
             "rows": self.rows,
             "thrice": lambda one: [one] * 3,
             "given": lambda: {"fix": FixSettings(), "stereo": StereoSettings()}.get(self.name, SETTINGS),

@@ -84,7 +84,8 @@ struct type_caster<View<T, kShape...>> {
   NB_TYPE_CASTER(Held, Base::Name)
   bool from_python(handle source, uint32_t flags, cleanup_list* cleanup) noexcept {
     Base base;
-    if (!base.from_python(source, flags & ~uint32_t(cast_flags::convert), cleanup)) return false;
+    const uint32_t refused = cast_flags::convert | cast_flags::accepts_none;  // None is for std::optional, not for an array in it
+    if (!base.from_python(source, flags & ~refused, cleanup)) return false;
     static_cast<typename Base::Value&>(value) = std::move(base.value);
     return true;
   }
