@@ -96,9 +96,9 @@ class Mode(ABC):
         """Return the mode for the first frame, at stamp_ns."""
         return self
 
+    @abstractmethod
     def follow(self, rig: OdometryRig) -> None:
         """Follow another camera of the rig from the next frame on."""
-        raise NotImplementedError(f"{type(self).__name__} follows one camera")
 
     @abstractmethod
     def predict(self, stamp_ns: int) -> None:

@@ -15,7 +15,7 @@ from fleetmap.odometry.modes import InertialMode
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
-from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet, WheelSample
 from fleetsim.motion.routes import Route
 from fleetsim.recorder import Order, prepare
 from fleetsim.scenarios import SCENARIOS, Run, Scenario
@@ -159,6 +159,29 @@ def test_a_pair_that_takes_over_from_a_single_camera_measures_its_own_depth() ->
             localizer.handle_stereo(rectifier.rectify(frame))
     assert localizer.perception.view == 1
     assert all(call.args[2].information is not None for call in process.call_args_list[-3:])
+
+
+@pytest.mark.parametrize("sensors", [SensorSet.STEREO, SensorSet.STEREO_INERTIAL])
+def test_a_pair_takes_over_from_a_single_camera_before_the_scale_is_known(sensors: SensorSet) -> None:
+    """The front camera is covered while the robot rests; wheels give the lengths, or the IMU as soon as rest has shown gravity."""
+    pairs, places = rig_of_two(sensors), []
+    rectifier = Rectifier(replace(pairs, cameras=(pairs.cameras[0], *pairs.cameras[2:])))
+    localizer = Localizer(rectifier.rig, LocalizerSettings())
+    for stamp_ns in range(0, 2_000_000_000, FRAME_NS):
+        frame = replace(with_noise(seen_at(stamp_ns), np.random.default_rng(stamp_ns)), right=None)
+        if stamp_ns > 200_000_000:
+            frame = spoilt(frame, "covered", is_rear=False, last=frame)
+        rates, velocity_mps, _ = Ride().motion(stamp_ns * 1e-9)
+        localizer.handle_imu(imu_between(stamp_ns - FRAME_NS, stamp_ns + IMU_NS))
+        localizer.handle_wheel([WheelSample(frame.stamp_ns, velocity_mps, float(rates[2]), 0.05, 0.02)])
+        odometry = localizer.handle_stereo(rectifier.rectify(frame)).odometry
+        places.append((stamp_ns, odometry.odom_from_body))
+    assert localizer.perception.view == 1
+    assert odometry.scale_known
+    assert odometry.status is OdometryStatus.TRACKING
+    moved = se3_inverse(at(places, 1_000_000_000)) @ odometry.odom_from_body
+    truth = se3_inverse(Ride().map_from_body(1.0)) @ Ride().map_from_body(stamp_ns * 1e-9)
+    assert np.linalg.norm((moved - truth)[:3, 3]) < 0.05
 
 
 @pytest.mark.parametrize("front", ["covered pair", "single camera"])

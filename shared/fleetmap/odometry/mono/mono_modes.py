@@ -139,6 +139,11 @@ class MonocularMode(Mode):
         elif isinstance(mode, VisualMode):
             self.imu = None
 
+    def follow(self, rig: OdometryRig) -> None:
+        """See Mode; vision begins anew with the other camera, without scale even if that is a pair."""
+        self._rig, self.visual_odometry = rig, VisualOdometry(rig.camera, rig.settings.monocular)
+        self._unscaled.clear()
+
     def predict(self, stamp_ns: int) -> None:
         self.stamp_ns = stamp_ns
         self._stamps_ns.append(stamp_ns)
@@ -406,6 +411,11 @@ class MonocularOdometry(Odometry):
             estimate = replace(estimate, new_odom_from_old_odom=change if later is None else later @ change)
         self._last = estimate
         return estimate
+
+    def follow(self, number: int, before: RectifiedFrame | None) -> None:
+        """As Odometry's, also for vision while it waits to resume."""
+        super().follow(number, before)
+        self.vision.follow(self._rig)
 
     def handle_fix(
         self, at: OdometryEstimate, map_from_body: Array, cov_rot_trans: Array, *, is_confirmed: bool

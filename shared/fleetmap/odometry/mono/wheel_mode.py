@@ -57,6 +57,9 @@ class WheelMode(Mode):
         self.seen_way: SeenWay | None = None  # until this frame
         self._way_begins: tuple[int, Tracked, float] | None = None  # and the motion in the image that it needs, pixels
 
+    def follow(self, rig: OdometryRig) -> None:
+        self._rig = rig
+
     def predict(self, stamp_ns: int) -> None:
         """See Mode: a sample counts until its stamp, the newest one also after it."""
         at_ns = since_ns = self.stamp_ns or stamp_ns
