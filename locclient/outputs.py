@@ -7,8 +7,7 @@ import msgspec
 
 from fleetmap.config import Section
 from fleetmap.geometry import Array
-from fleetmap.occupancy_grid import OccupancyGrid
-from fleetmap.version_grid import FLOOR_M, TOP_M
+from fleetmap.version_grid import FLOOR_M, TOP_M, OccupancyGrid
 from locclient.localization.estimate import Estimate
 from locclient.robot.continuous_odom import PublishedPose
 

@@ -142,7 +142,7 @@ def _replay_failure(
     """Report if the present localizer would have failed too; the site is the failure's unless another is named."""
     from fleetmap.encoding import to_json
     from locclient.delivery.failure_file import read_failure_file
-    from locclient.maps.connection import connected
+    from locclient.maps.map_client import connected
     from locclient.replay.failure_replay import compare_failure, phases
 
     for given in (playback, replace(files, report=None)):
@@ -188,7 +188,7 @@ def _run(
     from fleetmap.sources.replay_source import ReplaySource
     from locclient.config import image_priors_of
     from locclient.localization.priors.given import parse_prior
-    from locclient.maps.connection import connected
+    from locclient.maps.map_client import connected
     from locclient.replay.replay import ReplayOptions, load_map, spread_starts, starts
     from locclient.replay.replay import replay as play
 

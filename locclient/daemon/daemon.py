@@ -32,7 +32,7 @@ from locclient.hooks import LinkedRobot
 from locclient.identity import GivenAddress, MapAddress, check_reach
 from locclient.localization.priors.given import parse_prior
 from locclient.maps.building_maps import BuildingMaps
-from locclient.maps.connection import cache_folder, map_client, open_bus, outbox_path, replay_outbox
+from locclient.maps.map_client import cache_folder, map_client, open_bus, outbox_path, replay_outbox
 from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader

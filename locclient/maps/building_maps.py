@@ -22,8 +22,7 @@ from fleetmap.mapformat.building import (
     read_lifts,
 )
 from fleetmap.messages import WantedVersion
-from fleetmap.occupancy_grid import UNKNOWN, OccupancyGrid
-from fleetmap.version_grid import grid_of, occupancy
+from fleetmap.version_grid import UNKNOWN, OccupancyGrid, grid_of, occupancy
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.map_source import MapSource
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
+from fleetmap.bow.vocabulary import shipped_vocabulary
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UsageError, disk_errors
 from fleetmap.mapformat.manifest import Manifest, TileEntry, decode_manifest
 from fleetmap.mapformat.names import blob_path, check_name, check_sha256, current_path, verified

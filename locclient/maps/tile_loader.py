@@ -7,8 +7,7 @@ from fleetmap.errors import FleetmapError
 from fleetmap.mapformat.manifest import Manifest
 from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import WantedVersion
-from fleetmap.occupancy_grid import OccupancyGrid
-from fleetmap.version_grid import grid_of, occupancy
+from fleetmap.version_grid import OccupancyGrid, grid_of, occupancy
 from locclient.maps.loaded_map import Cell, LoadedMap, PositionBound, TileSelectionSettings, select_tiles
 from locclient.maps.map_source import MapSource
 

@@ -25,8 +25,8 @@ from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.identity import GivenAddress, MapAddress
 from locclient.localization.estimate import Estimate
 from locclient.localization.settings import LocalizerSettings
-from locclient.maps.connection import connected
 from locclient.maps.loaded_map import LoadedMap
+from locclient.maps.map_client import connected
 from locclient.maps.map_source import FetchedTiles, MapSource
 from locclient.maps.tile_cache import DEFAULT_MAX_BYTES
 from locclient.replay.run_metrics import FrameRecord

@@ -177,7 +177,7 @@ def export(
     ] = None,
 ) -> None:
     """Write the areas with a mask for nav2's costmap filters, in the frame of the map."""
-    from fleetmap.occupancy_grid import write_grid
+    from fleetmap.version_grid import write_grid
     from mapserver.floor_plan.areas import MaskKind
     from mapserver.floor_plan.masks import mask_grid
 

@@ -13,8 +13,7 @@ import numpy as np
 from fleetmap.errors import FleetmapError, UsageError
 from fleetmap.mapformat.building import ALIGNMENT
 from fleetmap.mapformat.tile_codec import decode_tile
-from fleetmap.occupancy_grid import OccupancyGrid
-from fleetmap.version_grid import known_grid, occupancy
+from fleetmap.version_grid import OccupancyGrid, known_grid, occupancy
 from mapserver import releases
 from mapserver.dashboard.map_layers import Box, Layer, Picture, box_of
 from mapserver.dashboard.plan import Plan, inked, make_plan, png

@@ -4,7 +4,7 @@ import time
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from fleetmap.bow.shipped_vocabulary import shipped_vocabulary
+from fleetmap.bow.vocabulary import shipped_vocabulary
 from fleetmap.errors import FleetmapError
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.data import EVER, MapData

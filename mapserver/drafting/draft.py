@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 from rich.console import Console
 
-from fleetmap.bow.shipped_vocabulary import default_vocabulary, default_vocabulary_bytes
+from fleetmap.bow.vocabulary import default_vocabulary, default_vocabulary_bytes
 from fleetmap.console import plain_console
 from fleetmap.encoding import to_json, to_plain
 from fleetmap.errors import RecordingError, StoreError, UsageError

@@ -44,9 +44,9 @@ from mapserver.drafting.worker import read_ahead
 from mapserver.evaluation.trajectory_error import check_truth
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.bundle.stereo_yaw_check import StereoYaw
-from mapserver.survey.finish.dock_alignment import aligned_by_priors
 from mapserver.survey.merge.multi_session import MergedMap, chained
 from mapserver.survey.odometry_pass import LEAD_NS, parts_between_lifts
+from mapserver.survey.pose_graph.position_priors import aligned_by_priors
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import Survey, begin_survey, finish_survey, survey
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools, Zones, zones_of

@@ -21,8 +21,7 @@ from mapserver.quality.figures import BlindView, SurveyedViews
 from mapserver.quality.probes import PRIOR_RADIUS_M, SAME_WAY_COSINE, Probe, place_xy, relocalized
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap
-from mapserver.tiles.landmark_budget import Sighting, choose_landmarks
-from mapserver.tiles.tiling import tiles_from_survey
+from mapserver.tiles.tiling import Sighting, choose_landmarks, tiles_from_survey
 
 
 class AskedView(NamedTuple):

@@ -4,9 +4,8 @@ import numpy as np
 
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3
-from fleetmap.mapformat.grid_tile import CELL_M
 from fleetmap.mapformat.manifest import Manifest
-from fleetmap.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
+from fleetmap.version_grid import CELL_M, FREE, OCCUPIED, OccupancyGrid
 from mapserver.floor_plan.areas import Areas, MaskKind
 
 _MAX_CELLS = 1 << 25

@@ -3,27 +3,66 @@
 A cell is a square column of the map: ground below FLOOR_M, then SLICES voxels of SLICE_M each.
 """
 
+import struct
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, TypeVar
 
 import msgspec
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from fleetmap.encoding import decode_json, to_json
-from fleetmap.errors import MapFormatError, NewerFormatError, StateError, UsageError
-from fleetmap.geometry import se3
-from fleetmap.mapformat.grid_tile import (
-    CELL_M,
-    GRID_FORMAT,
-    TILE_CELLS,
-    TILE_SIZE_M,
-    decode_grid_tile,
-    encode_grid_tile,
-)
+from fleetmap.errors import MapFormatError, NewerFormatError, StateError, UsageError, disk_errors
+from fleetmap.geometry import Array, se3, so3_log
+from fleetmap.mapformat.container import pack, unpack
 from fleetmap.mapformat.manifest import Manifest, Positive, Sha256, TileEntry, manifest_entry
 from fleetmap.mapformat.names import sha256_hex
-from fleetmap.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
+
+_MAGIC, GRID_FORMAT = b"FMGT", 1
+TILE_SIZE_M, CELL_M = 16.0, 0.05  # the size of the map's own tiles
+TILE_CELLS = round(TILE_SIZE_M / CELL_M)
+_HEAD = struct.Struct("<ii")
+_LAYERS, _LEVEL = 4, 12
+_LAYER_BYTES = TILE_CELLS**2
+_TILE_BYTES = _HEAD.size + _LAYERS * _LAYER_BYTES
+
+
+def encode_grid_tile(place: tuple[int, int], cells: NDArray[np.uint8]) -> bytes:
+    """Encode the tile at (x, y) with cells (N, N, 4): its place, then four layers of cells, in `container`'s envelope."""
+    layers = (np.ascontiguousarray(cells[..., layer]).tobytes() for layer in range(_LAYERS))
+    return pack(_MAGIC, GRID_FORMAT, [_HEAD.pack(*place), *layers], level=_LEVEL)
+
+
+def decode_grid_tile(data: bytes) -> tuple[tuple[int, int], NDArray[np.uint8]]:
+    """Decode place and cells (N, N, 4) of a tile.
+
+    MapFormatError or NewerFormatError for anything else; memory is bounded for any input.
+    """
+    payload = unpack(_MAGIC, GRID_FORMAT, data, "grid tile", _TILE_BYTES)
+    if len(payload) != _TILE_BYTES:
+        raise MapFormatError(f"grid tile: {len(payload)} bytes, not {_TILE_BYTES}; the bytes are damaged")
+    layers = np.frombuffer(payload, np.uint8, offset=_HEAD.size).reshape(_LAYERS, TILE_CELLS, TILE_CELLS)
+    x, y = _HEAD.unpack_from(payload)
+    return (x, y), np.ascontiguousarray(np.moveaxis(layers, 0, -1))
+
+
+OCCUPIED, FREE, UNKNOWN = 100, 0, -1
+# Thresholds of map_saver, except for free_thresh: with its 0.25 the grey of unknown cells is read as free.
+_SHADES = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
+_OCCUPIED_THRESH, _FREE_THRESH = 0.65, 0.196
+
+
+@dataclass(frozen=True, slots=True)
+class OccupancyGrid:
+    """cells (H, W) int8: 0 free to 100 occupied, -1 unknown; row 0 has the lowest y. map_from_grid (4, 4): of the corner of cell (0, 0)."""
+
+    cells: NDArray[np.int8]
+    resolution_m: float
+    map_from_grid: Array
+
 
 FLOOR_M, SLICE_M, SLICES = 0.10, 0.25, 8  # the ground's unevenness, and the noise of its points
 TOP_M = FLOOR_M + SLICES * SLICE_M
@@ -184,3 +223,34 @@ def whole_grid(parts: Mapping[tuple[int, int], NDArray[np.int8]], empty: int, *,
         cells = np.ascontiguousarray(cells[low[0] : high[0], low[1] : high[1]])
     corner = first * TILE_SIZE_M + low[::-1] * CELL_M
     return OccupancyGrid(cells, CELL_M, se3(np.eye(3), np.array([*corner, 0.0])))
+
+
+def write_grid(path: Path, grid: OccupancyGrid) -> None:
+    """Write NAME.yaml and NAME.pgm beside it, as of `map_server_files`. Raises StoreError if the disk refuses."""
+    text, image = map_server_files(grid, path.with_suffix(".pgm").name)
+    with disk_errors(f"{path} cannot be written", "check the folder, its space and rights"):
+        path.with_suffix(".pgm").write_bytes(image)
+        path.write_bytes(text)
+
+
+def map_server_files(grid: OccupancyGrid, image_name: str) -> tuple[bytes, bytes]:
+    """A map_server YAML file and its PGM image; mode trinary if all cells are free, occupied or unknown, else raw.
+
+    Source: nav2_map_server's documented file format.
+    """
+    values, trinary = grid.cells[::-1], bool(np.isin(grid.cells, list(_SHADES)).all())
+    shades = np.where(values < 0, 255, values).astype(np.uint8)
+    if trinary:
+        shades = np.select([values == value for value in _SHADES], list(_SHADES.values())).astype(np.uint8)
+    height, width = shades.shape
+    x, y, _ = grid.map_from_grid[:3, 3].tolist()
+    entries = {
+        "image": image_name,
+        "mode": "trinary" if trinary else "raw",
+        "resolution": grid.resolution_m,
+        "origin": [x, y, float(so3_log(grid.map_from_grid[:3, :3])[2])],
+        "negate": 0,
+        "occupied_thresh": _OCCUPIED_THRESH,
+        "free_thresh": _FREE_THRESH,
+    }
+    return yaml.safe_dump(entries, sort_keys=False).encode(), b"P5\n%d %d\n255\n" % (width, height) + shades.tobytes()

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fleetmap.errors import StoreError
 from fleetmap.geometry import se3, so3_exp
-from fleetmap.occupancy_grid import OccupancyGrid, write_grid
+from fleetmap.version_grid import OccupancyGrid, write_grid
 
 TRINARY = st.sampled_from([-1, 0, 100])
 

@@ -5,10 +5,19 @@ import numpy as np
 import pytest
 
 from fleetmap.errors import MapFormatError, NewerFormatError, StateError
-from fleetmap.mapformat.grid_tile import TILE_CELLS, TILE_SIZE_M, decode_grid_tile
 from fleetmap.mapformat.manifest import BlobEntry, Manifest
 from fleetmap.mapformat.names import sha256_hex
-from fleetmap.version_grid import Tiles, encode_grid, grid_of, grid_report, known_grid, read_index
+from fleetmap.version_grid import (
+    TILE_CELLS,
+    TILE_SIZE_M,
+    Tiles,
+    decode_grid_tile,
+    encode_grid,
+    grid_of,
+    grid_report,
+    known_grid,
+    read_index,
+)
 from mapserver.tiles import tiling
 from support.storage.map_samples import draft_details
 

@@ -11,7 +11,7 @@ from fleetmap.bus.zenoh_bus import Bus, _config
 from fleetmap.errors import UnreachableError
 from fleetmap.messages import WantedVersion, decode_message, encode_message, robot_key
 from locclient.identity import GivenAddress, RobotIdentity
-from locclient.maps.connection import connected
+from locclient.maps.map_client import connected
 from mapserver import releases
 from mapserver.store import MapStore
 from support.fleet.nav2_client import eventually

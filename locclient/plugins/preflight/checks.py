@@ -21,8 +21,8 @@ from locclient.config import LocclientConfig
 from locclient.daemon.daemon import check_run, configured_outbox
 from locclient.delivery.outbox import Outbox
 from locclient.identity import MapAddress
-from locclient.localization.calibration.pair_order import FAULTS, PairOrder, pair_order
-from locclient.maps.connection import cache_folder, map_client, open_bus
+from locclient.localization.calibration.monitor import FAULTS, PairOrder, pair_order
+from locclient.maps.map_client import cache_folder, map_client, open_bus
 from locclient.maps.map_source import LocalMapSource
 from locclient.maps.tile_cache import TileCache
 

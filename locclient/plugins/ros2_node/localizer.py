@@ -17,7 +17,6 @@ from fleetmap.errors import FleetmapError, RecordingError, UsageError
 from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array, se3_inverse, so3_log
 from fleetmap.messages import Status
-from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.recordings.ros2 import messages
 from fleetmap.recordings.ros2.cdr import pack, unpack
@@ -26,6 +25,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import UNSAID_SIGMAS, PositionPrior
 from fleetmap.sensors.source_settings import Topics
 from fleetmap.sources.intake import Intake
+from fleetmap.version_grid import OccupancyGrid
 from locclient.hooks import OutputHook
 from locclient.localization.estimate import Estimate
 from locclient.localization.place import transport_cov

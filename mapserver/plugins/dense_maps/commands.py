@@ -32,9 +32,7 @@ def export(
     check_output("--heights", heights)
     import numpy as np
 
-    from fleetmap.mapformat.grid_tile import CELL_M
-    from fleetmap.occupancy_grid import FREE, OCCUPIED, write_grid
-    from fleetmap.version_grid import grid_of, occupancy
+    from fleetmap.version_grid import CELL_M, FREE, OCCUPIED, grid_of, occupancy, write_grid
     from mapserver.plugins.dense_maps.site_grid import area_m2, height_map
 
     with open_store(store, read_only=True) as maps:

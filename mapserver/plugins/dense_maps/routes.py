@@ -11,8 +11,7 @@ from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
 from fleetmap.mapformat.names import sha256_hex
-from fleetmap.occupancy_grid import map_server_files
-from fleetmap.version_grid import FLOOR_M, TOP_M, grid_of, occupancy
+from fleetmap.version_grid import FLOOR_M, TOP_M, grid_of, map_server_files, occupancy
 from mapserver.api.bytes_response import bytes_response
 from mapserver.api.guard import address_of
 from mapserver.api.parameters import Number, Sha256, Site, Version

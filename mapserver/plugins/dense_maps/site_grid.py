@@ -8,10 +8,20 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.geometry import Array
-from fleetmap.mapformat.grid_tile import CELL_M, TILE_CELLS
-from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.sensors.rectification import StereoCamera
-from fleetmap.version_grid import FLOOR_M, HEIGHT_STEP_M, LOWEST_M, SLICE_M, SLICES, Counts, Tiles, whole_grid
+from fleetmap.version_grid import (
+    CELL_M,
+    FLOOR_M,
+    HEIGHT_STEP_M,
+    LOWEST_M,
+    SLICE_M,
+    SLICES,
+    TILE_CELLS,
+    Counts,
+    OccupancyGrid,
+    Tiles,
+    whole_grid,
+)
 from mapserver.plugins.dense_maps.dense_stereo import BLOCK_PX
 
 _RANGE_CELLS = 160  # of a view

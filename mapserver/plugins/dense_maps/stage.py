@@ -8,8 +8,7 @@ import numpy as np
 
 from fleetmap.errors import StateError
 from fleetmap.geometry import AnyArray
-from fleetmap.mapformat.grid_tile import CELL_M, TILE_CELLS, TILE_SIZE_M
-from fleetmap.version_grid import Tiles, encode_grid, grid_report, known_grid
+from fleetmap.version_grid import CELL_M, TILE_CELLS, TILE_SIZE_M, Tiles, encode_grid, grid_report, known_grid
 from mapserver.drafting.area_corrections import AreaCorrections
 from mapserver.drafting.extras import ChosenDraft, Extra
 from mapserver.plugins.dense_maps.surfel_map import (

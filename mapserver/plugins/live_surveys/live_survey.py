@@ -13,7 +13,7 @@ import numpy as np
 from msgspec import structs
 from rich.console import Console
 
-from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.errors import FleetmapError
 from fleetmap.recordings.images import jpeg_image
 from fleetmap.sensors.samples import Image

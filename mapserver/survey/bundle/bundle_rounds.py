@@ -10,8 +10,7 @@ from fleetmap.inertial import Preintegrated, preintegrate
 from fleetmap.odometry.sensor_buffer import is_pause
 from fleetmap.sensors.calibration import ImuNoise
 from mapserver.survey.bundle.bundle_adjustment import optimize
-from mapserver.survey.bundle.measured_noise import measured_sigmas
-from mapserver.survey.bundle.problem import OBSERVED, BundleProblem, BundleResult, InertialTerms
+from mapserver.survey.bundle.problem import OBSERVED, BundleProblem, BundleResult, InertialTerms, measured_sigmas
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import RelativeTerm, SurveyState
 

@@ -14,8 +14,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_problem
-from mapserver.survey.bundle.measured_noise import measured_sigmas
-from mapserver.survey.bundle.problem import BundleProblem
+from mapserver.survey.bundle.problem import BundleProblem, measured_sigmas
 from mapserver.survey.rig import CameraKind
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Landmarks, SurveyState

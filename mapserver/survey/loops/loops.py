@@ -7,8 +7,7 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow.place_index import PlaceIndex
-from fleetmap.bow.vocabulary import BowVector
+from fleetmap.bow.vocabulary import BowVector, PlaceIndex
 from fleetmap.geometry import Array, se3_adjoint, se3_inverse, se3_log, transform_points
 from fleetmap.relocalization.landmark_visibility import image_cells
 from fleetmap.sensors.rectification import StereoCamera

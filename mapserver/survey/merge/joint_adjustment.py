@@ -17,8 +17,14 @@ from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.relocalization.landmark_visibility import Rows
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_problem, inertial_edges
-from mapserver.survey.bundle.measured_noise import measured_sigmas
-from mapserver.survey.bundle.problem import OBSERVED, BundleProblem, BundleResult, InertialTerms, continued
+from mapserver.survey.bundle.problem import (
+    OBSERVED,
+    BundleProblem,
+    BundleResult,
+    InertialTerms,
+    continued,
+    measured_sigmas,
+)
 from mapserver.survey.merge.base_map import BaseMap, baseline_ratio, with_baseline
 from mapserver.survey.merge.guided_matching import Sightings
 from mapserver.survey.merge.merge import Change

@@ -13,11 +13,15 @@ from fleetmap.geometry import Array, interpolate_se3, length, rotation_angle_rad
 from fleetmap.inertial import GRAVITY_MPS2
 from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
-from fleetmap.odometry.filter.nav_state import InitialState, NavState
+from fleetmap.odometry.filter.msckf import InitialState, NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.gyro_clock import GyroClock
-from fleetmap.odometry.init.imu_alignment import dynamic_initialization
-from fleetmap.odometry.init.static_initialization import is_steady, polynomial_rate, static_initialization
+from fleetmap.odometry.init.imu_alignment import (
+    dynamic_initialization,
+    is_steady,
+    polynomial_rate,
+    static_initialization,
+)
 from fleetmap.odometry.lift_check import LiftCheck
 from fleetmap.odometry.odometry_checks import DivergenceMonitor, ZeroVelocityDetector
 from fleetmap.odometry.sensor_buffer import IMU_GAP_NS, SensorBuffer, is_pause

@@ -11,7 +11,7 @@ from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.odometry.estimate import OdometryEstimate
-from fleetmap.odometry.filter.nav_state import NavState
+from fleetmap.odometry.filter.msckf import NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.gyro_clock import GyroClock
 from fleetmap.odometry.modes import ImuInputs, Mode, StartingMode, VisualMode

@@ -20,7 +20,7 @@ from scipy.stats import chi2
 
 from benchmarks.common.recorded_runs import parsed, write_results
 from benchmarks.common.simulated_survey import SimulatedSurvey, drawn_alignment, session_of, simulated_survey
-from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.geometry import Array, se3_inverse, se3_log
 from fleetmap.sensors.samples import SensorSet
 from mapserver.config import survey_settings

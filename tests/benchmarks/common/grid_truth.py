@@ -8,9 +8,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
 from fleetmap.geometry import Array
-from fleetmap.mapformat.grid_tile import CELL_M
-from fleetmap.occupancy_grid import FREE, OCCUPIED, UNKNOWN, OccupancyGrid
-from fleetmap.version_grid import FLOOR_M
+from fleetmap.version_grid import CELL_M, FLOOR_M, FREE, OCCUPIED, UNKNOWN, OccupancyGrid
 from fleetsim.scene.faces import Faces
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.world import World

@@ -15,7 +15,7 @@ from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sources.replay_source import ReplaySource
 from locclient.identity import MapAddress
 from locclient.localization.settings import LocalizerSettings
-from locclient.maps.connection import connected
+from locclient.maps.map_client import connected
 from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.run_result import ReplayResult
 

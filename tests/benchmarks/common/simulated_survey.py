@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common.estimator_loop import EstimatorTracker, blank
-from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.features import orb, patch_align
 from fleetmap.geometry import Array
 from fleetmap.odometry.estimate import OdometryStatus

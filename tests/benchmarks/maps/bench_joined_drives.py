@@ -21,7 +21,7 @@ import numpy as np
 from rich.console import Console
 
 from benchmarks.common.recorded_runs import parsed, write_results
-from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory

@@ -18,7 +18,7 @@ import numpy as np
 from benchmarks.common.recorded_runs import SITE, parsed, surveyed, write_results
 from benchmarks.robot.bench_real_robots import mapped
 from benchmarks.robot.standing_robot import Standing
-from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.errors import UsageError
 from fleetmap.failure_definition import is_wrong
 from fleetmap.features.settings import OrbSettings

@@ -21,7 +21,7 @@ from mapserver.drafting.draft_evidence import PROBES
 from mapserver.quality.probes import Probe, starts_without_prior
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap
-from mapserver.tiles.landmark_budget import choose_landmarks
+from mapserver.tiles.tiling import choose_landmarks
 from support.estimator.landmarks import LandmarkField
 from support.estimator.simulated_run import EstimatorSession, Found, Ids, Sighting, Smudge
 

@@ -24,7 +24,7 @@ from fleetmap.sensors.samples import PositionPrior, wheel_between
 from fleetmap.sources.replay_source import ReplaySource
 from locclient.identity import MapAddress
 from locclient.localization.settings import LocalizerSettings
-from locclient.maps.connection import connected
+from locclient.maps.map_client import connected
 from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.run_result import ReplayResult
 from support.recordings.calibration_faults import (

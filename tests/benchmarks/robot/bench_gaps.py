@@ -20,7 +20,7 @@ from fleetmap.recordings import Recording, open_recording
 from fleetmap.sensors.samples import ImuSamples
 from fleetmap.sources.replay_source import ReplaySource
 from locclient.identity import MapAddress
-from locclient.maps.connection import connected
+from locclient.maps.map_client import connected
 from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.run_metrics import FrameRecord
 

@@ -19,7 +19,7 @@ from fleetmap.sources.replay_source import ReplaySource
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.identity import MapAddress
 from locclient.localization.settings import LocalizerSettings
-from locclient.maps.connection import connected
+from locclient.maps.map_client import connected
 from locclient.replay.replay import load_map
 from locclient.robot.robot import Robot
 from locclient.robot.version_trial import TrialSettings

@@ -35,7 +35,7 @@ from fleetsim.scene.layout import Layout
 from fleetsim.sensors.faults import Fault
 from locclient.identity import MapAddress
 from locclient.localization.estimate import Estimate
-from locclient.maps.connection import connected
+from locclient.maps.map_client import connected
 from locclient.replay import run_metrics
 from locclient.replay.replay import ReplayOptions, replay
 from studies.robot_days.drives import judged

@@ -21,7 +21,7 @@ from fleetmap.recordings.sensor_subset import reduced
 from fleetmap.sensors.samples import SensorSet
 from fleetmap.sources.replay_source import ReplaySource
 from locclient.identity import MapAddress
-from locclient.maps.connection import connected
+from locclient.maps.map_client import connected
 from locclient.replay import run_metrics
 from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.run_metrics import FrameRecord

@@ -28,8 +28,8 @@ from fleetsim.imaging.pipelines import IMAGE_PIPELINES, process_frame
 from fleetsim.recorder import Order, Session, prepare
 from locclient.identity import MapAddress
 from locclient.localization.settings import LocalizerSettings
-from locclient.maps.connection import connected
 from locclient.maps.loaded_map import LoadedMap
+from locclient.maps.map_client import connected
 from locclient.replay.replay import load_map
 from locclient.robot.robot import Robot
 from locclient.robot.version_trial import TrialSettings

@@ -16,11 +16,9 @@ from scipy.ndimage import binary_dilation
 from benchmarks.common.grid_truth import GridFigures, Mask, compare, in_hall, passable, plan, truth_mask
 from benchmarks.common.recorded_runs import write_results
 from fleetmap.features.settings import StereoSettings
-from fleetmap.mapformat.grid_tile import CELL_M, TILE_CELLS
-from fleetmap.occupancy_grid import OCCUPIED, OccupancyGrid
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
-from fleetmap.version_grid import FLOOR_M, SLICE_M, Tiles, occupancy
+from fleetmap.version_grid import CELL_M, FLOOR_M, OCCUPIED, SLICE_M, TILE_CELLS, OccupancyGrid, Tiles, occupancy
 from fleetsim.recorder import Order, Session, prepare
 from mapserver.plugins.dense_maps.dense_stereo import dense_disparity, floor_distance_m, nearest_around
 from mapserver.plugins.dense_maps.site_grid import REACH_PX, SessionViews, updated

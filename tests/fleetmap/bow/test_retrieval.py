@@ -8,14 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from fleetmap.bow.place_index import PlaceIndex
-from fleetmap.bow.shipped_vocabulary import (
+from fleetmap.bow.vocabulary import (
     DEFAULT_VOCABULARY_SHA256,
+    BowVector,
+    PlaceIndex,
     default_vocabulary,
     default_vocabulary_bytes,
+    encode_vocabulary,
     shipped_vocabulary,
 )
-from fleetmap.bow.vocabulary import BowVector, encode_vocabulary
 from fleetmap.features.orb import detect
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, rotation_angle_rad, rotation_from_quat_wxyz

@@ -12,7 +12,7 @@ from fleetmap.geometry import Array, se3, se3_inverse, se3_log, so3_exp, transfo
 from fleetmap.inertial import GRAVITY_MPS2
 from fleetmap.odometry import modes
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus, is_away
-from fleetmap.odometry.filter.nav_state import InitialState
+from fleetmap.odometry.filter.msckf import InitialState
 from fleetmap.odometry.filter.sliding_window import SlidingWindow
 from fleetmap.odometry.init.imu_alignment import dynamic_initialization
 from fleetmap.odometry.modes import InertialMode

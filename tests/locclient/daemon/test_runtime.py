@@ -22,10 +22,10 @@ from fleetmap.messages import (
     encode_message,
     robot_key,
 )
-from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.sensors.samples import CameraFrame, WheelSample
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.sensor_bundle import SensorBundle
+from fleetmap.version_grid import OccupancyGrid
 from locclient.daemon import runtime
 from locclient.daemon.runtime import Runtime, RuntimeParts
 from locclient.daemon.server_sync import ServerSync

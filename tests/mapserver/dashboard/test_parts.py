@@ -17,7 +17,7 @@ from PIL import Image
 from fleetmap.geometry import se3, se3_inverse
 from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame
 from fleetmap.mapformat.manifest import Manifest
-from fleetmap.occupancy_grid import OccupancyGrid
+from fleetmap.version_grid import OccupancyGrid
 from mapserver import releases
 from mapserver.dashboard import fleet_parts, map_layers
 from mapserver.dashboard.administration import ending_row

@@ -10,8 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from typer.testing import CliRunner, Result
 
-from fleetmap.bow.shipped_vocabulary import DEFAULT_VOCABULARY_SHA256
-from fleetmap.bow.vocabulary import decode_vocabulary
+from fleetmap.bow.vocabulary import DEFAULT_VOCABULARY_SHA256, decode_vocabulary
 from fleetmap.errors import FleetmapError, RecordingError, StoreError, UsageError
 from fleetmap.geometry import Array
 from fleetmap.mapformat.tile_codec import decode_tile

@@ -10,8 +10,7 @@ import numpy as np
 
 from mapserver.store import DraftContent, MapStore
 from mapserver.survey.settings import BudgetSettings
-from mapserver.tiles.landmark_budget import choose_landmarks
-from mapserver.tiles.tiling import tiles_from_survey
+from mapserver.tiles.tiling import choose_landmarks, tiles_from_survey
 from support.storage.map_samples import draft_details, random_survey
 
 GOLDEN = Path(__file__).parents[2] / "golden"

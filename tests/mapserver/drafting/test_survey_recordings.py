@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.errors import RecordingError, SurveyError
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings import image_series as series

@@ -8,8 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleetmap.bow.shipped_vocabulary import default_vocabulary_bytes
-from fleetmap.bow.vocabulary import decode_vocabulary
+from fleetmap.bow.vocabulary import decode_vocabulary, default_vocabulary_bytes
 from fleetmap.features import extraction
 from fleetmap.features.orb import Features, detect_in_slices
 from fleetmap.features.settings import OrbSettings

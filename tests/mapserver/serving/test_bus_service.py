@@ -20,7 +20,7 @@ from fleetmap.messages import (
     part_of,
     robot_key,
 )
-from fleetmap.occupancy_grid import OccupancyGrid
+from fleetmap.version_grid import OccupancyGrid
 from locclient.maps.loaded_map import TileSelectionSettings
 from locclient.maps.map_source import CachedMap, LocalMapSource
 from locclient.maps.tile_cache import TileCache

@@ -11,7 +11,7 @@ from scipy.stats import chi2
 from benchmarks.common.estimator_loop import SETTINGS as ROBOT
 from benchmarks.common.estimator_loop import SessionRelocalizer, blank
 from benchmarks.common.simulated_survey import SimulatedSurvey, drawn_alignment, simulated_survey
-from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.geometry import Array, se3_inverse, se3_log
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.samples import SensorSet

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet, Stamps, Trajectory

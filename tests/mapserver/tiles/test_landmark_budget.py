@@ -11,9 +11,8 @@ from fleetmap.geometry import Array, se3_exp
 from fleetmap.mapformat.tile_codec import encode_tile
 from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap, history_of
-from mapserver.tiles import landmark_budget as module
-from mapserver.tiles.landmark_budget import choose_landmarks, covered_path_m, distinctive_landmarks
-from mapserver.tiles.tiling import tiles_from_survey
+from mapserver.tiles import tiling as module
+from mapserver.tiles.tiling import choose_landmarks, covered_path_m, distinctive_landmarks, tiles_from_survey
 from support.storage.map_samples import random_survey
 
 

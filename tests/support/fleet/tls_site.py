@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from locclient.identity import RobotIdentity
-from locclient.maps.connection import outbox_path
+from locclient.maps.map_client import outbox_path
 
 START_S = 120.0  # on a machine that may be busy
 

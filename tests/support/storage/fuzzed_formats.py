@@ -14,11 +14,10 @@ from hypothesis import strategies as st
 
 from fleetmap.errors import FleetmapError
 from fleetmap.mapformat.container import pack, unpack
-from fleetmap.mapformat.grid_tile import TILE_CELLS, decode_grid_tile
 from fleetmap.mapformat.manifest import decode_manifest
 from fleetmap.mapformat.tile_codec import TILE_FORMAT, decode_tile
 from fleetmap.mapformat.version_file import open_export
-from fleetmap.version_grid import encode_grid
+from fleetmap.version_grid import TILE_CELLS, decode_grid_tile, encode_grid
 from mapserver.store.archive import ARCHIVE_FORMAT, decode_archive
 
 GOLDEN = Path(__file__).parents[2] / "golden"

@@ -7,13 +7,12 @@ import numpy as np
 
 from fleetmap.encoding import to_json
 from fleetmap.geometry import se3_exp
-from fleetmap.mapformat.grid_tile import TILE_CELLS
 from fleetmap.mapformat.manifest import CameraEntry, RecordingEntry
 from fleetmap.mapformat.names import sha256_hex
 from fleetmap.mapformat.tile import Tile
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import Trajectory
-from fleetmap.version_grid import encode_grid, grid_report
+from fleetmap.version_grid import TILE_CELLS, encode_grid, grid_report
 from mapserver import releases
 from mapserver.store import DraftContent, DraftDetails, MapStore
 from mapserver.store.survey_pictures import PICTURES_KEY, PictureIndex, PicturesReport, SurveyPicture

@@ -7,7 +7,7 @@ from itertools import pairwise, repeat
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.features.orb import SCALE_FACTOR, Features
 from fleetmap.geometry import Array, se3, se3_inverse, transform_points
 from fleetmap.mapformat.tile import Tile

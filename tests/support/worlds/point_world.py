@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log, transform_points
-from fleetmap.odometry.filter.msckf import InvariantFilter
-from fleetmap.odometry.filter.nav_state import NavState
+from fleetmap.odometry.filter.msckf import InvariantFilter, NavState
 from fleetmap.odometry.settings import FilterSettings
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import StereoCamera

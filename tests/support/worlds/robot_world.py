@@ -11,14 +11,13 @@ import numpy as np
 from fleetmap.bow.vocabulary import decode_vocabulary, encode_vocabulary
 from fleetmap.features import orb
 from fleetmap.geometry import Array
-from fleetmap.mapformat.grid_tile import TILE_CELLS
 from fleetmap.mapformat.manifest import CameraEntry
 from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples
 from fleetmap.sources.sensor_bundle import SensorBundle
-from fleetmap.version_grid import encode_grid, grid_report
+from fleetmap.version_grid import TILE_CELLS, encode_grid, grid_report
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import LoadedMap
 from locclient.robot.robot import Robot

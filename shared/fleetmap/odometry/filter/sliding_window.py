@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, length, rotation_angle_rad, se3_adjoint, se3_inverse
-from fleetmap.odometry.filter.msckf import InvariantFilter
-from fleetmap.odometry.filter.nav_state import NavState
+from fleetmap.odometry.filter.msckf import InvariantFilter, NavState
 from fleetmap.odometry.odometry_checks import middle
 from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.odometry.tracking.tracker import Tracked

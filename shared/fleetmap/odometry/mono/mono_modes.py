@@ -13,11 +13,9 @@ from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log, transform_points
 from fleetmap.inertial import preintegrate
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
-from fleetmap.odometry.filter.msckf import InvariantFilter
-from fleetmap.odometry.filter.nav_state import InitialState, NavState
+from fleetmap.odometry.filter.msckf import InitialState, InvariantFilter, NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
-from fleetmap.odometry.init.imu_alignment import mono_inertial_initialization
-from fleetmap.odometry.init.static_initialization import static_initialization
+from fleetmap.odometry.init.imu_alignment import mono_inertial_initialization, static_initialization
 from fleetmap.odometry.modes import ImuInputs, InertialMode, Mode, StartingMode, Step, VisualMode, WindowMode
 from fleetmap.odometry.mono.mono_vo import VisualEstimate, VisualOdometry
 from fleetmap.odometry.mono.wheel_mode import SeenWay, WheelMode

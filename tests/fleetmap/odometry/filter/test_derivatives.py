@@ -6,8 +6,7 @@ import pytest
 from fleetmap import core
 from fleetmap.geometry import Array, se3_inverse, so3_exp, transform_points
 from fleetmap.inertial import imu_intervals
-from fleetmap.odometry.filter.msckf import InvariantFilter
-from fleetmap.odometry.filter.nav_state import NavState
+from fleetmap.odometry.filter.msckf import InvariantFilter, NavState
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples
 from support.worlds.inertial_motion import analytic_motion, sample_motion

@@ -7,8 +7,7 @@ import pytest
 from msgspec.structs import replace
 
 from fleetmap.geometry import Array, se3_exp, se3_inverse, se3_log, skew, so3_exp
-from fleetmap.odometry.filter.msckf import InvariantFilter
-from fleetmap.odometry.filter.nav_state import NavState
+from fleetmap.odometry.filter.msckf import InvariantFilter, NavState
 from fleetmap.odometry.settings import FilterSettings
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples, WheelSample

@@ -5,9 +5,8 @@ import pytest
 
 from fleetmap.geometry import Array, rotation_angle_rad, se3, se3_exp, se3_inverse, so3_exp
 from fleetmap.odometry.estimate import OdometryEstimate
-from fleetmap.odometry.filter.nav_state import InitialState
-from fleetmap.odometry.init.imu_alignment import dynamic_initialization
-from fleetmap.odometry.init.static_initialization import static_initialization
+from fleetmap.odometry.filter.msckf import InitialState
+from fleetmap.odometry.init.imu_alignment import dynamic_initialization, static_initialization
 from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.sensors.calibration import ImuNoise

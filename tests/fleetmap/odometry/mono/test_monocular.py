@@ -8,7 +8,7 @@ import pytest
 from fleetmap.geometry import Array, align_points, transform_points
 from fleetmap.inertial import GRAVITY_MPS2
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
-from fleetmap.odometry.filter.nav_state import InitialState
+from fleetmap.odometry.filter.msckf import InitialState
 from fleetmap.odometry.init.imu_alignment import mono_inertial_initialization
 from fleetmap.odometry.mono import mono_modes
 from fleetmap.odometry.mono.mono_modes import MonocularOdometry, make_odometry

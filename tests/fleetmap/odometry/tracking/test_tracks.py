@@ -9,8 +9,7 @@ from fleetmap import core
 from fleetmap.core import longest_gap_ns
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, transform_points
-from fleetmap.odometry.filter.msckf import InvariantFilter
-from fleetmap.odometry.filter.nav_state import NavState
+from fleetmap.odometry.filter.msckf import InvariantFilter, NavState
 from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.sensor_buffer import SensorBuffer
 from fleetmap.odometry.settings import OdometrySettings, TrackerSettings

@@ -13,8 +13,8 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import Image, WheelSample
 from locclient.localization.calibration import mounting
 from locclient.localization.calibration.camera_view import CameraView, camera_view
+from locclient.localization.calibration.monitor import PairOrder, pair_order
 from locclient.localization.calibration.mounting import BasePose, WheelTravel
-from locclient.localization.calibration.pair_order import PairOrder, pair_order
 from locclient.localization.calibration.parameters import FOCAL, IMAGE, PITCH, RIGHT_FOCAL, ROLL, YAW
 from support.fleet.estimates import estimate
 from support.worlds.pinhole_pair import CAMERA, seen_with

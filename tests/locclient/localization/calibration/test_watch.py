@@ -207,7 +207,7 @@ def test_a_wrong_calibration_is_published() -> None:
 
 def test_an_exchanged_pair_is_never_tracking(monkeypatch: pytest.MonkeyPatch) -> None:
     from locclient.localization.calibration import monitor as module
-    from locclient.localization.calibration.pair_order import PairOrder
+    from locclient.localization.calibration.monitor import PairOrder
 
     said: list[Any] = [PairOrder.UNKNOWN, PairOrder.REVERSED]
     monkeypatch.setattr(module, "pair_order", lambda *_: said.pop(0))

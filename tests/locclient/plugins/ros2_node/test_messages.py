@@ -11,11 +11,11 @@ from zenoh.ext import Int64, z_deserialize
 
 from fleetmap.errors import UsageError
 from fleetmap.geometry import quat_wxyz_from_rotation, se3, so3_exp
-from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.recordings.images import grey_image, png_image
 from fleetmap.recordings.ros2 import messages
 from fleetmap.recordings.ros2.cdr import pack
 from fleetmap.sensors.samples import PositionPrior, WheelSample
+from fleetmap.version_grid import OccupancyGrid
 from locclient.plugins.ros2_node.keys import (
     DEFINITIONS,
     LATCHED,

@@ -12,12 +12,12 @@ from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.messages import Status
-from fleetmap.occupancy_grid import OccupancyGrid
 from fleetmap.recordings.ros2.cdr import unpack
 from fleetmap.recordings.ros2.messages import decode_frame_links, decode_prior
 from fleetmap.sensors.source_settings import SourceSection, Topics
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import open_source
+from fleetmap.version_grid import OccupancyGrid
 from locclient.daemon.publishers import output_of
 from locclient.localization.estimate import Estimate
 from locclient.outputs import OutputSection

@@ -14,7 +14,7 @@ from fleetmap.messages import RobotHealth, encode_message
 from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.identity import MapAddress, RobotIdentity
-from locclient.maps.connection import connected
+from locclient.maps.map_client import connected
 from mapserver.store import FailureFilter, MapStore
 from support.fleet.nav2_client import eventually
 from support.fleet.reports import blindness

@@ -7,8 +7,7 @@ import dask
 import pytest
 from distributed import Client, LocalCluster, Security
 
-from fleetmap.bow.shipped_vocabulary import default_vocabulary_bytes
-from fleetmap.bow.vocabulary import decode_vocabulary
+from fleetmap.bow.vocabulary import decode_vocabulary, default_vocabulary_bytes
 from fleetmap.errors import LinkError, UsageError
 from fleetmap.mapformat.tile_codec import encode_tile
 from fleetmap.sensors.rectification import Rectifier

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 
-from fleetmap.mapformat.grid_tile import TILE_CELLS
+from fleetmap.version_grid import TILE_CELLS
 from mapserver import releases
 from mapserver.store import MapStore, Retention
 from support.drawn_areas import geojson

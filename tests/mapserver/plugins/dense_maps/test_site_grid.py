@@ -8,9 +8,8 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.geometry import Array, se3, so3_exp
-from fleetmap.mapformat.grid_tile import CELL_M
 from fleetmap.sensors.rectification import StereoCamera
-from fleetmap.version_grid import FLOOR_M, SLICE_M, SLICES, Counts, occupancy
+from fleetmap.version_grid import CELL_M, FLOOR_M, SLICE_M, SLICES, Counts, occupancy
 from mapserver.plugins.dense_maps.dense_stereo import floor_distance_m, nearest_around
 from mapserver.plugins.dense_maps.site_grid import REACH_PX, SessionViews, height_map, updated
 

@@ -8,10 +8,8 @@ import pytest
 
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import so3_exp
-from fleetmap.mapformat.grid_tile import CELL_M
-from fleetmap.occupancy_grid import FREE, OCCUPIED, UNKNOWN
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
-from fleetmap.version_grid import occupancy
+from fleetmap.version_grid import CELL_M, FREE, OCCUPIED, UNKNOWN, occupancy
 from mapserver.drafting.extras import MappedSession
 from mapserver.plugins.dense_maps.expected_view import expected_view, pinhole
 from mapserver.plugins.dense_maps.exposure import Sample, estimate_exposure, lens_factor

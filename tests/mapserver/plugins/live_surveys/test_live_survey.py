@@ -11,7 +11,7 @@ import pytest
 from rich.console import Console
 from typer.testing import CliRunner
 
-from fleetmap.bow.shipped_vocabulary import default_vocabulary
+from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.errors import FleetmapError, UsageError
 from fleetmap.messages import MAX_MESSAGE_BYTES, encode_message
 from fleetmap.recordings import Topics, open_recording

@@ -8,8 +8,7 @@ import pytest
 from fleetmap.geometry import Array, align_points, se3_inverse
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import apply_result, bundle_problem, bundle_rounds
-from mapserver.survey.bundle.measured_noise import measured_sigmas
-from mapserver.survey.bundle.problem import BundleProblem
+from mapserver.survey.bundle.problem import BundleProblem, measured_sigmas
 from mapserver.survey.settings import SurveySettings
 from support.worlds.corridor_scene import SIGMA_DISPARITY_PX, SIGMA_PX, Scene, scene
 

@@ -8,8 +8,8 @@ import pytest
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp, transform_points
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.sensors.samples import PositionPrior, Trajectory
-from mapserver.survey.finish.dock_alignment import aligned_by_priors
 from mapserver.survey.odometry_pass import longest_run
+from mapserver.survey.pose_graph.position_priors import aligned_by_priors
 from mapserver.survey.state import OdometryPass
 from mapserver.survey.survey_map import SurveyMap
 from support.storage.map_samples import random_survey

@@ -8,8 +8,7 @@ import pytest
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, rotation_angle_rad, se3, se3_adjoint, se3_exp, se3_inverse
-from mapserver.survey.pose_graph.chain_covariance import ChainCovariance
-from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMarginals
+from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, ChainCovariance, GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
 from support.worlds.pose_graph_scene import LOOP_COV, ODOMETRY_COV, Drive, make_drive, measured
 
