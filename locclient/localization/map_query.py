@@ -127,9 +127,10 @@ class MapQuery:
         return self._advance(is_at_once=is_at_once)
 
     def _is_due(self, odometry: OdometryEstimate) -> bool:
-        confirmed, last_ns = self._tracker.confirmed, self._begun_ns
+        confirmed, last_ns, track = self._tracker.confirmed, self._begun_ns, self._track
         support = 0 if confirmed is None else confirmed.support
-        interval_s = self._track.query_interval_s(support, is_sure=odometry.inertial and not self.failed)
+        is_settled = odometry.inertial and not self.failed and support >= track.settled_fixes
+        interval_s = max(track.fix_interval_s, track.settled_interval_s) if is_settled else track.fix_interval_s
         return last_ns is None or odometry.after_gap or (odometry.stamp_ns - last_ns) * 1e-9 >= 0.999 * interval_s
 
     def _is_sparse(self, stamp_ns: int) -> bool:

@@ -44,11 +44,6 @@ class TrackSettings(Section, frozen=True):
     map_sigma_m: float = 0.02  # of the map itself, added to the estimate
     map_sigma_rad: float = 0.006  # of the map itself, added to the estimate
 
-    def query_interval_s(self, support: int, *, is_sure: bool) -> float:
-        """Return the interval between map queries: the longer one for a pose with enough support and no fault."""
-        is_settled = is_sure and support >= self.settled_fixes
-        return max(self.fix_interval_s, self.settled_interval_s) if is_settled else self.fix_interval_s
-
 
 class LocalizerSettings(Section, frozen=True):
     """Settings of a localizer."""

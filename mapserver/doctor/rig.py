@@ -169,7 +169,10 @@ def mounting_error(motions: Sequence[tuple[Array, Array]], repeated: Array | Non
     prior = np.diag([0.0] * 3 + [_PLACE_SIGMA_M**-2] * 3 + [_SCALE_SIGMA**-2])
     cov = np.eye(7)
     for _ in range(_ROUNDS):
-        rows, residuals = _linearized(first, np.array([_conjugated(each, error, scale) for each in other]))
+        # Motions of the body that a view with this error of its mounting has seen.
+        scaled = [se3(each[:3, :3], each[:3, 3] * (1.0 + scale)) for each in other]
+        moved = np.array([error @ each @ se3_inverse(error) for each in scaled])
+        rows, residuals = _linearized(first, moved)
         spread = np.where(is_known, np.abs(residuals), 0.0)
         sigmas = np.maximum(_MAD_SIGMA * np.median(spread[has_way | ~has_way.any()], axis=0), 1e-9)
         is_far = (spread > _FAR_SIGMAS * sigmas).any(axis=1, keepdims=True)  # one of its motions is wrong
@@ -185,11 +188,6 @@ def mounting_error(motions: Sequence[tuple[Array, Array]], repeated: Array | Non
     known, axes = np.linalg.eigh(np.linalg.inv(cov[:3, :3]))
     cov = axes @ np.diag(1.0 / np.maximum(known - by_noise, 1.0)) @ axes.T
     return Mounting(so3_log(error[:3, :3]), cov, lever @ (np.zeros((6, 6)) if repeated is None else repeated) @ lever.T)
-
-
-def _conjugated(motion: Array, error: Array, scale: float) -> Array:
-    """Return the motion of the body that a view with this error of its mounting has seen."""
-    return np.asarray(error @ se3(motion[:3, :3], motion[:3, 3] * (1.0 + scale)) @ se3_inverse(error))
 
 
 def _linearized(first: Array, other: Array) -> tuple[Array, Array]:

@@ -236,19 +236,19 @@ def read_areas(data: bytes, building: BuildingFrame | None) -> Areas:
         raise UsageError(
             f"areas: the file does not name the frame of its coordinates (plain GeoJSON means degrees); {words}"
         )
-    if collection.frame == "building" and building is None:
-        raise UsageError(
-            "areas drawn in the building need the map's pose in it; run `mapserver align --plan FILE --pin ...` first"
-        )
-    map_from_building = None
-    if collection.frame == "building" and building is not None:
-        map_from_building = se3_inverse(building.building_from_map)
+    map_from_drawn = np.eye(4)
+    if collection.frame == "building":
+        if building is None:
+            raise UsageError(
+                "areas drawn in the building need the map's pose in it; run `mapserver align --plan FILE --pin ...` first"
+            )
+        map_from_drawn = se3_inverse(building.building_from_map)
     if not 1 <= len(collection.features) <= _MAX_AREAS:
         raise UsageError(f"areas: {len(collection.features)} features; give 1 to {_MAX_AREAS}")
     areas: dict[str, Area] = {}
     corners = 0
     for feature in collection.features:
-        area = _area(feature, map_from_building)
+        area = _area(feature, map_from_drawn)
         corners += sum(len(ring) for ring in area.rings)
         if area.name in areas:
             raise UsageError(
@@ -260,7 +260,7 @@ def read_areas(data: bytes, building: BuildingFrame | None) -> Areas:
     return Areas.of(list(areas.values()), collection.frame)
 
 
-def _area(feature: _Feature, map_from_building: Array | None) -> Area:
+def _area(feature: _Feature, map_from_drawn: Array) -> Area:
     name = feature.properties.name.strip()
     if not 1 <= len(name) <= _MAX_NAME or not name.isprintable() or name == OUTSIDE:
         raise UsageError(
@@ -276,7 +276,6 @@ def _area(feature: _Feature, map_from_building: Array | None) -> Area:
         raise UsageError(f"area {name!r}: mask {mask and mask.value} with percent {percent}; give {_MASK_WORDS}")
     geometry = feature.geometry
     drawn = [geometry.coordinates] if isinstance(geometry, _Polygon) else geometry.coordinates
-    map_from_drawn = np.eye(4) if map_from_building is None else map_from_building
     polygons = [tuple(_moved(_ring(ring, f"area {name!r}"), map_from_drawn) for ring in rings) for rings in drawn]
     if not polygons or not all(polygons):
         raise UsageError(f"area {name!r} has no corners; draw it as a polygon")

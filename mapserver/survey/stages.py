@@ -277,7 +277,8 @@ def refine(
     first: GlobalMatch, settings: SurveySettings, tools: SurveyTools
 ) -> tuple[OdometryPass, SurveyState, tuple[StereoYaw, ...]]:
     """Observe and adjust once more, at the poses of the first adjustment, which give the stereo yaw error of each camera."""
-    yaws = _stereo_yaws(first.state, first.redundant, settings)
+    part = without_redundant(first.state, first.redundant)
+    yaws = tuple(estimate_stereo_yaw(part, settings, camera) for camera in range(len(part.rig)))
     tools.at("global adjustment", 1, 2)
     odometry, redundant, rounds = _with_depths(first.odometry, first.state, first.depths), first.redundant, 2
     posed = _posed(odometry, first.state)
@@ -321,11 +322,6 @@ def _adjusted(
     state = adjust_visits(state, settings, redundant, rounds)
     priors, same = judged_priors(state.priors, state.map_from_body)
     return state if same else adjust_visits(replace(state, priors=priors), settings, redundant, rounds=2)
-
-
-def _stereo_yaws(state: SurveyState, redundant: Mask, settings: SurveySettings) -> tuple[StereoYaw, ...]:
-    part = without_redundant(state, redundant)
-    return tuple(estimate_stereo_yaw(part, settings, camera) for camera in range(len(part.rig)))
 
 
 def _with_depths(odometry: OdometryPass, state: SurveyState, depths: MonoDepths | None) -> OdometryPass:

@@ -45,6 +45,9 @@ def assemble(
     marks, rows = state.landmarks.keep_observations(seen, 1), np.unique(state.landmarks.obs_landmark[seen])
     keyframes = [k for k, keep in zip(images, kept, strict=True) if keep]
     marks = replace(marks, obs_keyframe=(np.cumsum(kept) - 1)[marks.obs_keyframe].astype(np.int32))
+    tied = odometry.tracked.astype(bool) | placed.seen  # frames connected to the map by landmarks or unbroken odometry
+    if state.motion.inertial:  # or by the IMU through a gap
+        tied[odometry.keyframe_frames] = True
     survey_map = SurveyMap(
         camera=camera,
         body_from_cam=state.rig.body_from_cam[0],
@@ -60,7 +63,7 @@ def assemble(
         obs_octave=marks.of_features([k.features.octaves for k in keyframes]),
         obs_sigma_px=marks.obs_sigma_px,
         trajectory=Trajectory(odometry.stamps_ns, placed.map_from_body),
-        trajectory_estimated=_estimated(state, odometry, placed),
+        trajectory_estimated=tied,
         patches=cut_patches(marks, keyframes),
         scale_known=odometry.scale_known,
     )
@@ -102,14 +105,6 @@ def cut_patches(marks: Landmarks, keyframes: list[Keyframe]) -> NDArray[np.uint8
             columns = np.clip(x[:, None] + steps, 0, image.shape[1] - 1)
             out[index] = image[rows[:, :, None], columns[:, None, :]]
     return out
-
-
-def _estimated(state: SurveyState, odometry: OdometryPass, placed: PlacedFrames) -> NDArray[np.bool_]:
-    """Return (F,) frames connected to the map by measurements: landmarks, unbroken odometry, or the IMU through a gap."""
-    tied = odometry.tracked.astype(bool) | placed.seen
-    if state.motion.inertial:
-        tied[odometry.keyframe_frames] = True
-    return tied
 
 
 def cull(

@@ -74,7 +74,10 @@ def adjust_visits(
     adjusted = replace(part.landmarks, obs_keyframe=chosen[part.landmarks.obs_keyframe])
     seen = _seen_by(redundant, state.landmarks, adjusted, image_numbers(len(redundant), len(state.rig)))
     state = _localize(replace(_with_keyframes_of(state, ~redundant, part), landmarks=seen), settings, redundant)
-    return replace(state, landmarks=_together(adjusted, state.landmarks))
+    both = Landmarks.concatenated(adjusted.points_map, [adjusted, state.landmarks])
+    order = np.argsort(both.obs_landmark, kind="stable")
+    marks = both.taken(order, both.points_map, both.obs_keyframe[order], both.obs_landmark[order])
+    return replace(state, landmarks=marks)
 
 
 def _with_keyframes_of(state: SurveyState, used: NDArray[np.bool_], part: SurveyState) -> SurveyState:
@@ -106,10 +109,3 @@ def _localize(state: SurveyState, settings: SurveySettings, redundant: NDArray[n
         state = apply_result(state, result)
         state = replace(state, landmarks=state.landmarks.keep_observations(keep, 0))
     return state
-
-
-def _together(adjusted: Landmarks, placed: Landmarks) -> Landmarks:
-    """Return the same landmarks with the observations of both, the adjusted ones first."""
-    both = Landmarks.concatenated(adjusted.points_map, [adjusted, placed])
-    order = np.argsort(both.obs_landmark, kind="stable")
-    return both.taken(order, both.points_map, both.obs_keyframe[order], both.obs_landmark[order])

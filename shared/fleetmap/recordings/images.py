@@ -41,7 +41,9 @@ def image_size(data: bytes) -> tuple[int, int] | None:
         if data.startswith((b"II*\0", b"MM\0*")):
             return _tiff_size(data)
         if data.startswith(b"BM"):
-            return _bmp_size(data)
+            (header_bytes,) = struct.unpack_from("<I", data, 14)  # 12: OS/2's first form
+            width, height = struct.unpack_from("<HH" if header_bytes == 12 else "<ii", data, 18)
+            return abs(width), abs(height)
         found = _PNM.match(data[:4096])
         return None if found is None else (int(found[1]), int(found[2]))
     except struct.error:
@@ -79,12 +81,6 @@ def _tiff_size(data: bytes) -> tuple[int, int] | None:
             (size,) = struct.unpack_from(order + _TIFF_KINDS[kind], data, entry + 8)
             sizes[tag] = max(size, sizes.get(tag, 0))
     return (sizes[_TIFF_WIDTH], sizes[_TIFF_HEIGHT]) if len(sizes) == 2 else None
-
-
-def _bmp_size(data: bytes) -> tuple[int, int]:
-    (header_bytes,) = struct.unpack_from("<I", data, 14)
-    width, height = struct.unpack_from("<HH" if header_bytes == 12 else "<ii", data, 18)  # 12: OS/2's first form
-    return abs(width), abs(height)
 
 
 _BAYER_ORDERS = ("rggb", "bggr", "gbrg", "grbg")

@@ -286,12 +286,6 @@ def _knows_speed(covariance: Array, settings: FilterSettings) -> bool:
     return bool(np.linalg.eigvalsh(covariance[3:6, 3:6])[-1] <= settings.initial_velocity_sigma_mps**2)
 
 
-def _knows_direction(start: InitialState) -> bool:
-    """Return True if a state is certainly in motion: before, its images cannot place points, whose distance its step measures."""
-    velocity_mps = start.state.velocity_mps
-    return bool(velocity_mps @ np.linalg.solve(start.covariance[3:6, 3:6], velocity_mps) > _MOVES_3)
-
-
 class MapStart:
     """Scale, speed and gravity of one camera with an IMU, by its fixes in a map: its metres and vertical in place of a second camera.
 
@@ -429,7 +423,9 @@ class MonocularOdometry(Odometry):
             return
         window = MonocularWindow(self._rig, start.state, start.covariance, start.stamp_ns)
         window.filter = InvariantFilter(start.state, start.covariance, self._rig.settings.filter, self._rig.mounted)
-        window.is_blind = not _knows_direction(start)
+        # Before it is certainly in motion, its images cannot place points, whose distance its step measures.
+        velocity_mps = start.state.velocity_mps
+        window.is_blind = not velocity_mps @ np.linalg.solve(start.covariance[3:6, 3:6], velocity_mps) > _MOVES_3
         ids, pixels, self._mode = last.track_ids, last.track_pixels, InertialMode(window, imu)
         assert pixels is not None
         if at.frame_index < last.frame_index:
