@@ -356,16 +356,12 @@ class FailureAck(msgspec.Struct, frozen=True, kw_only=True):
 
 
 M = TypeVar("M", bound=msgspec.Struct)
+encode_message = to_msgpack
 
 
 def covariance_entries(cov_rot_trans: Array) -> tuple[float, ...]:
     """Entries (36,) of a covariance (6, 6), row by row; those that are not known, infinite or above MOST, as MOST."""
     return tuple(np.nan_to_num(cov_rot_trans, nan=MOST).clip(-MOST, MOST).ravel().tolist())
-
-
-def encode_message(message: msgspec.Struct) -> bytes:
-    """Encode a message as MessagePack."""
-    return to_msgpack(message)
 
 
 def decode_message(data: bytes, message_type: type[M]) -> M:

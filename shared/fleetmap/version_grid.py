@@ -26,18 +26,11 @@ TILE_SIZE_M, CELL_M = 16.0, 0.05  # the size of the map's own tiles
 TILE_CELLS = round(TILE_SIZE_M / CELL_M)
 _HEAD = struct.Struct("<ii")
 _LAYERS, _LEVEL = 4, 12
-_LAYER_BYTES = TILE_CELLS**2
-_TILE_BYTES = _HEAD.size + _LAYERS * _LAYER_BYTES
-
-
-def encode_grid_tile(place: tuple[int, int], cells: NDArray[np.uint8]) -> bytes:
-    """Encode the tile at (x, y) with cells (N, N, 4): its place, then four layers of cells, in `container`'s envelope."""
-    layers = (np.ascontiguousarray(cells[..., layer]).tobytes() for layer in range(_LAYERS))
-    return pack(_MAGIC, GRID_FORMAT, [_HEAD.pack(*place), *layers], level=_LEVEL)
+_TILE_BYTES = _HEAD.size + _LAYERS * TILE_CELLS**2
 
 
 def decode_grid_tile(data: bytes) -> tuple[tuple[int, int], NDArray[np.uint8]]:
-    """Decode place and cells (N, N, 4) of a tile.
+    """Decode place and cells (N, N, 4) of a tile: its place, then four layers of cells, in `container`'s envelope.
 
     MapFormatError or NewerFormatError for anything else; memory is bounded for any input.
     """
@@ -50,9 +43,7 @@ def decode_grid_tile(data: bytes) -> tuple[tuple[int, int], NDArray[np.uint8]]:
 
 
 OCCUPIED, FREE, UNKNOWN = 100, 0, -1
-# Thresholds of map_saver, except for free_thresh: with its 0.25 the grey of unknown cells is read as free.
 _SHADES = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
-_OCCUPIED_THRESH, _FREE_THRESH = 0.65, 0.196
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,7 +99,8 @@ def encode_grid(tiles: Mapping[tuple[int, int], Counts]) -> list[bytes]:
     """Encode the index and each tile; nothing for a grid without tiles. Equal grids give equal bytes."""
     blobs, entries = [], []
     for (x, y), cells in sorted(tiles.items()):
-        data = encode_grid_tile((x, y), cells)
+        layers = (np.ascontiguousarray(cells[..., layer]).tobytes() for layer in range(_LAYERS))
+        data = pack(_MAGIC, GRID_FORMAT, [_HEAD.pack(x, y), *layers], level=_LEVEL)
         entries.append(TileEntry(x=x, y=y, sha256=sha256_hex(data), bytes=len(data), landmarks=0))
         blobs.append(data)
     return [to_json(GridIndex(tiles=tuple(entries)), order="deterministic"), *blobs] if blobs else []
@@ -250,7 +242,8 @@ def map_server_files(grid: OccupancyGrid, image_name: str) -> tuple[bytes, bytes
         "resolution": grid.resolution_m,
         "origin": [x, y, float(so3_log(grid.map_from_grid[:3, :3])[2])],
         "negate": 0,
-        "occupied_thresh": _OCCUPIED_THRESH,
-        "free_thresh": _FREE_THRESH,
+        # Those of map_saver, but for free_thresh: with its 0.25 the grey of unknown cells is read as free.
+        "occupied_thresh": 0.65,
+        "free_thresh": 0.196,
     }
     return yaml.safe_dump(entries, sort_keys=False).encode(), b"P5\n%d %d\n255\n" % (width, height) + shades.tobytes()

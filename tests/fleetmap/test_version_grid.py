@@ -4,27 +4,20 @@ import msgspec
 import numpy as np
 import pytest
 
+from fleetmap import version_grid
 from fleetmap.errors import MapFormatError, NewerFormatError, StateError
 from fleetmap.mapformat.manifest import BlobEntry, Manifest
 from fleetmap.mapformat.names import sha256_hex
-from fleetmap.version_grid import (
-    TILE_CELLS,
-    TILE_SIZE_M,
-    Tiles,
-    decode_grid_tile,
-    encode_grid,
-    grid_of,
-    grid_report,
-    known_grid,
-    read_index,
-)
 from mapserver.tiles import tiling
 from support.storage.map_samples import draft_details
 
 
-def random_grid() -> Tiles:
+def random_grid() -> version_grid.Tiles:
     rng = np.random.default_rng(5)
-    return {place: rng.integers(0, 256, (TILE_CELLS, TILE_CELLS, 4), np.uint8) for place in ((-1, 2), (0, 0))}
+    return {
+        place: rng.integers(0, 256, (version_grid.TILE_CELLS, version_grid.TILE_CELLS, 4), np.uint8)
+        for place in ((-1, 2), (0, 0))
+    }
 
 
 def manifest_with(report: dict[str, object]) -> Manifest:
@@ -35,44 +28,44 @@ def manifest_with(report: dict[str, object]) -> Manifest:
 
 def test_bytes_and_back_and_only_what_changed_is_new() -> None:
     tiles = random_grid()
-    blobs = encode_grid(tiles)
+    blobs = version_grid.encode_grid(tiles)
     kept = {sha256_hex(data): data for data in blobs}
-    manifest = manifest_with({"grid": msgspec.to_builtins(grid_report(blobs, {}))})
-    found = grid_of(manifest, kept.__getitem__)
+    manifest = manifest_with({"grid": msgspec.to_builtins(version_grid.grid_report(blobs, {}))})
+    found = version_grid.grid_of(manifest, kept.__getitem__)
     assert list(found) == sorted(tiles)
     for place, cells in tiles.items():
         np.testing.assert_array_equal(found[place], cells)
-    assert encode_grid(found) == blobs
+    assert version_grid.encode_grid(found) == blobs
     changed = dict(tiles)
     changed[0, 0] = tiles[0, 0] ^ 1
-    assert len(set(encode_grid(changed)) - set(blobs)) == 2  # the index and one tile
+    assert len(set(version_grid.encode_grid(changed)) - set(blobs)) == 2  # the index and one tile
 
 
 def test_its_tiles_are_squares_of_the_maps() -> None:
-    assert TILE_SIZE_M == tiling.TILE_SIZE_M
+    assert version_grid.TILE_SIZE_M == tiling.TILE_SIZE_M
 
 
 def test_a_version_without_a_grid_says_why() -> None:
     with pytest.raises(StateError, match="occupancy_grid = true"):
-        grid_of(manifest_with({}), {}.__getitem__)
-    assert known_grid(manifest_with({}), {}.__getitem__) == {}
-    said = msgspec.to_builtins(grid_report([], {"walk": "one camera measures no depth"}))
+        version_grid.grid_of(manifest_with({}), {}.__getitem__)
+    assert version_grid.known_grid(manifest_with({}), {}.__getitem__) == {}
+    said = msgspec.to_builtins(version_grid.grid_report([], {"walk": "one camera measures no depth"}))
     with pytest.raises(StateError, match="walk: one camera measures no depth"):
-        grid_of(manifest_with({"grid": said}), {}.__getitem__)
+        version_grid.grid_of(manifest_with({"grid": said}), {}.__getitem__)
     with pytest.raises(MapFormatError, match=r"report\.grid"):
-        grid_of(manifest_with({"grid": {"sha256": "x"}}), {}.__getitem__)
+        version_grid.grid_of(manifest_with({"grid": {"sha256": "x"}}), {}.__getitem__)
 
 
 def test_damaged_bytes_are_told() -> None:
-    index, tile, _ = encode_grid(random_grid())
+    index, tile, _ = version_grid.encode_grid(random_grid())
     for data in (tile[:-1], tile[:40], b"", b"FMTL" + tile[4:]):
         with pytest.raises(MapFormatError):
-            decode_grid_tile(data)
+            version_grid.decode_grid_tile(data)
     with pytest.raises(NewerFormatError):
-        decode_grid_tile(tile[:4] + b"\x02\x00" + tile[6:])
+        version_grid.decode_grid_tile(tile[:4] + b"\x02\x00" + tile[6:])
     with pytest.raises(MapFormatError):
-        read_index(index[:-1])
+        version_grid.read_index(index[:-1])
     with pytest.raises(NewerFormatError, match="format 2"):
-        read_index(index.replace(b'"format_version":1', b'"format_version":2'))
+        version_grid.read_index(index.replace(b'"format_version":1', b'"format_version":2'))
     with pytest.raises(NewerFormatError):
-        read_index(index.replace(b'"cell_m":0.05', b'"cell_m":0.1'))
+        version_grid.read_index(index.replace(b'"cell_m":0.05', b'"cell_m":0.1'))

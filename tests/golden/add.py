@@ -15,11 +15,7 @@ from fleetmap.mapformat.manifest import MANIFEST_FORMAT  # noqa: E402
 from fleetmap.mapformat.tile_codec import TILE_FORMAT, decode_tile, encode_tile  # noqa: E402
 from fleetmap.mapformat.version_file import EXPORT_FORMAT  # noqa: E402
 from fleetmap.messages import FailureReport, Thumbnail  # noqa: E402
-from fleetmap.version_grid import (  # noqa: E402
-    TILE_CELLS,
-    encode_grid,
-    grid_report,
-)
+from fleetmap.version_grid import TILE_CELLS, encode_grid, grid_report  # noqa: E402
 from mapserver import releases  # noqa: E402
 from mapserver.fleet.fleet import Fleet  # noqa: E402
 from mapserver.quality.figures import Comparison, Evidence, ProbeFigures, TrajectoryBreaks  # noqa: E402
