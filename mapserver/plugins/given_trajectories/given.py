@@ -126,8 +126,8 @@ class GivenTrajectory:
         written = read_poses(self.file)
         stamps_ns = recording.frame_stamps_ns[indices]
         other_trajectory = Trajectory(stamps_on_clock(written, recording, indices, self), written.map_from_it)
-        poses = [pose_at(other_trajectory, int(stamp)) for stamp in stamps_ns]
-        known = np.array([pose is not None for pose in poses])
+        map_from_it = [pose_at(other_trajectory, int(stamp)) for stamp in stamps_ns]
+        known = np.array([each is not None for each in map_from_it])
         if known.sum() <= LEAST_STRETCHES:
             raise _foreign_stamps(written, recording, self)
         _check_span(stamps_ns, known, recording, self)
@@ -136,7 +136,7 @@ class GivenTrajectory:
         followed = _followed(recording, indices, whole=whole)
         shown = Reference(followed, stretches(followed, known), recording.calibration.cameras[0].body_from_cam)
         found, words = _judged(other_trajectory, f"{self.file.name} ({written.kind})", shown, recording, self)
-        at_frames = np.array([np.eye(4) if pose is None else pose for pose in poses])
+        at_frames = np.array([np.eye(4) if each is None else each for each in map_from_it])
         at_frames[:, :3, 3] *= found.in_metres
         at_frames = at_frames @ se3_inverse(shown.body_from(found.reading))
         if not known.all():
