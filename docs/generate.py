@@ -25,7 +25,6 @@ from locclient.config import with_plugins  # noqa: E402
 from locclient.hooks import link_hooks, prior_hooks  # noqa: E402
 from mapserver.config import TIERS as MAPSERVER_TIERS  # noqa: E402
 from mapserver.config import MapserverConfig  # noqa: E402
-from mapserver.hooks import command_hooks  # noqa: E402
 
 COMMANDS, SETTINGS = REPOSITORY / "docs/command_line.md", REPOSITORY / "docs/settings.md"
 PROGRAMS: dict[str, tuple[Section, Tiers]] = {
@@ -123,8 +122,7 @@ def command_page(page: str, plugin: str | None = None) -> str:
         seen.add(heading[1])
         if rows := list(_command_rows(known[heading[1]])):
             parts[number] = with_table(part, "argument or option", rows)
-    hooks = {("mapserver", name) for name in command_hooks()}
-    hooks |= {("locclient", name) for name in plugins("locclient.commands")}
+    hooks = {(side, name) for side in ("mapserver", "locclient") for name in plugins(f"{side}.commands")}
     own = {name for name in known if tuple(name.split()[:2]) not in hooks}
     if plugin is None and (missing := sorted(own - seen)):
         raise ValueError(f"{COMMANDS.name} lacks {', '.join(missing)}; give each a heading and a sentence")

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from fleetmap.cli_exit import require_extra, run_cli
 from fleetmap.cli_options import Commands, ConfigFile, Options, Version, make_app
+from fleetmap.hooks import plugins
 from mapserver.commands.build import build
 from mapserver.commands.building import AREAS, BUILDING, align
 from mapserver.commands.fleet import FLEET
@@ -17,7 +18,6 @@ from mapserver.commands.robots import ROBOTS
 from mapserver.commands.serve import serve
 from mapserver.commands.store import attach, audit, export, gc, import_, retention, verify
 from mapserver.commands.trust import TRUST
-from mapserver.hooks import command_hooks
 
 if TYPE_CHECKING:
     from mapserver.config import MapserverConfig
@@ -47,7 +47,7 @@ COMMANDS: Commands = {
     "operators": OPERATORS,
     "audit": audit,
     "trust": TRUST,
-    **command_hooks(),
+    **plugins("mapserver.commands"),
 }
 
 

@@ -17,7 +17,6 @@
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
-from fleetmap.cli_options import Command
 from fleetmap.hooks import plugin, plugins
 
 if TYPE_CHECKING:
@@ -55,23 +54,3 @@ def open_url(group: str, url: str, what: str) -> Any:
     """Return what opens URLs of this scheme, by a hook; UsageError if nothing does."""
     scheme = url.partition("://")[0]
     return plugin(group, scheme if scheme in plugins(group) else "other", f"{what} under {scheme}://")
-
-
-def part_hooks() -> dict[str, PartHook]:
-    """Return the installed parts of a server."""
-    return plugins("mapserver.parts")
-
-
-def route_hooks() -> dict[str, RouteHook]:
-    """Return the installed parts of the HTTP API."""
-    return plugins("mapserver.routes")
-
-
-def stage_hooks() -> dict[str, StageHook]:
-    """Return the installed stages after a build's surveys."""
-    return plugins("mapserver.stages")
-
-
-def command_hooks() -> dict[str, Command]:
-    """Return the installed commands beside those of the road."""
-    return plugins("mapserver.commands")

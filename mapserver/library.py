@@ -35,6 +35,15 @@ from mapserver.survey.survey_map import SurveyMap
 __all__ = ["Actor", "BuildOptions", "BuiltMap", "GateSettings", "MapArrays", "MapStore", "build_map", "open_map"]
 __all__ += ["open_store", "settings_for"]
 
+_NONE: dict[str, NDArray[Any]] = {
+    "landmark_ids": np.zeros(0, np.uint32),
+    "points_map": np.zeros((0, 3)),
+    "descriptors": np.zeros((0, 32), np.uint8),
+    "place_ids": np.zeros(0, np.uint32),
+    "map_from_cam": np.zeros((0, 4, 4)),
+}
+"""The arrays of a map without tiles."""
+
 
 @dataclass(frozen=True)
 class BuiltMap:
@@ -96,10 +105,9 @@ class BuiltMap:
         A site's first version is refused if its recordings are too short or too straight to judge the calibration. With
         trust_calibration the actor, who needs a name and a reason, confirms it; the manifest records that.
         """
+        choices = {"trust_calibration": trust_calibration, "force": force}
         with MapStore.open(self.store) as maps:
-            if trust_calibration:
-                releases.trust_calibration(maps, maps.version(self.site, self.version), actor)
-            releases.publish(maps, self.site, self.version, force=force, actor=actor, gate=gate or GateSettings())
+            releases.publish(maps, self.site, self.version, actor=actor, **choices, gate=gate or GateSettings())
 
 
 def build_map(
@@ -154,18 +162,5 @@ def open_map(store: str | Path, site: str, version: int | None = None) -> MapArr
             version = current.version
         manifest = maps.manifest(site, version)
         tiles = tuple(decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles)
-    return MapArrays(
-        site=site,
-        version=version,
-        manifest=manifest,
-        tiles=tiles,
-        landmark_ids=_joined([tile.landmark_ids for tile in tiles], np.zeros(0, np.uint32)),
-        points_map=_joined([tile.points_map for tile in tiles], np.zeros((0, 3))),
-        descriptors=_joined([tile.descriptors for tile in tiles], np.zeros((0, 32), np.uint8)),
-        place_ids=_joined([tile.place_ids for tile in tiles], np.zeros(0, np.uint32)),
-        map_from_cam=_joined([tile.map_from_cam for tile in tiles], np.zeros((0, 4, 4))),
-    )
-
-
-def _joined(arrays: Sequence[NDArray[Any]], none: NDArray[Any]) -> NDArray[Any]:
-    return np.concatenate([none, *arrays])
+    joined = {name: np.concatenate([none, *(getattr(tile, name) for tile in tiles)]) for name, none in _NONE.items()}
+    return MapArrays(site=site, version=version, manifest=manifest, tiles=tiles, **joined)

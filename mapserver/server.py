@@ -45,9 +45,6 @@ from mapserver.trust.http_certificate import HttpCertificate
 _STOP_WITHIN_S = 5  # limit for open requests
 _END_WITHIN_S = 5.0  # additional limit for threads
 _SWITCH_INTERVAL_S = 0.001
-_RENEW_EVERY_S = 10.0
-_WARN_EVERY_S = 86_400.0
-_BUILD_EVERY_S = 60.0
 _log = logging.getLogger(__name__)
 
 
@@ -91,8 +88,8 @@ class Server:
         config = self._http_config(served)
         if self.certificate is not None and config.ssl is not None:
             renew = partial(self.certificate.renew, config.ssl)
-            groups[0].append(BackgroundTask("checking the certificate of HTTP", _WARN_EVERY_S, self.certificate.warn))
-            groups[0].append(BackgroundTask("renewing the certificate of HTTP", _RENEW_EVERY_S, renew))
+            groups[0].append(BackgroundTask("checking the certificate of HTTP", 86_400.0, self.certificate.warn))
+            groups[0].append(BackgroundTask("renewing the certificate of HTTP", 10.0, renew))
         # uvicorn stops on these signals and afterwards raises them again for the previous handlers:
         # the default handlers would end the process with a status of being killed.
         for number in (signal.SIGTERM, signal.SIGINT):
@@ -121,9 +118,8 @@ class Server:
         bus_service = BusService(maps, fleet, self.bus, metrics.count_bus, self.robots, take)
         usual = tasks.server_tasks(maps, fleet, bus_service, settings.canary)
         if drives is not None:
-            usual.append(BackgroundTask("building robots' drives", _BUILD_EVERY_S, drives.build))
-        sections = (settings.gate, settings.canary, settings.resurvey, settings.alerts, settings.ingest)
-        api = ApiSettings(self.guard, *sections, self.certificate, webhook, nights)
+            usual.append(BackgroundTask("building robots' drives", 60.0, drives.build))
+        api = ApiSettings(self.guard, settings, self.certificate, webhook, nights)
         app = create_app(maps, fleet, metrics, self.bus, lifespan, api)
         install_dashboard(app, maps, fleet, api, bus_service.hear)
         alerts = tasks.alert_tasks(maps, fleet, settings.alerts, webhook)

@@ -22,6 +22,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 import fleetmap
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import StateError
+from fleetmap.hooks import plugins
 from fleetmap.mapformat.manifest import MANIFEST_FORMAT
 from fleetmap.mapformat.tile_codec import TILE_FORMAT
 from mapserver.api import building_routes, fleet_routes, inbox_routes, people_routes, problems, version_routes, views
@@ -32,7 +33,6 @@ from mapserver.api.request_limits import RequestLimits
 from mapserver.api.views import Problem
 from mapserver.fleet.alerts import active_alerts
 from mapserver.fleet.fleet import Fleet
-from mapserver.hooks import route_hooks
 from mapserver.operators.operators import Operators
 from mapserver.serving.server_health import ServerHealth, server_health
 from mapserver.store import MapStore
@@ -71,7 +71,7 @@ def create_app(
     app.include_router(router)
     for routes in (version_routes, people_routes, inbox_routes, fleet_routes, building_routes):
         app.include_router(routes.router)
-    for install in route_hooks().values():
+    for install in plugins("mapserver.routes").values():
         install(app, store, partial(version_routes.offered_file, store))
     app.openapi = cache(partial(_described, app))  # type: ignore[method-assign]  # made at the first request
     return app
@@ -112,13 +112,13 @@ def metrics_text(service: p.Service) -> Response:
 def server(service: p.Service) -> ServerHealth:
     """State of the server: version, disk, store, memory, days until certificates and signed lists expire, retention."""
     settings = service.settings
-    return server_health(service.store, service.fleet, settings.ingest, settings.certificate)
+    return server_health(service.store, service.fleet, settings.config.ingest, settings.certificate)
 
 
 @router.get("/v1/alerts", response_model=views.AlertList)
 def alerts(service: p.Service, page: p.NamePage) -> Any:
     """Active alerts, by site, name and subject."""
-    found = active_alerts(service.store, service.fleet, service.settings.alerts, time.time_ns())
+    found = active_alerts(service.store, service.fleet, service.settings.config.alerts, time.time_ns())
     return page.of(views.AlertList, found, lambda alert: f"{alert.site}/{alert.name}/{alert.about}")
 
 

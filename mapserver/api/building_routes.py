@@ -56,11 +56,6 @@ Scale = Annotated[
 router = APIRouter()
 
 
-def _file(media_type: str) -> dict[str, Any]:
-    """The OpenAPI description of a body that is a file."""
-    return {"requestBody": {"content": {media_type: {"schema": {"type": "string", "format": "binary"}}}}}
-
-
 @router.get("/v1/sites/{site}/areas")
 def areas(response: Response, store: p.Store, site: p.Site) -> dict[str, Any]:
     """Named areas of a site as GeoJSON, with metres in `map` instead of degrees."""
@@ -69,7 +64,7 @@ def areas(response: Response, store: p.Store, site: p.Site) -> dict[str, Any]:
     return store.areas(site).geojson(site)
 
 
-@router.put("/v1/sites/{site}/areas", openapi_extra=_file("application/geo+json"))
+@router.put("/v1/sites/{site}/areas", openapi_extra=p.file_body("application/geo+json"))
 def replace(
     response: Response, store: p.Store, site: p.Site, by: By, data: File, if_match: IfMatch = None
 ) -> dict[str, Any]:
@@ -104,7 +99,7 @@ def alignment(store: p.Store, site: p.Site) -> dict[str, Any]:
     return dict(to_plain(found))
 
 
-@router.put("/v1/sites/{site}/alignment", openapi_extra=_file("application/octet-stream"))
+@router.put("/v1/sites/{site}/alignment", openapi_extra=p.file_body("application/octet-stream"))
 def set_alignment(
     store: p.Store,
     site: p.Site,

@@ -19,7 +19,7 @@ from mapserver.fleet.resurvey_list import ResurveyList, resurvey_list
 from mapserver.fleet_statistics.kpis import HOUR_NS, hour_of, kpis
 from mapserver.fleet_statistics.resurvey_decision import route_geojson
 from mapserver.floor_plan.survey_requests import SurveyRequest
-from mapserver.serving.robot_placing import place_robot
+from mapserver.serving.bus_service import place_robot
 
 _MAX_PAGE_BYTES = 4_000_000
 
@@ -124,7 +124,7 @@ def replay(request: Request, store: p.Store, number: p.Number) -> Response:
 @router.get("/v1/sites/{site}/resurvey")
 def resurvey(service: p.Service, site: p.Site) -> ResurveyList:
     """Tiles to resurvey, the most urgent first, each with its reasons, and a route through them."""
-    return resurvey_list(service.store, site, service.settings.resurvey, time.time_ns())
+    return resurvey_list(service.store, site, service.settings.config.resurvey, time.time_ns())
 
 
 @router.post("/v1/sites/{site}/resurvey/requests")

@@ -14,7 +14,7 @@ from mapserver.api import views
 from mapserver.api.guard import By, Sender
 from mapserver.api.problems import refused_with
 from mapserver.drafting.job_lock import log_path
-from mapserver.nightly.inbox import contents, put_back, sites_of
+from mapserver.nightly.inbox import Inbox, contents, put_back, sites_of
 from mapserver.nightly.upload import Upload
 from mapserver.serving.night_runs import SETTLE_S, NightRuns
 from mapserver.store import Actor, JobInfo, MapStore
@@ -23,12 +23,6 @@ NO_INBOX = "This server has no inbox; `mapserver serve --inbox DIR` gives it one
 _MOST_UPLOADS = 4  # at once
 _WRITTEN_BYTES = 1 << 20  # at once, by another thread
 _LOG_BYTES = 64 << 10
-_FILE = {
-    "requestBody": {
-        "required": True,
-        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
-    }
-}
 _TEXT = {"content": {"text/plain": {"schema": {"type": "string"}}}}
 _log = logging.getLogger(__name__)
 router = APIRouter()
@@ -51,15 +45,18 @@ def _logged(store: MapStore, kind: str, words: str, site: str, actor: Actor) -> 
 
 
 @router.get("/v1/sites/{site}/inbox")
-def inbox(runs: Runs, store: p.Store, site: p.Site) -> views.Inbox:
+def inbox(runs: Runs, store: p.Store, site: p.Site) -> Inbox:
     """Recordings in the inbox of a site: those that wait, were held or are bad with the reason, and how many are in a version."""
     if site not in {*sites_of(runs.inbox), *store.sites_with_jobs(), *(info.site for info in store.sites())}:
         raise UsageError(f"no inbox of a site {site}; its first upload makes one")
-    here = contents(runs.inbox / site, SETTLE_S, time.time_ns())
-    return views.Inbox(site=site, waiting=here.waiting, held=here.held, bad=here.bad, done=here.done)
+    return contents(runs.inbox / site, SETTLE_S, time.time_ns())
 
 
-@router.put("/v1/sites/{site}/inbox/{name}", status_code=201, openapi_extra=_FILE)
+@router.put(
+    "/v1/sites/{site}/inbox/{name}",
+    status_code=201,
+    openapi_extra=p.file_body("application/octet-stream", required=True),
+)
 async def upload(
     request: Request, runs: Runs, service: p.Service, site: p.Site, name: p.RecordingName, who: By
 ) -> views.Uploaded:
@@ -95,7 +92,7 @@ async def upload(
 @router.post("/v1/sites/{site}/inbox/{box}/{name}/retry")
 def retry(
     runs: Runs, store: p.Store, sender: Sender, site: p.Site, box: p.Box, name: p.RecordingName, act: views.Act
-) -> views.Inbox:
+) -> Inbox:
     """Move a held or bad recording back into the inbox, for the next build."""
     who = sender.of(act)
     put_back(runs.inbox / site, box, name)

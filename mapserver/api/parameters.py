@@ -22,28 +22,20 @@ from mapserver.api.guard import GuardSettings
 from mapserver.api.metrics import Metrics
 from mapserver.api.moments import read_range
 from mapserver.api.problems import refused_with
-from mapserver.fleet.alerts import AlertSettings
+from mapserver.config import MapserverConfig
 from mapserver.fleet.fleet import Fleet
-from mapserver.fleet.ingest import IngestSettings
-from mapserver.fleet_statistics.canary_decision import CanarySettings
-from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.operators.operators import Operators
 from mapserver.operators.roles import OPERATOR_PATTERN
-from mapserver.quality.gate import GateSettings
 from mapserver.serving.night_runs import NightRuns
 from mapserver.store import FailureFilter, MapStore
 from mapserver.trust.http_certificate import HttpCertificate
 
 
 class ApiSettings(NamedTuple):
-    """Settings of access, the gate, canaries, tiles, alerts and reports; the certificate of HTTP, webhook and inbox, None without one."""
+    """Settings of access, and those of the server's file; the certificate of HTTP, webhook and inbox, None without one."""
 
     guard: GuardSettings = GuardSettings()
-    gate: GateSettings = GateSettings()
-    canary: CanarySettings = CanarySettings()
-    resurvey: ResurveySettings = ResurveySettings()
-    alerts: AlertSettings = AlertSettings()
-    ingest: IngestSettings = IngestSettings()
+    config: MapserverConfig = MapserverConfig()
     certificate: HttpCertificate | None = None
     webhook: Any = None
     nights: NightRuns | None = None
@@ -114,6 +106,11 @@ def time_range(since: Since = None, until: Until = None) -> tuple[int | None, in
 
 
 TimeRange = Annotated[tuple[int | None, int | None], Depends(time_range)]
+
+
+def file_body(media_type: str, **more: bool) -> dict[str, Any]:
+    """The OpenAPI description of a body that is a file."""
+    return {"requestBody": {"content": {media_type: {"schema": {"type": "string", "format": "binary"}}}, **more}}
 
 
 async def known_parameters(request: HTTPConnection) -> None:

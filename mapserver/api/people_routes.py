@@ -17,7 +17,7 @@ from mapserver.api.problems import refused_with
 from mapserver.operators.operators import Operators
 from mapserver.operators.roles import SCOPES, Role
 from mapserver.store import MapStore
-from mapserver.trust.enrolment import LISTENING, RobotRegister
+from mapserver.trust.enrolment import LISTENING, EnrolledRobot, RobotRegister
 
 _ONCE = {"Cache-Control": "no-store"}
 router = APIRouter()
@@ -41,9 +41,9 @@ def operators_of(store: MapStore) -> list[views.OperatorView]:
     ]
 
 
-def enrolled_of(store: MapStore, site: str) -> list[views.EnrolledRobot]:
+def enrolled_of(store: MapStore, site: str) -> list[EnrolledRobot]:
     """Return the enrolled robots of a site, by name."""
-    return [views.EnrolledRobot(**entry.row(store.now_ns())) for entry in RobotRegister(store).robots(site)]
+    return [entry.shown(store.now_ns()) for entry in RobotRegister(store).robots(site)]
 
 
 @router.get("/v1/operators", response_model=views.OperatorList)

@@ -50,10 +50,8 @@ def problem(status: int, detail: str, path: str, headers: dict[str, str] | None 
 
 def install(app: FastAPI) -> None:
     """Make every error of `app` a problem document."""
-    app.add_exception_handler(FleetmapError, _fleetmap_error)
-    app.add_exception_handler(HTTPException, _http_error)
-    app.add_exception_handler(RequestValidationError, _validation_error)
-    app.add_exception_handler(Exception, _unexpected)
+    for kind in (FleetmapError, HTTPException, RequestValidationError, Exception):
+        app.add_exception_handler(kind, _answer)
 
 
 @contextmanager
@@ -67,25 +65,18 @@ def refused_with(status: int) -> Iterator[None]:
         raise HTTPException(status, str(error)) from error
 
 
-def _fleetmap_error(request: Request, error: Exception) -> Response:
-    status = next((status for kind, status in _STATUS if isinstance(error, kind)), HTTPStatus.INTERNAL_SERVER_ERROR)
-    if status >= HTTPStatus.INTERNAL_SERVER_ERROR:
-        _log.error("%s %r: %s", request.method, request.url.path, error)
-    return problem(status, str(error), request.url.path)
-
-
-def _http_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, HTTPException)
-    headers = None if error.headers is None else dict(error.headers)
-    return problem(error.status_code, str(error.detail), request.url.path, headers)
-
-
-def _validation_error(request: Request, error: Exception) -> Response:
-    assert isinstance(error, RequestValidationError)
-    faults = "; ".join(f"{'.'.join(str(part) for part in fault['loc'])}: {fault['msg']}" for fault in error.errors())
-    return problem(HTTPStatus.UNPROCESSABLE_ENTITY, faults, request.url.path)
-
-
-def _unexpected(request: Request, error: Exception) -> Response:
-    _log.error("%s %r failed", request.method, request.url.path, exc_info=error)
-    return problem(HTTPStatus.INTERNAL_SERVER_ERROR, "an internal error; see the server's log", request.url.path)
+def _answer(request: Request, error: Exception) -> Response:
+    """Return the problem document of an error; what is no fault of the request is logged."""
+    path = request.url.path
+    if isinstance(error, HTTPException):
+        return problem(error.status_code, str(error.detail), path, dict(error.headers or {}))
+    if isinstance(error, RequestValidationError):
+        faults = (f"{'.'.join(str(part) for part in fault['loc'])}: {fault['msg']}" for fault in error.errors())
+        return problem(HTTPStatus.UNPROCESSABLE_ENTITY, "; ".join(faults), path)
+    if isinstance(error, FleetmapError):
+        status = next((status for kind, status in _STATUS if isinstance(error, kind)), HTTPStatus.INTERNAL_SERVER_ERROR)
+        if status >= HTTPStatus.INTERNAL_SERVER_ERROR:
+            _log.error("%s %r: %s", request.method, path, error)
+        return problem(status, str(error), path)
+    _log.error("%s %r failed", request.method, path, exc_info=error)
+    return problem(HTTPStatus.INTERNAL_SERVER_ERROR, "an internal error; see the server's log", path)

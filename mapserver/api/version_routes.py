@@ -150,10 +150,8 @@ def publish(
     service: p.Service, sender: Sender, site: p.Site, version: p.Version, act: views.PublishAct
 ) -> views.VersionView:
     """Check a draft by the gate and make it current."""
-    store, actor = service.store, sender.of(act)
-    if act.trust_calibration:
-        releases.trust_calibration(store, store.version(site, version), actor)
-    releases.publish(store, site, version, actor=actor, force=act.force, gate=service.settings.gate)
+    store, chosen = service.store, {"trust_calibration": act.trust_calibration, "force": act.force}
+    releases.publish(store, site, version, actor=sender.of(act), **chosen, gate=service.settings.config.gate)
     return views.version_view(store, store.version(site, version))
 
 
@@ -183,7 +181,7 @@ def canary(service: p.Service, site: p.Site) -> views.CanaryView:
             f"site {site} never had a canary; `mapserver promote VERSION "
             f"--canary 5% --site {site} --store {shlex.quote(str(store.folder))}` starts one",
         )
-    return _view(store, found[0], service.settings.canary)
+    return _view(store, found[0], service.settings.config.canary)
 
 
 @router.post("/v1/sites/{site}/versions/{version}/canary")
@@ -195,9 +193,9 @@ def start_canary(
     `rollback` withdraws it, promoting it ends it early; otherwise the server decides by the failures of both groups.
     """
     store, settings = service.store, service.settings
-    share = settings.canary.share if act.share is None else act.share
-    releases.start_canary(store, site, version, share, actor=sender.of(act), gate=settings.gate)
-    return _view(store, store.canaries(site)[0], settings.canary)
+    share = settings.config.canary.share if act.share is None else act.share
+    releases.start_canary(store, site, version, share, actor=sender.of(act), gate=settings.config.gate)
+    return _view(store, store.canaries(site)[0], settings.config.canary)
 
 
 def _view(store: MapStore, row: CanaryRow, settings: CanarySettings) -> views.CanaryView:

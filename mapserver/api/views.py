@@ -11,11 +11,10 @@ from mapserver.fleet.building import MOST_CORNERS
 from mapserver.fleet.fleet import RobotStatus
 from mapserver.fleet_statistics.canary_decision import CanaryFinding
 from mapserver.fleet_statistics.kpis import Kpis
-from mapserver.nightly.inbox import InboxEntry
 from mapserver.operators.operators import MAX_TOKEN_DAYS
 from mapserver.operators.roles import OPERATOR_PATTERN, Role, Scope
 from mapserver.quality.figures import TrustedCalibration
-from mapserver.serving.robot_placing import MOST_SIGMA_M
+from mapserver.serving.bus_service import MOST_SIGMA_M
 from mapserver.store import (
     CanaryRow,
     Event,
@@ -27,6 +26,7 @@ from mapserver.store import (
     VerdictRow,
     VersionInfo,
 )
+from mapserver.trust.enrolment import EnrolledRobot
 
 
 class VersionView(BaseModel):
@@ -53,16 +53,6 @@ class VersionView(BaseModel):
 def version_view(store: MapStore, info: VersionInfo) -> VersionView:
     """Return the API's view of a version."""
     return VersionView.model_validate(info).model_copy(update={"trusted_calibrations": store.trusted(info)})
-
-
-class Inbox(BaseModel):
-    """Recordings in the inbox of a site, at most 1000 of each kind; done: number of those in a version."""
-
-    site: str
-    waiting: list[InboxEntry]
-    held: list[InboxEntry]
-    bad: list[InboxEntry]
-    done: int
 
 
 class Uploaded(BaseModel):
@@ -137,18 +127,6 @@ class Secret(BaseModel):
 
     name: str
     secret: str
-
-
-class EnrolledRobot(BaseModel):
-    """A robot that is admitted to the bus. certificate: the name in it; days_left: of it, or of the bundle while that is not used."""
-
-    site: str
-    robot: str
-    certificate: str
-    enrolled_ns: int
-    is_used: bool
-    days_left: float
-    state: str
 
 
 Decimal = Annotated[float, Field(ge=-MOST, le=MOST)]

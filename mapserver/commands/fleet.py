@@ -38,9 +38,8 @@ def report(
     """Write a one-page report for the shift leader: failures per robot-day, worst robots, versions, causes, tiles to resurvey."""
     from mapserver.dashboard.shift_page import html_page
 
-    settings = settings_of(context)
     with open_store(store, read_only=True) as maps:
-        page = html_page(maps, site, hours, time.time_ns(), settings.canary, settings.resurvey)
+        page = html_page(maps, site, hours, time.time_ns(), settings_of(context))
     write_output(out, page.encode())
     typer.echo(str(out))
 

@@ -56,7 +56,8 @@ def inspect(
         manifest = maps.manifest(site, info.version)
         verdicts = maps.verdicts(site, info.version)
         history = [event for event in maps.events(site) if event.version == info.version]
-    per_m = _bytes_per_m(info, manifest)
+    path_m = manifest.report.get("path_m")
+    per_m = info.map_bytes / path_m if isinstance(path_m, int | float) and path_m > 0 else None
     shown = {name: getattr(info, name) for name in ("state", "manifest_sha256", "map_bytes")}
     shown |= {"bytes_per_m": per_m, "verdicts": verdicts, "history": history, "manifest": manifest}
     print_result(shown, _words(info, manifest, per_m, verdicts, history), json=json)
@@ -69,12 +70,6 @@ def _chosen(maps: "MapStore", site: str, version: int | None) -> "VersionInfo":
     if not infos:
         raise UsageError(f"site {site} has no version; make one with `mapserver build RECORDING --site {site}`")
     return maps.current(site) or infos[-1]
-
-
-def _bytes_per_m(info: "VersionInfo", manifest: "Manifest") -> float | None:
-    """Return the size of the map per metre of surveyed path, None if the report has no path length."""
-    path_m = manifest.report.get("path_m")
-    return info.map_bytes / path_m if isinstance(path_m, int | float) and path_m > 0 else None
 
 
 _FIGURES = {
@@ -184,10 +179,8 @@ def publish(
 
     gate = settings_of(context).gate
     with open_store(where.store) as maps:
-        draft = releases.chosen_draft(maps.releases(where.site), version)
-        if trust:
-            draft = releases.trust_calibration(maps, draft, by.named())
-        published = releases.publish(maps, where.site, draft.version, actor=by.named(), force=force, gate=gate)
+        chosen = {"trust_calibration": trust, "force": force}
+        published = releases.publish(maps, where.site, version, actor=by.named(), **chosen, gate=gate)
         info = maps.version(where.site, published)
         verdict = maps.verdicts(where.site, published)[-1]
         evidence = maps.evidence(where.site, published)

@@ -82,14 +82,13 @@ def list_(
     from mapserver.trust.enrolment import RobotRegister
 
     with open_store(store, read_only=True) as maps:
-        rows = [entry.row(maps.now_ns()) for entry in RobotRegister(maps).robots(site)]
+        found = [entry.shown(maps.now_ns()) for entry in RobotRegister(maps).robots(site)]
     if json:
-        print_json(rows)
+        print_json(found)
         return
-    for row in rows:
-        row["enrolled"] = f"{datetime.fromtimestamp(row['enrolled_ns'] / 1e9, UTC):%Y-%m-%d %H:%M}"
-    columns = ("site", "robot", "certificate", "enrolled", "state")
-    print_table(columns, ([row[name] for name in columns] for row in rows))
+    enrolled = [f"{datetime.fromtimestamp(row.enrolled_ns / 1e9, UTC):%Y-%m-%d %H:%M}" for row in found]
+    rows = ((r.site, r.robot, r.certificate, at, r.state) for r, at in zip(found, enrolled, strict=True))
+    print_table(("site", "robot", "certificate", "enrolled", "state"), rows)
 
 
 ROBOTS = Group(

@@ -8,7 +8,6 @@ from typing import NamedTuple
 
 from fleetmap.errors import StateError
 from mapserver.api.people_routes import enrolled_of, operators_of
-from mapserver.api.views import EnrolledRobot
 from mapserver.dashboard.console import PageContext, Services
 from mapserver.dashboard.live import ORDER, LiveRobot
 from mapserver.dashboard.rendering import size
@@ -16,7 +15,7 @@ from mapserver.fleet.alerts import active_alerts
 from mapserver.operators.operators import MAX_TOKEN_DAYS
 from mapserver.operators.roles import OPERATOR_PATTERN, SCOPES, Role, Scope
 from mapserver.serving.server_health import Ending, ServerHealth, server_health
-from mapserver.trust.enrolment import RobotRegister
+from mapserver.trust.enrolment import EnrolledRobot, RobotRegister
 
 _NAMES = {
     "http": "Certificate of these pages",
@@ -59,10 +58,10 @@ class Row(NamedTuple):
 def page(services: Services, _: PageContext) -> dict[str, object]:
     """What the template needs."""
     store, settings, now_ns = services.maps.store, services.settings, time.time_ns()
-    found = server_health(store, services.robots.fleet, settings.ingest, settings.certificate)
+    found = server_health(store, services.robots.fleet, settings.config.ingest, settings.certificate)
     kept = found.retention
     return {
-        "alerts": active_alerts(store, services.robots.fleet, settings.alerts, now_ns),
+        "alerts": active_alerts(store, services.robots.fleet, settings.config.alerts, now_ns),
         "now_ns": now_ns,
         "webhook": settings.webhook,
         "found": found,

@@ -1,7 +1,9 @@
 """Maps and surveys for the pages: all that they read from the store."""
 
 import logging
+import math
 import threading
+import time
 from collections import OrderedDict
 from collections.abc import Callable, Hashable
 from pathlib import Path
@@ -19,7 +21,7 @@ from mapserver.dashboard.map_layers import Box, Layer, Picture, box_of
 from mapserver.dashboard.plan import Plan, inked, make_plan, png
 from mapserver.floor_plan.alignment import PLAN, Alignment
 from mapserver.floor_plan.plan_file import decode_plan
-from mapserver.nightly.inbox import InboxContents, contents, sites_of
+from mapserver.nightly.inbox import Inbox, contents, sites_of
 from mapserver.quality.gate import GateSettings
 from mapserver.releases import Difference
 from mapserver.serving.night_runs import SETTLE_S
@@ -29,6 +31,7 @@ _log = logging.getLogger(__name__)
 T = TypeVar("T")
 _GRID_HEIGHT_M = 1.1  # as the API's grid without a height
 JOBS_SHOWN = 100
+MANY_SITES = 1000
 Span = tuple[int | None, int | None]
 """From when and until before when, nanoseconds since 1970; None: without an end."""
 EVER: Span = (None, None)
@@ -63,20 +66,25 @@ def grid_picture(grid: OccupancyGrid) -> tuple[bytes, Box]:
     return png(picture[::-1]), (x, y, x + width * grid.resolution_m, y + height * grid.resolution_m)
 
 
-class _Kept(Generic[T]):
-    """The last values that were made, by key: a second browser waits for the first one's instead of making it again."""
+class Kept(Generic[T]):
+    """The last values that were made, by key: a second browser waits for the first one's instead of making it again.
 
-    def __init__(self, most: int = 8) -> None:
-        self._lock, self._values, self._most = threading.Lock(), OrderedDict[Hashable, T](), most
+    age: after which, by the clock, a value is made again.
+    """
+
+    def __init__(self, most: int = 8, age: float = math.inf, clock: Callable[[], float] = time.monotonic) -> None:
+        self._lock, self._most, self._age, self._clock = threading.Lock(), most, age, clock
+        self._values = OrderedDict[Hashable, tuple[float, T]]()
 
     def get(self, key: Hashable, make: Callable[[], T]) -> T:
         with self._lock:
-            if key not in self._values:
-                self._values[key] = make()
+            if key not in self._values or self._clock() - self._values[key][0] >= self._age:
+                value = make()
+                self._values[key] = self._clock(), value
             self._values.move_to_end(key)
             while len(self._values) > self._most:
                 self._values.popitem(last=False)
-            return self._values[key]
+            return self._values[key][1]
 
 
 class MapData:
@@ -86,8 +94,8 @@ class MapData:
         """inbox: the folder with an inbox for each site; None if the server has none."""
         self.store, self.inbox = store, inbox
         self._gate, self.trial_share = gate, trial_share
-        self._plans, self._underlays = _Kept[Plan](), _Kept[tuple[bytes, Box] | None]()
-        self._differences, self._foretold = _Kept[Difference](64), _Kept[VerdictRow]()
+        self._plans, self._underlays = Kept[Plan](), Kept[tuple[bytes, Box] | None]()
+        self._differences, self._foretold = Kept[Difference](64), Kept[VerdictRow]()
 
     def sites(self) -> list[str]:
         """Names of all sites, also of those that have only jobs or an inbox yet."""
@@ -117,7 +125,7 @@ class MapData:
         """Whether the store has a version."""
         return self.is_mapped(site) and any(info.version == version for info in self.store.versions(site))
 
-    def inbox_of(self, site: str) -> InboxContents | None:
+    def inbox_of(self, site: str) -> Inbox | None:
         """What lies in the inbox of a site; None if the server has no inbox."""
         return None if self.inbox is None else contents(self.inbox / site, SETTLE_S, self.store.now_ns())
 

@@ -11,19 +11,18 @@ from itertools import groupby, pairwise
 from math import hypot
 
 from fleetmap.failure_definition import is_blind, is_usable
-from fleetmap.failure_summary import FailureSummary, Moment
+from fleetmap.failure_summary import Moment
 from fleetmap.messages import Cause, FailureReport, Status
 from mapserver.api.moments import clock_text
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.failures import ADVICE, failure_marks, tone_of
-from mapserver.dashboard.fleet_health import MANY_FAILURES
+from mapserver.dashboard.fleet_health import MANY_FAILURES, NEAR_NS
 from mapserver.dashboard.live import words_of
 from mapserver.dashboard.map_layers import Layer, Line, Mark
 from mapserver.store import FailureDetail, FailureFilter, FailureRow, PictureRow
 
 _NEAR_M = 5.0
 _LISTED = 6
-_NEAR_NS = 60_000_000_000
 _JUMP_M, _JUMP_MPS = 0.3, 3.0  # beyond both an estimate was corrected: no robot drives so
 _FARTHEST_M = 1e5
 
@@ -61,14 +60,9 @@ class BlindTime:
     found_ns: int | None
 
 
-def moments_near(summary: FailureSummary | None, began_ns: int) -> list[Moment]:
-    """What the robot said within a minute of the beginning; nothing without a recording."""
-    return [] if summary is None else [each for each in summary.moments if abs(each.stamp_ns - began_ns) <= _NEAR_NS]
-
-
 def pictures_near(pictures: Sequence[PictureRow], began_ns: int) -> list[PictureRow]:
     """The pictures of the recording within a minute of the beginning, the oldest first."""
-    near = [each for each in pictures if each.kind == "replay" and abs(each.stamp_ns - began_ns) <= _NEAR_NS]
+    near = [each for each in pictures if each.kind == "replay" and abs(each.stamp_ns - began_ns) <= NEAR_NS]
     return sorted(near, key=lambda each: each.stamp_ns)
 
 
@@ -193,7 +187,7 @@ def page(services: Services, context: PageContext, failure: str) -> dict[str, ob
     detail = services.maps.store.fleet.failure(number(failure, "failure") or 0)
     row, report, began_ns = detail.failure, detail.report, detail.report.stamp_ns
     context = replace(context, site=row.site)  # whatever site the address names, or none
-    moments = moments_near(services.health.replay(row.number), began_ns)
+    moments = services.health.moments(row.number, began_ns)
     clock = FailureClock(began_ns, row.happened_ns, context.zone)
     recorded = pictures_near(detail.pictures, began_ns)
     seen = recorded or [picture for picture in detail.pictures if picture.kind == "frame"]

@@ -1,15 +1,15 @@
 """Fleet health for the pages: rates with their intervals, failures, versions on trial."""
 
 import logging
-import threading
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import scipy
 
 from fleetmap.errors import RecordingError
-from fleetmap.failure_summary import FailureSummary, decode_summary
+from fleetmap.failure_summary import Moment, decode_summary
 from fleetmap.messages import CameraNote
+from mapserver.dashboard.data import MANY_SITES, Kept
 from mapserver.dashboard.fleet_parts import Trial, trial_of
 from mapserver.fleet.alerts import Alert
 from mapserver.fleet.canary_controller import find
@@ -25,6 +25,7 @@ DAY_H, WEEK_H = 24, 7 * 24
 DAYS_SHOWN = 14
 FAILURES_SHOWN = 50
 MANY_FAILURES = 5000
+NEAR_NS = 60_000_000_000  # of a failure's beginning
 _CACHED_NS = 5_000_000_000
 _ENDED_SHOWN_NS = 7 * DAY_H * HOUR_NS
 _SIGNIFICANCE = 0.05
@@ -59,19 +60,11 @@ class HealthData:
         alerts: Callable[[int], Iterable[Alert]],
     ) -> None:  # fmt: skip
         self._store, self._canary, self._resurvey, self._clock_ns = store, canary, resurvey, clock_ns
-        self._alerts = alerts
-        self._lock = threading.Lock()
-        self._cached: dict[str, tuple[int, SiteHealth]] = {}
+        self._alerts, self._sites = alerts, Kept[SiteHealth](MANY_SITES, _CACHED_NS, clock_ns)
 
     def site(self, site: str) -> SiteHealth:
         """A site's figures, a few seconds old at most, computed once for all open pages."""
-        with self._lock:
-            cached = self._cached.get(site)
-            if cached is not None and self._clock_ns() - cached[0] < _CACHED_NS:
-                return cached[1]
-            found = self._site(site)
-            self._cached[site] = (self._clock_ns(), found)
-        return found
+        return self._sites.get(site, lambda: self._site(site))
 
     def trace(self, site: str, robot: str, since_ns: int, until_ns: int) -> list[TraceRow]:
         """Where a robot was and what it said of itself, thinned, oldest first."""
@@ -101,16 +94,15 @@ class HealthData:
         told = {robot: self._store.fleet.failure(number).report.camera for robot, number in newest.items()}
         return {robot: camera for robot, camera in told.items() if camera is not None}
 
-    def replay(self, number: int) -> FailureSummary | None:
-        """What the robot said in the seconds around a failure; None without a recording, and for one of another fleetmap."""
+    def moments(self, number: int, began_ns: int) -> list[Moment]:
+        """What the robot said within a minute of a failure's beginning; nothing without a recording, and for one of another fleetmap."""
         found = self._store.fleet.replay_summary(number)
-        if found is None:
-            return None
         try:
-            return decode_summary(found)
+            told = () if found is None else decode_summary(found).moments
         except RecordingError as error:
             _log.warning("failure %d is shown without its recording: %s", number, error)
-            return None
+            return []
+        return [each for each in told if abs(each.stamp_ns - began_ns) <= NEAR_NS]
 
     def _site(self, site: str) -> SiteHealth:
         now_ns = self._clock_ns()
@@ -118,7 +110,7 @@ class HealthData:
         hours = self._store.fleet.hours(site, "site", since_hour=next_hour - DAY_H * DAYS_SHOWN)
         days = [_sum(hours, next_hour - DAY_H * (n + 1), next_hour - DAY_H * n) for n in reversed(range(DAYS_SHOWN))]
         week = _sum(hours, next_hour - DAY_H * 8, next_hour - DAY_H)
-        robots = self._store.fleet.counters(site, "robot", since_hour=next_hour - DAY_H)
+        robots = self._store.fleet.counters_of(site, "robot", next_hour - DAY_H)
         ended_ns = now_ns - _ENDED_SHOWN_NS
         trials = [row for row in self._store.canaries(site) if row.ended_ns is None or row.ended_ns > ended_ns][:3]
         has_areas = bool(self._store.areas(site))
@@ -128,7 +120,7 @@ class HealthData:
             kpis(week),
             trend_words(days[-1], week),
             tuple(rate(counts.position_failures, counts.robot_days) for counts in days),
-            {robot: kpis(counts) for (_, robot), counts in robots.items()},
+            {robot: kpis(counts) for robot, counts in robots.items()},
             tuple(trial_of(row, find(self._store, row, self._canary, now_ns)) for row in trials),
             tuple(resurvey_list(self._store, site, self._resurvey, now_ns).tiles) if is_mapped else (),
             tuple(self.area_trends(site, None, None)),
@@ -142,14 +134,8 @@ class HealthData:
         end = hour_of(self._clock_ns() if until_ns is None else until_ns - 1) + 1
         first = end - WEEK_H if since_ns is None else hour_of(since_ns)
         axis = "area" if self._store.areas(site) else "tile"
-        now, before = (
-            {
-                key: counts
-                for (_, key), counts in self._store.fleet.counters(site, axis, since_hour=a, until_hour=b).items()
-            }
-            for a, b in ((first, end), (first - WEEK_H, first))
-        )
-        return area_trends(now, before)
+        spans = (first, end), (first - WEEK_H, first)
+        return area_trends(*(self._store.fleet.counters_of(site, axis, *span) for span in spans))
 
 
 def _sum(hours: Mapping[int, Counters], since: int, until: int) -> Counters:

@@ -14,6 +14,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from starlette.middleware.gzip import GZipMiddleware
 
 from fleetmap.errors import FleetmapError, StateError
+from fleetmap.hooks import plugins
 from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.guard import SIGN_IN, SIGN_OUT, STYLE, GuardSettings, address_of, set_session
 from mapserver.api.parameters import ApiSettings
@@ -25,7 +26,6 @@ from mapserver.dashboard.live import LiveRobots
 from mapserver.dashboard.rendering import TEMPLATES
 from mapserver.fleet.alerts import active_alerts
 from mapserver.fleet.fleet import Fleet
-from mapserver.hooks import part_hooks
 from mapserver.store import MapStore
 
 LASTING = "private, max-age=31536000, immutable"  # versions do not change
@@ -51,10 +51,10 @@ def install_dashboard(
 ) -> None:
     """Adds the pages to `app`, and the parts that plug-ins have."""
     inbox = None if settings.nights is None else settings.nights.inbox
-    alerts = partial(active_alerts, store, fleet, settings.alerts)
+    alerts = partial(active_alerts, store, fleet, settings.config.alerts)
     services = Services(
-        MapData(store, settings.gate, settings.canary.share, inbox),
-        HealthData(store, settings.canary, settings.resurvey, time.time_ns, alerts),
+        MapData(store, settings.config.gate, settings.config.canary.share, inbox),
+        HealthData(store, settings.config.canary, settings.config.resurvey, time.time_ns, alerts),
         LiveRobots(fleet, time.monotonic),
         settings,
     )
@@ -63,7 +63,7 @@ def install_dashboard(
     console = Console(pages, services)
     console.files("static", Path(__file__).parent / "static")
     _install_pages(console)
-    for install in part_hooks().values():
+    for install in plugins("mapserver.parts").values():
         install(Host(store, fleet, settings, app, console, hear))
     link = _link("Administration")  # behind those of the parts
     console.page("administration", "administration.html", administration.page, link=link, of_site=False)

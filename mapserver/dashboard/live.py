@@ -2,12 +2,12 @@
 
 import math
 import re
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 from fleetmap.messages import Status
+from mapserver.dashboard.data import MANY_SITES, Kept
 from mapserver.dashboard.map_layers import Mark
 from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet_statistics.robot_calibration import CalibrationFigure, calibration_figures
@@ -101,22 +101,16 @@ class LiveRobots:
     """Reads the fleet at most about once a second, for any number of pages."""
 
     def __init__(self, fleet: Fleet, clock_s: Callable[[], float]) -> None:
-        self.fleet = fleet
-        self._clock_s = clock_s
-        self._lock = threading.Lock()
-        self._cached: dict[str, tuple[float, LiveSite]] = {}
+        self.fleet, self._sites = fleet, Kept[LiveSite](MANY_SITES, _CACHED_S, clock_s)
 
     def look(self, site: str) -> LiveSite:
         """The site's robots as of now."""
-        with self._lock:
-            cached = self._cached.get(site)
-            if cached is not None and self._clock_s() - cached[0] < _CACHED_S:
-                return cached[1]
-            robots = [live_robot(status) for status in self.fleet.robots(site)]
-            robots.sort(key=lambda robot: (ORDER.get(robot.tone, 1), _counted(robot.name)))
-            found = LiveSite(tuple(robots))
-            self._cached[site] = (self._clock_s(), found)
-        return found
+
+        def read() -> LiveSite:
+            robots = map(live_robot, self.fleet.robots(site))
+            return LiveSite(tuple(sorted(robots, key=lambda one: (ORDER.get(one.tone, 1), _counted(one.name)))))
+
+        return self._sites.get(site, read)
 
 
 def _counted(name: str) -> list[str | int]:

@@ -156,7 +156,7 @@ def page(services: Services, context: PageContext, robot: str) -> dict[str, obje
     version = live.status.version or services.maps.current_version(context.site)
     drawn = None
     if version is not None and services.maps.has_version(context.site, version):
-        trail = way(rows, shown, services.settings.ingest.trace_every_s)
+        trail = way(rows, shown, services.settings.config.ingest.trace_every_s)
         layers = [
             Layer("Way", trail),
             Layer("Failures", failure_marks(context, within)),

@@ -6,14 +6,13 @@ from pathlib import Path
 from markupsafe import Markup
 
 from mapserver.api.moments import moment_text
+from mapserver.config import MapserverConfig
 from mapserver.dashboard import fleet_parts
 from mapserver.dashboard.fleet_parts import Bar, Bars, Figure
 from mapserver.dashboard.rendering import TEMPLATES, share
 from mapserver.fleet.canary_controller import find
 from mapserver.fleet.resurvey_list import resurvey_list
-from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, Kpis, Rate, format_rate, hour_of, kpis
-from mapserver.fleet_statistics.resurvey_decision import ResurveySettings
 from mapserver.store import FailureFilter, MapStore
 
 _STYLE = Path(__file__).parent / "static" / "style.css"
@@ -21,23 +20,15 @@ _ROWS = 15
 _BARS = 24
 _SHOWN_FAILURES = 50
 _UNKNOWN = "not known"
+_USUAL = MapserverConfig()
 
 
-def html_page(
-    store: MapStore,
-    site: str,
-    hours: int,
-    now_ns: int,
-    canary: CanarySettings = CanarySettings(),  # noqa: B008  frozen
-    resurvey: ResurveySettings = ResurveySettings(),  # noqa: B008
-) -> str:
-    """The page as a file's content: the last `hours` of a site beside as many before; UsageError for an unknown site. canary, resurvey:
-    their settings.
-    """
+def html_page(store: MapStore, site: str, hours: int, now_ns: int, config: MapserverConfig = _USUAL) -> str:
+    """The page as a file's content: the last `hours` of a site beside as many before; UsageError for an unknown site."""
     current, until, step = store.current(site), hour_of(now_ns) + 1, -(-hours // _BARS)
     since, wanted = until - hours, FailureFilter(site=site, since_ns=(until - hours) * HOUR_NS)
     total = _total(store, site, since, until)
-    trials = (fleet_parts.trial_of(row, find(store, row, canary, now_ns)) for row in store.canaries(site)[:1])
+    trials = (fleet_parts.trial_of(row, find(store, row, config.canary, now_ns)) for row in store.canaries(site)[:1])
     return TEMPLATES.get_template("shift.html").render(
         site=site,
         until_ns=now_ns,
@@ -50,7 +41,7 @@ def html_page(
         by_hour=_by_hour(store.fleet.hours(site, "site", since_hour=since), range(since, until, step)),
         step=step,
         tables={axis: _table(store, site, axis, since) for axis in ("robot", "version", "area", "cause")},
-        concerns=resurvey_list(store, site, resurvey, now_ns).tiles,
+        concerns=resurvey_list(store, site, config.resurvey, now_ns).tiles,
         failures=store.fleet.failures(wanted, limit=_SHOWN_FAILURES),
         most=_ROWS,
         moment=_moment,
@@ -60,13 +51,12 @@ def html_page(
 
 
 def _total(store: MapStore, site: str, since: int, until: int) -> Kpis:
-    found = store.fleet.counters(site, "site", since_hour=since, until_hour=until)
-    return kpis(found.get((site, ""), Counters()))
+    return kpis(store.fleet.counters_of(site, "site", since, until).get("", Counters()))
 
 
 def _table(store: MapStore, site: str, axis: str, since: int) -> list[tuple[str, Kpis]]:
     """The figures of each key, the worst first."""
-    rows = [(key, kpis(counts)) for (_, key), counts in store.fleet.counters(site, axis, since_hour=since).items()]
+    rows = [(key, kpis(counts)) for key, counts in store.fleet.counters_of(site, axis, since).items()]
     return sorted(rows, key=lambda row: (-row[1].failures.events, -row[1].silent_estimated.events, row[0]))
 
 

@@ -15,6 +15,7 @@ from fleetmap.bow.vocabulary import default_vocabulary, default_vocabulary_bytes
 from fleetmap.console import plain_console
 from fleetmap.encoding import to_json, to_plain
 from fleetmap.errors import RecordingError, StoreError, UsageError
+from fleetmap.hooks import plugins
 from fleetmap.mapformat.manifest import CameraEntry
 from fleetmap.mapformat.tile import Tile
 from fleetmap.recordings import Topics
@@ -51,7 +52,6 @@ from mapserver.drafting.survey_recordings import (
 from mapserver.drafting.view_check import TileChooser, asked_views
 from mapserver.drafting.worker import open_executor, single_threaded_libraries
 from mapserver.evaluation.trajectory_error import Accuracy, accuracy, truth_from_estimate
-from mapserver.hooks import stage_hooks
 from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged
 from mapserver.quality.probes import alias_step_m
 from mapserver.store import NOBODY, Actor, DraftContent, DraftDetails, MapStore
@@ -271,7 +271,8 @@ def _keep(run: _Run, built: BuildResult, parent: Before | None, maps: MapStore) 
     ]
     before = None if parent is None else parent.manifest
     chosen = ChosenDraft(sessions, run.settings, built.corrections, before, maps)
-    extras: dict[str, Extra] = {key: made for stage in stage_hooks().values() for key, made in stage(chosen).items()}
+    stages = plugins("mapserver.stages").values()
+    extras: dict[str, Extra] = {key: made for stage in stages for key, made in stage(chosen).items()}
     run.times.begin("examining")
     evidence = msgspec.structs.replace(_evidence(run, built, judged, tiles, parent), views=views)
     run.times.begin("storing")

@@ -73,8 +73,8 @@ def active_alerts(store: MapStore, fleet: Fleet, settings: AlertSettings, now_ns
 
 
 def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site: str, now_ns: int) -> Iterator[Alert]:
-    counters = store.fleet.counters(site, "site", since_hour=hour_of(now_ns) + 1 - _RATE_HOURS)
-    failures = kpis(counters.get((site, ""), Counters())).failures
+    counters = store.fleet.counters_of(site, "site", hour_of(now_ns) + 1 - _RATE_HOURS)
+    failures = kpis(counters.get("", Counters())).failures
     if failures.low is not None and failures.low > settings.failures_per_robot_day:
         words = (
             f"robots of {site} failed {failures.events} times in {_RATE_HOURS} h: {format_rate(failures)} per robot-day, "

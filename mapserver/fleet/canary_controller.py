@@ -15,9 +15,8 @@ _log = logging.getLogger(__name__)
 
 def find(store: MapStore, canary: CanaryRow, settings: CanarySettings, now_ns: int) -> CanaryFinding:
     """Return the counts of both arms since the canary began, and the decision."""
-    arms = store.fleet.counters(canary.site, "arm")
-    ours = arms.get((canary.site, arm_key(canary.id, is_canary=True)), Counters())
-    theirs = arms.get((canary.site, arm_key(canary.id, is_canary=False)), Counters())
+    arms = store.fleet.counters_of(canary.site, "arm", 0)
+    ours, theirs = (arms.get(arm_key(canary.id, is_canary=is_ours), Counters()) for is_ours in (True, False))
     end_ns = now_ns if canary.ended_ns is None else canary.ended_ns
     return judge_canary(ours, theirs, (end_ns - canary.started_ns) / DAY_NS, settings)
 

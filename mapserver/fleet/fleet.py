@@ -32,7 +32,7 @@ from mapserver.fleet.ingest import Ingest, IngestSettings
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.fleet.replay_intake import ReplayIntake
 from mapserver.fleet_statistics.canary_decision import number_of
-from mapserver.fleet_statistics.clock_skew import ClockSkew
+from mapserver.fleet_statistics.health_stream import ClockSkew
 from mapserver.store import CanaryRow, MapStore
 from mapserver.store.files import check_no_link, make_folder
 from mapserver.store.rows import RobotInfo
@@ -143,6 +143,7 @@ class Fleet:
         self._clock_ns = clock_ns
         self._lock = threading.Lock()
         self._ingest = Ingest(store, settings)
+        self.prune = self._ingest.prune
         self.replays = ReplayIntake(store, settings.replay_bytes, clock_ns)
         self._failures = RateLimit(FAILURE_BURST, FAILURES_PER_S, clock_ns)
         self._robots: dict[tuple[str, str], _Robot] = {}
@@ -290,10 +291,6 @@ class Fleet:
         if self._ingest.has_counted():
             with self._storing():
                 self._ingest.flush()
-
-    def prune(self) -> int:
-        """Remove reports from the store that are too old or too many; return the number of removed rows."""
-        return self._ingest.prune()
 
     def known_robots(self, site: str) -> list[str]:
         with self._lock:

@@ -11,8 +11,7 @@ from fleetmap.config import Positive, Section
 from fleetmap.errors import FleetmapError, UnknownOutcomeError
 from fleetmap.messages import FailureKind, FailureReport, PoseMessage, RobotHealth
 from mapserver.fleet_statistics.canary_decision import DAY_NS
-from mapserver.fleet_statistics.clock_skew import server_time_ns
-from mapserver.fleet_statistics.health_stream import HealthStream
+from mapserver.fleet_statistics.health_stream import HealthStream, server_time_ns
 from mapserver.fleet_statistics.kpis import Counters, hour_of
 from mapserver.floor_plan.areas import OUTSIDE, Areas
 from mapserver.store import CanaryRow, CounterKey, FleetBatch, FleetRetention, MapStore, TraceRow, tile_key

@@ -40,13 +40,8 @@ def resurvey_list(store: MapStore, site: str, settings: ResurveySettings, now_ns
     current = store.current(site)
     recent_hour = hour_of(now_ns) - round(settings.recent_days * 24)
     before_hour = recent_hour - round(settings.before_days * 24)
-    recent, before = (
-        {
-            key: counts
-            for (_, key), counts in store.fleet.counters(site, "tile", since_hour=since, until_hour=until).items()
-        }
-        for since, until in ((recent_hour, 1 << 60), (before_hour, recent_hour))
-    )
+    recent = store.fleet.counters_of(site, "tile", recent_hour)
+    before = store.fleet.counters_of(site, "tile", before_hour, recent_hour)
     found = concerns(recent, before, settings)
     requests = store.survey_requests(site)
     if current is None:

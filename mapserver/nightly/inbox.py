@@ -197,9 +197,10 @@ class InboxEntry:
 
 
 @dataclass(frozen=True, slots=True)
-class InboxContents:
-    """Entries of an inbox by name, at most 1000 of each kind; done: number of recordings that are in a version."""
+class Inbox:
+    """Recordings in the inbox of a site, at most 1000 of each kind; done: number of those in a version."""
 
+    site: str
     waiting: list[InboxEntry]
     held: list[InboxEntry]
     bad: list[InboxEntry]
@@ -213,13 +214,13 @@ def sites_of(folder: Path) -> list[str]:
     return []
 
 
-def contents(inbox: Path, settle_s: float, now_ns: int) -> InboxContents:
+def contents(inbox: Path, settle_s: float, now_ns: int) -> Inbox:
     """Return what lies in an inbox, empty if it is missing, without a look into folders; names that cannot be shown are left out.
 
     Raises UsageError if it cannot be listed.
     """
     if not inbox.is_dir():
-        return InboxContents([], [], [], 0)
+        return Inbox(inbox.name, [], [], [], 0)
     here = arrivals(inbox, settle_s, now_ns, is_brief=True)
     known = f"no recording; a recording is a folder, or a file that ends in {', '.join(file_suffixes())}"
     reasons = {path.name: "" for path in here.complete} | dict.fromkeys(here.others, known)
@@ -232,7 +233,7 @@ def contents(inbox: Path, settle_s: float, now_ns: int) -> InboxContents:
             with suppress(OSError), os.fdopen(os.open(f"{path}{_REASON}", _FOR_READING), "rb") as file:
                 reason = (file.read(_REASON_BYTES) or b"").decode("utf-8", "replace").strip()
             entries.append(_entry(path, reason.replace(f"{inbox}/", "")))
-    return InboxContents(waiting[:_MOST_LISTED], kept[HELD], kept[BAD], len(names(inbox / DONE)))
+    return Inbox(inbox.name, waiting[:_MOST_LISTED], kept[HELD], kept[BAD], len(names(inbox / DONE)))
 
 
 def names(folder: Path) -> list[str]:

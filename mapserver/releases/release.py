@@ -38,18 +38,28 @@ def publish(
     version: int | None = None,
     *,
     actor: Actor = NOBODY,
+    trust_calibration: bool = False,
     force: bool = False,
     gate: GateSettings = _USUAL_GATE,
 ) -> int:
     """Take a draft (by default the newest one) through the gate, make it current and return its number.
 
-    force: the gate's reasons are logged with the actor, and only its hard limits refuse.
+    trust_calibration: confirms its calibration before, as `confirm_calibration`. force: the gate's reasons are logged with the actor, and
+    only its hard limits refuse.
 
     Raises UsageError for an unknown draft, GateRefusedError for a refused one (its reasons are stored with
     it), StoreError or MapFormatError for one with missing bytes.
     """
-    draft = chosen_draft(store.releases(site), version)
-    version = draft.version
+    rows = store.releases(site)
+    if version is None:
+        version = max((info.version for info in rows.versions.values() if info.state == "draft"), default=None)
+    if version is None:
+        raise UsageError(
+            f"site {site} has no draft to publish; make one with `mapserver build RECORDING --site {site}`"
+        )
+    draft = _draft(rows, version)
+    if trust_calibration:
+        draft = confirm_calibration(store, draft, actor)
     if force and not (actor.name and actor.reason):
         raise UsageError("publishing by force needs an actor and a reason; add --reason")
     judged_against = _pass_gate(store, draft, actor, gate, force=force)
@@ -66,17 +76,7 @@ def publish(
     return version
 
 
-def chosen_draft(rows: SiteReleases, version: int | None) -> VersionInfo:
-    """Return the draft of this number, by default the newest one; UsageError without any, StateError for a version that is not a draft."""
-    drafts = [info.version for info in rows.versions.values() if info.state == "draft"]
-    if version is None and not drafts:
-        raise UsageError(
-            f"site {rows.site} has no draft to publish; make one with `mapserver build RECORDING --site {rows.site}`"
-        )
-    return _draft(rows, drafts[-1] if version is None else version)
-
-
-def trust_calibration(store: MapStore, draft: VersionInfo, actor: Actor) -> VersionInfo:
+def confirm_calibration(store: MapStore, draft: VersionInfo, actor: Actor) -> VersionInfo:
     """Return the draft with an operator's confirmation of its calibrations in its manifest.
 
     It stays a draft for the gate to judge. The confirmation names calibrations by their fingerprint: versions built on this one

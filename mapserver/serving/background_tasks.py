@@ -20,16 +20,7 @@ from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from mapserver.trust import update_lists
 
-_ANNOUNCE_EVERY_S = 1.0
-_FLUSH_EVERY_S = 2.0  # a crash loses this much of the counts; failures are written at once
-_PRESENCE_EVERY_S = 5.0
-_PRUNE_EVERY_S = 600.0
-_CANARIES_EVERY_S = 10.0
 _LOOK_EVERY_S = 0.2
-_JOBS_EVERY_S = 20.0
-_ADMIT_EVERY_S = 1.0  # changes in between are combined
-_CONNECTED_EVERY_S = 5.0
-_ALERTS_EVERY_S = 10.0
 _log = logging.getLogger(__name__)
 
 
@@ -58,20 +49,19 @@ def server_tasks(
         return acts if store.is_shared else act
 
     return [
-        BackgroundTask("following other servers", _ANNOUNCE_EVERY_S, store.files.follow),
+        BackgroundTask("following other servers", 1.0, store.files.follow),
         # Before the announcement: robots accept only versions on the lists.
-        BackgroundTask("signing the lists of versions", _ANNOUNCE_EVERY_S, lambda: update_lists(store)),
-        BackgroundTask("announcing versions", _ANNOUNCE_EVERY_S, bus_service.announce_changes),
-        BackgroundTask("keeping reports", _FLUSH_EVERY_S, fleet.flush),
-        BackgroundTask("looking for robots", _PRESENCE_EVERY_S, bus_service.look_for_robots),
-        BackgroundTask("removing old reports", _PRUNE_EVERY_S, alone(fleet.prune, "prune")),
-        BackgroundTask("measuring the disk", _PRUNE_EVERY_S, store.disk_space),
+        BackgroundTask("signing the lists of versions", 1.0, lambda: update_lists(store)),
+        BackgroundTask("announcing versions", 1.0, bus_service.announce_changes),
+        # A crash loses this much of the counts; failures are written at once.
+        BackgroundTask("keeping reports", 2.0, fleet.flush),
+        BackgroundTask("looking for robots", 5.0, bus_service.look_for_robots),
+        BackgroundTask("removing old reports", 600.0, alone(fleet.prune, "prune")),
+        BackgroundTask("measuring the disk", 600.0, store.disk_space),
         BackgroundTask(
-            "searching for killed jobs", _JOBS_EVERY_S, alone(lambda: end_interrupted(store, time.time_ns()), "jobs")
+            "searching for killed jobs", 20.0, alone(lambda: end_interrupted(store, time.time_ns()), "jobs")
         ),
-        BackgroundTask(
-            "looking at canaries", _CANARIES_EVERY_S, alone(lambda: review(store, canary, time.time_ns()), "canaries")
-        ),
+        BackgroundTask("looking at canaries", 10.0, alone(lambda: review(store, canary, time.time_ns()), "canaries")),
     ]
 
 
@@ -84,7 +74,7 @@ def alert_tasks(store: MapStore, fleet: Fleet, settings: AlertSettings, receiver
         if store.leads():
             receiver.tell(active_alerts(store, fleet, settings, now_ns := time.time_ns()), now_ns)
 
-    return [BackgroundTask("looking for alerts", _ALERTS_EVERY_S, look)]
+    return [BackgroundTask("looking for alerts", 10.0, look)]
 
 
 def admission_tasks(guard: BusGuard | None, fleet: Fleet) -> list[BackgroundTask]:
@@ -97,8 +87,8 @@ def admission_tasks(guard: BusGuard | None, fleet: Fleet) -> list[BackgroundTask
         fleet.take_copied(guard.copied)
 
     return [
-        BackgroundTask("admitting robots", _ADMIT_EVERY_S, guard.follow),
-        BackgroundTask("checking connections", _CONNECTED_EVERY_S, look),
+        BackgroundTask("admitting robots", 1.0, guard.follow),  # changes in between are combined
+        BackgroundTask("checking connections", 5.0, look),
     ]
 
 

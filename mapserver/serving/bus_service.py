@@ -1,18 +1,20 @@
-"""The server's side of the bus: answers queries for versions, manifests and bytes; receives robots' messages; announces versions."""
+"""The server's side of the bus: answers queries for versions, bytes; receives robots' messages; announces versions; sends poses."""
 
 import logging
+import math
 import threading
 from collections.abc import Callable
 
 import msgspec
 
 from fleetmap.bus.zenoh_bus import Bus, Handle
-from fleetmap.errors import FleetmapError, LinkError
+from fleetmap.errors import FleetmapError, LinkError, StateError, UsageError
 from fleetmap.failure_summary import ReplayPart
 from fleetmap.log_lines import LogLimit
 from fleetmap.mapformat.names import check_name
 from fleetmap.messages import (
     FailureAck,
+    InitialPoseMessage,
     PoseMessage,
     RobotAck,
     RobotHealth,
@@ -23,10 +25,10 @@ from fleetmap.messages import (
     robot_key,
     split_key,
 )
-from mapserver.fleet.fleet import Fleet
+from mapserver.fleet.fleet import Fleet, RobotStatus
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.serving.bus_access import BusGuard
-from mapserver.store import MapStore
+from mapserver.store import Actor, MapStore
 from mapserver.trust import SignedLists
 
 TakeDrive = Callable[[str, str, ReplayPart], FailureAck]
@@ -41,6 +43,9 @@ REPORT_RATES = {"ack": (20, 1.0), "health": (20, 4.0), "pose": (80, 60.0)}
 _MOST_AREAS = 20  # told to a robot, the oldest requests first
 _CACHED_BYTES = 64_000_000
 _ENTRY_BYTES = 200  # overhead of a cache entry, so that empty ones are limited too
+MOST_SIGMA_M = 20.0  # of an operator's pose
+# Robots report every second. One without its liveliness token has left.
+_HEARD_WITHIN_S, _LEFT_S = 10.0, 3.0
 
 
 class BusService:
@@ -74,21 +79,18 @@ class BusService:
         self._announced: dict[tuple[str, str], str | None] = {}
         self._recent = ByteCache(_CACHED_BYTES, store.blob)
         self._handles: list[Handle] = [
-            bus.queryable(robot_key("*", "*", "wanted"), self._counted("wanted", self._wanted)),
-            bus.queryable(robot_key("*", "*", "failures"), self._counted("failure", self._failure)),
-            bus.queryable(robot_key("*", "*", "replays"), self._counted("replay", self._replay)),
-            *(
-                bus.queryable(robot_key("*", "*", f"{part}/*"), self._counted(what, self._parts(answer)))
-                for part, what, answer in (
-                    ("manifests", "manifest", self._manifest),
-                    ("blobs", "blob", self._blob),
-                    ("trust", "trust", self._list_file),
-                )
-            ),
-            *(bus.subscribe(robot_key("*", "*", what), self._hear) for what in ("ack", "health", "pose")),
+            bus.queryable(robot_key("*", "*", keys), self._counted(what, answer))
+            for keys, what, answer in (
+                ("wanted", "wanted", self._wanted),
+                ("failures", "failure", self._failure),
+                ("replays", "replay", self._replay),
+                ("manifests/*", "manifest", self._parts(self._manifest)),
+                ("blobs/*", "blob", self._parts(self._blob)),
+                ("trust/*", "trust", self._parts(self._list_file)),
+                *([] if guard is None else [("renew", "renewal", self._renew)]),
+            )
         ]
-        if guard is not None:
-            self._handles.append(bus.queryable(robot_key("*", "*", "renew"), self._counted("renewal", self._renew)))
+        self._handles += [bus.subscribe(robot_key("*", "*", what), self._hear) for what in REPORT_RATES]
 
     def announce_changes(self) -> list[str]:
         """Notify every known robot whose wanted version changed since the last call; return the sites of notified robots.
@@ -228,6 +230,42 @@ class BusService:
         """Log and count the refusal: published messages have no answer."""
         self._refusals.warning(key, "message under %r refused: %s", key[:200], error)
         self._count(what, "refused", 0)
+
+
+def place_robot(store: MapStore, fleet: Fleet, bus: Bus | None, told: InitialPoseMessage, actor: Actor) -> None:
+    """Publish the pose for its robot, and log its author in the site's history. bus: None if the server has none.
+
+    UsageError for an unknown site or robot and a position outside the map, StateError for a robot that is not connected.
+    """
+    store.current(told.site)  # raises for an unknown site
+    robot = next((robot for robot in fleet.robots(told.site) if robot.robot == told.robot), None)
+    if robot is None:
+        raise UsageError(f"site {told.site} has no robot {told.robot[:64]!r}; /v1/robots lists its robots")
+    if robot.seconds_since > (_LEFT_S if robot.is_present is False else _HEARD_WITHIN_S):
+        last = f"{told.robot} was last seen {robot.seconds_since:.0f} s ago"
+        raise StateError(f"{last} and is not connected; try again when it is back")
+    if bus is None or bus.closed():
+        raise StateError("this server has no bus to notify robots; start one with `mapserver serve`")
+    _check_place(store, told, robot)
+    heading = "" if told.heading_rad is None else f", heading {math.degrees(told.heading_rad):.0f} degrees"
+    words = f"{told.robot} is at {told.x_map_m:.2f}, {told.y_map_m:.2f} m{heading}, within {told.sigma_m:g} m"
+    bus.publish(robot_key(told.site, told.robot, "initial_pose"), encode_message(told))
+    store.audit("robot placed", words, actor=actor, site=told.site)
+
+
+def _check_place(store: MapStore, told: InitialPoseMessage, robot: RobotStatus) -> None:
+    values = (told.x_map_m, told.y_map_m, told.heading_rad or 0.0, told.sigma_m)
+    if not all(map(math.isfinite, values)) or not 0 < told.sigma_m <= MOST_SIGMA_M:
+        raise UsageError(f"x, y, heading and sigma must be numbers, sigma above 0 and at most {MOST_SIGMA_M:g} m")
+    current = store.current(told.site)
+    version = robot.version if robot.version is not None else None if current is None else current.version
+    if version is None:
+        raise StateError(f"{told.robot} runs no map yet; publish one first")
+    manifest = store.manifest(told.site, version)
+    x, y = (math.floor(value / manifest.tile_size_m) for value in values[:2])
+    if (x, y) not in {(tile.x, tile.y) for tile in manifest.tiles}:
+        where = f"{told.x_map_m:.1f}, {told.y_map_m:.1f} m"
+        raise UsageError(f"{where} is outside of version {version}: it has no tile {x},{y}")
 
 
 class ByteCache:

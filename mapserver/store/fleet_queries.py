@@ -128,6 +128,11 @@ class FleetQueries:
         rows = self._sums(sums, "k.id, k.site, k.key", "k.site, k.key", site, axis, key, since_hour, until_hour)
         return {(row.pop("site"), row.pop("key")): Counters(**row) for row in rows}
 
+    def counters_of(self, site: str, axis: str, since_hour: int, until_hour: int = 1 << 60) -> dict[str, Counters]:
+        """Return the sums of one site by key."""
+        found = self.counters(site, axis, since_hour=since_hour, until_hour=until_hour)
+        return {key: counts for (_, key), counts in found.items()}
+
     def hours(
         self, site: str | None, axis: str, *, key: str | None = None, since_hour: int = 0, until_hour: int = 1 << 60
     ) -> dict[int, Counters]:

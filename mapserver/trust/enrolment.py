@@ -7,9 +7,9 @@ import hashlib
 import secrets
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -36,7 +36,20 @@ _MAX_ROBOTS = 20_000
 _NAME_LENGTH = 40  # a certificate's name has 64 characters at most; the mark after it makes it unique
 
 
-class EnrolledRobot(msgspec.Struct, frozen=True, kw_only=True):
+@dataclass(frozen=True, slots=True)
+class EnrolledRobot:
+    """A robot that is admitted to the bus. certificate: the name in it; days_left: of it, or of the bundle while that is not used."""
+
+    site: str
+    robot: str
+    certificate: str
+    enrolled_ns: int
+    is_used: bool
+    days_left: float
+    state: str
+
+
+class Enrolment(msgspec.Struct, frozen=True, kw_only=True):
     """One robot. key: fingerprint of the key that may renew; before: of the key that it replaced, in case the answer was lost.
 
     mark: suffix of the name in its certificates, changed by each renewal, so that rules can distinguish them; mark_before:
@@ -81,17 +94,16 @@ class EnrolledRobot(msgspec.Struct, frozen=True, kw_only=True):
         """Name in the certificate of its bundle."""
         return f"{self.certificate}.enrol"
 
-    def row(self, now_ns: int) -> dict[str, Any]:
-        """Return the row of `robots list`. certificate: the name in it; days_left: of it, or of the bundle while `is_used` is false."""
+    def shown(self, now_ns: int) -> EnrolledRobot:
+        """Return it as people see it."""
         since_ns = self.enrolled_ns if self.renewed_ns is None else self.renewed_ns
         left = DAYS["enrol" if self.renewed_ns is None else "robot"] - (now_ns - since_ns) / _DAY_NS
         if self.renewed_ns is None:
             state = f"bundle unused, {24 * left:.0f} h left" if left > 0 else "bundle expired: enrol again"
         else:
             state = f"certificate for {left:.0f} days" if left > 0 else "certificate expired: revoke and enrol again"
-        named = {"site": self.site, "robot": self.robot, "certificate": self.certificate}
-        used = {"enrolled_ns": self.enrolled_ns, "is_used": self.renewed_ns is not None}
-        return {**named, **used, "days_left": round(left, 2), "state": state}
+        used = self.enrolled_ns, self.renewed_ns is not None
+        return EnrolledRobot(self.site, self.robot, self.certificate, *used, round(left, 2), state)
 
 
 class RobotRegister:
@@ -118,13 +130,13 @@ class RobotRegister:
             )
         return authorities.tls
 
-    def robots(self, site: str | None = None) -> list[EnrolledRobot]:
+    def robots(self, site: str | None = None) -> list[Enrolment]:
         """Return all robots (of a site), by site and name; StoreError if the file is unreadable."""
         if not self._path.is_file():
             return []
         with disk_errors(f"{self._path} cannot be read", "check the account"):
             data = self._path.read_bytes()
-        found = decode_json(data, list[EnrolledRobot], f"{self._path} cannot be read ({{}}); restore it", StoreError)
+        found = decode_json(data, list[Enrolment], f"{self._path} cannot be read ({{}}); restore it", StoreError)
         return [entry for entry in found if site in {None, entry.site}]
 
     def access(self) -> Access:
@@ -177,7 +189,7 @@ class RobotRegister:
                 if known is None and len(entries) >= _MAX_ROBOTS:
                     raise StateError(f"{len(entries)} robots are enrolled, the limit of a server; revoke some")
                 mark = secrets.token_hex(4)
-                entry = EnrolledRobot(site=site, robot=robot, mark=mark, key="", enrolled_ns=self.store.now_ns())
+                entry = Enrolment(site=site, robot=robot, mark=mark, key="", enrolled_ns=self.store.now_ns())
                 own = authorities.make_own(entry.bundle, "enrol")
                 entries[site, robot] = msgspec.structs.replace(entry, key=key_fingerprint(own))
                 bundle = Bundle(
@@ -259,7 +271,7 @@ class RobotRegister:
         return f"{listening.partition('/')[0]}/{f'[{host}]' if ':' in host else host}:{listening.rpartition(':')[2]}"
 
     @contextmanager
-    def _changing(self) -> Iterator[dict[tuple[str, str], EnrolledRobot]]:
+    def _changing(self) -> Iterator[dict[tuple[str, str], Enrolment]]:
         """Yield the robots, to be changed by one process at a time; written at the end unless an error was raised."""
         with disk_errors(f"{self._path} cannot be written", "free some space, and check the account"):
             make_folder(self._keys)

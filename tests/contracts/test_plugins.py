@@ -11,7 +11,6 @@ import pytest
 from fleetmap.errors import UsageError
 from fleetmap.hooks import plugins
 from locclient.config import LocclientConfig, read_config, with_plugins
-from mapserver.hooks import command_hooks, part_hooks, route_hooks, stage_hooks
 from mapserver.store import MapStore
 from mapserver.store.places import Places, write_places
 from support.fleet.contracts_documents import REPOSITORY, text
@@ -58,7 +57,8 @@ def test_without_plugins_a_robot_reads_its_file_and_refuses_their_sections(
     for package in packages:
         monkeypatch.setitem(sys.modules, package, None)
     assert with_plugins()[0].__struct_fields__ == LocclientConfig.__struct_fields__
-    assert route_hooks() == command_hooks() == part_hooks() == stage_hooks() == plugins("fleetmap.recordings") == {}
+    groups = ("fleetmap.recordings", *(f"mapserver.{what}" for what in ("routes", "commands", "parts", "stages")))
+    assert [plugins(group) for group in groups] == [{}] * len(groups)
     for places in (Places(content="s3://bucket"), Places(database="postgresql://host/name")):
         write_places(tmp_path, places)
         with pytest.raises(

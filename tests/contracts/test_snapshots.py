@@ -13,10 +13,10 @@ import click
 import pytest
 import typer.core
 
+from fleetmap.hooks import plugins
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
 from mapserver.fleet.fleet import Fleet
-from mapserver.hooks import command_hooks
 from mapserver.store import MapStore
 from support.core_arguments import CALLS, refusals
 from support.fleet.contracts_documents import REPOSITORY, click_command
@@ -31,7 +31,7 @@ def is_as_kept(name: str, text: str) -> bool:
 
 
 def test_openapi(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mapserver.api.app.route_hooks", dict)  # without plug-ins
+    monkeypatch.setattr("mapserver.api.app.plugins", lambda _: {})  # without plug-ins
     with MapStore.open(tmp_path, create=True) as store:
         fleet = Fleet(store)
         document = create_app(store, fleet, Metrics(store, fleet), None).openapi()
@@ -54,7 +54,7 @@ def _help(path: str) -> Iterator[str]:
     command = click_command(path)
     yield f"{path}: {' '.join((command.help or '').split())}"
     if isinstance(command, click.Group | typer.core.TyperGroup):
-        for name in sorted(command.commands.keys() - command_hooks().keys()):  # without plug-ins
+        for name in sorted(command.commands.keys() - plugins("mapserver.commands").keys()):  # without plug-ins
             yield from _help(f"{path} {name}")
         return
     for parameter in command.params:

@@ -14,9 +14,9 @@ from fleetmap.messages import CameraNote, FailureReport
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.data import JOBS_SHOWN
 from mapserver.dashboard.install import Host, file_response
-from mapserver.dashboard.loops import loops_of_version
 from mapserver.dashboard.map_layers import Layer
 from mapserver.dashboard.rendering import TEMPLATES
+from mapserver.dashboard.survey_jobs import loops_of_version
 from mapserver.plugins.dense_maps.expected_views import failure_camera, is_camera
 from mapserver.plugins.dense_maps.space_points import COARSEST_M, FINEST_M, space_bytes, surfel_bytes
 from mapserver.plugins.dense_maps.surfel_map import index_address, surfels_of

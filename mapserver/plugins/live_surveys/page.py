@@ -17,9 +17,9 @@ from fleetmap.messages import decode_message, split_key
 from mapserver.dashboard.console import PageContext, Services
 from mapserver.dashboard.install import Host
 from mapserver.dashboard.live import words_of
-from mapserver.dashboard.loops import VERDICTS
 from mapserver.dashboard.map_layers import Dots, Layer, Line, Mark, Square, trail
 from mapserver.dashboard.rendering import TEMPLATES
+from mapserver.dashboard.survey_jobs import VERDICTS
 from mapserver.plugins.live_surveys.message import COLUMNS, COVERAGE_CELL_M, LiveSurveyState, live_key
 
 _FOLDER = Path(__file__).parent

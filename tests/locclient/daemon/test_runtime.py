@@ -47,8 +47,7 @@ from mapserver.dashboard.live import live_robot
 from mapserver.dashboard.overview import remarks
 from mapserver.fleet.alerts import AlertSettings, active_alerts
 from mapserver.fleet.fleet import Fleet
-from mapserver.serving.bus_service import BusService
-from mapserver.serving.robot_placing import place_robot
+from mapserver.serving.bus_service import BusService, place_robot
 from mapserver.store import Actor, FailureFilter, MapStore
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.recordings.recording_samples import calibration

@@ -6,8 +6,7 @@ import msgspec
 import pytest
 
 from fleetmap.messages import Flag, PoseMessage, RobotHealth
-from mapserver.fleet_statistics.clock_skew import ClockSkew, server_time_ns
-from mapserver.fleet_statistics.health_stream import HealthStream
+from mapserver.fleet_statistics.health_stream import ClockSkew, HealthStream, server_time_ns
 from mapserver.fleet_statistics.kpis import Counters, kpis
 
 NS = 1_000_000_000

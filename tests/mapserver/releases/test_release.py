@@ -102,12 +102,12 @@ def test_a_person_trusts_a_calibration_that_nothing_judged_and_the_version_carri
     draft = store.version("lab", 1)
     for nobody in (Actor("ada"), Actor("", "a board")):
         with pytest.raises(UsageError, match="--reason"):
-            releases.trust_calibration(store, draft, nobody)
-    trusted = releases.trust_calibration(store, draft, ADA)
+            releases.confirm_calibration(store, draft, nobody)
+    trusted = releases.confirm_calibration(store, draft, ADA)
     assert store.version("lab", 1) == trusted != draft
-    assert releases.trust_calibration(store, trusted, Actor("bob", "again")) == trusted
+    assert releases.confirm_calibration(store, trusted, Actor("bob", "again")) == trusted
     with pytest.raises(StateError, match="changed meanwhile by another operator"):
-        releases.trust_calibration(store, draft, ADA)
+        releases.confirm_calibration(store, draft, ADA)
     assert releases.publish(store, "lab") == 1
     assert store.trusted(trusted) == [TrustedCalibration("a1", ["metric scale"], "ada", "a test")]
     assert [(e.kind, e.actor, e.reason) for e in store.events("lab")][-2] == ("calibration trusted", "ada", "a test")

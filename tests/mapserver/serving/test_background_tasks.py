@@ -1,6 +1,7 @@
 """What the server does by itself: in turn, again and again, whatever happens to one of them; a bad version goes by itself."""
 
 import asyncio
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,6 @@ from fleetmap.messages import RobotHealth
 from mapserver import releases
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet_statistics.canary_decision import CanarySettings
-from mapserver.serving import background_tasks
 from mapserver.serving.background_tasks import BackgroundTask, run_background_tasks, server_tasks
 from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
@@ -50,9 +50,7 @@ def test_one_that_fails_stops_no_other(caplog: pytest.LogCaptureFixture) -> None
     assert "ZeroDivisionError" in caplog.text
 
 
-def test_the_server_takes_a_bad_version_back_by_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for name in ("_FLUSH_EVERY_S", "_PRESENCE_EVERY_S", "_CANARIES_EVERY_S"):
-        monkeypatch.setattr(background_tasks, name, 0.05)
+def test_the_server_takes_a_bad_version_back_by_itself(tmp_path: Path) -> None:
     with MapStore.open(tmp_path, create=True) as store, MemoryBus(MemoryHub()) as bus:
         publish_samples(store, 1)
         save_sample_draft(store, seed=3)
@@ -69,7 +67,7 @@ def test_the_server_takes_a_bad_version_back_by_itself(tmp_path: Path, monkeypat
         for number in range(8):
             at_ns = store.canaries()[0].started_ns + NS
             fleet.take_failure("lab", "r1", blindness(f"f{number}", wall_ns=at_ns, cause="changed", version=2))
-        run_for(server_tasks(store, fleet, service, CanarySettings()), 2.0)
+        run_for([replace(task, every_s=0.05) for task in server_tasks(store, fleet, service, CanarySettings())], 2.0)
         (canary,) = store.canaries("lab")
         assert canary.state == "rolled_back", canary
         assert "8 failures in" in canary.outcome

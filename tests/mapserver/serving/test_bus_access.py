@@ -24,7 +24,7 @@ from mapserver.serving.bus_service import BusService
 from mapserver.store import MapStore
 from mapserver.trust import init_here
 from mapserver.trust.authorities import Authorities, Authority
-from mapserver.trust.enrolment import EnrolledRobot, RobotRegister
+from mapserver.trust.enrolment import Enrolment, RobotRegister
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.storage.map_samples import publish_samples
 
@@ -118,7 +118,7 @@ def test_what_was_signed_while_the_clock_was_ahead_counts_once_it_is_right(regis
     made = register.authorities.make_own("r1.1", "robot")
     assert load_pem_x509_certificate(made).not_valid_before_utc <= datetime.now(UTC) - timedelta(minutes=10)
     marks = {"mark": "2", "mark_before": "1"}
-    entry = EnrolledRobot(site="lab", robot="r1", key="", enrolled_ns=0, renewed_ns=400 * DAY_NS, **marks)
+    entry = Enrolment(site="lab", robot="r1", key="", enrolled_ns=0, renewed_ns=400 * DAY_NS, **marks)
     assert {holder.purpose for holder in entry.holders(35 * DAY_NS) if holder.certificate == "r1.1"} == {Purpose.ENROL}
 
 

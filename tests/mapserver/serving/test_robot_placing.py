@@ -8,7 +8,7 @@ import pytest
 
 from fleetmap.errors import StateError, UsageError
 from fleetmap.messages import InitialPoseMessage, RobotHealth, decode_message, robot_key
-from mapserver.serving.robot_placing import place_robot
+from mapserver.serving.bus_service import place_robot
 from mapserver.store import Actor
 from support.fleet.served_api import Server, check_problem, served_api
 

@@ -134,7 +134,7 @@ def test_the_bundles_name_leaves_the_rules_after_a_day(world: World) -> None:
     assert world.register.access().holder(name).purpose is Purpose.ENROL
     world.clock["ns"] += DAY_NS + 1
     assert world.register.access().holder(name) is None
-    assert "bundle expired" in world.register.robots()[0].row(world.clock["ns"])["state"]
+    assert "bundle expired" in world.register.robots()[0].shown(world.clock["ns"]).state
 
 
 def test_long_names_differ_by_their_marks(world: World) -> None:

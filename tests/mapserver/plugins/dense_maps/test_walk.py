@@ -6,7 +6,7 @@ from collections.abc import Iterator
 import pytest
 from playwright.sync_api import Page, expect
 
-from mapserver.dashboard.loops import Loop, loops_of_version
+from mapserver.dashboard.survey_jobs import Loop, loops_of_version
 from support.fleet.dashboard_scene import Served, build_report, marks, opened, serving, wait_until
 from support.pages.browser import Chromium, box_of
 from support.pages.whole_page import assert_whole
