@@ -33,14 +33,14 @@ _SIGNIFICANCE = 0.05
 
 @dataclass(frozen=True, slots=True)
 class SiteHealth:
-    """A site's figures. day: the last 24 h; week: the 7 days before; days: rates of 24 h each, oldest first, the last ends now.
+    """A site's figures. day: the last 24 h; days: rates of 24 h each, oldest first, the last ends now.
 
-    robots: each one's figures of the last 24 h. trend: how day compares with week, in words. areas: the last 7 days beside the 7 before
-    them by named area, or by tile where has_areas says that none is named, from week_since_ns on. alerts: of the site and the server.
+    robots: each one's figures of the last 24 h. trend: how day compares with the 7 days before, in words. areas: the last 7 days beside
+    the 7 before them by named area, or by tile where has_areas says that none is named, from week_since_ns on. alerts: of the site and the
+    server.
     """
 
     day: Kpis
-    week: Kpis
     trend: str
     days: tuple[Rate, ...]
     robots: Mapping[str, Kpis]
@@ -117,7 +117,6 @@ class HealthData:
         is_mapped = any(info.site == site for info in self._store.sites())
         return SiteHealth(
             kpis(days[-1]),
-            kpis(week),
             trend_words(days[-1], week),
             tuple(rate(counts.position_failures, counts.robot_days) for counts in days),
             {robot: kpis(counts) for robot, counts in robots.items()},

@@ -3,7 +3,7 @@
 A robot-day is 16 h of driving. Intervals hold the true value with 95 %.
 """
 
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Self
 
 import scipy
@@ -59,10 +59,6 @@ class Counters:
     def add(self, other: Self) -> None:
         for name in COUNTER_COLUMNS:
             setattr(self, name, getattr(self, name) + getattr(other, name))
-
-    def values(self) -> tuple[float, ...]:
-        """All sums in the order of COUNTER_COLUMNS."""
-        return astuple(self)
 
     @property
     def robot_days(self) -> float:
