@@ -40,8 +40,8 @@ def _mounting(rig: RigCalibration, stamp_ns: int) -> TFMessage:
     for parent, child, parent_from_child in links:
         quat_xyzw = Rotation.from_matrix(parent_from_child[:3, :3]).as_quat().tolist()
         turn = Quaternion(**dict(zip("xyzw", quat_xyzw, strict=True)))
-        transform = Transform(translation=_vector(parent_from_child[:3, 3]), rotation=turn)
-        link = TransformStamped(header=_header(stamp_ns, parent), child_frame_id=child, transform=transform)
+        place = Transform(translation=_vector(parent_from_child[:3, 3]), rotation=turn)
+        link = TransformStamped(header=_header(stamp_ns, parent), child_frame_id=child, transform=place)
         message.transforms.append(link)
     return message
 
