@@ -23,7 +23,7 @@ TIERS = {
     "user": {
         "": "site store server",
         "run": "server store site robot prior cache cache_bytes root identity insecure outbox failures replays surveys",
-        "source": "kind sensors calibration endpoint recording device",
+        "source": "kind sensors calibration recording device",
         "output": "format endpoint robot_height_m autostart",
         "topics": "*",
     },
@@ -31,8 +31,8 @@ TIERS = {
         "run": "outbox_bytes replays_bytes frame_queue imu_wait_s",
         "run.window": "*",
         "run.trial": "*",
-        "source": "domain keys speed width_px height_px rate_hz delay_s",
-        "output": "domain keys namespace node pose_topic initial_pose_topic odom_topic status_topic map_topic tf_topic "
+        "source": "speed width_px height_px rate_hz delay_s",
+        "output": "namespace node pose_topic initial_pose_topic odom_topic status_topic map_topic tf_topic "
         "map_frame building_frame odom_frame base_frame sensor_frames publish_odom transform_tolerance_s",
         "localizer": "seed",
         "localizer.orb": "extractor count",

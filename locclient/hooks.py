@@ -90,13 +90,13 @@ class LinkHook:
 class OutputHook:
     """A format of estimates for the robot's own programs. check: raises UsageError for settings of [output] that do not suit [topics].
 
-    connect: opens the bus at [output] endpoint. open: by that bus, or the map server's, the names of site and robot, and the rig;
-    the intake receives commands of the robot's own programs. Raises UsageError for an invalid topic.
+    open: by the bus at [output] endpoint or the map server's, the names of site and robot, and the rig; the intake receives commands of the
+    robot's own programs. Raises UsageError for an invalid topic. needs_bus: not opened without one.
     """
 
-    open: "Callable[[OutputSection, Bus, str, str, RigCalibration, Intake], Publisher]"
+    open: "Callable[[OutputSection, Bus | None, str, str, RigCalibration, Intake], Publisher]"
     check: "Callable[[OutputSection, Topics], None]"
-    connect: "Callable[[str], Bus]"
+    needs_bus: bool = True
 
 
 @dataclass(frozen=True)

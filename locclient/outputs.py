@@ -19,8 +19,6 @@ class OutputSection(Section, frozen=True):
     endpoint: str | None = None
     robot_height_m: Annotated[float, msgspec.Meta(gt=FLOOR_M, le=TOP_M)] = 1.1
     autostart: bool = True
-    domain: int = 0
-    keys: str = "rmw_zenoh"
     namespace: str = ""
     node: str = "fleetmap_localizer"
     pose_topic: str = "amcl_pose"

@@ -25,12 +25,12 @@ _PRESETS = Path(__file__).parent / "presets"
 TIERS = {
     "user": {
         "": "site store",
-        "source": "kind sensors calibration endpoint recording device",
+        "source": "kind sensors calibration recording device",
         "topics": "*",
         "alerts": "*",
     },
     "tuning": {
-        "source": "domain keys speed width_px height_px rate_hz delay_s",
+        "source": "speed width_px height_px rate_hz delay_s",
         "gate": "*",
         "ingest": "*",
         "canary": "*",

@@ -50,12 +50,10 @@ def check_run(config: LocclientConfig) -> MapAddress:
         address = GivenAddress.of(run).resolve(may_be_alone=bool(links))
     except UsageError as error:
         raise UsageError(f"[run] {error}") from error
-    topics = None if config.source.kind == "recording" else config.source.endpoint
-    for section, endpoint in (("source", topics), ("output", config.output.endpoint)):
-        try:
-            check_reach(endpoint, insecure=run.insecure)
-        except UsageError as error:
-            raise UsageError(f"[{section}] endpoint = {error}") from error
+    try:
+        check_reach(config.output.endpoint, insecure=run.insecure)
+    except UsageError as error:
+        raise UsageError(f"[output] endpoint = {error}") from error
     output_of(config.output).check(config.output, config.topics)
     if run.replays not in ("off", *PICTURES):
         raise UsageError(f"[run] replays = {run.replays!r}: choose off, {' or '.join(PICTURES)}")
@@ -164,11 +162,11 @@ def _opened_publisher(
     calibration: RigCalibration,
     intake: Intake,
 ) -> Publisher | None:
-    """Return the publisher at [output] endpoint, else on the map server's bus, which the stack closes; None without either."""
+    """Return the publisher at [output] endpoint, else on the map server's bus, which the stack closes; None without one that it needs."""
     output = output_of(config.output)
     if config.output.endpoint is not None:
-        bus = stack.enter_context(output.connect(config.output.endpoint))
-    elif bus is None or address.server is None:
+        bus = stack.enter_context(Bus.connect(config.output.endpoint))
+    elif output.needs_bus and (bus is None or address.server is None):
         return None
     publisher = output.open(config.output, bus, address.site, address.robot, calibration, intake)
     stack.callback(publisher.close)

@@ -16,8 +16,9 @@ _MAX_HYPOTHESES = 16
 class MessagePackPublisher(Publisher):
     """Sends EstimateMessage under the robot's key."""
 
-    def __init__(self, _section: OutputSection, bus: Bus, site: str, robot: str, *_: object) -> None:
+    def __init__(self, _section: OutputSection, bus: Bus | None, site: str, robot: str, *_: object) -> None:
         """See `OutputHook`."""
+        assert bus is not None
         self._bus, self._key = bus, robot_key(site, robot, "estimate")
 
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
@@ -39,7 +40,7 @@ class MessagePackPublisher(Publisher):
         self._bus.publish(self._key, encode_message(message), may_drop=True)
 
 
-OUTPUTS = {"messagepack": OutputHook(MessagePackPublisher, lambda _section, _topics: None, Bus.connect)}
+OUTPUTS = {"messagepack": OutputHook(MessagePackPublisher, lambda _section, _topics: None)}
 
 
 def output_of(section: OutputSection) -> OutputHook:

@@ -7,13 +7,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from fleetmap.bus.endpoints import with_free_port
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.messages import FailureAck, FailureReport, decode_message, encode_message, robot_key
 from fleetmap.recordings.calibration_files import format_calibration
@@ -25,7 +23,6 @@ from mapserver.serving.bus_service import BusService
 from mapserver.store import FailureFilter, MapStore
 from mapserver.trust import init_here
 from support.fleet.memory_bus import MemoryBus, MemoryHub
-from support.fleet.nav2_client import ACTIVE, LifecycleManager, eventually, rmw_router
 from support.fleet.tls_site import TlsSite
 from support.recordings.recording_samples import calibration
 from support.worlds import robot_world
@@ -158,48 +155,3 @@ def test_an_enrolled_robot_drives_on_through_failures_a_new_version_and_restarts
         assert {row.cause for row in store.fleet.failures(FailureFilter(site="room"))} == {"dark"}
     for log in (site.log("r1"), tmp_path / "server.log"):
         assert "Traceback" not in log.read_text("utf-8", "replace")
-
-
-def test_nav2_starts_it_asks_it_and_stops_it(tmp_path: Path) -> None:
-    """The daemon on a store's folder, behind rmw_zenoh's router: lifecycle manager, BasicNavigator, behaviour tree."""
-    pytest.importorskip("locclient.plugins.ros2_node")
-    with MapStore.open(tmp_path / "store", create=True) as store:
-        robot_world.save(store)
-    endpoint = with_free_port("tcp/127.0.0.1:0")
-    path = tmp_path / "robot.toml"
-    path.write_text(
-        f'[run]\nstore = "{tmp_path}/store"\nsite = "room"\nrobot = "r1"\noutbox = "{tmp_path}/spool.sqlite3"\n'
-        f'[source]\nkind = "recording"\nrecording = "{write_walk(tmp_path / "walk", 280, range(0))}"\nspeed = 0.4\n'
-        f'[output]\nformat = "ros2"\nendpoint = "{endpoint}"\nautostart = false\n'
-    )
-    posed, node = "geometry_msgs/msg/PoseWithCovarianceStamped", "fleetmap_localizer"
-    with (
-        rmw_router(endpoint),
-        closing(LifecycleManager(endpoint, node)) as manager,
-        closing(LifecycleManager(endpoint, node)) as navigator,
-        daemon(path, tmp_path / "notify") as process,
-    ):
-        manager.endpoint("SS", f"/{node}/get_state", PATIENCE_S)
-        assert manager.startup()
-        assert navigator.state() == ACTIVE, "waitUntilNav2Active(localizer=...)"
-        links = manager.listen("/tf", "tf2_msgs/msg/TFMessage")
-        assert eventually(lambda: any(link.header.frame_id == "map" for told in links for link in told.transforms), 30)
-        late = navigator.listen("/amcl_pose", posed, is_transient_local=True)
-        assert eventually(lambda: bool(late), 5)
-        health = navigator.listen("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
-        assert eventually(lambda: any(told.status[0].message == "TRACKING" for told in health), 15)
-        given = late[-1]
-        given.pose.pose.position.x += 6.0
-        given.pose.covariance = np.zeros(36)
-        seen = len(late)
-        navigator.publish("/initialpose", posed, given)
-        assert eventually(
-            lambda: any(abs(one.pose.pose.position.x - given.pose.pose.position.x) < 1 for one in late[seen:]), 5
-        )
-        before = len(health)
-        assert navigator.call("/reinitialize_global_localization", "std_srvs/srv/Empty") is not None
-        assert eventually(lambda: any(told.status[0].message == "TRACKING" for told in health[before + 1 :]), 15)
-        process.send_signal(signal.SIGTERM)
-        assert process.wait(30) == 0
-        assert eventually(lambda: not [parts for parts in manager.graph() if parts[8] == node])
-        assert eventually(lambda: not manager.beats[-1].active), "it takes leave of the manager"

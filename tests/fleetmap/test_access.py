@@ -19,7 +19,7 @@ from fleetmap.bus.zenoh_bus import Bus, _config
 from fleetmap.errors import LinkError, UnreachableError
 from mapserver.trust.authorities import Authorities
 from support.fleet.memory_bus import MemoryBus, MemoryHub, permits
-from support.fleet.nav2_client import eventually
+from support.waiting import eventually
 
 OWN, OTHERS = "fleetmap/hall/robots/a/", "fleetmap/hall/robots/b/"
 ACCESS = Access(

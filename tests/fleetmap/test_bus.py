@@ -13,7 +13,7 @@ from fleetmap.bus.endpoints import check_endpoint
 from fleetmap.bus.zenoh_bus import MAX_MESSAGE_BYTES, Bus
 from fleetmap.errors import LinkError, StoreError, UnreachableError, UsageError
 from support.fleet.memory_bus import MemoryBus, MemoryHub
-from support.fleet.nav2_client import eventually
+from support.waiting import eventually
 
 
 @pytest.fixture(params=["memory", "zenoh"])

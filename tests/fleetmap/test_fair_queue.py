@@ -112,8 +112,8 @@ def test_what_comes_beside_a_payload_counts() -> None:
         assert begun.is_set()
         before = len(heard)
         for _ in range(20):
-            evil.publish("fleetmap/hall/robots/r1/health", b"x", attachment=bytes(900_000))
-        evil.publish("fleetmap/hall/robots/r2/health", b"last", attachment=b"small")
+            evil._session.put("fleetmap/hall/robots/r1/health", b"x", attachment=bytes(900_000))
+        evil._session.put("fleetmap/hall/robots/r2/health", b"last", attachment=b"small")
         time.sleep(0.5)
         gate.set()
         while b"last" not in heard and time.monotonic() < until_s:

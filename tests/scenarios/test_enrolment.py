@@ -14,9 +14,9 @@ from locclient.identity import GivenAddress, RobotIdentity
 from locclient.maps.map_client import connected
 from mapserver import releases
 from mapserver.store import MapStore
-from support.fleet.nav2_client import eventually
 from support.fleet.tls_site import TlsSite
 from support.storage.map_samples import save_sample_draft
+from support.waiting import eventually
 
 SITE = "lab"
 FORGED = encode_message(WantedVersion(site=SITE, version=99, manifest_sha256="f" * 64))

@@ -1,8 +1,9 @@
 """A UVC stereo camera that delivers both images side by side, through OpenCV; IMU and wheels come as ROS 2 topics."""
 
+import logging
+import threading
 import time
 from collections.abc import Callable
-from contextlib import ExitStack
 
 import cv2
 import numpy as np
@@ -13,10 +14,12 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame
 from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
-from locclient.plugins.ros2_node.source import Ros2Source, open_topics
+from fleetmap.sources.source import Source
+from locclient.plugins.ros2_node import has_ros, open_topics, rig_of
 
 _REOPEN_S = 1.0
 _CLOCKS_AGREE_S = 1.0
+_log = logging.getLogger(__name__)
 
 
 class UvcSource:
@@ -32,7 +35,7 @@ class UvcSource:
         open_capture: Callable[[], cv2.VideoCapture],
         calibration: RigCalibration,
         section: SourceSection,
-        topics: Ros2Source | None,
+        topics: Source | None,
         *,
         monotonic_s: Callable[[], float] = time.monotonic,
         wall_ns: Callable[[], int] = time.time_ns,
@@ -43,17 +46,16 @@ class UvcSource:
         self.calibration, self.has_depth = calibration, False
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
-        with ExitStack() as stack:
-            for handle in [] if self._topics is None else self._topics.subscribe(intake):
-                stack.callback(handle.close)
-            while not wait(0.0):
-                capture = self._open()
-                try:
-                    self._read_frames(capture, intake, wait)
-                finally:
-                    capture.release()
-                if wait(_REOPEN_S):
-                    return
+        if self._topics is not None:
+            threading.Thread(target=self._topics.run, args=(intake, wait), name="topics", daemon=True).start()
+        while not wait(0.0):
+            capture = self._open()
+            try:
+                self._read_frames(capture, intake, wait)
+            finally:
+                capture.release()
+            if wait(_REOPEN_S):
+                return
 
     def close(self) -> None:
         if self._topics is not None:
@@ -93,8 +95,12 @@ def open_source(section: SourceSection, topics: Topics, map_frame: str) -> UvcSo
             f'[source] sensors = "{section.sensors}": a uvc camera sends pairs; take topics, kind = "ros2"'
         )
     device: int | str = int(section.device) if section.device.isdecimal() else section.device
-    others = open_topics(section, topics, map_frame, images=False)
-    return UvcSource(lambda: cv2.VideoCapture(device), others.calibration, section, others)
+    calibration, others = rig_of(section), None
+    if calibration.imu is not None or has_ros():
+        others = open_topics(section, topics, map_frame, images=False)
+    else:
+        _log.warning("ROS 2 is not sourced: the camera is used without wheels and priors")
+    return UvcSource(lambda: cv2.VideoCapture(device), calibration, section, others)
 
 
 def split_frame(picture: np.ndarray, stamp_ns: int) -> CameraFrame:

@@ -11,10 +11,9 @@ from operator import methodcaller
 from typing import Any, Literal, Self
 
 import zenoh
-import zenoh.ext
 
 from fleetmap.access import Access
-from fleetmap.bus.endpoints import TlsFiles, check_endpoint, has_tls, is_loopback, with_free_port
+from fleetmap.bus.endpoints import TlsFiles, check_endpoint, has_tls, with_free_port
 from fleetmap.bus.fair_queue import FairQueue, sender_of
 from fleetmap.errors import FleetmapError, LinkError, UnreachableError, UsageError
 
@@ -24,15 +23,10 @@ Answer = Callable[[str, bytes], bytes]
 Listen = Callable[[str, bytes], None]
 """Receives (key, payload) of a publication. Runs on a thread of the bus."""
 
-Attach = Callable[[bytes], bytes]
-"""Computes the attachment of a reply from that of its query; empty for none."""
-
 MAX_MESSAGE_BYTES = 1 << 20  # larger content is sent in parts, because one large message delays all others behind it
-_MAX_LATCHED_BYTES = 1 << 26  # a robot's own programs take a map in one message
 _RETRY_S = 0.05
 _REOPEN_WITHIN_S = 10.0
 _MAX_ALIVE, _ALIVE_WITHIN_S = 1 << 17, 2.0
-_HEARTBEAT_S = 0.5  # period after which a subscriber detects that the last message was lost; same as in rmw_zenoh
 _MAX_SESSIONS = 20_000  # zenoh's default is 1000: further robots would get no response
 # Connections without a session yet, each for at most 10 s. At zenoh's default, 100, so many silent ones would shut out all robots.
 _MAX_PENDING = 4096
@@ -56,22 +50,6 @@ class Handle:
         undo, self._undo = self._undo, None
         if undo is not None:
             undo()
-
-
-class LatchedPublisher(Handle):
-    """Publishes under one key and keeps the last message for late subscribers, which query it."""
-
-    def __init__(self, put: Callable[[bytes, bytes], None], undo: Callable[[], None]) -> None:
-        super().__init__(undo)
-        self._put = put
-
-    def put(self, payload: bytes, attachment: bytes = b"") -> None:
-        """Publish; raises LinkError for more than _MAX_LATCHED_BYTES or on a closed bus."""
-        if len(payload) > _MAX_LATCHED_BYTES:
-            raise LinkError(
-                f"{len(payload)} bytes are more than the {_MAX_LATCHED_BYTES} that are kept for late subscribers"
-            )
-        self._put(payload, attachment)
 
 
 class _Declaration:
@@ -98,17 +76,15 @@ class Bus:
         is_server: bool = False,
         tls: TlsFiles | None = None,
         access: Access | None = None,
-        is_ros: bool = False,
     ) -> None:
-        """Create a closed bus: see `open`. tls: mutual TLS; access: rules of a server with mutual TLS. is_ros: connects to the router
-        of a robot's ROS 2; a router on another machine must be running when the bus is opened.
+        """Create a closed bus: see `open`. tls: mutual TLS; access: rules of a server with mutual TLS.
 
         Raises UsageError for an invalid endpoint and for TLS without its files.
         """
         self.endpoint = check_endpoint(endpoint)
         if has_tls(endpoint) and tls is None and is_server:
             raise UsageError(f"endpoint {endpoint}: listening with TLS needs a certificate")
-        self._is_server, self._tls, self.access, self._is_ros = is_server, tls, access, is_ros
+        self._is_server, self._tls, self.access = is_server, tls, access
         self._lock = threading.RLock()
         self._session: Any = None
         self._is_closed = False
@@ -126,9 +102,9 @@ class Bus:
         return bus
 
     @classmethod
-    def connect(cls, endpoint: str, *, tls: TlsFiles | None = None, is_ros: bool = False) -> Self:
+    def connect(cls, endpoint: str, *, tls: TlsFiles | None = None) -> Self:
         """Open a robot's side. Returns at once; connects, and reconnects after every loss, in the background."""
-        bus = cls(endpoint, tls=tls, is_ros=is_ros)
+        bus = cls(endpoint, tls=tls)
         bus.open()
         return bus
 
@@ -181,7 +157,7 @@ class Bus:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def queryable(self, key_expr: str, answer: Answer, attach: Attach | None = None) -> Handle:
+    def queryable(self, key_expr: str, answer: Answer) -> Handle:
         """Answer queries for keys that match `key_expr` (`*` is one chunk, `**` any number)."""
 
         def reply(query: Any, key: str) -> None:
@@ -193,9 +169,7 @@ class Bus:
                     if data is None:
                         query.reply_err(reason.encode("utf-8", "replace"))
                     else:
-                        asked = b"" if query.attachment is None else query.attachment.to_bytes()
-                        beside = attach(asked) if attach is not None else b""
-                        query.reply(key, data, attachment=beside or None)
+                        query.reply(key, data)
                 except zenoh.ZError as error:
                     _log.debug("the session that asked for %r is gone: %s", key[:200], error)  # the client retries
 
@@ -234,43 +208,14 @@ class Bus:
             time.sleep(min(_RETRY_S, max(0.0, deadline - time.monotonic())))
         raise no_answer(key, self.endpoint, timeout_s, is_silenced=self._tls is not None and self.connected())
 
-    def publish(self, key: str, payload: bytes, *, may_drop: bool = False, attachment: bytes = b"") -> None:
-        """Publish to all subscribers; having none is not an error. `may_drop`: drop the message instead of waiting for a congested network.
-
-        attachment: metadata beside the payload, for other programs; subscribers of this class do not receive it.
-        """
+    def publish(self, key: str, payload: bytes, *, may_drop: bool = False) -> None:
+        """Publish to all subscribers; having none is not an error. `may_drop`: drop the message on a congested network."""
         control = zenoh.CongestionControl.DROP if may_drop else zenoh.CongestionControl.BLOCK
-        beside = {"attachment": attachment} if attachment else {}
         check_size(payload, key)
-        self._guarded(lambda session: session.put(key, payload, congestion_control=control, **beside))
+        self._guarded(lambda session: session.put(key, payload, congestion_control=control))
 
-    def latched_publisher(self, key: str) -> LatchedPublisher:
-        """Declare a publisher under `key` that keeps its last message.
-
-        Late subscribers query it with an AdvancedSubscriber that has a history, as rmw_zenoh and zenoh-bridge-ros2dds do.
-        """
-        declared = self._declared_now(
-            lambda session: zenoh.ext.declare_advanced_publisher(
-                session,
-                key,
-                reliability=zenoh.Reliability.RELIABLE,
-                cache=zenoh.ext.CacheConfig(max_samples=1),
-                sample_miss_detection=zenoh.ext.MissDetectionConfig(heartbeat=None, sporadic_heartbeat=_HEARTBEAT_S),
-                publisher_detection=True,
-            )
-        )
-
-        def put(payload: bytes, attachment: bytes) -> None:
-            self._guarded(lambda _: declared.current.put(payload, attachment=attachment or None))
-
-        return LatchedPublisher(put, partial(self._undeclare, declared))
-
-    def session_id(self) -> str:
-        """Id of this participant on its network."""
-        return str(self._guarded(lambda session: session.zid()))
-
-    def subscribe(self, key_expr: str, listen: Listen, *, is_latched: bool = False) -> Handle:
-        """Call `listen` for every publication under matching keys; is_latched: first for the kept messages of latched publishers."""
+    def subscribe(self, key_expr: str, listen: Listen) -> Handle:
+        """Call `listen` for every publication under matching keys."""
 
         def take(sample: Any) -> None:
             key = str(sample.key_expr)
@@ -280,11 +225,6 @@ class Bus:
 
         if not self._is_server:
             plain = lambda sample: deliver(listen, str(sample.key_expr), sample.payload.to_bytes())  # noqa: E731
-            if is_latched:
-                history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
-                return self._declare(
-                    lambda session: zenoh.ext.declare_advanced_subscriber(session, key_expr, plain, history=history)
-                )
             return self._declare(lambda session: session.declare_subscriber(key_expr, plain))
         queue = FairQueue(f"hears {key_expr}")
         direct = zenoh.handlers.Callback(take, lambda: None, indirect=False)
@@ -337,22 +277,17 @@ class Bus:
             entries |= _SERVER | {"transport/unicast/accept_pending": min(_MAX_PENDING, files // 4)}
             if self.access is not None:
                 entries |= {"transport/link/rx/max_message_size": _MAX_RECEIVED_BYTES, **self.access.zenoh_config()}
-        if self._is_ros:
-            entries |= _ROS_HERE if is_loopback(self.endpoint) else _ROS_AWAY
         self._session = zenoh.open(_config(entries))
         for entry in self._declared:
             entry.current = entry.declare(self._session)
 
     def _declare(self, declare: Callable[[Any], Any], stop: Callable[[], None] = lambda: None) -> Handle:
-        return Handle(partial(self._undeclare, self._declared_now(declare, stop)))
-
-    def _declared_now(self, declare: Callable[[Any], Any], stop: Callable[[], None] = lambda: None) -> _Declaration:
         declared = _Declaration(declare, stop)
         with self._lock:
             if self._session is not None:
                 declared.current = self._guarded(declare)
             self._declared.append(declared)
-        return declared
+        return Handle(partial(self._undeclare, declared))
 
     def _undeclare(self, declared: _Declaration) -> None:
         with self._lock:
@@ -441,11 +376,6 @@ _COMMON: dict[str, Any] = {
     "transport/shared_memory/enabled": False,
     "adminspace/enabled": False,
 }
-# A router of ROS 2 does not forward messages between peers: its programs discover each other by the router's gossip, and connect.
-# So does a robot's side, which does not listen. From another machine peers cannot be reached: there the router serves a client.
-_ROS: dict[str, Any] = {"timestamping/enabled": True}
-_ROS_HERE = _ROS | {"scouting/gossip/enabled": True, "scouting/gossip/target": {"router": [], "peer": ["router"]}}
-_ROS_AWAY = _ROS | {"mode": "client", "connect/timeout_ms": 10_000, "connect/exit_on_failure": True}
 _SERVER: dict[str, Any] = {"mode": "router", "transport/unicast/max_sessions": _MAX_SESSIONS}
 
 

@@ -262,7 +262,7 @@ def test_pairs_are_those_of_the_mounting_and_a_silent_camera_costs_its_own(
 
 def test_a_robot_and_its_recordings_pair_by_mounting(tmp_path: Path) -> None:
     calibration, frames = interleaved()
-    live, complete = pytest.importorskip("locclient.plugins.ros2_node.source").RigFrames(calibration), []
+    live, complete = pytest.importorskip("locclient.plugins.ros2_node.sensor_messages").RigFrames(calibration), []
     for frame in map(store_frame, frames):
         (rear,) = frame.others
         for number, image in ((1, rear.left), (3, rear.right), (0, frame.left), (2, frame.right)):

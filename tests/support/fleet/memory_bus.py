@@ -7,10 +7,8 @@ from typing import Any
 from fleetmap.access import Access, Act, Direction, _rules
 from fleetmap.bus.zenoh_bus import (
     Answer,
-    Attach,
     Bus,
     Handle,
-    LatchedPublisher,
     Listen,
     answer_query,
     check_size,
@@ -57,8 +55,7 @@ class MemoryBus(Bus):
         self._handles: list[Handle] | None = []
         hub.certificates.append(certificate)
 
-    def queryable(self, key_expr: str, answer: Answer, attach: Attach | None = None) -> Handle:
-        """See Bus; nothing here carries attachments."""
+    def queryable(self, key_expr: str, answer: Answer) -> Handle:
         return self._declare(self._hub.queryables, (key_expr, answer, self._certificate))
 
     def get(self, key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:
@@ -82,7 +79,7 @@ class MemoryBus(Bus):
             raise query_refused(key, reason)
         return data
 
-    def publish(self, key: str, payload: bytes, *, may_drop: bool = False, attachment: bytes = b"") -> None:
+    def publish(self, key: str, payload: bytes, *, may_drop: bool = False) -> None:
         check_size(payload, key)
         hub = self._hub
         with hub.lock:
@@ -97,19 +94,7 @@ class MemoryBus(Bus):
             for listen in listeners:
                 deliver(listen, key, payload)
 
-    def latched_publisher(self, key: str) -> LatchedPublisher:
-        """See Bus; earlier publications are not queried here."""
-
-        def put(payload: bytes, attachment: bytes) -> None:
-            self.publish(key, payload, may_drop=True, attachment=attachment)
-
-        return LatchedPublisher(put, lambda: None)
-
-    def session_id(self) -> str:
-        return f"{id(self):x}"
-
-    def subscribe(self, key_expr: str, listen: Listen, *, is_latched: bool = False) -> Handle:
-        """See Bus; nothing here is kept for later."""
+    def subscribe(self, key_expr: str, listen: Listen) -> Handle:
         return self._declare(self._hub.subscribers, (key_expr, listen, self._certificate))
 
     def declare_alive(self, key: str) -> Handle:

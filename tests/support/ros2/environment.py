@@ -52,7 +52,9 @@ def ros_environment() -> dict[str, str]:
 def ros_program(*words: str) -> Iterator[subprocess.Popen[str]]:
     """A program of .venv's Python with ROS, such as ("-m", "locclient", ...), its output as a pipe of text. Interrupted at the end."""
     command = [sys.executable, *words]
-    with subprocess.Popen(command, env=ros_environment(), stdout=subprocess.PIPE, text=True) as program:
+    with subprocess.Popen(
+        command, env=ros_environment(), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as program:
         try:
             yield program
         finally:

@@ -17,9 +17,7 @@ from fleetmap.recordings.images import decode_frame
 from fleetmap.recordings.mcap.writer import copy_to_mcap
 from fleetmap.sensors.source_settings import Topics
 from fleetmap.sources.intake import Intake
-from locclient.plugins.ros2_node.keys import RmwZenohKeys
-from locclient.plugins.ros2_node.source import Ros2Source
-from support.fleet.memory_bus import MemoryBus, MemoryHub
+from locclient.plugins.ros2_node.sensor_messages import SensorMessages
 from support.recordings.bag_samples import write_rosbag1, write_rosbag2
 from support.recordings.mcap_samples import SAMPLE, Message, foreign_messages, write_foreign
 from support.recordings.recording_samples import HEIGHT, WIDTH, calibration
@@ -55,15 +53,15 @@ def with_images(topic: str, form: str, data: bytes) -> list[Message]:
 
 
 def live_depth(form: str, data: bytes) -> np.ndarray:
-    hub, queue = MemoryHub(), Intake(frames=9, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
+    queue = Intake(frames=9, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
     rig, topics = replace(calibration(), cameras=calibration().cameras[:1], imu=None), Topics()
-    with MemoryBus(hub) as driver, MemoryBus(hub) as robot:
-        Ros2Source(robot, RmwZenohKeys(0), topics, rig, has_depth=True).subscribe(queue)
-        for topic, payload in (
-            (f"{topics.left}/compressed", compressed(50, "mono8; png compressed", png(SAMPLE.left[0]))),
-            (f"{topics.depth}/compressedDepth", compressed(50, form, data)),
-        ):
-            driver.publish(RmwZenohKeys(0).key(topic, "sensor_msgs/CompressedImage"), payload)
+    sensors = SensorMessages(topics, rig, has_depth=True)
+    for topic, payload in (
+        (f"{topics.left}/compressed", compressed(50, "mono8; png compressed", png(SAMPLE.left[0]))),
+        (f"{topics.depth}/compressedDepth", compressed(50, form, data)),
+    ):
+        (take,) = (take for names, _, take in sensors.topics if topic in names)
+        take(queue, True, payload)
     frame = queue.take(1.0).frame
     assert isinstance(frame, StoredFrame)
     depth_m = decode_frame(frame).depth_m

@@ -21,8 +21,8 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.plugins import alert_messages
 from mapserver.plugins.alert_messages import Webhook, check_address
 from mapserver.store import MapStore
-from support.fleet.nav2_client import eventually
 from support.fleet.webhook_receiver import receiver
+from support.waiting import eventually
 
 NOW_NS = 1_900_000_000_000_000_000
 

@@ -16,10 +16,10 @@ from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.identity import MapAddress, RobotIdentity
 from locclient.maps.map_client import connected
 from mapserver.store import FailureFilter, MapStore
-from support.fleet.nav2_client import eventually
 from support.fleet.reports import blindness
 from support.fleet.tls_site import TlsSite
 from support.storage.map_samples import publish_samples
+from support.waiting import eventually
 
 SITE, WITHIN_S = "lab", 30.0
 ROBOTS = [f"tote-{number}" for number in range(30)]

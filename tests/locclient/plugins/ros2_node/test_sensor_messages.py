@@ -1,14 +1,11 @@
-"""Sensors as a ROS 2 driver publishes them through rmw_zenoh, over real zenoh on loopback; frames of a rig from images one by one."""
+"""Messages of drivers, and frames of a rig from images one by one; without ROS."""
 
-import time
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from fleetmap.bus.zenoh_bus import Bus
-from fleetmap.errors import UsageError
+from fleetmap.errors import RecordingError
 from fleetmap.geometry import se3, so3_exp
 from fleetmap.recordings import Topics
 from fleetmap.recordings.images import (
@@ -21,7 +18,6 @@ from fleetmap.recordings.images import (
     png_image,
     store_frame,
 )
-from fleetmap.recordings.ros2 import messages
 from fleetmap.recordings.ros2.messages import (
     encode_compressed_image,
     encode_image,
@@ -31,17 +27,12 @@ from fleetmap.recordings.ros2.messages import (
 )
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
-from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
-from fleetmap.sources.source import open_source
-from locclient.plugins.ros2_node.keys import RmwZenohKeys, attachment
-from locclient.plugins.ros2_node.source import RigFrames, Ros2Source, StereoPairs
-from support.fleet.memory_bus import MemoryBus, MemoryHub
+from locclient.plugins.ros2_node.sensor_messages import RigFrames, SensorMessages, StereoPairs
 from support.recordings.recording_samples import calibration
 from support.recordings.rig_samples import simulated
 
 TOPICS = Topics(left="/rig/left/image_raw", right="/rig/right/image_raw", imu="/rig/imu")
-GID = bytes(range(16))
 LEFT = np.arange(48, dtype=np.uint8).reshape(6, 8)
 RIGHT = LEFT[:, ::-1].copy()
 
@@ -50,79 +41,33 @@ def intake() -> Intake:
     return Intake(frames=10, imu_minus_cam_s=0.0, has_imu=True, imu_wait_s=0.0)
 
 
-@pytest.fixture
-def buses() -> Iterator[tuple[Bus, Bus]]:
-    """A driver's router and a robot's session."""
-    with Bus.listen("tcp/127.0.0.1:0") as driver, Bus.connect(driver.endpoint) as robot:
-        yield driver, robot
+def put(sensors: SensorMessages, queue: Intake, topic: str, message: bytes, *, is_compressed: bool = False) -> None:
+    (take,) = (take for topics, _, take in sensors.topics if topic in topics)
+    take(queue, is_compressed, message)
 
 
-def test_topics_of_a_driver_become_moments(buses: tuple[Bus, Bus]) -> None:
-    driver, robot = buses
-    queue, sent = intake(), 0
-
-    def send(topic: str, type_name: str, payload: bytes) -> None:
-        nonlocal sent
-        sent += 1
-        driver.publish(RmwZenohKeys(7).key(topic, type_name), payload, attachment=attachment(sent, sent, GID))
-
-    def send_prior(frame: str) -> None:
-        prior = PositionPrior(start_ns, np.eye(4), np.eye(6))
-        send("/prior", "geometry_msgs/PoseWithCovarianceStamped", encode_prior(prior, frame))
-
-    source = Ros2Source(robot, RmwZenohKeys(7), TOPICS, calibration())
-    handles = source.subscribe(queue)
-    deadline = time.monotonic() + 20
-    while not queue.counts.imu_samples and time.monotonic() < deadline:  # until the subscription stands
-        send(TOPICS.imu, "sensor_msgs/Imu", encode_imu(time.time_ns(), "imu", np.ones(3), np.ones(3)))
-        time.sleep(0.02)
-    start_ns = time.time_ns()
+def test_messages_of_drivers_become_moments() -> None:
+    sensors, queue = SensorMessages(TOPICS, calibration()), intake()
     for number in range(4):
-        stamp_ns = start_ns + number * 50_000_000
-        send(TOPICS.right, "sensor_msgs/Image", encode_image(stamp_ns + 1_000_000, "r", grey_image(RIGHT)))
+        stamp_ns = 10**9 + number * 50_000_000
+        put(sensors, queue, TOPICS.right, encode_image(stamp_ns + 1_000_000, "r", grey_image(RIGHT)))
         left = encode_compressed_image(stamp_ns, "l", png_image(LEFT), "png")
-        send(TOPICS.left + "/compressed", "sensor_msgs/CompressedImage", left)
-        send(TOPICS.imu, "sensor_msgs/Imu", encode_imu(stamp_ns, "imu", np.array([1.0, 2, 3]), np.array([0, 0, 9.8])))
+        put(sensors, queue, TOPICS.left + "/compressed", left, is_compressed=True)
+        put(sensors, queue, TOPICS.imu, encode_imu(stamp_ns, "imu", np.array([1.0, 2, 3]), np.array([0, 0, 9.8])))
         wheel = WheelSample(stamp_ns, np.ones(3), 0.1, 0.1, 0.1)
-        send("/odom", "nav_msgs/Odometry", encode_odometry(wheel, "odom", "base"))
-    send_prior("map")
-    send(TOPICS.imu, "sensor_msgs/Imu", b"nonsense")
-    while queue.counts.unreadable < 1 and time.monotonic() < deadline:  # topics keep no order among each other
-        time.sleep(0.01)
-    send_prior("odom")
-    while (queue.counts.frames < 4 or queue.counts.unreadable < 2) and time.monotonic() < deadline:
-        time.sleep(0.01)
+        put(sensors, queue, "/odom", encode_odometry(wheel, "odom", "base"))
+    put(sensors, queue, "/prior", encode_prior(PositionPrior(10**9, np.eye(4), np.eye(6)), "map"))
+    with pytest.raises(RecordingError, match="position prior in the frame 'odom' is not used; give it in 'map'"):
+        put(sensors, queue, "/prior", encode_prior(PositionPrior(10**9, np.eye(4), np.eye(6)), "odom"))
+    with pytest.raises(ValueError, match="CDR"):
+        put(sensors, queue, TOPICS.imu, b"nonsense")
     moments = [queue.take(1.0) for _ in range(4)]
-    assert [moment.frame.stamp_ns for moment in moments] == [start_ns + n * 50_000_000 for n in range(4)]
-    assert isinstance(moments[0].frame, StoredFrame)
-    decoded = decode_frame(moments[0].frame)
+    assert [moment.frame.stamp_ns for moment in moments] == [10**9 + n * 50_000_000 for n in range(4)]
+    decoded = decode_frame(moments[0].frame)  # type: ignore[arg-type]
     np.testing.assert_array_equal(decoded.left, LEFT)
     np.testing.assert_array_equal(decoded.right, RIGHT)
     np.testing.assert_allclose(moments[1].imu.gyro_radps, [[1.0, 2.0, 3.0]])
-    assert len(moments[0].priors) == 1
-    assert [len(moment.wheel) for moment in moments] == [1, 1, 1, 1]
-    assert queue.counts.unreadable == 2
-    assert "position prior in the frame 'odom' is not used; give it in 'map'" in queue.unreadable_why
-    for handle in handles:
-        handle.close()
-
-
-def test_running_ends_when_it_is_told_and_hears_nothing_more() -> None:
-    hub = MemoryHub()
-    with MemoryBus(hub) as bus, MemoryBus(hub) as driver:
-        queue, source = intake(), Ros2Source(bus, RmwZenohKeys(0), TOPICS, calibration())
-
-        def publish_and_stop(_: float) -> bool:
-            for stamp_ns in (5, 6):
-                payload = encode_imu(stamp_ns, "imu", np.ones(3), np.ones(3))
-                driver.publish(RmwZenohKeys(0).key(TOPICS.imu, "sensor_msgs/Imu"), payload)
-            return True
-
-        source.run(queue, publish_and_stop)
-        assert queue.counts.imu_samples == 2
-        publish_and_stop(0.0)
-        assert (queue.counts.imu_samples, queue.counts.imu_refused) == (2, 0)
-        source.close()
+    assert [len(moment.wheel) for moment in moments] == [1, 1, 1, 1] and len(moments[0].priors) == 1
 
 
 def test_pairs_are_by_stamp_and_the_lonely_are_counted() -> None:
@@ -140,17 +85,14 @@ def test_pairs_are_by_stamp_and_the_lonely_are_counted() -> None:
 
 @pytest.mark.parametrize("has_depth", [False, True])
 def test_one_camera_needs_no_right_image(has_depth: bool) -> None:
-    hub, queue = MemoryHub(), intake()
-    depth_m = np.full((6, 8), 1.5, np.float32)
-    with MemoryBus(hub) as driver:
-        rig = replace(calibration(), cameras=calibration().cameras[:1])
-        source = Ros2Source(MemoryBus(hub), RmwZenohKeys(7), TOPICS, rig, has_depth=has_depth)
-        source.subscribe(queue)
-        images = {TOPICS.left: grey_image(LEFT), TOPICS.right: grey_image(RIGHT), TOPICS.depth: depth_image(depth_m)}
-        for topic, image in images.items():
-            driver.publish(RmwZenohKeys(7).key(topic, "sensor_msgs/Image"), encode_image(50, "cam0", image))
-        queue.put_imu(ImuSamples(np.array([10**9]), np.zeros((1, 3)), np.zeros((1, 3))))
-        found = queue.take(1.0).frame
+    queue, depth_m = intake(), np.full((6, 8), 1.5, np.float32)
+    sensors = SensorMessages(TOPICS, replace(calibration(), cameras=calibration().cameras[:1]), has_depth=has_depth)
+    for topic, image in ((TOPICS.left, grey_image(LEFT)), (TOPICS.depth, depth_image(depth_m))):
+        if topic == TOPICS.left or has_depth:
+            put(sensors, queue, topic, encode_image(50, "cam0", image))
+    assert all(TOPICS.right not in topics for topics, _, _ in sensors.topics)
+    queue.put_imu(ImuSamples(np.array([10**9]), np.zeros((1, 3)), np.zeros((1, 3))))
+    found = queue.take(1.0).frame
     assert isinstance(found, StoredFrame)
     frame = decode_frame(found)
     np.testing.assert_array_equal(frame.left, LEFT)
@@ -160,11 +102,6 @@ def test_one_camera_needs_no_right_image(has_depth: bool) -> None:
         np.testing.assert_array_equal(frame.depth_m, depth_m)
     else:
         assert frame.depth_m is None
-
-
-def test_a_uvc_camera_has_a_pair() -> None:
-    with pytest.raises(UsageError, match="uvc camera sends pairs"):
-        open_source(SourceSection(kind="uvc", sensors="mono"), TOPICS)
 
 
 PERIOD_NS, LATE_NS = 50_000_000, 3_000_000
@@ -299,21 +236,19 @@ def test_live_images_and_depth_make_one_view() -> None:
 
 def test_a_live_source_takes_the_topic_of_a_cameras_depth() -> None:
     calibration, frames = simulated("front-depth")
-    hub, queue = MemoryHub(), Intake(frames=9, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
+    queue = Intake(frames=9, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
     topics, stored = Topics(cam2_depth="/back/aligned_depth"), store_frame(frames[0])
     (back,) = stored.others
     assert back is not None
-    with MemoryBus(hub) as driver, MemoryBus(hub) as robot:
-        Ros2Source(robot, RmwZenohKeys(0), topics, calibration).subscribe(queue)
-        for topic, image in (
-            (topics.cam2, back.left),
-            ("/back/aligned_depth", back.depth),
-            (topics.left, stored.left),
-            (topics.right, stored.right),
-        ):
-            assert image is not None
-            payload = messages.encode_image(stored.stamp_ns, "cam", image)
-            driver.publish(RmwZenohKeys(0).key(topic, "sensor_msgs/Image"), payload)
+    sensors = SensorMessages(topics, calibration)
+    for topic, image in (
+        (topics.cam2, back.left),
+        ("/back/aligned_depth", back.depth),
+        (topics.left, stored.left),
+        (topics.right, stored.right),
+    ):
+        assert image is not None
+        put(sensors, queue, topic, encode_image(stored.stamp_ns, "cam", image))
     frame = queue.take(1.0).frame
     assert frame is not None
     decoded = decode_frame(frame)  # type: ignore[arg-type]

@@ -1,0 +1,61 @@
+"""A robot's side of its sensors: `python -m support.ros2.sensor_listener CALIBRATION [--publish]` reads topics as the daemon does, until
+its standard input ends, and prints a line of counts, CPU time and memory every second."""
+
+import json
+import resource
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+
+from fleetmap.recordings import Topics
+from fleetmap.sensors.source_settings import SourceSection
+from fleetmap.sources.intake import Intake
+from locclient.outputs import OutputSection
+from locclient.plugins.ros2_node import OUTPUT, open_topics
+from locclient.robot.continuous_odom import ContinuousOdom
+from support.fleet.estimates import estimate
+
+
+def main() -> None:
+    source = open_topics(SourceSection(calibration=sys.argv[1]), Topics(), "map")
+    intake = Intake(frames=5, imu_minus_cam_s=0.0, has_imu=source.calibration.imu is not None, imu_wait_s=0.05)
+    ended = threading.Event()
+    reading = threading.Thread(target=source.run, args=(intake, ended.wait))
+    reading.start()
+    publisher, odom = None, ContinuousOdom(np.eye(4))
+    if "--publish" in sys.argv:
+        publisher = OUTPUT.open(OutputSection(format="ros2"), None, "hall", "r1", source.calibration, intake)
+    told_s, taken = time.monotonic(), 0
+    threading.Thread(target=lambda: (sys.stdin.read(), ended.set()), daemon=True).start()
+    while not ended.is_set():
+        frame = intake.take(0.2).frame
+        taken += frame is not None
+        if publisher is not None and frame is not None:
+            told = estimate(frame.stamp_ns * 1e-9)
+            publisher.publish(told, odom.handle(told), np.eye(4))
+        if time.monotonic() - told_s >= 1.0:
+            told_s = time.monotonic()
+            if publisher is not None:
+                publisher.alive(False)
+            print(json.dumps(figures(intake, taken)), flush=True)
+    reading.join()
+    if publisher is not None:
+        publisher.close()
+    source.close()
+    print(json.dumps(figures(intake, taken)), flush=True)
+
+
+def figures(intake: Intake, taken: int) -> dict[str, float]:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    counts = intake.counts
+    return {
+        "frames": counts.frames, "taken": taken, "imu": counts.imu_samples, "unreadable": counts.unreadable,
+        "cpu_s": time.process_time(), "rss_mb": pages * resource.getpagesize() / 1e6,
+    }  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()
