@@ -4,6 +4,7 @@ ROS's own launch is in no wheel: stand-ins for its actions are called, and what 
 """
 
 import json
+import re
 import runpy
 import subprocess
 import sys
@@ -15,8 +16,13 @@ import pytest
 import yaml
 
 from locclient.config import read_config
+from mapserver.store import MapStore
+from mapserver.trust import init_here
 from support.fleet.contracts_documents import REPOSITORY
+from support.recordings.recording_samples import kalibr_text
 from support.ros2.environment import needs_ros, ros_environment, ros_program
+from support.ros2.peer import UNCONFIGURED, lifecycle_manager
+from support.storage.map_samples import publish_samples
 
 PACKAGE = REPOSITORY / "deploy/ros2/fleetmap_ros"
 NAV2 = Path("/nav2_bringup")  # whose files ROS has
@@ -45,59 +51,57 @@ def test_colcon_builds_a_program_that_leaves_arguments_of_ros_to_rclpy(tmp_path:
     for folder in ("config", "launch", "rviz"):
         installed = [path.name for path in sorted((built / "share/fleetmap_ros" / folder).iterdir())]
         assert installed == [path.name for path in sorted((PACKAGE / folder).iterdir())]
-    words = [built / "lib/fleetmap_ros/localizer", "--config", "no.toml", "--ros-args", "-r", "__ns:=/r1"]
-    command = ["sh", "-c", '. install/setup.sh && exec "$0" "$@"', *map(str, words)]
-    path = f"{Path(sys.executable).parent}:/usr/bin:/bin"
-    environment = ros_environment() | {"PATH": path}
-    ended = subprocess.run(command, cwd=tmp_path, env=environment, check=False, capture_output=True, text=True)
-    assert "no.toml" in ended.stderr
-    assert "ros-args" not in ended.stderr
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        publish_samples(store, 1)
+        init_here(store)
+    (tmp_path / "rig.yaml").write_text(kalibr_text())
+    settings = (PACKAGE / "config/locclient.toml").read_text()
+    for name, value in {"identity": "store", "outbox": "outbox", "cache": "cache", "calibration": "rig.yaml"}.items():
+        settings = re.sub(f"^{name} = .*$", f'{name} = "{value}"', settings, flags=re.MULTILINE)
+    settings = settings.replace("identity =", 'site = "lab"\nrobot = "r1"\nstore =')
+    (tmp_path / "locclient.toml").write_text(settings)
+    words = "--config locclient.toml --ros-args -r __ns:=/r1 -p output.autostart:=false"
+    command = f". install/setup.sh && exec {built}/lib/fleetmap_ros/localizer {words}"
+    environment = ros_environment() | {"PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin"}
+    with (
+        subprocess.Popen(["sh", "-c", command], cwd=tmp_path, env=environment) as localizer,
+        lifecycle_manager("r1/fleetmap_localizer") as manager,
+    ):
+        assert manager.state() == UNCONFIGURED
+        localizer.terminate()
 
 
-def launched(name: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, MagicMock]:
-    """The stand-ins for launch's actions, by name, after a launch file was loaded and described."""
-    modules = {
-        "ament_index_python.packages": ["get_package_share_directory"],
-        "launch": ["LaunchDescription"],
-        "launch.actions": ["DeclareLaunchArgument", "IncludeLaunchDescription"],
-        "launch.conditions": ["IfCondition"],
-        "launch.launch_description_sources": ["PythonLaunchDescriptionSource"],
-        "launch.substitutions": ["LaunchConfiguration"],
-        "launch_ros.actions": ["Node"],
-        "launch_ros.parameter_descriptions": ["ParameterValue"],
-    }
-    actions = {action: MagicMock() for names in modules.values() for action in names}
-    actions["get_package_share_directory"].side_effect = {"fleetmap_ros": str(PACKAGE), "nav2_bringup": str(NAV2)}.get
-    actions["PythonLaunchDescriptionSource"].side_effect = Path
-    for module, names in modules.items():
-        monkeypatch.setitem(sys.modules, module.partition(".")[0], MagicMock())
-        monkeypatch.setitem(sys.modules, module, MagicMock(**{action: actions[action] for action in names}))
-    runpy.run_path(str(PACKAGE / "launch" / name))["generate_launch_description"]()
-    return actions
-
-
-def arguments(actions: dict[str, MagicMock]) -> dict[str, str]:
-    return {call.args[0]: call.kwargs["default_value"] for call in actions["DeclareLaunchArgument"].call_args_list}
+def launched(name: str, monkeypatch: pytest.MonkeyPatch) -> tuple[MagicMock, dict[str, str]]:
+    """A stand-in for all actions, after a launch file was loaded and described, and its arguments with their defaults."""
+    launch = MagicMock(PythonLaunchDescriptionSource=Path)
+    launch.get_package_share_directory = {"fleetmap_ros": str(PACKAGE), "nav2_bringup": str(NAV2)}.get
+    file = PACKAGE / "launch" / name
+    for module in re.findall(r"^from ((?:launch|ament_index_python)\S*) import", file.read_text(), re.MULTILINE):
+        monkeypatch.setitem(sys.modules, module.partition(".")[0], launch)
+        monkeypatch.setitem(sys.modules, module, launch)
+    runpy.run_path(str(file))["generate_launch_description"]()
+    declared = [(call.args[0], call.kwargs["default_value"]) for call in launch.DeclareLaunchArgument.call_args_list]
+    return launch, dict(declared)
 
 
 def test_launch_files_name_what_there_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    alone, with_nav2 = (launched(name, monkeypatch) for name in ("localization.launch.py", "nav2.launch.py"))
-    for actions in (alone, with_nav2):
-        declared = arguments(actions)
-        assert {call.args[0] for call in actions["LaunchConfiguration"].call_args_list} == set(declared)
+    alone, arguments = launched("localization.launch.py", monkeypatch)
+    with_nav2, arguments_with_nav2 = launched("nav2.launch.py", monkeypatch)
+    for launch, declared in ((alone, arguments), (with_nav2, arguments_with_nav2)):
+        assert {call.args[0] for call in launch.LaunchConfiguration.call_args_list} == set(declared)
         files = [Path(value) for value in declared.values() if "/" in value]
         assert all(path.exists() or path.is_relative_to(NAV2) for path in files)
-    localizer, rviz = (call.kwargs for call in alone["Node"].call_args_list)
+    localizer, rviz = (call.kwargs for call in alone.Node.call_args_list)
     assert f'"{localizer["executable"]} = ' in (PACKAGE / "setup.py").read_text()
     assert Path(rviz["arguments"][1]).exists()
-    (manager,) = (call.kwargs for call in with_nav2["Node"].call_args_list)
+    ours, nav2 = with_nav2.IncludeLaunchDescription.call_args_list
+    assert set(dict(ours.kwargs["launch_arguments"])) <= set(arguments)
+    assert ours.args[0].exists() and nav2.args[0] == NAV2 / "launch/navigation_launch.py"
+    (manager,) = (call.kwargs for call in with_nav2.Node.call_args_list)
     assert manager["parameters"] == [str(PARAMETERS)]
     parameters = yaml.safe_load(PARAMETERS.read_text())
     config, _ = read_config(PACKAGE / "config/locclient.toml", {})
     assert parameters[manager["name"]]["ros__parameters"]["node_names"] == [config.output.node]
-    ours, nav2 = (call for call in with_nav2["IncludeLaunchDescription"].call_args_list)
-    assert set(dict(ours.kwargs["launch_arguments"])) <= set(arguments(alone))
-    assert ours.args[0].exists() and nav2.args[0] == NAV2 / "launch/navigation_launch.py"
     # One publisher of /map: the node, not nav2's map_server.
     assert config.output.map_topic == "map" and "map_server" not in parameters
 
