@@ -105,9 +105,11 @@ class BuiltMap:
         A site's first version is refused if its recordings are too short or too straight to judge the calibration. With
         trust_calibration the actor, who needs a name and a reason, confirms it; the manifest records that.
         """
-        choices = {"trust_calibration": trust_calibration, "force": force}
+        gate = gate or GateSettings()
         with MapStore.open(self.store) as maps:
-            releases.publish(maps, self.site, self.version, actor=actor, **choices, gate=gate or GateSettings())
+            releases.publish(
+                maps, self.site, self.version, actor=actor, trust_calibration=trust_calibration, force=force, gate=gate
+            )
 
 
 def build_map(

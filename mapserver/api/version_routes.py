@@ -150,8 +150,10 @@ def publish(
     service: p.Service, sender: Sender, site: p.Site, version: p.Version, act: views.PublishAct
 ) -> views.VersionView:
     """Check a draft by the gate and make it current."""
-    store, chosen = service.store, {"trust_calibration": act.trust_calibration, "force": act.force}
-    releases.publish(store, site, version, actor=sender.of(act), **chosen, gate=service.settings.config.gate)
+    store, gate = service.store, service.settings.config.gate
+    releases.publish(
+        store, site, version, actor=sender.of(act), trust_calibration=act.trust_calibration, force=act.force, gate=gate
+    )
     return views.version_view(store, store.version(site, version))
 
 

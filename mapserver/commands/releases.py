@@ -179,8 +179,9 @@ def publish(
 
     gate = settings_of(context).gate
     with open_store(where.store) as maps:
-        chosen = {"trust_calibration": trust, "force": force}
-        published = releases.publish(maps, where.site, version, actor=by.named(), **chosen, gate=gate)
+        published = releases.publish(
+            maps, where.site, version, actor=by.named(), trust_calibration=trust, force=force, gate=gate
+        )
         info = maps.version(where.site, published)
         verdict = maps.verdicts(where.site, published)[-1]
         evidence = maps.evidence(where.site, published)

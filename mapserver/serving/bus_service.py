@@ -1,4 +1,4 @@
-"""The server's side of the bus: answers queries for versions, bytes; receives robots' messages; announces versions; sends poses."""
+"""The server's side of the bus: answers queries for versions and bytes, receives robots' messages, announces versions, sends poses."""
 
 import logging
 import math

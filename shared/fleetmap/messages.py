@@ -357,6 +357,7 @@ class FailureAck(msgspec.Struct, frozen=True, kw_only=True):
 
 M = TypeVar("M", bound=msgspec.Struct)
 encode_message = to_msgpack
+"""Encode a message as MessagePack."""
 
 
 def covariance_entries(cov_rot_trans: Array) -> tuple[float, ...]:

@@ -225,10 +225,10 @@ class Judgement:
 def pose_at(as_read: Trajectory, stamp_ns: int) -> Array | None:
     """Return (4, 4) interpolated, or that of the nearest stamp if it is near, since stamps may be rounded; None without either."""
     found = as_read.at(stamp_ns, GAP_NS)
-    nearest = int(np.argmin(np.abs(as_read.stamps_ns - stamp_ns)))
-    if found is None and abs(int(as_read.stamps_ns[nearest]) - stamp_ns) <= NEAR_NS:
-        return np.asarray(as_read.frame_from_body[nearest])
-    return found
+    if found is not None:
+        return found
+    off_ns = np.abs(as_read.stamps_ns - stamp_ns)
+    return np.asarray(as_read.frame_from_body[off_ns.argmin()]) if off_ns.min() <= NEAR_NS else None
 
 
 def read_as(trajectory: Trajectory, reading: PoseReading) -> Trajectory:

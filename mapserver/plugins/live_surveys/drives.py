@@ -130,7 +130,8 @@ class SensorDrive(Drive):
         begun_s = time.monotonic()
         try:
             while not self._intake.exhausted:
-                bundle, due_s = self._take(), time.monotonic()
+                bundle = self._take()
+                due_s = time.monotonic()
                 self.dropped = self._intake.counts.frames_dropped
                 frame = None if bundle.frame is None else self._recorded(writer, bundle)
                 yield None if frame is None else DueFrame(frame, bundle.imu, bundle.wheel, due_s)
