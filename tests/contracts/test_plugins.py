@@ -39,6 +39,12 @@ def test_a_plugin_is_registered_and_the_road_does_not_know_it(folder: Path) -> N
     assert [str(path) for path in ROAD if name.search(path.read_text("utf-8").lower())] == []
 
 
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
+def test_a_plugins_readme_names_files_that_are_there(folder: Path) -> None:
+    named = re.findall(r"`(?!test_)(\w+\.(?:py|js|html))`", (folder / "README.md").read_text("utf-8"))
+    assert [name for name in named if not any(folder.rglob(name))] == []
+
+
 def test_entry_points_lead_to_hooks() -> None:
     for group, points in GROUPS.items():
         side = next(side for side in SIDES if side.endswith(group.partition(".")[0]))

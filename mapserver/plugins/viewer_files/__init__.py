@@ -12,7 +12,7 @@ from mapserver.store import FailureFilter, MapStore
 
 
 def write_failures(store: MapStore, wanted: FailureFilter, path: Path) -> int:
-    """See `FailureExport`. Raises UsageError without the extra `foxglove`."""
+    """Write the failures and return their number; as `write_json_lines`. Raises UsageError without the extra `foxglove`."""
     require_foxglove("MCAP")
     from fleetmap.plugins.viewer_channels import channels
 
