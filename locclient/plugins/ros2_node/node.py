@@ -5,13 +5,14 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import product
 from typing import Any
 
 import rclpy
 from rclpy.callback_groups import CallbackGroup
-from rclpy.exceptions import NameValidationException
+from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
 from rclpy.qos import (
@@ -32,11 +33,11 @@ _log = logging.getLogger(__name__)
 
 @contextmanager
 def ros_errors() -> Iterator[None]:
-    """Turn errors of ROS 2, such as an invalid name, into a UsageError."""
+    """Turn what ROS 2 refuses at the start into a UsageError."""
     try:
         yield
-    except (RuntimeError, NameValidationException) as error:
-        raise UsageError(f"ROS 2 refuses a name or does not start: {error}") from error
+    except (RuntimeError, NameValidationException, ParameterException) as error:
+        raise UsageError(f"ROS 2 refuses a name or a parameter, or does not start: {error}") from error
 
 
 def ensure_ros() -> None:
@@ -67,14 +68,16 @@ class MessageReader:
 
     def __init__(self, node: Node, feeds: Sequence[Feed]) -> None:
         """Subscribe; UsageError for an invalid topic."""
-        self._node, self._feeds = node, feeds
+        self._node = node
         self._subscriptions: dict[int, Any] = {}  # by feed
         self._publishers: list[int] = []
         with ros_errors():
+            resolved = [[(node.resolve_topic_name(topic), kind) for topic, kind in feed.choices] for feed in feeds]
+            self._feeds = [replace(feed, choices=choices) for feed, choices in zip(feeds, resolved, strict=True)]
             self._suit_publishers()
 
     def read(self, timeout_s: float) -> None:
-        """Hand over the messages that are there, or else the first ones that come within the timeout; log those that are refused."""
+        """Hand over a message of each topic that has one, or else of the first within the timeout; log those that are refused."""
         if time.monotonic() - self._suited_s > _CHECK_S:
             self._suit_publishers()
         self._waiting.clear_entities()
@@ -85,14 +88,12 @@ class MessageReader:
         for subscription in self._subscriptions.values():
             if subscription.handle.pointer not in ready:
                 continue
-            for _ in range(subscription.qos_profile.depth):
-                taken = subscription.handle.take_message(subscription.msg_type, True)
-                if taken is None:
-                    break
-                try:
+            taken = subscription.handle.take_message(subscription.msg_type, True)
+            try:
+                if taken is not None:
                     subscription.callback(taken[0])
-                except (FleetmapError, ValueError, RuntimeError) as error:
-                    _log.warning("%s: %s", subscription.topic_name, error)
+            except (FleetmapError, ValueError, RuntimeError) as error:
+                _log.warning("%s: %s", subscription.topic_name, error)
 
     def _suit_publishers(self) -> None:
         """Subscribe where nothing is subscribed to yet, and anew where publishers changed."""
@@ -137,24 +138,14 @@ def _type_name(message: type) -> str:
 def unconnected(node: Node) -> list[str]:
     """Return which publishers and subscriptions ROS 2 does not connect with the node's because their quality of service differs: both
     sides of each, and the reason."""
-    doubtful = {
-        each.topic_name
-        for each in node.publishers
-        if _misses(each.get_subscription_count, node.count_subscribers, each)
-    }
-    doubtful |= {
-        each.topic_name for each in node.subscriptions if _misses(each.get_publisher_count, node.count_publishers, each)
-    }
+    own = node.get_name(), node.get_namespace()
+    lists = node.get_publisher_names_and_types_by_node(*own), node.get_subscriber_names_and_types_by_node(*own)
     found = []
-    for topic in sorted(doubtful):
+    for topic in sorted({topic for listed in lists for topic, _ in listed}):
         readers = node.get_subscriptions_info_by_topic(topic)
-        for writer, reader in ((w, r) for w in node.get_publishers_info_by_topic(topic) for r in readers):
+        for writer, reader in product(node.get_publishers_info_by_topic(topic), readers):
             verdict, reason = qos_check_compatible(writer.qos_profile, reader.qos_profile)
-            if verdict == QoSCompatibility.ERROR and node.get_name() in (writer.node_name, reader.node_name):
+            if verdict == QoSCompatibility.ERROR and own[0] in (writer.node_name, reader.node_name):
                 why = reason.replace("ERROR: ", "").rstrip(";")
                 found.append(f"{topic}: {reader.node_name} does not receive from {writer.node_name}: {why}")
     return found
-
-
-def _misses(connected: Callable[[], int], known: Callable[[str], int], entity: Any) -> bool:
-    return connected() != known(entity.topic_name)

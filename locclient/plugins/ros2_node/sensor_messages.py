@@ -9,7 +9,7 @@ import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import StoredFrame, Topics
-from fleetmap.recordings.images import StoredImage, grey_bits, grey_image, grey_peak
+from fleetmap.recordings.images import StoredImage, grey_bits, grey_image, grey_peak, is_wide
 from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS
 from fleetmap.recordings.ros2 import messages
 from fleetmap.sensors.calibration import RigCalibration
@@ -176,7 +176,7 @@ class SensorMessages:
         stamp_ns, _ = messages.header_of(payload)
         decode = messages.decode_compressed_image if is_compressed else messages.decode_image
         image, is_depth = decode(payload, f"{role} at {stamp_ns}"), role in DEPTH_ROLES
-        if not is_depth:
+        if is_wide(image) and not is_depth:
             self._grey_peak = max(self._grey_peak, grey_peak(image) if self._grey_peak < 1 << 12 else 0)
             image = replace(image, bits=grey_bits(self._grey_peak))
         for frame in self._rig.add(number, stamp_ns, image, is_depth=is_depth):

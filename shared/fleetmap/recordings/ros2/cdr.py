@@ -84,15 +84,13 @@ class _Reader:
         if field in _NUMBERS:
             return self._number(_NUMBERS[field])
         count = field if isinstance(field, int) else self._number("I")
-        self._align(8 if count else 1)
+        self._at += -(self._at - len(_HEAD)) % (8 if count else 1)
         return np.frombuffer(self._take(8 * count), np.dtype(self._order + "f8")).astype(np.float64)
 
     def _number(self, code: str) -> Any:
-        self._align(_SIZES[code])
-        return struct.unpack(self._order + code, self._take(_SIZES[code]))[0]
-
-    def _align(self, size: int) -> None:
+        size = _SIZES[code]
         self._at += -(self._at - len(_HEAD)) % size
+        return struct.unpack(self._order + code, self._take(size))[0]
 
     def _take(self, count: int) -> bytes:
         if self._at + count > len(self._data):

@@ -1,6 +1,7 @@
 """Sensors of ROS itself: drivers of rclpy in other processes, which send to those whom the graph shows as subscribers."""
 
 import json
+import signal
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -9,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from fleetmap.errors import UsageError
-from fleetmap.recordings import Topics
+from fleetmap.recordings import Topics, open_recording
 from fleetmap.recordings.calibration_files import format_calibration
 from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.source import open_source
@@ -51,6 +52,22 @@ def test_all_frames_of_a_driver_arrive(tmp_path: Path, options: tuple[str, ...])
     (figures,) = told
     assert (figures["frames"], figures["unreadable"]) == (sent, 0) == (210, 0)
     assert figures["imu"] > 6 * 90 or "--imu" not in options
+
+
+@needs_ros
+def test_a_live_survey_records_what_drivers_send(tmp_path: Path) -> None:
+    (tmp_path / "rig.yaml").write_text(format_calibration(calibration()))
+    (tmp_path / "sensors.toml").write_text(f'[source]\nkind = "ros2"\ncalibration = "{tmp_path}/rig.yaml"\n')
+    files = ("--store", tmp_path / "store", "--sensors", tmp_path / "sensors.toml", "--record", tmp_path / "drive.mcap")
+    with ros_program("-m", "mapserver.cli", "live", "--site", "lab", *map(str, files)) as survey:
+        with driver(60, "--imu", "--size", "320x240") as camera:
+            assert camera.wait(60) == 0
+            sent = int(camera.stdout.read())
+        survey.send_signal(signal.SIGINT)  # of a standing robot no map is made
+        survey.wait(60)
+    with open_recording(tmp_path / "drive.mcap") as recording:
+        assert len(recording.frame_stamps_ns) == sent == 60
+        assert len(recording.imu.stamps_ns) > 6 * 60
 
 
 def test_without_ros_the_robot_says_what_to_source(tmp_path: Path) -> None:

@@ -1,0 +1,68 @@
+"""What ROS 2 costs a robot: a stereo driver of rclpy at 30 Hz and 752x480 sends to the robot's side, raw for long, then compressed, then
+with an IMU of 210 Hz while the robot publishes its estimates. CPU per frame is that of ROS 2 in the robot's process.
+
+`python tests/benchmarks/robot/bench_ros2.py --out FILE.json [--seconds 1200]`; needs `make ros2-env`.
+"""
+
+import argparse
+import json
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+from common.yardstick import at_reference, slowness
+
+from fleetmap.recordings.calibration_files import format_calibration
+from support.recordings.recording_samples import calibration
+from support.ros2.environment import ros_program
+
+_RATE_HZ = 30
+_SETTLED_S = 10  # after which memory must not grow
+_SHORT_S = 60
+
+
+def measured(rig: Path, seconds: int, driver: list[str], robot: list[str]) -> dict[str, float | None]:
+    """Figures of a drive."""
+    before, frames = slowness(), str(seconds * _RATE_HZ)
+    with ros_program("-m", "support.ros2.sensor_listener", str(rig), *robot) as process:
+        with ros_program("-m", "support.ros2.camera_driver", frames, *driver) as camera:
+            lines = []
+            while camera.poll() is None:
+                lines.append(json.loads(process.stdout.readline()))
+            sent = int(camera.stdout.read())
+        process.stdin.close()
+        last = json.loads(process.stdout.read().splitlines()[-1])
+    running = [line for line in lines if line["frames"] > _SETTLED_S * _RATE_HZ]
+    first, final = running[0], running[-1]
+    cpu_ms = 1e3 * (final["cpu_s"] - first["cpu_s"]) / (final["frames"] - first["frames"])
+    return {
+        "sent": sent,
+        "lost_share": 1 - last["frames"] / sent,
+        "cpu_ms": cpu_ms,
+        "cpu_ms_at_reference": at_reference(cpu_ms, [before, slowness()]),
+        "rss_growth_mb": final["rss_mb"] - first["rss_mb"],
+    }
+
+
+def main() -> None:
+    """Write a table of the three drives."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--seconds", type=int, default=1200)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        rig = Path(folder) / "rig.yaml"
+        rig.write_text(format_calibration(replace(calibration(), imu=None)))
+        with_imu = Path(folder) / "inertial.yaml"
+        with_imu.write_text(format_calibration(calibration()))
+        short = min(options.seconds, _SHORT_S)
+        figures = {
+            "raw": measured(rig, options.seconds, [], []),
+            "compressed": measured(rig, short, ["--compressed"], []),
+            "raw, IMU, estimates": measured(with_imu, short, ["--imu"], ["--publish"]),
+        }
+    options.out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()
