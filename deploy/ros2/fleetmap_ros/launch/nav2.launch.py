@@ -3,8 +3,6 @@
 ros2 launch fleetmap_ros nav2.launch.py config:=/etc/fleetmap/locclient.toml params_file:=YOUR_PARAMS.yaml
 """
 
-from pathlib import Path
-
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
@@ -12,34 +10,29 @@ from launch.launch_description_sources import PythonLaunchDescriptionSource
 from launch.substitutions import LaunchConfiguration
 from launch_ros.actions import Node
 
-SHARE = Path(get_package_share_directory("fleetmap_ros"))
-NAV2 = Path(get_package_share_directory("nav2_bringup"))
+SHARE, NAV2 = (get_package_share_directory(name) for name in ("fleetmap_ros", "nav2_bringup"))
+
+
+def _included(file: str, **arguments: object) -> IncludeLaunchDescription:
+    return IncludeLaunchDescription(PythonLaunchDescriptionSource(file), launch_arguments=arguments.items())
 
 
 def generate_launch_description() -> LaunchDescription:
-    """Arguments: config, a file of locclient's settings; params_file, the parameters of nav2's navigation; rviz."""
-    arguments = {
-        "config": str(SHARE / "config/locclient.toml"),
-        "params_file": str(NAV2 / "params/nav2_params.yaml"),
-        "rviz": "false",
-    }
-    localization = IncludeLaunchDescription(
-        PythonLaunchDescriptionSource(str(SHARE / "launch/localization.launch.py")),
-        launch_arguments={
-            "config": LaunchConfiguration("config"),
-            "autostart": "false",
-            "rviz": LaunchConfiguration("rviz"),
-        }.items(),
-    )
+    """Arguments: config, a file of locclient's settings; params_file, the parameters of nav2's navigation."""
     lifecycle_manager = Node(
         package="nav2_lifecycle_manager",
         executable="lifecycle_manager",
         name="lifecycle_manager_localization",
-        parameters=[str(SHARE / "config/nav2_params.yaml")],
+        parameters=[f"{SHARE}/config/nav2_params.yaml"],
     )
-    navigation = IncludeLaunchDescription(
-        PythonLaunchDescriptionSource(str(NAV2 / "launch/navigation_launch.py")),
-        launch_arguments={"params_file": LaunchConfiguration("params_file")}.items(),
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument("config", default_value=f"{SHARE}/config/locclient.toml"),
+            DeclareLaunchArgument("params_file", default_value=f"{NAV2}/params/nav2_params.yaml"),
+            _included(
+                f"{SHARE}/launch/localization.launch.py", config=LaunchConfiguration("config"), autostart="false"
+            ),
+            lifecycle_manager,
+            _included(f"{NAV2}/launch/navigation_launch.py", params_file=LaunchConfiguration("params_file")),
+        ]
     )
-    declared = [DeclareLaunchArgument(name, default_value=value) for name, value in arguments.items()]
-    return LaunchDescription([*declared, localization, lifecycle_manager, navigation])
