@@ -75,7 +75,7 @@ def adjust_visits(
     seen = _seen_by(redundant, state.landmarks, adjusted, image_numbers(len(redundant), len(state.rig)))
     state = _localize(replace(_with_keyframes_of(state, ~redundant, part), landmarks=seen), settings, redundant)
     both = Landmarks.concatenated(adjusted.points_map, [adjusted, state.landmarks])
-    order = np.argsort(both.obs_landmark, kind="stable")
+    order = np.argsort(both.obs_landmark, kind="stable")  # of each landmark the adjusted ones first
     marks = both.taken(order, both.points_map, both.obs_keyframe[order], both.obs_landmark[order])
     return replace(state, landmarks=marks)
 
