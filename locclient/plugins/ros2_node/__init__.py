@@ -3,6 +3,7 @@
 rclpy is the robot's own, and imported once a robot's settings ask for ROS 2; this package itself needs none.
 """
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -23,10 +24,7 @@ from locclient.plugins.ros2_node.sensor_messages import SensorMessages
 if TYPE_CHECKING:
     from locclient.plugins.ros2_node.source import Ros2Source
 
-
-def has_ros() -> bool:
-    """True if this process can have ROS 2: its environment was sourced."""
-    return find_spec("rclpy") is not None
+_log = logging.getLogger(__name__)
 
 
 @contextmanager
@@ -50,6 +48,14 @@ def open_topics(section: SourceSection, topics: Topics, map_frame: str, *, image
     has_depth = section.sensors == "rgbd"
     messages = SensorMessages(topics, calibration, images=images, has_depth=has_depth, map_frame=map_frame)
     return Ros2Source(messages, calibration, has_depth=has_depth)
+
+
+def topics_beside(section: SourceSection, topics: Topics, map_frame: str) -> "Ros2Source | None":
+    """Open the topics beside another source of images; None, with a warning, without ROS 2 and an IMU, which would need it."""
+    if find_spec("rclpy") is None and rig_of(section).imu is None:
+        _log.warning("ROS 2 is not sourced: the camera is used without wheels and priors")
+        return None
+    return open_topics(section, topics, map_frame, images=False)
 
 
 def rig_of(section: SourceSection) -> RigCalibration:

@@ -263,7 +263,10 @@ class Ros2Localizer(Publisher, ManagedEntity):
         executor = SingleThreadedExecutor()
         executor.add_node(self._node)
         while not self._ended.is_set():
-            executor.spin_once(timeout_sec=_IDLE_S)
+            try:
+                executor.spin_once(timeout_sec=_IDLE_S)
+            except Exception:  # no request of another program ends the robot's localization
+                _log.exception("a request to the node failed")
         executor.shutdown()
 
     def _hear_tf(self, _: type, message: bytes) -> None:
@@ -318,9 +321,6 @@ class Ros2Localizer(Publisher, ManagedEntity):
     def _is_active(self) -> bool:
         return self._lifecycle == "active"
 
-    def on_configure(self, _: object) -> TransitionCallbackReturn:
-        return self._enter("inactive")
-
     def on_activate(self, _: object) -> TransitionCallbackReturn:
         self._enter("active")
         self._send_latched()
@@ -328,8 +328,10 @@ class Ros2Localizer(Publisher, ManagedEntity):
             self._bond.begin()
         return TransitionCallbackReturn.SUCCESS
 
-    def on_deactivate(self, _: object) -> TransitionCallbackReturn:
+    def on_configure(self, _: object) -> TransitionCallbackReturn:
         return self._enter("inactive")
+
+    on_deactivate = on_configure
 
     def on_cleanup(self, _: object) -> TransitionCallbackReturn:
         return self._enter("unconfigured")

@@ -4,7 +4,7 @@ import atexit
 import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -139,8 +139,9 @@ def unconnected(node: Node) -> list[str]:
     """Return which publishers and subscriptions ROS 2 does not connect with the node's because their quality of service differs: both
     sides of each, and the reason."""
     own = node.get_name(), node.get_namespace()
-    lists = node.get_publisher_names_and_types_by_node(*own), node.get_subscriber_names_and_types_by_node(*own)
-    found = []
+    lists, found = list[Any](), list[str]()
+    with suppress(RuntimeError):  # the graph does not know the node yet
+        lists = [node.get_publisher_names_and_types_by_node(*own), node.get_subscriber_names_and_types_by_node(*own)]
     for topic in sorted({topic for listed in lists for topic, _ in listed}):
         readers = node.get_subscriptions_info_by_topic(topic)
         for writer, reader in product(node.get_publishers_info_by_topic(topic), readers):

@@ -1,6 +1,5 @@
 """A UVC stereo camera that delivers both images side by side, through OpenCV; IMU and wheels come as ROS 2 topics."""
 
-import logging
 import threading
 import time
 from collections.abc import Callable
@@ -15,11 +14,10 @@ from fleetmap.sensors.samples import CameraFrame
 from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import Source
-from locclient.plugins.ros2_node import has_ros, open_topics, rig_of
+from locclient.plugins.ros2_node import rig_of, topics_beside
 
 _REOPEN_S = 1.0
 _CLOCKS_AGREE_S = 1.0
-_log = logging.getLogger(__name__)
 
 
 class UvcSource:
@@ -95,12 +93,8 @@ def open_source(section: SourceSection, topics: Topics, map_frame: str) -> UvcSo
             f'[source] sensors = "{section.sensors}": a uvc camera sends pairs; take topics, kind = "ros2"'
         )
     device: int | str = int(section.device) if section.device.isdecimal() else section.device
-    calibration, others = rig_of(section), None
-    if calibration.imu is not None or has_ros():
-        others = open_topics(section, topics, map_frame, images=False)
-    else:
-        _log.warning("ROS 2 is not sourced: the camera is used without wheels and priors")
-    return UvcSource(lambda: cv2.VideoCapture(device), calibration, section, others)
+    others = topics_beside(section, topics, map_frame)
+    return UvcSource(lambda: cv2.VideoCapture(device), rig_of(section), section, others)
 
 
 def split_frame(picture: np.ndarray, stamp_ns: int) -> CameraFrame:

@@ -135,13 +135,15 @@ def test_nav2_starts_it_asks_it_and_stops_it(tmp_path: Path) -> None:
         results = []
         for name, value in (
             ("map_frame", {"type": 4, "string_value": "site"}),
+            ("transform_tolerance_s", {"type": 0}),
+            ("transform_tolerance_s", {"type": 3, "double_value": -1.0}),
             ("transform_tolerance_s", {"type": 3, "double_value": 0.3}),
         ):
             change = [{"name": f"output.{name}", "value": value}]
             results += navigator.call(f"/{NODE}/set_parameters", "rcl_interfaces/srv/SetParameters", parameters=change)[
                 "results"
             ]
-        assert [one["successful"] for one in results] == [False, True]
+        assert [one["successful"] for one in results] == [False, False, False, True]
         assert "output.map_frame: it is read at the start" in results[0]["reason"]
 
         # Another subscriber than ROS connects with it.

@@ -1,6 +1,9 @@
 """A side-by-side camera, played by a test: cut in two, stamped, opened again after it was unplugged."""
 
 from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -9,6 +12,7 @@ import pytest
 
 from fleetmap.errors import RecordingError, UsageError
 from fleetmap.recordings import Topics
+from fleetmap.recordings.calibration_files import format_calibration
 from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import open_source
@@ -86,6 +90,14 @@ def test_stamps_are_the_drivers_where_its_clock_is_known(driver_s: float | None,
 def test_what_is_no_pair_is_refused(picture: Callable[[], None]) -> None:
     with pytest.raises(RecordingError, match="side by side"):
         split_frame(picture, 0)  # type: ignore[arg-type]
+
+
+def test_without_ros_a_camera_runs_alone_unless_its_rig_has_an_imu(tmp_path: Path) -> None:
+    for imu in (None, calibration().imu):
+        (tmp_path / "rig.yaml").write_text(format_calibration(replace(calibration(), imu=imu)))
+        section = SourceSection(kind="uvc", calibration=str(tmp_path / "rig.yaml"))
+        with nullcontext() if imu is None else pytest.raises(UsageError, match="source /opt/ros"):
+            open_source(section, Topics()).close()
 
 
 def test_a_uvc_camera_has_a_pair() -> None:
