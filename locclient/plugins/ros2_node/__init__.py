@@ -80,18 +80,23 @@ def _open_output(
     return Ros2Localizer(section, robot, calibration, intake)
 
 
-def _check(section: OutputSection, topics: Topics) -> None:
-    """Raise UsageError for an endpoint, for frame names that tf2 rejects, and for odometry that would come back as that of the wheels."""
-    if section.endpoint is not None:
-        raise UsageError(
-            f"[output] endpoint = {section.endpoint!r} is none of ROS 2, which has ROS_DOMAIN_ID and RMW_IMPLEMENTATION in the "
-            "environment; leave it out"
-        )
+def check_frames(section: OutputSection) -> None:
+    """Raise UsageError for names of frames that tf2 rejects."""
     frames = (section.map_frame, section.odom_frame, section.base_frame)
     if len(set(frames)) < 3 or any(not name or name.startswith("/") for name in frames):
         raise UsageError(
             f"[output] map_frame, odom_frame and base_frame = {', '.join(map(repr, frames))}: tf2 needs three different names "
             "that do not begin with a slash"
+        )
+
+
+def _check(section: OutputSection, topics: Topics) -> None:
+    """Raise UsageError for an endpoint, for frames that tf2 rejects, and for odometry that would come back as that of the wheels."""
+    check_frames(section)
+    if section.endpoint is not None:
+        raise UsageError(
+            f"[output] endpoint = {section.endpoint!r} is none of ROS 2, which has ROS_DOMAIN_ID and RMW_IMPLEMENTATION in the "
+            "environment; leave it out"
         )
     if section.odom_topic.lstrip("/") == topics.wheel.lstrip("/"):
         raise UsageError(

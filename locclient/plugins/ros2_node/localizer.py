@@ -37,6 +37,7 @@ from fleetmap.sources.intake import Intake
 from fleetmap.version_grid import OccupancyGrid
 from locclient.localization.estimate import Estimate
 from locclient.outputs import OutputSection, Publisher
+from locclient.plugins.ros2_node import check_frames
 from locclient.plugins.ros2_node.conversions import decode_initial_pose, motion_between, sensor_links
 from locclient.plugins.ros2_node.driver_odometry import DriverOdometry
 from locclient.plugins.ros2_node.node import LATCHED, Feed, MessageReader, ensure_ros, ros_errors, unconnected
@@ -65,6 +66,7 @@ class Ros2Localizer(Publisher, ManagedEntity):
             ensure_ros()
             self._node = LifecycleNode(section.node, namespace=section.namespace or None)
             self._section = section = self._declare_parameters(section)
+        check_frames(section)
         self.grid_height_m = section.robot_height_m if section.map_topic else None
         self._grid: OccupancyGrid | None = None
         self._map_words = "none yet"
