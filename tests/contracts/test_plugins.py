@@ -30,19 +30,14 @@ ROAD = [
 def test_a_plugin_is_registered_and_the_road_does_not_know_it(folder: Path) -> None:
     package = ".".join(folder.relative_to(REPOSITORY).parts).removeprefix("shared.")
     named = [where for points in GROUPS.values() for where in points.values()]
-    named += [
-        text(str(path.relative_to(REPOSITORY))) for other in FOLDERS if other != folder for path in other.glob("*.py")
-    ]
+    named += [path.read_text("utf-8") for other in FOLDERS if other != folder for path in other.glob("*.py")]
     assert any(package in words for words in named), f"no entry point in pyproject.toml and no plug-in names {package}"
-    title = (folder / "README.md").read_text("utf-8").splitlines()[0].removeprefix("# ")
+    readme = (folder / "README.md").read_text("utf-8")
+    files = re.findall(r"`(?!test_)(\w+\.(?:py|js|html))`", readme)
+    assert [name for name in files if not any(folder.rglob(name))] == [], "the README names files that are not there"
+    title = readme.splitlines()[0].removeprefix("# ")
     name = re.compile(rf"(?<![a-z0-9])({folder.name}|{re.escape(title.lower())})(?![a-z0-9])")
     assert [str(path) for path in ROAD if name.search(path.read_text("utf-8").lower())] == []
-
-
-@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: folder.name)
-def test_a_plugins_readme_names_files_that_are_there(folder: Path) -> None:
-    named = re.findall(r"`(?!test_)(\w+\.(?:py|js|html))`", (folder / "README.md").read_text("utf-8"))
-    assert [name for name in named if not any(folder.rglob(name))] == []
 
 
 def test_entry_points_lead_to_hooks() -> None:
