@@ -131,7 +131,7 @@ class RigFrames:
             if near is not None:
                 self._used_ns[view] = near.stamp_ns
             others.append(near)
-        return replace(frame, others=tuple(others))
+        return replace(frame, others=tuple(others)) if others else frame
 
 
 def _period_ns(recent: deque[StoredFrame]) -> int | None:

@@ -151,6 +151,11 @@ def test_nav2_starts_it_asks_it_and_stops_it(tmp_path: Path) -> None:
         pair = "/localization/status: navigator does not receive from fleetmap_localizer: Volatile publisher"
         assert eventually(lambda: pair in diagnosis(navigator)["message"], 5)
 
+        link = {"header": given["header"] | {"frame_id": "odom"}, "child_frame_id": "base_link"}
+        navigator.publish("/tf", "tf2_msgs/msg/TFMessage", transforms=[link])
+        other = "another program publishes odom -> base_link too"
+        assert eventually(lambda: other in diagnosis(navigator)["message"] and diagnosis(navigator)["level"] == 2, 5)
+
         assert manager.change(0, "deactivate") and manager.state() == INACTIVE
         assert eventually(lambda: not manager.beats()[-1]["active"], 5), "the bond ends with the active state"
         assert manager.change(3)
