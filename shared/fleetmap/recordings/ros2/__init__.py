@@ -1,1 +1,1 @@
-"""ROS 2 messages without ROS: CDR, definitions, rmw_zenoh keys."""
+"""ROS 2 messages without ROS: CDR and definitions."""
