@@ -4,16 +4,15 @@ Two neighbours share a keyframe, the last of one and the first of the other: it 
 every edge between neighbouring keyframes was measured and adjusted in some segment. Segments that cannot be joined are processed as one.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
-from fleetmap.sensors.samples import ImuSamples, Stamps, wheel_between
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, Stamps, WheelSample, wheel_between
 from mapserver.survey.keyframes.keyframes import set_aside
 from mapserver.survey.odometry_pass import initial_state
 from mapserver.survey.pose_graph.odometry_factors import blackout_factors, carried, edge_covariance
@@ -42,10 +41,13 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """A segment, its own part of the survey's inputs by their names, and the store for the pictures of its keyframes."""
+    """A segment with its frames and the samples of IMU and wheels between them. images: store for the pictures of its keyframes."""
 
     segment: Segment
-    inputs: dict[str, Any]
+    frames: Iterable[CameraFrame]
+    imu: ImuSamples
+    wheel: tuple[WheelSample, ...]
+    keyframes_at: frozenset[int]
     images: ImageStore
 
 
@@ -166,20 +168,27 @@ def _task_of(segment: Segment, inputs: SurveyInputs, tools: SurveyTools) -> _Tas
     since_ns = int(stamps_ns[segment.lead]) + offset_ns if segment.lead else -(2**62)
     until_ns = int(stamps_ns[segment.last]) + offset_ns + _MARGIN_NS
     ends = {segment.begin, segment.last} - {0, len(stamps_ns) - 1}
-    part = {
-        "frames": inputs.parts.part(segment.lead, segment.last + 1),
-        "frame_count": segment.last - segment.lead + 1,
-        "imu": inputs.imu.between(since_ns, until_ns),
-        "wheel": tuple(wheel_between(inputs.wheel, since_ns, until_ns)),
-        "keyframes_at": frozenset(frame - segment.lead for frame in ends),
-    }
-    return _Task(segment, part, tools.images)
+    return _Task(
+        segment,
+        inputs.parts.part(segment.lead, segment.last + 1),
+        inputs.imu.between(since_ns, until_ns),
+        tuple(wheel_between(inputs.wheel, since_ns, until_ns)),
+        frozenset(frame - segment.lead for frame in ends),
+        tools.images,
+    )
 
 
 def _survey_segment(shared: _Shared, task: _Task, tools: SurveyTools | None = None) -> SegmentSurvey | str:
     """Return the survey of one segment in any process, or the text of the reason if there is none."""
+    inputs = replace(
+        shared.inputs,
+        frames=task.frames,
+        frame_count=task.segment.last - task.segment.lead + 1,
+        imu=task.imu,
+        wheel=task.wheel,
+        keyframes_at=task.keyframes_at,
+    )
     try:
-        inputs = replace(shared.inputs, **task.inputs)
         chain = shared.begin(inputs, shared.settings, tools or SurveyTools(images=task.images))
     except SurveyError as error:
         return str(error)
