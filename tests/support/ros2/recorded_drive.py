@@ -32,12 +32,12 @@ def _vector(values: Array) -> Fields:
 def _mounting(rig: RigCalibration) -> Fields:
     links = [("base_link", "imu_link", rig.base_from_body)]
     links += [("imu_link", f"cam{n}_optical", camera.body_from_cam) for n, camera in enumerate(rig.cameras)]
-    transforms = []
+    told = []
     for parent, child, parent_from_child in links:
         turn = Rotation.from_matrix(parent_from_child[:3, :3]).as_quat()
         place = {"translation": _vector(parent_from_child[:3, 3]), "rotation": _vector(turn)}
-        transforms.append({"header": _header(0, parent), "child_frame_id": child, "transform": place})
-    return {"transforms": transforms}
+        told.append({"header": _header(0, parent), "child_frame_id": child, "transform": place})
+    return {"transforms": told}
 
 
 def messages(recording: Recording) -> Iterator[tuple[int, str, str, Fields]]:
