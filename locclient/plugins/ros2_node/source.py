@@ -1,5 +1,6 @@
 """Sensors as ROS 2 topics: raw and compressed images, depth, IMU, wheels and priors."""
 
+import threading
 from collections.abc import Callable
 
 from geometry_msgs.msg import PoseWithCovarianceStamped
@@ -25,16 +26,19 @@ class Ros2Source:
     def __init__(self, messages: SensorMessages, calibration: RigCalibration, *, has_depth: bool) -> None:
         """See `open_topics`."""
         self.calibration, self.has_depth, self._messages = calibration, has_depth, messages
+        self._reading = threading.Lock()
         with ros_errors():
             ensure_ros()
             self._node = Node("fleetmap_sensors", start_parameter_services=False)
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
-        reader = MessageReader(self._node, [_feed(*each, intake) for each in self._messages.topics if each[0][0]])
-        while not wait(0.0):
-            reader.read(_IDLE_S)
+        with self._reading:
+            reader = MessageReader(self._node, [_feed(*each, intake) for each in self._messages.topics if each[0][0]])
+            while not wait(0.0):
+                reader.read(_IDLE_S)
 
     def close(self) -> None:
+        self._reading.acquire(timeout=10 * _IDLE_S)  # another thread may still read, beside a camera
         self._node.destroy_node()
 
 

@@ -16,6 +16,7 @@ from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.source import open_source
 from locclient.outputs import OutputSection
 from locclient.plugins.ros2_node import OUTPUT
+from support.fleet.contracts_documents import REPOSITORY
 from support.recordings.recording_samples import calibration
 from support.ros2.environment import needs_ros, ros_program
 
@@ -36,9 +37,15 @@ def listener(folder: Path, told: list[dict[str, float]]) -> Iterator[None]:
 
 
 @needs_ros
-@pytest.mark.parametrize("options", [(), ("--compressed", "--imu"), ("--best-effort", "--size", "320x240")])
-def test_all_frames_of_a_driver_arrive(tmp_path: Path, options: tuple[str, ...]) -> None:
+@pytest.mark.parametrize("options", [(), ("--compressed", "--imu"), ("--best-effort",)])
+def test_all_frames_of_a_driver_arrive(
+    tmp_path: Path, options: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Started before the robot and after it, and started again in another quality."""
+    if "--best-effort" in options:
+        monkeypatch.setenv(
+            "FASTDDS_DEFAULT_PROFILES_FILE", str(REPOSITORY / "deploy/ros2/fleetmap_ros/config/fastdds.xml")
+        )
     told: list[dict[str, float]] = []
     with driver(90, *options) as early:
         time.sleep(2.0)
