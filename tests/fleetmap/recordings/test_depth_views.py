@@ -13,6 +13,7 @@ from fleetmap.recordings.mcap.writer import McapRecordingWriter, copy_to_mcap
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import RGBD_BASELINE_M, Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
+from support.plugins import needs_plugin
 from support.recordings.rig_samples import simulated, write_rig
 
 
@@ -52,6 +53,7 @@ def test_depth_beside_a_pair_is_written_read_and_copied(tmp_path: Path) -> None:
         check(copy)
 
 
+@needs_plugin("mcap")
 def test_without_a_calibration_file_the_topic_says_that_a_camera_has_depth(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

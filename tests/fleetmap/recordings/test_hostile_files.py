@@ -31,6 +31,7 @@ from fleetmap.recordings.limits import MAX_CALIBRATION_BYTES, MAX_MESSAGE_BYTES,
 from fleetmap.recordings.mcap.reader import MAGIC
 from fleetmap.recordings.ros2.messages import encode_image
 from mapserver.config import MapserverConfig
+from support.plugins import needs_plugin
 from support.recordings.bag_samples import write_rosbag1, write_rosbag2
 from support.recordings.mcap_samples import foreign_messages, write_foreign
 from support.storage.memory_limit import memory_at_most
@@ -122,7 +123,11 @@ def test_many_chunks_that_each_obey_do_not_add_up(tmp_path: Path) -> None:
         open_recording(path)
 
 
-@pytest.mark.parametrize("kind", ["chunks", "chunks without messages", "messages", "sqlite", "ros1"])
+SQLITE = pytest.param("sqlite", marks=needs_plugin("rosbag2-sqlite"))
+ROS1 = pytest.param("ros1", marks=needs_plugin("rosbag1"))
+
+
+@pytest.mark.parametrize("kind", ["chunks", "chunks without messages", "messages", SQLITE, ROS1])
 def test_what_is_unpacked_adds_up(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str) -> None:
     """Black pictures of a megabyte, each within its limit: 8 MiB of them took minutes."""
     monkeypatch.setattr(limits, "_UNPACKED_BYTES", 1 << 20)
@@ -171,6 +176,7 @@ def test_lengths_inside_of_records_are_not_believed(tmp_path: Path, length: int)
         assert {"damaged chunks (checksum or compression)", "a damaged record"} <= {i.what for i in recording.issues}
 
 
+@needs_plugin("mcap")
 def test_an_index_that_points_at_the_whole_file_is_not_read_at_once(tmp_path: Path) -> None:
     path = tmp_path / "sparse.mcap"
     with path.open("wb") as file:

@@ -18,6 +18,7 @@ from fleetmap.recordings.ros2 import messages
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
+from support.plugins import needs_plugin
 from support.recordings.mcap_samples import Message, write_foreign
 from support.recordings.recording_samples import START_NS, make_sample, write_euroc
 from support.recordings.rig_samples import images_of, simulated, write_kitti_raw, write_rig
@@ -84,6 +85,7 @@ def test_cameras_with_stamps_of_their_own_are_the_nearest_of_each_frame(tmp_path
         assert rear is not None and rear.stamp_ns == frame.stamp_ns
 
 
+@needs_plugin("kitti-raw")
 def test_a_drive_of_kittis_raw_data_is_a_rig_of_two_pairs(tmp_path: Path) -> None:
     calibration, frames = simulated("front-rear")
     drive = write_kitti_raw(tmp_path / "2024_01_01_drive_0001", calibration, frames)
@@ -105,6 +107,7 @@ def test_a_drive_of_kittis_raw_data_is_a_rig_of_two_pairs(tmp_path: Path) -> Non
         open_recording(drive)
 
 
+@needs_plugin("kitti-raw")
 def test_rectified_images_of_kittis_raw_data_are_described_by_p_rect(tmp_path: Path) -> None:
     calibration, frames = simulated("front-rear")
     drive = write_kitti_raw(tmp_path / "drive", calibration, frames)

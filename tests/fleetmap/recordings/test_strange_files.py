@@ -11,7 +11,7 @@ import pytest
 
 from contracts.test_recordings import WITHOUT_CALIBRATION, WRITERS
 from fleetmap.errors import FleetmapError, RecordingError
-from fleetmap.recordings import OpenOptions, open_recording
+from fleetmap.recordings import OpenOptions, open_recording, recording_formats
 from fleetmap.recordings.ros2 import messages as ros_messages
 from support.command_line import status
 from support.recordings.bag_samples import write_rosbag1
@@ -50,7 +50,7 @@ OF_A_LIBRARY = re.compile(
 )
 
 
-@pytest.mark.parametrize("name", list(WRITERS))
+@pytest.mark.parametrize("name", list(recording_formats()))
 def test_damaged_files_of_every_format(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (tmp_path / "rig.yaml").write_text(kalibr_text().partition("cam1:")[0])
     rig = tmp_path / "rig.yaml" if name in WITHOUT_CALIBRATION else None

@@ -19,6 +19,7 @@ from fleetmap.sensors.samples import CameraFrame, ImuSamples, SensorSet, WheelSa
 from mapserver.doctor import Verdict, camera_motion
 from mapserver.doctor.calibration import MeasuredCalibration
 from mapserver.doctor.images import fine_structure, fixed_pattern
+from support.plugins import needs_plugin
 from support.recordings.bag_samples import write_rosbag1
 from support.recordings.calibration_faults import baseline
 from support.recordings.painted_room import Ride, write_ride
@@ -149,6 +150,7 @@ def rotated(message: Any) -> None:
     message.data = message.data[::-1].copy()  # grey rows without padding
 
 
+@needs_plugin("rosbag1")
 @pytest.mark.parametrize(
     ("kind", "change", "name", "says"),
     [

@@ -17,6 +17,7 @@ from fleetmap.mapformat.tile_codec import decode_tile
 from mapserver.cli import app
 from mapserver.store import MapStore
 from mapserver.store.archive import decode_archive
+from support.plugins import needs_plugin
 from support.recordings.recording_samples import make_sample, write_euroc, write_mcap
 
 FRAMES = 24
@@ -70,6 +71,7 @@ def done(drive: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@needs_plugin("dense_maps", "mapserver.stages")
 def test_the_report_has_the_stable_keys_with_their_meanings(done: Path) -> None:
     """Against the files that the same build left, counted independently."""
     report = json.loads((done / "r.json").read_text())
@@ -114,6 +116,7 @@ def test_the_store_notes_the_build_as_a_job_with_its_loops_on_the_map(done: Path
             assert np.linalg.norm(path_m - end, axis=1).min() < 1e-3
 
 
+@needs_plugin("dense_maps", "mapserver.stages")
 def test_the_manifest_tells_what_the_map_depends_on(done: Path) -> None:
     with MapStore.open(done / "store") as maps:
         manifest = maps.manifest("lab", 1)

@@ -20,6 +20,7 @@ from mapserver.fleet.ingest import IngestSettings
 from mapserver.store import MapStore
 from support.fleet.failed_robot import asked, small_file
 from support.fleet.reports import blindness
+from support.plugins import needs_plugin
 from support.storage.clock import Clock
 from support.storage.map_samples import publish_samples
 
@@ -90,7 +91,7 @@ def test_a_part_that_is_lost_or_comes_twice_is_asked_for(server: Server, tmp_pat
         ({"id": "f9"}, "failure 'f9'"),
         ({"attached": False}, "not a failure's recording"),
         ({"jpegs": [b"\xff\xd8<script>\xff\xd9"] * 2}, "cannot be read as an image"),
-        ({"jpegs": []}, "no message"),
+        pytest.param({"jpegs": []}, "no message", marks=needs_plugin("mcap")),
     ],
 )
 def test_what_no_robot_writes_is_refused_and_nothing_else_is_lost(

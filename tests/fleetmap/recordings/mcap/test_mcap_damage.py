@@ -12,6 +12,7 @@ from fleetmap.geometry import Array
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, Trajectory
+from support.plugins import needs_plugin
 from support.recordings.mcap_samples import foreign_messages, write_foreign
 from support.recordings.recording_samples import calibration, make_sample
 
@@ -76,6 +77,7 @@ def test_a_tail_of_zeros_as_a_power_loss_leaves_it(whole: bytes, tmp_path: Path)
         assert recording.issues
 
 
+@needs_plugin("mcap")
 def test_single_flipped_bits_anywhere(whole: bytes, tmp_path: Path) -> None:
     """Whatever bit is flipped: either what is read is what was written, or the error is a RecordingError."""
     rng = np.random.default_rng(11)
