@@ -33,7 +33,7 @@ class OutputSection(Section, frozen=True):
     base_frame: str = "base_link"
     sensor_frames: str = "fleetmap_"
     publish_odom: bool = True
-    transform_tolerance_s: float = 0.0
+    transform_tolerance_s: Annotated[float, msgspec.Meta(ge=0, le=60)] = 0.0
 
 
 class Publisher(ABC):

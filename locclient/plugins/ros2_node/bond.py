@@ -2,13 +2,15 @@
 
 import time
 import uuid
+from contextlib import suppress
 from typing import Any
 
 from bond.msg import Status
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
 
-from locclient.plugins.ros2_node.node import Feed
+from fleetmap.errors import LinkError
+from locclient.plugins.ros2_node.node import Feed, ros_sends
 
 PERIOD_S, _TIMEOUT_S = 0.1, 4.0  # as in nav2
 
@@ -26,9 +28,10 @@ class Bond:
 
     def beat(self) -> None:
         """Renew it if it is time."""
-        if self._instance and time.monotonic() - self._said_s >= PERIOD_S:
+        instance = self._instance  # which another thread may end meanwhile
+        if instance and time.monotonic() - self._said_s >= PERIOD_S:
             self._said_s = time.monotonic()
-            self._say(self._instance, is_active=True)
+            self._say(instance, is_active=True)
 
     def end(self) -> None:
         instance, self._instance = self._instance, ""
@@ -45,4 +48,5 @@ class Bond:
         said = Status(id=self._node.get_name(), instance_id=instance, active=is_active)
         said.header.stamp = self._node.get_clock().now().to_msg()
         said.heartbeat_timeout, said.heartbeat_period = _TIMEOUT_S, PERIOD_S
-        self._publisher.publish(said)
+        with suppress(LinkError), ros_sends():  # the other side notices
+            self._publisher.publish(said)

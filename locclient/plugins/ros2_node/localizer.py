@@ -6,7 +6,6 @@ import time
 from array import array
 from collections import deque
 from importlib.util import find_spec
-from math import isfinite
 from typing import Any
 
 import msgspec
@@ -40,7 +39,15 @@ from locclient.outputs import OutputSection, Publisher
 from locclient.plugins.ros2_node import check_frames
 from locclient.plugins.ros2_node.conversions import decode_initial_pose, motion_between, sensor_links
 from locclient.plugins.ros2_node.driver_odometry import DriverOdometry
-from locclient.plugins.ros2_node.node import LATCHED, Feed, MessageReader, ensure_ros, ros_errors, unconnected
+from locclient.plugins.ros2_node.node import (
+    LATCHED,
+    Feed,
+    MessageReader,
+    ensure_ros,
+    ros_errors,
+    ros_sends,
+    unconnected,
+)
 from locclient.robot.continuous_odom import PublishedPose
 
 _IDLE_S = 0.1
@@ -98,7 +105,7 @@ class Ros2Localizer(Publisher, ManagedEntity):
         given = {name: value for name, value in msgspec.structs.asdict(section).items() if value is not None}
         given = {name: self._node.declare_parameter(f"output.{name}", value).value for name, value in given.items()}
         self._node.add_on_set_parameters_callback(self._change_parameters)
-        return msgspec.structs.replace(section, **given)
+        return _changed(section, given)
 
     def _declare(self) -> list[Feed]:
         """Declare publishers and services; return the topics to read."""
@@ -134,6 +141,7 @@ class Ros2Localizer(Publisher, ManagedEntity):
 
     # --- called by the thread that localizes --------------------------------------------------------------------------
 
+    @ros_sends()
     def publish(self, estimate: Estimate, published: PublishedPose, base_from_body: Array) -> None:
         """Send the pose of the base in the map; only with its covariance."""
         before, self._last = self._last, (estimate, published)
@@ -177,6 +185,7 @@ class Ros2Localizer(Publisher, ManagedEntity):
         self._sent_tf.append(message)
         self._tf.publish(message)
 
+    @ros_sends()
     def alive(self, is_silent: bool) -> None:
         self._alive_s = time.monotonic()
         level, words, values = self._diagnosis(is_silent)
@@ -236,6 +245,7 @@ class Ros2Localizer(Publisher, ManagedEntity):
             _log.warning("%s", fault or "/tf is whole again")
         return fault
 
+    @ros_sends()
     def show_grid(self, version: int, grid: OccupancyGrid | None, why: str) -> None:
         """Publish the grid. Without one the last grid stays on the topic: all versions of a site share the map's frame."""
         self._map_words = why if grid is None else f"grid of version {version}"
@@ -310,11 +320,11 @@ class Ros2Localizer(Publisher, ManagedEntity):
             if parameter.name != _CHANGEABLE and parameter.name.startswith("output."):
                 why = "it is read at the start: change it in locclient's file or in the launch file, and start again"
                 return SetParametersResult(successful=False, reason=f"{parameter.name}: {why}")
-            if parameter.name == _CHANGEABLE and not (isfinite(parameter.value) and parameter.value >= 0):
-                return SetParametersResult(successful=False, reason=f"{_CHANGEABLE}: give a finite number, 0 or more")
-        for parameter in parameters:
-            if parameter.name == _CHANGEABLE:
-                self._section = msgspec.structs.replace(self._section, transform_tolerance_s=parameter.value)
+        given = {each.name.removeprefix("output."): each.value for each in parameters if each.name == _CHANGEABLE}
+        try:
+            self._section = _changed(self._section, given)
+        except msgspec.ValidationError as error:
+            return SetParametersResult(successful=False, reason=f"{_CHANGEABLE} = {given}: {error}")
         return SetParametersResult(successful=True)
 
     # --- lifecycle: called by the thread of services, in the constructor if the node starts by itself -----------------
@@ -337,6 +347,8 @@ class Ros2Localizer(Publisher, ManagedEntity):
 
     def on_cleanup(self, _: object) -> TransitionCallbackReturn:
         return self._enter("unconfigured")
+
+    on_error = on_cleanup
 
     def on_shutdown(self, _: object) -> TransitionCallbackReturn:
         return self._enter("finalized")
@@ -364,6 +376,11 @@ class Ros2Localizer(Publisher, ManagedEntity):
             links.append(FrameLink(section.building_frame, section.map_frame, self._building_from_map))
         if links:
             self._tf_static.publish(encode_frame_links(self._node.get_clock().now().nanoseconds, links))
+
+
+def _changed(section: OutputSection, given: dict[str, Any]) -> OutputSection:
+    """Return the section with other values; ValidationError for one that the settings' file may not have either."""
+    return msgspec.convert(msgspec.structs.asdict(section) | given, OutputSection)
 
 
 def grid_message(stamp: Any, frame_id: str, grid: OccupancyGrid) -> GridMessage:

@@ -5,11 +5,12 @@ import logging
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from itertools import product
 from typing import Any
 
+import msgspec
 import rclpy
 from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import NameValidationException, ParameterException
@@ -24,7 +25,7 @@ from rclpy.qos import (
 )
 from rclpy.signals import SignalHandlerOptions
 
-from fleetmap.errors import FleetmapError, UsageError
+from fleetmap.errors import FleetmapError, LinkError, UsageError
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 _CHECK_S = 0.2
@@ -36,8 +37,17 @@ def ros_errors() -> Iterator[None]:
     """Turn what ROS 2 refuses at the start into a UsageError."""
     try:
         yield
-    except (RuntimeError, NameValidationException, ParameterException) as error:
+    except (RuntimeError, NameValidationException, ParameterException, msgspec.ValidationError) as error:
         raise UsageError(f"ROS 2 refuses a name or a parameter, or does not start: {error}") from error
+
+
+@contextmanager
+def ros_sends() -> Iterator[None]:
+    """Turn what the middleware does not send, such as Cyclone to a subscriber that takes nothing, into a LinkError."""
+    try:
+        yield
+    except rclpy_implementation.RCLError as error:
+        raise LinkError(f"ROS 2 did not send: {error}; does a subscriber over a slow network hold it up?") from error
 
 
 def ensure_ros() -> None:
@@ -68,12 +78,10 @@ class MessageReader:
 
     def __init__(self, node: Node, feeds: Sequence[Feed]) -> None:
         """Subscribe; UsageError for an invalid topic."""
-        self._node = node
+        self._node, self._feeds = node, feeds
         self._subscriptions: dict[int, Any] = {}  # by feed
         self._publishers: list[int] = []
         with ros_errors():
-            resolved = [[(node.resolve_topic_name(topic), kind) for topic, kind in feed.choices] for feed in feeds]
-            self._feeds = [replace(feed, choices=choices) for feed, choices in zip(feeds, resolved, strict=True)]
             self._suit_publishers()
 
     def read(self, timeout_s: float) -> None:
@@ -88,8 +96,8 @@ class MessageReader:
         for subscription in self._subscriptions.values():
             if subscription.handle.pointer not in ready:
                 continue
-            taken = subscription.handle.take_message(subscription.msg_type, True)
             try:
+                taken = subscription.handle.take_message(subscription.msg_type, True)
                 if taken is not None:
                     subscription.callback(taken[0])
             except (FleetmapError, ValueError, RuntimeError) as error:
@@ -98,7 +106,8 @@ class MessageReader:
     def _suit_publishers(self) -> None:
         """Subscribe where nothing is subscribed to yet, and anew where publishers changed."""
         self._suited_s = time.monotonic()
-        counts = [self._node.count_publishers(topic) for feed in self._feeds for topic, _ in feed.choices]
+        named = self._node.resolve_topic_name  # of these calls, only the counting does not remap the topic itself
+        counts = [self._node.count_publishers(named(topic)) for feed in self._feeds for topic, _ in feed.choices]
         if counts == self._publishers:
             return
         self._publishers = counts
@@ -145,8 +154,10 @@ def unconnected(node: Node) -> list[str]:
     for topic in sorted({topic for listed in lists for topic, _ in listed}):
         readers = node.get_subscriptions_info_by_topic(topic)
         for writer, reader in product(node.get_publishers_info_by_topic(topic), readers):
+            if own[0] not in (writer.node_name, reader.node_name):  # all nodes have /parameter_events
+                continue
             verdict, reason = qos_check_compatible(writer.qos_profile, reader.qos_profile)
-            if verdict == QoSCompatibility.ERROR and own[0] in (writer.node_name, reader.node_name):
+            if verdict == QoSCompatibility.ERROR:
                 why = reason.replace("ERROR: ", "").rstrip(";")
                 found.append(f"{topic}: {reader.node_name} does not receive from {writer.node_name}: {why}")
     return found
