@@ -51,6 +51,7 @@ from locclient.plugins.ros2_node.node import (
 from locclient.robot.continuous_odom import PublishedPose
 
 _IDLE_S = 0.1
+_SERVICES_IDLE_S = 1.0  # a wait of rclpy's executor costs 1.2 ms CPU; the end wakes it
 _STUCK_S = 3.0  # without a sign of life from the localizing thread, after which the bond is not renewed
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 _LEVELS = {Status.TRACKING: _OK, Status.LOST: _ERROR}
@@ -80,7 +81,7 @@ class Ros2Localizer(Publisher, ManagedEntity):
         self._lifecycle = "unconfigured"
         self._last: tuple[Estimate, PublishedPose] | None = None
         self._fix_refused = ""  # by the newest finished query: most frames finish none
-        self._refused: deque[str] = deque(maxlen=1)
+        self._refused = ""  # why the newest initial pose was
         self._alive_s = time.monotonic()
         self._building_from_map: Array | None = None
         self._sent_tf: deque[bytes] = deque(maxlen=_OWN_TF)
@@ -91,6 +92,8 @@ class Ros2Localizer(Publisher, ManagedEntity):
         with ros_errors():
             reader = MessageReader(self._node, self._declare())
         self._node.add_managed_entity(self)
+        self._executor = SingleThreadedExecutor()
+        self._executor.add_node(self._node)
         self._ended = threading.Event()
         works = {"ros messages": lambda: self._read(reader), "ros services": self._serve}
         self._threads = [threading.Thread(target=work, name=name, daemon=True) for name, work in works.items()]
@@ -228,8 +231,8 @@ class Ros2Localizer(Publisher, ManagedEntity):
             level, words = _ERROR, f"{words}; {fault}"
         if is_silent:
             level, words = _ERROR, "no frames come"
-        if self._refused:
-            values["refused_initial_pose"] = self._refused[0]
+        if refused := self._refused:
+            values["refused_initial_pose"] = refused
         return level, words, values
 
     def _tf_fault(self) -> str:
@@ -258,6 +261,7 @@ class Ros2Localizer(Publisher, ManagedEntity):
 
     def close(self) -> None:
         self._ended.set()
+        self._executor.shutdown()
         for thread in self._threads:
             thread.join()
         self._end_bond()
@@ -272,14 +276,11 @@ class Ros2Localizer(Publisher, ManagedEntity):
                 self._bond.beat()
 
     def _serve(self) -> None:
-        executor = SingleThreadedExecutor()
-        executor.add_node(self._node)
         while not self._ended.is_set():
             try:
-                executor.spin_once(timeout_sec=_IDLE_S)
+                self._executor.spin_once(timeout_sec=_SERVICES_IDLE_S)
             except Exception:  # no request of another program ends the robot's localization
                 _log.exception("a request to the node failed")
-        executor.shutdown()
 
     def _hear_tf(self, _: type, message: bytes) -> None:
         """Handle transforms of other programs; those sent here are received back as well."""
@@ -298,9 +299,9 @@ class Ros2Localizer(Publisher, ManagedEntity):
         try:
             prior = decode_initial_pose(message, self._section.map_frame)
         except (FleetmapError, ValueError) as error:
-            self._refused.append(str(error))
+            self._refused = str(error)
             raise
-        self._refused.clear()
+        self._refused = ""
         self._intake.put_prior(prior)
 
     def _set_initial_pose(self, request: Any, response: Any) -> Any:

@@ -29,7 +29,12 @@ class Ros2Source:
         self._reading = threading.Lock()
         with ros_errors():
             ensure_ros()
-            self._node = Node("fleetmap_sensors", start_parameter_services=False)
+            own = [
+                "--ros-args",
+                "-r",
+                "__node:=fleetmap_sensors",
+            ]  # the name that a launch file gives is that of the localizer
+            self._node = Node("fleetmap_sensors", cli_args=own, start_parameter_services=False)
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
         with self._reading:

@@ -60,14 +60,15 @@ def test_colcon_builds_a_program_that_leaves_arguments_of_ros_to_rclpy(tmp_path:
         settings = re.sub(f"^{name} = .*$", f'{name} = "{value}"', settings, flags=re.MULTILINE)
     settings = settings.replace("identity =", 'site = "lab"\nrobot = "r1"\nstore =')
     (tmp_path / "locclient.toml").write_text(settings)
-    words = "--config locclient.toml --ros-args -r __ns:=/r1 -p output.autostart:=false"
+    words = "--config locclient.toml --ros-args -r __ns:=/r1 -r __node:=place -p output.autostart:=false"
     command = f". install/setup.sh && exec {built}/lib/fleetmap_ros/localizer {words}"
     environment = ros_environment() | {"PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin"}
     with (
         subprocess.Popen(["sh", "-c", command], cwd=tmp_path, env=environment) as localizer,
-        lifecycle_manager("r1/fleetmap_localizer") as manager,
+        lifecycle_manager("r1/place") as manager,
     ):
         assert manager.state() == UNCONFIGURED
+        assert {"place", "fleetmap_sensors"} <= set(manager.nodes())
         localizer.terminate()
 
 
