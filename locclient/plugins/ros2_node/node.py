@@ -16,13 +16,7 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.qos import (
-    DurabilityPolicy,
-    QoSCompatibility,
-    QoSProfile,
-    ReliabilityPolicy,
-    qos_check_compatible,
-)
+from rclpy.qos import DurabilityPolicy, QoSCompatibility, QoSProfile, ReliabilityPolicy, qos_check_compatible
 from rclpy.signals import SignalHandlerOptions
 
 from fleetmap.errors import FleetmapError, LinkError, UsageError
@@ -113,11 +107,8 @@ class MessageReader:
         self._publishers = counts
         for number, feed in enumerate(self._feeds):
             offers = {topic: self._node.get_publishers_info_by_topic(topic) for topic, _ in feed.choices}
-            sent = [
-                (topic, kind)
-                for topic, kind in feed.choices
-                if _type_name(kind) in {o.topic_type for o in offers[topic]}
-            ]
+            types = {topic: {offer.topic_type for offer in offers[topic]} for topic in offers}
+            sent = [(topic, kind) for topic, kind in feed.choices if _type_name(kind) in types[topic]]
             topic, kind = (sent or feed.choices)[0]
             is_lossy = ReliabilityPolicy.BEST_EFFORT in {offer.qos_profile.reliability for offer in offers[topic]}
             reliability = ReliabilityPolicy.BEST_EFFORT if is_lossy else ReliabilityPolicy.RELIABLE

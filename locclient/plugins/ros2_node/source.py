@@ -29,11 +29,7 @@ class Ros2Source:
         self._reading = threading.Lock()
         with ros_errors():
             ensure_ros()
-            own = [
-                "--ros-args",
-                "-r",
-                "__node:=fleetmap_sensors",
-            ]  # the name that a launch file gives is that of the localizer
+            own = ["--ros-args", "-r", "__node:=fleetmap_sensors"]  # a launch file's name is that of the localizer
             self._node = Node("fleetmap_sensors", cli_args=own, start_parameter_services=False)
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
