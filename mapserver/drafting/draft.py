@@ -270,9 +270,7 @@ def _keep(run: _Run, built: BuildResult, parent: Before | None, maps: MapStore) 
         for s, session in zip(built.taken, judged, strict=True)
     ]
     before = None if parent is None else parent.manifest
-    chosen = ChosenDraft(sessions, run.settings, built.corrections, before, maps)
-    stages = plugins("mapserver.stages").values()
-    extras: dict[str, Extra] = {key: made for stage in stages for key, made in stage(chosen).items()}
+    extras = _extras(ChosenDraft(sessions, run.settings, built.corrections, before, maps))
     run.times.begin("examining")
     evidence = msgspec.structs.replace(_evidence(run, built, judged, tiles, parent), views=views)
     run.times.begin("storing")
@@ -308,6 +306,11 @@ def _keep(run: _Run, built: BuildResult, parent: Before | None, maps: MapStore) 
     draft = Draft(version, maps.areas(site).name_tiles(words, TILE_SIZE_M), said, left_out)
     _write_files(run, built, draft)
     return draft
+
+
+def _extras(chosen: ChosenDraft) -> dict[str, Extra]:
+    """Return what the stages of plug-ins add to the draft, by key; what they kept on the way ends with this call."""
+    return {key: made for stage in plugins("mapserver.stages").values() for key, made in stage(chosen).items()}
 
 
 def _details(

@@ -277,8 +277,7 @@ def refine(
     first: GlobalMatch, settings: SurveySettings, tools: SurveyTools
 ) -> tuple[OdometryPass, SurveyState, tuple[StereoYaw, ...]]:
     """Observe and adjust once more, at the poses of the first adjustment, which give the stereo yaw error of each camera."""
-    part = without_redundant(first.state, first.redundant)
-    yaws = tuple(estimate_stereo_yaw(part, settings, camera) for camera in range(len(part.rig)))
+    yaws = _stereo_yaws(first.state, first.redundant, settings)
     tools.at("global adjustment", 1, 2)
     odometry, redundant, rounds = _with_depths(first.odometry, first.state, first.depths), first.redundant, 2
     posed = _posed(odometry, first.state)
@@ -322,6 +321,11 @@ def _adjusted(
     state = adjust_visits(state, settings, redundant, rounds)
     priors, same = judged_priors(state.priors, state.map_from_body)
     return state if same else adjust_visits(replace(state, priors=priors), settings, redundant, rounds=2)
+
+
+def _stereo_yaws(state: SurveyState, redundant: Mask, settings: SurveySettings) -> tuple[StereoYaw, ...]:
+    part = without_redundant(state, redundant)  # a copy of most landmarks, which must not outlive this call
+    return tuple(estimate_stereo_yaw(part, settings, camera) for camera in range(len(part.rig)))
 
 
 def _with_depths(odometry: OdometryPass, state: SurveyState, depths: MonoDepths | None) -> OdometryPass:
