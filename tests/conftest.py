@@ -34,8 +34,8 @@ def own_cache_folder(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]
 
 
 def pytest_xdist_auto_num_workers() -> int:
-    """Two processes a core: half of the time tests wait, for servers, browsers, clocks and programs of ROS."""
-    return 2 * len(os.sched_getaffinity(0))
+    """Three processes for two cores: half of the time tests wait, for servers, for browsers and for clocks."""
+    return max(2, 3 * len(os.sched_getaffinity(0)) // 2)
 
 
 def entries_of_tier(tier: str) -> list[str]:
