@@ -4,6 +4,8 @@ import threading
 import time
 from functools import partial
 
+import zenoh
+
 from fleetmap.bus.fair_queue import SHARED, FairQueue, sender_of
 from fleetmap.bus.zenoh_bus import Bus
 
@@ -111,9 +113,10 @@ def test_what_comes_beside_a_payload_counts() -> None:
             begun.wait(0.1)
         assert begun.is_set()
         before = len(heard)
+        send = partial(evil._session.put, congestion_control=zenoh.CongestionControl.BLOCK)  # by default zenoh drops
         for _ in range(20):
-            evil._session.put("fleetmap/hall/robots/r1/health", b"x", attachment=bytes(900_000))
-        evil._session.put("fleetmap/hall/robots/r2/health", b"last", attachment=b"small")
+            send("fleetmap/hall/robots/r1/health", b"x", attachment=bytes(900_000))
+        send("fleetmap/hall/robots/r2/health", b"last", attachment=b"small")
         time.sleep(0.5)
         gate.set()
         while b"last" not in heard and time.monotonic() < until_s:
