@@ -51,9 +51,9 @@ def drive(given: argparse.Namespace) -> int:
             imu.publish(message)
         if tick % ticks == 0:
             subscribed = [camera.get_subscription_count() > 0 for camera in cameras]
-            for camera, image in zip(cameras, pair, strict=True):
+            for camera, image, is_heard in zip(cameras, pair, subscribed, strict=True):
                 image.header.stamp = stamp
-                if camera.get_subscription_count() > 0:
+                if is_heard:
                     camera.publish(image)
             sent += all(subscribed)
         tick += 1

@@ -19,6 +19,7 @@ from support.ros2.environment import ros_program
 from support.waiting import eventually
 
 ACTIVE, INACTIVE, UNCONFIGURED, FINALIZED = 3, 2, 1, 4
+PATIENCE_S = 60.0  # with what takes a second on an idle machine
 POSE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 
 
@@ -52,12 +53,17 @@ class RosPeer:
         found: list[dict[str, Any]] = self.ask(heard=topic)
         return found
 
+    def newest(self, topic: str) -> dict[str, Any]:
+        """The topic's last message, once one has come."""
+        assert eventually(lambda: bool(self.heard(topic)), PATIENCE_S), f"nothing comes on {topic}"
+        return self.heard(topic)[-1]
+
     def nodes(self) -> list[str]:
         found: list[str] = self.ask(nodes=True)
         return found
 
     def endpoints(self, node: str) -> dict[str, dict[str, list[str]]]:
-        """Publishers, subscriptions and services of a node by their names."""
+        """Publishers, subscriptions and services of a node by their names, as far as they are discovered: ask until they are."""
         found: dict[str, dict[str, list[str]]] = self.ask(endpoints=node)
         return found
 
@@ -78,12 +84,12 @@ class LifecycleManager(RosPeer):
         return bool(answer["success"])
 
     def startup(self) -> bool:
-        """Configures, activates, and waits for the bond: half its timeout of 4 s."""
+        """Configures, activates, and waits for the bond."""
         if not (self.change(1) and self.state() == INACTIVE and self.change(3) and self.state() == ACTIVE):
             return False
         self.listen("/bond", "bond/msg/Status")
         self.tell_bond(active=True)
-        return eventually(lambda: any(beat["active"] for beat in self.beats()), 2.0)
+        return eventually(lambda: any(beat["active"] for beat in self.beats()), PATIENCE_S)
 
     def beats(self) -> list[dict[str, Any]]:
         """Messages of the robot on the bond: a subscriber receives its own too."""
@@ -165,16 +171,18 @@ class Node:
                 kind = message_class(type_name)
                 client = self.clients.setdefault(service, None) or self.node.create_client(kind, service)
                 self.clients[service] = client
-                assert client.wait_for_service(60), f"nobody serves {service}"
+                assert client.wait_for_service(PATIENCE_S), f"nobody serves {service}"
                 future = client.call_async(fill(kind.Request(), fields))
-                assert eventually(future.done, 20), f"{service} does not answer"
+                assert eventually(future.done, PATIENCE_S), f"{service} does not answer"
                 return plain(future.result())
             case {"publish": topic, "type": type_name, "qos": given, "fields": fields}:
                 if topic not in self.publishers:
                     self.publishers[topic] = self.node.create_publisher(
                         message_class(type_name), topic, self.qos(given)
                     )
-                    eventually(lambda: self.publishers[topic].get_subscription_count() > 0, 3.0)
+                own = int(topic in self.heard)
+                is_heard = lambda: self.publishers[topic].get_subscription_count() > own  # noqa: E731
+                assert eventually(is_heard, PATIENCE_S), f"nobody else listens to {topic}"
                 raw = fields.get("raw")
                 message = fill(message_class(type_name)(), fields) if raw is None else bytes(raw)
                 self.publishers[topic].publish(message)
@@ -191,7 +199,10 @@ class Node:
                     "subscriptions": self.node.get_subscriber_names_and_types_by_node,
                     "services": self.node.get_service_names_and_types_by_node,
                 }
-                return {what: dict(listed(name, "/")) for what, listed in lists.items()}
+                found = {what: dict[str, list[str]]() for what in lists}
+                with suppress(RuntimeError):  # the graph does not know the node yet
+                    found |= {what: dict(listed(name, "/")) for what, listed in lists.items()}
+                return found
         return None
 
 

@@ -17,7 +17,17 @@ from fleetmap.recordings.ros2.messages import FrameLink, position_quat_xyzw
 from mapserver.store import MapStore
 from support.recordings.recording_samples import calibration
 from support.ros2.environment import needs_ros, ros_program
-from support.ros2.peer import ACTIVE, FINALIZED, INACTIVE, POSE, UNCONFIGURED, RosPeer, lifecycle_manager, ros_peer
+from support.ros2.peer import (
+    ACTIVE,
+    FINALIZED,
+    INACTIVE,
+    PATIENCE_S,
+    POSE,
+    UNCONFIGURED,
+    RosPeer,
+    lifecycle_manager,
+    ros_peer,
+)
 from support.waiting import eventually
 from support.worlds import robot_world
 
@@ -71,28 +81,24 @@ def test_nav2_starts_it_asks_it_and_stops_it(tmp_path: Path) -> None:
         assert manager.startup()
         assert manager.beats()[-1]["heartbeat_period"] == pytest.approx(0.1)
 
-        own = navigator.endpoints(NODE)
-        services = {
-            "get_state",
-            "change_state",
-            "get_available_states",
-            "get_available_transitions",
-            "get_transition_graph",
-        }
-        services = {f"/{NODE}/{name}" for name in (*services, "list_parameters", "set_parameters")}
-        services |= {"/set_initial_pose", "/reinitialize_global_localization", "/request_nomotion_update"}
-        assert services <= own["services"].keys()
-        assert {"/tf", "/tf_static", "/amcl_pose", "/visual_odom", "/map", "/bond", "/diagnostics"} <= own[
-            "publishers"
-        ].keys()
-        assert {"/initialpose", "/tf", "/bond"} <= own["subscriptions"].keys()
+        services = ["change_state", "get_available_states", "get_available_transitions", "get_transition_graph"]
+        services = [f"/{NODE}/{name}" for name in (*services, "get_state", "list_parameters", "set_parameters")]
+        services += ["/set_initial_pose", "/reinitialize_global_localization", "/request_nomotion_update"]
+        published = ["/tf", "/tf_static", "/amcl_pose", "/visual_odom", "/map", "/bond", "/diagnostics"]
+        wanted = {"services": services, "publishers": published, "subscriptions": ["/initialpose", "/tf", "/bond"]}
+
+        def missing() -> list[str]:
+            own = navigator.endpoints(NODE)
+            return [name for kind, names in wanted.items() for name in names if name not in own[kind]]
+
+        assert eventually(lambda: not missing(), PATIENCE_S), missing()
 
         def is_placed() -> bool:
             return any(
                 link["header"]["frame_id"] == "map" for told in navigator.heard("/tf") for link in told["transforms"]
             )
 
-        assert eventually(is_placed, 30)
+        assert eventually(is_placed, PATIENCE_S)
         for topic, kind in (
             ("/amcl_pose", POSE),
             ("/map", "nav_msgs/msg/OccupancyGrid"),
@@ -101,33 +107,32 @@ def test_nav2_starts_it_asks_it_and_stops_it(tmp_path: Path) -> None:
             navigator.listen(topic, kind, **LATCHED)  # late: BasicNavigator waits for a pose
         navigator.listen("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
         navigator.listen("/visual_odom", "nav_msgs/msg/Odometry")
-        assert eventually(lambda: diagnosis(navigator)["message"] == "TRACKING", 20)
-        (grid,) = navigator.heard("/map")
+        assert eventually(lambda: diagnosis(navigator)["message"] == "TRACKING", PATIENCE_S)
+        grid = navigator.newest("/map")
         assert {100, 0} <= set(grid["data"]) and grid["header"]["frame_id"] == "map"
-        (static,) = navigator.heard("/tf_static")
+        static = navigator.newest("/tf_static")
         found = [(link["header"]["frame_id"], link["child_frame_id"]) for link in static["transforms"]]
         assert found[0] == ("base_link", "fleetmap_body") and found[2][1] == "fleetmap_cam1_optical"
-        assert eventually(lambda: bool(navigator.heard("/visual_odom")), 5)
-        assert navigator.heard("/visual_odom")[-1]["child_frame_id"] == "base_link"
+        assert navigator.newest("/visual_odom")["child_frame_id"] == "base_link"
 
         # An operator.
-        given = navigator.heard("/amcl_pose")[-1]
+        given = navigator.newest("/amcl_pose")
         far = given["pose"] | {"covariance": [0.0] * 36}
         far["pose"]["position"]["x"] += 6.0
         bad = far | {"covariance": [-1.0, *[0.0] * 35]}
         for topic, words in ((given["header"], "positive"), (given["header"] | {"frame_id": "odom"}, "frame 'odom'")):
             navigator.call("/set_initial_pose", "nav2_msgs/srv/SetInitialPose", pose={"header": topic, "pose": bad})
-            assert eventually(lambda w=words: w in diagnosis(navigator).get("refused_initial_pose", ""), 5)
+            assert eventually(lambda w=words: w in diagnosis(navigator).get("refused_initial_pose", ""), PATIENCE_S)
         navigator.publish("/initialpose", POSE, raw=list(b"nonsense"))
         assert abs(pose_at(navigator) - far["pose"]["position"]["x"]) > 3, "what was refused changes nothing"
         navigator.publish("/initialpose", POSE, header=given["header"], pose=far)
-        assert eventually(lambda: abs(pose_at(navigator) - far["pose"]["position"]["x"]) < 1, 5)
+        assert eventually(lambda: abs(pose_at(navigator) - far["pose"]["position"]["x"]) < 1, PATIENCE_S)
         navigator.call("/reinitialize_global_localization", "std_srvs/srv/Empty")
         at_m = far["pose"]["position"]["x"]
         assert eventually(
-            lambda: diagnosis(navigator)["message"] == "TRACKING" and abs(pose_at(navigator) - at_m) > 3, 20
+            lambda: diagnosis(navigator)["message"] == "TRACKING" and abs(pose_at(navigator) - at_m) > 3, PATIENCE_S
         )
-        assert eventually(lambda: "refused_initial_pose" not in diagnosis(navigator), 5)
+        assert eventually(lambda: "refused_initial_pose" not in diagnosis(navigator), PATIENCE_S)
 
         # `ros2 param`.
         names = navigator.call(f"/{NODE}/list_parameters", "rcl_interfaces/srv/ListParameters")["result"]["names"]
@@ -149,24 +154,26 @@ def test_nav2_starts_it_asks_it_and_stops_it(tmp_path: Path) -> None:
         # Another subscriber than ROS connects with it.
         navigator.listen("/localization/status", "std_msgs/msg/String", **LATCHED)
         pair = "/localization/status: navigator does not receive from fleetmap_localizer: Volatile publisher"
-        assert eventually(lambda: pair in diagnosis(navigator)["message"], 5)
+        assert eventually(lambda: pair in diagnosis(navigator)["message"], PATIENCE_S)
 
         link = {"header": given["header"] | {"frame_id": "odom"}, "child_frame_id": "base_link"}
         navigator.publish("/tf", "tf2_msgs/msg/TFMessage", transforms=[link])
         other = "another program publishes odom -> base_link too"
-        assert eventually(lambda: other in diagnosis(navigator)["message"] and diagnosis(navigator)["level"] == 2, 5)
+        assert eventually(
+            lambda: other in diagnosis(navigator)["message"] and diagnosis(navigator)["level"] == 2, PATIENCE_S
+        )
 
         assert manager.change(0, "deactivate") and manager.state() == INACTIVE
-        assert eventually(lambda: not manager.beats()[-1]["active"], 5), "the bond ends with the active state"
+        assert eventually(lambda: not manager.beats()[-1]["active"], PATIENCE_S), "the bond ends with the active state"
         assert manager.change(3)
-        assert eventually(lambda: manager.beats()[-1]["active"], 5)
+        assert eventually(lambda: manager.beats()[-1]["active"], PATIENCE_S)
         manager.tell_bond(active=False)
-        assert eventually(lambda: not manager.beats()[-1]["active"], 5), "the end is acknowledged"
+        assert eventually(lambda: not manager.beats()[-1]["active"], PATIENCE_S), "the end is acknowledged"
         assert manager.state() == ACTIVE
         assert manager.change(7) and manager.state() == FINALIZED
         process.send_signal(signal.SIGTERM)
-        assert process.wait(30) == 0
-        assert eventually(lambda: NODE not in manager.nodes(), 5)
+        assert process.wait(PATIENCE_S) == 0
+        assert eventually(lambda: NODE not in manager.nodes(), PATIENCE_S)
 
 
 LIVES = (range(110), range(110, 230))
