@@ -19,13 +19,12 @@ LEAD_NS = 30_000_000  # IMU and wheels are fed a little ahead of each frame
 def run_odometry(recording: Recording) -> Trajectory:
     """Return the estimated odom_from_body at every frame."""
     rectifier = Rectifier(recording.calibration, has_depth=recording.sensor_set is SensorSet.RGBD)
-    camera, shift_s = rectifier.camera, rectifier.imu_minus_cam_s
-    odometry = make_odometry(recording.calibration, camera, rectifier.body_from_cam, shift_s, OdometrySettings())
+    odometry = make_odometry(rectifier.rig, OdometrySettings())
     odom_from_body, fed_ns = [], -(2**62)
     for index in range(len(recording)):
         frame = recording.read_frame(index)
         # 1. Feed the inertial samples and wheel odometry up to the frame, on the IMU's clock.
-        until_ns = frame.stamp_ns + int(shift_s * 1e9) + LEAD_NS
+        until_ns = frame.stamp_ns + int(rectifier.imu_minus_cam_s * 1e9) + LEAD_NS
         odometry.handle_imu(recording.imu.between(fed_ns, until_ns))
         odometry.handle_wheel(wheel_between(recording.wheel, fed_ns, until_ns))
         fed_ns = until_ns

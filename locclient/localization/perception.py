@@ -27,11 +27,10 @@ class Perception:
 
     def __init__(self, rig: MountedRig, settings: LocalizerSettings, clock: Callable[[], float]) -> None:
         """Arguments as of `Localizer`."""
-        self._clock, self._mounted, shift_s = clock, rig.mounted, rig.imu_minus_cam_s
-        followed = (rig.calibration, *rig.mounted[0], shift_s, settings.odometry, settings.stereo)
-        self.odometry = make_odometry(*followed, rig.mounted[1:], by_wheels=True)
+        self._clock, self._mounted = clock, rig.mounted
+        self.odometry = make_odometry(rig, settings.odometry, settings.stereo, by_wheels=True)
         self.gauge, self.gauges = RideGauge(rig.calibration.imu), False
-        self._imu_minus_cam_ns = int(shift_s * 1e9)
+        self._imu_minus_cam_ns = int(rig.imu_minus_cam_s * 1e9)
         self.percept: Percept | None = None
         self.view = 0
         self.stage_s: dict[str, float] = {}

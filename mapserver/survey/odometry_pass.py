@@ -11,7 +11,7 @@ from fleetmap.odometry.estimate import ContinuousFrame, OdometryEstimate, Odomet
 from fleetmap.odometry.lift_check import WINDOW_NS
 from fleetmap.odometry.mono.mono_modes import make_odometry
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
+from fleetmap.sensors.rectification import MountedRig, RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample, wheel_between
 from mapserver.survey.keyframes.keyframes import KeyframePolicy, make_keyframes, sharpness
 from mapserver.survey.pose_graph.odometry_factors import carried, odometry_factors
@@ -48,8 +48,8 @@ class OdometryRun:
         keyframes_at: Container[int] = (),
     ) -> None:
         """keyframes_at: numbers of frames, counted from 0, that always become keyframes."""
-        mounting = rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s
-        self._odometry = make_odometry(calibration, *mounting, settings.odometry, settings.stereo)
+        rig = MountedRig(calibration, rectifier.mounted[:1], rectifier.imu_minus_cam_s)
+        self._odometry = make_odometry(rig, settings.odometry, settings.stereo)
         self._policy = KeyframePolicy(settings.keyframes, keyframes_at)
         self.chain = FrameChain()
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from fleetmap.features.settings import StereoSettings
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array
 from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.odometry.filter.msckf import NavState
@@ -19,8 +19,7 @@ from fleetmap.odometry.odometry_checks import MAX_OFFSET_SIGMAS
 from fleetmap.odometry.sensor_buffer import SensorBuffer
 from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.odometry.tracking.tracker import Ids, Tracker
-from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame, StereoCamera
+from fleetmap.sensors.rectification import MountedRig, RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, WheelSample
 
 _IMU_MEMORY_S = 25.0
@@ -33,24 +32,12 @@ class Odometry:
     _points_in_camera: Callable[[Ids], Array] | None = None  # see Tracker
 
     def __init__(
-        self,
-        calibration: RigCalibration,
-        camera: StereoCamera,
-        body_from_cam: Array,
-        imu_minus_cam_s: float,
-        settings: OdometrySettings,
-        stereo_settings: StereoSettings | None = None,
-        others: Sequence[MountedCamera] = (),
+        self, rig: MountedRig, settings: OdometrySettings, stereo_settings: StereoSettings | None = None
     ) -> None:
-        """others: further cameras, see `follow`."""
-        cam_from_body, base_from_body = se3_inverse(body_from_cam), calibration.base_from_body
-        mounted = (MountedCamera(camera, body_from_cam), *others)
-        self._rig = OdometryRig(
-            camera, body_from_cam, cam_from_body, base_from_body, imu_minus_cam_s, calibration.imu, settings, mounted
-        )
-        self._stereo_settings = stereo_settings
+        """rig: its first camera is followed until `follow`."""
+        self._rig, self._stereo_settings = OdometryRig(rig, settings), stereo_settings
         self._samples = SensorBuffer()
-        self.accelerometer = AccelerometerCheck(base_from_body)
+        self.accelerometer = AccelerometerCheck(rig.base_from_body)
         self._clock = GyroClock(MAX_OFFSET_SIGMAS * settings.filter.time_offset_sigma_s)
         self._tracker = self._new_tracker(0, 0)
         self._before: RectifiedFrame | None = None  # of a camera that is followed from the next frame on
@@ -68,7 +55,7 @@ class Odometry:
 
     def follow(self, number: int, before: RectifiedFrame | None) -> None:
         """Take the frames of another view from now on; before: its frame at the last moment, in which its tracks begin."""
-        self._rig = self._rig.following(number)
+        self._rig = OdometryRig(self._rig.rig, self._rig.settings, number)
         self._mode.follow(self._rig)
         self._before = before if self._frame_index else None
         first_frame = self._frame_index - (self._before is not None)

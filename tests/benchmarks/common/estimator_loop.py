@@ -148,14 +148,22 @@ class _Blank(OtherView):
         return self.frame
 
 
+def odometry_of(
+    session: EstimatorSession, settings: OdometrySettings, calibration: RigCalibration | None = None
+) -> Odometry:
+    """The odometry of a session's first camera; `calibration` in the place of the rig's nominal one."""
+    nominal, mounted = calibration or session.session.nominal, MountedCamera(session.camera, session.body_from_cam)
+    odometry = Odometry(MountedRig(nominal, (mounted,), nominal.cameras[0].imu_minus_cam_s), settings)
+    odometry._tracker = EstimatorTracker(session, session.camera, settings.tracker)
+    return odometry
+
+
 def run_odometry(
     session: EstimatorSession, frames: int | None = None, calibration: RigCalibration | None = None,
     settings: OdometrySettings | None = None,
 ) -> list[OdometryEstimate]:  # fmt: skip
     """The odometry's estimates over a session; `calibration` in the place of the rig's nominal one."""
-    nominal, settings = calibration or session.session.nominal, settings or OdometrySettings()
-    odometry = Odometry(nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s, settings)
-    odometry._tracker = EstimatorTracker(session, session.camera, settings.tracker)
+    odometry = odometry_of(session, settings or OdometrySettings(), calibration)
     estimates, last_ns = [], 0
     for frame in range(len(session) if frames is None else min(frames, len(session))):
         stamp_ns = session.stamps_ns[frame]

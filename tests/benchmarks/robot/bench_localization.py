@@ -41,10 +41,7 @@ def odometry_ms(path: Path, settings: LocalizerSettings) -> list[float]:
     with open_recording(path) as recording:
         source = ReplaySource.of(recording, FrameSelection.parse(":"), reverse=False)
         rectifier = Rectifier(source.calibration)
-        odometry = Odometry(
-            source.calibration, rectifier.camera, rectifier.body_from_cam, rectifier.imu_minus_cam_s, settings.odometry,
-            settings.stereo,
-        )  # fmt: skip
+        odometry = Odometry(rectifier.rig, settings.odometry, settings.stereo)
         for number, imu in enumerate(source.imu_before_each()):
             raw = source.frame(number)
             begun_s = time.process_time()

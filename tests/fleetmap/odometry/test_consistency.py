@@ -9,7 +9,6 @@ from benchmarks.common import consistency, estimator_loop
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse
 from fleetmap.odometry.estimate import ContinuousFrame, OdometryEstimate
 from fleetmap.odometry.modes import InertialMode
-from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings
 from fleetsim.sensors.faults import Fault
 from support.estimator.simulated_run import EstimatorSession
@@ -106,11 +105,8 @@ def test_an_imu_that_falls_silent_again_and_again_leaves_an_honest_motion(
 
 def test_over_a_gap_of_the_imu_a_corrected_estimate_is_no_speed(site: consistency.Site) -> None:
     """An update moved the last frame by half a metre; what comes next is as the pictures moved, not half a metre more in each frame."""
-    session, settings = site.session(2031, "tote-1"), WITHOUT_WHEELS
-    nominal = session.session.nominal
-    rig = nominal, session.camera, session.body_from_cam, nominal.cameras[0].imu_minus_cam_s
-    odometry = Odometry(*rig, settings)
-    odometry._tracker = estimator_loop.EstimatorTracker(session, session.camera, settings.tracker)
+    session = site.session(2031, "tote-1")
+    odometry = estimator_loop.odometry_of(session, WITHOUT_WHEELS)
     last = 100
     odometry.handle_imu(session.session.imu.between(0, session.stamps_ns[last]))
     for frame in range(last + 1):
@@ -123,7 +119,7 @@ def test_over_a_gap_of_the_imu_a_corrected_estimate_is_no_speed(site: consistenc
     mode.window.filter.predict_random_walk(off, 1e-6, 1e-6)
     mode.window.filter.remove_clone(last)
     mode.window.filter.add_clone(last, np.zeros(3))
-    mode.predict(session.stamps_ns[last + 1] + int(nominal.cameras[0].imu_minus_cam_s * 1e9))
+    mode.predict(session.stamps_ns[last + 1] + int(session.session.nominal.cameras[0].imu_minus_cam_s * 1e9))
     predicted = mode.cam_from_earlier(last)
     np.testing.assert_allclose(predicted[:3, 3], before[:3, 3], atol=0.03)
 

@@ -15,7 +15,7 @@ from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples
 from support.worlds.inertial_motion import analytic_motion
 from support.worlds.point_world import noisy_imu
-from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, rig, stereo_frame
+from support.worlds.textured_room import mounted, stereo_frame
 
 FRAME_NS = 50_000_000
 IMU = ImuNoise(2e-4, 1e-5, 2e-3, 1e-4)
@@ -131,7 +131,7 @@ def test_clocks_that_are_said_to_be_exact_are_not_accused_of_nothing(limit_s: fl
 
 @pytest.mark.parametrize(("wrong", "frames"), [("accelerometer", 80), ("clock", 50)])
 def test_the_odometry_goes_on_without_what_is_wrong(wrong: str, frames: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    odometry, fed_ns, estimates = Odometry(rig(IMU), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings()), 0, []
+    odometry, fed_ns, estimates = Odometry(mounted(IMU), OdometrySettings()), 0, []
     imu = replace(SAMPLES, accel_mps2=-SAMPLES.accel_mps2) if wrong == "accelerometer" else SAMPLES
     for k in range(1, frames + 1):
         if k == 30 and wrong == "clock":

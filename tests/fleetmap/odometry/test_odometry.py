@@ -29,7 +29,7 @@ from locclient.localization.settings import TrackSettings
 from mapserver.survey.odometry_pass import FrameChain
 from support.worlds.inertial_motion import analytic_motion
 from support.worlds.point_world import noisy_imu
-from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, black_frame, rig, stereo_frame, view
+from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, black_frame, mounted, stereo_frame, view
 
 IMU = ImuNoise(2e-4, 1e-5, 2e-3, 1e-4)
 FRAME_NS = 50_000_000
@@ -41,7 +41,7 @@ def run(
 ) -> tuple[Odometry, list[OdometryEstimate]]:  # fmt: skip
     """before: something done before each frame."""
     settings = OdometrySettings(filter=filtering or FilterSettings())
-    odometry = Odometry(rig(imu), CAMERA, BODY_FROM_CAM, 0.0, settings)
+    odometry = Odometry(mounted(imu), settings)
     samples = noisy_imu(
         np.random.default_rng(1), 6.5, IMU, np.array([0.01, -0.02, 0.015]), np.array([0.03, -0.02, 0.04])
     )
@@ -143,7 +143,7 @@ def test_stereo_alone_follows_too(visual: tuple[Odometry, list[OdometryEstimate]
 
 def test_the_motion_since_a_frame_is_known_although_it_was_dropped_with_the_next() -> None:
     """Slowly: most frames are hardly elsewhere than the one before, and are not kept."""
-    odometry = Odometry(rig(None), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    odometry = Odometry(mounted(None), OdometrySettings())
     slow_ns, dropped = FRAME_NS // 10, 0
     frames = [stereo_frame(k * slow_ns) for k in range(1, 41)]
     for number, frame in enumerate(frames):
@@ -300,7 +300,7 @@ def test_darkness_of_any_length_leaves_a_covariance() -> None:
     """Without an IMU: nobody goes on for minutes at the last speed, and what is seen afterwards is followed as ever."""
     dark = [black_frame(k * FRAME_NS) for k in range(11, 411)]
     light = [replace(stereo_frame((k - 400) * FRAME_NS), stamp_ns=k * FRAME_NS) for k in range(411, 431)]
-    odometry = Odometry(rig(None), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    odometry = Odometry(mounted(None), OdometrySettings())
     way_m, hypothesis = 0.0, PoseHypothesis(0, 0, ORIGIN, ORIGIN)
     for frame in [*(stereo_frame(k * FRAME_NS) for k in range(1, 11)), *dark, *light]:
         estimate = odometry.handle_stereo(frame)
@@ -410,7 +410,7 @@ def test_tracks_that_no_motion_explains_are_not_used(monkeypatch: pytest.MonkeyP
 
     monkeypatch.setattr(Tracker, "track", lost)
     monkeypatch.setattr(SlidingWindow, "update", recorded)
-    odometry = Odometry(rig(None), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    odometry = Odometry(mounted(None), OdometrySettings())
     said = [odometry.handle_stereo(stereo_frame(k * FRAME_NS)) for k in range(1, 7)]
     assert min(taken[:3]) > 50
     assert taken[3:] == [0, 0, 0]
@@ -419,7 +419,7 @@ def test_tracks_that_no_motion_explains_are_not_used(monkeypatch: pytest.MonkeyP
 
 
 def test_wheels_of_a_rig_without_imu_are_not_collected() -> None:
-    odometry = Odometry(rig(None), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    odometry = Odometry(mounted(None), OdometrySettings())
     period_ns = FRAME_NS // 5
     for k in range(1, 21):
         odometry.handle_wheel(

@@ -49,7 +49,7 @@ def frame_with_body(stamp_ns: int) -> CameraFrame:
 def drift_m(calibration: RigCalibration) -> float:
     """Error of the distance covered in two seconds."""
     rectifier = Rectifier(calibration)
-    odometry = make_odometry(calibration, rectifier.camera, rectifier.body_from_cam, 0.0, OdometrySettings(), None)
+    odometry = make_odometry(rectifier.rig, OdometrySettings())
     placed = [
         odometry.handle_stereo(rectifier.rectify(frame_with_body(k * FRAME_NS))).odom_from_body for k in range(1, 40)
     ]
@@ -81,7 +81,7 @@ def core_tracker_pixels(left: NDArray[np.uint8], clearance_px: NDArray[np.uint8]
 def test_points_end_at_the_body() -> None:
     """A point that the flow carries into the window around the body ends; the same point goes on without a mask."""
     rectifier = Rectifier(masked())
-    odometry = make_odometry(masked(), rectifier.camera, rectifier.body_from_cam, 0.0, OdometrySettings(), None)
+    odometry = make_odometry(rectifier.rig, OdometrySettings())
     clearance_px = rectifier.camera.clearance_px
     assert clearance_px is not None
     for k in range(1, 20):

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration
-from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.rectification import MountedCamera, MountedRig, RectifiedFrame, StereoCamera
 from support.worlds.inertial_motion import analytic_motion
 
 CAMERA = StereoCamera(190.0, 160.0, 100.0, 0.12, 320, 200)
@@ -27,6 +27,11 @@ def rig(imu: ImuNoise | None) -> RigCalibration:
     beside = BODY_FROM_CAM @ se3(np.eye(3), np.array([CAMERA.baseline_m, 0, 0]))
     right = CameraCalibration("radial-tangential", CAMERA.width_px, CAMERA.height_px, intrinsics, np.zeros(4), beside)
     return RigCalibration((left, right), imu)
+
+
+def mounted(imu: ImuNoise | None) -> MountedRig:
+    """The same, rectified."""
+    return MountedRig(rig(imu), (MountedCamera(CAMERA, BODY_FROM_CAM),))
 
 
 @lru_cache(maxsize=2)

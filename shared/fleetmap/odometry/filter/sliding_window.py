@@ -1,7 +1,6 @@
 """Sliding window of the odometry: the filter, its clones, and the observations that link them."""
 
 from collections import deque
-from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +10,7 @@ from fleetmap.odometry.filter.msckf import InvariantFilter, NavState
 from fleetmap.odometry.odometry_checks import middle
 from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.odometry.tracking.tracker import Tracked
-from fleetmap.sensors.calibration import ImuNoise
-from fleetmap.sensors.rectification import MountedCamera, StereoCamera
+from fleetmap.sensors.rectification import MountedRig
 
 _UNKNOWN_DEPTH_M = 5.0
 _FAR_DEPTH_M = 20.0
@@ -20,29 +18,18 @@ _FAR_DEPTH_M = 20.0
 _LEAST_TAKEN, _JUDGED_TRACKS, _JUDGED_UPDATES = 0.2, 10, 3
 
 
-@dataclass(frozen=True, slots=True)
 class OdometryRig:
-    """The rectified camera on its body that the odometry follows, and the calibration of the other sensors.
+    """A rig of which the odometry follows one camera, with the number `followed` among those mounted: camera, body_from_cam (4, 4).
 
-    body_from_cam, cam_from_body and base_from_body are (4, 4); imu is None for a rig without noise figures. mounted: all cameras of
-    the rig, of which this one has the number `followed`.
+    imu is None for a rig without noise figures.
     """
 
-    camera: StereoCamera
-    body_from_cam: Array
-    cam_from_body: Array
-    base_from_body: Array
-    imu_minus_cam_s: float
-    imu: ImuNoise | None
-    settings: OdometrySettings
-    mounted: tuple[MountedCamera, ...]
-    followed: int = 0
-
-    def following(self, number: int) -> "OdometryRig":
-        """The same rig, of which another camera is followed."""
-        camera, body_from_cam = self.mounted[number]
-        mounting = {"camera": camera, "body_from_cam": body_from_cam, "cam_from_body": se3_inverse(body_from_cam)}
-        return replace(self, followed=number, **mounting)  # type: ignore[arg-type]
+    def __init__(self, rig: MountedRig, settings: OdometrySettings, followed: int = 0) -> None:
+        self.rig, self.settings, self.followed = rig, settings, followed
+        self.mounted, self.imu_minus_cam_s = rig.mounted, rig.imu_minus_cam_s
+        self.imu, self.base_from_body = rig.calibration.imu, rig.base_from_body
+        self.camera, self.body_from_cam = rig.mounted[followed]
+        self.cam_from_body = se3_inverse(self.body_from_cam)
 
 
 class SlidingWindow:

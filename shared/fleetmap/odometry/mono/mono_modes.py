@@ -1,7 +1,6 @@
 """Odometry with one camera: metric once the IMU has determined the scale; before that, or without an IMU, up to scale and marked so."""
 
 from collections import deque
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -24,8 +23,7 @@ from fleetmap.odometry.odometry_checks import is_image_still
 from fleetmap.odometry.sensor_buffer import IMU_GAP_NS
 from fleetmap.odometry.settings import FilterSettings, OdometrySettings
 from fleetmap.odometry.tracking.tracker import Tracked
-from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.rectification import MountedCamera, RectifiedFrame, StereoCamera
+from fleetmap.sensors.rectification import MountedRig, RectifiedFrame
 from fleetmap.sensors.samples import Trajectory
 
 _STILL_S = 0.5
@@ -363,21 +361,17 @@ class MapStart:
 
 
 def make_odometry(
-    calibration: RigCalibration,
-    camera: StereoCamera,
-    body_from_cam: Array,
-    imu_minus_cam_s: float,
+    rig: MountedRig,
     settings: OdometrySettings,
     stereo_settings: StereoSettings | None = None,
-    others: Sequence[MountedCamera] = (),
     *,
     by_wheels: bool = False,
 ) -> Odometry:
-    """Create the odometry for a rectified camera: `MonocularOdometry` for a single one without a depth sensor; by_wheels: `WheelOdometry`
-    if that has no IMU either, for a robot, whose map has the scale."""
-    of_one_camera = WheelOdometry if by_wheels and calibration.imu is None else MonocularOdometry
-    kind = Odometry if camera.baseline_m else of_one_camera
-    made = kind(calibration, camera, body_from_cam, imu_minus_cam_s, settings, stereo_settings, others)
+    """Create the odometry of a rig: `MonocularOdometry` for a single camera without a depth sensor; by_wheels: `WheelOdometry` if that has
+    no IMU either, for a robot, whose map has the scale."""
+    of_one_camera = WheelOdometry if by_wheels and rig.calibration.imu is None else MonocularOdometry
+    kind = Odometry if rig.mounted[0].camera.baseline_m else of_one_camera
+    made = kind(rig, settings, stereo_settings)
     if isinstance(made, MonocularOdometry):
         made.vision.is_in_map = by_wheels
     return made

@@ -14,7 +14,7 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, Trajectory, WheelSample
 from support.worlds.inertial_motion import analytic_motion
 from support.worlds.point_world import NOISE, noisy_imu
-from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, rig, view
+from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, mounted, view
 
 SETTINGS = OdometrySettings()
 START, FILTER = SETTINGS.start, SETTINGS.filter
@@ -179,7 +179,7 @@ def started(
     *, wheels: bool, imu_from_ns: int, speed_mps: float = 0.0, speeding_up_mps2: float = SPEEDING_UP_MPS2
 ) -> list[OdometryEstimate]:
     """Estimates of a robot that speeds up evenly; its IMU, and its wheels, speak from imu_from_ns on."""
-    odometry = Odometry(rig(IMU), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    odometry = Odometry(mounted(IMU), OdometrySettings())
     rng = np.random.default_rng(2)
     stamps_ns = np.arange(imu_from_ns, (FRAMES + 1) * FRAME_NS, IMU_NS)
     gyro = rng.normal(0, 2e-4 * np.sqrt(200), (len(stamps_ns), 3))
@@ -226,7 +226,7 @@ def test_the_speed_of_an_even_drive_is_known_at_once(wheels: bool, imu_from_ns: 
 
 def test_the_gyro_leads_the_eye_through_a_turn_at_the_start() -> None:
     """Before gravity is known, too: a turn that begins is nothing like the motion before, and flow follows the wrong points."""
-    odometry = Odometry(rig(IMU), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    odometry = Odometry(mounted(IMU), OdometrySettings())
     stamps_ns = np.arange(0, 10 * TURN_NS, IMU_NS)
     gyro = np.where((stamps_ns >= 2 * TURN_NS)[:, None], [0.0, 0.0, TURN_RADPS], 0.0)
     force = np.tile([0.0, 0.0, 9.81], (len(stamps_ns), 1))

@@ -16,11 +16,11 @@ from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.odometry_checks import DivergenceMonitor
 from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.sensors.calibration import ImuNoise
-from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.sensors.rectification import MountedCamera, MountedRig, RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, Trajectory
 from support.worlds.inertial_motion import analytic_motion
 from support.worlds.point_world import noisy_imu
-from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, rig, stereo_frame
+from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, mounted, rig, stereo_frame
 
 IMU = ImuNoise(2e-4, 1e-5, 2e-3, 1e-4)
 GYRO_BIAS, ACCEL_BIAS = np.array([0.01, -0.02, 0.015]), np.array([0.03, -0.02, 0.04])
@@ -29,12 +29,15 @@ SINGLE = replace(CAMERA, baseline_m=0.0)
 FRAMES = 90
 
 
+def single(imu: ImuNoise | None) -> MountedRig:
+    """The left camera alone."""
+    calibration = rig(imu)
+    return MountedRig(replace(calibration, cameras=calibration.cameras[:1]), (MountedCamera(SINGLE, BODY_FROM_CAM),))
+
+
 def run(imu: ImuNoise | None) -> tuple[list[OdometryEstimate], dict[int, Array]]:
     """Estimates, and where each frame was in the end (4, 4), revisions included."""
-    calibration = rig(imu)
-    odometry = make_odometry(
-        replace(calibration, cameras=calibration.cameras[:1]), SINGLE, BODY_FROM_CAM, 0.0, OdometrySettings()
-    )
+    odometry = make_odometry(single(imu), OdometrySettings())
     assert isinstance(odometry, MonocularOdometry)
     samples = noisy_imu(np.random.default_rng(1), 6.0, IMU, GYRO_BIAS, ACCEL_BIAS)
     estimates, placed, fed_ns = [], {}, 0
@@ -61,7 +64,7 @@ def aligned(placed: dict[int, Array], first: int, *, with_scale: bool) -> tuple[
 
 
 def test_the_class_goes_by_the_camera() -> None:
-    both = make_odometry(rig(None), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    both = make_odometry(mounted(None), OdometrySettings())
     assert type(both) is Odometry
 
 
@@ -134,10 +137,7 @@ def test_a_steady_way_shows_no_scale() -> None:
 
 def standing() -> tuple[Odometry, RectifiedFrame]:
     """The odometry of one camera with six seconds of samples of a resting IMU, and the image that it sees all the time."""
-    calibration = rig(IMU)
-    odometry = make_odometry(
-        replace(calibration, cameras=calibration.cameras[:1]), SINGLE, BODY_FROM_CAM, 0.0, OdometrySettings()
-    )
+    odometry = make_odometry(single(IMU), OdometrySettings())
     stamps_ns = np.arange(0, int(6e9), 5_000_000)
     rest = np.tile([0.0, 0.0, GRAVITY_MPS2], (len(stamps_ns), 1))
     odometry.handle_imu(ImuSamples(stamps_ns, np.zeros_like(rest), rest))

@@ -18,7 +18,7 @@ from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import ImuSamples
 from support.worlds.point_world import CAMERAS, SETTINGS, noisy_imu, observe, room
 from support.worlds.synthetic_texture import picture, pixel_grid, smooth_texture
-from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, rig, stereo_frame
+from support.worlds.textured_room import mounted, stereo_frame
 
 
 def test_a_filter_keeps_observations_as_lists_would() -> None:
@@ -153,7 +153,7 @@ def test_points_that_are_known_need_no_disparity() -> None:
 @pytest.mark.skipif("FLEETMAP_CORE" in os.environ, reason="a sanitizer's allocations are its own")
 def test_a_frame_allocates_nothing() -> None:
     """Tracker, window and filter keep their memory, once as many points were followed as fit."""
-    odometry = Odometry(rig(IMU), CAMERA, BODY_FROM_CAM, 0.0, OdometrySettings())
+    odometry = Odometry(mounted(IMU), OdometrySettings())
     samples, counts, fed_ns = noisy_imu(np.random.default_rng(1), 6.5, IMU, np.zeros(3), np.zeros(3)), [], 0
     for stamp_ns in range(FRAME_NS, 60 * FRAME_NS, FRAME_NS):
         odometry.handle_imu(samples.between(fed_ns, stamp_ns + 1))
