@@ -4,13 +4,10 @@ The format is a folder of numbered stereo pairs, NNN_left.png and NNN_right.png 
 Kalibr camchain). Every program of the project reads it once it is in RECORDING_FORMATS.
 """
 
-import hashlib
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap import (
     RECORDING_FORMATS,
@@ -22,55 +19,36 @@ from fleetmap import (
     read_calibration,
 )
 from fleetmap.recordings.finalize import RecordingParts, finalize
-from fleetmap.recordings.images import StoredFrame, StoredImage, decode_frame
+from fleetmap.recordings.image_series import ImageReader, ImageSeries, SeriesFrames, paired
+from fleetmap.recordings.images import StoredImage
 from fleetmap.recordings.ordering import ReadLog
-from fleetmap.sensors.samples import CameraFrame
 
 PERIOD_NS = 100_000_000
 
 
-@dataclass(frozen=True)
-class NumberedPairs:
-    """Random access to the images, encoded or decoded (a FrameSource)."""
+class FileReader(ImageReader):
+    """Reads image files by their paths; the recording's content hash covers read_files."""
 
-    lefts: list[Path]
-    stamps_ns: NDArray[np.int64]
+    def read(self, source: Path, stamp_ns: int) -> StoredImage:
+        """Return an image, encoded."""
+        return StoredImage("file", source.read_bytes(), str(source))
 
-    def stored(self, index: int) -> StoredFrame:
-        """Return an encoded pair."""
-        left = self.lefts[index]
-        right = left.with_name(left.name.replace("left", "right"))
-        images = [StoredImage("file", file.read_bytes(), str(file)) for file in (left, right)]
-        return StoredFrame(int(self.stamps_ns[index]), *images)
-
-    def frame(self, index: int) -> CameraFrame:
-        """Return a decoded pair."""
-        return decode_frame(self.stored(index))
-
-    def part(self, indices: NDArray[np.int64]) -> "NumberedPairs":
-        """Return a subset of the pairs, for a process that reads it in parallel to others."""
-        return NumberedPairs([self.lefts[int(index)] for index in indices], self.stamps_ns[indices])
-
-    def hash_into(self, digest: "hashlib._Hash") -> None:
-        """Feed every input byte to the recording's content hash."""
-        for index in range(len(self.lefts)):
-            frame = self.stored(index)
-            for image in (frame.left, frame.right):
-                digest.update(b"" if image is None else image.data)
-
-    def close(self) -> None:
-        """Do nothing: no file is open."""
+    def apart(self) -> "FileReader":
+        """Return a reader for a process that reads in parallel to others: no file is open between reads."""
+        return self
 
 
 def open_numbered_pairs(path: Path, options: OpenOptions) -> Recording:
     """Open a folder of numbered pairs."""
-    log, lefts = ReadLog(), sorted(path.glob("*_left.png"))
+    log = ReadLog()
     calibration = read_calibration(options.calibration_file or path / "calibration.yaml")
-    stamps_ns = np.arange(len(lefts), dtype=np.int64) * PERIOD_NS
-    parts = RecordingParts(
-        path, "numbered-pairs", calibration, stamps_ns, NumberedPairs(lefts, stamps_ns), has_right=True
+    lefts, rights = (sorted(path.glob(f"*_{side}.png")) for side in ("left", "right"))
+    left, right = (
+        ImageSeries(np.array([int(file.name[:3]) for file in files]) * PERIOD_NS, tuple(files))
+        for files in (lefts, rights)
     )
-    return finalize(parts, log)  # checks the first image against the calibration
+    frames = SeriesFrames(FileReader([*lefts, *rights]), (paired(left, {"right": right}, log),))
+    return finalize(RecordingParts(path, "numbered-pairs", calibration, frames), log)  # checks the first image, too
 
 
 RECORDING_FORMATS["numbered-pairs"] = RecordingFormat(

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -13,8 +12,8 @@ from fleetmap.recordings.calibration_files import CalibrationFile, calibration_f
 from fleetmap.recordings.image_series import SeriesFrames
 from fleetmap.recordings.images import grey_bits, grey_peak, is_mosaic, is_wide
 from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS, ReadLog, check_together
-from fleetmap.recordings.recording import FrameSource, OpenOptions, Recording, sensors_of_view
-from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.recordings.recording import OpenOptions, Recording, sensors_of_view
+from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Stamps, Trajectory, WheelSample
 
 _MIN_SAMPLES = 50
@@ -27,34 +26,18 @@ _ROTATION_OFF = 0.02  # as of a quaternion whose length is 1 % off
 
 @dataclass(frozen=True)
 class RecordingParts:
-    """Parts read by a format, input of `finalize`. The name is the path's unless given. others: numbers of the calibration's cameras
-    beside the first one or pair, with images."""
+    """Parts read by a format, input of `finalize`: the calibration's cameras follow one another view by view, as far as they have images.
+    The name is the path's unless given."""
 
     path: Path
     format: str
     calibration: RigCalibration
-    frame_stamps_ns: Stamps
-    frames: FrameSource
-    has_right: bool = False
-    has_depth: bool = False
-    others: tuple[int, ...] = ()
+    frames: SeriesFrames
     name: str = ""
     imu: ImuSamples = field(default_factory=ImuSamples.empty)
     wheel: tuple[WheelSample, ...] = ()
     priors: tuple[PositionPrior, ...] = ()
     ground_truth: Trajectory | None = None
-
-
-def image_parts(
-    path: Path, format_: str, calibration: RigCalibration, frames: SeriesFrames, **others: Any
-) -> RecordingParts:
-    """The parts of a format that pairs series of images, of cameras that follow one another view by view. others: fields of
-    RecordingParts, as of other sensors."""
-    first, *_ = counts = [1 + ("right" in view.images) for view in frames.views]
-    has_depth, numbers = "depth" in frames.views[0].images, tuple(range(first, sum(counts)))
-    return RecordingParts(
-        path, format_, calibration, frames.stamps_ns, frames, first == 2, has_depth, numbers, **others
-    )
 
 
 def calibration_of_options(options: OpenOptions, log: ReadLog) -> CalibrationFile | None:
@@ -87,18 +70,19 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
     RecordingError for no frame, for wrong units and for a first image that contradicts the calibration;
     CalibrationError for too few cameras in the calibration.
     """
-    if len(parts.frame_stamps_ns) == 0:
+    frame_stamps_ns, views = parts.frames.stamps_ns, parts.frames.views
+    if len(frame_stamps_ns) == 0:
         raise RecordingError(f"{parts.path}: no frame is complete; {log.told() or 'the recording is empty'}")
-    cameras, count = parts.calibration.cameras, 2 if parts.has_right else 1
+    cameras, count = parts.calibration.cameras, sum(1 + ("right" in view.images) for view in views)
     if len(cameras) < count:
         raise CalibrationError(
             f"{parts.path}: {count} cameras are recorded, the calibration describes {len(cameras)}; "
             "pass one that has all with --calibration FILE"
         )
-    recorded = (*cameras[:count], *(cameras[number] for number in parts.others))
-    _check_depths(parts)
-    if len(cameras) > len(recorded) and not parts.has_depth:
-        log.note("cameras missing", f"the calibration describes {len(cameras)}, there are images of {len(recorded)}")
+    recorded, has_depth = cameras[:count], "depth" in views[0].images
+    _check_depths(parts, recorded)
+    if len(cameras) > count and not has_depth:
+        log.note("cameras missing", f"the calibration describes {len(cameras)}, there are images of {count}")
     imu, wheel, truth = parts.imu, parts.wheel, parts.ground_truth
     for what, stamps_ns in {
         "imu": imu.stamps_ns,
@@ -106,7 +90,7 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
         "position priors": [prior.stamp_ns for prior in parts.priors],
         "ground truth": () if truth is None else truth.stamps_ns,
     }.items():
-        check_together(np.array(stamps_ns, np.int64), what, parts.frame_stamps_ns)
+        check_together(np.array(stamps_ns, np.int64), what, frame_stamps_ns)
     truth = None if truth is None else _sound_truth(truth, log)
     if len(imu) and parts.calibration.imu is None:
         how = "the mounting of the IMU is unknown; pass a calibration with --calibration FILE"
@@ -121,17 +105,17 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
         # A file's name may be no UTF-8, which reports cannot hold.
         name=(parts.name or parts.path.resolve().name).encode("utf-8", "backslashreplace").decode(),
         format=parts.format,
-        sensor_set=sensors_of_view(parts.has_right, parts.has_depth, len(imu) > 0),
+        sensor_set=sensors_of_view("right" in views[0].images, has_depth, len(imu) > 0),
         calibration=replace(parts.calibration, cameras=recorded, imu=parts.calibration.imu if len(imu) else None),
-        frame_stamps_ns=np.ascontiguousarray(parts.frame_stamps_ns, np.int64),
+        frame_stamps_ns=np.ascontiguousarray(frame_stamps_ns, np.int64),
         imu=imu,
         frames=parts.frames,
         wheel=wheel,
         priors=parts.priors,
         ground_truth=truth,
-        damaged_ns=_damaged_moments(log.damaged_ns, parts.frame_stamps_ns),
+        damaged_ns=_damaged_moments(log.damaged_ns, frame_stamps_ns),
     )
-    if isinstance(parts.frames, SeriesFrames) and (bits := _grey_bits(parts.frames)) < 16:
+    if (bits := _grey_bits(parts.frames)) < 16:
         log.note(f"{bits} bits in 16", f"no value of the images is above {2**bits - 1}; they are used as {bits} bits")
         parts.frames.grey_bits = bits
     if is_mosaic(_first_frame(recording).left):
@@ -139,10 +123,10 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
     return replace(recording, issues=tuple(log.issues))
 
 
-def _check_depths(parts: RecordingParts) -> None:
+def _check_depths(parts: RecordingParts, cameras: tuple[CameraCalibration, ...]) -> None:
     """Raise CalibrationError for a camera of another view that should have depth and has none."""
-    others = parts.frames.views[1:] if isinstance(parts.frames, SeriesFrames) else ()
-    firsts = [number for number in parts.others if parts.calibration.cameras[number].has_depth]
+    first, *others = parts.frames.views
+    firsts = [n for n, camera in enumerate(cameras) if camera.has_depth and n > ("right" in first.images)]
     if len(firsts) > sum("depth" in other.images for other in others):
         names = " and ".join(f"cam{number} (--topic cam{number}_depth=/NAME)" for number in firsts)
         raise CalibrationError(

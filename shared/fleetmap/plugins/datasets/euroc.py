@@ -10,7 +10,7 @@ from fleetmap.geometry import Array, se3_inverse
 from fleetmap.plugins.datasets.layout import existing_images, read_ground_truth, read_image_list, read_imu, rig_frames
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.calibration_files import calibration_files, camera_of, imu_noise, read_yaml
-from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts, logged_calibration
+from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize, logged_calibration
 from fleetmap.recordings.ordering import ReadLog
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
 from fleetmap.sensors.samples import Trajectory
@@ -43,7 +43,7 @@ def open_euroc(path: Path, options: OpenOptions) -> Recording:
     frames = rig_frames(root, log, cameras, calibration)
     imu = read_imu(root / "mav0/imu0/data.csv", log)
     truth, name = _ground_truth(root, euroc_from_imu, log), root.resolve().name
-    return finalize(image_parts(path, "euroc", *frames, name=name, imu=imu, ground_truth=truth), log)
+    return finalize(RecordingParts(path, "euroc", *frames, name=name, imu=imu, ground_truth=truth), log)
 
 
 def _calibration(root: Path, count: int, options: OpenOptions, log: ReadLog) -> tuple[RigCalibration, Array]:

@@ -12,7 +12,7 @@ from fleetmap.geometry import Array, se3, se3_inverse
 from fleetmap.plugins.datasets import layout
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.files import lines_of, natural_key
-from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
+from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.image_series import ImageSeries, SeriesFrames, paired
 from fleetmap.recordings.images import decode_grey
 from fleetmap.recordings.ordering import ReadLog, check_seconds
@@ -51,7 +51,7 @@ def open_kitti_raw(path: Path, options: OpenOptions) -> Recording:
             tuple(_raw_camera(file, name[-2:], _size_px(series)) for name, series in zip(present, cameras, strict=True))
         )
         log.files.append(file)
-    return finalize(image_parts(path, "kitti-raw", *layout.rig_frames(path, log, cameras, calibration)), log)
+    return finalize(RecordingParts(path, "kitti-raw", *layout.rig_frames(path, log, cameras, calibration)), log)
 
 
 def _raw_stamps(file: Path, log: ReadLog) -> Stamps:
@@ -122,7 +122,7 @@ def open_kitti(path: Path, options: OpenOptions) -> Recording:
     view = paired(left, {"right": right}, log, 0)
     truth = layout.optional_truth(path / "poses.txt", log, lambda file: _ground_truth(file, stamps_of_number, log))
     frames = SeriesFrames(layout.FileReader(path, log.files), (view,))
-    return finalize(image_parts(path, "kitti", calibration, frames, ground_truth=truth), log)
+    return finalize(RecordingParts(path, "kitti", calibration, frames, ground_truth=truth), log)
 
 
 def _images(folder: Path, stamps_of_number: Stamps | None, log: ReadLog) -> ImageSeries:

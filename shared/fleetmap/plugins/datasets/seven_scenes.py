@@ -16,7 +16,7 @@ from fleetmap.errors import RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse
 from fleetmap.plugins.datasets import layout
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
-from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
+from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.image_series import ImageSeries, paired
 from fleetmap.recordings.images import decode_depth, decode_grey
 from fleetmap.recordings.ordering import ReadLog
@@ -49,7 +49,7 @@ def open_seven_scenes(path: Path, options: OpenOptions) -> Recording:
     calibration = RigCalibration((colour_camera,), None, calibration.base_from_body)
     truth = _ground_truth(colour, se3_inverse(depth_camera.body_from_cam), log)
     frames = layout.RegisteredFrames(layout.FileReader(path, log.files), (view,), register=register)
-    return finalize(image_parts(path, "7scenes", calibration, frames, ground_truth=truth), log)
+    return finalize(RecordingParts(path, "7scenes", calibration, frames, ground_truth=truth), log)
 
 
 class DepthRegistration:

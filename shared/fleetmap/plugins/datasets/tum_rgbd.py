@@ -12,7 +12,7 @@ from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import se3_inverse
 from fleetmap.plugins.datasets import layout
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
-from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
+from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.image_series import ImageSeries, paired
 from fleetmap.recordings.ordering import DEPTH_TOLERANCE_NS, ReadLog, pair_stamps
 from fleetmap.recordings.tum import read_truth as read_tum_truth
@@ -58,7 +58,7 @@ def open_tum_rgbd(path: Path, options: OpenOptions) -> Recording:
     calibration = RigCalibration(calibration.cameras[:1], None, calibration.base_from_body)
     truth = layout.optional_truth(path / "groundtruth.txt", log, read_truth)
     frames = layout.RegisteredFrames(layout.FileReader(path, log.files), (view,), register=_metres)
-    return finalize(image_parts(path, "tum-rgbd", calibration, frames, ground_truth=truth), log)
+    return finalize(RecordingParts(path, "tum-rgbd", calibration, frames, ground_truth=truth), log)
 
 
 def _metres(depth: layout.Depth, _: str) -> layout.Depth:

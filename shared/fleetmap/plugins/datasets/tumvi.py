@@ -8,7 +8,7 @@ from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.plugins.datasets.layout import existing_images, read_ground_truth, read_imu, read_table, rig_frames
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.files import natural_key
-from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts, logged_calibration
+from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize, logged_calibration
 from fleetmap.recordings.image_series import ImageSeries
 from fleetmap.recordings.ordering import ReadLog, check_seconds
 from fleetmap.recordings.tum import parse_stamp_ns
@@ -31,7 +31,7 @@ def open_tumvi(path: Path, options: OpenOptions) -> Recording:
         raise CalibrationError(f"{camchain} is missing; pass a calibration with --calibration FILE")
     frames = rig_frames(path, log, cameras, (given or logged_calibration(camchain, log)).calibration)
     imu, truth = read_imu(path / "imu.txt", log), read_ground_truth(path / "gt_imu.csv", log)
-    return finalize(image_parts(path, "tumvi", *frames, imu=imu, ground_truth=truth), log)
+    return finalize(RecordingParts(path, "tumvi", *frames, imu=imu, ground_truth=truth), log)
 
 
 def _images(folder: Path, name: str, log: ReadLog) -> ImageSeries:

@@ -18,7 +18,7 @@ import numpy as np
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.files import file_head
-from fleetmap.recordings.finalize import calibration_of_options, finalize, image_parts
+from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.image_series import ImageReader, ImageSeries, SeriesFrames, paired
 from fleetmap.recordings.images import StoredImage, grey_image
 from fleetmap.recordings.limits import MAX_PIXELS, MAX_VIDEO_TABLE_BYTES
@@ -52,7 +52,7 @@ def open_video(path: Path, options: OpenOptions) -> Recording:
         if rotation := reader.rotation(series.sources[0], int(series.stamps_ns[0])):
             log.note("video turned", f"players turn it by {rotation} degrees; images are used as the sensor gave them")
         frames = SeriesFrames(reader, (paired(series, {}, log),))
-        return finalize(image_parts(path, "video", given.calibration, frames, name=path.stem), log)
+        return finalize(RecordingParts(path, "video", given.calibration, frames, name=path.stem), log)
     except BaseException:
         reader.close()
         raise

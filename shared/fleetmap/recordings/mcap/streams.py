@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array
 from fleetmap.recordings.calibration_files import CalibrationFile, parse_calibration
-from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize, image_parts
+from fleetmap.recordings.finalize import RecordingParts, calibration_of_options, finalize
 from fleetmap.recordings.image_series import ImageReader, ImageSeries, SeriesFrames, ViewImages, paired, rig_views
 from fleetmap.recordings.images import StoredImage, check_image
 from fleetmap.recordings.mcap.container import CALIBRATION_ATTACHMENT, UNDECODABLE, Channel, Container, Place
@@ -236,7 +236,7 @@ def assemble(
             what = f"{stream.channel.topic}: damaged messages"
             log.note(what, f"{stream.damaged} left out, {len(stream.messages)} were found")
     frames = SeriesFrames(MessageReader(opener, container, log.files), views)
-    return image_parts(container.path, "", calibration, frames, name=container.name, **sensors)
+    return RecordingParts(container.path, "", calibration, frames, name=container.name, **sensors)
 
 
 def _images(
