@@ -36,7 +36,7 @@ from fleetmap.messages import (
     encode_message,
     robot_key,
 )
-from fleetmap.trust import TrustedMap, ask_over
+from fleetmap.trust.trusted_map import TrustedMap, ask_over
 from fleetmap.version_grid import grid_blobs, grid_index
 from locclient.identity import MapAddress
 from locclient.maps.map_source import (

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from fleetmap.errors import StoreError, UntrustedError, disk_errors
 from fleetmap.messages import WantedVersion
-from fleetmap.trust import SiteList, read_site_list, site_role
+from fleetmap.trust.site_list import SiteList, read_site_list, site_role
 from mapserver.store.files import is_plain_file
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from tuf.api.serialization.json import JSONSerializer
 
 from fleetmap.errors import StateError, disk_errors
 from fleetmap.files import write_atomically
-from fleetmap.trust import AdmittedVersion, manifest_target, site_role
+from fleetmap.trust.site_list import AdmittedVersion, manifest_target, site_role
 from mapserver.store.files import make_folder
 from mapserver.trust.keys import KeyFolder
 from mapserver.trust.lists import DAYS, TIMESTAMP, SignedLists, is_fresh

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Literal, cast
 from fleetmap.bus.endpoints import is_loopback
 from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, StateError, UntrustedError, UsageError, disk_errors
-from fleetmap.trust import AdmittedVersion, SiteList, site_role
-from fleetmap.trust.site_list import VersionState
+from fleetmap.trust.site_list import AdmittedVersion, SiteList, VersionState, site_role
 from mapserver.store import MapStore, VersionInfo
 from mapserver.store.files import make_folder
 from mapserver.store.rows import SiteReleases

@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 
 from fleetmap.errors import StateError
-from fleetmap.trust import site_role
+from fleetmap.trust.site_list import site_role
 from mapserver.store import MapStore
 from mapserver.trust.enrolment import RobotRegister
 from mapserver.trust.keys import KeyFolder

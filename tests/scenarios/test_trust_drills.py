@@ -18,8 +18,8 @@ from typer.testing import CliRunner
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import FleetmapError
 from fleetmap.messages import WantedVersion
-from fleetmap.trust import AdmittedVersion, TrustedMap, ask_over
-from fleetmap.trust.site_list import VersionState
+from fleetmap.trust.site_list import AdmittedVersion, VersionState
+from fleetmap.trust.trusted_map import TrustedMap, ask_over
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from mapserver import cli, releases

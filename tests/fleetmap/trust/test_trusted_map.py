@@ -25,7 +25,9 @@ from tuf.api.metadata import (
 from fleetmap.errors import FleetmapError, LinkError, UnreachableError, UntrustedError
 from fleetmap.mapformat.names import sha256_hex
 from fleetmap.messages import Part, WantedVersion, encode_message, robot_key
-from fleetmap.trust import Ask, TrustedMap, ask_over, manifest_target, site_role, tuf_client
+from fleetmap.trust import tuf_client
+from fleetmap.trust.site_list import manifest_target, site_role
+from fleetmap.trust.trusted_map import Ask, TrustedMap, ask_over
 from support.fleet.memory_bus import MemoryBus, MemoryHub
 
 SITE = "hall"

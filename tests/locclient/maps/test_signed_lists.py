@@ -14,7 +14,7 @@ from fleetmap.errors import FleetmapError, LinkError, UntrustedError
 from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame
 from fleetmap.mapformat.names import blob_path
 from fleetmap.messages import PART_BYTES, RobotAck, WantedVersion, decode_message, encode_message, part_of, robot_key
-from fleetmap.trust import TrustedMap, ask_over
+from fleetmap.trust.trusted_map import TrustedMap, ask_over
 from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.outbox import Outbox
 from locclient.maps.map_client import MapClient

@@ -11,7 +11,7 @@ import pytest
 import fleetmap.trust.tuf_client  # noqa: F401 - before an account is taken that cannot read it
 from fleetmap.errors import FleetmapError, MapFormatError, StoreError, UnreachableError
 from fleetmap.mapformat.names import blob_path, sha256_hex
-from fleetmap.trust import TrustedMap
+from fleetmap.trust.trusted_map import TrustedMap
 from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.delivery.report_delivery import write_failure
 from locclient.identity import RobotIdentity

@@ -23,7 +23,7 @@ from fleetmap.messages import (
     encode_message,
     part_of,
 )
-from fleetmap.trust import TrustedMap, ask_over
+from fleetmap.trust.trusted_map import TrustedMap, ask_over
 from locclient.maps import map_client
 from locclient.maps.building_maps import BuildingMaps
 from locclient.maps.loaded_map import PositionBound, PositionBoundTracker, TileSelectionSettings

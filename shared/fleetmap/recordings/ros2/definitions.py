@@ -37,24 +37,13 @@ DEFINITIONS = {
     ),
     "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
 }
-_SEPARATOR = "=" * 80
 
 
 def ros2msg(type_name: str) -> str:
     """The full definition of a message type such as `sensor_msgs/Imu`, followed by those of its parts."""
-    parts = [DEFINITIONS[type_name]]
-    for name in _parts_of(type_name):
-        parts += [_SEPARATOR, f"MSG: {name}", DEFINITIONS[name]]
-    return "\n".join(parts) + "\n"
-
-
-def _parts_of(type_name: str) -> list[str]:
-    found: list[str] = []
-    waiting = [type_name]
-    while waiting:
-        for line in DEFINITIONS[waiting.pop(0)].splitlines():
-            name = line.split()[0].removesuffix("[]")
-            if name in DEFINITIONS and name not in found:
-                found.append(name)
-                waiting.append(name)
-    return found
+    parts = [type_name]
+    for name in parts:  # which grows by the parts of parts
+        kinds = (line.split()[0].removesuffix("[]") for line in DEFINITIONS[name].splitlines())
+        parts += [kind for kind in dict.fromkeys(kinds) if kind in DEFINITIONS and kind not in parts]
+    separator = "=" * 80
+    return "".join([DEFINITIONS[type_name], *(f"\n{separator}\nMSG: {n}\n{DEFINITIONS[n]}" for n in parts[1:]), "\n"])

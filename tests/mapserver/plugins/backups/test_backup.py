@@ -16,7 +16,7 @@ from fleetmap.encoding import to_json
 from fleetmap.errors import FleetmapError, MapFormatError, StoreError, UsageError
 from fleetmap.mapformat.names import blob_path, sha256_hex
 from fleetmap.messages import WantedVersion
-from fleetmap.trust import TrustedMap
+from fleetmap.trust.trusted_map import TrustedMap
 from mapserver.plugins.backups.backup import back_up, recipient_of
 from mapserver.plugins.backups.restore import identities_of, restore, verify
 from mapserver.plugins.backups.snapshots import BackupTarget

@@ -10,8 +10,7 @@ import pyrage
 import pytest
 
 from fleetmap.messages import FailureReport, encode_message
-from fleetmap.trust import TrustedMap
-from fleetmap.trust.trusted_map import ask_over
+from fleetmap.trust.trusted_map import TrustedMap, ask_over
 from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.maps.map_client import MapClient
