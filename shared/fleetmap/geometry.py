@@ -42,6 +42,14 @@ def so3_exp(rotvec_rad: Array) -> Array:
     return np.asarray(turned)
 
 
+def so3_exps(rotvecs_rad: Array) -> Array:
+    """(N, 3, 3) of rotation vectors (N, 3), by Rodrigues' formula; vectorised: a loop of `so3_exp` takes a fifth of a frame's time."""
+    angles = np.linalg.norm(rotvecs_rad, axis=1)[:, None, None]
+    cross = np.cross(rotvecs_rad[:, None], np.eye(3)).transpose(0, 2, 1)
+    sine, half_sine = np.sinc(angles / np.pi), np.sinc(0.5 * angles / np.pi)  # sin x / x
+    return np.asarray(np.eye(3) + sine * cross + 0.5 * half_sine**2 * cross @ cross)
+
+
 def so3_log(rotation: Array) -> Array:
     """Rotation vector (3,) of a rotation (3, 3), angle in [0, pi]. Goes through the quaternion, stable near pi."""
     quat = quat_wxyz_from_rotation(rotation)

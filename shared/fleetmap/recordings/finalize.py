@@ -7,7 +7,7 @@ import numpy as np
 
 from fleetmap.encoding import MOST
 from fleetmap.errors import CalibrationError, RecordingError
-from fleetmap.geometry import Array
+from fleetmap.geometry import Array, so3_exps
 from fleetmap.recordings.calibration_files import CalibrationFile, calibration_files, load_calibration
 from fleetmap.recordings.image_series import SeriesFrames
 from fleetmap.recordings.images import grey_bits, grey_peak, is_mosaic, is_wide
@@ -223,14 +223,7 @@ def gravity_direction_errors_rad(imu: ImuSamples, gyro_scale: float) -> Array:
     predicted, measured = accel[starts], accel[starts + window]
     for step in range(window):
         steps_s = (imu.stamps_ns[starts + step + 1] - imu.stamps_ns[starts + step]) * 1e-9
-        predicted = _turned(predicted, -gyro_scale * steps_s[:, None] * imu.gyro_radps[starts + step])
+        turns = so3_exps(-gyro_scale * steps_s[:, None] * imu.gyro_radps[starts + step])
+        predicted = (turns @ predicted[:, :, None])[:, :, 0]
     norms = np.linalg.norm(predicted, axis=1) * np.linalg.norm(measured, axis=1)
     return np.asarray(np.arccos(np.clip((predicted * measured).sum(axis=1) / norms, -1, 1)))
-
-
-def _turned(vectors: Array, rotvecs_rad: Array) -> Array:
-    """Vectors (K, 3), each rotated by its rotation vector (K, 3). Source: Rodrigues' formula."""
-    angles = np.linalg.norm(rotvecs_rad, axis=1, keepdims=True)
-    axes = rotvecs_rad / np.maximum(angles, 1e-300)
-    along = axes * (axes * vectors).sum(axis=1, keepdims=True)
-    return np.asarray(along + np.cos(angles) * (vectors - along) + np.sin(angles) * np.cross(axes, vectors))
