@@ -2,8 +2,9 @@
 
 import signal
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
     from mapserver.config import MapserverConfig
     from mapserver.plugins.live_surveys.drives import Drive
     from mapserver.plugins.live_surveys.message import LiveSurveyState
-    from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer, LiveViewer
     from mapserver.survey.settings import SurveySettings
 _LOOPBACK = "127.0.0.1"
 
@@ -65,27 +65,36 @@ def live(
         )
     from fleetmap.console import plain_console
     from fleetmap.plugins.viewer_channels import require_foxglove
-
-    at = None if options.foxglove is None else viewer_address(options.foxglove, insecure=options.insecure)
-    if at is not None:
-        require_foxglove("--foxglove")
-        from mapserver.plugins.live_surveys.viewer_server import LiveViewer
     from fleetmap.recordings.sensor_subset import named_sensor_set
     from mapserver.plugins.live_surveys.live_survey import LiveRequest, run_live
 
+    at = None if options.foxglove is None else viewer_address(options.foxglove, insecure=options.insecure)
     use = None if options.use is None else named_sensor_set(options.use)
     build, is_stopped = options.build_options(context, use=use), _stopping()
-    with (
-        _foxglove(at, options.site) as foxglove,
-        _played(recording, build, options.speed)
-        if recording is not None
-        else _driven(context.obj.read_config(sensors)[0], options.record, build) as (drive, settings),
-        _bus(options.server, options.store) as bus,
-    ):
+    tells, see = list[Callable[["LiveSurveyState"], None]](), None
+    with ExitStack() as opened:
+        if at is not None:
+            require_foxglove("--foxglove")
+            from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer, LiveViewer
+
+            foxglove = opened.enter_context(FoxgloveServer(*at, options.site))
+            typer.echo(f"foxglove: {foxglove.url}")
+        drive, settings = opened.enter_context(
+            _played(recording, build, options.speed)
+            if recording is not None
+            else _driven(context.obj.read_config(sensors)[0], options.record, build)
+        )
+        if at is not None:
+            viewer = LiveViewer(foxglove, drive)
+            tells, see = [viewer.tell], viewer.see
+        if options.server is not None:
+            tells.append(partial(_publish, opened.enter_context(_bus(options.server, options.store))))
         request = LiveRequest(options.site, options.store, settings, build)
-        viewer = None if foxglove is None else LiveViewer(foxglove, drive)
-        tell = _teller(bus, viewer)
-        see = None if viewer is None else viewer.see
+
+        def tell(state: "LiveSurveyState") -> None:
+            for each in tells:
+                each(state)
+
         result = run_live(request, drive, tell, is_stopped, plain_console(stderr=True), see)
     typer.echo(result.figures.words())
     typer.echo(result.built.sentence)
@@ -108,16 +117,16 @@ def _driven(
     given: "MapserverConfig", record: Path | None, build: "BuildOptions"
 ) -> "Iterator[tuple[Drive, SurveySettings]]":
     """Return the sensors named in a configuration file, and their settings; errors of `open_source`."""
-    from fleetmap.sensors.samples import SensorSet
+    from fleetmap.recordings.recording import sensors_of_view
     from fleetmap.sources.source import open_source
     from mapserver.config import survey_settings
     from mapserver.plugins.live_surveys.drives import SensorDrive
 
     assert record is not None
     drive = SensorDrive(open_source(given.source, given.topics), record, given.topics)
-    rig = "stereo" if len(drive.calibration.cameras) > 1 else "mono"
-    kind = SensorSet(rig if drive.calibration.imu is None else f"{rig}-inertial")
-    yield drive, survey_settings(build.config, SensorSet.RGBD if drive.has_depth else kind)
+    rig = drive.calibration
+    sensors = sensors_of_view(len(rig.cameras) > 1, drive.has_depth, rig.imu is not None)
+    yield drive, survey_settings(build.config, sensors)
 
 
 def _stopping() -> Callable[[], bool]:
@@ -135,12 +144,10 @@ def _stopping() -> Callable[[], bool]:
     return lambda: stopped
 
 
-def _bus(server: str | None, store: Path) -> "AbstractContextManager[Bus | None]":
+def _bus(server: str, store: Path) -> "Bus":
     from fleetmap.bus.endpoints import check_endpoint, has_tls
     from fleetmap.bus.zenoh_bus import Bus
 
-    if server is None:
-        return nullcontext(None)
     if not has_tls(check_endpoint(server)):
         return Bus.connect(server)
     from mapserver.trust.enrolment import RobotRegister
@@ -150,28 +157,12 @@ def _bus(server: str | None, store: Path) -> "AbstractContextManager[Bus | None]
     return Bus.connect(server, tls=tls)
 
 
-def _foxglove(at: tuple[str, int] | None, site: str) -> "AbstractContextManager[FoxgloveServer | None]":
-    if at is None:
-        return nullcontext(None)
-    from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer
-
-    server = FoxgloveServer(*at, site)
-    typer.echo(f"foxglove: {server.url}")
-    return server
-
-
-def _teller(bus: "Bus | None", viewer: "LiveViewer | None") -> "Callable[[LiveSurveyState], None]":
+def _publish(bus: "Bus", state: "LiveSurveyState") -> None:
     from fleetmap.messages import encode_message
     from mapserver.plugins.live_surveys.message import live_key
 
-    def tell(state: "LiveSurveyState") -> None:
-        if bus is not None:
-            with suppress(LinkError):  # a survey continues without viewers
-                bus.publish(live_key(state.site), encode_message(state), may_drop=True)
-        if viewer is not None:
-            viewer.tell(state)
-
-    return tell
+    with suppress(LinkError):  # a survey continues without viewers
+        bus.publish(live_key(state.site), encode_message(state), may_drop=True)
 
 
 def viewer_address(text: str, *, insecure: bool) -> tuple[str, int]:

@@ -201,8 +201,5 @@ class LiveParts(NamedTuple):
 
 def joined_imu(parts: Sequence[ImuSamples]) -> ImuSamples:
     """Concatenate samples of consecutive parts."""
-    return ImuSamples(
-        np.concatenate([part.stamps_ns for part in parts]),
-        np.concatenate([part.gyro_radps for part in parts]),
-        np.concatenate([part.accel_mps2 for part in parts]),
-    )
+    columns = zip(*((part.stamps_ns, part.gyro_radps, part.accel_mps2) for part in parts), strict=True)
+    return ImuSamples(*map(np.concatenate, columns))
