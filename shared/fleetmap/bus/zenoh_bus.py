@@ -41,10 +41,6 @@ class Handle:
     def __init__(self, undo: Callable[[], None]) -> None:
         self._undo: Callable[[], None] | None = undo
 
-    def closed(self) -> bool:
-        """True if it was undeclared."""
-        return self._undo is None
-
     def close(self) -> None:
         """Undeclare it; a second call does nothing."""
         undo, self._undo = self._undo, None
@@ -97,26 +93,22 @@ class Bus:
 
         Errors as of `open`.
         """
-        bus = cls(endpoint, is_server=True, tls=tls, access=access)
-        bus.open()
-        return bus
+        return cls(endpoint, is_server=True, tls=tls, access=access).open()
 
     @classmethod
     def connect(cls, endpoint: str, *, tls: TlsFiles | None = None) -> Self:
         """Open a robot's side. Returns at once; connects, and reconnects after every loss, in the background."""
-        bus = cls(endpoint, tls=tls)
-        bus.open()
-        return bus
+        return cls(endpoint, tls=tls).open()
 
-    def open(self) -> None:
-        """Open the session with all declarations so far; raises LinkError if it cannot listen or connect."""
+    def open(self) -> Self:
+        """Open the session with all declarations so far, and return the bus; raises LinkError if it cannot listen or connect."""
         wanted = self.endpoint
         with self._lock:
             for attempt in range(5):
                 self.endpoint = with_free_port(wanted)
                 try:
                     self._open()
-                    return
+                    break
                 except zenoh.ZError as error:
                     if not self._is_server:
                         raise LinkError(f"cannot connect to {wanted} ({error}); check the endpoint") from error
@@ -125,6 +117,7 @@ class Bus:
                         raise LinkError(
                             f"cannot listen on {wanted} ({error}); is another server running there?"
                         ) from error
+        return self
 
     def reopen(self, access: Access) -> None:
         """Reopen a server's session with these rules and the current certificate: zenoh reads both only when it opens.

@@ -24,7 +24,7 @@ last bits.
 import io
 import reprlib
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -224,7 +224,9 @@ def format_calibration(calibration: RigCalibration) -> str:
         out.write(
             f"cam{number}:\n  camera_model: {sphere.kalibr if sphere else 'pinhole'}\n  distortion_model: {name}\n"
         )
-        out.write(f"  intrinsics: {_row([*shape, *camera.intrinsics_px])}\n  distortion_coeffs: {_row(plane)}\n")
+        out.write(
+            f"  intrinsics: {[*map(float, (*shape, *camera.intrinsics_px))]}\n  distortion_coeffs: {[*map(float, plane)]}\n"
+        )
         out.write(f"  resolution: [{camera.width_px}, {camera.height_px}]\n")
         out.write(f"  timeshift_cam_imu: {float(camera.imu_minus_cam_s)!r}\n")
         if camera.line_delay_s:
@@ -483,9 +485,5 @@ def _check_events(text: str, where: str) -> None:
             raise CalibrationError(f"{where} holds a value of {len(event.value)} characters; the limit is {_MAX_WORD}")
 
 
-def _row(values: Iterable[float]) -> str:
-    return "[" + ", ".join(repr(float(v)) for v in values) + "]"
-
-
 def _rows(matrix: Array, indent: str) -> str:
-    return "".join(f"{indent}- {_row(row)}\n" for row in matrix)
+    return "".join(f"{indent}- {row}\n" for row in np.asarray(matrix, np.float64).tolist())

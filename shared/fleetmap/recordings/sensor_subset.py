@@ -20,8 +20,6 @@ REDUCTIONS: dict[SensorSet, tuple[SensorSet, ...]] = {
     SensorSet.MONO_INERTIAL: (SensorSet.MONO_INERTIAL, SensorSet.MONO),
     SensorSet.MONO: (SensorSet.MONO,),
 }
-_INERTIAL = (SensorSet.STEREO_INERTIAL, SensorSet.MONO_INERTIAL)
-_SINGLE = (SensorSet.MONO, SensorSet.MONO_INERTIAL)
 
 
 def sensor_set_of(path: Path, options: OpenOptions | None = None) -> SensorSet:
@@ -51,13 +49,13 @@ def reduced(recording: Recording, use: SensorSet | None) -> Recording:
         fault = f"is {recording.sensor_set}, it cannot be used as {use}"
         raise RecordingError(f"{recording.path} {fault}; use it as {possible}")
     calibration, imu = recording.calibration, recording.imu
-    if use not in _INERTIAL:
+    is_single = use.startswith("mono")
+    if not use.endswith("-inertial"):
         calibration, imu = replace(calibration, imu=None), ImuSamples.empty()
-    if use in _SINGLE:
+    if is_single:
         calibration = replace(calibration, cameras=calibration.cameras[:1])
-    return replace(
-        recording, sensor_set=use, calibration=calibration, imu=imu, frames=_Reduced(recording.frames, use in _SINGLE)
-    )
+    frames = _Reduced(recording.frames, is_single)
+    return replace(recording, sensor_set=use, calibration=calibration, imu=imu, frames=frames)
 
 
 def with_other_views(rig: RigCalibration, whole: RigCalibration) -> RigCalibration:

@@ -66,7 +66,6 @@ class CertificateInfo:
     """name: the common name; fingerprint: of the public key."""
 
     name: str
-    begins: datetime
     ends: datetime
     fingerprint: str
 
@@ -117,8 +116,7 @@ def certificate_info(pem: bytes) -> CertificateInfo:
         raise UsageError(f"this file contains no certificate ({error})") from error
     key = certificate.public_key()
     assert isinstance(key, ec.EllipticCurvePublicKey)
-    times = certificate.not_valid_before_utc, certificate.not_valid_after_utc
-    return CertificateInfo(name, *times, public_fingerprint(key))
+    return CertificateInfo(name, certificate.not_valid_after_utc, public_fingerprint(key))
 
 
 def key_fingerprint(pem: bytes) -> str:

@@ -42,14 +42,19 @@ class AdmittedVersion(msgspec.Struct, frozen=True):
     about: VersionState
 
 
-class _Signed(msgspec.Struct, frozen=True):
+class Signed(msgspec.Struct, frozen=True):
+    """What is signed in every list."""
+
     version: Positive
     expires: datetime
+
+
+class _SignedTargets(Signed, frozen=True):
     targets: dict[Annotated[str, msgspec.Meta(max_length=256)], _Target]
 
 
 class _File(msgspec.Struct, frozen=True):
-    signed: _Signed
+    signed: _SignedTargets
 
 
 class SiteList(msgspec.Struct, frozen=True):

@@ -14,7 +14,7 @@ from fleetmap.errors import LinkError, StoreError, UntrustedError, disk_errors
 from fleetmap.files import sync_path, write_atomically
 from fleetmap.mapformat.names import check_name
 from fleetmap.messages import ChunkRequest, Part, WantedVersion, decode_message, encode_message, robot_key
-from fleetmap.trust.site_list import AdmittedVersion, SiteList, read_site_list, site_role
+from fleetmap.trust.site_list import AdmittedVersion, Signed, SiteList, read_site_list, site_role
 
 if TYPE_CHECKING:
     from fleetmap.bus.zenoh_bus import Bus
@@ -29,13 +29,8 @@ _CLOCK_EVERY_S = 600.0  # largest age of the clock on the disk: it is not writte
 _log = logging.getLogger(__name__)
 
 
-class _Signed(msgspec.Struct, frozen=True):
-    version: int
-    expires: datetime
-
-
 class _File(msgspec.Struct, frozen=True):
-    signed: _Signed
+    signed: Signed
 
 
 class _Clock(NamedTuple):

@@ -140,7 +140,7 @@ class MemoryBus(Bus):
                 table.remove(entry)
 
         handle = Handle(undo)
-        self._handles = [*(other for other in self._handles if not other.closed()), handle]
+        self._handles.append(handle)
         return handle
 
 

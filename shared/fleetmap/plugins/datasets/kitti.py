@@ -2,7 +2,7 @@
 each with its images in data and their timestamps.txt; calib_cam_to_cam.txt is there or in the folder above.
 """
 
-import re
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -74,31 +74,34 @@ def _size_px(images: ImageSeries) -> tuple[int, int]:
 
 def _raw_camera(file: Path, number: str, size_px: tuple[int, int]) -> CameraCalibration:
     """A camera, by the size of its images: of rectified ones by P_rect, else by K and D, and R and T, which lead from camera 0 to it."""
-    rows = dict(line.split(":", 1) for line in _calibration_lines(file) if ":" in line)
-
-    def numbers(name: str, count: int) -> Array:
-        values = _numbers(rows.get(f"{name}_{number}", ""))
-        if len(values) != count or not np.isfinite(values).all():
-            raise CalibrationError(f"{file}: {name}_{number} are not {count} numbers; copy the file again")
-        return values
-
-    if np.array_equal(numbers("S_rect", 2), size_px):
-        return _projected(numbers("P_rect", 12).reshape(3, 4), size_px, f"{file}: P_rect_{number}")
-    matrix, turn = (numbers(name, 9).reshape(3, 3) for name in "KR")
-    body_from_cam = se3_inverse(se3(turn, numbers("T", 3)))
-    model, distortion = lens_of("radtan", numbers("D", 5), f"{file}: D_{number}")
+    rows = _rows(file)
+    if np.array_equal(_numbers(file, rows, f"S_rect_{number}", 2), size_px):
+        return _projected(file, rows, f"P_rect_{number}", size_px)
+    matrix, turn = (_numbers(file, rows, f"{name}_{number}", 9).reshape(3, 3) for name in "KR")
+    body_from_cam = se3_inverse(se3(turn, _numbers(file, rows, f"T_{number}", 3)))
+    model, distortion = lens_of("radtan", _numbers(file, rows, f"D_{number}", 5), f"{file}: D_{number}")
     camera = CameraCalibration(model, *size_px, intrinsics_of(matrix), distortion, body_from_cam)
     return check_camera(camera, f"{file}: camera {number}")
 
 
-def _calibration_lines(file: Path) -> list[str]:
+def _rows(file: Path) -> dict[str, Array]:
+    """The numbers in each line of a calibration, NaN for other words, by its label; those of lines without one are P0, P1 and so on."""
     if not file.is_file():
         raise CalibrationError(f"{file} is missing; add it or pass a calibration with --calibration FILE")
-    return layout.read_table(file).splitlines()
+    rows: dict[str, Array] = {}
+    for _, line in lines_of(layout.read_table(file), file):
+        label, words = line.split(":", 1) if ":" in line else (f"P{len(rows)}", line)
+        rows[label] = np.array([layout.number_or_nan(word) for word in words.split()])
+    return rows
 
 
-def _numbers(words: str) -> Array:
-    return np.array([layout.number_or_nan(word) for word in words.split()])
+def _numbers(file: Path, rows: Mapping[str, Array], name: str, count: int) -> Array:
+    """The finite numbers (count,) of a line."""
+    if name not in rows:
+        raise CalibrationError(f"{file} has no {name}; it describes {', '.join(rows)[:200] or 'no camera'}")
+    if len(rows[name]) != count or not np.isfinite(rows[name]).all():
+        raise CalibrationError(f"{file}: {name} are not {count} numbers; copy the file again")
+    return rows[name]
 
 
 def open_kitti(path: Path, options: OpenOptions) -> Recording:
@@ -117,8 +120,10 @@ def open_kitti(path: Path, options: OpenOptions) -> Recording:
     if given := calibration_of_options(options, log):
         calibration = given.calibration
     else:
-        calibration = _calibration(path / "calib.txt", _size_px(left), (left_row, right_row))
-        log.files.append(path / "calib.txt")
+        file, size_px = path / "calib.txt", _size_px(left)
+        names = (f"P{row}" for row in (left_row, right_row))
+        calibration = RigCalibration(tuple(_projected(file, _rows(file), name, size_px) for name in names))
+        log.files.append(file)
     view = paired(left, {"right": right}, log, 0)
     truth = layout.optional_truth(path / "poses.txt", log, lambda file: _ground_truth(file, stamps_of_number, log))
     frames = SeriesFrames(layout.FileReader(path, log.files), (view,))
@@ -146,24 +151,9 @@ def _images(folder: Path, stamps_of_number: Stamps | None, log: ReadLog) -> Imag
     return layout.existing_images(stamps_ns, paths, folder.name, log)
 
 
-def _calibration(file: Path, size_px: tuple[int, int], numbers: tuple[int, int]) -> RigCalibration:
-    """The cameras of these numbers, from lines of twelve numbers with or without a leading `P0:`."""
-    rows: dict[int, Array] = {}
-    for line in _calibration_lines(file):
-        label, colon, words = line.partition(":") if ":" in line else ("", "", line)
-        values = _numbers(words)
-        if np.isnan(values).any():
-            raise CalibrationError(f"{file}: {line[:60]!r} are not twelve numbers")
-        if len(values) == 12 and (not colon or re.fullmatch(r"P\d{1,3}", label)):
-            rows[int(label[1:]) if colon else len(rows)] = values.reshape(3, 4)
-    for number in (number for number in numbers if number not in rows):
-        described = ", ".join(f"P{row}" for row in rows) or "no camera"
-        raise CalibrationError(f"{file} has no P{number}; it describes {described}")
-    return RigCalibration(tuple(_projected(rows[number], size_px, f"{file}: P{number}") for number in numbers))
-
-
-def _projected(projection: Array, size_px: tuple[int, int], where: str) -> CameraCalibration:
-    """The camera of rectified images with a projection (3, 4) from the rectified camera 0."""
+def _projected(file: Path, rows: Mapping[str, Array], name: str, size_px: tuple[int, int]) -> CameraCalibration:
+    """The camera of rectified images, by the line with its projection (3, 4) from the rectified camera 0."""
+    where, projection = f"{file}: {name}", _numbers(file, rows, name, 12).reshape(3, 4)
     matrix = projection[:, :3]
     if np.linalg.det(matrix) == 0:
         raise CalibrationError(f"{where} is {projection.tolist()}, which is not a camera's projection")

@@ -58,13 +58,13 @@ class FileReader(ImageReader):
 
     def hash_into(self, digest: "hashlib._Hash", images: list[Path]) -> None:
         """Hash names, sizes and bytes of all files read, in the order of their names."""
-        named = {self._portable_name(path): path for path in (*self.read_files, *images)}
+        named = {}
+        for path in (*self.read_files, *images):
+            is_inside = path.is_relative_to(self._root)
+            named[path.relative_to(self._root).as_posix() if is_inside else f"outside/{path.name}"] = path
         for name in sorted(named):
             digest.update(f"{name}\0{named[name].stat().st_size}\0".encode())
             hash_file(named[name], digest)
-
-    def _portable_name(self, path: Path) -> str:
-        return path.relative_to(self._root).as_posix() if path.is_relative_to(self._root) else f"outside/{path.name}"
 
 
 def rig_frames(

@@ -205,11 +205,9 @@ def assemble(
     images = {
         role: _images(roles[role], f"{role} images", log, usable.get(role)) for role in _FIRST_ROLES if role in roles
     }
-    views = tuple[ViewImages, ...]()
-    if "depth" in images and "right" not in images:
-        views = (paired(images["left"], {"depth": images["depth"]}, log),)
     calibration, described = calibrate(imu_frame)
-    if views:
+    if "depth" in images and "right" not in images:
+        views: tuple[ViewImages, ...] = (paired(images["left"], {"depth": images["depth"]}, log),)
         if beside := [role for role in CAMERA_ROLES[2:] if role in roles]:
             how = "let a stereo pair be left and right, and the depth camera cam2, with its depth on cam2_depth"
             what = f"{', '.join(beside)}: beside a depth camera as first view no other is used"
@@ -225,7 +223,7 @@ def assemble(
         calibration, views = rig_views(calibration, cameras, log, depths)
     else:
         views = (paired(images["left"], {role: images[role] for role in images if role == "right"}, log),)
-    sensors = {
+    sensors: dict[str, Any] = {
         "imu": imu,
         "wheel": _samples(roles.get("wheel", ()), "wheel odometry", log),
         "priors": _samples(roles.get("prior", ()), "position priors", log),
