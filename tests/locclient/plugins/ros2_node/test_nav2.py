@@ -1,10 +1,12 @@
 """The daemon, and programs of ROS itself in other processes that know nothing of it: nav2's manager, operators, drivers."""
 
-import json
 import signal
 import subprocess
+import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from functools import partial
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any
@@ -13,229 +15,289 @@ import numpy as np
 import pytest
 
 from fleetmap.geometry import Array, rotation_from_quat_wxyz, se3, se3_inverse, so3_exp, so3_log
-from fleetmap.recordings.ros2.messages import FrameLink, position_quat_xyzw
+from fleetmap.recordings.ros2.messages import position_quat_xyzw
 from mapserver.store import MapStore
 from support.recordings.recording_samples import calibration
 from support.ros2.environment import needs_ros, ros_program
-from support.ros2.peer import (
-    ACTIVE,
-    FINALIZED,
-    INACTIVE,
-    PATIENCE_S,
-    POSE,
-    UNCONFIGURED,
-    RosPeer,
-    lifecycle_manager,
-    ros_peer,
-)
+from support.ros2.peer import BEST_EFFORT, LATCHED, PATIENCE_S, POSE, TF, RosPeer, ros_peer
 from support.waiting import eventually
 from support.worlds import robot_world
 
 pytestmark = [needs_ros, pytest.mark.timeout(600)]
 NODE = "fleetmap_localizer"
-LATCHED = {"durability": "TRANSIENT_LOCAL"}
+DIAGNOSTICS = "/diagnostics", "diagnostic_msgs/msg/DiagnosticArray"
+soon = partial(eventually, within_s=PATIENCE_S)
+FRAME_NS = round(robot_world.FRAME_S * 1e9)
 
 
 @contextmanager
-def robot(folder: Path, frames: range, *, output: str = "", speed: float = 0.4) -> Iterator[subprocess.Popen[str]]:
+def robot(
+    folder: Path, frames: range, output: str, *, speed: float, name: str = "r1"
+) -> Iterator[subprocess.Popen[str]]:
     """`locclient run` on a store's folder, with a ride that lasts."""
+    path, walk = folder / f"{name}.toml", folder / f"walk{frames.start}"
     if not (folder / "store").exists():
         with MapStore.open(folder / "store", create=True) as store:
             robot_world.save(store, has_grid=True)
-    path = folder / "robot.toml"
-    walk = robot_world.write(
-        folder / f"walk{frames.start}", islice(robot_world.bundles(frames.stop), frames.start, None)
-    )
+    if not walk.exists():
+        robot_world.write(walk, islice(robot_world.bundles(frames.stop), frames.start, None))
     path.write_text(
-        f'[run]\nstore = "{folder}/store"\nsite = "room"\nrobot = "r1"\noutbox = "{folder}/spool.sqlite3"\nframe_queue = 500\n'
+        f'[run]\nstore = "{folder}/store"\nsite = "room"\nrobot = "{name}"\noutbox = "{folder}/{name}.sqlite3"\nframe_queue = 500\n'
         f'[source]\nkind = "recording"\nrecording = "{walk}"\nspeed = {speed}\n[output]\nformat = "ros2"\n{output}'
     )
     with ros_program("-m", "locclient.cli", "run", "--config", str(path)) as process:
         yield process
 
 
-def diagnosis(peer: RosPeer) -> dict[str, Any]:
-    """The newest one's level, message and values."""
-    (status,) = (peer.heard("/diagnostics") or [{"status": [{"level": 9, "message": "", "values": []}]}])[-1]["status"]
-    return {"level": status["level"], "message": status["message"], **{v["key"]: v["value"] for v in status["values"]}}
+def diagnoses(peer: RosPeer, node: str = NODE) -> list[dict[str, Any]]:
+    """Severity, message and values of all so far."""
+    told = [status for message in peer.heard("/diagnostics") for status in message["status"]]
+    return [
+        {"severity": status["level"], "message": status["message"]} | {v["key"]: v["value"] for v in status["values"]}
+        for status in told
+        if status["name"].startswith(node)
+    ]
 
 
-def pose_at(peer: RosPeer) -> float:
-    return float(
-        (peer.heard("/amcl_pose") or [{"pose": {"pose": {"position": {"x": np.nan}}}}])[-1]["pose"]["pose"]["position"][
-            "x"
-        ]
-    )
+def diagnosis(peer: RosPeer, node: str = NODE) -> dict[str, Any]:
+    return [{"message": ""}, *diagnoses(peer, node)][-1]
+
+
+def is_contradicted(peer: RosPeer, node: str, what: str) -> bool:
+    """True if the node has said that another program publishes the same transform."""
+    words = f"another program publishes {what} too"
+    return any(words in told["message"] and told["severity"] == 2 for told in diagnoses(peer, node))
+
+
+def beats(manager: RosPeer) -> list[bool]:
+    """What the robot says on the bond: a subscriber receives its own messages too."""
+    return [beat["active"] for beat in manager.heard("/bond") if beat["instance_id"] != "manager"]
 
 
 def test_nav2_starts_it_asks_it_and_stops_it(tmp_path: Path) -> None:
     with (
-        lifecycle_manager(NODE) as manager,
+        ros_peer("lifecycle_manager_localization") as manager,
         ros_peer("navigator") as navigator,
-        robot(tmp_path, range(400), output="autostart = false\n") as process,
+        robot(tmp_path, range(400), "autostart = false\n", speed=0.4) as process,
     ):
-        navigator.listen("/tf", "tf2_msgs/msg/TFMessage")
-        assert manager.state() == UNCONFIGURED
-        assert not manager.change(3) and not manager.change(99) and not manager.change(0, "nonsense")
-        assert not eventually(lambda: bool(navigator.heard("/tf")), 1.0), "nothing is told before activation"
-        assert manager.startup()
-        assert manager.beats()[-1]["heartbeat_period"] == pytest.approx(0.1)
 
-        services = ["change_state", "get_available_states", "get_available_transitions", "get_transition_graph"]
-        services = [f"/{NODE}/{name}" for name in (*services, "get_state", "list_parameters", "set_parameters")]
-        services += ["/set_initial_pose", "/reinitialize_global_localization", "/request_nomotion_update"]
-        published = ["/tf", "/tf_static", "/amcl_pose", "/visual_odom", "/map", "/bond", "/diagnostics"]
-        wanted = {"services": services, "publishers": published, "subscriptions": ["/initialpose", "/tf", "/bond"]}
+        def state() -> str:
+            return manager.call(f"/{NODE}/get_state", "lifecycle_msgs/srv/GetState")["current_state"]["label"]
 
-        def missing() -> list[str]:
-            own = navigator.endpoints(NODE)
-            return [name for kind, names in wanted.items() for name in names if name not in own[kind]]
+        def change(number: int, label: str = "") -> bool:
+            transition = {"id": number, "label": label}
+            kind = "lifecycle_msgs/srv/ChangeState"
+            return manager.call(f"/{NODE}/change_state", kind, transition=transition)["success"]
 
-        assert eventually(lambda: not missing(), PATIENCE_S), missing()
+        def bond(*, active: bool) -> None:
+            said = {"id": NODE, "instance_id": "manager", "heartbeat_timeout": 4.0, "heartbeat_period": 0.1}
+            manager.publish("/bond", "bond/msg/Status", active=active, **said)
 
-        def is_placed() -> bool:
-            return any(
-                link["header"]["frame_id"] == "map" for told in navigator.heard("/tf") for link in told["transforms"]
-            )
+        navigator.listen("/tf", TF)
+        manager.listen("/bond", "bond/msg/Status")
+        assert state() == "unconfigured"
+        assert not change(3) and not change(99) and not change(0, "nonsense")
+        assert not eventually(lambda: navigator.heard("/tf") or beats(manager), 1.0), "nothing before activation"
+        assert change(1) and state() == "inactive" and change(3) and state() == "active"
+        bond(active=True)
+        assert soon(lambda: True in beats(manager))
+        assert manager.newest("/bond")["heartbeat_period"] == pytest.approx(0.1)
 
-        assert eventually(is_placed, PATIENCE_S)
-        for topic, kind in (
-            ("/amcl_pose", POSE),
-            ("/map", "nav_msgs/msg/OccupancyGrid"),
-            ("/tf_static", "tf2_msgs/msg/TFMessage"),
-        ):
-            navigator.listen(topic, kind, **LATCHED)  # late: BasicNavigator waits for a pose
-        navigator.listen("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+        own = ["get_state", "change_state", "get_available_states", "get_available_transitions", "get_transition_graph"]
+        services = [f"{NODE}/{name}" for name in (*own, "list_parameters", "set_parameters")]
+        services += ["set_initial_pose", "reinitialize_global_localization", "request_nomotion_update"]
+        wanted = {f"service /{name}" for name in services}
+        wanted |= {f"publisher /{name}" for name in ("tf", "tf_static", "visual_odom", "map", "bond", "diagnostics")}
+        wanted |= {f"subscription /{name}" for name in ("initialpose", "tf", "bond")}
+        assert soon(lambda: wanted <= set(navigator.endpoints(NODE))), wanted - set(navigator.endpoints(NODE))
+
+        assert soon(lambda: any(link[0] == "map" for link in links(navigator, "/tf")))
+        late = {"/amcl_pose": POSE, "/map": "nav_msgs/msg/OccupancyGrid", "/tf_static": TF}
+        for topic, kind in late.items():  # as BasicNavigator waits for a pose
+            navigator.listen(topic, kind, **LATCHED)
+        navigator.listen(*DIAGNOSTICS)
         navigator.listen("/visual_odom", "nav_msgs/msg/Odometry")
-        assert eventually(lambda: diagnosis(navigator)["message"] == "TRACKING", PATIENCE_S)
+        assert soon(lambda: diagnosis(navigator)["message"] == "TRACKING")
         grid = navigator.newest("/map")
         assert {100, 0} <= set(grid["data"]) and grid["header"]["frame_id"] == "map"
-        static = navigator.newest("/tf_static")
-        found = [(link["header"]["frame_id"], link["child_frame_id"]) for link in static["transforms"]]
-        assert found[0] == ("base_link", "fleetmap_body") and found[2][1] == "fleetmap_cam1_optical"
+        navigator.newest("/tf_static")
+        static = links(navigator, "/tf_static")
+        assert static[0][:2] == ("base_link", "fleetmap_body") and static[2][1] == "fleetmap_cam1_optical"
         assert navigator.newest("/visual_odom")["child_frame_id"] == "base_link"
 
         # An operator.
+        def places_m() -> list[float]:
+            return [told["pose"]["pose"]["position"]["x"] for told in navigator.heard("/amcl_pose")]
+
         given = navigator.newest("/amcl_pose")
         far = given["pose"] | {"covariance": [0.0] * 36}
         far["pose"]["position"]["x"] += 6.0
-        bad = far | {"covariance": [-1.0, *[0.0] * 35]}
-        for topic, words in ((given["header"], "positive"), (given["header"] | {"frame_id": "odom"}, "frame 'odom'")):
-            navigator.call("/set_initial_pose", "nav2_msgs/srv/SetInitialPose", pose={"header": topic, "pose": bad})
-            assert eventually(lambda w=words: w in diagnosis(navigator).get("refused_initial_pose", ""), PATIENCE_S)
+        far_m, bad = far["pose"]["position"]["x"], far | {"covariance": [-1.0, *[0.0] * 35]}
+        for header, words in ((given["header"], "positive"), (given["header"] | {"frame_id": "odom"}, "frame 'odom'")):
+            navigator.call("/set_initial_pose", "nav2_msgs/srv/SetInitialPose", pose={"header": header, "pose": bad})
+            assert soon(lambda w=words: w in diagnosis(navigator).get("refused_initial_pose", ""))
         navigator.publish("/initialpose", POSE, raw=list(b"nonsense"))
-        assert abs(pose_at(navigator) - far["pose"]["position"]["x"]) > 3, "what was refused changes nothing"
+        assert min(abs(x_m - far_m) for x_m in places_m()) > 3, "what was refused changes nothing"
         navigator.publish("/initialpose", POSE, header=given["header"], pose=far)
-        assert eventually(lambda: abs(pose_at(navigator) - far["pose"]["position"]["x"]) < 1, PATIENCE_S)
+        assert soon(lambda: min(abs(x_m - far_m) for x_m in places_m()) < 1)
         navigator.call("/reinitialize_global_localization", "std_srvs/srv/Empty")
-        at_m = far["pose"]["position"]["x"]
-        assert eventually(
-            lambda: diagnosis(navigator)["message"] == "TRACKING" and abs(pose_at(navigator) - at_m) > 3, PATIENCE_S
-        )
-        assert eventually(lambda: "refused_initial_pose" not in diagnosis(navigator), PATIENCE_S)
+        assert soon(lambda: abs(places_m()[-1] - far_m) > 3 and diagnosis(navigator)["message"] == "TRACKING")
+        assert soon(lambda: "refused_initial_pose" not in diagnosis(navigator))
 
         # `ros2 param`.
         names = navigator.call(f"/{NODE}/list_parameters", "rcl_interfaces/srv/ListParameters")["result"]["names"]
         assert {"output.publish_odom", "output.map_frame", "output.transform_tolerance_s"} <= set(names)
         results = []
-        for name, value in (
-            ("map_frame", {"type": 4, "string_value": "site"}),
-            ("transform_tolerance_s", {"type": 0}),
-            ("transform_tolerance_s", {"type": 3, "double_value": -1.0}),
-            ("transform_tolerance_s", {"type": 3, "double_value": 0.3}),
-        ):
-            change = [{"name": f"output.{name}", "value": value}]
-            results += navigator.call(f"/{NODE}/set_parameters", "rcl_interfaces/srv/SetParameters", parameters=change)[
-                "results"
-            ]
-        assert [one["successful"] for one in results] == [False, False, False, True]
+        changes = [("map_frame", {"type": 4, "string_value": "site"}), ("transform_tolerance_s", {"type": 0})]
+        tolerances = [{"type": 3, "double_value": seconds} for seconds in (-1.0, 61.0, float("nan"), 0.3)]
+        for name, value in (*changes, *(("transform_tolerance_s", each) for each in tolerances)):
+            parameters = [{"name": f"output.{name}", "value": value}]
+            service = f"/{NODE}/set_parameters", "rcl_interfaces/srv/SetParameters"
+            results += navigator.call(*service, parameters=parameters)["results"]
+        assert [one["successful"] for one in results] == [False] * 5 + [True]
         assert "output.map_frame: it is read at the start" in results[0]["reason"]
 
-        # Another subscriber than ROS connects with it.
+        # Another subscriber than ROS connects with it, and another publisher of its transform.
         navigator.listen("/localization/status", "std_msgs/msg/String", **LATCHED)
         pair = "/localization/status: navigator does not receive from fleetmap_localizer: Volatile publisher"
-        assert eventually(lambda: pair in diagnosis(navigator)["message"], PATIENCE_S)
-
+        assert soon(lambda: pair in diagnosis(navigator)["message"])
         link = {"header": given["header"] | {"frame_id": "odom"}, "child_frame_id": "base_link"}
-        navigator.publish("/tf", "tf2_msgs/msg/TFMessage", transforms=[link])
-        other = "another program publishes odom -> base_link too"
-        assert eventually(
-            lambda: other in diagnosis(navigator)["message"] and diagnosis(navigator)["level"] == 2, PATIENCE_S
-        )
+        navigator.publish("/tf", TF, transforms=[link])
+        assert soon(lambda: is_contradicted(navigator, NODE, "odom -> base_link"))
 
-        assert manager.change(0, "deactivate") and manager.state() == INACTIVE
-        assert eventually(lambda: not manager.beats()[-1]["active"], PATIENCE_S), "the bond ends with the active state"
-        assert manager.change(3)
-        assert eventually(lambda: manager.beats()[-1]["active"], PATIENCE_S)
-        manager.tell_bond(active=False)
-        assert eventually(lambda: not manager.beats()[-1]["active"], PATIENCE_S), "the end is acknowledged"
-        assert manager.state() == ACTIVE
-        assert manager.change(7) and manager.state() == FINALIZED
+        assert change(0, "deactivate") and state() == "inactive"
+        assert soon(lambda: not beats(manager)[-1]), "the bond ends with the active state"
+        assert change(3)
+        assert soon(lambda: beats(manager)[-1])
+        bond(active=False)
+        assert soon(lambda: not beats(manager)[-1]), "the end is acknowledged"
+        assert state() == "active"
+        assert change(7) and state() == "finalized"
         process.send_signal(signal.SIGTERM)
         assert process.wait(PATIENCE_S) == 0
-        assert eventually(lambda: NODE not in manager.nodes(), PATIENCE_S)
+        assert soon(lambda: NODE not in manager.nodes())
+
+
+def test_what_nodes_tell_of_their_map_of_a_building_of_a_stuck_robot_and_of_a_middleware_that_fails() -> None:
+    """A topic that is remapped is so once, and gets what a best-effort publisher sends there."""
+    remapped = ["--ros-args", "-r", "/initialpose:=/given", "-r", "/given:=/other"]
+    with ros_program("-m", "support.ros2.scripted_localizer", *remapped) as process, ros_peer("navigator") as peer:
+        peer.listen(*DIAGNOSTICS)
+        peer.listen("/bond", "bond/msg/Status")
+        peer.listen("/tf_static", TF, **LATCHED)
+        peer.listen("/map", "nav_msgs/msg/OccupancyGrid", **LATCHED)
+        assert soon(lambda: diagnosis(peer, "whole")["message"] == "TRACKING")
+        told = {"map": "version 2 has no grid", "floor": "hall_2", "level": "2", "radius_95_m": "0.056"}
+        assert told.items() <= diagnosis(peer, "whole").items()
+        assert peer.newest("/map")["info"]["width"] == 3, "the last grid stays"
+        assert soon(lambda: ("building", "map") in [link[:2] for link in links(peer, "/tf_static")])
+
+        assert soon(lambda: "publisher /attic/tf" in peer.endpoints("bare", "/attic"))
+        assert "publisher /attic/map" not in peer.endpoints("bare", "/attic")
+        peer.publish("/attic/tf", TF, transforms=[{"header": {"frame_id": "map"}, "child_frame_id": "odom"}])
+        assert soon(lambda: is_contradicted(peer, "bare", "map -> odom"))
+
+        peer.publish("/given", POSE, qos=BEST_EFFORT, header={"frame_id": "odom"})
+        assert soon(lambda: "'odom'" in diagnosis(peer, "whole").get("refused_initial_pose", ""))
+        assert "subscription /other" not in peer.endpoints("whole")
+
+        def is_bonded(within_s: float = 2.0) -> bool:
+            count = len(peer.heard("/bond"))
+            return eventually(lambda: len(peer.heard("/bond")) > count, within_s)
+
+        assert is_bonded(PATIENCE_S)
+        process.stdin.write("stuck\n")
+        process.stdin.flush()
+        assert soon(lambda: not is_bonded())
+        process.stdin.write("on\n")
+        process.stdin.flush()
+        assert is_bonded(PATIENCE_S)
+        process.stdin.write("down\n")
+        process.stdin.flush()
+        assert [line.split(":")[0] for line in process.stdout] == ["ROS 2 did not send"] * 2
+        assert process.wait(PATIENCE_S) == 0
 
 
 LIVES = (range(110), range(110, 230))
 RESET_FRAME, RESTART_FRAMES = 80, range(185, 198)
 
 
-def driver_poses(truth: list[Array]) -> list[list[tuple[int, list[float]]]]:
+def driver_poses(truth: list[Array]) -> list[deque[tuple[int, Array]]]:
     """Stamps and odom_from_base of two runs of the driver: of the first the origin is reset once; the second starts at another one."""
-    camera, frame_ns = calibration().cameras[0], round(robot_world.FRAME_S * 1e9)
+    camera = calibration().cameras[0]
     begun_ns = int(robot_world.cycle().stamps_ns[0]) + round(camera.imu_minus_cam_s * 1e9)
-    runs: list[list[tuple[int, list[float]]]] = [[], []]
+    runs = [deque[tuple[int, Array]](), deque[tuple[int, Array]]()]
+    begin = se3(so3_exp(np.array([0, 0, 1.0])), np.array([-40.0, 7.0, 0.0]))
     for number, (before, after) in enumerate(pairwise(truth)):
-        turn = so3_log(before[:3, :3].T @ after[:3, :3])
-        for step in range(5):
+        turn, step_m = so3_log(before[:3, :3].T @ after[:3, :3]), after[:3, 3] - before[:3, 3]
+        for step in range(5 * (number not in RESTART_FRAMES)):
             share = step / 5
-            map_from_base = se3(
-                before[:3, :3] @ so3_exp(share * turn), (1 - share) * before[:3, 3] + share * after[:3, 3]
-            )
-            run, origin = (
-                int(number >= RESTART_FRAMES.stop),
-                se3(so3_exp(np.array([0, 0, 1.0])), np.array([-40.0, 7.0, 0.0])),
-            )
-            if run:
-                origin = truth[0]
-            elif number > RESET_FRAME or (number == RESET_FRAME and step > 2):
-                origin = truth[RESET_FRAME]
-            if number not in RESTART_FRAMES:
-                stamp_ns = begun_ns + number * frame_ns + step * frame_ns // 5
-                runs[run].append((stamp_ns, position_quat_xyzw(se3_inverse(origin) @ map_from_base).tolist()))
+            map_from_base = se3(before[:3, :3] @ so3_exp(share * turn), before[:3, 3] + share * step_m)
+            run = int(number >= RESTART_FRAMES.stop)
+            origin = truth[0] if run else truth[RESET_FRAME] if number + share > RESET_FRAME + 0.5 else begin
+            runs[run].append((begun_ns + number * FRAME_NS + step * FRAME_NS // 5, se3_inverse(origin) @ map_from_base))
     return runs
 
 
-@pytest.mark.parametrize("publish_odom", [True, False])
-def test_the_tree_holds_the_true_pose_at_every_frame(tmp_path: Path, publish_odom: bool) -> None:
-    """Over two lives of the localizer, a reset of the driver's odometry, and a restart of the driver."""
+def drive(driver: RosPeer, way: deque[tuple[int, Array]], until_ns: int) -> None:
+    """Publish the driver's transforms up to then."""
+    transforms = []
+    while way and way[0][0] <= until_ns:
+        stamp_ns, odom_from_base = way.popleft()
+        values = position_quat_xyzw(odom_from_base).tolist()
+        place, turn = (dict(zip("xyzw", part, strict=False)) for part in (values[:3], values[3:]))
+        header = {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}, "frame_id": "odom"}
+        transform = {"translation": place, "rotation": turn}
+        transforms.append({"header": header, "child_frame_id": "base_link", "transform": transform})
+    if transforms:
+        driver.publish("/wheels/tf", TF, transforms=transforms)
+
+
+def links(peer: RosPeer, topic: str) -> list[tuple[str, str, int, Array]]:
+    """Parent, child, stamp and parent_from_child (4, 4) of all transforms of a topic."""
+    found = []
+    for told in [told for message in peer.heard(topic) for told in message["transforms"]]:
+        stamp, place, turn = told["header"]["stamp"], told["transform"]["translation"], told["transform"]["rotation"]
+        rotation = rotation_from_quat_wxyz(np.array([turn[axis] for axis in "wxyz"]))
+        parent_from_child = se3(rotation, np.array([place[axis] for axis in "xyz"]))
+        stamp_ns = stamp["sec"] * 10**9 + stamp["nanosec"]
+        found.append((told["header"]["frame_id"], told["child_frame_id"], stamp_ns, parent_from_child))
+    return found
+
+
+def test_the_tree_holds_the_true_pose_at_every_frame(tmp_path: Path) -> None:
+    """Over two lives of the localizer, with its own odometry, and with a driver's, which is reset once and started again."""
     truth = [robot_world.truth(n) @ se3_inverse(calibration().base_from_body) for n in range(LIVES[-1].stop + 1)]
-    with ros_peer("listener") as listener, ExitStack() as drivers:
-        listener.listen("/tf", "tf2_msgs/msg/TFMessage")
-        for number, run in enumerate(driver_poses(truth) if not publish_odom else []):
-            (tmp_path / f"poses{number}.json").write_text(json.dumps(run))
-            drivers.enter_context(ros_program("-m", "support.ros2.wheel_driver", str(tmp_path / f"poses{number}.json")))
+    is_own, runs = {"camera": True, "wheels": False}, driver_poses(truth)
+    with ExitStack() as stack:
+        listener, *drivers = [stack.enter_context(ros_peer(name)) for name in ("listener", "driver", "restarted")]
+        listener.listen("/wheels/visual_odom", "nav_msgs/msg/Odometry")
+        for name in is_own:
+            listener.listen(f"/{name}/tf", TF)
+        for driver in drivers:
+            driver.publish("/wheels/tf", TF)
         for life in LIVES:
-            settings = f"publish_odom = {str(publish_odom).lower()}\n"
-            with robot(tmp_path, life, output=settings, speed=1.0) as process:
-                assert process.wait(120) == 0
-        links = [link_of(told) for message in listener.heard("/tf") for told in message["transforms"]]
-    begun_ns, frame_ns = int(robot_world.cycle().stamps_ns[0]), round(robot_world.FRAME_S * 1e9)
-    place_of = {link.stamp_ns: link.parent_from_child for link in links if link.child == "base_link"}
-    placed = [((link.stamp_ns - begun_ns) // frame_ns, link) for link in links if link.parent == "map"]
-    wanted = {
-        n for life in LIVES for n in life[50:] if publish_odom or n not in (RESTART_FRAMES.start - 1, *RESTART_FRAMES)
-    }
-    assert wanted <= {number for number, _ in placed}, "once ROS has connected all, if the driver's pose is known"
-    for number, link in placed:
-        error_m = (link.parent_from_child @ place_of[link.stamp_ns])[:3, 3] - truth[number][:3, 3]
-        assert np.linalg.norm(error_m) < 0.025, number
-
-
-def link_of(told: dict[str, Any]) -> FrameLink:
-    stamp, place, turn = told["header"]["stamp"], told["transform"]["translation"], told["transform"]["rotation"]
-    rotation = rotation_from_quat_wxyz(np.array([turn[axis] for axis in "wxyz"]))
-    parent_from_child = se3(rotation, np.array([place[axis] for axis in "xyz"]))
-    return FrameLink(
-        told["header"]["frame_id"], told["child_frame_id"], parent_from_child, stamp["sec"] * 10**9 + stamp["nanosec"]
-    )
+            with ExitStack() as alive:
+                robots = []
+                for name, is_publisher in is_own.items():
+                    output = f'namespace = "{name}"\npublish_odom = {str(is_publisher).lower()}\n'
+                    robots.append(alive.enter_context(robot(tmp_path, life, output, speed=2.0, name=name)))
+                while any(process.poll() is None for process in robots):
+                    stamp = listener.newest("/wheels/visual_odom")["header"]["stamp"]
+                    for driver, way in zip(drivers, runs, strict=True):
+                        drive(driver, way, stamp["sec"] * 10**9 + stamp["nanosec"] + 5 * FRAME_NS)
+                    time.sleep(0.05)
+                assert [process.returncode for process in robots] == [0, 0]
+        sent = {name: links(listener, f"/{name}/tf") for name in is_own}
+    begun_ns = int(robot_world.cycle().stamps_ns[0])
+    for name, is_publisher in is_own.items():
+        odom_from_base = {stamp_ns: pose for _, child, stamp_ns, pose in sent[name] if child == "base_link"}
+        placed = {(ns - begun_ns) // FRAME_NS: (ns, pose) for parent, _, ns, pose in sent[name] if parent == "map"}
+        for life in LIVES:
+            first = min(set(placed) & set(life))
+            assert first < life.start + 75, "ROS has connected all before the driver's pose is not known"
+            unknown = {*RESTART_FRAMES, RESTART_FRAMES.start - 1} if not is_publisher else set()
+            assert set(range(first, life.stop - 5)) - unknown <= set(placed)
+        for number, (stamp_ns, map_from_odom) in placed.items():
+            error_m = (map_from_odom @ odom_from_base[stamp_ns])[:3, 3] - truth[number][:3, 3]
+            assert np.linalg.norm(error_m) < 0.025, (name, number)

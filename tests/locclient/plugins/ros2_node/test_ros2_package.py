@@ -21,8 +21,9 @@ from mapserver.trust import init_here
 from support.fleet.contracts_documents import REPOSITORY
 from support.recordings.recording_samples import kalibr_text
 from support.ros2.environment import needs_ros, ros_environment, ros_program
-from support.ros2.peer import UNCONFIGURED, lifecycle_manager
+from support.ros2.peer import ros_peer
 from support.storage.map_samples import publish_samples
+from support.waiting import eventually
 
 PACKAGE = REPOSITORY / "deploy/ros2/fleetmap_ros"
 NAV2 = Path("/nav2_bringup")  # whose files ROS has
@@ -65,10 +66,11 @@ def test_colcon_builds_a_program_that_leaves_arguments_of_ros_to_rclpy(tmp_path:
     environment = ros_environment() | {"PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin"}
     with (
         subprocess.Popen(["sh", "-c", command], cwd=tmp_path, env=environment) as localizer,
-        lifecycle_manager("r1/place") as manager,
+        ros_peer("lifecycle_manager_localization") as manager,
     ):
-        assert manager.state() == UNCONFIGURED
-        assert {"place", "fleetmap_sensors"} <= set(manager.nodes())
+        state = manager.call("/r1/place/get_state", "lifecycle_msgs/srv/GetState")["current_state"]
+        assert state["label"] == "unconfigured"
+        assert eventually(lambda: {"place", "fleetmap_sensors"} <= set(manager.nodes()))
         localizer.terminate()
 
 

@@ -1,0 +1,60 @@
+"""Outputs of a robot whose estimates are made up, two nodes: `python -m support.ros2.scripted_localizer [ARGUMENTS OF ROS]`.
+
+A line "stuck" on its standard input stops them until the next line; "down" ends ROS 2 below them, and prints what they say to that.
+"""
+
+import select
+import sys
+import time
+from dataclasses import replace
+
+import numpy as np
+import rclpy
+from rclpy.utilities import get_default_context
+
+from fleetmap.errors import LinkError
+from fleetmap.geometry import se3
+from fleetmap.sources.intake import Intake
+from fleetmap.version_grid import OccupancyGrid
+from locclient.outputs import OutputSection
+from locclient.plugins.ros2_node import OUTPUT
+from locclient.robot.continuous_odom import ContinuousOdom
+from support.fleet.estimates import estimate
+from support.recordings.recording_samples import calibration
+
+BUILDING_FROM_MAP = se3(np.eye(3), np.array([40.0, 0.0, 0.0]))
+SECTIONS = (
+    OutputSection(format="ros2", node="whole", building_frame="building"),
+    OutputSection(format="ros2", node="bare", namespace="attic", map_topic="", publish_odom=False),
+)
+
+
+def main() -> None:
+    rclpy.init(args=sys.argv)
+    intake, odom = Intake(frames=1, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0), ContinuousOdom(np.eye(4))
+    localizers = [OUTPUT.open(section, None, "hall", "r1", calibration(), intake) for section in SECTIONS]
+    for localizer in localizers:
+        localizer.show_grid(1, OccupancyGrid(np.full((2, 3), 100, np.int8), 0.05, np.eye(4)), "")
+        localizer.show_grid(2, None, "version 2 has no grid")
+    word = ""
+    while word != "down":
+        told = replace(estimate(time.time()), floor="hall_2")
+        published = replace(odom.handle(told), building_from_map=BUILDING_FROM_MAP, level="2")
+        for localizer in localizers:
+            localizer.publish(told, published, np.eye(4))
+            localizer.alive(False)
+        if select.select([sys.stdin], [], [], 0.1)[0]:
+            word = sys.stdin.readline().strip()
+        if word == "stuck":
+            word = sys.stdin.readline().strip()
+    get_default_context().handle.shutdown()
+    for localizer in localizers:
+        try:
+            localizer.publish(told, published, np.eye(4))
+        except LinkError as error:
+            print(error, flush=True)
+        localizer.close()
+
+
+if __name__ == "__main__":
+    main()
