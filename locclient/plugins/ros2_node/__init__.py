@@ -9,7 +9,6 @@ from contextlib import contextmanager
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import UsageError
@@ -17,14 +16,14 @@ from fleetmap.recordings import Topics, read_calibration
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.source_settings import SourceSection
 from fleetmap.sources.intake import Intake
+from fleetmap.sources.source import Source
 from locclient.hooks import OutputHook
 from locclient.outputs import OutputSection, Publisher
 from locclient.plugins.ros2_node.sensor_messages import SensorMessages
 
-if TYPE_CHECKING:
-    from locclient.plugins.ros2_node.source import Ros2Source
-
 _log = logging.getLogger(__name__)
+# Of the robot of this process, as they were checked: a source is opened without [output], an output without [topics].
+_checked = [(OutputSection(), Topics())]
 
 
 @contextmanager
@@ -40,17 +39,17 @@ def _sourced() -> Iterator[None]:
         ) from error
 
 
-def open_topics(section: SourceSection, topics: Topics, map_frame: str, *, images: bool = True) -> "Ros2Source":
+def open_topics(section: SourceSection, topics: Topics, map_frame: str, *, images: bool = True) -> Source:
     """Open ROS 2 topics as the source, or beside another one, which has the images."""
-    calibration = rig_of(section)
+    calibration, has_depth = rig_of(section), section.sensors == "rgbd"
+    messages = SensorMessages(topics, calibration, images=images, has_depth=has_depth, map_frame=map_frame)
     with _sourced():
         from locclient.plugins.ros2_node.source import Ros2Source
-    has_depth = section.sensors == "rgbd"
-    messages = SensorMessages(topics, calibration, images=images, has_depth=has_depth, map_frame=map_frame)
-    return Ros2Source(messages, calibration, has_depth=has_depth)
+
+        return Ros2Source(messages, calibration, has_depth=has_depth, namespace=_checked[0][0].namespace)
 
 
-def topics_beside(section: SourceSection, topics: Topics, map_frame: str) -> "Ros2Source | None":
+def topics_beside(section: SourceSection, topics: Topics, map_frame: str) -> Source | None:
     """Open the topics beside another source of images; None, with a warning, without ROS 2 and an IMU, which would need it."""
     if find_spec("rclpy") is None and rig_of(section).imu is None:
         _log.warning("ROS 2 is not sourced: the camera is used without wheels and priors")
@@ -77,32 +76,26 @@ def _open_output(
 ) -> Publisher:
     with _sourced():
         from locclient.plugins.ros2_node.localizer import Ros2Localizer
-    return Ros2Localizer(section, robot, calibration, intake)
+
+        return Ros2Localizer(section, _checked[0][1], robot, calibration, intake)
 
 
-def check_frames(section: OutputSection) -> None:
-    """Raise UsageError for names of frames that tf2 rejects."""
-    frames = (section.map_frame, section.odom_frame, section.base_frame)
-    if len(set(frames)) < 3 or any(not name or name.startswith("/") for name in frames):
-        raise UsageError(
-            f"[output] map_frame, odom_frame and base_frame = {', '.join(map(repr, frames))}: tf2 needs three different names "
-            "that do not begin with a slash"
-        )
-
-
-def _check(section: OutputSection, topics: Topics) -> None:
+def check(section: OutputSection, topics: Topics) -> None:
     """Raise UsageError for an endpoint, for frames that tf2 rejects, and for odometry that would come back as that of the wheels."""
-    check_frames(section)
+    frames = (section.map_frame, section.odom_frame, section.base_frame)
+    names = ", ".join(map(repr, frames))
+    if len(set(frames)) < 3 or any(not name or name.startswith("/") for name in frames):
+        fault = f"map_frame, odom_frame and base_frame = {names}: tf2 needs three different names that do not begin with a slash"
+        raise UsageError(f"[output] {fault}")
     if section.endpoint is not None:
-        raise UsageError(
-            f"[output] endpoint = {section.endpoint!r} is none of ROS 2, which has ROS_DOMAIN_ID and RMW_IMPLEMENTATION in the "
-            "environment; leave it out"
-        )
+        fault = "is none of ROS 2, which has ROS_DOMAIN_ID and RMW_IMPLEMENTATION in the environment; leave it out"
+        raise UsageError(f"[output] endpoint = {section.endpoint!r} {fault}")
     if section.odom_topic.lstrip("/") == topics.wheel.lstrip("/"):
         raise UsageError(
             f"[output] odom_topic = {section.odom_topic!r} is also the topic of [topics] wheel: the robot would take its own "
             'odometry for that of its wheels; set wheel = "" if it has none'
         )
+    _checked[0] = section, topics
 
 
-OUTPUT = OutputHook(_open_output, _check, needs_bus=False)
+OUTPUT = OutputHook(_open_output, check, needs_bus=False)

@@ -1,51 +1,84 @@
 """From the messages of a robot's ROS 2 to frames of its rig and samples of its other sensors; without ROS itself."""
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import StoredFrame, Topics
 from fleetmap.recordings.images import StoredImage, grey_bits, grey_image, grey_peak, is_wide
-from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS
+from fleetmap.recordings.ordering import DEPTH_TOLERANCE_NS, PAIR_TOLERANCE_NS
 from fleetmap.recordings.ros2 import messages
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.samples import ImuSamples
+from fleetmap.sensors.samples import UNSAID_SIGMAS, ImuSamples, PositionPrior
 from fleetmap.sensors.source_settings import CAMERA_ROLES, DEPTH_ROLES, transports
 from fleetmap.sources.intake import Intake
 
 _WAITING_IMAGES = 8  # images of each side waiting for their partner
-_DEAD_NS = 500_000_000
+_DEAD_NS, _NEVER_NS = 500_000_000, -(2**63)
 Take = Callable[[Intake, bool, bytes], None]
 
 
-class StereoPairs:
-    """Pairs the images of two streams whose stamps are within the tolerance of one rig; images without a partner are counted."""
+class _View:
+    """A view of a rig: images that wait for their partner of the same moment, and its last frames."""
 
-    def __init__(self) -> None:
-        self._waiting: dict[str, deque[tuple[int, StoredImage]]] = {"left": deque(), "right": deque()}
-        self.unpaired = 0
+    def __init__(self, numbers: tuple[int, ...], has_depth: bool) -> None:
+        self.numbers, self.recent = numbers, deque[StoredFrame](maxlen=_WAITING_IMAGES)
+        self.used_ns = _NEVER_NS  # last stamp in a frame of the rig
+        self.silent_since_ns: int | None = None  # first stamp since the first view's last frame
+        self._second = "depth" if has_depth else "right" if len(numbers) > 1 else ""
+        self._tolerance_ns = DEPTH_TOLERANCE_NS if has_depth else PAIR_TOLERANCE_NS
+        self._unpaired = tuple(deque[StoredFrame](maxlen=_WAITING_IMAGES) for _ in range(2))  # of either side
 
-    def add(self, side: str, stamp_ns: int, image: StoredImage) -> StoredFrame | None:
-        """Add an image; return the frame that it completes, None while its partner is missing. side: left or right."""
-        others = self._waiting["right" if side == "left" else "left"]
-        partner = min(others, key=lambda item: abs(item[0] - stamp_ns), default=None)
-        if partner is None or abs(partner[0] - stamp_ns) > PAIR_TOLERANCE_NS:
-            own = self._waiting[side]
-            own.append((stamp_ns, image))
-            if len(own) > _WAITING_IMAGES:
-                own.popleft()
-                self.unpaired += 1
-            return None
-        for items in self._waiting.values():
-            while items and items[0][0] <= max(partner[0], stamp_ns):
-                if items.popleft() is not partner:
-                    self.unpaired += 1
-        left, right = (image, partner[1]) if side == "left" else (partner[1], image)
-        return StoredFrame(stamp_ns if side == "left" else partner[0], left, right)
+    def add(self, side: int, stamp_ns: int, image: StoredImage) -> StoredFrame | None:
+        """Add an image; return the frame that it completes, None while its partner is missing. side: 1 for a right image or depth.
+
+        RecordingError if those of both sides find none.
+        """
+        frame = StoredFrame(stamp_ns, image)
+        if self._second:
+            own, others = self._unpaired[side], self._unpaired[1 - side]
+            partner = min(others, key=lambda item: abs(item.stamp_ns - stamp_ns), default=None)
+            if partner is None or abs(partner.stamp_ns - stamp_ns) > self._tolerance_ns:
+                is_full = len(own) == own.maxlen
+                own.append(frame)
+                if is_full and others:  # both sides send
+                    within = f"within {self._tolerance_ns * 1e-6:g} ms"
+                    raise RecordingError(
+                        f"an image at {stamp_ns} has no partner {within}: are both triggered together?"
+                    )
+                return None
+            for items in self._unpaired:
+                while items and items[0].stamp_ns <= max(partner.stamp_ns, stamp_ns):
+                    items.popleft()
+            left, second = (partner, frame) if side else (frame, partner)
+            field: dict[str, Any] = {self._second: second.left}
+            frame = replace(left, **field)
+        if self.recent and frame.stamp_ns <= self.recent[-1].stamp_ns:  # its clock was set
+            self.recent.clear()
+            self.used_ns = _NEVER_NS
+        self.recent.append(frame)
+        return frame
+
+    @property
+    def period_ns(self) -> int | None:
+        stamps = [frame.stamp_ns for frame in self.recent]
+        return int(np.median(np.diff(stamps))) if len(stamps) > 1 else None
+
+    def take_near(self, stamp_ns: int, within_ns: int) -> StoredFrame | None:
+        """Return the unused frame nearest to a stamp, None if there is none within."""
+        near = [
+            frame
+            for frame in self.recent
+            if frame.stamp_ns > self.used_ns and abs(frame.stamp_ns - stamp_ns) <= within_ns
+        ]
+        found = min(near, key=lambda frame: abs(frame.stamp_ns - stamp_ns), default=None)
+        self.used_ns = self.used_ns if found is None else found.stamp_ns
+        return found
 
 
 class RigFrames:
@@ -57,86 +90,54 @@ class RigFrames:
 
     def __init__(self, calibration: RigCalibration, *, has_depth: bool = False) -> None:
         """has_depth: whether the first view is a camera with depth."""
-        self._views = calibration.views
-        self._has_depth = [has_depth, *(calibration.cameras[view[0]].has_depth for view in self._views[1:])]
-        self._pairs = [
-            StereoPairs() if len(view) > 1 or has_depth else None
-            for view, has_depth in zip(self._views, self._has_depth, strict=True)
-        ]
-        self._recent = [deque[StoredFrame](maxlen=_WAITING_IMAGES) for _ in self._views]  # of each view
+        has_depths = [has_depth, *(calibration.cameras[view[0]].has_depth for view in calibration.views[1:])]
+        self._views = [_View(*view) for view in zip(calibration.views, has_depths, strict=True)]
+        self._leader = self._views[0]
         self._waiting: StoredFrame | None = None
-        self._leader = 0
-        self._silent_since_ns = dict[int, int]()  # first stamps of other views since the first view's last frame
-        self._used_ns = dict[int, int]()  # last stamps in a frame, of other views
         first = calibration.cameras[0]
         self._black = grey_image(np.zeros((first.height_px, first.width_px), np.uint8))
 
-    @property
-    def unpaired(self) -> int:
-        return sum(pairs.unpaired for pairs in self._pairs if pairs is not None)
-
     def add(self, number: int, stamp_ns: int, image: StoredImage, *, is_depth: bool = False) -> list[StoredFrame]:
-        """Add an image of a camera, or its depth; return the frames that are complete."""
-        view = next(k for k, numbers in enumerate(self._views) if number in numbers)
-        pairs, side = self._pairs[view], "left" if number == self._views[view][0] and not is_depth else "right"
-        frame = StoredFrame(stamp_ns, image) if pairs is None else pairs.add(side, stamp_ns, image)
-        if frame is None:
-            return []
-        if self._has_depth[view]:
-            frame = replace(frame, right=None, depth=frame.right)
-        recent = self._recent[view]
-        if recent and frame.stamp_ns <= recent[-1].stamp_ns:  # its clock was set
-            recent.clear()
-            self._used_ns.pop(view, None)
-        recent.append(frame)
+        """Add an image of a camera, or its depth; return the frames that are complete. RecordingError for one without a partner."""
+        view = next(view for view in self._views if number in view.numbers)
+        frame = view.add(int(is_depth or number != view.numbers[0]), stamp_ns, image)
         done = list[StoredFrame]()
+        if frame is None:
+            return done
         if self._leads(view, frame.stamp_ns):
-            done += [] if self._waiting is None else [self._with_others(self._waiting)]
-            self._waiting = frame if view == 0 else StoredFrame(frame.stamp_ns, self._black)
-        if self._waiting is not None and not any(map(self._is_expected, self._recent[1:])):
+            done = [] if self._waiting is None else [self._with_others(self._waiting)]
+            self._waiting = frame if view is self._views[0] else StoredFrame(frame.stamp_ns, self._black)
+        if self._waiting is not None and not any(self._is_expected(view, self._waiting) for view in self._views[1:]):
             done.append(self._with_others(self._waiting))
             self._waiting = None
         return done
 
-    def _leads(self, view: int, stamp_ns: int) -> bool:
+    def _leads(self, view: _View, stamp_ns: int) -> bool:
         """True if frames have the stamps of this view, the first one or one that stands in for it."""
-        if view == 0:
-            self._leader = 0
-            self._silent_since_ns.clear()
-        elif stamp_ns - self._silent_since_ns.setdefault(view, stamp_ns) > _DEAD_NS and (
-            self._leader == 0 or abs(stamp_ns - self._recent[self._leader][-1].stamp_ns) > _DEAD_NS
-        ):
+        first, *others = self._views
+        if view is first:
+            self._leader = first
+            for other in others:
+                other.silent_since_ns = None
+            return True
+        if view.silent_since_ns is None:
+            view.silent_since_ns = stamp_ns
+        is_alone = self._leader is first or abs(stamp_ns - self._leader.recent[-1].stamp_ns) > _DEAD_NS
+        if is_alone and stamp_ns - view.silent_since_ns > _DEAD_NS:
             self._leader = view
-        return view == self._leader
+        return view is self._leader
 
-    def _is_expected(self, recent: deque[StoredFrame]) -> bool:
+    def _is_expected(self, view: _View, waiting: StoredFrame) -> bool:
         """True if the next image of a view that still sends belongs to the waiting frame, by the rate of that view."""
-        assert self._waiting is not None
-        if not recent or recent[-1].stamp_ns >= self._waiting.stamp_ns:
+        if not view.recent or view.recent[-1].stamp_ns >= waiting.stamp_ns:
             return False
-        leader_ns = self._period_ns()
-        own_ns, since_ns = _period_ns(recent) or leader_ns, self._waiting.stamp_ns - recent[-1].stamp_ns
-        return own_ns - leader_ns // 2 <= since_ns < 1.5 * own_ns
-
-    def _period_ns(self) -> int:
-        return _period_ns(self._recent[self._leader]) or _DEAD_NS
+        leader_ns = self._leader.period_ns or _DEAD_NS
+        own_ns = view.period_ns or leader_ns
+        return own_ns - leader_ns // 2 <= waiting.stamp_ns - view.recent[-1].stamp_ns < 1.5 * own_ns
 
     def _with_others(self, frame: StoredFrame) -> StoredFrame:
-        others = list[StoredFrame | None]()
-        for view, recent in enumerate(list(self._recent)[1:], start=1):
-            unused = [other for other in recent if other.stamp_ns > self._used_ns.get(view, other.stamp_ns - 1)]
-            near = min(unused, key=lambda other: abs(other.stamp_ns - frame.stamp_ns), default=None)
-            if near is not None and abs(near.stamp_ns - frame.stamp_ns) > self._period_ns() // 2:
-                near = None
-            if near is not None:
-                self._used_ns[view] = near.stamp_ns
-            others.append(near)
-        return replace(frame, others=tuple(others)) if others else frame
-
-
-def _period_ns(recent: deque[StoredFrame]) -> int | None:
-    stamps = [frame.stamp_ns for frame in recent]
-    return int(np.median(np.diff(stamps))) if len(stamps) > 1 else None
+        within_ns = (self._leader.period_ns or _DEAD_NS) // 2
+        return replace(frame, others=tuple(view.take_near(frame.stamp_ns, within_ns) for view in self._views[1:]))
 
 
 class SensorMessages:
@@ -157,20 +158,19 @@ class SensorMessages:
         """
         self._grey_peak = 0  # used bits of 16-bit images, until one has more than 12
         self.topics: list[tuple[tuple[str, ...], str, Take]] = [
-            ((topics.wheel,), "wheel", _take_wheel),
-            ((topics.prior,), "prior", partial(_take_prior, map_frame)),
+            ((topics.wheel,), "wheel", lambda intake, _, data: intake.put_wheel(messages.decode_odometry(data))),
+            ((topics.prior,), "prior", lambda intake, _, data: intake.put_prior(_decode_prior(data, ("", map_frame)))),
         ]
         if calibration.imu is not None:
             self.topics.append(((topics.imu,), "imu", _take_imu))
         if images:
             cameras = calibration.cameras[:1] if has_depth else calibration.cameras
             self._rig = RigFrames(replace(calibration, cameras=cameras), has_depth=has_depth)
-            roles = [*enumerate(CAMERA_ROLES[: len(cameras)]), *([(0, DEPTH_ROLES[0])] if has_depth else [])]
-            depths = zip(range(2, len(cameras)), DEPTH_ROLES[1:], strict=False)
-            roles += [(number, role) for number, role in depths if cameras[number].has_depth]
-            for number, role in roles:
-                names = transports(getattr(topics, role), role)
-                self.topics.append((names, "image", partial(self._take_image, number, role)))
+            for number, camera in enumerate(cameras):
+                depths = DEPTH_ROLES[max(number - 1, 0) :][: has_depth or (number > 1 and camera.has_depth)]
+                for role in (*CAMERA_ROLES[number : number + 1], *depths):
+                    names = transports(getattr(topics, role), role)
+                    self.topics.append((names, "image", partial(self._take_image, number, role)))
 
     def _take_image(self, number: int, role: str, intake: Intake, is_compressed: bool, payload: bytes) -> None:
         stamp_ns, _ = messages.header_of(payload)
@@ -183,17 +183,34 @@ class SensorMessages:
             intake.put_frame(frame)
 
 
-def _take_imu(intake: Intake, _is_compressed: bool, payload: bytes) -> None:
-    stamps_ns, gyro_radps, accel_mps2, _ = messages.decode_imu([payload])
+def _take_imu(intake: Intake, _is_compressed: bool, data: bytes) -> None:
+    stamps_ns, gyro_radps, accel_mps2, _ = messages.decode_imu([data])
     intake.put_imu(ImuSamples(stamps_ns, gyro_radps, accel_mps2))
 
 
-def _take_wheel(intake: Intake, _is_compressed: bool, payload: bytes) -> None:
-    intake.put_wheel(messages.decode_odometry(payload))
+def _decode_prior(data: bytes, frames: Sequence[str]) -> PositionPrior:
+    _, frame_id = messages.header_of(data)
+    if frame_id.lstrip("/") not in frames:
+        raise RecordingError(f"a pose in the frame {frame_id!r} is not used; give it in {frames[-1]!r}")
+    try:
+        return messages.decode_prior(data)
+    except ValueError as error:
+        raise RecordingError(f"a pose is not used: {error}; give a finite position and a unit quaternion") from error
 
 
-def _take_prior(map_frame: str, intake: Intake, _is_compressed: bool, payload: bytes) -> None:
-    _, frame_id = messages.header_of(payload)
-    if frame_id.lstrip("/") not in ("", map_frame):
-        raise RecordingError(f"a position prior in the frame {frame_id!r} is not used; give it in {map_frame!r}")
-    intake.put_prior(messages.decode_prior(payload))
+def decode_initial_pose(data: bytes, map_frame: str) -> PositionPrior:
+    """geometry_msgs/PoseWithCovarianceStamped of an operator: a prior from now on, independent of its stamp.
+
+    RecordingError for another frame, a pose or covariance that is not finite, and an invalid covariance.
+    """
+    prior, fault = _decode_prior(data, (map_frame,)), ""
+    cov = prior.cov_rot_trans
+    if not np.isfinite(cov).all():
+        fault = "holds NaN or infinity; give variances, or zeros"
+    elif not np.allclose(cov, cov.T, atol=1e-6) or np.linalg.eigvalsh((cov + cov.T) / 2)[0] < -1e-6:
+        fault = "is not symmetric and positive; check its order"
+    if fault:
+        raise RecordingError(f"an initial pose is not used: its covariance {fault}")
+    said = np.diag(cov) > 0
+    cov = np.where(np.outer(said, said), (cov + cov.T) / 2, 0.0) + np.diag(np.where(said, 0.0, UNSAID_SIGMAS**2))
+    return PositionPrior(0, prior.map_from_base, cov, is_revisable=True)

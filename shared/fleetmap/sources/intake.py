@@ -103,12 +103,15 @@ class _Stream(Generic[V]):
 
 
 class Intake:
-    """Queue with any number of producer threads and one consumer. unreadable_why: reason for the last unreadable message or image."""
+    """Queue with any number of producer threads and one consumer.
+
+    unreadable_why: reason for the last unreadable message or image. source_faults: why the source has nothing of a sensor now.
+    """
 
     def __init__(self, *, frames: int, imu_minus_cam_s: float, has_imu: bool, imu_wait_s: float) -> None:
         """frames: capacity. imu_wait_s: longest wait of a frame for the inertial samples up to it."""
         self.counts = IntakeCounts()
-        self.unreadable_why = ""
+        self.unreadable_why, self.source_faults = "", list[str]()
         self._frames: deque[CameraFrame | StoredFrame] = deque()
         self._limit = frames
         self._offset_ns = int(imu_minus_cam_s * 1e9)

@@ -22,8 +22,8 @@ from fleetmap.sensors.samples import PositionPrior
 from fleetmap.sensors.source_settings import Topics
 from locclient.outputs import OutputSection
 from locclient.plugins.ros2_node import OUTPUT
-from locclient.plugins.ros2_node.conversions import decode_initial_pose, motion_between
-from locclient.plugins.ros2_node.driver_odometry import DriverOdometry, Missing, PoseHistory
+from locclient.plugins.ros2_node.odometry import DriverOdometry, Missing, PoseHistory, motion_between
+from locclient.plugins.ros2_node.sensor_messages import decode_initial_pose
 from locclient.robot.continuous_odom import ContinuousOdom
 from support.fleet.estimates import estimate
 

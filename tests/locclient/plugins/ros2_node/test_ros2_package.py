@@ -8,6 +8,7 @@ import re
 import runpy
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -21,7 +22,7 @@ from mapserver.trust import init_here
 from support.fleet.contracts_documents import REPOSITORY
 from support.recordings.recording_samples import kalibr_text
 from support.ros2.environment import needs_ros, ros_environment, ros_program
-from support.ros2.peer import ros_peer
+from support.ros2.peer import PATIENCE_S, ros_peer
 from support.storage.map_samples import publish_samples
 from support.waiting import eventually
 
@@ -33,6 +34,13 @@ NAV2_TYPES = {
     "autostart": bool, "bond_timeout": float, "node_names": list, "global_frame": str, "robot_base_frame": str, "odom_topic": str,
     "transform_tolerance": float,
 }  # fmt: skip
+REFUSED = {
+    "-p output.odom_topic:=/odom": "the robot would take its own odometry for that of its wheels",
+    "-r visual_odom:=/odom": "the robot would take its own odometry for that of its wheels",
+    "-p output.node:=place": "output.node = 'place' as a parameter of ROS comes too late",
+    "-p output.map_frame:=base_link": "three different names",
+    "-p output.pose_topic:=1st": "ROS 2 does not start: ",
+}
 # What rcl makes of the file `sys.argv[1]` for nodes, NAMESPACE/NAME.
 READER = """
 import json, sys, rclpy
@@ -61,17 +69,31 @@ def test_colcon_builds_a_program_that_leaves_arguments_of_ros_to_rclpy(tmp_path:
         settings = re.sub(f"^{name} = .*$", f'{name} = "{value}"', settings, flags=re.MULTILINE)
     settings = settings.replace("identity =", 'site = "lab"\nrobot = "r1"\nstore =')
     (tmp_path / "locclient.toml").write_text(settings)
-    words = "--config locclient.toml --ros-args -r __ns:=/r1 -r __node:=place -p output.autostart:=false"
-    command = f". install/setup.sh && exec {built}/lib/fleetmap_ros/localizer {words}"
-    environment = ros_environment() | {"PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin"}
+
+    def localizer(words: str) -> subprocess.Popen[str]:
+        environment = ros_environment() | {"PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin"}
+        command = (
+            f". install/setup.sh && exec {built}/lib/fleetmap_ros/localizer --config locclient.toml --ros-args {words}"
+        )
+        return subprocess.Popen(["sh", "-c", command], cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
+
+    for words, reason in REFUSED.items():
+        with localizer(words) as refused:
+            assert reason in refused.communicate(timeout=60)[1] and refused.returncode == 2
     with (
-        subprocess.Popen(["sh", "-c", command], cwd=tmp_path, env=environment) as localizer,
+        localizer("-r __ns:=/r1 -r __node:=place -p output.autostart:=false") as running,
         ros_peer("lifecycle_manager_localization") as manager,
     ):
         state = manager.call("/r1/place/get_state", "lifecycle_msgs/srv/GetState")["current_state"]
         assert state["label"] == "unconfigured"
         assert eventually(lambda: {"place", "fleetmap_sensors"} <= set(manager.nodes()))
-        localizer.terminate()
+        manager.publish("/imu0", "std_msgs/msg/String", data="an IMU?")
+        manager.listen("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
+        wrong = "/imu0: /r1/fleetmap_sensors does not receive from /lifecycle_manager_localization: it is std_msgs/msg/String"
+        silent = "no frames come; /cam0/image_raw: nobody publishes it, as sensor_msgs/msg/Image; "
+        told = partial(manager.heard, "/diagnostics")
+        assert eventually(lambda: any(silent in str(each) and wrong in str(each) for each in told()), PATIENCE_S)
+        running.terminate()
 
 
 def launched(name: str, monkeypatch: pytest.MonkeyPatch) -> tuple[MagicMock, dict[str, str]]:

@@ -28,7 +28,7 @@ from fleetmap.recordings.ros2.messages import (
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from fleetmap.sources.intake import Intake
-from locclient.plugins.ros2_node.sensor_messages import RigFrames, SensorMessages, StereoPairs
+from locclient.plugins.ros2_node.sensor_messages import RigFrames, SensorMessages
 from support.recordings.recording_samples import calibration
 from support.recordings.rig_samples import simulated
 
@@ -57,7 +57,7 @@ def test_messages_of_drivers_become_moments() -> None:
         wheel = WheelSample(stamp_ns, np.ones(3), 0.1, 0.1, 0.1)
         put(sensors, queue, "/odom", encode_odometry(wheel, "odom", "base"))
     put(sensors, queue, "/prior", encode_prior(PositionPrior(10**9, np.eye(4), np.eye(6)), "map"))
-    with pytest.raises(RecordingError, match="position prior in the frame 'odom' is not used; give it in 'map'"):
+    with pytest.raises(RecordingError, match="in the frame 'odom' is not used; give it in 'map'"):
         put(sensors, queue, "/prior", encode_prior(PositionPrior(10**9, np.eye(4), np.eye(6)), "odom"))
     with pytest.raises(ValueError, match="CDR"):
         put(sensors, queue, TOPICS.imu, b"nonsense")
@@ -70,17 +70,15 @@ def test_messages_of_drivers_become_moments() -> None:
     assert [len(moment.wheel) for moment in moments] == [1, 1, 1, 1] and len(moments[0].priors) == 1
 
 
-def test_pairs_are_by_stamp_and_the_lonely_are_counted() -> None:
-    pairs, image = StereoPairs(), grey_image(LEFT)
-    assert pairs.add("left", 0, image) is None
-    assert pairs.add("left", 50_000_000, image) is None
-    found = pairs.add("right", 51_000_000, image)
-    assert found is not None
-    assert found.stamp_ns == 50_000_000
-    assert pairs.unpaired == 1
-    for number in range(20):
-        assert pairs.add("right", (100 + 50 * number) * 1_000_000, image) is None
-    assert pairs.unpaired == 13
+def test_pairs_are_by_stamp_and_cameras_that_are_not_triggered_together_are_named() -> None:
+    rig, image, ms = RigFrames(calibration()), grey_image(LEFT), 1_000_000
+    assert rig.add(0, 0, image) == rig.add(0, 50 * ms, image) == []
+    assert [frame.stamp_ns for frame in rig.add(1, 51 * ms, image)] == [50 * ms]
+    for number in range(100, 120):  # of the right camera alone
+        assert rig.add(1, number * 50 * ms, image) == []
+    with pytest.raises(RecordingError, match=r"no partner within 5 ms: are both triggered together\?"):
+        for number in range(121, 130):
+            assert rig.add(0, (number * 50 + 20) * ms, image) == rig.add(1, number * 50 * ms, image) == []
 
 
 @pytest.mark.parametrize("has_depth", [False, True])
