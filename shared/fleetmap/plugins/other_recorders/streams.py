@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -33,7 +34,6 @@ from fleetmap.plugins.other_recorders.topics import (
     note_videos,
 )
 from fleetmap.recordings.calibration_files import CalibrationFile
-from fleetmap.recordings.finalize import RecordingParts
 from fleetmap.recordings.mcap.container import UNDECODABLE, Channel, Container, Place
 from fleetmap.recordings.mcap.streams import (
     ImageStream,
@@ -42,7 +42,7 @@ from fleetmap.recordings.mcap.streams import (
     assemble,
     attached_calibration,
     collect,
-    open_container,
+    opened,
 )
 from fleetmap.recordings.ordering import ReadLog
 from fleetmap.recordings.recording import OpenOptions, Recording
@@ -81,17 +81,11 @@ class _InfoStream(Stream):
         super().take(data, place, logged_ns, log)
 
 
-@dataclass(frozen=True)
-class _Lenses:
-    """The distinct lenses of the CameraInfo messages, and the lens number of each image (N,)."""
+class _Lens(NamedTuple):
+    """The lens of most of a camera's images, None if no CameraInfo describes one; and (N,) the images that were taken with it."""
 
-    infos: list[CameraInfo]
-    numbers: NDArray[np.int64]
-
-    @property
-    def usual(self) -> int:
-        """Number of the lens of most images."""
-        return int(np.bincount(self.numbers, minlength=1).argmax())
+    info: CameraInfo | None
+    usable: NDArray[np.bool_]
 
 
 def open_messages(path: Path, file_format: str, opener: Callable[[], Container], options: OpenOptions) -> Recording:
@@ -99,42 +93,33 @@ def open_messages(path: Path, file_format: str, opener: Callable[[], Container],
 
     opener: must be picklable, because other processes may read part of the frames.
     """
-    return open_container(path, file_format, opener, options, partial(_parts, opener, options))
+    with opened(opener, options) as (container, given, log):
+        streams, others = collect(container, partial(_stream_of, container, options.topics), log)
+        note_videos(others, log)
+        channels = [stream.channel for stream in streams if stream.messages or isinstance(stream, ImageStream)]
+        if not channels:
+            there = ", ".join(f"{c.topic} ({c.type_name} in {c.encoding or 'no encoding'})" for c in others[:8])
+            known = f"; known encodings are {', '.join(ENCODINGS)}" if others else ""
+            why = f"{log.told() or there or 'it is empty'}{known}"
+            raise RecordingError(f"{container.path} holds no message that can be read ({why})")
+        topics = _with_hints(options.topics, given, {channel.topic for channel in channels})
+        chosen = choose_topics(channels, topics, str(container.path), log)
+        by_id = {stream.channel.id: stream for stream in streams}
+        roles = {role: [by_id[channel.id] for channel in chosen[role]] for role in chosen}
+        calibration = given.calibration if given else attached_calibration(container)
+        lenses = _lenses_of(roles, log) if calibration is None else {}
 
+        def calibrate(imu_frame: str | None) -> tuple[RigCalibration, Sequence[str]]:
+            found = calibration
+            described: Sequence[str] = CAMERA_ROLES
+            if found is None:
+                found, described = _calibration(container, roles, lenses, imu_frame, log)
+            if "depth" in roles and "right" not in roles:
+                _note_unregistered(streams, roles, found.cameras[0], log)
+            return found, described
 
-def _parts(
-    opener: Callable[[], Container],
-    options: OpenOptions,
-    container: Container,
-    given: CalibrationFile | None,
-    log: ReadLog,
-) -> RecordingParts:
-    streams, others = collect(container, partial(_stream_of, container, options.topics), log)
-    note_videos(others, log)
-    channels = [stream.channel for stream in streams if stream.messages or isinstance(stream, ImageStream)]
-    if not channels:
-        there = ", ".join(f"{c.topic} ({c.type_name} in {c.encoding or 'no encoding'})" for c in others[:8])
-        known = f"; known encodings are {', '.join(ENCODINGS)}" if others else ""
-        why = f"{log.told() or there or 'it is empty'}{known}"
-        raise RecordingError(f"{container.path} holds no message that can be read ({why})")
-    topics = _with_hints(options.topics, given, {channel.topic for channel in channels})
-    chosen = choose_topics(channels, topics, str(container.path), log)
-    by_id = {stream.channel.id: stream for stream in streams}
-    roles = {role: [by_id[channel.id] for channel in chosen[role]] for role in chosen}
-    calibration = given.calibration if given else attached_calibration(container)
-    lenses = _lenses_of(roles, log) if calibration is None else {}
-    usable = {role: _usable(f"{role} images", told, log) for role, told in lenses.items()}
-
-    def calibrate(imu_frame: str | None) -> tuple[RigCalibration, Sequence[str]]:
-        found = calibration
-        described: Sequence[str] = CAMERA_ROLES
-        if found is None:
-            found, described = _calibration(container, roles, lenses, imu_frame, log)
-        if "depth" in roles and "right" not in roles:
-            _note_unregistered(streams, roles, found.cameras[0], log)
-        return found, described
-
-    return assemble(container, opener, streams, roles, calibrate, log, usable)
+        usable = {role: lens.usable for role, lens in lenses.items()}
+        return assemble(path, file_format, container, opener, streams, roles, calibrate, log, usable)
 
 
 def _stream_of(container: Container, topics: Topics, channel: Channel) -> Stream | None:
@@ -159,39 +144,29 @@ def _with_hints(topics: Topics, given: CalibrationFile | None, present: set[str]
     return msgspec.structs.replace(topics, **changes)
 
 
-def _lenses_of(roles: Roles, log: ReadLog) -> dict[str, _Lenses]:
+def _lenses_of(roles: Roles, log: ReadLog) -> dict[str, _Lens]:
     """The lenses of the cameras that can be used, by their roles."""
     lenses = {}
     for side in CAMERA_ROLES[:2] if "depth" in roles else CAMERA_ROLES:
         if side in roles:
-            told, topic = _lenses(roles[side], roles.get(f"{side}_info", ())), roles[side][0].channel.topic
-            if side in CAMERA_ROLES[:2] or (told.infos and len(told.numbers)):
-                lenses[side] = told
-            elif told.infos:
+            lens, topic = _lens(side, roles[side], roles.get(f"{side}_info", ()), log), roles[side][0].channel.topic
+            if side in CAMERA_ROLES[:2] or (lens.info and len(lens.usable)):
+                lenses[side] = lens
+            elif lens.info:
                 log.note("camera without an image", f"{side}: none of the images on {topic} can be read")
             else:
                 log.note("camera without a lens", f"{side}: no CameraInfo beside {topic}; its images are not used")
     return lenses
 
 
-def _usable(what: str, lenses: _Lenses, log: ReadLog) -> NDArray[np.bool_]:
-    """(N,) images taken with the usual lens; others are noted."""
-    of_usual = np.asarray(lenses.numbers == lenses.usual)
-    if not of_usual.all():
-        setting, other = (setting_of(lenses.infos[n]) for n in (lenses.usual, int(lenses.numbers[~of_usual][0])))
-        log.note(
-            f"{what}: the CameraInfo changes",
-            f"{int((~of_usual).sum())} of {len(of_usual)} left out, which have {other}; "
-            f"{setting} is used: keep zoom, focus, binning and roi as they are while you record",
-        )
-    return of_usual
-
-
-def _lenses(images: Sequence[ImageStream], streams: Sequence[Stream]) -> _Lenses:
-    """CalibrationError if the number of lenses keeps growing, as with autofocus."""
+def _lens(role: str, images: Sequence[ImageStream], streams: Sequence[Stream], log: ReadLog) -> _Lens:
+    """Images of other lenses are noted; CalibrationError if the number of lenses keeps growing, as with autofocus."""
     values: list[tuple[int, CameraInfo]] = [value for stream in streams for value in stream.values]
     told = [(info.stamp_ns or log_time_ns, info) for log_time_ns, info in values if info.matrix[0, 0] > 0]
     told.sort(key=lambda each: each[0])
+    stamps_ns = [stamp_ns for stream in images for stamp_ns, *_ in stream.images]
+    if not told:
+        return _Lens(None, np.ones(len(stamps_ns), np.bool_))
     infos, numbers = list[CameraInfo](), list[int]()
     for _, info in told:
         number = next((n for n, lens in enumerate(infos) if same_lens(lens, info)), len(infos))
@@ -202,11 +177,18 @@ def _lenses(images: Sequence[ImageStream], streams: Sequence[Stream]) -> _Lenses
                 f"{streams[0].channel.topic} describes more than {_MOST_LENSES} lenses, from {setting_of(infos[0])} to "
                 f"{setting_of(info)}; a map needs one: switch off zoom and autofocus, or pass a calibration with --calibration FILE"
             )
-    stamps_ns = [stamp_ns for stream in images for stamp_ns, *_ in stream.images]
-    if not numbers:
-        return _Lenses(infos, np.zeros(len(stamps_ns), np.int64))
     rows = np.searchsorted([stamp_ns for stamp_ns, _ in told], stamps_ns, side="right") - 1
-    return _Lenses(infos, np.array(numbers)[np.maximum(rows, 0)])
+    of_images = np.array(numbers)[np.maximum(rows, 0)]
+    usual = int(np.bincount(of_images, minlength=1).argmax())
+    usable = np.asarray(of_images == usual)
+    if not usable.all():
+        setting, other = (setting_of(infos[n]) for n in (usual, int(of_images[~usable][0])))
+        log.note(
+            f"{role} images: the CameraInfo changes",
+            f"{int((~usable).sum())} of {len(usable)} left out, which have {other}; "
+            f"{setting} is used: keep zoom, focus, binning and roi as they are while you record",
+        )
+    return _Lens(infos[usual], usable)
 
 
 def _note_unregistered(streams: Iterable[Stream], roles: Roles, camera: CameraCalibration, log: ReadLog) -> None:
@@ -227,13 +209,13 @@ def _note_unregistered(streams: Iterable[Stream], roles: Roles, camera: CameraCa
 
 
 def _calibration(
-    container: Container, roles: Roles, lenses: Mapping[str, _Lenses], imu_frame: str | None, log: ReadLog
+    container: Container, roles: Roles, lenses: Mapping[str, _Lens], imu_frame: str | None, log: ReadLog
 ) -> tuple[RigCalibration, tuple[str, ...]]:
     """The calibration by the messages in the container, and the roles of its cameras."""
     cameras, sides = [], tuple(lenses)
-    for side, told in lenses.items():
+    for side, lens in lenses.items():
         image_topic = roles[side][0].channel.topic
-        if not told.infos:
+        if lens.info is None:
             has_messages = any(len(stream.messages) > stream.damaged for stream in roles.get(f"{side}_info", ()))
             fault = f"no CameraInfo beside {image_topic} describes its lens;"
             if has_messages:
@@ -241,9 +223,9 @@ def _calibration(
                 fault = f"every CameraInfo beside {image_topic} {zeros}"
             raise CalibrationError(f"{container.path}: {fault} pass a calibration with --calibration FILE")
         sizes_px = [size_px for stream in roles[side] for *_, size_px in stream.images]
-        of_usual = [size for size, n in zip(sizes_px, told.numbers, strict=True) if n == told.usual]
-        size_px = Counter(of_usual).most_common(1)[0][0]
-        info = info_of_images(told.infos[told.usual], size_px, f"{container.path}: {image_topic}")
+        used = [size for size, is_usable in zip(sizes_px, lens.usable, strict=True) if is_usable]
+        size_px = Counter(used).most_common(1)[0][0]
+        info = info_of_images(lens.info, size_px, f"{container.path}: {image_topic}")
         if info.binning != (1, 1) or info.roi[:2] != (0, 0):
             setting = f"{setting_of(info)}, of images of just that size; the calibration is used as it is"
             log.note("binning or roi not used", f"the CameraInfo beside {image_topic} says {setting}")

@@ -1,6 +1,7 @@
 """A recording from the messages in a container: orders stamps, leaves images in the file."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -98,23 +99,16 @@ Roles = Mapping[str, Sequence[Any]]
 """Streams by their role, ImageStreams for roles of images."""
 
 
-def open_container(
-    path: Path,
-    file_format: str,
-    opener: Callable[[], Container],
-    options: OpenOptions,
-    parts_of: Callable[[Container, CalibrationFile | None, ReadLog], RecordingParts],
-) -> Recording:
-    """Open the recording at `path` through the container that `opener` opens; its issues list unreadable messages.
-
-    parts_of: builds its parts, by the calibration that the caller chose, if any.
-    """
+@contextmanager
+def opened(
+    opener: Callable[[], Container], options: OpenOptions
+) -> Iterator[tuple[Container, CalibrationFile | None, ReadLog]]:
+    """Open a container, beside the calibration that the caller chose, if any; closed if the block fails."""
     log = ReadLog()
     given = calibration_of_options(options, log)
     container = opener()
     try:
-        parts = parts_of(container, given, log)
-        return finalize(replace(parts, path=path, format=file_format, name=parts.name or path.stem), log)
+        yield container, given, log
     except BaseException:
         container.close()
         raise
@@ -125,8 +119,7 @@ def open_written(path: Path, opener: Callable[[], Container], options: OpenOptio
 
     opener: must be picklable, because other processes may read part of the frames. CalibrationError without a calibration.
     """
-
-    def parts_of(container: Container, given: CalibrationFile | None, log: ReadLog) -> RecordingParts:
+    with opened(opener, options) as (container, given, log):
         streams, others = collect(container, lambda channel: _stream_of(container, channel), log)
         there = ", ".join(f"{c.topic} ({c.type_name})" for c in (*(s.channel for s in streams), *others)) or "none"
         found = "; ".join(filter(None, (f"there is {there}", log.told())))
@@ -139,9 +132,7 @@ def open_written(path: Path, opener: Callable[[], Container], options: OpenOptio
                 raise CalibrationError(f"{container.path} has no attachment {CALIBRATION_ATTACHMENT}; {how}")
             return calibration, CAMERA_ROLES
 
-        return assemble(container, opener, streams, roles, calibrate, log)
-
-    return open_container(path, "mcap", opener, options, parts_of)
+        return assemble(path, "mcap", container, opener, streams, roles, calibrate, log)
 
 
 def _stream_of(container: Container, channel: Channel) -> Stream | None:
@@ -189,6 +180,8 @@ def collect(
 
 
 def assemble(
+    path: Path,
+    file_format: str,
     container: Container,
     opener: Callable[[], Container],
     streams: Sequence[Stream],
@@ -196,8 +189,8 @@ def assemble(
     calibrate: Callable[[str | None], tuple[RigCalibration, Sequence[str]]],
     log: ReadLog,
     usable: Mapping[str, NDArray[np.bool_]] = MappingProxyType({}),
-) -> RecordingParts:
-    """Build the parts of a recording from the streams by their roles.
+) -> Recording:
+    """Build a recording from the streams by their roles; its issues list unreadable messages.
 
     calibrate: by the frame of the IMU's messages, the calibration and the roles of its cameras. usable: (N,) by role, images to take.
     """
@@ -234,7 +227,8 @@ def assemble(
             what = f"{stream.channel.topic}: damaged messages"
             log.note(what, f"{stream.damaged} left out, {len(stream.messages)} were found")
     frames = SeriesFrames(MessageReader(opener, container, log.files), views)
-    return RecordingParts(container.path, "", calibration, frames, name=container.name, **sensors)
+    name = container.name or path.stem
+    return finalize(RecordingParts(path, file_format, calibration, frames, name=name, **sensors), log)
 
 
 def _images(
