@@ -149,12 +149,12 @@ def _bus(server: str, store: Path) -> "Bus":
     from fleetmap.bus.zenoh_bus import Bus
 
     if not has_tls(check_endpoint(server)):
-        return Bus.connect(server)
+        return Bus(server).open()
     from mapserver.trust.enrolment import RobotRegister
 
     with open_store(store) as maps:
         tls = RobotRegister(maps).survey_tls()
-    return Bus.connect(server, tls=tls)
+    return Bus(server, tls=tls).open()
 
 
 def _publish(bus: "Bus", state: "LiveSurveyState") -> None:

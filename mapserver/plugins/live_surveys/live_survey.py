@@ -21,7 +21,7 @@ from mapserver.drafting.draft import BuildOptions
 from mapserver.drafting.survey_recordings import read_zones
 from mapserver.library import BuiltMap, build_map
 from mapserver.plugins.live_surveys.drives import Drive, DueFrame
-from mapserver.plugins.live_surveys.mapping_process import NO_SKETCH, MappingProcess
+from mapserver.plugins.live_surveys.mapping_process import MappingProcess
 from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, MOST_PLACES, LiveRig, LiveSurveyState, thinning
 from mapserver.plugins.live_surveys.tracking import LiveTracking, Tracked
 from mapserver.survey.settings import SurveySettings
@@ -116,13 +116,10 @@ class _Survey:
     def __init__(self, request: LiveRequest, drive: Drive, tell: Tell, see: See | None) -> None:
         self._request, self._drive, self._tell, self._see = request, drive, tell, see
         self._stamps_ns: list[int] = []
-        self._most_behind = 0
         self._latencies_s: list[float] = []
         self._qualities: list[float] = []  # of each keyframe, the worst since the previous one
         self._worst = 1.0
-        self._sketch = NO_SKETCH
         self._seen: Image | None = None  # the newest keyframe
-        self._behind, self._failed, self._lag_s = 0, "", 0.0
         # Also with an IMU: odometry finds the scale, but in one recording the map's adjustment halved it.
         self._scale_known = drive.rectifier.camera.baseline_m > 0
         rectifier, imu = drive.rectifier, drive.calibration.imu
@@ -135,6 +132,7 @@ class _Survey:
             drive.has_depth,
             scale_known=rectifier.camera.baseline_m > 0 or imu is not None,
         )
+        self._mapping = MappingProcess(self._rig)
 
     def check(self) -> list[str]:
         """Return shortcomings before the start as text; FleetmapErrors for a survey certain to fail."""
@@ -151,22 +149,20 @@ class _Survey:
         """Track all frames, each when it is due; call `check` first."""
         drive, told_s = self._drive, 0.0
         # One thread per process, and no garbage collection of the survey's objects: both would delay frames.
-        with _one_thread(), MappingProcess(self._config, self._rig) as mapping:
+        with _one_thread(), self._mapping.start(self._config):
             tracking = LiveTracking(drive.calibration, drive.rectifier, self._request.settings)
             with closing(drive.frames()) as frames:
                 for due in frames:
                     if is_stopped():
                         break
                     if due is not None:
-                        self._take(due, tracking, mapping)
-                    self._look(mapping)
+                        self._take(due, tracking)
                     if time.monotonic() - told_s >= _TELL_EVERY_S:
                         told_s = time.monotonic()
                         self.say("tracking")
-            mapping.finish()
-            self._look(mapping)
+            self._mapping.finish()
 
-    def _take(self, due: DueFrame, tracking: LiveTracking, mapping: MappingProcess) -> None:
+    def _take(self, due: DueFrame, tracking: LiveTracking) -> None:
         tracked = tracking.handle(due.frame, due.imu, due.wheel)
         if due.due_s is not None:
             self._latencies_s.append(time.monotonic() - due.due_s)
@@ -175,14 +171,10 @@ class _Survey:
         self._stamps_ns.append(due.frame.stamp_ns)
         self._worst = min(self._worst, tracked.quality)
         if tracked.keyframe is not None:
-            mapping.put(due.frame, tracked.keyframe)
+            self._mapping.put(due.frame, tracked.keyframe)
             self._qualities.append(self._worst)
             self._seen = due.frame.left
             self._worst = 1.0
-
-    def _look(self, mapping: MappingProcess) -> None:
-        self._sketch, self._behind, self._failed = mapping.sketch, mapping.behind, mapping.failed
-        self._most_behind, self._lag_s = max(self._most_behind, self._behind), mapping.longest_lag_s
 
     def figures(self) -> LiveFigures:
         latency = None
@@ -195,12 +187,12 @@ class _Survey:
             keyframes=len(self._qualities),
             latency_ms=latency,
             late_frames=self._late(),
-            most_behind=self._most_behind,
-            lag_s=round(self._lag_s, 3),
+            most_behind=self._mapping.most_behind,
+            lag_s=round(self._mapping.longest_lag_s, 3),
             dropped=self._drive.dropped,
-            loops=self._sketch.loops,
-            parts=len(self._sketch.parts),
-            mapping_failed=self._failed,
+            loops=self._mapping.sketch.loops,
+            parts=len(self._mapping.sketch.parts),
+            mapping_failed=self._mapping.failed,
         )
 
     def _late(self) -> int:
@@ -211,7 +203,7 @@ class _Survey:
         return int(np.sum(latencies_s > float(np.median(np.diff(stamps_ns))) * 1e-9 / self._drive.speed))
 
     def say(self, phase: str, *, version: int | None = None, words: str = "") -> None:
-        figures, sketch = self.figures(), self._sketch
+        figures, sketch = self.figures(), self._mapping.sketch
         qualities = np.array(self._qualities[: sketch.keyframes])[thinning(sketch.keyframes, MOST_PLACES)]
         mapped = structs.asdict(sketch) | {"keyframes": figures.keyframes}
         self._tell(
@@ -223,14 +215,14 @@ class _Survey:
                 phase=phase,
                 seconds=round(figures.seconds, 3),
                 frames=figures.frames,
-                behind=self._behind,
+                behind=self._mapping.behind,
                 latency_ms=None if figures.latency_ms is None else figures.latency_ms[1],
                 late_frames=figures.late_frames,
                 quality=np.round(255 * np.clip(qualities, 0, 1)).astype(np.uint8).tobytes(),
                 scale_known=self._scale_known,
                 picture=self._picture(),
                 version=version,
-                words=(words or self._failed)[:2000],
+                words=(words or figures.mapping_failed)[:2000],
             )
         )
 

@@ -44,26 +44,27 @@ _Item = tuple[RectifiedFrame, NewKeyframe]
 
 
 class MappingProcess:
-    """The process and its communication threads, from `with` until its end."""
+    """The process and its communication threads, from `start` until `finish` or the end of a `with`."""
 
-    def __init__(self, config: SurveyConfig, rig: LiveRig) -> None:
+    def __init__(self, rig: LiveRig) -> None:
         context = multiprocessing.get_context("spawn")
         self._ours, theirs = context.Pipe()
         # Its arguments go through the pipe: larger process arguments would block for ever if the process dies.
         self._process = context.Process(target=_map, args=(theirs,), daemon=True, name="mapping")
-        self._theirs, self._needed = theirs, (config, rig)
+        self._theirs, self._rig = theirs, rig
         self._waiting: queue.Queue[_Item | None] = queue.Queue()
-        self._sent = 0
+        self._sent = self.most_behind = 0
         self.sketch = NO_SKETCH  # after the newest processed keyframe
         self.failed = ""  # why no more keyframes are accepted
         self._put_s: deque[float] = deque()  # of keyframes not yet in a sketch
         self.longest_lag_s = 0.0  # from a keyframe to its sketch
         self._threads = [threading.Thread(target=work, daemon=True) for work in (self._send, self._receive)]
 
-    def __enter__(self) -> Self:
+    def start(self, config: SurveyConfig) -> Self:
+        """Start the process; FleetmapError if it is not ready in time."""
         self._process.start()
         self._theirs.close()
-        if not self._is_ready():
+        if not self._is_ready(config):
             self._process.kill()
             raise FleetmapError(
                 "mapping did not start: see the messages of its process above; without any, check that the machine has a core and memory "
@@ -71,6 +72,9 @@ class MappingProcess:
             )
         for thread in self._threads:
             thread.start()
+        return self
+
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -93,6 +97,7 @@ class MappingProcess:
             self._waiting.put(None)
             return
         self._sent += 1
+        self.most_behind = max(self.most_behind, self.behind)
         self._put_s.append(time.monotonic())
         self._waiting.put((frame, keyframe))
 
@@ -108,9 +113,9 @@ class MappingProcess:
             self._process.join()
         self._ours.close()
 
-    def _is_ready(self) -> bool:
+    def _is_ready(self, config: SurveyConfig) -> bool:
         try:
-            self._ours.send(self._needed)
+            self._ours.send((config, self._rig))
             return self._ours.poll(_READY_WITHIN_S) and self._ours.recv() == "ready"
         except (EOFError, OSError):  # it ended before it was ready
             return False

@@ -29,11 +29,15 @@ class MappingHere:
 
     made: "MappingHere"
 
-    def __init__(self, config: SurveyConfig, rig: LiveRig) -> None:
-        self.map, self.sketch = LiveMap(config, rig), NO_SKETCH
-        self.behind, self.failed, self.longest_lag_s = 0, "", 0.0
+    def __init__(self, rig: LiveRig) -> None:
+        self._rig, self.sketch = rig, NO_SKETCH
+        self.behind, self.most_behind, self.failed, self.longest_lag_s = 0, 0, "", 0.0
         self.after: dict[int, MapSketch] = {}  # by frame
         MappingHere.made = self
+
+    def start(self, config: SurveyConfig) -> Self:
+        self.map = LiveMap(config, self._rig)
+        return self
 
     def __enter__(self) -> Self:
         return self

@@ -134,7 +134,7 @@ def not_begun(*_: object) -> MappingHere:
 def test_what_a_build_would_refuse_is_refused_before_the_drive(
     site: Site, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(live_survey, "MappingProcess", not_begun)
+    monkeypatch.setattr(MappingHere, "start", not_begun)
     config = configured(tmp_path, site, SensorSet.STEREO)
     other = tmp_path / "other.yaml"
     rig = yaml.safe_load(kalibr_text())  # of which the right camera looks down by a degree
@@ -155,16 +155,18 @@ def test_what_a_build_would_refuse_is_refused_before_the_drive(
 
 
 class Scripted:
-    """Sensors that send these frames and no IMU, whatever the calibration says."""
+    """Sensors that send these frames and no IMU, whatever the calibration says; with an error they die then."""
 
     has_depth = False
 
-    def __init__(self, frames: list[CameraFrame]) -> None:
-        self.calibration, self._frames = calibration(), frames
+    def __init__(self, frames: list[CameraFrame], error: Exception | None = None) -> None:
+        self.calibration, self._frames, self._error = calibration(), frames, error
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
         for frame in self._frames:
             intake.put_frame(frame)
+        if self._error is not None:
+            raise self._error
         while not wait(0.05):
             pass
 
@@ -191,19 +193,6 @@ def test_sensors_that_say_nothing_are_not_waited_for(
     assert "sensors" not in {thread.name for thread in threading.enumerate()}
 
 
-class Broken(Scripted):
-    """Sensors that die after their frames."""
-
-    def __init__(self, frames: list[CameraFrame], error: Exception) -> None:
-        super().__init__(frames)
-        self._error = error
-
-    def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
-        for frame in self._frames:
-            intake.put_frame(frame)
-        raise self._error
-
-
 @pytest.mark.parametrize(
     ("count", "error", "says"),
     [
@@ -216,7 +205,7 @@ def test_sensors_that_die_end_the_drive_with_their_reason(
 ) -> None:
     record, sample = tmp_path / "drive.mcap", robot_world.cycle()
     frames = [CameraFrame(int(sample.stamps_ns[n]), sample.left[n], sample.right[n]) for n in range(count)]
-    drive = SensorDrive(Broken(frames, error), record, Topics())
+    drive = SensorDrive(Scripted(frames, error), record, Topics())
     with pytest.raises(RecordingError, match=f"the sensors ended the drive: {says}"):
         driven(site, drive, SensorSet.STEREO_INERTIAL)
     assert record.exists() == bool(count)

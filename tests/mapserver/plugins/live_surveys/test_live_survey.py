@@ -170,7 +170,7 @@ def test_what_a_killed_survey_has_recorded_can_be_read(recording: Path, tmp_path
 
 def test_pictures_that_do_not_change_at_all_are_mapped() -> None:
     """A robot that stands, under a camera without noise: every point is seen first by the first of them."""
-    mapping = MappingHere(SurveyConfig(SETTINGS, default_vocabulary()), LiveRig(CAMERA, BODY_FROM_CAM))
+    mapping = MappingHere(LiveRig(CAMERA, BODY_FROM_CAM)).start(SurveyConfig(SETTINGS, default_vocabulary()))
     still, step = np.zeros(3), np.diag([1e-4] * 6)
     for number in range(3):
         frame = replace(stereo_frame(50_000_000), stamp_ns=50_000_000 * (number + 1))
@@ -190,8 +190,8 @@ def test_one_source_must_be_named(given: list[str], tmp_path: Path) -> None:
 
 def test_mapping_that_does_not_start_is_an_error_with_a_next_step() -> None:
     broken: Any = None  # settings without which the process ends before it is ready
-    with pytest.raises(FleetmapError, match="did not start"), MappingProcess(broken, broken):
-        pass
+    with pytest.raises(FleetmapError, match="did not start"):
+        MappingProcess(broken).start(broken)
 
 
 def _fails() -> None:
@@ -207,8 +207,8 @@ class _Unreadable:
 
 def test_a_process_that_dies_before_it_has_read_its_orders_is_not_waited_for() -> None:
     orders: Any = (_Unreadable(), bytes(1 << 20))  # more than a pipe holds
-    with pytest.raises(FleetmapError, match="did not start"), MappingProcess(orders, orders):
-        pass
+    with pytest.raises(FleetmapError, match="did not start"):
+        MappingProcess(orders).start(orders)
 
 
 def test_thinned_rows_fit_a_message_and_keep_the_last() -> None:
