@@ -115,7 +115,7 @@ class RobotIdentity:
         first = TlsFiles(folder / "servers.ca", folder / "bundle.pem")
         if fault := handshake_fault(who.endpoint, first):
             raise LinkError(f"{who.endpoint}: {fault}")
-        with Bus.connect(who.endpoint, tls=first) as bus:
+        with Bus(who.endpoint, tls=first).open() as bus:
             made._ask(bus, given.own.encode())
         (folder / "bundle.pem").unlink(missing_ok=True)
         return made

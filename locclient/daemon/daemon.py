@@ -165,7 +165,7 @@ def _opened_publisher(
     """Return the publisher at [output] endpoint, else on the map server's bus, which the stack closes; None without one that it needs."""
     output = output_of(config.output)
     if config.output.endpoint is not None:
-        bus = stack.enter_context(Bus.connect(config.output.endpoint))
+        bus = stack.enter_context(Bus(config.output.endpoint).open())
     elif output.needs_bus and (bus is None or address.server is None):
         return None
     publisher = output.open(config.output, bus, address.site, address.robot, calibration, intake)

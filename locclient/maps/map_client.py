@@ -357,7 +357,7 @@ _PATIENCE_S = 120.0  # without an answer during a fetch; long enough for a serve
 
 def open_bus(address: MapAddress) -> Bus:
     """Open a connection to the server, with the robot's identity if it has one. Without a server the bus stays closed."""
-    return Bus(_NOWHERE) if address.server is None else Bus.connect(str(address.server), tls=address.tls)
+    return Bus(_NOWHERE) if address.server is None else Bus(str(address.server), tls=address.tls).open()
 
 
 def map_client(bus: Bus, cache: TileCache, address: MapAddress, **how: float) -> MapClient:

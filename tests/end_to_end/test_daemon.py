@@ -83,7 +83,7 @@ def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell
             link.bring(link.wanted())
             service.close()
 
-        with Bus.listen("tcp/127.0.0.1:0") as found_port:
+        with Bus("tcp/127.0.0.1:0", is_server=True).open() as found_port:
             endpoint = found_port.endpoint  # free again in a moment, and nobody answers there
         dark_walk = write_walk(tmp_path / "dark", 280, range(130, 280))
         with daemon(configuration(tmp_path, dark_walk, endpoint, speed=0.0), tmp_path / "notify") as process:
@@ -104,7 +104,7 @@ def test_a_failure_arrives_once_though_the_robot_was_killed_before_it_could_tell
             return encode_message(FailureAck(id=table[-1]))
 
         fleet = Fleet(store)
-        with Bus.listen(endpoint) as bus:
+        with Bus(endpoint, is_server=True).open() as bus:
             init_here(store)
             service = BusService(store, fleet, bus, lambda *_: None)
             bus.queryable(robot_key("*", "*", "failures"), take)

@@ -76,7 +76,7 @@ def test_a_fleet_manager_gives_a_robot_its_maps_and_hears_that_it_was_carried_aw
     with (
         mosquitto(tmp_path) as broker,
         MapStore.open(tmp_path / "store", create=True) as store,
-        Bus.listen("tcp/127.0.0.1:0") as bus,
+        Bus("tcp/127.0.0.1:0", is_server=True).open() as bus,
     ):
         robot_world.save(store)
         init_here(store)

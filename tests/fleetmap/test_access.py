@@ -57,7 +57,8 @@ class World:
             self.hub = MemoryHub(ACCESS if is_guarded else None)
             self.server: Bus = MemoryBus(self.hub)
         else:
-            self.server = Bus.listen("tls/127.0.0.1:0", tls=keys.ours.tls, access=ACCESS if is_guarded else None)
+            access = ACCESS if is_guarded else None
+            self.server = Bus("tls/127.0.0.1:0", is_server=True, tls=keys.ours.tls, access=access).open()
         stack.enter_context(self.server)
         self.heard: list[str] = []
         self.server.subscribe("fleetmap/*/robots/*/health", lambda key, _: self.heard.append(key))
@@ -258,7 +259,7 @@ def test_the_admin_space_is_closed(keys: Keys) -> None:
         world.settle()
         assert answer(robot, OTHERS + "wanted") == DENIED
         control = _config({"mode": "router", "listen/endpoints": ["tcp/127.0.0.1:17448"], "adminspace/enabled": True})
-        with zenoh.open(control) as bare, Bus.connect("tcp/127.0.0.1:17448") as reader:
+        with zenoh.open(control) as bare, Bus("tcp/127.0.0.1:17448").open() as reader:
             assert eventually(reader.connected)
             where = f"@/{bare.zid()}/**"
             assert [reply for reply in reader._session.get(where, timeout=1) if reply.ok is not None], "the control"
@@ -276,30 +277,29 @@ def test_certificates_of_others(keys: Keys, tmp_path: Path) -> None:
         wrong_server.authority.write_text(keys.strangers.servers)
         assert "server's certificate is refused" in handshake_fault(endpoint, wrong_server)
         for files in (stranger, wrong_server):
-            bus = stack.enter_context(Bus.connect(endpoint, tls=files))
+            bus = stack.enter_context(Bus(endpoint, tls=files).open())
             with pytest.raises(UnreachableError):
                 bus.get(OWN + "wanted", timeout_s=1.0)
             assert not bus.connected()
         # A robot's certificate cannot play the server, and neither can the server under another name.
-        fake = stack.enter_context(
-            Bus.listen("tls/127.0.0.1:0", tls=TlsFiles(keys.ours.tls.authority, keys.robot("a.1").own), access=ACCESS)
-        )
+        played = TlsFiles(keys.ours.tls.authority, keys.robot("a.1").own)
+        fake = stack.enter_context(Bus("tls/127.0.0.1:0", is_server=True, tls=played, access=ACCESS).open())
         fake.queryable("fleetmap/**", lambda *_: b"EVIL")
         elsewhere = world.server.endpoint.replace("127.0.0.1", "localhost")
         for wrong in (fake.endpoint, elsewhere):
-            victim = stack.enter_context(Bus.connect(wrong, tls=keys.robot("b.1")))
+            victim = stack.enter_context(Bus(wrong, tls=keys.robot("b.1")).open())
             with pytest.raises(UnreachableError):
                 victim.get(OTHERS + "blobs/00ff", timeout_s=1.0)
             assert not victim.connected()
             assert "server's certificate is refused" in handshake_fault(wrong, keys.robot("b.1"))
-        good = stack.enter_context(Bus.connect(endpoint, tls=keys.robot("b.1")))
+        good = stack.enter_context(Bus(endpoint, tls=keys.robot("b.1")).open())
         assert good.get(OTHERS + "blobs/00ff") == b"honest"
         # The control: without TLS, or where it is not looked at who signed the server's certificate, the robot believes both.
         for how, robot in ((None, None), (keys.strangers.tls, TlsFiles(wrong_server.authority, stranger.own))):
-            there = Bus.listen("tls/127.0.0.1:0" if how else "tcp/127.0.0.1:0", tls=how)
+            there = Bus("tls/127.0.0.1:0" if how else "tcp/127.0.0.1:0", is_server=True, tls=how).open()
             fake = stack.enter_context(there)
             fake.queryable("fleetmap/**", lambda *_: b"EVIL")
-            victim = stack.enter_context(Bus.connect(fake.endpoint, tls=robot))
+            victim = stack.enter_context(Bus(fake.endpoint, tls=robot).open())
             assert victim.get(OTHERS + "blobs/00ff") == b"EVIL"
     assert "cannot be reached" in handshake_fault(endpoint, keys.robot("a.1"))
 
@@ -308,14 +308,14 @@ def test_certificates_of_others(keys: Keys, tmp_path: Path) -> None:
 def test_a_revoked_robot_is_out_while_it_is_connected(keys: Keys, protocol: str) -> None:
     """Row 6: what robots and the server had declared comes back by itself, but not the revoked one's."""
     heard: list[str] = []
-    with Bus.listen(f"{protocol}/127.0.0.1:0", tls=keys.ours.tls, access=ACCESS) as server:
+    with Bus(f"{protocol}/127.0.0.1:0", is_server=True, tls=keys.ours.tls, access=ACCESS).open() as server:
         server.queryable("fleetmap/*/robots/*/wanted", lambda key, _: key.encode())
         server.subscribe("fleetmap/*/robots/*/health", lambda key, _: heard.append(key))
         closed = server.queryable("fleetmap/*/robots/*/blobs/*", lambda *_: b"")
         closed.close()
         with (
-            Bus.connect(server.endpoint, tls=keys.robot("a.1")) as a,
-            Bus.connect(server.endpoint, tls=keys.robot("b.1")) as b,
+            Bus(server.endpoint, tls=keys.robot("a.1")).open() as a,
+            Bus(server.endpoint, tls=keys.robot("b.1")).open() as b,
         ):
             for bus, own in ((a, OWN), (b, OTHERS)):
                 assert bus.get(own + "wanted", timeout_s=10)
@@ -344,9 +344,10 @@ def test_a_revoked_robot_is_out_while_it_is_connected(keys: Keys, protocol: str)
 def test_a_damaged_certificate_does_not_close_the_bus(keys: Keys, tmp_path: Path) -> None:
     own = tmp_path / "server.pem"
     own.write_bytes(keys.ours.tls.own.read_bytes())
-    with Bus.listen("tls/127.0.0.1:0", tls=TlsFiles(keys.ours.tls.authority, own), access=ACCESS) as server:
+    files = TlsFiles(keys.ours.tls.authority, own)
+    with Bus("tls/127.0.0.1:0", is_server=True, tls=files, access=ACCESS).open() as server:
         server.queryable("fleetmap/*/robots/*/blobs/*", lambda *_: b"honest")
-        with Bus.connect(server.endpoint, tls=keys.robot("a.1")) as robot:
+        with Bus(server.endpoint, tls=keys.robot("a.1")).open() as robot:
             own.write_text("damaged")
             with pytest.raises(LinkError, match="the bus stays as it is"):
                 server.reopen(ACCESS)

@@ -23,8 +23,8 @@ def pair(request: pytest.FixtureRequest) -> Iterator[tuple[Bus, Bus]]:
         hub = MemoryHub()
         server, robot = MemoryBus(hub), MemoryBus(hub)
     else:
-        server = Bus.listen("tcp/127.0.0.1:0")
-        robot = Bus.connect(server.endpoint)
+        server = Bus("tcp/127.0.0.1:0", is_server=True).open()
+        robot = Bus(server.endpoint).open()
     with server, robot:
         yield server, robot
     assert server.closed()
@@ -77,7 +77,7 @@ def test_silence_is_an_error(pair: tuple[Bus, Bus]) -> None:
 
 def test_a_slow_answer_is_silence_not_a_refusal() -> None:
     done = threading.Event()
-    with Bus.listen("tcp/127.0.0.1:0") as server, Bus.connect(server.endpoint) as robot:
+    with Bus("tcp/127.0.0.1:0", is_server=True).open() as server, Bus(server.endpoint).open() as robot:
         server.queryable("slow", lambda *_: b"late" if done.wait(20) else b"")
         with pytest.raises(UnreachableError):
             robot.get("slow", timeout_s=0.3)
@@ -93,7 +93,7 @@ def test_a_server_that_is_behind_answers_the_last_of_equal_questions() -> None:
         return payload if go.wait(20) else b""
 
     key = "fleetmap/s/robots/r/failures"
-    with Bus.listen("tcp/127.0.0.1:0") as server, Bus.connect(server.endpoint) as robot:
+    with Bus("tcp/127.0.0.1:0", is_server=True).open() as server, Bus(server.endpoint).open() as robot:
         server.queryable(key, answer)
         assert eventually(robot.connected)
         for payload in (b"first", b"again", b"again", b"again", b"other"):
@@ -107,7 +107,7 @@ def test_a_server_that_is_behind_answers_the_last_of_equal_questions() -> None:
 
 def test_who_connects_hears_bursts_and_images_whole() -> None:
     """As cameras publish them: a server alone drops what floods it."""
-    with Bus.listen("tcp/127.0.0.1:0") as server, Bus.connect(server.endpoint) as robot:
+    with Bus("tcp/127.0.0.1:0", is_server=True).open() as server, Bus(server.endpoint).open() as robot:
         heard: dict[str, list[int]] = {"server": [], "robot": []}
         server.subscribe("fleetmap/s/robots/r/health", lambda _, payload: heard["server"].append(len(payload)))
         robot.subscribe("image", lambda _, payload: heard["robot"].append(len(payload)))
@@ -175,44 +175,44 @@ def test_a_closed_handle_answers_no_more(pair: tuple[Bus, Bus]) -> None:
 
 
 def test_a_robot_survives_the_absence_of_its_server() -> None:
-    server = Bus.listen("tcp/127.0.0.1:0")
+    server = Bus("tcp/127.0.0.1:0", is_server=True).open()
     endpoint = server.endpoint
     server.close()
-    with Bus.connect(endpoint) as robot:
+    with Bus(endpoint).open() as robot:
         robot.publish("lost", b"")
         with pytest.raises(UnreachableError):
             robot.get("x", timeout_s=0.2)
         for _ in range(2):
-            with Bus.listen(endpoint) as back:
+            with Bus(endpoint, is_server=True).open() as back:
                 back.queryable("x", lambda *_: b"back")
                 assert robot.get("x", timeout_s=20) == b"back"
 
 
 def test_silent_connections_do_not_shut_out_robots() -> None:
     """More than zenoh lets wait for their sessions by default."""
-    with Bus.listen("tcp/127.0.0.1:0") as server, ExitStack() as stack:
+    with Bus("tcp/127.0.0.1:0", is_server=True).open() as server, ExitStack() as stack:
         server.queryable("key", lambda *_: b"answer")
         port = int(server.endpoint.rpartition(":")[2])
         for _ in range(150):
             stack.enter_context(socket.create_connection(("127.0.0.1", port)))
-        with Bus.connect(server.endpoint) as robot:
+        with Bus(server.endpoint).open() as robot:
             assert robot.get("key") == b"answer"
 
 
 def test_the_server_stays_on_its_own_endpoint() -> None:
-    with Bus.listen("tcp/127.0.0.1:0") as server:
+    with Bus("tcp/127.0.0.1:0", is_server=True).open() as server:
         with pytest.raises(LinkError, match="another server"):
-            Bus.listen(server.endpoint)
-        with Bus.listen("tcp/127.0.0.1:0") as other:
+            Bus(server.endpoint, is_server=True).open()
+        with Bus("tcp/127.0.0.1:0", is_server=True).open() as other:
             other.queryable("x", lambda *_: b"not yours")
-            with Bus.connect(server.endpoint) as robot, pytest.raises(UnreachableError):
+            with Bus(server.endpoint).open() as robot, pytest.raises(UnreachableError):
                 # Nothing is found by multicast or gossip: servers on one network don't see each other's robots.
                 robot.get("x", timeout_s=0.5)
 
 
 def test_threads_end_with_the_bus() -> None:
     before = threading.active_count()
-    with Bus.listen("tcp/127.0.0.1:0") as server:
+    with Bus("tcp/127.0.0.1:0", is_server=True).open() as server:
         server.subscribe("a", lambda *_: None)
         server.queryable("b", lambda *_: b"")
     assert eventually(lambda: threading.active_count() <= before)
@@ -227,7 +227,7 @@ def test_wrong_endpoints_are_usage_errors(endpoint: str) -> None:
 
 
 def test_presence_of_more_than_a_channel_usually_holds() -> None:
-    with Bus.listen("tcp/127.0.0.1:0") as server, Bus.connect(server.endpoint) as robots:
+    with Bus("tcp/127.0.0.1:0", is_server=True).open() as server, Bus(server.endpoint).open() as robots:
         keys = [f"fleetmap/lab/robots/r{n}/alive" for n in range(700)]
         for key in keys:
             robots.declare_alive(key)

@@ -105,7 +105,7 @@ def test_what_comes_beside_a_payload_counts() -> None:
         begun.set()
         gate.wait(20)
 
-    with Bus.listen("tcp/127.0.0.1:0") as server, Bus.connect(server.endpoint) as evil:
+    with Bus("tcp/127.0.0.1:0", is_server=True).open() as server, Bus(server.endpoint).open() as evil:
         server.subscribe("fleetmap/*/robots/*/health", listen)
         until_s = time.monotonic() + 20
         while not begun.is_set() and time.monotonic() < until_s:

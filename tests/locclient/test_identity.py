@@ -51,7 +51,7 @@ def server(tmp_path: Path) -> Iterator[Server]:
         init_here(store)
         register = RobotRegister(store)
         register.authorities.init(["127.0.0.1"], None, None)
-        with Bus.listen("tls/127.0.0.1:0", tls=register.tls, access=register.access()) as bus:
+        with Bus("tls/127.0.0.1:0", is_server=True, tls=register.tls, access=register.access()).open() as bus:
             made = Server(register, bus)
             bus.queryable(robot_key("*", "*", "renew"), made.renew)
             bus.queryable(robot_key("*", "*", "wanted"), lambda key, _: key.encode())
@@ -59,7 +59,7 @@ def server(tmp_path: Path) -> Iterator[Server]:
 
 
 def asks(identity: RobotIdentity, robot: str) -> bytes:
-    with Bus.connect(identity.who.endpoint, tls=identity.tls) as bus:
+    with Bus(identity.who.endpoint, tls=identity.tls).open() as bus:
         return bus.get(robot_key("lab", robot, "wanted"), timeout_s=5)
 
 
@@ -82,7 +82,7 @@ def test_enrolment_and_renewal(tmp_path: Path, server: Server) -> None:
     now = datetime.now(UTC)
     assert not identity.is_renewal_due(now)
     assert identity.is_renewal_due(now + timedelta(days=31))
-    with Bus.connect(identity.who.endpoint, tls=identity.tls) as bus:
+    with Bus(identity.who.endpoint, tls=identity.tls).open() as bus:
         identity.renew(bus)
         assert bus.get(robot_key("lab", "r1", "wanted"), timeout_s=5), "the connection that stands goes on"
     after = RobotIdentity.load(folder).certificate()
@@ -100,7 +100,7 @@ def test_lost_answers_do_no_harm(tmp_path: Path, server: Server) -> None:
     server.answers = True
     identity = RobotIdentity.enrol(folder, bundle)
     server.answers = False
-    with Bus.connect(identity.who.endpoint, tls=identity.tls) as bus:
+    with Bus(identity.who.endpoint, tls=identity.tls).open() as bus:
         before = identity.certificate()
         with pytest.raises(LinkError, match="lost on its way"):
             identity.renew(bus)

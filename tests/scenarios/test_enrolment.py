@@ -69,7 +69,7 @@ def test_two_robots_from_an_empty_folder(site: TlsSite) -> None:
             assert listed.count("certificate for 365 days") == 2
             # Row 1: a robot that answers in the server's place.
             thief = stack.enter_context(attacker(site.endpoint, one))
-            honest = stack.enter_context(Bus.connect(two.who.endpoint, tls=two.tls))
+            honest = stack.enter_context(Bus(two.who.endpoint, tls=two.tls).open())
             assert [wanted(honest, "r2") for _ in range(10)] == [1] * 10
             address = GivenAddress(identity=two.folder).resolve()
             with connected(address, site.folder / "cache", 10**8) as maps:
@@ -78,7 +78,7 @@ def test_two_robots_from_an_empty_folder(site: TlsSite) -> None:
         with site.serving(site.endpoint):
             assert [wanted(honest, "r2") for _ in range(10)] == [1] * 10
             # Row 6: revoked while it is connected.
-            with Bus.connect(one.who.endpoint, tls=one.tls) as stolen:
+            with Bus(one.who.endpoint, tls=one.tls).open() as stolen:
                 assert wanted(stolen, "r1") == 1
                 site.run("mapserver", "robots", "revoke", "r1", "--site", SITE, "--store", site.store)
                 assert eventually(lambda: wanted(stolen, "r1", 0.3) is None, 5)
@@ -89,21 +89,21 @@ def test_two_robots_from_an_empty_folder(site: TlsSite) -> None:
 
 def test_the_same_thief_without_tls_is_heard(site: TlsSite) -> None:
     """The control: on an open bus he answers first, most of the time."""
-    with site.serving("tcp/127.0.0.1:0"), Bus.connect(site.endpoint) as honest, attacker(site.endpoint, None) as thief:
+    with site.serving("tcp/127.0.0.1:0"), Bus(site.endpoint).open() as honest, attacker(site.endpoint, None) as thief:
         assert eventually(lambda: wanted(honest, "r2") == 99, 20)
         thief.close()
 
 
 def test_a_bus_that_listens_before_the_server_answers_is_the_thiefs() -> None:
     """The control of row 2: as it was while the server still read its store."""
-    with Bus.listen("tcp/127.0.0.1:0") as bare, Bus.connect(bare.endpoint) as honest:
+    with Bus("tcp/127.0.0.1:0", is_server=True).open() as bare, Bus(bare.endpoint).open() as honest:
         thief = attacker(bare.endpoint, None)
         assert wanted(honest, "r2") == 99
         thief.close()
 
 
 def test_the_demo_needs_no_keys(site: TlsSite) -> None:
-    with site.serving("tcp/127.0.0.1:0"), Bus.connect(site.endpoint) as robot:
+    with site.serving("tcp/127.0.0.1:0"), Bus(site.endpoint).open() as robot:
         assert wanted(robot, "anybody") == 1
     assert re.search(
         "has no certificate", site.run("mapserver", "serve", "--store", site.store, "--zenoh", "tls/127.0.0.1:0")

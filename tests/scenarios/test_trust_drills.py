@@ -60,7 +60,7 @@ class Drill:
         return ["--key", self.stick / "root-1.pem"]
 
     def robot(self, name: str) -> "Robot":
-        return Robot(self, self.robots.enter_context(Bus.connect(self.endpoint)), name)
+        return Robot(self, self.robots.enter_context(Bus(self.endpoint).open()), name)
 
     def repository(self) -> ListRepository:
         return ListRepository(self.store, datetime.now(UTC))

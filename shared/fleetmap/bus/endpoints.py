@@ -13,12 +13,11 @@ from fleetmap.errors import UsageError
 
 def check_endpoint(endpoint: str) -> str:
     """Return `endpoint`; raise UsageError unless it has the form tcp/HOST:PORT (also tls, quic, udp)."""
-    protocol, slash, address = endpoint.partition("/")
-    host, _, port = address.rpartition(":")
-    if not slash or protocol not in {"tcp", "tls", "quic", "udp"} or not host or not port.isdecimal():
+    written = re.fullmatch(r"(tcp|tls|quic|udp)/.+:([0-9]+)", endpoint)
+    if written is None:
         raise UsageError(f"endpoint {endpoint!r}: write it like tcp/127.0.0.1:7447")
-    if int(port) > 65535:
-        raise UsageError(f"endpoint {endpoint!r}: port {port} is above 65535")
+    if int(written[2]) > 65535:
+        raise UsageError(f"endpoint {endpoint!r}: port {written[2]} is above 65535")
     return endpoint
 
 

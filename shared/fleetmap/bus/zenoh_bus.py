@@ -87,21 +87,11 @@ class Bus:
         # A declaration lives as long as its object: without this list a token would vanish with a discarded handle.
         self._declared: list[_Declaration] = []
 
-    @classmethod
-    def listen(cls, endpoint: str, *, tls: TlsFiles | None = None, access: Access | None = None) -> Self:
-        """Open the server's side: a router that robots connect to. Port 0 takes a free one: see `endpoint`.
-
-        Errors as of `open`.
-        """
-        return cls(endpoint, is_server=True, tls=tls, access=access).open()
-
-    @classmethod
-    def connect(cls, endpoint: str, *, tls: TlsFiles | None = None) -> Self:
-        """Open a robot's side. Returns at once; connects, and reconnects after every loss, in the background."""
-        return cls(endpoint, tls=tls).open()
-
     def open(self) -> Self:
-        """Open the session with all declarations so far, and return the bus; raises LinkError if it cannot listen or connect."""
+        """Open the session with all declarations so far, and return the bus; raises LinkError if it cannot listen or connect.
+
+        A robot connects, and reconnects after every loss, in the background. A server's port 0 takes a free one: see `endpoint`.
+        """
         wanted = self.endpoint
         with self._lock:
             for attempt in range(5):

@@ -70,7 +70,7 @@ def opening_and_revoking(folder: Path, count: int, connected: int) -> dict[str, 
             guard.follow()
 
     threading.Thread(target=follow, daemon=True).start()
-    robots = [Bus.connect(bus.endpoint, tls=robot_files(register, holder, folder)) for holder in holders]
+    robots = [Bus(bus.endpoint, tls=robot_files(register, holder, folder)).open() for holder in holders]
 
     def answered(number: int) -> bool:
         try:

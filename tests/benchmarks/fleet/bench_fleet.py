@@ -59,7 +59,7 @@ class _Robot:
             SITE, f"robot-{number}", np.random.default_rng(number), known, rate_per_robot_day=60.0, tiles=_TILES,
             bad_tile=number % _TILES, ahead_s=(number % 7) - 3.0, cause=("dark", "blur", "covered")[number % 3], suspected_share=0.2,
         )  # fmt: skip
-        self.bus = Bus.connect(endpoint)
+        self.bus = Bus(endpoint).open()
         self.alive = self.bus.declare_alive(robot_key(SITE, self.made.name, "alive"))
 
     def say(self, message: RobotHealth | PoseMessage) -> None:

@@ -86,7 +86,7 @@ class _Robot:
     """One client: its connection, its manifest, what it received."""
 
     def __init__(self, endpoint: str, name: str) -> None:
-        self.bus, self._name = Bus.connect(endpoint), name
+        self.bus, self._name = Bus(endpoint).open(), name
         self._parts = ChunkReader(self.bus, timeout_s=_TIMEOUT_S, patience_s=_PATIENCE_S)
         self.manifest: Manifest | None = None
 
@@ -128,7 +128,7 @@ def _robots(endpoint: str, numbers: range, orders: Any, said: Any) -> None:
 def announced(endpoint: str) -> Iterator[None]:
     """Waits until a robot is told of what the block publishes, as robots do before they fetch."""
     heard = threading.Event()
-    with Bus.connect(endpoint) as bus:
+    with Bus(endpoint).open() as bus:
         bus.subscribe(robot_key(SITE, "robot-0", "wanted"), lambda *_: heard.set())
         while not bus.connected():
             time.sleep(0.05)

@@ -64,7 +64,7 @@ def test_a_server_that_is_killed_in_the_middle_of_a_fetch_is_waited_for(tmp_path
         releases.publish(store, "lab")
     with ExitStack() as servers:
         served = servers.enter_context(serving(tmp_path / "store"))
-        bus = servers.enter_context(Bus.connect(served.zenoh))
+        bus = servers.enter_context(Bus(served.zenoh).open())
         through, asked, failed = bus.get, [], []
 
         def get(key: str, payload: bytes = b"", *, timeout_s: float = 5.0) -> bytes:

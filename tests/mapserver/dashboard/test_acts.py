@@ -29,7 +29,7 @@ from support.storage.map_samples import draft_details
 
 def test_a_robot_is_told_where_it_stands(page: Page, served: Served) -> None:
     heard: list[InitialPoseMessage] = []
-    with talking(served.zenoh, 8), Bus.connect(served.zenoh) as bus:
+    with talking(served.zenoh, 8), Bus(served.zenoh).open() as bus:
         key = robot_key(SITE, "tug-5", "initial_pose")
         bus.subscribe(key, lambda _, data: heard.append(decode_message(data, InitialPoseMessage)))
         seen = opened(page, served, "robots/tug-5")

@@ -185,7 +185,7 @@ def test_a_failure_is_found_opened_and_shown_with_its_context(page: Page, served
 def test_a_new_failure_appears_by_itself(page: Page, served: Served) -> None:
     seen = opened(page, served, "failures", robot="tug-12")
     expect(page.get_by_role("status")).to_have_text("No failures match.")
-    with Bus.connect(served.zenoh) as bus:
+    with Bus(served.zenoh).open() as bus:
         report = encode_message(failure("tug-12", "live", cause="glare"))
         answer = bus.get(robot_key(SITE, "tug-12", "failures"), report)
         assert not decode_message(answer, FailureAck).refused

@@ -223,13 +223,13 @@ def test_a_renewed_certificate_ends_within_a_day_and_its_robot_goes_on(tmp_path:
         stack.callback(service.close)
         stack.enter_context(bus)
         bus.open()
-        robot = stack.enter_context(Bus.connect(bus.endpoint, tls=TlsFiles(servers, own)))
+        robot = stack.enter_context(Bus(bus.endpoint, tls=TlsFiles(servers, own)).open())
         wanted, renew = robot_key("lab", "r1", "wanted"), robot_key("lab", "r1", "renew")
         assert robot.get(wanted, timeout_s=20)
         stolen.write_bytes(own.read_bytes())
         own.write_bytes(renewed(own.read_bytes()))
         assert not guard.follow()
-        thief = stack.enter_context(Bus.connect(bus.endpoint, tls=TlsFiles(servers, stolen)))
+        thief = stack.enter_context(Bus(bus.endpoint, tls=TlsFiles(servers, stolen)).open())
         assert thief.get(wanted, timeout_s=20), "the control: at once both certificates are let in"
         clock["ns"] += DAY_NS
         guard._due_s = 0.0

@@ -79,7 +79,7 @@ def test_a_flood_of_reports_delays_nobody(served: Served, kind: str) -> None:
     calm = f"calm-{kind.replace(' ', '-')}"
     before_mb, before_disk_mb = memory_mb(served), disk_mb(served.folder)
     ended, sent, waits, numbers = threading.Event(), [0], [], count()
-    with Bus.connect(served.zenoh) as evil, Bus.connect(served.zenoh) as bus:
+    with Bus(served.zenoh).open() as evil, Bus(served.zenoh).open() as bus:
         decode_message(bus.get(robot_key("lab", calm, "wanted")), WantedVersion)
 
         def ask(key: str, payload: bytes) -> None:
@@ -129,7 +129,7 @@ def test_a_flood_of_failures_is_taken_slowly_and_refused_for_none(served: Served
     """60 at once, then one a minute; what waits is no refusal, so that the robot keeps it."""
     before_mb, before_disk_mb = memory_mb(served), disk_mb(served.folder)
     taken, later = 0, 0
-    with Bus.connect(served.zenoh) as evil, Bus.connect(served.zenoh) as bus:
+    with Bus(served.zenoh).open() as evil, Bus(served.zenoh).open() as bus:
         for number in range(300):
             report = msgspec.structs.replace(FAILURE, robot="tug-9", id=f"f{number}", thumbnails=(PICTURE,) * 4)
             try:
@@ -202,7 +202,7 @@ def test_a_client_that_sends_all_before_it_reads_gets_the_answer(served: Served,
 def test_a_key_of_the_bus_writes_no_line_of_its_own(served: Served) -> None:
     """Row 22 of docs/security.md, with the program as it runs."""
     forged = "2026-11-22 00:00:00,000 INFO mapserver: ada promoted version 9 "
-    with Bus.connect(served.zenoh) as evil:
+    with Bus(served.zenoh).open() as evil:
         decode_message(evil.get(robot_key("lab", "r1", "wanted")), WantedVersion)
         evil.publish(f"fleetmap/lab/robots/x\n{forged}/health", b"nonsense")
         until_s = time.monotonic() + 10

@@ -211,7 +211,7 @@ def test_a_robot_is_served_while_strangers_do_their_worst(tmp_path: Path) -> Non
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (1024, hard))
     try:
-        with serving(tmp_path) as served, Bus.connect(served.zenoh) as robot, ExitStack() as stack:
+        with serving(tmp_path) as served, Bus(served.zenoh).open() as robot, ExitStack() as stack:
             resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
             port, number = int(served.http.rpartition(":")[2]), 0
 

@@ -204,7 +204,7 @@ def talking(endpoint: str, count: int) -> Iterator[dict[str, tuple[float, float]
     """Robots that report every second, as real ones do; entries of the dictionary move them."""
     moved: dict[str, tuple[float, float]] = {}
     ended = threading.Event()
-    with Bus.connect(endpoint) as bus:
+    with Bus(endpoint).open() as bus:
 
         def talk() -> None:
             stamp_ns = time.time_ns()

@@ -122,7 +122,7 @@ class Robot(threading.Thread):
         self.questions = 0
 
     def run(self) -> None:
-        with Bus.connect(self._endpoint) as bus:
+        with Bus(self._endpoint).open() as bus:
             while not self._over.wait(random.uniform(0, 2 * self._every_s)):
                 self._report(bus, f"f{len(self.acknowledged)}")
                 if not self._over.is_set():

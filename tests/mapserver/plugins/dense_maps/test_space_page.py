@@ -209,7 +209,7 @@ def test_a_robots_view_has_the_angles_and_the_mounting_of_its_own_camera() -> No
 
 def test_a_robot_that_told_its_camera_is_drawn_with_it(page: Page, served: Served) -> None:
     report = msgspec.structs.replace(failure("tug-3", "f7"), camera=told_camera())
-    with Bus.connect(served.zenoh) as bus:
+    with Bus(served.zenoh).open() as bus:
         ack = decode_message(bus.get(robot_key(SITE, "tug-3", "failures"), encode_message(report)), FailureAck)
     assert not ack.refused
     seen = opened(page, served, "space")

@@ -41,7 +41,7 @@ def served(tmp_path: Path) -> Iterator[Served]:
 
 
 def test_a_survey_is_followed_to_its_end(page: Page, served: Served) -> None:
-    with Bus.connect(served.zenoh) as bus:
+    with Bus(served.zenoh).open() as bus:
         page.goto(f"{served.http}/dashboard/live?site=yard")
         expect(page.get_by_role("link", name="Live", exact=True)).to_have_count(1)
         deadline_s = time.monotonic() + 20
