@@ -16,7 +16,7 @@ from fleetmap.recordings import images, open_recording
 from fleetmap.recordings.images import INVERSE_DEPTH, RAW_ENCODINGS, StoredImage, decode_depth, decode_grey
 from fleetmap.recordings.ros2 import messages as ros_messages
 from support.recordings.mcap_samples import SAMPLE, foreign_messages, write_foreign
-from support.recordings.recording_samples import HEIGHT, WIDTH, make_sample, write_euroc
+from support.recordings.recording_samples import HEIGHT, WIDTH, make_sample, png_of, write_euroc
 
 NOISE = np.random.default_rng(0).integers(0, 255, (60, 80), np.uint8)
 PNG, JPEG = (bytes(cv2.imencode(kind, NOISE)[1]) for kind in (".png", ".jpg"))
@@ -32,16 +32,6 @@ def without_middle(data: bytes) -> bytes:
     return data[: len(data) // 3] + data[len(data) // 2 :]
 
 
-def png_of(stream: bytes) -> bytes:
-    """A PNG of 80x60 whose checksums are right, whatever its stream of pixels is."""
-
-    def chunk(name: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
-
-    head = chunk(b"IHDR", struct.pack(">IIBBBBB", 80, 60, 8, 0, 0, 0, 0))
-    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", stream) + chunk(b"IEND", b"")
-
-
 ROWS = b"".join(b"\0" + bytes(row) for row in NOISE)
 
 
@@ -51,10 +41,10 @@ ROWS = b"".join(b"\0" + bytes(row) for row in NOISE)
         flipped(PNG),
         without_middle(PNG),
         without_middle(JPEG),
-        png_of(zlib.compress(ROWS[:1000])),
-        png_of(zlib.compress(ROWS)[:-4] + b"abcd"),
-        png_of(zlib.compress(b"\x09" * len(ROWS))),
-        png_of(b""),
+        png_of(zlib.compress(ROWS[:1000]), 80, 60),
+        png_of(zlib.compress(ROWS)[:-4] + b"abcd", 80, 60),
+        png_of(zlib.compress(b"\x09" * len(ROWS)), 80, 60),
+        png_of(b"", 80, 60),
         PNG[:100],
         b"",
     ],

@@ -30,11 +30,8 @@ def written(file: Path, rig: str, frames: tuple[CameraFrame, ...] | None = None)
 
 
 def shows_the_same(one: CameraFrame, other: CameraFrame) -> bool:
-    return one.stamp_ns == other.stamp_ns and has_the_images(one, other)
-
-
-def has_the_images(one: CameraFrame, other: CameraFrame) -> bool:
-    return all(np.array_equal(a, b) for a, b in zip(images_of(one), images_of(other), strict=True))
+    shown = zip(images_of(one), images_of(other), strict=True)
+    return one.stamp_ns == other.stamp_ns and all(np.array_equal(a, b) for a, b in shown)
 
 
 @pytest.mark.parametrize(("rig", "views"), [("front-rear", ((0, 1), (2, 3))), ("front-sides", ((0, 1), (2,), (3,)))])

@@ -105,16 +105,8 @@ def test_tables_of_euroc_as_other_programs_write_them(tmp_path: Path, joint: str
     wanted, folder = write_euroc(tmp_path / "a", sample), write_euroc(tmp_path / "b", sample)
     images, imu = folder / "mav0/cam0/data.csv", folder / "mav0/imu0/data.csv"
     rewritten(images, lambda rows: [["stamp", "file", "exposure"], *([*row, "0.01"] for row in rows[1:])], joint)
-    header = [
-        "timestamp",
-        "a_RS_S_x [m s^-2]",
-        "a_RS_S_y",
-        "a_RS_S_z",
-        "w_RS_S_x [rad s^-1]",
-        "w_RS_S_y",
-        "w_RS_S_z",
-        "temperature",
-    ]
+    accel, gyro = "a_RS_S_x [m s^-2],a_RS_S_y,a_RS_S_z", "w_RS_S_x [rad s^-1],w_RS_S_y,w_RS_S_z"
+    header = f"timestamp,{accel},{gyro},temperature".split(",")
     rewritten(
         imu, lambda rows: [header, *([row[0], *row[4:7], *row[1:4], "21"] for row in rows if row[0].isdecimal())], joint
     )

@@ -69,13 +69,9 @@ def test_no_descriptor_and_no_corner_touches_the_body() -> None:
     room_px = clearance_px[tuple(np.rint(features.pixels).astype(int).T[::-1])]
     assert (room_px > 14.0 * SCALE_FACTOR**features.octaves).all()
     assert len(features) > 0.5 * len(everywhere)
-    tracker = core_tracker_pixels(frame.left, clearance_px)
+    none = np.zeros((0, 2), np.float32)
+    tracker, _ = core.spread_corners(frame.left, 100, 8.0, 12, 8, none, clearance_px, 1.0, 5.0)
     assert (clearance_px[tuple(np.rint(tracker).astype(int).T[::-1])] > 5).all() and len(tracker) > 20
-
-
-def core_tracker_pixels(left: NDArray[np.uint8], clearance_px: NDArray[np.uint8]) -> NDArray[np.float64]:
-    pixels, _ = core.spread_corners(left, 100, 8.0, 12, 8, np.zeros((0, 2), np.float32), clearance_px, 1.0, 5.0)
-    return pixels.astype(np.float64)
 
 
 def test_points_end_at_the_body() -> None:

@@ -3,6 +3,8 @@
 A textured wall 5 m before a stereo pair that turns about all three axes; nothing here uses the code under test.
 """
 
+import struct
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -240,6 +242,16 @@ def write_video(path: Path, images: Sequence[NDArray[np.uint8]], times_ms: Seque
             container.mux(stream.encode(frame))
         container.mux(stream.encode(None))
     return path
+
+
+def png_of(stream: bytes, width: int, height: int) -> bytes:
+    """A PNG whose checksums are right, whatever its stream of pixels is."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    head = chunk(b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0))
+    return b"\x89PNG\r\n\x1a\n" + head + chunk(b"IDAT", stream) + chunk(b"IEND", b"")
 
 
 def _euroc_yaml(camera: CameraCalibration, yaml_line: bool) -> str:

@@ -153,14 +153,6 @@ def test_what_comes_too_quickly_is_dropped_and_counted() -> None:
             assert [stamp_ns for stamp_ns, _ in viewer.wait_for("/fixes", 33)] == [1, *range(70, 102)]
 
 
-def test_a_port_in_use_is_told_at_once(server: FoxgloveServer) -> None:
-    port = int(server.url.rpartition(":")[2])
-    with pytest.raises(UsageError, match=f"--foxglove 127.0.0.1:{port}: cannot listen there.*choose another"):
-        FoxgloveServer("127.0.0.1", port, "hall")
-    with pytest.raises(UsageError, match="cannot listen there"):
-        FoxgloveServer("no.such.name.invalid", 0, "hall")
-
-
 def test_surveys_are_shown_in_their_own_frame_or_in_the_map() -> None:
     estimate = EstimateMessage(
         stamp_ns=6, status="TRACKING", map_version=None, odom_from_base=Placement.of(TURNED), map_from_odom=Placement.of(TURNED),
