@@ -9,6 +9,7 @@ import json
 import tempfile
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from common.yardstick import at_reference, slowness
 
@@ -21,23 +22,24 @@ _SETTLED_S = 10  # after which memory must not grow
 _SHORT_S = 60
 
 
-def measured(rig: Path, seconds: int, driver: list[str], robot: list[str]) -> dict[str, float | None]:
+def measured(rig: Path, driver: dict[str, Any], robot: list[str]) -> dict[str, float | None]:
     """Figures of a drive."""
-    before, frames = slowness(), str(seconds * _RATE_HZ)
+    before, lines = slowness(), list[dict[str, float]]()
     with ros_program("-m", "support.ros2.sensor_listener", str(rig), *robot) as process:
-        with ros_program("-m", "support.ros2.camera_driver", frames, *driver) as camera:
-            lines = []
+        with ros_program("-m", "support.ros2.camera_driver") as camera:
+            camera.stdin.write(json.dumps(driver) + "\n")
+            camera.stdin.close()
             while camera.poll() is None:
                 lines.append(json.loads(process.stdout.readline()))
-            sent = int(camera.stdout.read())
+            sent = len(json.loads(camera.stdout.read().splitlines()[-1]))
         process.stdin.close()
-        last = json.loads(process.stdout.read().splitlines()[-1])
+        lines += map(json.loads, process.stdout)
     running = [line for line in lines if line["frames"] > _SETTLED_S * _RATE_HZ]
     first, final = running[0], running[-1]
     cpu_ms = 1e3 * (final["cpu_s"] - first["cpu_s"]) / (final["frames"] - first["frames"])
     return {
         "sent": sent,
-        "lost_share": 1 - last["frames"] / sent,
+        "lost_share": 1 - lines[-1]["frames"] / sent,
         "cpu_ms": cpu_ms,
         "cpu_ms_at_reference": at_reference(cpu_ms, [before, slowness()]),
         "rss_growth_mb": final["rss_mb"] - first["rss_mb"],
@@ -55,11 +57,11 @@ def main() -> None:
         rig.write_text(format_calibration(replace(calibration(), imu=None)))
         with_imu = Path(folder) / "inertial.yaml"
         with_imu.write_text(format_calibration(calibration()))
-        short = min(options.seconds, _SHORT_S)
+        frames, short = options.seconds * _RATE_HZ, min(options.seconds, _SHORT_S) * _RATE_HZ
         figures = {
-            "raw": measured(rig, options.seconds, [], []),
-            "compressed": measured(rig, short, ["--compressed"], []),
-            "raw, IMU, estimates": measured(with_imu, short, ["--imu"], ["--publish"]),
+            "raw": measured(rig, {"frames": frames}, []),
+            "compressed": measured(rig, {"frames": short, "is_compressed": True}, []),
+            "raw, IMU, estimates": measured(with_imu, {"frames": short, "has_imu": True}, ["--publish"]),
         }
     options.out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
 
