@@ -8,6 +8,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
+from functools import cache
 from pathlib import Path
 
 import av
@@ -65,11 +66,8 @@ class Sample:
 
 def make_sample(frames: int = 6, *, imu_before_ns: int = 500_000_000) -> Sample:
     """Stereo pairs at 20 Hz, an IMU at 200 Hz from `imu_before_ns` before the first to 0.1 s after the last."""
-    texture = _texture()
     stamps_ns = START_NS + FRAME_NS * np.arange(frames, dtype=np.int64)
-    left = [_render(texture, world_from_cam0(int(s))) for s in stamps_ns]
-    shift = se3(np.eye(3), np.array([BASELINE_M, 0, 0]))
-    right = [_render(texture, world_from_cam0(int(s)) @ shift) for s in stamps_ns]
+    left, right = ([_view(int(s), offset_m).copy() for s in stamps_ns] for offset_m in (0.0, BASELINE_M))
     imu_stamps_ns = np.arange(stamps_ns[0] - imu_before_ns, stamps_ns[-1] + 100_000_000, IMU_NS, dtype=np.int64)
     gyro, accel = zip(*(_imu(int(s)) for s in imu_stamps_ns), strict=True)
     truth = [world_from_cam0(int(s)) @ se3_inverse(BODY_FROM_CAM0) for s in stamps_ns]
@@ -265,6 +263,7 @@ def _euroc_yaml(camera: CameraCalibration, yaml_line: bool) -> str:
     )
 
 
+@cache
 def _imu(stamp_ns: int) -> tuple[Array, Array]:
     half = 100_000
     before, after = world_from_cam0(stamp_ns - half)[:3, :3], world_from_cam0(stamp_ns + half)[:3, :3]
@@ -274,6 +273,7 @@ def _imu(stamp_ns: int) -> tuple[Array, Array]:
     return body_from_cam @ rate_cam, 9.81 * body_from_cam @ up_cam
 
 
+@cache
 def _texture() -> NDArray[np.uint8]:
     rng = np.random.default_rng(7)
     noise = [cv2.resize(rng.random((n, n)), (1600, 1600), interpolation=cv2.INTER_CUBIC) for n in (40, 130, 400)]
@@ -281,11 +281,14 @@ def _texture() -> NDArray[np.uint8]:
     return np.asarray(255 * mixed / mixed.max(), np.uint8)
 
 
-def _render(texture: NDArray[np.uint8], world_from_cam: Array) -> NDArray[np.uint8]:
+@cache
+def _view(stamp_ns: int, offset_m: float) -> NDArray[np.uint8]:
+    """The picture of a camera so far right of the left one."""
+    world_from_cam = world_from_cam0(stamp_ns) @ se3(np.eye(3), np.array([offset_m, 0, 0]))
     u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
     rays = np.stack([(u - (WIDTH / 2 - 0.5)) / FOCAL, (v - (HEIGHT / 2 - 0.5)) / FOCAL, np.ones_like(u, float)], -1)
     rays_world = rays @ world_from_cam[:3, :3].T
     distance = (WALL_M - world_from_cam[2, 3]) / rays_world[..., 2]
     points = world_from_cam[:3, 3] + rays_world * distance[..., None]
     pixels = (points[..., :2] * 80 + 800).astype(np.float32)
-    return np.asarray(cv2.remap(texture, pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT), np.uint8)
+    return np.asarray(cv2.remap(_texture(), pixels, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REFLECT), np.uint8)
