@@ -9,7 +9,7 @@ import re
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
-from functools import partial
+from functools import cache, partial
 from importlib.metadata import entry_points
 from pathlib import Path
 
@@ -39,6 +39,7 @@ Row = tuple[
 ]  # what stands in the three columns: the name, its default, and what it means where the page has no words
 
 
+@cache
 def commands() -> dict[str, click.Command]:
     """All commands of all programs by their words, such as "mapserver build", groups left out."""
     found: dict[str, click.Command] = {}

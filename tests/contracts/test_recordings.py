@@ -75,9 +75,9 @@ WRITERS: dict[str, Callable[[Path], Path]] = {
 WITHOUT_CALIBRATION = ("tum-rgbd", "video")
 
 
-@pytest.fixture(params=list(recording_formats()))
-def path(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    return WRITERS[request.param](tmp_path / "recording")
+@pytest.fixture(params=list(recording_formats()), scope="module")
+def path(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return WRITERS[request.param](tmp_path_factory.mktemp(request.param) / "recording")
 
 
 def opened(path: Path) -> Recording:
@@ -129,14 +129,11 @@ def test_stamps_increase_and_images_are_the_samples(path: Path) -> None:
 def test_the_hash_is_that_of_a_copy_elsewhere_and_not_of_another_recording(path: Path, tmp_path: Path) -> None:
     first = opened(path).content_hash()
     elsewhere = tmp_path / "elsewhere"
-    if path.is_dir():
-        shutil.copytree(path, elsewhere)
-    else:
-        shutil.copy(path, elsewhere)
+    (shutil.copytree if path.is_dir() else shutil.copy)(path, elsewhere)
     assert opened(elsewhere).content_hash() == first
-    image = max((p for p in path.rglob("*") if p.is_file()), key=lambda p: p.stat().st_size) if path.is_dir() else path
+    image = max((p for p in (elsewhere, *elsewhere.rglob("*")) if p.is_file()), key=lambda p: p.stat().st_size)
     image.write_bytes(image.read_bytes() + b"\0")
-    assert opened(path).content_hash() != first
+    assert opened(elsewhere).content_hash() != first
 
 
 def test_truth_is_that_of_the_body(path: Path) -> None:
@@ -167,14 +164,10 @@ def test_a_conversion_to_mcap_loses_nothing(path: Path, tmp_path: Path) -> None:
         np.testing.assert_allclose(copy.ground_truth.frame_from_body, source.ground_truth.frame_from_body, atol=1e-12)
 
 
-def test_a_frame_outside_is_refused(path: Path) -> None:
+def test_a_frame_outside_is_refused_and_closing_twice_is_fine(path: Path) -> None:
     recording = opened(path)
     for index in (-1, len(recording)):
         with pytest.raises(RecordingError, match=str(index)):
             recording.read_frame(index)
-
-
-def test_closing_twice_is_fine(path: Path) -> None:
-    recording = opened(path)
     recording.close()
     recording.close()
