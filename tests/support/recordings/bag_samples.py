@@ -1,7 +1,9 @@
 """The messages of `mcap_samples` in bags that rosbags' writers make."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from functools import reduce
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
@@ -14,6 +16,26 @@ from support.recordings.mcap_samples import Message
 _STORE = get_typestore(Stores.ROS2_JAZZY)
 _STORE1 = get_typestore(Stores.ROS1_NOETIC)
 _STORE1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf2_msgs/msg/TFMessage"))
+
+
+def edited(
+    messages: Iterable[Message],
+    topic: str,
+    change: dict[str, Any] | Callable[[Any], None],
+    rows: slice = slice(None),
+) -> list[Message]:
+    """The messages, those of a topic in these rows changed in rosbags' form: fields by dotted names, or by a function of it."""
+    edited = list(messages)
+    for number in [number for number, message in enumerate(edited) if message[0] == topic][rows]:
+        name, kind, stamp_ns, data = edited[number]
+        message = _STORE.deserialize_cdr(data, kind.replace("/", "/msg/"))
+        for path, value in () if callable(change) else change.items():
+            *parents, field = path.split(".")
+            setattr(reduce(getattr, parents, message), field, value)
+        if callable(change):
+            change(message)
+        edited[number] = name, kind, stamp_ns, bytes(_STORE.serialize_cdr(message, kind.replace("/", "/msg/")))
+    return edited
 
 
 def write_rosbag2(

@@ -18,8 +18,9 @@ from fleetmap.recordings.ros2 import messages as ros_messages
 from fleetmap.sensors.cameras import lens_of
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import SensorSet
-from support.recordings.mcap_samples import IMU, SAMPLE, Message, foreign_messages, write_foreign
-from support.recordings.recording_samples import FOCAL, HEIGHT, WIDTH, calibration, kalibr_text
+from support.recordings.bag_samples import edited
+from support.recordings.mcap_samples import IMU, SAMPLE, foreign_messages, write_foreign
+from support.recordings.recording_samples import HEIGHT, WIDTH, calibration, kalibr_text
 from support.recordings.rig_samples import simulated, write_rig
 
 
@@ -51,18 +52,22 @@ def test_files_of_this_project_are_the_same_for_both_readers(tmp_path: Path, rig
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("topics", "options"),
     [
-        {"compression": CompressionType.ZSTD},
-        {"compression": CompressionType.LZ4},
-        {"use_chunking": False},
-        {"use_summary_offsets": False, "use_statistics": False, "repeat_channels": False, "repeat_schemas": False},
-        {"enable_crcs": False},
+        ({}, {"compression": CompressionType.ZSTD}),
+        ({}, {"compression": CompressionType.LZ4}),
+        ({}, {"use_chunking": False}),
+        (
+            {},
+            {"use_summary_offsets": False, "use_statistics": False, "repeat_channels": False, "repeat_schemas": False},
+        ),
+        ({}, {"enable_crcs": False}),
+        ({"left": "/camera/left/image_raw", "right": "/camera/right/image_raw", "imu": "/sensors/imu"}, {}),
     ],
-    ids=["zstd", "lz4", "unchunked", "no summary", "no checksums"],
+    ids=["zstd", "lz4", "unchunked", "no summary", "no checksums", "other topics"],
 )
-def test_all_ways_to_store_it(tmp_path: Path, options: dict[str, Any]) -> None:
-    with open_recording(write_foreign(tmp_path / "a.mcap", foreign_messages(), **options)) as recording:
+def test_all_ways_to_store_and_to_name_it(tmp_path: Path, topics: dict[str, str], options: dict[str, Any]) -> None:
+    with open_recording(write_foreign(tmp_path / "a.mcap", foreign_messages(**topics), **options)) as recording:
         assert recording.issues == ()
         assert_is_the_sample(recording)
 
@@ -82,12 +87,6 @@ def test_no_transform_to_the_imu_nor_between_cameras(tmp_path: Path) -> None:
         open_recording(write_foreign(tmp_path / "a.mcap", foreign_messages(tf=False)))
 
 
-def test_topics_by_their_type_and_name(tmp_path: Path) -> None:
-    messages = foreign_messages(left="/camera/left/image_raw", right="/camera/right/image_raw", imu="/sensors/imu")
-    with open_recording(write_foreign(tmp_path / "a.mcap", messages)) as recording:
-        assert_is_the_sample(recording)
-
-
 def test_topics_noted_in_the_calibration_file(tmp_path: Path) -> None:
     text = kalibr_text().replace("/cam0/image_raw", "/a/image").replace("/cam1/image_raw", "/b/image")
     (tmp_path / "rig.yaml").write_text(text)
@@ -96,27 +95,14 @@ def test_topics_noted_in_the_calibration_file(tmp_path: Path) -> None:
         assert_is_the_sample(recording)
 
 
-def camera_info(lens: str, distortion: list[float]) -> bytes:
-    """sensor_msgs/CameraInfo built by another CDR writer than ours."""
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_JAZZY)
-    types = store.types
-    header = types["std_msgs/msg/Header"](types["builtin_interfaces/msg/Time"](0, 7), "cam0_optical")
-    k = np.array([FOCAL, 0, WIDTH / 2, 0, FOCAL, HEIGHT / 2, 0, 0, 1.0])
-    p = np.array([FOCAL, 0, WIDTH / 2, 0, 0, FOCAL, HEIGHT / 2, 0, 0, 0, 1.0, 0])
-    roi = types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)
-    message = types["sensor_msgs/msg/CameraInfo"](
-        header, HEIGHT, WIDTH, lens, np.array(distortion), k, np.eye(3).ravel(), p, 0, 0, roi
-    )
-    return bytes(store.serialize_cdr(message, "sensor_msgs/msg/CameraInfo"))
+LEFT = [message for message in foreign_messages() if message[0].startswith("/cam0/")]
+INFO = LEFT[1]
 
 
-def mono(tmp_path: Path, info: bytes) -> Recording:
-    messages = [m for m in foreign_messages() if m[0] == "/cam0/image_raw"]
-    return open_recording(
-        write_foreign(tmp_path / "a.mcap", [*messages, ("/cam0/camera_info", "sensor_msgs/CameraInfo", 1, info)])
-    )
+def mono(tmp_path: Path, lens: str, distortion: list[float]) -> Recording:
+    """A camera whose CameraInfo rosbags wrote."""
+    messages = edited(LEFT, INFO[0], {"distortion_model": lens, "d": np.array(distortion)})
+    return open_recording(write_foreign(tmp_path / "a.mcap", messages))
 
 
 RATIONAL = [0.42, 0.03, 2e-4, -1e-4, 1e-3, 0.72, 0.14, 4e-3]
@@ -134,7 +120,7 @@ RATIONAL = [0.42, 0.03, 2e-4, -1e-4, 1e-3, 0.72, 0.14, 4e-3]
     ],
 )
 def test_lenses(tmp_path: Path, lens: str, distortion: list[float], model: str, kept: int) -> None:
-    recording = mono(tmp_path, camera_info(lens, distortion))
+    recording = mono(tmp_path, lens, distortion)
     camera = recording.calibration.cameras[0]
     assert (recording.sensor_set, camera.model) == (SensorSet.MONO, model)
     assert camera.distortion.tolist() == distortion[:kept]
@@ -156,7 +142,7 @@ def test_lenses(tmp_path: Path, lens: str, distortion: list[float], model: str, 
 )
 def test_other_lenses_are_refused_by_name(tmp_path: Path, lens: str, distortion: list[float], says: str) -> None:
     with pytest.raises(CalibrationError, match=says) as caught:
-        mono(tmp_path, camera_info(lens, distortion))
+        mono(tmp_path, lens, distortion)
     assert "calibrat" in str(caught.value)
 
 
@@ -166,22 +152,17 @@ def test_images_of_every_encoding(tmp_path: Path) -> None:
     wanted = cv2.cvtColor(colour, cv2.COLOR_BGR2GRAY)
     padded = np.zeros((HEIGHT, WIDTH + 12), np.uint8)
     padded[:, :WIDTH] = grey
+    deep = grey.astype(np.uint16) * 256
     cases = [
         (StoredImage("bgr8", colour.tobytes(), "", WIDTH, HEIGHT, 3 * WIDTH), wanted),
         (StoredImage("rgb8", colour[..., ::-1].tobytes(), "", WIDTH, HEIGHT, 3 * WIDTH), wanted),
-        (StoredImage("mono16", (grey.astype("<u2") * 256).tobytes(), "", WIDTH, HEIGHT, 2 * WIDTH), grey),
-        (
-            StoredImage(
-                "mono16", (grey.astype(np.uint16) * 256).astype(">u2").tobytes(), "", WIDTH, HEIGHT, 2 * WIDTH, True
-            ),
-            grey,
-        ),
+        (StoredImage("mono16", deep.astype("<u2").tobytes(), "", WIDTH, HEIGHT, 2 * WIDTH), grey),
+        (StoredImage("mono16", deep.astype(">u2").tobytes(), "", WIDTH, HEIGHT, 2 * WIDTH, True), grey),
         (StoredImage("mono8", padded.tobytes(), "", WIDTH, HEIGHT, WIDTH + 12), grey),
     ]
-    messages: list[Message] = [("/cam0/camera_info", "sensor_msgs/CameraInfo", 1, camera_info("", []))]
-    for stamp, (image, _) in enumerate(cases, start=1):
-        messages.append(("/cam0/image_raw", "sensor_msgs/Image", stamp, ros_messages.encode_image(stamp, "c", image)))
-    recording = open_recording(write_foreign(tmp_path / "a.mcap", messages))
+    encoded = [ros_messages.encode_image(stamp, "c", image) for stamp, (image, _) in enumerate(cases, start=1)]
+    messages = [("/cam0/image_raw", "sensor_msgs/Image", stamp, data) for stamp, data in enumerate(encoded, start=1)]
+    recording = open_recording(write_foreign(tmp_path / "a.mcap", [INFO, *messages]))
     for index, (_, expected) in enumerate(cases):
         np.testing.assert_array_equal(recording.read_frame(index).left, expected)
 
@@ -192,23 +173,15 @@ def test_depth_beside_colour(tmp_path: Path, encoding: str) -> None:
     depth_mm[:5], depth_mm[5:9] = 0, 65535
     if encoding == "png":
         name, data = "sensor_msgs/CompressedImage", cv2.imencode(".png", depth_mm)[1].tobytes()
-        message = ros_messages.encode_compressed_image(10, "c", StoredImage("file", data), "16UC1; png compressed")
+        message = ros_messages.encode_compressed_image(
+            LEFT[0][2], "c", StoredImage("file", data), "16UC1; png compressed"
+        )
     else:
         pixels = depth_mm if encoding == "16UC1" else np.where(depth_mm == 2500, np.float32(2.5), np.float32(np.nan))
         rows = StoredImage(encoding, pixels.tobytes(), "", WIDTH, HEIGHT, pixels.strides[0])
-        name, message = "sensor_msgs/Image", ros_messages.encode_image(10, "c", rows)
-    left = StoredImage("mono8", SAMPLE.left[0].tobytes(), "", WIDTH, HEIGHT, WIDTH)
-    topic = "/depth/image_raw" + ("/compressed" if encoding == "png" else "")
-    recording = open_recording(
-        write_foreign(
-            tmp_path / "a.mcap",
-            [
-                ("/cam0/image_raw", "sensor_msgs/Image", 5, ros_messages.encode_image(5, "c", left)),
-                (topic, name, 10, message),
-                ("/cam0/camera_info", "sensor_msgs/CameraInfo", 1, camera_info("", [])),
-            ],
-        )
-    )
+        name, message = "sensor_msgs/Image", ros_messages.encode_image(LEFT[0][2], "c", rows)
+    topic, now = "/depth/image_raw" + ("/compressed" if encoding == "png" else ""), LEFT[0][2]
+    recording = open_recording(write_foreign(tmp_path / "a.mcap", [*LEFT[:2], (topic, name, now, message)]))
     assert recording.sensor_set is SensorSet.RGBD
     depth = recording.read_frame(0).depth_m
     np.testing.assert_array_equal(depth, np.where(depth_mm == 2500, np.float32(2.5), np.float32(0)))

@@ -20,7 +20,7 @@ from fleetmap.plugins.other_recorders import ros1
 from fleetmap.recordings import open_recording
 from fleetmap.recordings.ros2.messages import FrameLink, encode_frame_links
 from fleetmap.sensors.rectification import Rectifier
-from support.recordings.bag_samples import _STORE, assert_same, write_rosbag1
+from support.recordings.bag_samples import assert_same, edited, write_rosbag1
 from support.recordings.mcap_samples import SAMPLE, Message, foreign_messages, write_foreign
 from support.recordings.recording_samples import BASELINE_M, FOCAL
 from support.storage.memory_limit import memory_at_most
@@ -175,7 +175,6 @@ def test_without_the_library_the_message_names_the_extra(tmp_path: Path, monkeyp
 
 # Static transforms and CameraInfo as robots publish them: the last transform of a frame counts, and a pair has its baseline.
 
-INFO = "sensor_msgs/msg/CameraInfo"
 Link = tuple[str, str, float]  # parent, child, metres to the right
 IMU, LEFT, RIGHT = "imu_link", "cam0_optical", "cam1_optical"
 TREE = (IMU, LEFT, 0.1), (LEFT, RIGHT, BASELINE_M)
@@ -218,12 +217,8 @@ def test_a_pair_has_the_baseline_of_its_transforms_or_of_its_projection(
     tmp_path: Path, right: Link | tuple[()], right_frame: str, in_projection_m: float
 ) -> None:
     messages = [*foreign_messages(tf=False), static_links(1, TREE[0], *([right] if right else []))]
-    for number, (topic, name, stamp_ns, data) in enumerate(messages):
-        if topic == "/cam1/camera_info":
-            info = _STORE.deserialize_cdr(data, INFO)
-            info.header.frame_id, info.p = right_frame, np.copy(info.p)
-            info.p[3] = -FOCAL * in_projection_m
-            messages[number] = topic, name, stamp_ns, bytes(_STORE.serialize_cdr(info, INFO))
+    projection = np.array([FOCAL, 0, 0, -FOCAL * in_projection_m, 0, FOCAL, 0, 0, 0, 0, 1, 0])
+    messages = edited(messages, "/cam1/camera_info", {"header.frame_id": right_frame, "p": projection})
     file = write_foreign(tmp_path / "a.mcap", messages)
     if not in_projection_m and (right_frame == LEFT or right != TREE[1]):
         with pytest.raises(CalibrationError, match=r"the pose of the right camera is unknown .* no baseline in its"):
