@@ -106,20 +106,19 @@ def replay(
         profile = RobotProfile(maps.site, options.robot or "replay", rectifier.rig, options.settings)
         options.export.begin(first_ns, loaded, profile, rectifier)
     unread: list[str] = []
-    for number, imu in enumerate(source.imu_before_each()):
+    for number, before in enumerate(source.samples_before_each()):
         decode_s = time.process_time()
-        wheel, priors = list(source.wheel_before(number)), source.priors_before(number)
         try:
             raw = source.frame(number)
         except RecordingError as error:
             unread.append(str(error))
-            robot.handle(SensorBundle(None, imu, wheel, priors))
+            robot.handle(before)
             continue
         decode_s = time.process_time() - decode_s
         if options.realtime:
             time.sleep(max(0.0, (raw.stamp_ns - first_ns) * 1e-9 - (time.monotonic() - begun_s)))
         wall_s = time.monotonic()
-        outcome = robot.handle(SensorBundle(raw, imu, wheel, priors))
+        outcome = robot.handle(replace(before, frame=raw))
         wall_s = time.monotonic() - wall_s
         if outcome is not None:  # else the view that it follows has no image in this frame
             _add(result, outcome, source.truth_map_from_body(number), wall_s, decode_s)
@@ -202,10 +201,10 @@ def starts(
         robot = Robot(rectifier, settings, TrialSettings())
         robot.use(loaded)
         found = []
-        for number, before in enumerate(part.imu_before_each()):
+        for number, before in enumerate(part.samples_before_each()):
             frame = shown[start + number]
-            imu = before if number else before.between(frame.stamp_ns - _IMU_LEAD_NS, 1 << 62)
-            outcome = robot.handle(SensorBundle(frame, imu, list(part.wheel_before(number) if number else []), []))
+            imu = before.imu if number else before.imu.between(frame.stamp_ns - _IMU_LEAD_NS, 1 << 62)
+            outcome = robot.handle(SensorBundle(frame, imu, before.wheel if number else []))
             if outcome is not None:
                 found.append(outcome.estimate)
         yield found

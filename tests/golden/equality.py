@@ -17,6 +17,7 @@ import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -28,7 +29,6 @@ from fleetmap.mapformat.building import Building, BuildingFrame, FloorEntry
 from fleetmap.recordings import open_recording
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.replay_source import ReplaySource
-from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient import LocalizeOptions, localize
 from locclient.localization.estimate import Estimate
 from locclient.localization.settings import LocalizerSettings
@@ -103,10 +103,8 @@ def in_a_building(drive: Path, store: Path) -> Iterable[Estimate]:
         robot.use(load_map(own)[0])
         robot.use_building(change.building, change.maps)
         source = ReplaySource(recording, np.arange(len(recording.frame_stamps_ns)), reverse=False)
-        for number, imu in enumerate(source.imu_before_each()):
-            outcome = robot.handle(
-                SensorBundle(source.frame(number), imu, list(source.wheel_before(number)), source.priors_before(number))
-            )
+        for number, before in enumerate(source.samples_before_each()):
+            outcome = robot.handle(replace(before, frame=source.frame(number)))
             if outcome is not None:
                 yield outcome.estimate
 

@@ -1,6 +1,6 @@
 """Samples of a replay: a recording, forwards, or backwards with new stamps and without IMU."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array
 from fleetmap.recordings import FrameSelection, Recording
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample, wheel_between
+from fleetmap.sensors.samples import CameraFrame, wheel_between
+from fleetmap.sources.sensor_bundle import SensorBundle
 
 _IMU_LEAD_NS = 10_000_000  # a frame is handled once IMU samples slightly past it have arrived
 _NEVER_NS = -(2**62)
@@ -58,29 +59,21 @@ class ReplaySource:
         others = tuple(None if other is None else self._played(other) for other in frame.others)
         return replace(frame, stamp_ns=self.played_stamp_ns(frame.stamp_ns), others=others)
 
-    def imu_before_each(self) -> Iterator[ImuSamples]:
-        """For each frame of the playback, the IMU samples that arrive before it is handled; none backwards."""
-        for number in range(len(self)):
-            since_ns, until_ns = (self._body_ns(each) + _IMU_LEAD_NS for each in (number - 1, number))
-            yield ImuSamples.empty() if self.reverse else self.recording.imu.between(since_ns, until_ns)
-
-    def priors_before(self, number: int) -> list[PositionPrior]:
-        """Coarse poses in the recording between the frame before and frame `number`; none backwards."""
-        if self.reverse:
-            return []
-        since = self.recorded_stamp_ns(number - 1) if number else _NEVER_NS
-        return [p for p in self.recording.priors if since < p.stamp_ns <= self.recorded_stamp_ns(number)]
-
-    def wheel_before(self, number: int) -> Sequence[WheelSample]:
-        """Wheel odometry between the frame before and frame `number`; none backwards."""
-        if self.reverse:
-            return []
-        return wheel_between(self.recording.wheel, self._body_ns(number - 1) + 1, self._body_ns(number) + 1)
-
-    def _body_ns(self, number: int) -> int:
-        """Stamp of a frame on the clock of the IMU and the wheels; -1 for before all frames."""
-        offset_ns = int(self.recording.calibration.cameras[0].imu_minus_cam_s * 1e9)
-        return _NEVER_NS if number < 0 else self.recorded_stamp_ns(number) + offset_ns
+    def samples_before_each(self) -> Iterator[SensorBundle]:
+        """For each frame of the playback, the other samples that are handled before it; none backwards."""
+        recording, since_ns = self.recording, _NEVER_NS
+        offset_ns = int(
+            recording.calibration.cameras[0].imu_minus_cam_s * 1e9
+        )  # to the clock of the IMU and the wheels
+        for until_ns in recording.frame_stamps_ns[self.indices].tolist():
+            if self.reverse:
+                yield SensorBundle()
+                continue
+            imu = recording.imu.between(*(ns + offset_ns + _IMU_LEAD_NS for ns in (since_ns, until_ns)))
+            wheel = wheel_between(recording.wheel, *(ns + offset_ns + 1 for ns in (since_ns, until_ns)))
+            priors = [prior for prior in recording.priors if since_ns < prior.stamp_ns <= until_ns]
+            yield SensorBundle(None, imu, list(wheel), priors)
+            since_ns = until_ns
 
     def truth_map_from_body(self, number: int) -> Array | None:
         """The recording's ground truth at frame `number`, None if absent."""

@@ -42,7 +42,7 @@ class RecordingSource:
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
         begun_s, recorded_s = time.monotonic(), 0.0
-        for number, imu in enumerate(self._source.imu_before_each()):
+        for number, before in enumerate(self._source.samples_before_each()):
             if number:
                 gap_ns = self._source.recorded_stamp_ns(number) - self._source.recorded_stamp_ns(number - 1)
                 recorded_s += min(gap_ns * 1e-9, _LONGEST_GAP_S)
@@ -52,10 +52,10 @@ class RecordingSource:
             while not self._speed and not intake.wait_for_room(_ROOM_WAIT_S):
                 if wait(0.0):
                     return
-            intake.put_imu(imu)
-            for sample in self._source.wheel_before(number):
+            intake.put_imu(before.imu)
+            for sample in before.wheel:
                 intake.put_wheel(sample)
-            for prior in self._source.priors_before(number):
+            for prior in before.priors:
                 intake.put_prior(prior)
             try:
                 intake.put_frame(self._recording.stored_frame(int(self._source.indices[number])))

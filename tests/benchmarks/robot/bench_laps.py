@@ -9,6 +9,8 @@ import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
 
+from dataclasses import replace
+
 from benchmarks.common.laps import repeated
 from benchmarks.common.recorded_runs import SITE, parsed, recorded, resident_mb, surveyed, write_results
 from fleetmap.free_memory import give_back_free_memory
@@ -16,7 +18,6 @@ from fleetmap.messages import Status
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.replay_source import ReplaySource
-from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.identity import MapAddress
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.map_client import connected
@@ -40,9 +41,9 @@ def main() -> None:
         rectifier = Rectifier(source.calibration)
         robot = Robot(rectifier, LocalizerSettings(), TrialSettings(), keeps_replay=True)
         robot.use(load_map(link)[0])
-        for number, imu in enumerate(source.imu_before_each()):
+        for number, before in enumerate(source.samples_before_each()):
             raw = source.frame(number)
-            outcome = robot.handle(SensorBundle(raw, imu, source.wheel_before(number), source.priors_before(number)))
+            outcome = robot.handle(replace(before, frame=raw))
             tracking += outcome.estimate.status is Status.TRACKING
             minute = (raw.stamp_ns - int(laps_ns[0])) // 60_000_000_000
             if minute > len(resident):

@@ -42,11 +42,11 @@ def odometry_ms(path: Path, settings: LocalizerSettings) -> list[float]:
         source = ReplaySource.of(recording, FrameSelection.parse(":"), reverse=False)
         rectifier = Rectifier(source.calibration)
         odometry = Odometry(rectifier.rig, settings.odometry, settings.stereo)
-        for number, imu in enumerate(source.imu_before_each()):
+        for number, before in enumerate(source.samples_before_each()):
             raw = source.frame(number)
             begun_s = time.process_time()
-            odometry.handle_imu(imu)
-            odometry.handle_wheel(source.wheel_before(number))
+            odometry.handle_imu(before.imu)
+            odometry.handle_wheel(before.wheel)
             odometry.handle_stereo(rectifier.rectify(raw))
             out.append(1e3 * (time.process_time() - begun_s))
     return out[run_metrics.WARM_UP_FRAMES :]

@@ -177,7 +177,7 @@ def test_every_imu_sample_comes_once_and_in_time(recording: Recording, frames: s
     cameras = tuple(replace(camera, imu_minus_cam_s=offset_s) for camera in recording.calibration.cameras)
     moved = replace(recording, calibration=replace(recording.calibration, cameras=cameras))
     played = source(moved, frames)
-    parts = list(played.imu_before_each())
+    parts = [before.imu for before in played.samples_before_each()]
     assert len(parts) == len(played)
     fed: list[int] = []
     for number, part in enumerate(parts):
@@ -207,7 +207,7 @@ def test_backwards_the_pictures_turn_and_the_stamps_rise(recording: Recording) -
         truth = played.truth_map_from_body(number)
         np.testing.assert_allclose(truth, SAMPLE.world_from_body[1::3][::-1][number], atol=1e-9)
     assert played.calibration.imu is None, "its samples would say the opposite of what happens"
-    assert [len(samples) for samples in played.imu_before_each()] == [0, 0, 0]
+    assert [len(before.imu) for before in played.samples_before_each()] == [0, 0, 0]
 
 
 def test_no_frame_is_a_usage_error(recording: Recording) -> None:

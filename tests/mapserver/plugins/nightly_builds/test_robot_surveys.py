@@ -2,6 +2,7 @@
 
 import io
 import time
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -15,7 +16,6 @@ from fleetmap.messages import FailureAck, SurveyArea, decode_message
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.replay_source import ReplaySource
-from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.delivery.survey_drives import SurveyDrives
 from locclient.localization.settings import LocalizerSettings
 from locclient.replay.replay import fetch_map
@@ -45,8 +45,8 @@ def drive(recording: Path, store: Path, area: SurveyArea, folder: Path) -> Surve
         robot.use(fetch_map(store, "lab"))
         drives = SurveyDrives(folder, source.calibration)
         drives.requests = (area,)
-        for number, imu in enumerate(source.imu_before_each()):
-            bundle = SensorBundle(source.frame(number), imu, list(source.wheel_before(number)))
+        for number, before in enumerate(source.samples_before_each()):
+            bundle = replace(before, frame=source.frame(number))
             outcome = robot.handle(bundle)
             drives.handle(bundle, None if outcome is None else outcome.estimate)
             drives.work()
