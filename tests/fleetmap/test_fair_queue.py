@@ -8,6 +8,7 @@ import zenoh
 
 from fleetmap.bus.fair_queue import SHARED, FairQueue, sender_of
 from fleetmap.bus.zenoh_bus import Bus
+from support.waiting import eventually
 
 
 def test_the_sender_stands_in_the_key() -> None:
@@ -32,8 +33,7 @@ def test_a_flood_is_in_its_own_way_alone() -> None:
 def test_what_waits_is_bounded_in_number_and_bytes() -> None:
     queue, gate, taken = FairQueue("test"), threading.Event(), 0
     assert queue.put("a", 1, gate.wait)
-    while queue._jobs:
-        time.sleep(0.001)
+    assert eventually(lambda: not queue._jobs)
     taken = sum(queue.put("a", 1, lambda: None) for _ in range(1000))
     assert taken == 64
     assert sum(queue.put("b", 1 << 20, lambda: None) for _ in range(10)) == 2
@@ -42,11 +42,7 @@ def test_what_waits_is_bounded_in_number_and_bytes() -> None:
     assert not queue.put("another", 1 << 20, lambda: None)
     assert "another" not in queue._jobs
     gate.set()
-    until_s = time.monotonic() + 10
-    while queue._jobs and time.monotonic() < until_s:
-        time.sleep(0.001)
-    time.sleep(0.01)
-    assert (queue._all_bytes, queue._bytes) == (0, {})
+    assert eventually(lambda: (queue._jobs, queue._all_bytes, queue._bytes) == ({}, 0, {}))
     queue.close()
     assert not queue.put("a", 1, lambda: None)
 
@@ -55,8 +51,7 @@ def test_a_question_asked_again_is_answered_once() -> None:
     """Otherwise a server that is behind answers those only who do not wait any more, and never catches up."""
     queue, found, gate, ended = FairQueue("test"), list[str](), threading.Event(), threading.Event()
     queue.put("a", 1, gate.wait)
-    while queue._jobs:
-        time.sleep(0.001)
+    assert eventually(lambda: not queue._jobs)
     for number in range(100):
         for sender, question in (("a", "x"), ("a", "y"), ("b", "x")):
             job = partial(found.append, f"{sender} {question} {number}")
@@ -107,11 +102,8 @@ def test_what_comes_beside_a_payload_counts() -> None:
 
     with Bus("tcp/127.0.0.1:0", is_server=True).open() as server, Bus(server.endpoint).open() as evil:
         server.subscribe("fleetmap/*/robots/*/health", listen)
-        until_s = time.monotonic() + 20
-        while not begun.is_set() and time.monotonic() < until_s:
-            evil.publish("fleetmap/hall/robots/r1/health", b"first")
-            begun.wait(0.1)
-        assert begun.is_set()
+        first = partial(evil.publish, "fleetmap/hall/robots/r1/health", b"first")
+        assert eventually(lambda: first() or begun.wait(0.1), 20)
         before = len(heard)
         send = partial(evil._session.put, congestion_control=zenoh.CongestionControl.BLOCK)  # by default zenoh drops
         for _ in range(20):
@@ -119,7 +111,5 @@ def test_what_comes_beside_a_payload_counts() -> None:
         send("fleetmap/hall/robots/r2/health", b"last", attachment=b"small")
         time.sleep(0.5)
         gate.set()
-        while b"last" not in heard and time.monotonic() < until_s:
-            time.sleep(0.02)
-    assert b"last" in heard
+        assert eventually(lambda: b"last" in heard, 20)
     assert heard[before:].count(b"x") <= 2

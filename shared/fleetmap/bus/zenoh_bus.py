@@ -6,6 +6,8 @@ import resource
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
 from functools import partial
 from operator import methodcaller
 from typing import Any, Literal, Self
@@ -35,25 +37,17 @@ _BUSY = b"later: too much of this sender is waiting already"
 _log = logging.getLogger(__name__)
 
 
-class Handle:
-    """A declaration on the bus; ends with `close` or with the bus."""
-
-    def __init__(self, undo: Callable[[], None]) -> None:
-        self._undo: Callable[[], None] | None = undo
-
-    def close(self) -> None:
-        """Undeclare it; a second call does nothing."""
-        undo, self._undo = self._undo, None
-        if undo is not None:
-            undo()
+Handle = ExitStack
+"""A declaration on the bus; ends with `close`, of which a second call does nothing, or with the bus."""
 
 
+@dataclass(eq=False)
 class _Declaration:
-    """A declaration: function that declares it on a session, zenoh's object for it, and resources that end with it."""
+    """A declaration: function that declares it on a session, and one that ends its resources; zenoh's object for it."""
 
-    def __init__(self, declare: Callable[[Any], Any], stop: Callable[[], None]) -> None:
-        self.declare, self.stop = declare, stop
-        self.current: Any = None
+    declare: Callable[[Any], Any]
+    stop: Callable[[], None]
+    current: Any = None
 
 
 class Bus:
@@ -270,7 +264,9 @@ class Bus:
             if self._session is not None:
                 declared.current = self._guarded(declare)
             self._declared.append(declared)
-        return Handle(partial(self._undeclare, declared))
+        handle = Handle()
+        handle.callback(self._undeclare, declared)
+        return handle
 
     def _undeclare(self, declared: _Declaration) -> None:
         with self._lock:

@@ -139,7 +139,8 @@ class MemoryBus(Bus):
             with self._hub.lock:
                 table.remove(entry)
 
-        handle = Handle(undo)
+        handle = Handle()
+        handle.callback(undo)
         self._handles.append(handle)
         return handle
 
