@@ -58,15 +58,11 @@ class LiveSurveys:
         self._lock = threading.Lock()
 
     def hear(self, key: str, payload: bytes) -> None:
-        """Store a survey's message; LinkError for one that is invalid, or of another site than its key."""
+        """Store a survey's state; LinkError for an invalid one, and for one of another site than its key."""
         site, _, _ = split_key(key)
         state = decode_message(payload, LiveSurveyState)
         if state.site != check_name(site, "site"):
             raise LinkError(f"a survey of {state.site[:64]!r} under the key of another site; check its sender")
-        self.take(state)
-
-    def take(self, state: LiveSurveyState) -> None:
-        """Store a state; LinkError for invalid arrays, which are not stored."""
         state.path(), state.part_numbers(), *map(state.rows, COLUMNS)
         with self._lock:
             before = self._states.pop(state.site, None)

@@ -90,10 +90,6 @@ class FoxgloveServer(ServerListener):
         if self.dropped:
             _log.warning("%d messages came too quickly for the viewers and were dropped", self.dropped)
 
-    def wants(self, topic: str) -> bool:
-        """True if a viewer subscribes to the topic; check it before making expensive messages."""
-        return self._channels[topic].has_sinks()
-
     def show(self, some: Iterable[Shown]) -> None:
         """Queue messages, in order for each topic; returns at once. The oldest are dropped if too many wait."""
         with self._lock:

@@ -21,7 +21,6 @@ takes precedence over T_cam_imu: this project writes it, because inverting a mat
 last bits.
 """
 
-import io
 import reprlib
 from collections import Counter
 from collections.abc import Mapping
@@ -214,39 +213,42 @@ def parse_calibration(text: str, where: str, folder: Path | None = None) -> Cali
 
 def format_calibration(calibration: RigCalibration) -> str:
     """Format a calibration as YAML text, from which `parse_calibration` restores it bit for bit."""
-    out = io.StringIO()
+    sections, imu = dict[str, Any](), calibration.imu
     for number, camera in enumerate(calibration.cameras):
         sphere = LENSES.get(camera.model)
-        model = "equidistant" if camera.model == "equidistant" else "radtan"
         plane, shape = (camera.distortion[:PLANE], camera.distortion[PLANE:]) if sphere else (camera.distortion, ())
         plane = plane if plane.any() or not sphere else plane[:0]  # Kalibr has no ds and no eucm with distortion
-        name = "none" if len(plane) == 0 else model
-        out.write(
-            f"cam{number}:\n  camera_model: {sphere.kalibr if sphere else 'pinhole'}\n  distortion_model: {name}\n"
-        )
-        out.write(
-            f"  intrinsics: {[*map(float, (*shape, *camera.intrinsics_px))]}\n  distortion_coeffs: {[*map(float, plane)]}\n"
-        )
-        out.write(f"  resolution: [{camera.width_px}, {camera.height_px}]\n")
-        out.write(f"  timeshift_cam_imu: {float(camera.imu_minus_cam_s)!r}\n")
-        if camera.line_delay_s:
-            out.write(f"  line_delay: {camera.line_delay_s!r}\n")
-        if camera.has_depth:
-            out.write("  has_depth: true\n")
-        if camera.mask:
-            polygons = [[[float(u), float(v)] for u, v in polygon] for polygon in camera.mask]
-            out.write(f"  mask: {polygons}\n")
-        out.write(f"  T_cam_imu:\n{_rows(se3_inverse(camera.body_from_cam), '  ')}")
-        out.write(f"  body_from_cam:\n{_rows(camera.body_from_cam, '  ')}")
-    if calibration.imu is None:
-        out.write("has_imu: false\n")
-    else:
-        out.write("imu0:\n")
-        for field_name, key in _NOISE_KEYS.items():
-            out.write(f"  {key}: {float(getattr(calibration.imu, field_name))!r}\n")
-    if "base_from_body" not in calibration.assumed:
-        out.write(f"base_from_body:\n{_rows(calibration.base_from_body, '')}")
-    return out.getvalue()
+        model = "equidistant" if camera.model == "equidistant" else "radtan"
+        sections[f"cam{number}"] = {
+            "camera_model": sphere.kalibr if sphere else "pinhole",
+            "distortion_model": model if len(plane) else "none",
+            "intrinsics": [*map(float, (*shape, *camera.intrinsics_px))],
+            "distortion_coeffs": [*map(float, plane)],
+            "resolution": [camera.width_px, camera.height_px],
+            "timeshift_cam_imu": camera.imu_minus_cam_s,
+            "line_delay": camera.line_delay_s or None,
+            "has_depth": "true" if camera.has_depth else None,
+            "mask": [[[float(u), float(v)] for u, v in polygon] for polygon in camera.mask] or None,
+            "T_cam_imu": se3_inverse(camera.body_from_cam),
+            "body_from_cam": camera.body_from_cam,
+        }
+    sections["has_imu"] = "false" if imu is None else None
+    sections["imu0"] = None if imu is None else {key: getattr(imu, name) for name, key in _NOISE_KEYS.items()}
+    sections["base_from_body"] = None if "base_from_body" in calibration.assumed else calibration.base_from_body
+    return _mapping(sections)
+
+
+def _mapping(values: Mapping[str, Any], indent: str = "") -> str:
+    """Lines of YAML for the values that are not None, of matrices one for each row."""
+    text = ""
+    for key, value in values.items():
+        if isinstance(value, dict):
+            text += f"{indent}{key}:\n{_mapping(value, '  ')}"
+        elif isinstance(value, np.ndarray):
+            text += f"{indent}{key}:\n" + "".join(f"{indent}- {row}\n" for row in value.astype(np.float64).tolist())
+        elif value is not None:
+            text += f"{indent}{key}: {value}\n"
+    return text
 
 
 def read_yaml(path: Path) -> Section:
@@ -483,7 +485,3 @@ def _check_events(text: str, where: str) -> None:
             raise CalibrationError(f"{where} is nested deeper than {_MAX_DEPTH} levels; check the file")
         if isinstance(event, yaml.ScalarEvent) and len(event.value) > _MAX_WORD:
             raise CalibrationError(f"{where} holds a value of {len(event.value)} characters; the limit is {_MAX_WORD}")
-
-
-def _rows(matrix: Array, indent: str) -> str:
-    return "".join(f"{indent}- {row}\n" for row in np.asarray(matrix, np.float64).tolist())

@@ -31,6 +31,10 @@ def state(site: str = "hall", **changed: object) -> LiveSurveyState:
     return msgspec.structs.replace(drive, **changed)
 
 
+def take(surveys: LiveSurveys, told: LiveSurveyState) -> None:
+    surveys.hear(live_key(told.site), encode_message(told))
+
+
 @pytest.fixture
 def world(tmp_path: Path) -> Iterator[World]:
     with served_world(tmp_path) as made:
@@ -93,11 +97,11 @@ def test_what_is_no_state_of_the_site_is_refused_and_counted(
 def test_silence_is_seen_only_of_surveys_that_should_speak() -> None:
     now_s = 0.0
     surveys = LiveSurveys(lambda: now_s)
-    surveys.take(state())
+    take(surveys, state())
     now_s = SILENT_S + 1
     found = surveys.of("hall")
     assert found.is_silent
-    surveys.take(state(phase="adjusting"))
+    take(surveys, state(phase="adjusting"))
     now_s += 60
     found = surveys.of("hall")
     assert not found.is_silent
@@ -106,7 +110,7 @@ def test_silence_is_seen_only_of_surveys_that_should_speak() -> None:
 def test_a_state_that_is_told_again_keeps_its_number() -> None:
     surveys, numbers = LiveSurveys(lambda: 0.0), []
     for site, phase in (("hall", "tracking"), ("hall", "tracking"), ("yard", "tracking"), ("hall", "adjusting")):
-        surveys.take(state(site, phase=phase))
+        take(surveys, state(site, phase=phase))
         found = surveys.of(site)
         numbers.append(found.number)
     assert numbers == [1, 1, 2, 3]
@@ -115,11 +119,11 @@ def test_a_state_that_is_told_again_keeps_its_number() -> None:
 def test_the_number_of_sites_is_bounded() -> None:
     surveys = LiveSurveys(lambda: 0.0)
     for number in range(100):
-        surveys.take(state(f"site-{number}"))
-    surveys.take(state("site-80"))
+        take(surveys, state(f"site-{number}"))
+    take(surveys, state("site-80"))
     assert len(surveys.sites()) == 32
     assert surveys.of("site-80") is not None
     assert surveys.of("site-1") is None
     with pytest.raises(LinkError):
-        surveys.take(state("site-1", quality=b""))
+        take(surveys, state("site-1", quality=b""))
     assert surveys.of("site-1") is None
