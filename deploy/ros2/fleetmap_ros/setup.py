@@ -16,5 +16,5 @@ setup(
         (f"share/{NAME}", ["package.xml", "README.md"]),
         *((f"share/{NAME}/{folder}", [str(path) for path in sorted(Path(folder).iterdir())]) for folder in FOLDERS),
     ],
-    entry_points={"console_scripts": [f"localizer = {NAME}.localizer:main"]},
+    entry_points={"console_scripts": [f"localizer = {NAME}:main"]},
 )

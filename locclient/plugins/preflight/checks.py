@@ -109,7 +109,8 @@ def _streams(source: Source, config: LocclientConfig, listen_s: float, rectifier
     text = f"{frame_hz:.1f} Hz of frames"
     if frame_hz < _MIN_FRAME_HZ:
         why = f" ({intake.unreadable_why})" if counts.unreadable else ""
-        hint = f"{counts.unreadable} unreadable messages{why}; check the camera and [topics]"
+        faults = "".join(f"; {fault}" for fault in intake.source_faults)
+        hint = f"{counts.unreadable} unreadable messages{why}{faults}; check the camera and [topics]"
         yield Finding(FAIL, "frames", f"{text} in {listen_s:g} s, {hint}")
     else:
         bad = counts.frames_disordered + counts.unreadable

@@ -3,6 +3,7 @@
 import logging
 import threading
 import time
+import uuid
 from collections import deque
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
@@ -23,7 +24,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.lifecycle.managed_entity import ManagedEntity
 from rclpy.parameter import Parameter
-from rclpy.serialization import serialize_message
+from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import String
 from std_srvs.srv import Empty as EmptyService
 from tf2_msgs.msg import TFMessage
@@ -43,20 +44,13 @@ from fleetmap.version_grid import OccupancyGrid
 from locclient.localization.estimate import Estimate
 from locclient.outputs import OutputSection, Publisher
 from locclient.plugins.ros2_node import check
-from locclient.plugins.ros2_node.node import (
-    LATCHED,
-    Feed,
-    MessageReader,
-    ensure_ros,
-    faults_logged,
-    keep_on,
-    ros_errors,
-)
+from locclient.plugins.ros2_node.node import LATCHED, Feed, MessageReader, faults_logged, keep_on, ros_started
 from locclient.plugins.ros2_node.odometry import DriverOdometry, Localized, motion_between
 from locclient.plugins.ros2_node.sensor_messages import decode_initial_pose
 from locclient.robot.continuous_odom import PublishedPose
 
-_IDLE_S = 0.1  # also the period of the bond's messages, as in nav2
+_IDLE_S, _BOND_TIMEOUT_S = 0.1, 4.0  # also the period of the bond's messages, as in nav2
+_SERVICES_IDLE_S = 1.0  # a wait of rclpy's executor costs 1.2 ms CPU; the end wakes it, unless it comes just before
 _WAITING = 30  # what is to be sent: of a second
 _STUCK_S = 3.0  # without a sign of life from the localizing thread, after which the bond is not renewed
 _OK, _WARN, _ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -65,6 +59,46 @@ _CHANGEABLE, _EARLY = "transform_tolerance_s", ("format", "node", "namespace")  
 _OWN_TF = 256  # last sent messages, to recognize them when they are received back
 _OTHER_S = 5.0  # another publisher is reported for so long after its last transform
 _log = logging.getLogger(__name__)
+
+
+class _Bond(ManagedEntity):
+    """Our side of the bond with nav2's lifecycle manager while the node is active: signs of life, which name the node. Source: bondcpp."""
+
+    def __init__(self, node: LifecycleNode, message_type: Any) -> None:
+        self._node, self._type, self._instance, self._said_s = node, message_type, "", 0.0
+        self._publisher = node.create_publisher(message_type, "bond", 10)
+
+    def on_activate(self, _: object) -> TransitionCallbackReturn:
+        self._instance = str(uuid.uuid4())
+        return TransitionCallbackReturn.SUCCESS
+
+    def beat(self) -> None:
+        """Renew it if it is time."""
+        instance = self._instance  # which another thread may end meanwhile
+        if instance and time.monotonic() - self._said_s >= _IDLE_S:
+            self._said_s = time.monotonic()
+            self._say(instance, is_active=True)
+
+    def end(self, *_: object) -> TransitionCallbackReturn:
+        instance, self._instance = self._instance, ""
+        if instance:
+            self._say(instance, is_active=False)
+        return TransitionCallbackReturn.SUCCESS
+
+    on_deactivate = on_cleanup = on_shutdown = on_error = end
+
+    def hear(self, _: type, message: bytes) -> None:
+        """Acknowledge the end of the other side, as bondcpp does; the node stays active."""
+        said: Any = deserialize_message(message, self._type)
+        if said.id == self._node.get_name() and said.instance_id != self._instance and not said.active:
+            self.end()
+
+    def _say(self, instance: str, *, is_active: bool) -> None:
+        said = self._type(id=self._node.get_name(), instance_id=instance, active=is_active)
+        said.header.stamp = self._node.get_clock().now().to_msg()
+        said.heartbeat_timeout, said.heartbeat_period = _BOND_TIMEOUT_S, _IDLE_S
+        with suppress(RuntimeError):  # the other side notices
+            self._publisher.publish(said)
 
 
 class Ros2Localizer(Publisher, ManagedEntity):
@@ -92,8 +126,7 @@ class Ros2Localizer(Publisher, ManagedEntity):
         self._is_latched_due = False
         self._beat: Callable[[], None] = lambda: None  # of a bond
         self._ended = threading.Event()
-        with ros_errors(), ExitStack() as failed:
-            ensure_ros()
+        with ros_started(), ExitStack() as failed:
             self._node = LifecycleNode(section.node, namespace=section.namespace)
             failed.callback(self._node.destroy_node)
             self._section = section = self._declare_parameters(section, topics)
@@ -105,7 +138,7 @@ class Ros2Localizer(Publisher, ManagedEntity):
         self._node.add_managed_entity(self)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self._node)
-        works = [partial(self._reader.read, _IDLE_S), self._send, self._executor.spin]
+        works = [partial(self._reader.read, _IDLE_S), self._send, partial(self._executor.spin_once, _SERVICES_IDLE_S)]
         self._threads = [threading.Thread(target=keep_on, args=(work, self._ended.wait), daemon=True) for work in works]
         for thread, name in zip(self._threads, ("ros messages", "ros sending", "ros services"), strict=True):
             thread.name = name
@@ -124,11 +157,8 @@ class Ros2Localizer(Publisher, ManagedEntity):
                 raise UsageError(f"output.{name} = {given[name]!r} as a parameter of ROS comes too late: {hint}")
         self._node.add_on_set_parameters_callback(self._change_parameters)
         section, named = _changed(section, given), self._node.resolve_topic_name
-        resolved = topics.wheel and named(topics.wheel)
-        check(
-            _changed(section, {"odom_topic": named(section.odom_topic)}),
-            msgspec.structs.replace(topics, wheel=resolved),
-        )
+        topics = msgspec.structs.replace(topics, wheel=topics.wheel and named(topics.wheel))
+        check(_changed(section, {"odom_topic": named(section.odom_topic)}), topics)
         return section
 
     def _declare(self) -> list[Feed]:
@@ -155,12 +185,12 @@ class Ros2Localizer(Publisher, ManagedEntity):
 
             service(SetInitialPose, "set_initial_pose", self._set_initial_pose)
         if find_spec("bond") is not None:
-            from locclient.plugins.ros2_node.bond import Bond
+            from bond.msg import Status as BondStatus
 
-            bond = Bond(self._node)
+            bond = _Bond(self._node, BondStatus)
             self._node.add_managed_entity(bond)
             self._beat = bond.beat
-            feeds.append(bond.feed)
+            feeds.append(Feed([("bond", BondStatus)], bond.hear))
         return feeds
 
     # --- called by the threads of the robot: what is to be sent waits for the thread that sends ------------------------

@@ -30,21 +30,17 @@ _limit = LogLimit(_log)
 
 
 @contextmanager
-def ros_errors() -> Iterator[None]:
-    """Turn what ROS 2 refuses at the start into a UsageError."""
+def ros_started() -> Iterator[None]:
+    """Start ROS 2 in this process, which keeps its own handlers of signals; turn what is refused then into a UsageError."""
     try:
+        if not rclpy.ok():
+            rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+            atexit.register(rclpy.try_shutdown)
         yield
     except (RuntimeError, ValueError, NameValidationException, ParameterException, msgspec.ValidationError) as error:
         raise UsageError(
             f"ROS 2 does not start: {error}; correct [topics], [output], the arguments after --ros-args, or RMW_IMPLEMENTATION"
         ) from error
-
-
-def ensure_ros() -> None:
-    """Start ROS 2 in this process, which keeps its own handlers of signals."""
-    if not rclpy.ok():
-        rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
-        atexit.register(rclpy.try_shutdown)
 
 
 def keep_on(work: Callable[[], None], wait: Callable[[float], bool]) -> None:
@@ -101,7 +97,7 @@ class MessageReader:
         self.faults: list[str] = []
         self._node, self._feeds = node, feeds
         self._subscriptions: dict[int, Any] = {}  # by feed
-        with ros_errors():
+        with ros_started():
             self._look()
             self._waiting = rclpy_implementation.WaitSet(len(feeds), 0, 0, 0, 0, 0, node.context.handle)
 

@@ -11,7 +11,7 @@ from fleetmap.errors import FleetmapError
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.source_settings import PACKED
 from fleetmap.sources.intake import Intake
-from locclient.plugins.ros2_node.node import Feed, MessageReader, ensure_ros, keep_on, ros_errors
+from locclient.plugins.ros2_node.node import Feed, MessageReader, keep_on, ros_started
 from locclient.plugins.ros2_node.sensor_messages import SensorMessages, Take
 
 _IDLE_S = 0.2
@@ -27,8 +27,7 @@ class Ros2Source:
     ) -> None:
         """See `open_topics`."""
         self.calibration, self.has_depth, self._messages = calibration, has_depth, messages
-        with ros_errors():
-            ensure_ros()
+        with ros_started():
             own = ["--ros-args", "-r", "__node:=fleetmap_sensors"]  # a launch file's name is that of the localizer
             self._node = Node("fleetmap_sensors", namespace=namespace, cli_args=own, start_parameter_services=False)
 

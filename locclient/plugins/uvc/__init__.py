@@ -16,7 +16,7 @@ from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import Source
 from locclient.plugins.ros2_node import rig_of, topics_beside
 
-_REOPEN_S = 1.0
+_REOPEN_S, _JOINED_S = 1.0, 5.0
 _CLOCKS_AGREE_S = 1.0
 
 
@@ -42,10 +42,12 @@ class UvcSource:
         self._open, self._section, self._topics = open_capture, section, topics
         self._monotonic_s, self._wall_ns = monotonic_s, wall_ns
         self.calibration, self.has_depth = calibration, False
+        self._others: threading.Thread | None = None
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
         if self._topics is not None:
-            threading.Thread(target=self._topics.run, args=(intake, wait), name="topics", daemon=True).start()
+            self._others = threading.Thread(target=self._topics.run, args=(intake, wait), name="topics", daemon=True)
+            self._others.start()
         while not wait(0.0):
             capture = self._open()
             try:
@@ -56,6 +58,8 @@ class UvcSource:
                 return
 
     def close(self) -> None:
+        if self._others is not None:
+            self._others.join(_JOINED_S)
         if self._topics is not None:
             self._topics.close()
 

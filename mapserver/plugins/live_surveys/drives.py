@@ -174,7 +174,8 @@ class SensorDrive(Drive):
 
     def _unreadable(self) -> str:
         count = self._intake.counts.unreadable
-        return f"; {count} messages could not be read ({self._intake.unreadable_why})" if count else ""
+        unread = f"; {count} messages could not be read ({self._intake.unreadable_why})" if count else ""
+        return unread + "".join(f"; {fault}" for fault in self._intake.source_faults)
 
     def _feed(self) -> None:
         try:

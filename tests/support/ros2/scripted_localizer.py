@@ -1,15 +1,20 @@
 """Outputs of a robot whose estimates are made up, two nodes: `python -m support.ros2.scripted_localizer [ARGUMENTS OF ROS]`.
 
-A line "stuck" on its standard input stops them until the next line; "down" ends ROS 2 below them, and prints what they say to that.
+Every fiftieth look at ROS's graph fails. A line "stuck" on its standard input stops them until the next line; "down" ends ROS 2 below
+them, and prints what they say to that.
 """
 
 import select
 import sys
 import time
 from dataclasses import replace
+from itertools import count
+from typing import Any
 
 import numpy as np
 import rclpy
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
 from rclpy.utilities import get_default_context
 
 from fleetmap.errors import LinkError
@@ -36,6 +41,14 @@ def main() -> None:
     for localizer in localizers:
         localizer.show_grid(1, OccupancyGrid(np.full((2, 3), 100, np.int8), 0.05, np.eye(4)), "")
         localizer.show_grid(2, None, "version 2 has no grid")
+    look, calls = Node.get_publishers_info_by_topic, count(1)
+
+    def failing_look(node: Node, topic: str) -> Any:
+        if next(calls) % 50 == 0:
+            raise rclpy_implementation.RCLError("the graph")
+        return look(node, topic)
+
+    Node.get_publishers_info_by_topic = failing_look
     word = ""
     while word != "down":
         told = replace(estimate(time.time()), floor="hall_2")

@@ -8,6 +8,7 @@ import re
 import runpy
 import subprocess
 import sys
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -82,18 +83,19 @@ def test_colcon_builds_a_program_that_leaves_arguments_of_ros_to_rclpy(tmp_path:
             assert reason in refused.communicate(timeout=60)[1] and refused.returncode == 2
     with (
         localizer("-r __ns:=/r1 -r __node:=place -p output.autostart:=false") as running,
+        ExitStack() as stack,
         ros_peer("lifecycle_manager_localization") as manager,
     ):
+        stack.callback(running.terminate)
         state = manager.call("/r1/place/get_state", "lifecycle_msgs/srv/GetState")["current_state"]
         assert state["label"] == "unconfigured"
         assert eventually(lambda: {"place", "fleetmap_sensors"} <= set(manager.nodes()))
-        manager.publish("/imu0", "std_msgs/msg/String", data="an IMU?")
+        manager.listen("/r1/amcl_pose", "std_msgs/msg/String")
         manager.listen("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
-        wrong = "/imu0: /r1/fleetmap_sensors does not receive from /lifecycle_manager_localization: it is std_msgs/msg/String"
-        silent = "no frames come; /cam0/image_raw: nobody publishes it, as sensor_msgs/msg/Image; "
+        silent = "no frames come; /r1/amcl_pose: /lifecycle_manager_localization does not receive from /r1/place: it is geometry_msgs"
+        unsent = "; /cam0/image_raw: nobody publishes it, as sensor_msgs/msg/Image; "
         told = partial(manager.heard, "/diagnostics")
-        assert eventually(lambda: any(silent in str(each) and wrong in str(each) for each in told()), PATIENCE_S)
-        running.terminate()
+        assert eventually(lambda: any(silent in str(each) and unsent in str(each) for each in told()), PATIENCE_S)
 
 
 def launched(name: str, monkeypatch: pytest.MonkeyPatch) -> tuple[MagicMock, dict[str, str]]:
