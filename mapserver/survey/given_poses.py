@@ -33,10 +33,8 @@ def poses_as_odometry(
     """
     inertial = inputs.calibration.imu is not None and len(inputs.imu) > 0
     odom_from_body, gyro_bias = _upright(given, inputs, inertial)
-    seconds = (given.stamps_ns - given.stamps_ns[0]) * 1e-9
-    velocities = np.zeros((len(given), 3))
-    if len(given) > 1:
-        velocities = np.asarray(np.gradient(odom_from_body[:, :3, 3], seconds, axis=0)).reshape(-1, 3)
+    seconds, positions_m = (given.stamps_ns - given.stamps_ns[0]) * 1e-9, odom_from_body[:, :3, 3]
+    velocities = np.gradient(positions_m, seconds, axis=0) if len(given) > 1 else np.zeros_like(positions_m)
     covariances = _covariances(odom_from_body)
     odom_from_cam = odom_from_body @ inputs.rectifier.body_from_cam
     policy, rectifier = KeyframePolicy(settings.keyframes, inputs.keyframes_at), inputs.rectifier

@@ -4,7 +4,7 @@ Two neighbours share a keyframe, the last of one and the first of the other: it 
 every edge between neighbouring keyframes was measured and adjusted in some segment. Segments that cannot be joined are processed as one.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
-from fleetmap.sensors.samples import CameraFrame, ImuSamples, Stamps, WheelSample, wheel_between
+from fleetmap.sensors.samples import ImuSamples, Stamps, wheel_between
 from mapserver.survey.keyframes.keyframes import set_aside
 from mapserver.survey.odometry_pass import initial_state
 from mapserver.survey.pose_graph.odometry_factors import blackout_factors, carried, edge_covariance
@@ -23,6 +23,7 @@ from mapserver.survey.survey_inputs import AdjustedChain, SurveyInputs, SurveyTo
 _MARGIN_NS = 1_000_000_000  # of IMU and wheels after the last frame
 _GATE = 22.46  # 0.999 of chi-square with 6 degrees of freedom
 Begin = Callable[[SurveyInputs, SurveySettings, SurveyTools], AdjustedChain]
+_How = tuple[Begin, SurveySettings]  # computes the chain of one piece
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,23 +42,11 @@ class Segment:
 
 @dataclass(frozen=True, slots=True)
 class _Task:
-    """A segment with its frames and the samples of IMU and wheels between them. images: store for the pictures of its keyframes."""
+    """A segment with its part of the inputs. images: store for the pictures of its keyframes."""
 
     segment: Segment
-    frames: Iterable[CameraFrame]
-    imu: ImuSamples
-    wheel: tuple[WheelSample, ...]
-    keyframes_at: frozenset[int]
-    images: ImageStore
-
-
-@dataclass(frozen=True, slots=True)
-class _Shared:
-    """Data of a process common to all tasks. begin: computes the chain of one piece; inputs: of the survey, without its samples."""
-
-    begin: Begin
     inputs: SurveyInputs
-    settings: SurveySettings
+    images: ImageStore
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,14 +83,20 @@ def in_segments(begin: Begin, inputs: SurveyInputs, settings: SurveySettings, to
     segments = planned(stamps_ns, settings.segments)
     if len(segments) == 1:
         return begin(inputs, settings, tools)
-    shared = _Shared(begin, replace(inputs, frames=(), imu=ImuSamples.empty(), wheel=(), parts=None), settings)
-    made = list(_in_parallel(segments, shared, inputs, tools))
+    how = begin, settings
+    tasks = (_task_of(segment, inputs, tools) for segment in segments)
+    made: list[_Made] = []
+    for segment, survey in zip(segments, tools.executor.map(_survey_segment, how, tasks), strict=True):
+        tools.at("odometry", segment.last + 1, inputs.frame_count)
+        tools.release()
+        made.append((segment, survey if isinstance(survey, str) else _stored(survey, tools.images)))
+        del survey  # with its pictures, which are in the survey's own store now
     refused: dict[int, str] = {}
     while wrong := _refusals(made):
         refused |= wrong
         made = [
             # In this process: it may be long, and the survey's own store keeps its pictures out of memory.
-            known or (whole, _survey_segment(shared, _task_of(whole, inputs, tools), tools))
+            known or (whole, _survey_segment(how, _task_of(whole, inputs, tools), tools))
             for whole, known in _regrouped(made, refused)
         ]
     cuts = tuple(
@@ -130,18 +125,8 @@ def planned(stamps_ns: Stamps, settings: SegmentSettings) -> list[Segment]:
     return [Segment(*each) for each in zip(leads.tolist(), begins.tolist(), ends, strict=True)]
 
 
-def _in_parallel(
-    segments: Sequence[Segment], shared: _Shared, inputs: SurveyInputs, tools: SurveyTools
-) -> Iterator[_Made]:
-    """Yield the result of each; pictures returned by processes are put into the survey's own store as they arrive."""
-    tasks = (_task_of(segment, inputs, tools) for segment in segments)
-    for segment, survey in zip(segments, tools.executor.map(_survey_segment, shared, tasks), strict=True):
-        tools.at("odometry", segment.last + 1, inputs.frame_count)
-        tools.release()
-        yield segment, survey if isinstance(survey, str) else _stored(survey, tools.images)
-
-
 def _stored(survey: SegmentSurvey, images: ImageStore) -> SegmentSurvey:
+    """Return the survey with its pictures, which a process may have sent, in the survey's own store."""
     numbers = dict[int, int]()  # of pictures that images share: black ones
     keyframes = [_kept(keyframe, images, numbers) for keyframe in survey.odometry.keyframes]
     return replace(survey, odometry=replace(survey.odometry, keyframes=keyframes))
@@ -168,28 +153,23 @@ def _task_of(segment: Segment, inputs: SurveyInputs, tools: SurveyTools) -> _Tas
     since_ns = int(stamps_ns[segment.lead]) + offset_ns if segment.lead else -(2**62)
     until_ns = int(stamps_ns[segment.last]) + offset_ns + _MARGIN_NS
     ends = {segment.begin, segment.last} - {0, len(stamps_ns) - 1}
-    return _Task(
-        segment,
-        inputs.parts.part(segment.lead, segment.last + 1),
-        inputs.imu.between(since_ns, until_ns),
-        tuple(wheel_between(inputs.wheel, since_ns, until_ns)),
-        frozenset(frame - segment.lead for frame in ends),
-        tools.images,
+    part = replace(
+        inputs,
+        frames=inputs.parts.part(segment.lead, segment.last + 1),
+        frame_count=segment.last - segment.lead + 1,
+        imu=inputs.imu.between(since_ns, until_ns),
+        wheel=tuple(wheel_between(inputs.wheel, since_ns, until_ns)),
+        parts=None,
+        keyframes_at=frozenset(frame - segment.lead for frame in ends),
     )
+    return _Task(segment, part, tools.images)
 
 
-def _survey_segment(shared: _Shared, task: _Task, tools: SurveyTools | None = None) -> SegmentSurvey | str:
+def _survey_segment(how: _How, task: _Task, tools: SurveyTools | None = None) -> SegmentSurvey | str:
     """Return the survey of one segment in any process, or the text of the reason if there is none."""
-    inputs = replace(
-        shared.inputs,
-        frames=task.frames,
-        frame_count=task.segment.last - task.segment.lead + 1,
-        imu=task.imu,
-        wheel=task.wheel,
-        keyframes_at=task.keyframes_at,
-    )
+    begin, settings = how
     try:
-        chain = shared.begin(inputs, shared.settings, tools or SurveyTools(images=task.images))
+        chain = begin(task.inputs, settings, tools or SurveyTools(images=task.images))
     except SurveyError as error:
         return str(error)
     return _without_lead(chain, task.segment)

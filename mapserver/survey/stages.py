@@ -16,7 +16,6 @@ Every stage receives the settings; depths of a single camera come from tracks/mo
 those of single cameras beside a pair are triangulated once, before loop closure.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -176,14 +175,9 @@ def _with_neighbours(
     """Return the state with the landmarks that the first camera sees in neighbouring keyframes, and the matched pairs of them."""
     allowed_m = drift_allowance_m(odometry.covariances[odometry.keyframe_frames], state.map_from_body[:, :3, 3])
     posed = _posed(odometry, state)
-    finder = PairFinder(posed, settings.pairs, tools.executor)
+    finder = PairFinder(posed, settings.pairs, tools.executor, tools.at)
     candidates = finder.candidates(max(settings.loops.min_gap_keyframes, settings.pairs.previous))
-    pairs = finder.match(
-        candidates,
-        allowed_m,
-        rotation_sigma_rad=_ADJUSTED_SIGMA_RAD if odometry.inertial else None,
-        progress=_progress_of(tools, "matching", len(candidates)),
-    )
+    pairs = finder.match(candidates, allowed_m, _ADJUSTED_SIGMA_RAD if odometry.inertial else None)
     landmarks = build_landmarks(posed, tracks_of(pairs), settings, tools.executor)
     return replace(state, landmarks=landmarks), {(p.i, p.j) for p in pairs}
 
@@ -295,19 +289,14 @@ def _observed(
     posed: RigImages, state: SurveyState, known: _Known | None, settings: SurveySettings, tools: SurveyTools
 ) -> tuple[Landmarks, Mask]:
     """Return the landmarks of all images, and the keyframes (K,) that their adjustment can do without."""
-    finder = PairFinder(posed, settings.pairs, tools.executor)
+    finder = PairFinder(posed, settings.pairs, tools.executor, tools.at)
     candidates, tracks = finder.candidates(), None
     if known is not None:
         first, (matched, tracks) = posed.numbers[:, 0].tolist(), known
         done = {(first[i], first[j]) for i, j in matched}
         candidates = [pair for pair in candidates if pair not in done]
-    pairs = finder.match(
-        candidates,
-        fixed_allowance_m(posed.map_from_body),
-        rotation_sigma_rad=_ADJUSTED_SIGMA_RAD,
-        progress=_progress_of(tools, "matching again", len(candidates)),
-    )
-    tracks = tracks_of(pairs, tracks)
+    allowed_m = fixed_allowance_m(posed.map_from_body)
+    tracks = tracks_of(finder.match(candidates, allowed_m, _ADJUSTED_SIGMA_RAD, "matching again"), tracks)
     redundant = redundant_keyframes(tracks, posed, settings)
     redundant[[term.k for term in state.priors]] = False
     return build_landmarks(posed, tracks, settings, tools.executor, redundant), redundant
@@ -337,8 +326,3 @@ def _with_depths(odometry: OdometryPass, state: SurveyState, depths: MonoDepths 
 
 def _posed(odometry: OdometryPass, state: SurveyState) -> RigImages:
     return RigImages.of(odometry.keyframes, state.map_from_body, state.rig)
-
-
-def _progress_of(tools: SurveyTools, stage: str, total: int) -> Callable[[int], None]:
-    """Report steps of a stage, numbered from 0."""
-    return lambda number: tools.at(stage, number + 1, total)

@@ -251,7 +251,7 @@ class LiveMap:
             return 3.0 * float(np.sqrt(gained + least**2))
 
         sigma = _ROTATION_SIGMA_RAD if self._news[-1].inertial else None
-        found = finder.match(wanted, allowed_m, rotation_sigma_rad=sigma, progress=lambda _number: None)
+        found = finder.match(wanted, allowed_m, sigma)
         return [replace(pair, i=pair.i + first, j=pair.j + first) for pair in found]
 
     def _place_features(self, first: int) -> None:

@@ -12,7 +12,7 @@ from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample
 from mapserver.plugins.live_surveys.message import NewKeyframe, joined_imu
 from mapserver.survey.odometry_pass import OdometryRun, TrackedFrame
-from mapserver.survey.pose_graph.odometry_factors import floor_of, step_covariance
+from mapserver.survey.pose_graph.odometry_factors import FLOOR, INERTIAL_FLOOR, step_covariance
 from mapserver.survey.settings import SurveySettings
 
 _TORN_M2 = 100.0
@@ -76,7 +76,7 @@ class LiveTracking:
         before, step_cov, imu = self._before, None, joined_imu(self._imu)
         if before is not None:
             step = se3_inverse(before.frame_from_body) @ frame_from_body
-            known, least = (before.covariance, covariance), floor_of(inertial=estimate.inertial)
+            known, least = (before.covariance, covariance), INERTIAL_FLOOR if estimate.inertial else FLOOR
             step_cov = step_covariance(known, before.frame_from_body[:3, :3], step, least)
             if self._torn_m2 > before.torn_m2:
                 step_cov = step_cov + _TORN_M2 * np.eye(6)

@@ -5,6 +5,7 @@ adjustment, a modern synthesis; inertial terms after Forster et al. 2017.
 """
 
 from collections.abc import Sequence
+from dataclasses import fields
 
 import numpy as np
 import scipy.sparse
@@ -21,20 +22,8 @@ from mapserver.survey.settings import BundleSettings
 # Lower bound of an increment's covariance: below is rounding error, and the bound keeps empty intervals invertible.
 FLOOR_SIGMA = np.repeat([1e-7, 1e-6, 1e-7, 1e-9, 1e-8], 3)
 
-# Parts of an increment in the core's order, and their sizes.
-_INCREMENTS = {
-    "dt_s": 1,
-    "delta_rotation": 9,
-    "delta_velocity_mps": 3,
-    "delta_position_m": 3,
-    "d_rotation_d_gyro": 9,
-    "d_velocity_d_gyro": 9,
-    "d_velocity_d_accel": 9,
-    "d_position_d_gyro": 9,
-    "d_position_d_accel": 9,
-    "gyro_bias_radps": 3,
-    "accel_bias_mps2": 3,
-}
+# Parts of an increment for the core, in its order
+_INCREMENTS = [f.name for f in fields(Preintegrated) if f.name not in {"start_ns", "end_ns", "cov", "max_gap_s"}]
 
 
 def optimize(problem: BundleProblem, settings: BundleSettings) -> BundleResult:
@@ -109,8 +98,8 @@ def _stacked(matrices: Sequence[Array], size: int) -> Array:
 
 def packed_increments(summed: Sequence[Preintegrated]) -> Array:
     """Return (E, 67): dt, dR, dv, dp, the five derivatives by the biases, and the biases of linearisation."""
-    parts = [np.array([getattr(each, name) for each in summed]).reshape(-1, size) for name, size in _INCREMENTS.items()]
-    return np.concatenate(parts, axis=1)
+    rows = [np.concatenate([np.ravel(getattr(each, name)) for name in _INCREMENTS]) for each in summed]
+    return np.array(rows).reshape(-1, 67)
 
 
 def _informations(covariances: Array) -> Array:

@@ -112,7 +112,11 @@ class _Chain:
         """Return the frames between keyframes a and b, of which one may lie beyond the ends; None if they see no points of the map."""
         first, last = np.searchsorted(self.numbers, [a, b])
         beside = self.numbers[max(first - _BESIDE, 0) : last + _BESIDE + 1]
-        frames = self._frames_between(a, b)
+        frames, lost = np.arange(a + 1, b), np.flatnonzero(~self._odometry.tracked[a + 1 : b].astype(bool))
+        if len(lost) and a < 0:  # before the first keyframe, and after the last, those connected without a break
+            frames = frames[lost[-1] + 1 :]
+        elif len(lost) and b == len(self.is_keyframe):
+            frames = frames[: lost[0]]
         nodes = np.union1d(frames, beside)
         ids, which, pixels = self._odometry.tracks.of(nodes)
         pixels[:, 2] += self._correction_px * disparity_shift(self._state.rig.camera, pixels)
@@ -143,13 +147,6 @@ class _Chain:
             relative=self._relative(nodes, joined, ties >= MIN_SEEN),
         )
         return _Interval(frames, np.searchsorted(nodes, frames), problem, tied)
-
-    def _frames_between(self, a: int, b: int) -> Indices:
-        """Return the frames in between; before the first keyframe and after the last one only those connected without a break."""
-        frames, lost = np.arange(a + 1, b), np.flatnonzero(~self._odometry.tracked[a + 1 : b].astype(bool))
-        if a < 0 and len(lost):
-            return frames[lost[-1] + 1 :]
-        return frames[: lost[0]] if b == len(self.is_keyframe) and len(lost) else frames
 
     def _points(self, nodes: Indices, which: Indices, marks: Indices, pixels: Array) -> tuple[Array, Mask]:
         """Return initial points_map (N, 3) and which are known: by a disparity, preferably of the nearest keyframe, else by rays."""

@@ -73,19 +73,14 @@ def adjust_visits(
     chosen = np.flatnonzero(~redundant).astype(np.int32)
     adjusted = replace(part.landmarks, obs_keyframe=chosen[part.landmarks.obs_keyframe])
     seen = _seen_by(redundant, state.landmarks, adjusted, image_numbers(len(redundant), len(state.rig)))
-    state = _localize(replace(_with_keyframes_of(state, ~redundant, part), landmarks=seen), settings, redundant)
+    map_from_body, motions = state.map_from_body.copy(), state.motion.motions.copy()
+    map_from_body[chosen], motions[chosen] = part.map_from_body, part.motion.motions
+    motion = replace(state.motion, motions=motions)
+    state = _localize(replace(state, map_from_body=map_from_body, motion=motion, landmarks=seen), settings, redundant)
     both = Landmarks.concatenated(adjusted.points_map, [adjusted, state.landmarks])
     order = np.argsort(both.obs_landmark, kind="stable")  # of each landmark the adjusted ones first
     marks = both.taken(order, both.points_map, both.obs_keyframe[order], both.obs_landmark[order])
     return replace(state, landmarks=marks)
-
-
-def _with_keyframes_of(state: SurveyState, used: NDArray[np.bool_], part: SurveyState) -> SurveyState:
-    """Return `state` with the used keyframes (K,) from `part`."""
-    map_from_body, motions = state.map_from_body.copy(), state.motion.motions.copy()
-    map_from_body[used] = part.map_from_body
-    motions[used] = part.motion.motions
-    return replace(state, map_from_body=map_from_body, motion=replace(state.motion, motions=motions))
 
 
 def _seen_by(redundant: NDArray[np.bool_], marks: Landmarks, adjusted: Landmarks, numbers: Indices) -> Landmarks:

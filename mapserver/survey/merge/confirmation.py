@@ -113,17 +113,11 @@ def confirmation(
     landmarks, found = (np.bincount(cell, weights, len(corners)) for weights in (None, (seen[judged] > 0) * 1.0))
     enough = landmarks >= _MIN_LANDMARKS
     is_seen = found[enough] >= _SEEN_SHARE * landmarks[enough]
-    blocks = np.floor(corners[enough] * (_CELL_M / _BLOCK_M))
-    return _bounded(is_seen, blocks, error_rate)
-
-
-def _bounded(is_seen: NDArray[np.bool_], blocks: Array, error_rate: float) -> Confirmation:
-    """Return the share of cells (C,) in blocks (C, 3), with its bounds."""
     count = len(is_seen)
     if count == 0:
         return Confirmation(0, 0, 0, 0.0, 1.0, error_rate)
     share = float(is_seen.mean())
-    _, block = np.unique(blocks, axis=0, return_inverse=True)
+    _, block = np.unique(np.floor(corners[enough] * (_CELL_M / _BLOCK_M)), axis=0, return_inverse=True)
     off = np.bincount(block.reshape(-1), is_seen - share)
     clustered = float((off**2).sum()) / count**2 * len(off) / max(len(off) - 1, 1)
     alone = share * (1.0 - share) / count

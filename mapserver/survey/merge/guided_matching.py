@@ -97,22 +97,18 @@ def match_keyframe(
     radius_px: float,
     settings: SurveySettings,
 ) -> Sighting | None:
-    """Return the landmarks seen by a keyframe near `map_from_cam`, at subpixel accuracy; None if too few agree."""
+    """Return the landmarks seen by a keyframe near `map_from_cam`, at subpixel accuracy; None if too few agree.
+
+    Coordinates are those from the landmarks' patches if these agree, else the corner's own with a wider sigma.
+    """
     fix = relocalizer.by_projection(keyframe_features(keyframe), map_from_cam, radius_px)
     if fix is None or fix.matches is None:
         return None
     features, rows = np.ascontiguousarray(fix.matches.T)
-    return _refined(base, keyframe, rows, features, se3_inverse(fix.map_from_cam), settings)
-
-
-def _refined(
-    base: BaseMap, keyframe: Keyframe, rows: Rows, features: Rows, cam_from_map: Array, settings: SurveySettings
-) -> Sighting:
-    """Return coordinates from the landmarks' patches if those agree, else the corner's own with a wider sigma."""
     noise = settings.noise
     left = keyframe.features.pixels[features].copy()
     sigma = noise.descriptor_sigma_px * SCALE_FACTOR ** keyframe.features.octaves[features].astype(np.float64)
-    aligned = _aligned(base, keyframe, rows, features, cam_from_map, settings)
+    aligned = _aligned(base, keyframe, rows, features, se3_inverse(fix.map_from_cam), settings)
     sure = np.isfinite(aligned[:, 0])
     left[sure] = aligned[sure, :2]
     sigma[sure] = np.hypot(noise.aligned_sigma_px, aligned[sure, 2])

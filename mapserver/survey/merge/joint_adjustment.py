@@ -20,7 +20,6 @@ from mapserver.survey.bundle.bundle_rounds import bundle_problem, inertial_edges
 from mapserver.survey.bundle.problem import (
     OBSERVED,
     BundleProblem,
-    BundleResult,
     InertialTerms,
     continued,
     measured_sigmas,
@@ -28,7 +27,7 @@ from mapserver.survey.bundle.problem import (
 from mapserver.survey.merge.base_map import BaseMap, baseline_ratio, with_baseline
 from mapserver.survey.merge.guided_matching import Sightings
 from mapserver.survey.merge.merge import Change
-from mapserver.survey.pose_graph.odometry_factors import floor_of
+from mapserver.survey.pose_graph.odometry_factors import INERTIAL_FLOOR
 from mapserver.survey.pose_graph.position_priors import in_frame, judged_priors, level_fit
 from mapserver.survey.rig import Rig
 from mapserver.survey.settings import BundleSettings, SessionSettings, SurveySettings
@@ -38,7 +37,7 @@ from mapserver.survey.survey_map import SurveyMap, history_of
 _LONGEST_GAP_NS = 10_000_000_000
 # Of a step between keyframes of a published map: that of adjusted ones with an IMU. It has no share by errors of calibration: by these a
 # new survey would bend or scale the map.
-_STEP = floor_of(inertial=True)._replace(rotation_share=0.0, translation_share=0.0)
+_STEP = INERTIAL_FLOOR._replace(rotation_share=0.0, translation_share=0.0)
 
 
 @dataclass(frozen=True)
@@ -167,7 +166,11 @@ def _solved(
     map_from_docks, old = known.map_from_docks, own.first_keyframe
     if map_from_docks is not None:
         stay = level_fit(problem.map_from_body[:old, :3, 3], result.map_from_body[:old, :3, 3])
-        result, map_from_docks = _in_frame(result, stay), stay @ map_from_docks
+        motions, points_map = result.motions, transform_points(stay, result.points_map)
+        if motions is not None:
+            motions = np.column_stack([motions[:, :3] @ stay[:3, :3].T, motions[:, 3:]])
+        result = replace(result, map_from_body=stay @ result.map_from_body, points_map=points_map, motions=motions)
+        map_from_docks = stay @ map_from_docks
         problem.priors = [in_frame(prior, stay) for prior in problem.priors]
     start = len(known.problem.obs_keyframe)
     fits = result.squared_sigmas[start : start + len(sightings.rows)] < settings.noise.cut_sigmas**2
@@ -288,15 +291,6 @@ def _placed(priors: Sequence[PriorTerm], known: Measured) -> list[PriorTerm]:
     """Return the priors of a survey in the frame of the map, none if that has no docks."""
     there = known.map_from_docks
     return [] if there is None else [in_frame(prior, there) for prior in priors]
-
-
-def _in_frame(result: BundleResult, new_from_map: Array) -> BundleResult:
-    """Return the result in another upright frame; new_from_map (4, 4)."""
-    motions = result.motions
-    if motions is not None:
-        motions = np.column_stack([motions[:, :3] @ new_from_map[:3, :3].T, motions[:, 3:]])
-    points_map = transform_points(new_from_map, result.points_map)
-    return replace(result, map_from_body=new_from_map @ result.map_from_body, points_map=points_map, motions=motions)
 
 
 def _carried(state: SurveyState, map_from_body: Array) -> SurveyState:

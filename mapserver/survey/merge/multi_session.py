@@ -153,15 +153,15 @@ class MapMerger:
             self._current, self._measured = _begun(session, self._settings)
             outcome = Outcome(number, MembershipVerdict.JOINED, "begins the map")
         else:
-            place = session.map_from_survey
-            result = extend(
-                self._current, session.survey, self._settings, known=known, map_from_survey=place, limits=self._limits
-            )
+            result = extend(self._current, session, self._settings, known, self._limits)
             if isinstance(result, Membership):
                 self._outcomes[number] = Outcome(number, result.verdict, result.reason, evidence=result.evidence)
                 return
             self._current, self._measured, self._has_grown = result.map, result.measured, True
-            outcome = Outcome(number, MembershipVerdict.JOINED, _words(result.evidence), result.counts, result.evidence)
+            seen = result.evidence
+            words = f"found in the map: {seen.fixes} fixes at {seen.places} places"
+            words += f", {seen.cells_seen} of {seen.cells_expected} parts of it seen"
+            outcome = Outcome(number, MembershipVerdict.JOINED, words, result.counts, seen)
         self._outcomes[number] = outcome
         self._found[number] = self._current.trajectory, self._current.trajectory_estimated, first
         self._waiting.remove(number)
@@ -174,10 +174,6 @@ class MapMerger:
         problem, count = self._measured.problem, len(survey.odometry.keyframes)
         map_from_cam = problem.map_from_body[first : first + count] @ problem.rig.body_from_cam[0]
         return _carried(found, survey, map_from_cam @ se3_inverse(survey.state.rig.body_from_cam[0]))
-
-
-def _words(found: MembershipEvidence) -> str:
-    return f"found in the map: {found.fixes} fixes at {found.places} places, {found.cells_seen} of {found.cells_expected} parts of it seen"
 
 
 def _begun(session: Session, settings: SurveySettings) -> tuple[SurveyMap, Measured]:
@@ -204,20 +200,14 @@ def chained(trajectories: Sequence[Trajectory], clocks: Sequence[Trajectory]) ->
 
 
 def extend(
-    base_map: SurveyMap,
-    survey: Survey,
-    settings: SurveySettings,
-    *,
-    known: Measured | None,
-    map_from_survey: Array | None,
-    limits: SurveyLimits,
+    base_map: SurveyMap, session: Session, settings: SurveySettings, known: Measured | None, limits: SurveyLimits
 ) -> Extension | Membership:
     """Return the map joined with a survey that passes the test of `membership`: at the pose by fixes, and after joint adjustment.
 
     known: constraints of base_map, which is adjusted as a whole; None for a published one, whose landmarks without
-    significant motion are bit-identical.
-    map_from_survey: pose by position priors, if any. limits: what operators do not let surveys change.
+    significant motion are bit-identical. limits: what operators do not let surveys change.
     """
+    survey = session.survey
     state, guess = survey.state, survey.odometry
     if not (guess.scale_known and base_map.scale_known):
         return Membership(
@@ -226,7 +216,7 @@ def extend(
     base = BaseMap(base_map, state.rig.camera, state.rig.body_from_cam[0])
     relocalizer = Relocalizer(base.view(survey.vocabulary), base.camera, session_relocalization(settings))
     firm = firm_landmarks(len(base.points_map), base.map.obs_landmark)
-    test = MembershipTest(relocalizer, firm, _session(survey, map_from_survey), settings.sessions)
+    test = MembershipTest(relocalizer, firm, _keyframes_of(session), settings.sessions)
     located = test.locate()
     if isinstance(located, Membership):
         return located
@@ -264,17 +254,17 @@ def extend(
     return Extension(result, measured, counts, located.evidence)
 
 
-def _session(survey: Survey, map_from_survey: Array | None) -> SessionKeyframes:
+def _keyframes_of(session: Session) -> SessionKeyframes:
     """Return a survey as the input of the test of membership."""
-    state, guess = survey.state, survey.odometry
+    state, guess = session.survey.state, session.survey.odometry
     posed = RigImages.of(guess.keyframes, state.map_from_body, state.rig)
     return SessionKeyframes(
         images=[[keyframe_features(posed.images[n]) for n in row] for row in posed.numbers.tolist()],
         survey_from_body=state.map_from_body,  # the survey's own frame, called `map` in a single survey
-        chain=[*chain_edges(guess, state), *survey.loops.edges],
+        chain=[*chain_edges(guess, state), *session.survey.loops.edges],
         camera=state.rig.camera,
         body_from_cams=state.rig.body_from_cam,
-        map_from_survey=map_from_survey,
+        map_from_survey=session.map_from_survey,
         pieces=find_groups(state, lambda *_: np.inf, 0.0).labels(),
     )
 

@@ -32,33 +32,20 @@ def loop_weights(
     squared = squared_residuals(loops, start)
     if (squared <= bound).all():
         return np.ones(len(loops)), start
-    reaches = (4.0 * float(np.median(squared)), 2.0 * float(squared.max()))
     found: list[tuple[float, Array, gtsam.Values]] = []
-    for reach in reaches:
-        found.append(_anneal(certain, loops, start, bound, min(bound / max(reach - bound, bound), 1.0)))
-        if found[-1][1].min() > 0.5:
+    for reach in (4.0 * float(np.median(squared)), 2.0 * float(squared.max())):
+        control, values = min(bound / max(reach - bound, bound), 1.0), start
+        for _ in range(_MAX_UPDATES):
+            weights = truncated_weights(squared_residuals(loops, values), bound, control)
+            values = improved(certain, loops, weights, values, _STEPS)
+            if (np.minimum(weights, 1.0 - weights) < _UNSURE).all() and control > 1.0:
+                break
+            control *= _GROWTH
+        cost = certain.error(values) + 0.5 * float(np.minimum(squared_residuals(loops, values), bound).sum())
+        found.append((cost, weights, values))
+        if weights.min() > 0.5:
             break
-    _, weights, values = min(found, key=lambda one: one[0])
-    return weights, values
-
-
-def _anneal(
-    certain: gtsam.NonlinearFactorGraph,
-    loops: list[gtsam.NoiseModelFactor],
-    start: gtsam.Values,
-    bound: float,
-    control: float,
-) -> tuple[float, Array, gtsam.Values]:
-    """Return truncated cost, weights and poses, annealed from a control parameter."""
-    values = start
-    for _ in range(_MAX_UPDATES):
-        weights = truncated_weights(squared_residuals(loops, values), bound, control)
-        values = improved(certain, loops, weights, values, _STEPS)
-        if (np.minimum(weights, 1.0 - weights) < _UNSURE).all() and control > 1.0:
-            break
-        control *= _GROWTH
-    cost = certain.error(values) + 0.5 * float(np.minimum(squared_residuals(loops, values), bound).sum())
-    return cost, weights, values
+    return min(found, key=lambda one: one[0])[1:]
 
 
 def truncated_weights(squared: Array, bound: float, control: float) -> Array:

@@ -258,11 +258,7 @@ class ChainCovariance:
         here = slice(6 * slot, 6 * slot + 6)
         self._joint[here, : 6 * slot], self._joint[: 6 * slot, here] = row, row.T
         self._joint[here, here] = 0.5 * (own + own.T)
-        self._split(k, slot)
-        return slot
-
-    def _split(self, k: int, slot: int) -> None:
-        """Make place k the end of the interval before it and the start of the one after it."""
+        # It is the end of the interval before it and the start of the one after it.
         start, had_end = int(self._starts[k]), self._after[k] != self._before[k]
         end = self._anchors[self._after[k]] if had_end else len(self._sums)
         self._anchors.append(k)
@@ -273,6 +269,7 @@ class ChainCovariance:
             self._share(k, end, int(self._after[k]))
         else:
             self._after[k:end] = slot
+        return slot
 
     def _share(self, start: int, end: int, slot: int) -> None:
         """Assign the places from start until before end to these two anchors; slot is that of the end."""

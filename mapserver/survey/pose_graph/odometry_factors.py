@@ -28,14 +28,9 @@ class Floor(NamedTuple):
 
 
 FLOOR = Floor(0.004, 0.0, 0.01, 0.02)
-# With an IMU, of keyframes adjusted with their neighbours. Odometry covariances do not include calibration errors: data
-# sheets of IMUs give the scale and the axes of their gyros to about 1 %, and a warm mount bends a stereo pair by as much.
-_INERTIAL_FLOOR = Floor(0.0005, 0.01, 0.002, 0.01)
-
-
-def floor_of(*, inertial: bool) -> Floor:
-    """Return the least covariance for steps of a chain of keyframes that are adjusted with their neighbours."""
-    return _INERTIAL_FLOOR if inertial else FLOOR
+# With an IMU, of a chain of keyframes that are adjusted with their neighbours. Odometry covariances do not include calibration errors:
+# data sheets of IMUs give the scale and the axes of their gyros to about 1 %, and a warm mount bends a stereo pair by as much.
+INERTIAL_FLOOR = Floor(0.0005, 0.01, 0.002, 0.01)
 
 
 def odometry_factors(odometry: OdometryPass, map_from_body: Array) -> list[RelativeTerm]:
@@ -67,7 +62,7 @@ def blackout_factors(odometry: OdometryPass, state: SurveyState) -> list[Relativ
 
 def chain_edges(odometry: OdometryPass, state: SurveyState) -> list[PoseEdge]:
     """Return edges between neighbours with their adjusted motion and the covariance of the odometry."""
-    least, edges = floor_of(inertial=odometry.inertial), []
+    least, edges = INERTIAL_FLOOR if odometry.inertial else FLOOR, []
     for k, (a, b) in enumerate(pairwise(odometry.keyframe_frames)):
         i_from_j = se3_inverse(state.map_from_body[k]) @ state.map_from_body[k + 1]
         edges.append(PoseEdge(k, k + 1, i_from_j, edge_covariance(odometry, a, b, least), is_loop=False))

@@ -72,7 +72,15 @@ def optimize_pose_graph(map_from_body: Array, edges: Sequence[PoseEdge], *, robu
         believed = iter(weights >= 0.5)
         kept = [edge for edge in edges if not edge.is_loop or next(believed)]
         graph = _graph(map_from_body, kept)
-        optimum = _optimum(graph, start, 6 * (len(kept) - len(map_from_body) + 1))
+        optimum, spent = descended(graph, start, _FIRST_ITERATIONS)
+        freedom = 6 * (len(kept) - len(map_from_body) + 1)
+        if 2.0 * graph.error(optimum) > freedom + 5.0 * np.sqrt(2.0 * max(freedom, 1)):
+            with suppress(RuntimeError):  # the graph may be too badly conditioned for a chordal start
+                other = descended(graph, gtsam.InitializePose3.initialize(graph), _FIRST_ITERATIONS)
+                if graph.error(other[0]) < graph.error(optimum):
+                    optimum, spent = other
+        if spent >= _FIRST_ITERATIONS:
+            optimum = descended(graph, optimum, _MAX_ITERATIONS - spent)[0]
     except RuntimeError as error:
         raise SurveyError(
             f"the pose graph of {len(map_from_body)} keyframes and {len(edges)} edges cannot be solved "
@@ -131,14 +139,3 @@ def _factor(edge: PoseEdge) -> gtsam.NoiseModelFactor:
     cov = j_from_i @ edge.cov_rot_trans @ j_from_i.T
     noise = gtsam.noiseModel.Gaussian.Covariance(0.5 * (cov + cov.T))
     return gtsam.BetweenFactorPose3(edge.i, edge.j, gtsam.Pose3(edge.i_from_j), noise)
-
-
-def _optimum(graph: gtsam.NonlinearFactorGraph, start: gtsam.Values, freedom: int) -> gtsam.Values:
-    """Return the lowest minimum found."""
-    best, spent = descended(graph, start, _FIRST_ITERATIONS)
-    if 2.0 * graph.error(best) > freedom + 5.0 * np.sqrt(2.0 * max(freedom, 1)):
-        with suppress(RuntimeError):  # the graph may be too badly conditioned for a chordal start
-            other = descended(graph, gtsam.InitializePose3.initialize(graph), _FIRST_ITERATIONS)
-            if graph.error(other[0]) < graph.error(best):
-                best, spent = other
-    return best if spent < _FIRST_ITERATIONS else descended(graph, best, _MAX_ITERATIONS - spent)[0]

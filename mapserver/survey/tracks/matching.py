@@ -22,8 +22,15 @@ _MAX_VIEW_ANGLE_DEG = 75.0
 class PairFinder:
     """Matches images that should see the same, given their poses."""
 
-    def __init__(self, posed: RigImages, settings: PairSettings, executor: Executor = SERIAL) -> None:
-        self._posed, self._settings, self._executor = posed, settings, executor
+    def __init__(
+        self,
+        posed: RigImages,
+        settings: PairSettings,
+        executor: Executor = SERIAL,
+        at: Callable[[str, int, int], None] = lambda *_: None,
+    ) -> None:
+        """at: called with the stage, and how many of how many candidates are matched."""
+        self._posed, self._settings, self._executor, self._at = posed, settings, executor, at
         self._map_from_cam, self._keyframe, self._camera = posed.map_from_cam, posed.keyframe, posed.camera
         self._inputs = MatchInputs([k.without_pictures() for k in posed.images], posed.rig.camera, settings)
         self._shared = replace(self._inputs, keyframes={})
@@ -63,9 +70,8 @@ class PairFinder:
         self,
         candidates: list[tuple[int, int]],
         allowed_m: Callable[[int, int], float],
-        *,
         rotation_sigma_rad: float | None,
-        progress: Callable[[int], None],
+        stage: str = "matching",
     ) -> list[PairMatch]:
         """Return verified matches whose measured motion agrees with the predicted one to within allowed_m of their keyframes."""
         predictions: list[tuple[int, int, PredictedMotion]] = []
@@ -81,7 +87,7 @@ class PairFinder:
                 off = se3_inverse(predicted.j_from_i) @ match.j_from_i
                 if np.linalg.norm(off[:3, 3]) <= most_m and rotation_angle_rad(off[:3, :3]) < np.radians(10.0):
                     matches.append(match)
-            progress(number)
+            self._at(stage, number + 1, len(candidates))
         return matches
 
 

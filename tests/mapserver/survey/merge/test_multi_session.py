@@ -99,12 +99,13 @@ class Sites:
     def __init__(self, needs: dict[str, str]) -> None:
         self.needs, self.tried = needs, ""
 
-    def extend(self, current: Any, survey: Any, *_: object, **__: object) -> Any:
-        self.tried += survey.name
-        if self.needs[survey.name] not in current.letters:
-            return Membership(f"{survey.name} needs {self.needs[survey.name]}")
+    def extend(self, current: Any, session: Any, *_: object) -> Any:
+        name = session.survey.name
+        self.tried += name
+        if self.needs[name] not in current.letters:
+            return Membership(f"{name} needs {self.needs[name]}")
         evidence = SimpleNamespace(fixes=3, places=3, cells_seen=9, cells_expected=9)
-        grown = made_up_map(current.letters + survey.name)
+        grown = made_up_map(current.letters + name)
         return SimpleNamespace(map=grown, measured=None, counts=None, evidence=evidence)
 
 

@@ -4,6 +4,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pytest
 
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.sensors.samples import PositionPrior
@@ -173,15 +174,12 @@ def test_a_block_whose_yaw_drifts_is_held_by_two_docks() -> None:
     assert np.median(bent_m) > 1.0
 
 
-def test_a_wrong_dock_is_not_obeyed_even_if_it_comes_first() -> None:
-    survey = Survey(7, docks=(0, 50, 120), wrong=0)
+@pytest.mark.parametrize("repeated", [(), (0,)])
+def test_a_wrong_dock_is_not_obeyed_even_if_it_comes_first_or_often(repeated: tuple[int, ...]) -> None:
+    """Samples of one visit have one vote."""
+    survey = Survey(7, docks=(0, 50, 120), wrong=0, repeated=repeated)
     assert [term.k for term in survey.priors if not term.is_believed] == [0]
     assert np.linalg.norm((survey.solved()[0] - _truth())[[50, 120], :2, 3], axis=1).max() < 3 * 0.05
-
-
-def test_samples_of_one_visit_have_one_vote() -> None:
-    survey = Survey(7, docks=(0, 50, 120), wrong=0, repeated=(0,))
-    assert [term.k for term in survey.priors if not term.is_believed] == [0]
 
 
 def test_samples_of_one_visit_weigh_as_one() -> None:

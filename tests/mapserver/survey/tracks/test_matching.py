@@ -68,9 +68,7 @@ def test_places_that_look_away_are_no_candidates() -> None:
 
 def matches(predicted_places: Array, allowed_m: float, sigma_rad: float | None = 0.02) -> set[tuple[int, int]]:
     candidates = [(3, 4), (4, 5), (0, 9)]
-    found = finder(predicted_places).match(
-        candidates, lambda i, j: allowed_m, rotation_sigma_rad=sigma_rad, progress=lambda n: None
-    )
+    found = finder(predicted_places).match(candidates, lambda i, j: allowed_m, sigma_rad)
     return {(m.i, m.j) for m in found}
 
 
@@ -151,10 +149,7 @@ def test_a_process_gets_the_keyframes_of_its_pairs_alone() -> None:
     watched, pairs = _Watched(), [(0, 1), (1, 2), (7, 8)]
     allowed_m = fixed_allowance_m(places)
     found = [
-        PairFinder(posed, SETTINGS.pairs, executor).match(
-            pairs, allowed_m, rotation_sigma_rad=0.02, progress=lambda _: None
-        )
-        for executor in (SERIAL, watched)
+        PairFinder(posed, SETTINGS.pairs, executor).match(pairs, allowed_m, 0.02) for executor in (SERIAL, watched)
     ]
     assert len(found[0]) == len(found[1]) > 0
     for own, other in zip(*found, strict=True):
