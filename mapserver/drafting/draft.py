@@ -113,7 +113,6 @@ class _Run:
     unusable: dict[Path, str] | None
     console: Console
     times: StageTimes
-    started_s: float
     images: MappedImageStore
 
     @contextmanager
@@ -164,14 +163,14 @@ def build_draft(
     With `unusable` a recording that cannot be surveyed is added there with its reason, and the others are used. recorded: as
     a job of the store.
     """
-    options, started_s = request.options, time.perf_counter()
+    options, times = request.options, StageTimes(time.perf_counter)
     if (given := options.trajectory) is not None and len(request.recordings) > 1:
         raise UsageError(f"{given.file} is for one recording, {len(request.recordings)} are named; build each alone")
     zones = read_zones(options.zones)
-    times, console = StageTimes(time.perf_counter), plain_console(stderr=True)
+    console = plain_console(stderr=True)
     folder = next(each for each in (request.store, *request.store.absolute().parents) if each.is_dir())
     with single_threaded_libraries(), OpenRecordings(options, folder) as reading, MappedImageStore(folder) as images:
-        run = _Run(request, reading, settings, zones, unusable, console, times, started_s, images)
+        run = _Run(request, reading, settings, zones, unusable, console, times, images)
         times.begin("examination")
         with run.tools() as tools:
             admitted = admit_recordings(
@@ -280,7 +279,7 @@ def _keep(run: _Run, built: BuildResult, parent: Before | None, maps: MapStore) 
         built.joined,
         built.accuracy,
         evidence,
-        time.perf_counter() - run.started_s,
+        sum(run.times.seconds.values()),
         surveyed_requests=covered_requests(maps, site, built.joined),
         removed_landmarks={} if parent is None else parent.removed(),
         alias_step_m=alias_step_m(evidence.repetition, known_m),

@@ -5,9 +5,10 @@ import os
 import tempfile
 import threading
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,7 +27,7 @@ _KEPT_BYTES = 1_000_000_000  # the first minute of a pair of 752 x 480 at 20 Hz
 _ALIGNED_BYTES = 64
 
 
-class MappedImageStore(ImageStore):
+class MappedImageStore(ImageStore, AbstractContextManager["MappedImageStore"]):
     """A store in an unnamed file in `folder`, deleted by the system with the process. Methods may be called from any thread."""
 
     def __init__(self, folder: Path) -> None:
@@ -38,9 +39,6 @@ class MappedImageStore(ImageStore):
         self._size, self._used = 0, 0  # of the file, and of its last segment
         self._pictures: list[Pictures] = []
         self._read: set[int] = set()  # pictures since the last release
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self._file.close()

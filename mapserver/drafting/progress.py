@@ -1,8 +1,6 @@
 """Progress of a build: bars on a terminal, one line for each stage elsewhere; and the seconds of each stage."""
 
 from collections.abc import Callable
-from types import TracebackType
-from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -35,32 +33,23 @@ class StageTimes:
         self._last_s = now_s
 
 
-class ProgressView:
+class ProgressView(Progress):
     """Shows calls (stage, done, total) on a console until it is closed."""
 
     def __init__(self, console: Console) -> None:
-        self._console = console
-        self._shown = ""
-        self._tasks: dict[str, TaskID] = {}
         columns = (TextColumn("{task.description:<18}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
-        self._bars = Progress(*columns, console=console, disable=not console.is_terminal)
-
-    def __enter__(self) -> Self:
-        self._bars.start()
-        return self
-
-    def __exit__(self, *_: type[BaseException] | BaseException | TracebackType | None) -> None:
-        self._bars.stop()
+        super().__init__(*columns, console=console, disable=not console.is_terminal)
+        self._shown, self._bars = "", dict[str, TaskID]()
 
     def __call__(self, stage: str, done: int, total: int) -> None:
         """Show that `done` of `total` parts of a stage are done."""
-        if self._console.is_terminal:
-            if stage not in self._tasks:
-                self._tasks[stage] = self._bars.add_task(stage, total=total)
+        if self.console.is_terminal:
+            if stage not in self._bars:
+                self._bars[stage] = self.add_task(stage, total=total)
             if self._shown and stage != self._shown:  # "matching again" occurs twice: close the previous bar
-                last = self._bars.tasks[self._tasks[self._shown]]
-                self._bars.update(last.id, completed=last.total)
-            self._bars.update(self._tasks[stage], completed=done, total=total)
+                last = self.tasks[self._bars[self._shown]]
+                self.update(last.id, completed=last.total)
+            self.update(self._bars[stage], completed=done, total=total)
         elif stage != self._shown:
-            self._console.print(f"{stage}: {total}" if total > 1 else stage, markup=False, highlight=False)
+            self.console.print(f"{stage}: {total}" if total > 1 else stage, markup=False, highlight=False)
         self._shown = stage

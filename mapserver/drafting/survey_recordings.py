@@ -1,12 +1,12 @@
 """Surveys of recordings: each is opened, checked, surveyed and closed in turn."""
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field, replace
 from itertools import count
 from pathlib import Path
-from typing import NamedTuple, Protocol, Self
+from typing import NamedTuple, Protocol
 
 import msgspec
 import numpy as np
@@ -179,7 +179,7 @@ class RecordingOptions:
             raise
 
 
-class OpenRecordings:
+class OpenRecordings(AbstractContextManager["OpenRecordings"]):
     """Recordings opened with `options`. The last used one stays open; frames decoded at its first use are not decoded again.
 
     folder: for their temporary file.
@@ -189,9 +189,6 @@ class OpenRecordings:
         self._options, self._folder, self.trajectory = options, folder, options.trajectory
         self._path: Path | None = None
         self._opened: tuple[Recording, NDArray[np.int64]]
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         if self._path is not None:
@@ -208,7 +205,10 @@ class OpenRecordings:
 
 @dataclass(frozen=True, slots=True)
 class RecordedParts:
-    """The selected frames (F,) of a recording as FrameParts: each part reads its own files and holds no data of the others."""
+    """The selected frames (F,) of a recording as FrameParts: each part reads its own files and holds no data of the others.
+
+    They are iterated once: that closes the recording.
+    """
 
     recording: Recording
     indices: NDArray[np.int64]
@@ -217,18 +217,14 @@ class RecordedParts:
     def stamps_ns(self) -> Stamps:
         return self.recording.frame_stamps_ns[self.indices]
 
-    def part(self, first: int, end: int) -> Iterable[CameraFrame]:
+    def part(self, first: int, end: int) -> "RecordedParts":
         part = self.recording.part(self.indices[first:end])
-        return _Frames(replace(part, imu=ImuSamples.empty(), wheel=(), priors=(), ground_truth=None, issues=()))
-
-
-@dataclass(frozen=True, slots=True)
-class _Frames:
-    recording: Recording
+        part = replace(part, imu=ImuSamples.empty(), wheel=(), priors=(), ground_truth=None, issues=())
+        return RecordedParts(part, np.arange(len(part)))
 
     def __iter__(self) -> Iterator[CameraFrame]:
         with self.recording as recording:
-            yield from map(recording.read_frame, range(len(recording)))
+            yield from map(recording.read_frame, self.indices.tolist())
 
 
 def survey_inputs_of(

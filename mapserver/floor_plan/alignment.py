@@ -5,7 +5,7 @@ from typing import Annotated
 import msgspec
 import numpy as np
 
-from fleetmap.encoding import to_json
+from fleetmap.encoding import decode_json, to_json
 from fleetmap.errors import StoreError
 from fleetmap.geometry import Array, transform_points
 from fleetmap.mapformat.building import BuildingFrame
@@ -35,10 +35,8 @@ def encode_alignment(alignment: Alignment) -> bytes:
 
 def decode_alignment(data: bytes) -> Alignment:
     """Decode the result of `encode_alignment`. StoreError for invalid data."""
-    try:
-        return msgspec.json.decode(data, type=Alignment)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise StoreError(f"the site's alignment cannot be read ({error}); run `mapserver align` again") from error
+    refusal = "the site's alignment cannot be read ({}); run `mapserver align` again"
+    return decode_json(data, Alignment, refusal, StoreError)
 
 
 def map_corners_m(manifest: Manifest) -> Array:

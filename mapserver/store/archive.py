@@ -93,7 +93,10 @@ def decode_archive(data: bytes) -> SurveyMap:
     """
     limit = min(MAX_ARCHIVE_PAYLOAD_BYTES, _FREE_BYTES + _MOST_TIMES_SMALLER * len(data))
     payload = unpack(ARCHIVE_MAGIC, ARCHIVE_FORMAT, data, "archive", limit)
-    head, offset = _read_head(payload)
+    if len(payload) < _HEAD_SIZE.size:
+        raise MapFormatError(f"archive: {len(payload)} bytes are too few for its head; the bytes are damaged")
+    offset = _HEAD_SIZE.size + int(_HEAD_SIZE.unpack_from(payload)[0])
+    head = decode_json(payload[_HEAD_SIZE.size : offset], _Head, "archive: head {}; the bytes are damaged")
     arrays: dict[str, AnyArray] = {}
     for entry in head.arrays:
         if entry.name not in _ARRAYS or _ARRAYS[entry.name][0] != entry.dtype or entry.name in arrays:
@@ -133,10 +136,3 @@ def _check(arrays: dict[str, AnyArray]) -> None:
     for name, most in (("obs_keyframe", lengths["K"]), ("obs_landmark", lengths["N"]), ("obs_octave", 32)):
         if np.any((arrays[name] < 0) | (arrays[name] >= most)):
             raise MapFormatError(f"archive: {name} is beyond 0 to {most - 1}; it is damaged")
-
-
-def _read_head(payload: bytes) -> tuple[_Head, int]:
-    if len(payload) < _HEAD_SIZE.size:
-        raise MapFormatError(f"archive: {len(payload)} bytes are too few for its head; the bytes are damaged")
-    end = _HEAD_SIZE.size + int(_HEAD_SIZE.unpack_from(payload)[0])
-    return decode_json(payload[_HEAD_SIZE.size : end], _Head, "archive: head {}; the bytes are damaged"), end

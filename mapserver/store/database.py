@@ -7,7 +7,7 @@ import sqlite3
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, closing, contextmanager, suppress
 from dataclasses import astuple
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar
@@ -297,12 +297,8 @@ class SqliteDatabase(Database):
                 self._reader.execute("COMMIT")
 
     def copy_to(self, path: Path) -> None:
-        target = sqlite3.connect(path)
-        try:
-            with self._reading, self._errors(f"copied to {path}"):
-                self._reader.backup(target)
-        finally:
-            target.close()
+        with closing(sqlite3.connect(path)) as target, self._reading, self._errors(f"copied to {path}"):
+            self._reader.backup(target)
 
     def shrink(self, pages: int) -> None:
         with self._lock, suppress(sqlite3.Error):  # a busy file is shrunk the next time

@@ -53,7 +53,7 @@ AREAS_BEFORE = "areas before"
 """Kind of a site's file with its areas before their last change."""
 
 
-class MapStore(StoreQueries):
+class MapStore(StoreQueries, AbstractContextManager["MapStore"]):
     """One open store. Methods may be called from any thread; every process opens its own."""
 
     def __init__(
@@ -105,13 +105,7 @@ class MapStore(StoreQueries):
             raise StoreError(reason) from error
 
     @classmethod
-    def attach(
-        cls,
-        path: Path,
-        places: Places,
-        progress: Callable[[int, int], None] = lambda done, total: None,
-        clock_ns: Callable[[], int] = time.time_ns,
-    ) -> int:
+    def attach(cls, path: Path, places: Places, progress: Callable[[int, int], None] = lambda done, total: None) -> int:
         """Copy what is in the folder to these places, where all who open the store then find it; return the copied bytes of content.
 
         A folder without a store is attached to the one that is there already. Files in the folder stay; the database is renamed.
@@ -129,22 +123,22 @@ class MapStore(StoreQueries):
                 raise UsageError(
                     f"{path} holds no map store; name the content and the database of the one that it shall share"
                 )
-            open_database(path, places, clock_ns, create=False, read_only=True).close()
+            open_database(path, places, time.time_ns, create=False, read_only=True).close()
             make_folder(path)
             write_places(path, places)
             return 0
-        with cls.open(path, clock_ns=clock_ns) as store, store._bytes(shared=False), store.served(shared=False):
+        with cls.open(path) as store, store._bytes(shared=False), store.served(shared=False):
             if running := store.running_jobs():
                 raise BusyError(f"job {running[0].id} of site {running[0].site} runs; wait for its end")
             target = Blobs(open_objects(places.content or path))
             copied = store._copy_content(target, progress) if places.content != before.content else 0
             with store._database.write():  # nobody writes what is not copied any more
                 if places.database != before.database:
-                    with closing(open_database(path, places, clock_ns, create=True, read_only=False)) as database:
+                    with closing(open_database(path, places, time.time_ns, create=True, read_only=False)) as database:
                         database.copy_from(store._database)
                 write_places(path, places)
         if places.database is not None:
-            with cls.open(path, clock_ns=clock_ns) as store:
+            with cls.open(path) as store:
                 store.files.share()
             if file.is_file():
                 with disk_errors(f"{file} cannot be renamed", "rename it: nobody may use it any more"):
@@ -169,9 +163,6 @@ class MapStore(StoreQueries):
 
     def close(self) -> None:
         self._database.close()
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(self, *_: object) -> None:
         self.close()

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import msgspec
 
-from fleetmap.encoding import to_json
+from fleetmap.encoding import decode_json, to_json
 from fleetmap.errors import UsageError, disk_errors
 from fleetmap.files import write_atomically
 from mapserver.hooks import open_url
@@ -28,10 +28,9 @@ def read_places(root: Path) -> Places:
     path = root / _FILE
     with disk_errors(f"{path} cannot be read", "check its rights"):
         data = path.read_bytes() if path.is_file() else b"{}"
-    try:
-        return msgspec.json.decode(data, type=Places)
-    except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: {error}; `mapserver attach --store DIR --content URL` writes it") from error
+    return decode_json(
+        data, Places, f"{path}: {{}}; `mapserver attach --store DIR --content URL` writes it", UsageError
+    )
 
 
 def write_places(root: Path, places: Places) -> None:

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable, Sequence, Set
+from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -183,11 +184,8 @@ class StoreQueries:
     def copy_database(self, path: Path) -> tuple[set[str], int]:
         """Copy the database into a new file, as of one moment; return the blobs that the copy names, and its number of versions."""
         self._database.copy_to(path)
-        copy = SqliteDatabase(path, self.now_ns, read_only=True)
-        try:
+        with closing(SqliteDatabase(path, self.now_ns, read_only=True)) as copy:
             return mentioned(copy), copy.value("SELECT count(*) FROM versions")
-        finally:
-            copy.close()
 
     # -------------------------------------------------------------------------------------------------- files of a site
 

@@ -14,6 +14,7 @@ from mapserver.store.places import Places, write_places
 from support.command_line import status as status_of
 from support.fleet.dashboard_scene import ROBOTS, Served, fill_store, serving, talking
 from support.pages.browser import Chromium, running_chromium
+from support.storage.clock import Clock
 from support.storage.postgres_server import PostgresServer, postgres_server
 from support.storage.s3_server import KEYS, s3_server
 
@@ -32,6 +33,11 @@ def roomy_disk(monkeypatch: pytest.MonkeyPatch) -> None:
         return os.statvfs_result(found)
 
     monkeypatch.setattr(os, "statvfs", measured)
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
 
 
 @pytest.fixture(scope="session")

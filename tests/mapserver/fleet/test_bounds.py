@@ -24,11 +24,6 @@ SECOND_NS = 10**9
 
 
 @pytest.fixture
-def clock() -> Clock:
-    return Clock()
-
-
-@pytest.fixture
 def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
     with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as made:
         publish_samples(made, 1)
@@ -123,7 +118,7 @@ def test_a_long_key_is_kept_nowhere(store: MapStore, fleet: Fleet, caplog: pytes
     """Of 64 kB in the place of a site: no rate is kept for it, and the log shows its beginning."""
     with MemoryBus(MemoryHub()) as bus:
         service = BusService(store, fleet, bus, lambda *_: None)
-        service._hear(f"fleetmap/{'x' * 60_000}/robots/r1/health", b"nonsense")
+        bus.publish(f"fleetmap/{'x' * 60_000}/robots/r1/health", b"nonsense")
         with pytest.raises(LinkError):
             service._failure(f"fleetmap/lab/robots/{'x' * 60_000}/failures", b"nonsense")
         assert not any(rate._buckets for rate in (*service._rates.values(), fleet._failures))

@@ -16,7 +16,7 @@ from fleetmap.errors import GateRefusedError, MapFormatError, StoreError
 from fleetmap.mapformat.names import current_path, sha256_hex
 from fleetmap.mapformat.tile_codec import decode_tile
 from mapserver import releases
-from mapserver.store import Actor, DraftContent, MapStore, chain_faults, queries, schema
+from mapserver.store import Actor, DraftContent, MapStore, chain_faults
 from mapserver.store.places import read_places
 from support.storage.map_samples import draft_details, publish_samples, random_tile, save_sample_draft
 from support.storage.s3_server import Content
@@ -174,10 +174,6 @@ def test_what_a_killed_writer_left_goes_after_a_day(tmp_path: Path) -> None:
             os.utime(path, (time.time() - age_s,) * 2)
         publish_samples(store, 1)
     assert (old.exists(), new.exists()) == (False, True)
-
-
-def test_the_table_names_every_served_kind_of_a_version() -> None:
-    assert all(f"'{kind}'" in schema.TABLES["version_blobs"] for kind in queries._OF_VERSIONS)
 
 
 def test_text_from_outside_is_kept_alike(metadata_folder: Path) -> None:

@@ -23,11 +23,6 @@ DAY_NS = 86_400_000_000_000
 
 
 @pytest.fixture
-def clock() -> Clock:
-    return Clock()
-
-
-@pytest.fixture
 def store(store_folder: Path, clock: Clock):
     with MapStore.open(store_folder, create=True, clock_ns=clock) as opened:
         yield opened
