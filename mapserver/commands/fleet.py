@@ -131,14 +131,14 @@ def replay(
         # In a separate process: the server does not import the robot's side (ARCHITECTURE.md), and the file is from a robot.
         command = [sys.executable, "-m", "locclient.cli", "replay", str(path), *options]
         done = run_bounded(command, ProcessLimits(), f"the replay of failure {failure}")
-        output = report.read_text("utf-8") if json and report.exists() else done.output
-    if done.has_network:
+        output = report.read_text("utf-8") if json and report.exists() else done.stdout
+    if done.args == command:
         typer.echo("it ran with the network: this system has no `unshare --net` for this account", err=True)
-    for text, is_error in ((done.errors, True), (output, False)):
+    for text, is_error in ((done.stderr, True), (output, False)):
         for line in text.splitlines():
             typer.echo(line if json and not is_error else printable(line), err=is_error)
-    if done.status:
-        raise typer.Exit(done.status)
+    if done.returncode:
+        raise typer.Exit(done.returncode)
 
 
 @expand_options

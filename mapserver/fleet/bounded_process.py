@@ -37,16 +37,6 @@ class ProcessLimits:
             resource.prlimit(process_id, kind, (limit, limit))
 
 
-@dataclass(frozen=True, slots=True)
-class ProcessResult:
-    """Result of a program: its status and its output. has_network: the system did not allow running without a network."""
-
-    status: int
-    output: str
-    errors: str
-    has_network: bool
-
-
 def without_network() -> list[str]:
     """Return the command prefix that removes the network; empty if the system refuses it for this account."""
     unshare = shutil.which("unshare")
@@ -57,12 +47,15 @@ def without_network() -> list[str]:
     return words if asked.returncode == 0 else []
 
 
-def run_bounded(command: list[str], limits: ProcessLimits, what: str) -> ProcessResult:
-    """Run a command within limits. Raises FleetmapError, naming `what`, if it is killed by a limit or crashes."""
-    prefix = without_network()
+def run_bounded(command: list[str], limits: ProcessLimits, what: str) -> "subprocess.CompletedProcess[str]":
+    """Run a command within limits; FleetmapError, naming `what`, if it is killed by a limit or crashes.
+
+    The result's `args` are the command as it is if the system did not allow running without a network.
+    """
+    whole = [*without_network(), *command]
     with TemporaryFile() as output, TemporaryFile() as errors:
         process = subprocess.Popen(
-            [*prefix, *command], stdin=subprocess.DEVNULL, stdout=output, stderr=errors, start_new_session=True
+            whole, stdin=subprocess.DEVNULL, stdout=output, stderr=errors, start_new_session=True
         )
         try:
             limits.apply(process.pid)  # not between fork and exec, where another thread's lock is never released
@@ -82,4 +75,4 @@ def run_bounded(command: list[str], limits: ProcessLimits, what: str) -> Process
             f"{what} was ended by {signal.Signals(-status).name}: it took more than {most}, or crashed the program; "
             "report it with the recording"
         )
-    return ProcessResult(status, said, complained, has_network=not prefix)
+    return subprocess.CompletedProcess(whole, status, said, complained)

@@ -222,12 +222,11 @@ class Fleet:
                 raise LinkError(
                     f"failure {report.id!r} began at {report.wall_ns} ns for {report.duration_s} s: invalid time"
                 )
-            if any(abs(thumbnail.stamp_ns) > MAX_STAMP_NS for thumbnail in report.thumbnails):
-                raise LinkError(f"failure {report.id!r} has a picture of an impossible time")
-            if not all(
-                thumb.jpeg.startswith(b"\xff\xd8") and thumb.jpeg.endswith(b"\xff\xd9") for thumb in report.thumbnails
-            ):
-                raise LinkError(f"failure {report.id!r} has a picture that is not a JPEG")
+            for picture in report.thumbnails:
+                if abs(picture.stamp_ns) > MAX_STAMP_NS:
+                    raise LinkError(f"failure {report.id!r} has a picture of an impossible time")
+                if not (picture.jpeg.startswith(b"\xff\xd8") and picture.jpeg.endswith(b"\xff\xd9")):
+                    raise LinkError(f"failure {report.id!r} has a picture that is not a JPEG")
             with self._lock:
                 ahead_s = self._entry(site, robot, now_ns, None).skew.ahead_s
         except (LinkError, UsageError) as error:

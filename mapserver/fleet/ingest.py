@@ -13,6 +13,7 @@ from fleetmap.messages import FailureKind, FailureReport, PoseMessage, RobotHeal
 from mapserver.fleet_statistics.canary_decision import DAY_NS
 from mapserver.fleet_statistics.health_stream import HealthStream, server_time_ns
 from mapserver.fleet_statistics.kpis import Counters, hour_of
+from mapserver.fleet_statistics.robot_calibration import number_of
 from mapserver.floor_plan.areas import OUTSIDE, Areas
 from mapserver.store import CanaryRow, CounterKey, FleetBatch, FleetRetention, MapStore, TraceRow, tile_key
 
@@ -265,10 +266,6 @@ def arm_key(canary: int, *, is_canary: bool) -> str:
 
 
 def _trace(health: RobotHealth, place: tuple[float, float, float] | None, now_ns: int) -> TraceRow:
-    def figure(name: str) -> float | None:
-        value = health.metrics.get(name)
-        return float(value) if isinstance(value, int | float) and math.isfinite(value) else None
-
     return TraceRow(
         site=health.site,
         robot=health.robot,
@@ -278,10 +275,10 @@ def _trace(health: RobotHealth, place: tuple[float, float, float] | None, now_ns
         version=health.version,
         x_map_m=None if place is None else place[0],
         y_map_m=None if place is None else place[1],
-        radius_95_m=figure("radius_95_m"),
+        radius_95_m=number_of(health.metrics.get("radius_95_m")),
         heard_ns=now_ns,
         flags=",".join(health.flags) or None,
-        frame_ms=figure("frame_ms_mean"),
-        exposure=figure("exposure"),
-        sharpness=figure("sharpness"),
+        frame_ms=number_of(health.metrics.get("frame_ms_mean")),
+        exposure=number_of(health.metrics.get("exposure")),
+        sharpness=number_of(health.metrics.get("sharpness")),
     )

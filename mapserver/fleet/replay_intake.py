@@ -120,7 +120,7 @@ def _judged(data: bytes, named: tuple[str, str, str]) -> FailureReplay:
         path.write_bytes(data)
         command = [sys.executable, "-m", "mapserver.fleet.replay_judge", str(path), str(found), *named]
         ended = run_bounded(command, _LIMITS, "the judgement of the recording")
-        if ended.status:
-            raise RecordingError(ended.errors.strip().rpartition("\n")[2].replace(str(path), "the recording"))
+        if ended.returncode:
+            raise RecordingError(ended.stderr.strip().rpartition("\n")[2].replace(str(path), "the recording"))
         summary, pictures = msgspec.msgpack.decode(found.read_bytes(), type=tuple[bytes, list[tuple[int, bytes]]])
     return FailureReplay(summary, data, pictures)

@@ -181,9 +181,8 @@ def poisson_interval(events: int) -> tuple[float, float]:
     """
     if events == 0:
         return 0.0, float(scipy.special.gammaincinv(1, 1 - _TAIL))
-    return float(scipy.special.gammaincinv(events, _TAIL / 2)), float(
-        scipy.special.gammaincinv(events + 1, 1 - _TAIL / 2)
-    )
+    low, high = scipy.special.gammaincinv([events, events + 1], [_TAIL / 2, 1 - _TAIL / 2]).tolist()
+    return low, high
 
 
 def share(hits: int, tries: int) -> Share:

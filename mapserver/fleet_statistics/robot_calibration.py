@@ -50,12 +50,13 @@ def calibration_figures(health: Mapping[str, Any] | None) -> tuple[CalibrationFi
     names = set(drifted.split(",")) if isinstance(drifted, str) else set()
     found = []
     for name in PARAMETERS:
-        value, sigma = _number(metrics.get(PREFIX + name)), _number(metrics.get(f"{PREFIX}{name}{SIGMA}"))
+        value, sigma = number_of(metrics.get(PREFIX + name)), number_of(metrics.get(f"{PREFIX}{name}{SIGMA}"))
         if value is not None and sigma is not None:
             found.append(CalibrationFigure(name, value, sigma, name in names))
     return tuple(found)
 
 
-def _number(value: object) -> float | None:
+def number_of(value: object) -> float | None:
+    """Return a figure of a robot as a finite number, None for anything else."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
     return float(value) if is_number else None  # type: ignore[arg-type]

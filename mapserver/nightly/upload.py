@@ -33,10 +33,11 @@ class Upload:
         """inbox: of the site, made if it is missing. stated_bytes: as the client says, None if it does not."""
         self._lock, self._stated_bytes, self.size_bytes = threading.Lock(), stated_bytes, 0
         self._path = check_upload_name(inbox, name)
+        self._words = f"{self._path} cannot be written", "check the rights and space of the inbox"
         # Another server may receive the same recording, from a robot that has changed to it.
         self._part = inbox / f".{name}.{secrets.token_hex(4)}{_PART}"
         self._descriptor: int | None = None
-        with disk_errors(*self._words()):
+        with disk_errors(*self._words):
             make_folder(inbox)
             self._check_space(stated_bytes or 0)
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
@@ -46,7 +47,7 @@ class Upload:
 
     def write(self, data: bytes) -> None:
         """Append bytes; StateError where the disk would get too full. After an error it is discarded."""
-        with self._lock, disk_errors(*self._words()):
+        with self._lock, disk_errors(*self._words):
             if self._descriptor is None:
                 return
             self._check_space(len(data))
@@ -60,7 +61,7 @@ class Upload:
         if self.size_bytes == 0 or self.size_bytes != (self._stated_bytes or self.size_bytes):
             stated = "" if self._stated_bytes is None else f", {self._stated_bytes} were announced"
             raise UsageError(f"{self._path.name} came with {self.size_bytes} bytes{stated}; upload it again")
-        with self._lock, disk_errors(*self._words()):
+        with self._lock, disk_errors(*self._words):
             assert self._descriptor is not None
             os.fsync(self._descriptor)
             check_upload_name(self._path.parent, self._path.name)
@@ -84,6 +85,3 @@ class Upload:
             raise StateError(
                 f"{self._path.name} is too large: {words}; remove old recordings from `done`, or give it a larger disk"
             )
-
-    def _words(self) -> tuple[str, str]:
-        return f"{self._path} cannot be written", "check the rights and space of the inbox"

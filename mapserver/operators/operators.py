@@ -57,9 +57,8 @@ class Operators:
     @property
     def is_sign_in_on(self) -> bool:
         """True once an operator was added; from then on every request needs a session or a token."""
-        if (
-            not self._are_there and abs(self._now_ns() - self._looked_ns) > _LOOK_EVERY_S * 1e9
-        ):  # also of a clock set back
+        is_due = abs(self._now_ns() - self._looked_ns) > _LOOK_EVERY_S * 1e9  # also of a clock set back
+        if not self._are_there and is_due:
             self._looked_ns, self._are_there = self._now_ns(), self._store.operators.are_there()
         return self._are_there
 

@@ -25,7 +25,7 @@ from fleetmap.messages import (
     robot_key,
     split_key,
 )
-from mapserver.fleet.fleet import Fleet, RobotStatus
+from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.rate_limit import RateLimit
 from mapserver.serving.bus_access import BusGuard
 from mapserver.store import Actor, MapStore
@@ -90,7 +90,8 @@ class BusService:
                 *([] if guard is None else [("renew", "renewal", self._renew)]),
             )
         ]
-        self._handles += [bus.subscribe(robot_key("*", "*", what), self._hear) for what in REPORT_RATES]
+        for what in REPORT_RATES:
+            self.hear(robot_key("*", "*", what), what, self._take)
 
     def announce_changes(self) -> list[str]:
         """Notify every known robot whose wanted version changed since the last call; return the sites of notified robots.
@@ -192,44 +193,37 @@ class BusService:
             raise LinkError(f"site {site} has no published bytes {sha256}; fetch its current manifest again")
         return self._recent.get(sha256)
 
-    def _hear(self, key: str, payload: bytes) -> None:
+    def _take(self, key: str, payload: bytes) -> str | None:
         what = key.rpartition("/")[2]
-        try:
-            site, robot = self._sender(key)
-            if not self._rates[what].admits((site, robot)):
-                self._count(what, "dropped", 0)
-                self._refusals.warning(key, "too many messages under %r; the excess is dropped", key[:200])
-                return
-            if len(payload) > MAX_REPORT_BYTES:
-                raise LinkError(f"{len(payload)} bytes; the limit is {MAX_REPORT_BYTES}")
-            if what == "ack":
-                self._fleet.take_ack(site, robot, decode_message(payload, RobotAck))
-            elif what == "health":
-                self._fleet.take_health(site, robot, decode_message(payload, RobotHealth))
-            else:
-                self._fleet.take_pose(site, robot, decode_message(payload, PoseMessage))
-        except FleetmapError as error:
-            self._refuse(key, what, error)
+        site, robot = self._sender(key)
+        if not self._rates[what].admits((site, robot)):
+            self._refusals.warning(key, "too many messages under %r; the excess is dropped", key[:200])
+            return "dropped"
+        if len(payload) > MAX_REPORT_BYTES:
+            raise LinkError(f"{len(payload)} bytes; the limit is {MAX_REPORT_BYTES}")
+        if what == "ack":
+            self._fleet.take_ack(site, robot, decode_message(payload, RobotAck))
+        elif what == "health":
+            self._fleet.take_health(site, robot, decode_message(payload, RobotHealth))
         else:
-            self._count(what, "ok", 0)
+            self._fleet.take_pose(site, robot, decode_message(payload, PoseMessage))
+        return None
 
-    def hear(self, keys: str, what: str, take: Callable[[str, bytes], None]) -> None:
-        """Pass messages under these keys on, counted as `what`; one at which `take` raises a FleetmapError is logged as refused."""
+    def hear(self, keys: str, what: str, take: Callable[[str, bytes], str | None]) -> None:
+        """Pass messages under these keys on, counted as `what` and "ok" or the outcome that `take` returns.
+
+        One at which it raises a FleetmapError is logged and counted as refused: published messages have no answer.
+        """
 
         def heard(key: str, payload: bytes) -> None:
             try:
-                take(key, payload)
+                outcome = take(key, payload) or "ok"
             except FleetmapError as error:
-                self._refuse(key, what, error)
-            else:
-                self._count(what, "ok", 0)
+                self._refusals.warning(key, "message under %r refused: %s", key[:200], error)
+                outcome = "refused"
+            self._count(what, outcome, 0)
 
         self._handles.append(self._bus.subscribe(keys, heard))
-
-    def _refuse(self, key: str, what: str, error: FleetmapError) -> None:
-        """Log and count the refusal: published messages have no answer."""
-        self._refusals.warning(key, "message under %r refused: %s", key[:200], error)
-        self._count(what, "refused", 0)
 
 
 def place_robot(store: MapStore, fleet: Fleet, bus: Bus | None, told: InitialPoseMessage, actor: Actor) -> None:
@@ -237,7 +231,7 @@ def place_robot(store: MapStore, fleet: Fleet, bus: Bus | None, told: InitialPos
 
     UsageError for an unknown site or robot and a position outside the map, StateError for a robot that is not connected.
     """
-    store.current(told.site)  # raises for an unknown site
+    current = store.current(told.site)  # raises for an unknown site
     robot = next((robot for robot in fleet.robots(told.site) if robot.robot == told.robot), None)
     if robot is None:
         raise UsageError(f"site {told.site} has no robot {told.robot[:64]!r}; /v1/robots lists its robots")
@@ -246,18 +240,9 @@ def place_robot(store: MapStore, fleet: Fleet, bus: Bus | None, told: InitialPos
         raise StateError(f"{last} and is not connected; try again when it is back")
     if bus is None or bus.closed():
         raise StateError("this server has no bus to notify robots; start one with `mapserver serve`")
-    _check_place(store, told, robot)
-    heading = "" if told.heading_rad is None else f", heading {math.degrees(told.heading_rad):.0f} degrees"
-    words = f"{told.robot} is at {told.x_map_m:.2f}, {told.y_map_m:.2f} m{heading}, within {told.sigma_m:g} m"
-    bus.publish(robot_key(told.site, told.robot, "initial_pose"), encode_message(told))
-    store.audit("robot placed", words, actor=actor, site=told.site)
-
-
-def _check_place(store: MapStore, told: InitialPoseMessage, robot: RobotStatus) -> None:
     values = (told.x_map_m, told.y_map_m, told.heading_rad or 0.0, told.sigma_m)
     if not all(map(math.isfinite, values)) or not 0 < told.sigma_m <= MOST_SIGMA_M:
         raise UsageError(f"x, y, heading and sigma must be numbers, sigma above 0 and at most {MOST_SIGMA_M:g} m")
-    current = store.current(told.site)
     version = robot.version if robot.version is not None else None if current is None else current.version
     if version is None:
         raise StateError(f"{told.robot} runs no map yet; publish one first")
@@ -266,6 +251,10 @@ def _check_place(store: MapStore, told: InitialPoseMessage, robot: RobotStatus) 
     if (x, y) not in {(tile.x, tile.y) for tile in manifest.tiles}:
         where = f"{told.x_map_m:.1f}, {told.y_map_m:.1f} m"
         raise UsageError(f"{where} is outside of version {version}: it has no tile {x},{y}")
+    heading = "" if told.heading_rad is None else f", heading {math.degrees(told.heading_rad):.0f} degrees"
+    words = f"{told.robot} is at {told.x_map_m:.2f}, {told.y_map_m:.2f} m{heading}, within {told.sigma_m:g} m"
+    bus.publish(robot_key(told.site, told.robot, "initial_pose"), encode_message(told))
+    store.audit("robot placed", words, actor=actor, site=told.site)
 
 
 class ByteCache:

@@ -51,9 +51,7 @@ class BoundedListener(socket.socket):
         If all are in use, the oldest one of the busiest address is closed for one of an address with fewer.
         """
         connection, address = super().accept()
-        host = _network(address[0])
-        if plain_address(address[0]) in self._proxies:
-            host = _PROXY
+        host = _PROXY if plain_address(address[0]) in self._proxies else _network(address[0])
         self._open = [entry for entry in self._open if entry[0].fileno() >= 0]
         counts = Counter(other for _, other, _ in self._open if other != _PROXY)
         busiest, most = max(counts.items(), key=itemgetter(1), default=("", 0))
@@ -137,10 +135,8 @@ def _shut(connection: socket.socket) -> None:
 
 def _network(host: str) -> str:
     """Return the unit that counts as one address: for IPv6 the 64 bits that one customer has at least."""
-    address = ip_address(host.partition("%")[0])
-    if address.version == 4:
-        return str(address)
-    return str(address.ipv4_mapped or f"{ip_address(int(address) >> 64 << 64)}/64")
+    address = ip_address(plain_address(host))
+    return str(address) if address.version == 4 else f"{ip_address(int(address) >> 64 << 64)}/64"
 
 
 def plain_address(address: str) -> str:

@@ -139,9 +139,8 @@ class ListRepository:
         _check(root, "targets", targets)
         meta = {"targets.json": MetaFile(targets.signed.version)}
         number, stamped = self.lists.newest("snapshot"), 0
-        before: Snapshot | None = (
-            None  # the last one, unless a replaced key signed it: then it cannot stay, despite the same content
-        )
+        # The last one, unless a replaced key signed it: then it cannot stay, despite the same content
+        before: Snapshot | None = None
         if number:
             last = self.lists.metadata("snapshot")
             with suppress(UnsignedMetadataError):
@@ -156,12 +155,8 @@ class ListRepository:
         if before is None or before.meta != meta or self.ahead or not is_fresh("snapshot", before.expires, self.now):
             number += 1 + self.ahead
             self._sign("snapshot", Snapshot(version=number, meta=meta), online)
-        self._sign(
-            TIMESTAMP,
-            Timestamp(version=stamped + 1 + self.ahead, snapshot_meta=MetaFile(number)),
-            online,
-            judges=(root,),
-        )
+        stamp = Timestamp(version=stamped + 1 + self.ahead, snapshot_meta=MetaFile(number))
+        self._sign(TIMESTAMP, stamp, online, judges=(root,))
 
     def _named(self, targets: Targets, name: str, newest: int, before: Snapshot | None) -> MetaFile | None:
         """Return the snapshot's entry of a site: its newest list, or the previous entry while another key must sign first.

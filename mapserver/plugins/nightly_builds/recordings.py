@@ -65,9 +65,9 @@ def _read(path: Path, options: OpenOptions, seconds: float) -> tuple[str, str]:
         raise
     except FleetmapError as error:
         return "", str(error)
-    if ended.status:
-        return "", f"{path} cannot be read: {ended.errors.strip().rpartition(chr(10))[2][:500]}"
-    return msgspec.json.decode(ended.output, type=tuple[str, str])
+    if ended.returncode:
+        return "", f"{path} cannot be read: {ended.stderr.strip().rpartition(chr(10))[2][:500]}"
+    return msgspec.json.decode(ended.stdout, type=tuple[str, str])
 
 
 def read(path: Path, options: OpenOptions) -> tuple[str, str]:

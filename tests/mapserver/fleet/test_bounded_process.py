@@ -1,6 +1,7 @@
 """Programs over strangers' files end within their limits, with all that they started, and reach nobody."""
 
 import os
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from mapserver.fleet.bounded_process import ProcessLimits, run_bounded, without_
 LIMITS = ProcessLimits(memory_bytes=1 << 30, cpu_s=2, wall_s=60.0, file_bytes=1 << 20, open_files=32)
 
 
-def run(program: str, limits: ProcessLimits = LIMITS) -> bounded_process.ProcessResult:
+def run(program: str, limits: ProcessLimits = LIMITS) -> "subprocess.CompletedProcess[str]":
     return run_bounded([sys.executable, "-c", program], limits, "the replay of failure 1")
 
 
@@ -42,14 +43,14 @@ def test_it_is_ended(program: str, limits: ProcessLimits) -> None:
 )
 def test_it_gets_no_more(program: str, error: str) -> None:
     ended = run(program)
-    assert ended.status == 1
-    assert error in ended.errors
-    assert len(ended.output) <= LIMITS.file_bytes
+    assert ended.returncode == 1
+    assert error in ended.stderr
+    assert len(ended.stdout) <= LIMITS.file_bytes
 
 
 def test_what_it_says_comes_back() -> None:
     ended = run("import sys; print('answer'); print('words', file=sys.stderr); sys.exit(3)")
-    assert (ended.status, ended.output, ended.errors) == (3, "answer\n", "words\n")
+    assert (ended.returncode, ended.stdout, ended.stderr) == (3, "answer\n", "words\n")
 
 
 def test_what_it_started_ends_with_it(tmp_path: Path) -> None:
@@ -68,12 +69,12 @@ def test_what_it_started_ends_with_it(tmp_path: Path) -> None:
 @pytest.mark.skipif(not without_network(), reason="this system gives no network namespaces to this account")
 def test_it_reaches_no_network() -> None:
     ended = run("import socket; print(len(socket.if_nameindex())); socket.create_connection(('192.0.2.1', 80), 1)")
-    assert ended.output == "1\n", "loopback alone"
-    assert "Network is unreachable" in ended.errors
-    assert not ended.has_network
+    assert ended.stdout == "1\n", "loopback alone"
+    assert "Network is unreachable" in ended.stderr
+    assert ended.args[0] != sys.executable
 
 
 def test_a_system_without_namespaces_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(bounded_process.shutil, "which", lambda _: "/bin/false")
     assert without_network() == []
-    assert run("pass").has_network
+    assert run("pass").args[0] == sys.executable

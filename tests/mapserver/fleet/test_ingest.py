@@ -317,8 +317,3 @@ def _size(folder: Path) -> int:
     connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
     connection.close()
     return (folder / "store.sqlite3").stat().st_size
-
-
-def test_settings_reach_the_retention() -> None:
-    settings = IngestSettings(tally_days=3.0, failure_days=4.0, picture_bytes=5, trace_days=6.0)
-    assert settings.retention() == FleetRetention(3.0, 4.0, 5, 6.0)

@@ -1,6 +1,7 @@
 """Recordings of failures come in parts, are judged as files of strangers, and cost the reports nothing. Rows 8, 23, 25."""
 
 import struct
+import subprocess
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,7 +15,7 @@ from fleetmap.errors import LinkError, UsageError
 from fleetmap.failure_summary import ReplayPart
 from fleetmap.messages import FailureAck, encode_message
 from mapserver.fleet import replay_intake
-from mapserver.fleet.bounded_process import ProcessLimits, ProcessResult
+from mapserver.fleet.bounded_process import ProcessLimits
 from mapserver.fleet.fleet import Fleet
 from mapserver.fleet.ingest import IngestSettings
 from mapserver.store import MapStore
@@ -145,7 +146,7 @@ def test_a_recording_without_a_report_and_one_too_large_are_refused(server: Serv
 
 
 def test_uploads_and_rates_are_bounded(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    ended = ProcessResult(1, "", "no recording", has_network=False)
+    ended = subprocess.CompletedProcess([], 1, "", "no recording")
     monkeypatch.setattr(replay_intake, "run_bounded", lambda *_: ended)
     for number in range(replay_intake.MAX_UPLOADS + 1):
         server.report("f1", robot=f"r{number}")

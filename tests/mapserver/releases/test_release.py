@@ -131,24 +131,6 @@ def test_an_import_with_damaged_evidence_is_refused(store: MapStore, tmp_path: P
             other.import_version(tmp_path / "bad.fmex")
 
 
-def test_a_draft_is_not_published_against_another_version_than_it_was_judged_by(store: MapStore, monkeypatch) -> None:
-    publish_samples(store, 1)
-    save_sample_draft(store, seed=2)
-    save_sample_draft(store, seed=3)
-    record = MapStore.record_verdict
-
-    def slow(*args, **more) -> None:
-        monkeypatch.setattr(MapStore, "record_verdict", record)
-        record(*args, **more)
-        releases.publish(store, "lab", 2)
-
-    monkeypatch.setattr(MapStore, "record_verdict", slow)
-    with pytest.raises(StateError, match="compared with 1"):
-        releases.publish(store, "lab", 3)
-    assert states(store) == {1: "published", 2: "current", 3: "draft"}
-    assert releases.publish(store, "lab", 3) == 3
-
-
 def test_hard_limits_are_not_forced(store: MapStore) -> None:
     store.save("lab", DraftContent(tiles=[], vocabulary=b"v", details=draft_details()))
     with pytest.raises(GateRefusedError, match="cannot be forced"):
