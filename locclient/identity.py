@@ -171,10 +171,6 @@ class MapAddress:
     identity: RobotIdentity | None = None
     version: int | None = None
 
-    @property
-    def tls(self) -> TlsFiles | None:
-        return None if self.identity is None else self.identity.tls
-
 
 @dataclass(frozen=True, kw_only=True)
 class GivenAddress:

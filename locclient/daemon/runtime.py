@@ -67,10 +67,8 @@ class RuntimeParts:
 class Runtime:
     """Runs until `stop` is called, the source ends and a connected server has its failures, or a thread fails; `run` raises its error."""
 
-    def __init__(
-        self, parts: RuntimeParts, manager: ServiceManager, *, wall_ns: Callable[[], int] = time.time_ns
-    ) -> None:
-        self._parts, self._manager, self._wall_ns = parts, manager, wall_ns
+    def __init__(self, parts: RuntimeParts, manager: ServiceManager) -> None:
+        self._parts, self._manager = parts, manager
         self._robot, self._server, self._publisher = parts.robot, parts.server, parts.publisher
         self._links = () if parts.server is None else parts.server.links
         self._stop, self._sensors_stop, self._disk_stop = (threading.Event() for _ in range(3))
@@ -213,7 +211,7 @@ class Runtime:
             failure = context.failure
             _log.warning("failure: %s, %s, %s", failure.kind, failure.cause, failure.estimate.status.value)
             self._figures.failures += 1
-            self._failures.append((context, self._wall_ns() - int(max(failure.duration_s, silent_s) * 1e9)))
+            self._failures.append((context, time.time_ns() - int(max(failure.duration_s, silent_s) * 1e9)))
 
     def _report(self, now_s: float) -> None:
         if now_s - self._health_s < _HEALTH_EVERY_S:
@@ -252,7 +250,7 @@ class Runtime:
             trust = self._server.client.trust
             counts["map_word_hours"] = None if trust is None else trust.word_hours
         profile, more = self._parts.profile, {**counts, **self._outbox_counts, **tiles}
-        return self._figures.report(profile.site, profile.robot, self._wall_ns(), more, self._is_silent())
+        return self._figures.report(profile.site, profile.robot, time.time_ns(), more, self._is_silent())
 
     # --- the other threads --------------------------------------------------------------------------------------------
 

@@ -16,7 +16,7 @@ from fleetmap.config import Section
 from fleetmap.errors import RecordingError
 from fleetmap.geometry import AnyArray
 from fleetmap.sensors.rectification import StereoCamera
-from locclient.localization.percept import QueryInput
+from locclient.localization.perception import QueryInput
 
 MAX_ROWS = 10_000  # of an array, and members of a list
 _MAX_INT, _MAX_SETTING, _MAX_SIDE_PX = 1 << 62, 1_000_000, 10_000

@@ -29,7 +29,7 @@ from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.rectification import MountedCamera, MountedRig, RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Image
 from locclient.delivery.failure_checks import MAX_ROWS, check_record
-from locclient.localization.percept import Percept
+from locclient.localization.perception import Percept
 from locclient.localization.pose_tracker import Start
 from locclient.localization.settings import LocalizerSettings
 from locclient.robot.failure_onset import block_px, reduced

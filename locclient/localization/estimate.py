@@ -71,13 +71,9 @@ class Estimate:
     @property
     def views_in_words(self) -> str:
         """Return the state of each view, and which one is compared with the map; empty for a rig of one view."""
-        if len(self.view_causes) == 1:
-            return ""
-        used = (" (compared with the map)" if number == self.view else "" for number in range(len(self.view_causes)))
-        return ", ".join(
-            f"view {n}: {cause.value or 'good'}{use}"
-            for n, (cause, use) in enumerate(zip(self.view_causes, used, strict=True))
-        )
+        states = [f"view {number}: {cause.value or 'good'}" for number, cause in enumerate(self.view_causes)]
+        states[self.view] += " (compared with the map)"
+        return ", ".join(states) if len(states) > 1 else ""
 
 
 def assemble(estimate: Estimate, tracker: PoseTracker, *, has_failed: bool) -> Estimate:

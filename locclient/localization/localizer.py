@@ -1,15 +1,13 @@
 """The localizer: samples and tiles in, one estimate for each frame out. Pure."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
-from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import se3_inverse
 from fleetmap.mapformat.building import Floor
-from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import Cause, Status
 from fleetmap.odometry.estimate import is_away
-from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes, MapView
+from fleetmap.relocalization.map_view import LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.rectification import MountedRig, RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
@@ -18,8 +16,7 @@ from locclient.localization.calibration.watch import Mounting
 from locclient.localization.estimate import Estimate, assemble, map_cov
 from locclient.localization.held_maps import HeldMap, HeldMaps
 from locclient.localization.map_query import MapQuery
-from locclient.localization.percept import Percept
-from locclient.localization.perception import Perception
+from locclient.localization.perception import Percept, Perception
 from locclient.localization.pose_tracker import PoseTracker, QueryResult, Start
 from locclient.localization.priors.given import GivenPrior
 from locclient.localization.priors.lift_ride import LiftRide
@@ -76,21 +73,13 @@ class Localizer:
         self._tracker.forget()
 
     def handle_version(
-        self,
-        version: int,
-        tiles: Iterable[Tile],
-        vocabulary: Vocabulary,
-        survey_focal_px: float,
-        lookalikes: LookAlikes | None = None,
-        alias_step_m: float = ALIAS_STEP_M,
-        site: str = "",
+        self, version: int, view: MapView, lookalikes: LookAlikes | None, alias_step_m: float, site: str = ""
     ) -> None:
-        """Use these tiles, all of one version, from now on; cancel a running map query.
+        """Use this part of a version from now on; cancel a running map query.
 
         lookalikes: similarity of unmapped places to the map; None if not measured. alias_step_m: smallest distance at which its
         places look alike. site: of another one's map in the building, see `handle_building`; empty for the robot's own.
         """
-        view = MapView(tiles, vocabulary, survey_focal_px)
         relocalizers = tuple(Relocalizer(view, camera, self._settings.relocalizer) for camera, _ in self._rig.mounted)
         self.maps.use(site, HeldMap(version, relocalizers, lookalikes, alias_step_m))
         self._query.begin_anew()

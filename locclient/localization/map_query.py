@@ -18,7 +18,7 @@ from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import ViewpointGate
 from locclient.localization.held_maps import HeldMaps
 from locclient.localization.image_quality import UNUSABLE
-from locclient.localization.percept import Percept, QueryInput
+from locclient.localization.perception import Percept, QueryInput
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.pose_tracker import PoseTracker, QueryResult
 from locclient.localization.settings import LocalizerSettings

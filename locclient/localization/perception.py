@@ -1,21 +1,59 @@
-"""Perception of a robot: its samples and images, as one percept for each frame. Pure."""
+"""Perception of a robot: its samples and images, as one percept for each frame: measurements that do not depend on a map. Pure."""
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fleetmap.messages import Cause
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.mono.mono_modes import make_odometry
+from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.sensors.rectification import MountedRig, RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, WheelSample
+from locclient.localization.calibration.parameters import NOT_JUDGED, CalibrationState
 from locclient.localization.image_quality import UNUSABLE, ImageQuality, ImageQualityMonitor
-from locclient.localization.percept import Percept
 from locclient.localization.pose_hypothesis import Motion
-from locclient.localization.priors.ride_gauge import RideGauge
+from locclient.localization.priors.ride_gauge import Ride, RideGauge
 from locclient.localization.settings import LocalizerSettings
 
 _DEAD_NS = 500_000_000  # without images, a camera is dead
+
+
+@dataclass(slots=True)
+class QueryInput:
+    """Features of the frame of a map query, and the number of slices of their extraction; None until they are complete.
+
+    view: number of the rig's view that they are of.
+    """
+
+    slices: int = 0
+    features: FrameFeatures | None = None
+    view: int = 0
+
+
+@dataclass(slots=True)
+class Percept:
+    """Percept of one frame. Robots store them for replays of failures.
+
+    motions: of the odometry, from start frames of hypotheses. is_reversed: images of a pair or of two cameras are exchanged, or mirrored.
+    calibration: its state by the map before this frame. query: of a map query that begins with this frame. image: of the view that the
+    odometry follows; view_causes: faults of the images of each view. ride: motion in a lift, None for a robot without a building.
+    """
+
+    odometry: OdometryEstimate
+    image: ImageQuality
+    motions: dict[int, Motion]
+    is_reversed: bool = False
+    calibration: CalibrationState = NOT_JUDGED
+    query: QueryInput | None = None
+    view_causes: tuple[Cause, ...] = (Cause.NONE,)
+    ride: Ride | None = None
+
+    @property
+    def has_broken(self) -> bool:
+        """True if tracks are lost in a good image: an object moved in front of the cameras, or the robot is elsewhere."""
+        return self.odometry.status is OdometryStatus.DEGRADED and self.image.cause is Cause.NONE
 
 
 class Perception:

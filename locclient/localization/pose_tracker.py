@@ -170,18 +170,12 @@ class PoseTracker:
         start = Start(was_tracking=self.was_tracking, is_carried=self.is_carried, failed_queries=failed_queries)
         if known is None:
             return start
-        return replace(
-            start,
-            frame_index=known.frame_index,
-            stamp_ns=known.stamp_ns,
-            support=known.support,
-            **known.start._asdict(),
-            is_confirmed=self.confirmed is not None,
-            is_revisable=prior is not None and prior.is_revisable,
-            is_told=prior is None or prior.is_told,
-            travelled_m=0.0 if prior is None else prior.travelled_m,
-            has_broken=known.has_broken,
-        )
+        if prior is not None:
+            start = replace(start, is_revisable=prior.is_revisable, is_told=prior.is_told)
+            start = replace(start, travelled_m=prior.travelled_m)
+        start = replace(start, frame_index=known.frame_index, stamp_ns=known.stamp_ns, support=known.support)
+        start = replace(start, **known.start._asdict(), has_broken=known.has_broken)
+        return replace(start, is_confirmed=self.confirmed is not None)
 
     def begin(self, start: Start) -> None:
         """Continue from `start` with the next frame."""

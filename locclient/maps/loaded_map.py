@@ -10,7 +10,7 @@ from fleetmap.geometry import Array
 from fleetmap.mapformat.manifest import Manifest
 from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import Status, WantedVersion
-from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes
+from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes, MapView
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
 
@@ -109,8 +109,8 @@ class LoadedMap:
 
     def show(self, localizer: Localizer, site: str = "") -> None:
         """Let a localizer use it as the map of a site of its building; empty: of the robot's own."""
-        shown = (self.version, self.tiles.values(), self.vocabulary, self.manifest.camera.focal_px)
-        localizer.handle_version(*shown, self.lookalikes, self.alias_step_m, site=site)
+        view = MapView(self.tiles.values(), self.vocabulary, self.manifest.camera.focal_px)
+        localizer.handle_version(self.version, view, self.lookalikes, self.alias_step_m, site)
 
     @property
     def alias_step_m(self) -> float:

@@ -5,6 +5,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
@@ -57,24 +58,18 @@ _RETRY_S = 0.2
 _MAX_INCOMPLETE = 8
 
 
+@dataclass
 class ChunkReader:
-    """Reads chunked downloads from a server. Chunks of an incomplete download are kept across errors and calls."""
+    """Reads chunked downloads from a server. Chunks of an incomplete download are kept across errors and calls.
 
-    def __init__(
-        self,
-        bus: Bus,
-        *,
-        timeout_s: float,
-        patience_s: float,
-        clock_s: Callable[[], float] = time.monotonic,
-    ) -> None:
-        """timeout_s: for each chunk. patience_s: time without any chunk after which a read fails; a later read resumes it."""
-        self._bus = bus
-        self._timeout_s = timeout_s
-        self._patience_s = patience_s
-        self._clock_s = clock_s
-        self._incomplete: dict[str, bytearray] = {}
-        self.received_bytes = 0
+    timeout_s: for each chunk. patience_s: time without any chunk after which a read fails; a later read resumes it.
+    """
+
+    bus: Bus
+    timeout_s: float
+    patience_s: float
+    clock_s: Callable[[], float] = time.monotonic
+    _incomplete: dict[str, bytearray] = field(default_factory=dict)
 
     def read(self, key: str, *, max_bytes: int) -> bytes:
         """Return all bytes under `key`, not yet verified.
@@ -95,7 +90,6 @@ class ChunkReader:
 
     def _chunk(self, key: str, offset: int, max_bytes: int) -> Part:
         chunk = self._request(key, encode_message(ChunkRequest(offset=offset)))
-        self.received_bytes += len(chunk.data)
         if chunk.total_bytes > max_bytes:
             raise LinkError(f"{key} has {chunk.total_bytes} bytes where at most {max_bytes} are expected")
         if chunk.offset != offset or offset + len(chunk.data) > chunk.total_bytes:
@@ -110,12 +104,12 @@ class ChunkReader:
 
     def _request(self, key: str, request: bytes) -> Part:
         """Repeat the request until an answer or the end of patience. Raises UnreachableError, or LinkError for a refusal."""
-        deadline_s = self._clock_s() + self._patience_s
+        deadline_s = self.clock_s() + self.patience_s
         while True:
             try:
-                return decode_message(self._bus.get(key, request, timeout_s=self._timeout_s), Part)
+                return decode_message(self.bus.get(key, request, timeout_s=self.timeout_s), Part)
             except UnreachableError:
-                if self._clock_s() >= deadline_s:
+                if self.clock_s() >= deadline_s:
                     raise
                 time.sleep(_RETRY_S)
 
@@ -153,11 +147,6 @@ class MapClient(MapSource):
             raise UntrustedError("signature", "this robot has no signed lists; it needs a server, not a folder")
         self.trust.refresh()
         self.trust.admitted(wanted)
-
-    @property
-    def received_bytes(self) -> int:
-        """Return the number of map bytes received over the bus so far."""
-        return self._chunks.received_bytes
 
     # --- versions -----------------------------------------------------------------------------------------------------
 
@@ -357,7 +346,8 @@ _PATIENCE_S = 120.0  # without an answer during a fetch; long enough for a serve
 
 def open_bus(address: MapAddress) -> Bus:
     """Open a connection to the server, with the robot's identity if it has one. Without a server the bus stays closed."""
-    return Bus(_NOWHERE) if address.server is None else Bus(str(address.server), tls=address.tls).open()
+    tls = None if address.identity is None else address.identity.tls
+    return Bus(_NOWHERE) if address.server is None else Bus(str(address.server), tls=tls).open()
 
 
 def map_client(bus: Bus, cache: TileCache, address: MapAddress, **how: float) -> MapClient:

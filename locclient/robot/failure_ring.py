@@ -20,7 +20,7 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.estimate import Estimate
-from locclient.localization.percept import Percept, QueryInput
+from locclient.localization.perception import Percept, QueryInput
 from locclient.localization.pose_tracker import Start
 from locclient.maps.loaded_map import LoadedMap
 

@@ -129,10 +129,11 @@ def fetched(folder: Path, cache: Path) -> int:
     hub = MemoryHub()
     with MapStore.open(folder) as store, MemoryBus(hub) as bus, MemoryBus(hub) as robot:
         service = BusService(store, Fleet(store), bus, lambda *_: None)
-        link = MapClient(robot, TileCache(cache), SITE, "r1")
+        kept = TileCache(cache)
+        link, before = MapClient(robot, kept, SITE, "r1"), kept.total_bytes
         link.bring(link.wanted())
         service.close()
-        return link.received_bytes
+        return kept.total_bytes - before
 
 
 def updated(number: int) -> Row:

@@ -9,7 +9,7 @@ from fleetmap.errors import LinkError, UsageError
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import InitialPoseMessage
 from fleetmap.sensors.samples import UNSAID_SIGMAS, PositionPrior
-from locclient.localization.percept import Percept
+from locclient.localization.perception import Percept
 from locclient.localization.pose_tracker import PoseTracker
 from locclient.localization.priors.prior import Prior, agrees
 

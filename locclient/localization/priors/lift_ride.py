@@ -8,7 +8,7 @@ import numpy as np
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat.building import Floor
 from fleetmap.odometry.estimate import OdometryEstimate
-from locclient.localization.percept import Percept
+from locclient.localization.perception import Percept
 from locclient.localization.place import Place
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.pose_tracker import PoseTracker

@@ -13,7 +13,7 @@ from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.hypothesis_set import HypothesisSet, Observations
-from locclient.localization.percept import Percept
+from locclient.localization.perception import Percept
 from locclient.localization.place import ORIGIN, Place
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings

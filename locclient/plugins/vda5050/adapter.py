@@ -12,7 +12,6 @@ import numpy as np
 
 from fleetmap.encoding import to_plain
 from fleetmap.errors import FleetmapError, LinkError
-from fleetmap.failure_definition import is_driving
 from fleetmap.geometry import se3, se3_inverse, so3_exp
 from fleetmap.mapformat.building import Floor
 from fleetmap.messages import Status, WantedVersion
@@ -261,24 +260,17 @@ class FleetAdapter:
         return None
 
     def after_frame(
-        self,
-        outcome: Outcome,
-        in_use: frozenset[int],
-        building: Mapping[str, Floor] | None = None,
-        visited_versions: Mapping[str, int] | None = None,
+        self, outcome: Outcome, in_use: frozenset[int], building: Mapping[str, Floor], visited: Mapping[str, int]
     ) -> None:
         """Handle the results of a frame, and the versions that the localizer holds; on the localizing thread.
 
-        building: as of `Localizer.handle_building`; visited_versions: of its other sites' maps.
+        building: as of `Localizer.handle_building`; visited: versions of its other sites' maps.
         """
         with self._lock:
-            self._in_use, self._building = in_use, building or {}
-            self._visited_versions = visited_versions or {}
+            self._in_use, self._building, self._visited_versions = in_use, building, visited
             if self._section.frame == "building":
                 self._fleet_from_map = outcome.published.building_from_map
-            how = (outcome, self._robot.lost_radius_m, self._fleet_from_map)
-            speed_mps = outcome.speed_mps  # an unknown one is no driving: nobody may rely on it
-            self._see(self._localization.after(*how, is_driving=speed_mps is not None and is_driving(speed_mps)))
+            self._see(self._localization.after(outcome, self._robot.lost_radius_m, self._fleet_from_map))
             self._judge_position()
 
     def silence(self) -> None:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from math import atan2, hypot, pi
 
-from fleetmap.failure_definition import radius_95_m
+from fleetmap.failure_definition import is_driving, radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.messages import Cause, Status
 from locclient.localization.estimate import Estimate
@@ -62,14 +62,12 @@ class Localization:
     is_silent: bool = True
     is_aligned: bool = True
 
-    def after(
-        self, outcome: Outcome, lost_radius_m: float, fleet_from_map: Array | None, *, is_driving: bool
-    ) -> "Localization":
+    def after(self, outcome: Outcome, lost_radius_m: float, fleet_from_map: Array | None) -> "Localization":
         """Update by the results of one frame. Beyond lost_radius_m (95 %) a position is unusable for driving at any status.
 
         fleet_from_map: None if the map does not define the fleet manager's frame; there is then no position.
         """
-        estimate, published = outcome.estimate, outcome.published
+        estimate, published, speed_mps = outcome.estimate, outcome.published, outcome.speed_mps
         position, is_localized = self.position, False
         if fleet_from_map is None:
             position = None
@@ -79,8 +77,9 @@ class Localization:
             heading_rad = float(atan2(fleet_from_base[1, 0], fleet_from_base[0, 0]))
             position = Position(x_m, y_m, heading_rad, radius_95_m(estimate.cov_rot_trans), estimate.floor)
             is_localized = estimate.status in {Status.TRACKING, Status.DEGRADED} and position.radius_m <= lost_radius_m
+        drives = speed_mps is not None and is_driving(speed_mps)  # an unknown one is none: nobody may rely on it
         is_aligned = fleet_from_map is not None
-        return Localization(estimate, position, is_localized, is_driving, is_silent=False, is_aligned=is_aligned)
+        return Localization(estimate, position, is_localized, drives, is_silent=False, is_aligned=is_aligned)
 
     def mobile_robot_position(self, map_id: str, lost_radius_m: float) -> dict[str, object] | None:
         """Return the object of the state; None before the first pose. The score is 1 for an exact pose, 0 at lost_radius_m.

@@ -26,7 +26,6 @@ from fleetmap.odometry.lift_check import LiftCheck
 from fleetmap.odometry.odometry_checks import DivergenceMonitor, ZeroVelocityDetector
 from fleetmap.odometry.sensor_buffer import IMU_GAP_NS, SensorBuffer, is_pause
 from fleetmap.odometry.tracking.tracker import Earlier, Tracked
-from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.samples import PAUSE_NS, Trajectory
 
 _GATE_4, _GATE_6 = 18.47, 22.46  # 0.999 of chi-square with 4 and 6 degrees of freedom
@@ -50,14 +49,10 @@ class ImuInputs:
     """
 
     def __init__(
-        self,
-        rig: OdometryRig,
-        noise: ImuNoise,
-        samples: SensorBuffer,
-        clock: GyroClock,
-        accelerometer: AccelerometerCheck | None = None,
+        self, rig: OdometryRig, samples: SensorBuffer, clock: GyroClock, accelerometer: AccelerometerCheck | None = None
     ) -> None:
-        settings = rig.settings.filter
+        settings, noise = rig.settings.filter, rig.imu
+        assert noise is not None
         self.samples, self.noise, self.clock, self.accelerometer = samples, noise, clock, accelerometer
         self.weighing_noise = replace(  # wider than its data sheet says
             noise,
@@ -183,7 +178,7 @@ class WindowMode(Mode):
         if frame_index > 0 and (tracked.lost or step.is_lost or self.window.contradicts_images):
             status = OdometryStatus.DEGRADED
         return {
-            "odom_from_body": state.odom_from_body,
+            "odom_from_body": window_filter.odom_from_body(),
             "cov_rot_trans": window_filter.body_covariance(),
             "velocity_odom_mps": state.velocity_mps,
             "gyro_bias_radps": state.gyro_bias_radps,
@@ -435,9 +430,9 @@ class StartingMode(GyroMode):
             velocity_body = seen[-1][1][:3, :3].T @ by_pictures
         elif speeds and np.linalg.norm(np.mean([speed for _, speed in speeds], axis=0)) > _NEAR_REST_MPS:
             return None
-        if np.linalg.norm(velocity_body) > _NEAR_REST_MPS:
-            start.state.velocity_mps = start.state.rotation @ velocity_body
-        return start
+        if np.linalg.norm(velocity_body) <= _NEAR_REST_MPS:
+            return start
+        return replace(start, state=start.state._replace(velocity_mps=start.state.rotation @ velocity_body))
 
     def _dynamic_start(self) -> InitialState | None:
         settings = self._rig.settings.start

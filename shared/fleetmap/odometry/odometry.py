@@ -121,4 +121,4 @@ class Odometry:
         window = SlidingWindow(self._rig, NavState(), np.diag([1e-10] * 15), 0)
         if self._rig.imu is None:
             return VisualMode(window)
-        return StartingMode(window, ImuInputs(self._rig, self._rig.imu, self._samples, self._clock, self.accelerometer))
+        return StartingMode(window, ImuInputs(self._rig, self._samples, self._clock, self.accelerometer))

@@ -62,11 +62,6 @@ class EarlierFrame:
     cam_from_query: Array
     cov_rot_trans: Array
 
-    @property
-    def sigmas(self) -> tuple[float, float]:
-        """The largest sigmas of rotation and position."""
-        return _sigmas(self.cov_rot_trans)
-
 
 class Relocalizer:
     """Finds fixes of frames in one map view."""
@@ -153,7 +148,12 @@ class Relocalizer:
         """
         place = np.ascontiguousarray(map_from_cam)
         others = [
-            (e.features.packed(), e.features.unmeasured(), np.ascontiguousarray(e.cam_from_query), *e.sigmas)
+            (
+                e.features.packed(),
+                e.features.unmeasured(),
+                np.ascontiguousarray(e.cam_from_query),
+                *_sigmas(e.cov_rot_trans),
+            )
             for e in earlier
         ]
         found = self._finder.by_projection(query.packed(), query.unmeasured(), place, radius_px, others)
@@ -215,8 +215,7 @@ class Relocalizer:
         matched = self._matched(query, pairs[:, 1], rows[pairs[:, 0]])
         found = None if rotation is None else self._with_rotation(matched, rotation, min_inliers)
         if found is None:
-            threshold_px, seed = settings.ransac_px, self._settings.seed
-            found = ransac_pnp(matched, threshold_px=threshold_px, min_inliers=min_inliers, seed=seed)
+            found = self._by_ransac(matched)
             if found is None or found.inliers.sum() < _MIN_RANSAC_SHARE * len(pairs):
                 return None
         fix = self.by_projection(query, se3_inverse(found.cam_from_source), settings.guided_radius_px)
@@ -230,16 +229,11 @@ class Relocalizer:
         """
         if fix.matched is None:
             return fix
-        settings = self._settings.fix
-        found = ransac_pnp(
-            fix.matched,
-            threshold_px=settings.ransac_px,
-            min_inliers=settings.min_inliers // 2,
-            seed=self._settings.seed,
-        )
+        found = self._by_ransac(fix.matched)
         if found is None or found.inliers.sum() <= fix.inliers:
             return fix
-        other = self.by_projection(query, se3_inverse(found.cam_from_source), settings.guided_radius_px)
+        radius_px = self._settings.fix.guided_radius_px
+        other = self.by_projection(query, se3_inverse(found.cam_from_source), radius_px)
         return other if other is not None and other.inliers > fix.inliers else fix
 
     def _with_aliases(self, query: FrameFeatures, fixes: list[Fix]) -> TimeSliced[list[Fix]]:
@@ -269,6 +263,10 @@ class Relocalizer:
         if found is None:
             return self.by_projection(query, alias.map_from_cam, settings.max_radius_px)
         return self.by_projection(query, se3_inverse(found.cam_from_source), settings.guided_radius_px)
+
+    def _by_ransac(self, matched: Correspondences) -> PnpResult | None:
+        settings, seed = self._settings.fix, self._settings.seed
+        return ransac_pnp(matched, threshold_px=settings.ransac_px, min_inliers=settings.min_inliers // 2, seed=seed)
 
     def _with_rotation(
         self, matched: Correspondences, map_from_cam_rotation: Array, min_inliers: int
@@ -311,6 +309,7 @@ def is_reliable(fix: Fix, settings: FixSettings, strong_inliers: int = STRONG_IN
 
 
 def _sigmas(cov_rot_trans: Array) -> tuple[float, float]:
+    """The largest sigmas of rotation and position."""
     widest = np.linalg.eigvalsh(np.stack([cov_rot_trans[:3, :3], cov_rot_trans[3:, 3:]]))[:, -1]
     rotation, position = np.sqrt(np.maximum(widest, 0.0))
     return float(rotation), float(position)

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.messages import Status
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
@@ -119,7 +118,6 @@ class Robot:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, **track: Any) -> None:
         self.relocalizer = ScriptedRelocalizer()
-        monkeypatch.setattr(module, "MapView", lambda *_: None)
         monkeypatch.setattr(module, "Relocalizer", lambda *_: self.relocalizer)
         self.odometry = ScriptedOdometry()
         self.localizer = scripted_localizer(self.odometry, track)
@@ -133,7 +131,7 @@ class Robot:
     def load(
         self, version: int = 1, lookalikes: LookAlikes | None = None, alias_step_m: float = ALIAS_STEP_M
     ) -> "Robot":
-        self.localizer.handle_version(version, [], Vocabulary.__new__(Vocabulary), 400.0, lookalikes, alias_step_m)
+        self.localizer.handle_version(version, None, lookalikes, alias_step_m)  # type: ignore[arg-type]
         return self
 
     def go(self, step_m: float, offsets: Iterable[Array] = TRUE, turn_rad: float = 0.02) -> Estimate:

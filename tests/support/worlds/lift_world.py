@@ -7,12 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import Array, Rings, se3, se3_inverse, so3_exp
 from fleetmap.mapformat.building import BuildingFrame, Floor, FloorEntry
 from fleetmap.messages import Status
 from fleetmap.odometry.accelerometer_check import AccelerometerCheck
-from fleetmap.relocalization.map_view import CovisibleLandmarks
+from fleetmap.relocalization.map_view import ALIAS_STEP_M, CovisibleLandmarks
 from fleetmap.relocalization.relocalizer import Fix
 from fleetmap.sensors.calibration import ImuNoise
 from fleetmap.sensors.rectification import RectifiedFrame
@@ -103,7 +102,6 @@ class LiftWorld:
         self.rng = np.random.default_rng(self.seed)
         self.keys = ["", *(f"floor-{n}" for n in range(1, self.floors))]
         self.fixes: dict[str, list[Fix]] = {key: [] for key in self.keys}
-        self.monkeypatch.setattr(module, "MapView", lambda tiles, *_: tiles[0])
         self.monkeypatch.setattr(module, "Relocalizer", lambda floor, *_: Relocalizer(floor, self.fixes, self.rng))
         self.odometry = Odometry()
         self.localizer = scripted_localizer(self.odometry, self.track, NOISE if self.has_imu else None)
@@ -118,7 +116,7 @@ class LiftWorld:
             )
         self.localizer.handle_building(held)
         for key in self.keys:
-            self.localizer.handle_version(1, [key], Vocabulary.__new__(Vocabulary), 400.0, site=key)  # type: ignore[list-item]
+            self.localizer.handle_version(1, key, None, ALIAS_STEP_M, key)  # type: ignore[arg-type]
         self.plan_from_body = se3(np.eye(3), np.array([0.0, 0.0, 0.3]))
         pallets = [(x, y, 0.5) for x in (0.0, 2.0, 4.0, 6.0) for y in (-2.0, 2.0)]
         stock = np.concatenate([np.random.default_rng(5).uniform(0.0, 0.5, (12, 3)) + at for at in pallets])

@@ -1,13 +1,14 @@
 """The right-invariant multi-state constraint filter, `core.Filter`, with its state, and the settings and records of Python."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from statistics import NormalDist
+from typing import NamedTuple
 
 import numpy as np
 
 from fleetmap import core
-from fleetmap.geometry import Array, se3
+from fleetmap.geometry import Array
 from fleetmap.inertial import GRAVITY_MPS2, densities
 from fleetmap.odometry.settings import FilterSettings
 from fleetmap.sensors.calibration import ImuNoise
@@ -15,29 +16,14 @@ from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples, WheelSample
 
 
-@dataclass
-class NavState:
+class NavState(NamedTuple):
     """Nominal state in `odom`."""
 
-    rotation: Array = field(default_factory=lambda: np.eye(3))
-    velocity_mps: Array = field(default_factory=lambda: np.zeros(3))
-    position_m: Array = field(default_factory=lambda: np.zeros(3))
-    gyro_bias_radps: Array = field(default_factory=lambda: np.zeros(3))
-    accel_bias_mps2: Array = field(default_factory=lambda: np.zeros(3))
-
-    @property
-    def odom_from_body(self) -> Array:
-        """(4, 4)."""
-        return se3(self.rotation, self.position_m)
-
-    @property
-    def arrays(self) -> tuple[Array, Array, Array, Array, Array]:
-        """All fields, in order."""
-        return self.rotation, self.velocity_mps, self.position_m, self.gyro_bias_radps, self.accel_bias_mps2
-
-    def copy(self) -> "NavState":
-        """A deep copy."""
-        return NavState(*(np.array(values, np.float64, order="C") for values in self.arrays))
+    rotation: Array = np.eye(3)
+    velocity_mps: Array = np.zeros(3)
+    position_m: Array = np.zeros(3)
+    gyro_bias_radps: Array = np.zeros(3)
+    accel_bias_mps2: Array = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,7 +60,8 @@ class InvariantFilter(core.Filter):
             np.array([camera.lens for camera, _ in cameras]),
             np.array([body_from_cam for _, body_from_cam in cameras]),
         )
-        super().__init__(*state.copy().arrays, nav_covariance, true_error_cov, *rig, settings, quantile, GRAVITY_MPS2)
+        begun = NavState(*(np.array(values, np.float64, order="C") for values in state))
+        super().__init__(*begun, nav_covariance, true_error_cov, *rig, settings, quantile, GRAVITY_MPS2)
 
     @property
     def state(self) -> NavState:

@@ -67,18 +67,13 @@ class SlidingWindow:
         if kept not in self.filter.clone_ids:
             return None
         kept_from_now, covariance = self.filter.motion_since(kept)
-        if kept == frame_index:
-            return kept_from_now, covariance
         carry = se3_adjoint(frame_from_kept)
         return frame_from_kept @ kept_from_now, carry @ covariance @ carry.T
 
     def body_since(self, frame_index: int) -> Array | None:
         """The transform of `motion_since` alone."""
         kept, frame_from_kept = self._kept(frame_index)
-        if kept not in self.filter.clone_ids:
-            return None
-        since = self.filter.body_since(kept)
-        return since if kept == frame_index else frame_from_kept @ since
+        return frame_from_kept @ self.filter.body_since(kept) if kept in self.filter.clone_ids else None
 
     def _kept(self, frame_index: int) -> tuple[int, Array]:
         """The kept frame that represents a dropped one, and frame_from_kept (4, 4); for a kept frame itself."""

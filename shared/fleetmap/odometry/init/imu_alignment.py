@@ -218,19 +218,10 @@ def dynamic_initialization(
 _POSITION_SIGMA_M, _VELOCITY_SIGMA_MPS = 0.006, 0.04
 
 
-@dataclass(frozen=True, slots=True)
-class MonoInertialStart:
-    """Initial state, metres per unit of vision, and the relative standard deviation of that."""
-
-    start: InitialState
-    metres_per_unit: float
-    scale_sigma_share: float
-
-
 def mono_inertial_initialization(
     vision: Trajectory, imu: ImuSamples, noise: ImuNoise, body_from_cam: Array, settings: OdometrySettings
-) -> MonoInertialStart | None:
-    """Align a camera's path up to scale with the IMU's, see `imu_alignment`.
+) -> tuple[InitialState, float] | None:
+    """Align a camera's path up to scale with the IMU's, see `imu_alignment`; return the first state and metres per unit of vision.
 
     vision holds vision_from_cam at IMU stamps. None if the motion does not determine the scale to within the settings' share, or
     if the fitted gravity is implausible.
@@ -250,8 +241,7 @@ def mono_inertial_initialization(
     vision_from_body = np.tile(np.eye(4), (len(vision), 1, 1))
     vision_from_body[:, :3, :3] = rotations
     vision_from_body[:, :3, 3] = scale * vision.positions_m + levers_m
-    start = initial_state(Trajectory(vision.stamps_ns, vision_from_body), found)
-    return MonoInertialStart(start, scale, sigma / scale)
+    return initial_state(Trajectory(vision.stamps_ns, vision_from_body), found), scale
 
 
 _MAX_LOOK_BACK_S = 20.0
@@ -301,9 +291,9 @@ def _limits(settings: StartSettings) -> tuple[float, float, float, float, float]
 def _steady_state(window: ImuSamples, stamp_ns: int, settings: FilterSettings) -> InitialState:
     force = window.accel_mps2.mean(axis=0)
     rotation = rotation_between_vectors(force, np.array([0.0, 0.0, 1.0]))
-    state = NavState(rotation=rotation, gyro_bias_radps=window.gyro_radps.mean(axis=0))
     # the accelerometer's bias along gravity shows in its size; across gravity it hides in the tilt
-    state.accel_bias_mps2 = 0.5 * (np.linalg.norm(force) - GRAVITY_MPS2) * (force / np.linalg.norm(force))
+    accel_bias = 0.5 * (np.linalg.norm(force) - GRAVITY_MPS2) * (force / np.linalg.norm(force))
+    state = NavState(rotation, gyro_bias_radps=window.gyro_radps.mean(axis=0), accel_bias_mps2=accel_bias)
     velocity, gyro, accel = (
         sigma**2
         for sigma in (

@@ -233,8 +233,7 @@ class MonocularMode(Mode):
         if len(vision) < settings.monocular.metric_samples:
             return None
         noise, body_from_cam = imu.weighing_noise, self._rig.body_from_cam
-        found = mono_inertial_initialization(vision, imu.samples.imu, noise, body_from_cam, settings)
-        return None if found is None else (found.start, found.metres_per_unit)
+        return mono_inertial_initialization(vision, imu.samples.imu, noise, body_from_cam, settings)
 
     def _spaced_trajectory(self) -> Trajectory:
         """vision_from_cam of located frames far enough apart in time, including the newest, in order of time."""
@@ -357,7 +356,7 @@ class MapStart:
                 self._imu.samples.imu, start.stamp_ns, stamp_ns, bias, np.zeros(3), self._imu.weighing_noise
             )
             bias = bias + np.linalg.lstsq(term.d_rotation_d_gyro, so3_log(term.delta_rotation.T @ seen), rcond=None)[0]
-        return replace(start, state=replace(start.state, gyro_bias_radps=bias))
+        return replace(start, state=start.state._replace(gyro_bias_radps=bias))
 
 
 def make_odometry(
@@ -435,7 +434,7 @@ class MonocularOdometry(Odometry):
 
     def _first_mode(self) -> Mode:
         rig = self._rig
-        imu = None if rig.imu is None else ImuInputs(rig, rig.imu, self._samples, self._clock)
+        imu = None if rig.imu is None else ImuInputs(rig, self._samples, self._clock)
         self.vision = MonocularMode(rig, imu)
         self._by_map = None if imu is None else MapStart(rig, imu)
         return self.vision

@@ -170,10 +170,7 @@ class Tracker:
         found = []
         free = np.ones(len(current.features), bool)
         for old in reversed(self._memory):
-            guess = motion_since(old.frame_index)
-            matched = self._match_pair(
-                old, current, free, np.eye(4) if guess is None else guess, None if guess is None else rotation_sigma_rad
-            )
+            matched = self._match_pair(old, current, free, motion_since(old.frame_index), rotation_sigma_rad)
             if matched is not None:
                 found.append(matched)
         self._memory = [*self._memory[-(self._settings.memory_frames - 1) :], current]
@@ -191,7 +188,7 @@ class Tracker:
         old: _Remembered,
         current: _Remembered,
         free: NDArray[np.bool_],
-        guess: Array,
+        guess: Array | None,
         rotation_sigma_rad: float | None,
     ) -> Earlier | None:
         """Match with one earlier frame; adds the tracks to the current points and removes them from `free`."""
@@ -222,12 +219,12 @@ class Tracker:
         return Earlier(old.frame_index, ids, earlier, found.cam_from_source)
 
     def _wide_motion(
-        self, points_cam: Array, measured: Array, guess: Array, rotation_sigma_rad: float | None
+        self, points_cam: Array, measured: Array, guess: Array | None, rotation_sigma_rad: float | None
     ) -> PnpResult | None:
-        """cam_from_previous from raw descriptor matches: first with a known rotation, then without a guess."""
+        """cam_from_previous from raw descriptor matches: first with the rotation of a guess that is known so well, then without."""
         settings, least = self._settings, self._settings.min_inliers
         matches = Correspondences(self._camera, points_cam, measured, np.full((len(points_cam), 2), 1.5))
-        if rotation_sigma_rad is not None:
+        if guess is not None and rotation_sigma_rad is not None:
             found = pnp_with_rotation(
                 matches,
                 guess[:3, :3],

@@ -53,7 +53,7 @@ def test_process_noise_is_the_scatter_of_noisy_runs() -> None:
         gyro = imu.gyro_radps + NOISE.gyro_noise_radps_rthz * white[0] + gyro_walk
         accel = imu.accel_mps2 + NOISE.accel_noise_mps2_rthz * white[1] + accel_walk
         state = moved(start, np.zeros((15, 15)), ImuSamples(imu.stamps_ns, gyro, accel), NOISE).state
-        motion = clean.state.arrays[:3]
+        motion = clean.state[:3]
         # here the samples' true biases walked away from the state's, which stayed at zero
         error = error_of(state, NavState(*motion, gyro_walk[end - 1], accel_walk[end - 1]))
         total += error @ inverse @ error / 15

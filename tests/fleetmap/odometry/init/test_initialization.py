@@ -97,7 +97,8 @@ def seen_motion(rng: np.random.Generator, sigma_rad: float, sigma_m: float) -> t
 
 
 def odom_from_old(start: InitialState, vision: Trajectory) -> Array:
-    return np.asarray(start.state.odom_from_body @ se3_inverse(vision.frame_from_body[-1]))
+    odom_from_body = se3(start.state.rotation, start.state.position_m)
+    return np.asarray(odom_from_body @ se3_inverse(vision.frame_from_body[-1]))
 
 
 @pytest.mark.parametrize("accel_bias", [np.zeros(3), np.array([0.06, -0.04, 0.05])], ids=["unbiased", "biased"])

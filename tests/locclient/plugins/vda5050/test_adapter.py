@@ -142,7 +142,7 @@ def test_a_robot_that_is_not_localized_says_why(status: Status, cause: Cause) ->
 def test_a_position_beyond_the_lost_radius_is_none(sigma_m: float, is_localized: bool) -> None:
     """The check of the calibration widens covariances of estimates that keep their status."""
     placed, adapter = PublishedPose(np.eye(4), np.eye(4)), Adapter()
-    adapter.after_frame(frame(placed, Status.DEGRADED, Cause.CALIBRATION, sigma_m=sigma_m), frozenset({1}))
+    adapter.after_frame(frame(placed, Status.DEGRADED, Cause.CALIBRATION, sigma_m=sigma_m), frozenset({1}), {}, {})
     assert adapter.said()["mobileRobotPosition"]["localized"] is is_localized
     assert ("LOCALIZATION_ERROR" in adapter.error_types()) is not is_localized
 
@@ -182,7 +182,7 @@ def test_positions_are_in_the_building_where_that_is_asked_for() -> None:
     given = {"x": 9.0, "y": -17.0, "theta": np.pi / 2, "mapId": "hall", "lastNodeId": "n"}
 
     def drive(known: np.ndarray | None, status: Status = Status.TRACKING) -> dict[str, Any]:
-        adapter.after_frame(frame(PublishedPose(np.eye(4), map_from_odom, known), status), frozenset({1}))
+        adapter.after_frame(frame(PublishedPose(np.eye(4), map_from_odom, known), status), frozenset({1}), {}, {})
         return adapter.said()
 
     unknown = drive(None)
