@@ -153,8 +153,8 @@ def _replay_failure(
                 )
     files.check()
     summary, record = read_failure_file(path)
-    used = record.used.site_of(summary.site) if record.used else summary.site
-    address = replace(map_options, site=map_options.site or used).address(version)
+    used = record.used.floor if record.used else ""
+    address = replace(map_options, site=map_options.site or used or summary.site).address(version)
     with connected(address, map_options.cache, map_options.cache_bytes) as maps:
         sha256 = None if version is None else maps.ready().wanted.manifest_sha256
         found = compare_failure((summary, record), maps, sha256)

@@ -32,7 +32,7 @@ from locclient.hooks import LinkedRobot
 from locclient.identity import GivenAddress, MapAddress, check_reach
 from locclient.localization.priors.given import parse_prior
 from locclient.maps.building_maps import BuildingMaps
-from locclient.maps.map_client import cache_folder, map_client, open_bus, outbox_path, replay_outbox
+from locclient.maps.map_client import cache_folder, map_client, open_bus, outbox_path
 from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
@@ -150,7 +150,8 @@ def _keep_recordings(
         server.drives = SurveyDrives(spool.with_name(f"{spool.stem}.drives"), profile.rig.calibration)
     if server.is_alone or run.replays == "off":
         return None
-    server.replays = Outbox(replay_outbox(spool), max_bytes=run.replays_bytes, is_needed=False)
+    replays = spool.with_name(f"{spool.stem}.replays{spool.suffix}")
+    server.replays = Outbox(replays, max_bytes=run.replays_bytes, is_needed=False)
     return ReplayQueue(server.replays, profile)
 
 

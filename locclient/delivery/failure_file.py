@@ -124,24 +124,18 @@ def read_failure_file(path: Path) -> tuple[FailureSummary, LocalizerRecord]:
         )
     summary = decode_summary(attachments[SUMMARY])
     try:
-        return summary, decode_record(data, summary)
+        record = msgspec.msgpack.decode(data, type=LocalizerRecord, dec_hook=_decoded_array)
+        check_record(record)
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from error
-
-
-def decode_record(data: bytes, summary: FailureSummary) -> LocalizerRecord:
-    """Unpack, decode and validate the localizer's part; RecordingError if no client of this version can have written it."""
-    try:
-        record = msgspec.msgpack.decode(data, type=LocalizerRecord, dec_hook=_decoded_array)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError, ValueError, TypeError) as error:
         raise RecordingError(
-            f"the localizer's part cannot be read ({error}); it was written by another fleetmap, replay it with that one; "
+            f"{path}: the localizer's part cannot be read ({error}); it was written by another fleetmap, replay it with that one; "
             "Foxglove opens the recording"
         ) from error
-    check_record(record)
     if [percept.odometry.stamp_ns for _, percept in record.frames] != [each.stamp_ns for each in summary.moments]:
-        raise RecordingError("the summary is of other frames than the localizer's part; fetch it again")
-    return record
+        raise RecordingError(f"{path}: the summary is of other frames than the localizer's part; fetch it again")
+    return summary, record
 
 
 # --- the localizer's part ---------------------------------------------------------------------------------------------

@@ -18,7 +18,6 @@ The result is a log Bayes factor (Kass and Raftery 1995); a landmark's observati
 
 from dataclasses import dataclass, field
 from math import lgamma
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,22 +41,13 @@ _PRESENT, _NEVER_SHARE, _ABSENT = (2.0, 2.8), 0.12, (0.5, 10.0)
 Flags = NDArray[np.bool_]
 
 
-class CellModel(NamedTuple):
-    """Prior probabilities of the content of a cell."""
-
-    least: float
-    taken_share: float
-    different_share: float
-    odd_share: float
-    threshold: float
-
-
-_MODEL = CellModel(
-    least=2.0,  # minimum number of absent landmarks: a single one may be one that is never observed
-    taken_share=0.05,  # of cells: stock was moved since the survey
-    different_share=0.15,  # of cells: an object without counterpart in the other place
-    odd_share=0.01,  # of cells: moved stock makes one place look like the other
-    threshold=1.25,  # a logarithm: cells hardly reach this by chance
+# Prior probabilities of the content of a cell, as `core.block_log_odds` takes them.
+_CELL_MODEL = (
+    2.0,  # minimum number of absent landmarks: a single one may be one that is never observed
+    0.05,  # share of cells whose stock was moved since the survey
+    0.15,  # share of cells with an object without counterpart in the other place
+    0.01,  # share of cells in which moved stock makes one place look like the other
+    1.25,  # threshold, a logarithm: cells hardly reach this by chance
 )
 
 
@@ -165,7 +155,7 @@ def _support(looks: int, one: tuple[ObservationHistory, Flags], other: tuple[Obs
     for history, excluded in (one, other):
         expected, found = history.counts(looks)
         sides.append((history.points_odom, _LOG_LIKELIHOODS[expected, found], excluded | (expected == 0)))
-    strongest = core.block_log_odds(sides[0], sides[1], _LATTICES, _MODEL, _BLOCK_M, _MAX_BLOCKS)
+    strongest = core.block_log_odds(sides[0], sides[1], _LATTICES, _CELL_MODEL, _BLOCK_M, _MAX_BLOCKS)
     return float(np.clip(strongest, 0.0, _MAX_BLOCK_LOG_ODDS).sum())
 
 

@@ -42,9 +42,6 @@ class HeldMaps:
         self.by_floor = {site: held for site, held in self.by_floor.items() if not site or site in building}
         self._compare()
 
-    def knows(self, floor: str) -> bool:
-        return floor in self.plan_from_map or floor in self.by_floor
-
     @property
     def missing(self) -> set[str]:
         """Return the floors whose maps the robot does not hold."""

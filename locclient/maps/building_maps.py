@@ -16,7 +16,6 @@ from fleetmap.mapformat.building import (
     MAX_FLOORS_BYTES,
     BuildingFrame,
     Floor,
-    FloorEntry,
     aligned_frame,
     read_building,
     read_lifts,
@@ -80,7 +79,13 @@ class BuildingMaps:
                 loaded = self._newest(source, asks=asks) if key else None
                 if key and source.site_file(FLOORS, MAX_FLOORS_BYTES) != data:
                     raise MapFormatError(f"site {key} does not name this building's floors; set the building again")
-                floors[key] = _floor(entry, source, files)
+                alignment = source.site_file(ALIGNMENT, _MAX_ALIGNMENT_BYTES)
+                if alignment is None:
+                    reason = f"site {entry.site} has no pose in the building; `mapserver align` estimates it"
+                    raise MapFormatError(reason)
+                frame, areas = aligned_frame(alignment), source.site_file(AREAS, _MAX_AREAS_BYTES)
+                floors[key] = Floor(entry, frame, read_lifts(areas, frame))
+                files += [alignment, areas]
                 maps += [] if loaded is None else [loaded]
                 self._note(entry.site, "")
             except FleetmapError as error:
@@ -124,14 +129,3 @@ class BuildingMaps:
         if fault and fault != self._faults.get(site):
             _log.warning("floor %s stays as it was: %s", site, fault)
         self._faults[site] = fault
-
-
-def _floor(entry: FloorEntry, source: MapSource, files: list[bytes | None]) -> Floor:
-    """Read a floor, and append the files that it is made of."""
-    alignment = source.site_file(ALIGNMENT, _MAX_ALIGNMENT_BYTES)
-    if alignment is None:
-        raise MapFormatError(f"site {entry.site} has no pose in the building; `mapserver align` estimates it")
-    frame, areas = aligned_frame(alignment), source.site_file(AREAS, _MAX_AREAS_BYTES)
-    floor = Floor(entry, frame, read_lifts(areas, frame))
-    files += [alignment, areas]
-    return floor

@@ -392,11 +392,6 @@ def outbox_path(site: str, robot: str, cache: str | Path | None = None) -> Path:
     return cache_folder(cache).parent / "spool" / f"{site}.{robot}.sqlite3"
 
 
-def replay_outbox(outbox: Path) -> Path:
-    """Return the outbox file of failure recordings, beside that of reports."""
-    return outbox.with_name(f"{outbox.stem}.replays{outbox.suffix}")
-
-
 def cache_folder(setting: str | Path | None = None) -> Path:
     """Return the folder of the setting `cache`, else `fleetmap/tiles` in the user's cache folder (XDG_CACHE_HOME)."""
     if setting is not None:

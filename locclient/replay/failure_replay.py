@@ -39,12 +39,12 @@ def replay_failure(record: LocalizerRecord, load: Load) -> list[Moment]:
     mounted = (MountedCamera(record.camera, record.body_from_cam), *record.others)
     localizer = Localizer(MountedRig(RigCalibration((), None, record.base_from_body), mounted), record.settings)
     if record.used is not None:
-        load(record.used).show(localizer, record.used.site_of(""))
+        load(record.used).show(localizer, record.used.floor)
     localizer.begin(record.start)
     said = []
     for commands, percept in record.frames:
         if commands.used is not None:
-            load(commands.used).show(localizer, commands.used.site_of(""))
+            load(commands.used).show(localizer, commands.used.floor)
         if commands.forgets:
             localizer.forget_pose()
         for prior in commands.priors:
@@ -126,7 +126,7 @@ def compare_failure(
 
     def load(used: UsedMap) -> LoadedMap:
         if used not in maps:
-            maps[used] = _loaded(source, used.site_of(summary.site), used, manifest_sha256)
+            maps[used] = _loaded(source, used.floor or summary.site, used, manifest_sha256)
         return maps[used]
 
     now = replay_failure(record, load)

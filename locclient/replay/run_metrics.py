@@ -203,18 +203,13 @@ def _merged(stretches: list[tuple[int, int]], fine: list[tuple[int, bool]]) -> l
     """Merge periods, sorted by begin, without 5 s of good tracking between them. fine: stamp and goodness of each frame."""
     merged: list[tuple[int, int]] = []
     for begin, end in stretches:
-        if merged and _longest_fine_ns(fine, merged[-1][1], begin) < GOOD_S * 1e9:
+        between = [each for each in fine if merged and merged[-1][1] <= each[0] <= begin]
+        runs = _runs([stamp_ns for stamp_ns, _ in between], [is_fine for _, is_fine in between])
+        if merged and max((until - since for since, until in runs), default=0) < GOOD_S * 1e9:
             merged[-1] = (merged[-1][0], max(end, merged[-1][1]))
         else:
             merged.append((begin, end))
     return merged
-
-
-def _longest_fine_ns(fine: list[tuple[int, bool]], since_ns: int, until_ns: int) -> int:
-    """Return the duration of the longest period of good tracking between two stamps, up to the frame that ends it."""
-    between = [each for each in fine if since_ns <= each[0] <= until_ns]
-    runs = _runs([stamp_ns for stamp_ns, _ in between], [is_fine for _, is_fine in between])
-    return max((end - begin for begin, end in runs), default=0)
 
 
 def spread(values: list[float], names: tuple[str, ...]) -> dict[str, float] | None:

@@ -41,10 +41,6 @@ class UsedMap:
     cells: tuple[tuple[int, int], ...]
     floor: str = ""
 
-    def site_of(self, own: str) -> str:
-        """Return the site whose map it is. own: the robot's."""
-        return self.floor or own
-
 
 @dataclass(slots=True, eq=False)
 class Commands:

@@ -29,7 +29,8 @@ class GivenPrior:
     def prior(self, percept: Percept) -> Prior | None:
         """Return the given prior at the present frame; None for one of a floor that the building had a moment ago."""
         given, tracker, self.waiting = self.waiting, self._tracker, None
-        if given is None or (given.floor and not tracker.maps.knows(given.floor)):
+        maps = tracker.maps
+        if given is None or (given.floor and given.floor not in maps.plan_from_map.keys() | maps.by_floor.keys()):
             return None
         confirmed, before = tracker.confirmed, tracker.prior
         if given.is_revisable and confirmed is not None:
@@ -39,7 +40,7 @@ class GivenPrior:
             confirmed = before = None
         floors: Mapping[str, Array | None] = {}
         is_open = not given.is_revisable or (before is not None and not before.names_floor)
-        building = tracker.maps.plan_from_map
+        building = maps.plan_from_map
         if given.floor is None and confirmed is None and is_open and len(building) > 1:
             floors = dict.fromkeys(sorted(building))
         given = replace(given, floor=tracker.floor if given.floor is None else given.floor)

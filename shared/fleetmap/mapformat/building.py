@@ -147,11 +147,9 @@ def read_lifts(areas: bytes | None, frame: BuildingFrame) -> dict[str, tuple[Rin
         for feature in read.features:
             if feature.properties.lift is None:
                 continue
-            if feature.geometry.type == "Polygon":
-                polygons = [msgspec.json.decode(feature.geometry.coordinates, type=list[list[list[float]]])]
-            else:
-                polygons = msgspec.json.decode(feature.geometry.coordinates, type=list[list[list[list[float]]]])
-            for polygon in polygons:
+            drawn = feature.geometry.coordinates
+            several = b"[%b]" % drawn if feature.geometry.type == "Polygon" else drawn
+            for polygon in msgspec.json.decode(several, type=list[list[list[list[float]]]]):
                 rings = [np.array([corner[:2] for corner in ring[:-1]], float) for ring in polygon]
                 if not rings or not all(r.ndim == 2 and r.shape[1] == 2 and len(r) >= 3 for r in rings):
                     raise ValueError(f"lift {feature.properties.lift[:64]!r} has no outline")

@@ -93,9 +93,6 @@ class MapView:
         unseen = _UNSEEN_LANDMARKS * (float(weights.mean()) if len(weights) else 1.0)
         self._place_weights = np.bincount(self._place_of_shown, self._shown_weights, minlength=len(counts)) + unseen
 
-    def __len__(self) -> int:
-        return len(self.points_map)
-
     def similar_places(self, descriptors: NDArray[np.uint8], allowed: NDArray[np.bool_] | None, top: int) -> Rows:
         """Rank places by the share of their landmarks, weighted by word rarity, found among descriptors (N, 32), best first.
 

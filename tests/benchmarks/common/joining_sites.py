@@ -162,7 +162,7 @@ def site_map(run: EstimatorSession) -> SiteMap:
     """The map that a run makes."""
     tiles, vocabulary = survey_map(run, np.random.default_rng(run.session.order.seed))
     view = MapView(tiles, vocabulary, run.camera.focal_px)
-    firm = firm_landmarks(len(view), np.concatenate(view.place_rows).astype(np.int32))
+    firm = firm_landmarks(len(view.points_map), np.concatenate(view.place_rows).astype(np.int32))
     return SiteMap(Relocalizer(view, run.camera, session_relocalization(SETTINGS)), firm)
 
 

@@ -198,16 +198,12 @@ def fullest_tile(kind: str) -> bytes:
 
 
 @pytest.mark.parametrize("kind", ["landmarks", "places", "references"])
-def test_the_fullest_tile_takes_little(kind: str) -> None:
+def test_the_fullest_tile_takes_little_time_and_memory(kind: str) -> None:
     data = pack(b"FMTL", 2, fullest_tile(kind), level=1)
     assert len(data) < 2000
     started_s = time.process_time()
     decode_tile(data)
     assert time.process_time() - started_s < 3  # a tenth of it, measured
-
-
-def test_the_fullest_tile_takes_little_memory() -> None:
-    data = pack(b"FMTL", 2, fullest_tile("landmarks"), level=1)
     tracemalloc.start()
     decode_tile(data)
     peak = tracemalloc.get_traced_memory()[1]
@@ -255,16 +251,13 @@ def test_rotations_with_ties_are_stable() -> None:
             _check_rotation(rotation_from_quat_wxyz(np.array(order) * np.array(signs)))
 
 
-def test_log_codes_clip_and_are_within_half_a_step() -> None:
+def test_codes_of_distances_and_angles_clip_and_are_within_half_a_step() -> None:
     values = np.geomspace(0.11, 600, 500).astype(np.float32)
     codes = quantise.log_code(values, 0.1, 20)
     back = quantise.log_value(codes, 0.1, 20)
     assert np.abs(np.log2(back / values)).max() <= 0.5 / 20 + 1e-6
     assert np.array_equal(quantise.log_code(back, 0.1, 20), codes)
     assert quantise.log_code(np.array([0.0, 1e9], np.float32), 0.1, 20).tolist() == [0, 255]
-
-
-def test_half_angles_clip_and_are_within_half_a_step() -> None:
     angles = np.linspace(0, np.pi, 500).astype(np.float32)
     codes = quantise.half_angle_code(angles)
     back = quantise.half_angle_value(codes)

@@ -16,6 +16,7 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.estimate import Estimate, Hypothesis
 from locclient.localization.image_quality import ImageQuality
+from locclient.maps.loaded_map import LoadedMap
 from locclient.robot.failure_onset import Evidence, OnsetRecorder, refined_cause
 from locclient.robot.failure_report import RobotProfile, failure_report
 from locclient.robot.robot import FailureContext
@@ -99,20 +100,15 @@ def test_a_robot_found_elsewhere_was_carried_where_its_tracks_broke(breaks: bool
     assert onset.stamp_ns == (3_000_000_000 if breaks else 3_500_000_000), "a carried robot failed when it was carried"
 
 
-def test_tracks_that_end_in_the_dark_are_no_sign_of_hands() -> None:
-    recorder = OnsetRecorder()
-    played(recorder, [estimate(0.1 * n, fix=True) for n in range(30)])
-    dark = broken(estimate(3.0, Status.DEGRADED), ImageQuality(Cause.DARK))
-    played(recorder, [dark])
-    assert not recorder.evidence(dark, BLIND, dark.stamp_ns, dark.odometry.odom_from_body).broke
-
-
-def test_tracks_that_end_where_frames_are_missing_are_no_sign_of_hands() -> None:
-    recorder = OnsetRecorder()
-    played(recorder, [estimate(0.1 * n, fix=True) for n in range(30)])
-    late = broken(estimate(3.1, Status.DEGRADED))
-    played(recorder, [late])
-    assert not recorder.evidence(late, BLIND, late.stamp_ns, late.odometry.odom_from_body).broke
+@pytest.mark.parametrize(
+    ("stamp_s", "cause", "is_sign"), [(3.0, Cause.NONE, True), (3.0, Cause.DARK, False), (3.1, Cause.NONE, False)]
+)
+def test_tracks_that_end_in_the_dark_or_where_frames_are_missing_are_no_sign_of_hands(
+    stamp_s: float, cause: Cause, is_sign: bool
+) -> None:
+    recorder, last = OnsetRecorder(), broken(estimate(stamp_s, Status.DEGRADED), ImageQuality(cause))
+    played(recorder, [*(estimate(0.1 * n, fix=True) for n in range(30)), last])
+    assert recorder.evidence(last, BLIND, last.stamp_ns, last.odometry.odom_from_body).broke is is_sign
 
 
 @pytest.mark.parametrize(
@@ -133,22 +129,26 @@ def test_causes_by_their_evidence(cause: Cause, evidence: Evidence, refined: Cau
     assert refined_cause(cause, evidence) is refined
 
 
-def reported(bundles: Iterable[SensorBundle], store: MapStore) -> list[FailureReport]:
+def reported(
+    bundles: Iterable[SensorBundle], whole: LoadedMap, other: LoadedMap | None = None, at: int = -1
+) -> list[FailureReport]:
+    """other: the map from frame `at` on."""
     robot, rig, contexts = robot_world.new_robot(), robot_world.rectifier(), list[FailureContext]()
-    robot.use(robot_world.loaded(store))
-    for bundle in bundles:
+    robot.use(whole)
+    for number, bundle in enumerate(bundles):
+        if other is not None and number == at:
+            robot.use(other)
         outcome = robot.handle(bundle)
         if outcome is not None and outcome.failure is not None:
             contexts.append(outcome.failure)
-    profile = RobotProfile("room", "r1", rig.rig, robot_world.SETTINGS)
-    profile = replace(profile, pictures="full")
+    profile = RobotProfile("room", "r1", rig.rig, robot_world.SETTINGS, "full")
     return [failure_report(context, profile, report_id="ab" * 16, wall_ns=7) for context in contexts]
 
 
 def test_a_carried_robot_says_what_it_believed_and_that_this_was_wrong(store: MapStore) -> None:
     """Put down 2.4 m away while it stood: the pose and radius of that moment, pictures from before it, and the error."""
     at = 75
-    (report,) = reported(robot_world.carried(110, at), store)
+    (report,) = reported(robot_world.carried(110, at), robot_world.loaded(store))
     assert report.cause == "carried"
     assert report.wrong_by_m == pytest.approx(2.4, abs=0.1)
     np.testing.assert_allclose(report.map_from_base.position_m, robot_world.truth(74)[:3, 3], atol=0.1)
@@ -173,21 +173,11 @@ def robot_left(number: int) -> np.ndarray:
 def test_a_changed_map_is_named(store: MapStore, monkeypatch: pytest.MonkeyPatch) -> None:
     """Every landmark's surroundings look otherwise from some frame on; odometry and images are sound."""
     monkeypatch.setattr(failure_definition, "FIND_DRIVING_S", 1.5)  # twenty would be three times this room's cycle
-    robot, rig = robot_world.new_robot(), robot_world.rectifier()
-    whole = robot_world.loaded(store)
-    robot.use(whole)
-    rng, contexts = np.random.default_rng(1), []
+    whole, rng = robot_world.loaded(store), np.random.default_rng(1)
     changed = {
         cell: replace(tile, descriptors=rng.integers(0, 256, tile.descriptors.shape, np.uint8))
         for cell, tile in whole.tiles.items()
     }
-    for number, bundle in enumerate(robot_world.bundles(110)):
-        if number == 62:
-            robot.use(replace(whole, tiles=changed))
-        outcome = robot.handle(bundle)
-        if outcome is not None and outcome.failure is not None:
-            contexts.append(outcome.failure)
-    profile = RobotProfile("room", "r1", rig.rig, robot_world.SETTINGS)
-    (report,) = [failure_report(context, profile, report_id="ab" * 16, wall_ns=7) for context in contexts]
+    (report,) = reported(robot_world.bundles(110), whole, replace(whole, tiles=changed), 62)
     assert report.cause == "map_changed"
     assert report.landmarks_expected > 10 * report.landmarks_seen

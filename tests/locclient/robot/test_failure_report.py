@@ -14,7 +14,14 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.sensors.samples import CameraFrame
 from locclient.config import LocclientConfig
 from locclient.delivery.report_delivery import write_failure
-from locclient.robot.failure_report import expected_matches, match_view, small_jpeg, without_detail
+from locclient.robot.failure_report import (
+    RobotProfile,
+    expected_matches,
+    failure_report,
+    match_view,
+    small_jpeg,
+    without_detail,
+)
 from mapserver.store import MapStore
 from support.worlds import robot_world
 
@@ -65,15 +72,10 @@ def test_pictures_are_small() -> None:
         assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED).shape[1] <= 800
 
 
-def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
+def test_a_dark_robot_reports_itself(tmp_path: Path, store: MapStore) -> None:
     """Expected: blind, dark, DEGRADED or LOST, the tile it was last in, pictures from before and from that moment."""
-    from locclient.robot.failure_report import RobotProfile, failure_report
-
-    robot = robot_world.new_robot()
-    with MapStore.open(tmp_path / "store", create=True) as store:
-        robot_world.save(store)
-        robot.use(robot_world.loaded(store))
-    told = []
+    robot, told = robot_world.new_robot(), []
+    robot.use(robot_world.loaded(store))
     for bundle in robot_world.bundles(130, dark=range(60, 130)):
         outcome = robot.handle(bundle)
         if outcome is not None and outcome.failure is not None:
@@ -98,11 +100,8 @@ def test_a_dark_robot_reports_itself(tmp_path: Path) -> None:
     other = failure_report(replace(told[0], onset=onset, unmatched=onset), profile, report_id="ab" * 16, wall_ns=7)
     assert (other.map_from_base, other.tile, other.landmarks_expected) == (None, None, None), "no place on this site"
     assert report.camera.size_px == (rig.camera.width_px, rig.camera.height_px)
-    assert (*report.camera.centre_px, report.camera.focal_px) == (
-        rig.camera.cx_px,
-        rig.camera.cy_px,
-        rig.camera.focal_px,
-    )
+    lens = rig.camera.cx_px, rig.camera.cy_px, rig.camera.focal_px
+    assert (*report.camera.centre_px, report.camera.focal_px) == lens
     assert len(encode_message(report.camera)) < 256
     assert len(encode_message(report)) < MAX_MESSAGE_BYTES / 4
     left = frame(60).left

@@ -18,13 +18,6 @@ from support.worlds.robot_world import SETTINGS, TRIAL
 FRAMES = 60
 
 
-@pytest.fixture(scope="module")
-def store(tmp_path_factory: pytest.TempPathFactory) -> MapStore:
-    made = MapStore.open(tmp_path_factory.mktemp("one") / "store", create=True)
-    robot_world.save(made)
-    return made
-
-
 def driven(store: MapStore, *, imu: bool, wheels: float, first: int = 0, frames: int = FRAMES) -> list[Outcome]:
     """What a robot tells of a ride to and fro, by the left camera and these sensors; wheels: factor on their speed, 0 for none."""
     whole = calibration()

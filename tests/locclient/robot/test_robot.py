@@ -117,20 +117,15 @@ def test_laps_cost_no_memory(store: MapStore) -> None:
 FRAMES, GIVEN = 150, 60
 
 
-def ride(
-    folder: Path, off_m: float, *, frames: int = FRAMES, is_revisable: bool = True, stands: bool = False
-) -> list[Estimate]:
+def ride(store: MapStore, off_m: float, *, is_revisable: bool = True) -> list[Estimate]:
     """The robot's ride; at frame GIVEN it is told a place off_m beside its own, with a sigma of half a metre."""
-    with MapStore.open(folder / "store", create=True) as store:
-        robot_world.save(store)
-        robot: Robot = robot_world.new_robot()
-        robot.use(robot_world.loaded(store))
+    robot: Robot = robot_world.new_robot()
+    robot.use(robot_world.loaded(store))
     told = robot_world.truth(GIVEN) @ se3_inverse(robot.base_from_body)
     told[0, 3] += off_m
     covariance = np.diag([0.05**2, 0.05**2, 0.26**2, 0.5**2, 0.5**2, 0.25**2])
-    bundles = robot_world.carried(frames, GIVEN) if stands else robot_world.bundles(frames)
     estimates = []
-    for number, bundle in enumerate(bundles):
+    for number, bundle in enumerate(robot_world.bundles(FRAMES)):
         priors = [PositionPrior(0, told, covariance, is_revisable)] if number == GIVEN else []
         outcome = robot.handle(replace(bundle, priors=priors))
         estimates.append(outcome.estimate)
@@ -142,13 +137,13 @@ def off_m(estimate: Estimate, number: int) -> float:
     return float(np.linalg.norm(estimate.map_from_body[:2, 3] - robot_world.truth(number)[:2, 3]))
 
 
-def test_a_pose_that_agrees_changes_nothing(tmp_path: Path) -> None:
-    estimates = ride(tmp_path, 0.3)
+def test_a_pose_that_agrees_changes_nothing(store: MapStore) -> None:
+    estimates = ride(store, 0.3)
     assert {one.status for one in estimates[GIVEN:]} == {Status.TRACKING}
 
 
-def test_a_wrong_pose_is_believed_until_fixes_outweigh_it(tmp_path: Path) -> None:
-    estimates = ride(tmp_path, 6.0)
+def test_a_wrong_pose_is_believed_until_fixes_outweigh_it(store: MapStore) -> None:
+    estimates = ride(store, 6.0)
     told = estimates[GIVEN]
     assert told.status is Status.DEGRADED
     assert off_m(told, GIVEN) == pytest.approx(6.0, abs=0.1)
@@ -164,20 +159,17 @@ def test_a_wrong_pose_is_believed_until_fixes_outweigh_it(tmp_path: Path) -> Non
     assert all(one.status is not Status.TRACKING or off_m(one, n) < 0.3 for n, one in enumerate(estimates))
 
 
-def test_a_docks_place_is_not_doubted(tmp_path: Path) -> None:
+def test_a_docks_place_is_not_doubted(store: MapStore) -> None:
     """The control: what is not from a person neither unseats a tracked pose, as before."""
-    estimates = ride(tmp_path, 6.0, is_revisable=False)
+    estimates = ride(store, 6.0, is_revisable=False)
     assert {one.status for one in estimates[GIVEN:]} == {Status.TRACKING}
 
 
 @pytest.mark.parametrize("forget", [False, True])
-def test_a_robot_that_forgets_claims_nothing_until_it_finds_itself(tmp_path: Path, forget: bool) -> None:
+def test_a_robot_that_forgets_claims_nothing_until_it_finds_itself(store: MapStore, forget: bool) -> None:
     """In the dark, where nothing can be found: what it claims there is what it remembers."""
-    with MapStore.open(tmp_path / "store", create=True) as store:
-        robot_world.save(store)
-        robot = robot_world.new_robot()
-        robot.use(robot_world.loaded(store))
-    estimates = []
+    robot, estimates = robot_world.new_robot(), []
+    robot.use(robot_world.loaded(store))
     for number, bundle in enumerate(robot_world.bundles(FRAMES, dark=range(GIVEN, GIVEN + 5))):
         outcome = robot.handle(replace(bundle, forget=forget and number == GIVEN))
         estimates.append(outcome.estimate)
