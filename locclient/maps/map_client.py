@@ -62,13 +62,14 @@ _MAX_INCOMPLETE = 8
 class ChunkReader:
     """Reads chunked downloads from a server. Chunks of an incomplete download are kept across errors and calls.
 
-    timeout_s: for each chunk. patience_s: time without any chunk after which a read fails; a later read resumes it.
+    timeout_s: for each chunk. patience_s: time without any chunk after which a read fails; a later read resumes it. received_bytes: so far.
     """
 
     bus: Bus
     timeout_s: float
     patience_s: float
     clock_s: Callable[[], float] = time.monotonic
+    received_bytes: int = 0
     _incomplete: dict[str, bytearray] = field(default_factory=dict)
 
     def read(self, key: str, *, max_bytes: int) -> bytes:
@@ -90,6 +91,7 @@ class ChunkReader:
 
     def _chunk(self, key: str, offset: int, max_bytes: int) -> Part:
         chunk = self._request(key, encode_message(ChunkRequest(offset=offset)))
+        self.received_bytes += len(chunk.data)
         if chunk.total_bytes > max_bytes:
             raise LinkError(f"{key} has {chunk.total_bytes} bytes where at most {max_bytes} are expected")
         if chunk.offset != offset or offset + len(chunk.data) > chunk.total_bytes:
@@ -133,7 +135,7 @@ class MapClient(MapSource):
         self.bus, self._cache = bus, cache
         self.robot = check_name(robot, "robot")
         self._timeout_s = timeout_s
-        self._chunks = ChunkReader(bus, timeout_s=timeout_s, patience_s=patience_s)
+        self.chunks = ChunkReader(bus, timeout_s=timeout_s, patience_s=patience_s)
         self.trust: TrustedMap | None = None
         self.takes_grids = False  # for planners, if versions have them; localization does not need them
         self.surveys: tuple[SurveyArea, ...] = ()  # that robots may make, by its last answer
@@ -290,7 +292,7 @@ class MapClient(MapSource):
         """Return the verified bytes of an address, from the cache or the server, and cache them."""
         data = self._cache.get(sha256)
         if data is None:
-            data = verified(self._chunks.read(key, max_bytes=max_bytes), sha256)
+            data = verified(self.chunks.read(key, max_bytes=max_bytes), sha256)
             self._cache.put(sha256, data)
         return data
 
@@ -307,7 +309,7 @@ class MapClient(MapSource):
             return kept
         data = None
         if (sha256 := named.get(kind)) is not None:
-            data = verified(self._chunks.read(self._key(f"blobs/{sha256}"), max_bytes=max_bytes), sha256)
+            data = verified(self.chunks.read(self._key(f"blobs/{sha256}"), max_bytes=max_bytes), sha256)
         self._cache.keep_file(self.site, kind, data)
         return data
 

@@ -129,11 +129,10 @@ def fetched(folder: Path, cache: Path) -> int:
     hub = MemoryHub()
     with MapStore.open(folder) as store, MemoryBus(hub) as bus, MemoryBus(hub) as robot:
         service = BusService(store, Fleet(store), bus, lambda *_: None)
-        kept = TileCache(cache)
-        link, before = MapClient(robot, kept, SITE, "r1"), kept.total_bytes
+        link = MapClient(robot, TileCache(cache), SITE, "r1")
         link.bring(link.wanted())
         service.close()
-        return kept.total_bytes - before
+        return link.chunks.received_bytes
 
 
 def updated(number: int) -> Row:

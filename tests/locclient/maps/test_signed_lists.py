@@ -212,10 +212,10 @@ def test_row_14_a_manifest_larger_than_its_signed_size(world: World) -> None:
     )
     with pytest.raises(LinkError, match=f"has {len(data)} bytes where at most {length} are expected"):
         client.fetch(client.wanted())
-    assert client.received_bytes <= PART_BYTES
+    assert client.chunks.received_bytes <= PART_BYTES
     with pytest.raises(FleetmapError):  # the control: without a signed size it takes them all before it looks
         victim.fetch(victim.wanted())
-    assert victim.received_bytes == len(data)
+    assert victim.chunks.received_bytes == len(data)
 
 
 def test_a_version_that_begins_to_be_run_is_finished(world: World) -> None:
@@ -303,8 +303,8 @@ def test_a_robot_learns_an_alignment_without_another_version(world: World) -> No
     update_lists(world.store)
     assert learned(client) == 7.0
     assert running(client) == 2
-    received = client.received_bytes
-    assert (learned(client), client.received_bytes) == (7.0, received)
+    received = client.chunks.received_bytes
+    assert (learned(client), client.chunks.received_bytes) == (7.0, received)
     plan = world.store._database.query("SELECT sha256 FROM site_files WHERE kind = 'plan'", ())[0]["sha256"]
     with pytest.raises(LinkError, match="no published bytes"):
         client.blob(plan, 1000)

@@ -88,7 +88,7 @@ def test_a_server_that_is_killed_in_the_middle_of_a_fetch_is_waited_for(tmp_path
         assert len(failed) >= 2
         assert cache.active("lab").version == 1
         # Nothing that had come was fetched again.
-        assert link.received_bytes == sum(len(cache.get(sha256)) for sha256 in cache.active("lab").blobs)
+        assert link.chunks.received_bytes == sum(len(cache.get(sha256)) for sha256 in cache.active("lab").blobs)
 
 
 def test_wrong_addresses_and_stores_are_told_at_once(tmp_path: Path) -> None:

@@ -80,18 +80,18 @@ def test_a_night_costs_what_changed(world: World) -> None:
     tiles = large_site(world)
     world.publish(tiles)
     world.hall.ready()
-    whole = world.hall.received_bytes
+    whole = world.hall.chunks.received_bytes
     assert whole > 900_000
     tiles = world.current_tiles()
     world.publish(tiles)  # nothing moved
     world.hall.ready()
-    unmoved = world.hall.received_bytes - whole
+    unmoved = world.hall.chunks.received_bytes - whole
     assert world.cache.active("hall").version == 2
     assert unmoved < 0.01 * whole
     world.publish([moved(tiles[0], slice(0, 450)), *tiles[1:]])
     world.hall.ready()
     assert world.cache.active("hall").version == 3
-    assert world.hall.received_bytes - whole - unmoved < 0.35 * whole  # one tile of three
+    assert world.hall.chunks.received_bytes - whole - unmoved < 0.35 * whole  # one tile of three
     fetched = world.hall.tiles(world.hall.manifest(world.hall.wanted()))
     np.testing.assert_allclose(fetched.tiles[0, 0].points_map[:450, 2], tiles[0].points_map[:450, 2] + 1.0, atol=1e-3)
 
@@ -119,7 +119,9 @@ def test_a_fetch_goes_on_where_it_was(world: World, died_after: int) -> None:
     world.hall.bring(wanted)
     assert world.cache.active("hall").version == 1
     assert len(asked) == len(set(asked))
-    assert world.hall.received_bytes == sum(len(world.cache.get(sha256)) for sha256 in world.cache.active("hall").blobs)
+    assert world.hall.chunks.received_bytes == sum(
+        len(world.cache.get(sha256)) for sha256 in world.cache.active("hall").blobs
+    )
 
 
 def test_no_message_of_a_large_site_exceeds_a_part(world: World) -> None:

@@ -95,7 +95,7 @@ def judged(estimates: list[Estimate], map_from_body: Array, stamps_ns: list[int]
     frames = [_record(e, t, float(v)) for e, t, v in zip(estimates, map_from_body, speeds, strict=True)]
     kinds = {
         "silent": run_metrics.silent_failures(frames) or 0,
-        "overconfident": len(run_metrics._episodes(frames, run_metrics._is_overconfident, _SILENT_S)),
+        "overconfident": len(run_metrics._episodes(frames, run_metrics.is_outside_its_bound, _SILENT_S)),
         "not found": len(run_metrics.not_found(frames)),
     }
     failures = run_metrics.position_failures(frames)
