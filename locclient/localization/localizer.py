@@ -51,7 +51,7 @@ class Localizer:
 
     def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
         self.perception.handle_wheel(samples)
-        self._calibration.watch.handle_wheel(samples)
+        self._calibration.watch.wheels.handle(samples)
 
     def handle_prior(self, prior: PositionPrior) -> None:
         """Use a prior from the next frame on until a pose is confirmed, with a covariance that grows with the distance since. One with

@@ -18,7 +18,7 @@ from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import is_other_viewpoint
 from locclient.localization.held_maps import HeldMaps
 from locclient.localization.hypothesis_set import HypothesisSet, Observations
-from locclient.localization.place import Place, innovation_of, kalman_update
+from locclient.localization.place import ORIGIN, Place, innovation_of, kalman_update
 from locclient.localization.pose_hypothesis import Motion, PoseHypothesis
 from locclient.localization.priors.prior import Prior
 from locclient.localization.settings import LocalizerSettings
@@ -123,8 +123,10 @@ class PoseTracker:
     # --- priors and starts --------------------------------------------------------------------------------------------
 
     def prior_at(self, known: PoseHypothesis, **how: Any) -> Prior:
-        """Return a pose as a prior. how: arguments of `Prior`."""
-        return Prior.at(known, self.base_from_body, self.settings, **how)
+        """Return a pose at a frame of the odometry as a prior. how: arguments of `Prior`."""
+        base = known.start.of_point(se3_inverse(self.base_from_body))
+        since = PoseHypothesis(known.frame_index, known.stamp_ns, ORIGIN, ORIGIN)
+        return Prior(base, since, known, self.base_from_body, self.settings, **how)
 
     def take(self, prior: Prior) -> None:
         """Use a prior from now on; it replaces any earlier one. One of a ride replaces the confirmed pose, too."""

@@ -11,7 +11,6 @@ from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.pnp.pnp import Correspondences
-from fleetmap.sensors.samples import WheelSample
 from locclient.localization.calibration import mounting
 from locclient.localization.calibration.camera_view import camera_view, pair_offsets
 from locclient.localization.calibration.mounting import BasePose, WheelTravel
@@ -82,16 +81,13 @@ class CalibrationWatch:
         """imu_minus_cam_s: time offset of the calibration."""
         self._rig, self._stereo, self._imu_minus_cam_s = rig, stereo_settings, imu_minus_cam_s
         self._looks: deque[_Look] = deque(maxlen=_WINDOW)
-        self._wheels = WheelTravel()
+        self.wheels = WheelTravel()
         self._last_map_from_cam: Array | None = None
         self._last_base: BasePose | None = None
         self._stood_from: tuple[int, Array] | None = None  # the oldest query from nearly the same place
         self._has_stood = False
         self.state = NOT_JUDGED
         self.has_confirmed = False  # a look of a confirmed pose was added
-
-    def handle_wheel(self, samples: Sequence[WheelSample]) -> None:
-        self._wheels.handle(samples)
 
     def handle(self, query: FinishedQuery) -> None:
         """Add a map query if it is a new look."""
@@ -155,11 +151,11 @@ class CalibrationWatch:
             at = np.r_[TILT, COUNT : COUNT + 2]
             information[np.ix_(at, at)] += jacobian.T @ jacobian
             score[at] += jacobian.T @ measured
-        if not self._wheels.is_heard:
+        if not self.wheels.is_heard:
             return
         map_from_base = fix.map_from_cam @ self._rig.cam_from_body @ se3_inverse(self._rig.base_from_body)
         covariance = transport_cov(fix.cov_rot_trans, map_from_base[:3, 3] - fix.map_from_cam[:3, 3])
-        base = BasePose(map_from_base, covariance, self._wheels.at(odometry.stamp_ns))
+        base = BasePose(map_from_base, covariance, self.wheels.at(odometry.stamp_ns))
         turned = None if self._last_base is None else mounting.heading(self._last_base, base)
         if turned is not None and abs(turned[0]) > _KNOCKED_RAD:
             turned = None

@@ -14,7 +14,7 @@ from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.hypothesis_set import HypothesisSet, Observations
 from locclient.localization.perception import Percept
-from locclient.localization.place import ORIGIN, Place
+from locclient.localization.place import Place
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
 
@@ -88,12 +88,6 @@ class Prior:
             known = PoseHypothesis.at(odometry, base.of_point(base_from_body))
         how = {"is_revisable": prior.is_revisable, "is_measured": prior.is_measured, "is_told": True} | how
         return cls(base, PoseHypothesis.at(odometry), known, base_from_body, settings, **how)
-
-    @classmethod
-    def at(cls, known: PoseHypothesis, base_from_body: Array, settings: TrackSettings, **how: Any) -> "Prior":
-        """Return a pose at a frame of the odometry as a prior. how: arguments of the constructor."""
-        since = PoseHypothesis(known.frame_index, known.stamp_ns, ORIGIN, ORIGIN)
-        return cls(known.start.of_point(se3_inverse(base_from_body)), since, known, base_from_body, settings, **how)
 
     @property
     def names_floor(self) -> bool:
