@@ -33,10 +33,12 @@ def test_a_manager_that_does_not_read_holds_nothing_up(tmp_path: Path) -> None:
             manager.alive("TRACKING")
 
 
-def test_without_a_manager_nothing_happens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_manager_or_a_folder_nothing_happens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    ServiceManager().ready()
-    ServiceManager(str(tmp_path / "gone")).alive("x")
+    for manager in (ServiceManager(), ServiceManager(str(tmp_path / "gone"), tmp_path / "gone")):
+        manager.ready()
+        manager.alive("TRACKING")
+        manager.stopping()
 
 
 def asked(monkeypatch: pytest.MonkeyPatch, folder: Path) -> int:
@@ -89,8 +91,3 @@ def test_an_old_or_broken_status_is_none(
     monkeypatch.setattr(time, "monotonic", lambda: now_s + later_s)
     assert asked(monkeypatch, tmp_path) == 3
     assert words in capsys.readouterr().err
-
-
-def test_a_status_that_cannot_be_written_stops_nobody(tmp_path: Path) -> None:
-    ServiceManager(folder=tmp_path / "gone").alive("TRACKING")
-    ServiceManager(folder=tmp_path / "gone").stopping()

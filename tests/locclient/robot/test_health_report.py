@@ -58,20 +58,15 @@ def test_the_largest_since_the_report_before_and_sums_since_the_beginning() -> N
     assert (second["landmarks_expected"], second["landmarks_seen"]) == (300, 180)
 
 
-@pytest.mark.parametrize("before", [Status.DEGRADED, Status.LOST])
-def test_who_says_that_he_is_lost_is_not_silently_wrong(before: Status) -> None:
+@pytest.mark.parametrize(("before", "moved_m"), [(Status.DEGRADED, None), (Status.LOST, None), (Status.LOST, 0.6)])
+def test_who_says_that_he_is_lost_is_wrong_where_he_is_found_elsewhere_alone(
+    before: Status, moved_m: float | None
+) -> None:
     figures = HealthFigures()
     handle(figures, estimate(0.0, before))
-    handle(figures, look(0.2, 3.0, 0.8, 10, 5))
+    handle(figures, replace(look(0.2, 3.0, 0.8, 10, 5), moved_m=moved_m))
     told = taken(figures)
-    assert (told["fix_innovation"], told["fix_innovation_m"]) == (3.0, None)
-
-
-def test_a_robot_that_is_found_elsewhere_than_it_said_tells_how_far() -> None:
-    figures = HealthFigures()
-    handle(figures, estimate(0.0, Status.LOST))
-    handle(figures, replace(look(0.2, 3.0, 0.8, 10, 5), moved_m=0.6))
-    assert taken(figures)["fix_innovation_m"] == 0.6
+    assert (told["fix_innovation"], told["fix_innovation_m"]) == (3.0, moved_m)
 
 
 def test_a_robot_tells_all_that_the_server_counts_with(store: MapStore) -> None:

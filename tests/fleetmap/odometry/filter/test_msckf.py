@@ -157,9 +157,8 @@ def test_a_point_is_looked_for_by_its_disparity_or_at_the_first_depth() -> None:
 def test_two_cameras_know_the_motion_better_and_as_well_as_they_say() -> None:
     """Of other lenses and directions; what one sees after the other, or both at once, is one track. Normalised error squared per dof."""
     points, squares, times_s = room(np.random.default_rng(3)), [], [0.0, 0.15, 0.3]
-    earlier_from_now = (
-        se3_inverse(analytic_motion(times_s[0]).map_from_body) @ analytic_motion(times_s[2]).map_from_body
-    )
+    earlier, _, now = (analytic_motion(time_s).map_from_body for time_s in times_s)
+    earlier_from_now = se3_inverse(earlier) @ now
     for seed in range(20):
         covariances = []
         for cameras in (1, 2):
