@@ -1,5 +1,6 @@
 """The watch over a drive: what drifts is named, nothing else is, and repaired cameras are sound again."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, cast
@@ -51,6 +52,16 @@ def parameters(**sizes: float) -> Array:
     return out
 
 
+def after(
+    numbers: Iterable[int], wrong: Array, turn: Array | None = None, watch: CalibrationWatch | None = None
+) -> CalibrationWatch:
+    """The watch, a new one by default, after these looks."""
+    watch = watch or CalibrationWatch(RIG, StereoSettings())
+    for number in numbers:
+        watch.handle(look(number, wrong, turn))
+    return watch
+
+
 def drifted(watch: CalibrationWatch) -> list[str]:
     return [drift.parameter.figure for drift in watch.state.drifts if drift.is_drifted]
 
@@ -72,9 +83,7 @@ def test_good_cameras_are_left_alone() -> None:
     ],
 )
 def test_what_drifts_is_named_with_its_size(figure: str, wrong: Array) -> None:
-    watch = CalibrationWatch(RIG, StereoSettings())
-    for number in range(25):
-        watch.handle(look(number, wrong))
+    watch = after(range(25), wrong)
     assert drifted(watch) == [figure]
     told = watch.state.figures
     value = told[f"calibration_{figure}"]
@@ -84,46 +93,29 @@ def test_what_drifts_is_named_with_its_size(figure: str, wrong: Array) -> None:
 
 
 def test_a_knock_is_found_and_a_repair_too() -> None:
-    watch = CalibrationWatch(RIG, StereoSettings())
-    for number in range(40):
-        watch.handle(look(number, parameters()))
-    for number in range(40, 55):
-        watch.handle(look(number, parameters(yaw=0.003)))
+    watch = after(range(40, 55), parameters(yaw=0.003), watch=after(range(40), parameters()))
     assert drifted(watch) == ["pair_yaw_deg"]
-    for number in range(55, 75):
-        watch.handle(look(number, parameters()))
-    assert not watch.state.is_wrong
+    assert not after(range(55, 75), parameters(), watch=watch).state.is_wrong
 
 
 def test_a_robot_that_stands_learns_nothing() -> None:
-    watch = CalibrationWatch(RIG, StereoSettings())
-    for _ in range(50):
-        watch.handle(look(3, parameters(focal=0.03)))
-    assert not watch.state.drifts
+    assert not after([3] * 50, parameters(focal=0.03)).state.drifts
 
 
-def stood(watch: CalibrationWatch) -> CalibrationWatch:
-    """The watch after half a second at the first place."""
-    first = look(0, parameters())
+def stood() -> CalibrationWatch:
+    """A watch after half a second at the first place."""
+    watch, first = CalibrationWatch(RIG, StereoSettings()), look(0, parameters())
     watch.handle(first)
     watch.handle(replace(first, odometry=replace(first.odometry, stamp_ns=first.odometry.stamp_ns + 500_000_000)))
     return watch
 
 
 def test_gravity_is_not_believed_before_the_robot_has_stood() -> None:
-    watch = CalibrationWatch(RIG, StereoSettings())
-    for number in range(30):
-        watch.handle(look(number, parameters(), np.radians([2.0, 0.0, 0.0])))
-    assert not watch.state.is_wrong
+    assert not after(range(30), parameters(), np.radians([2.0, 0.0, 0.0])).state.is_wrong
 
 
 def test_turned_cameras_are_told_from_a_tilted_map() -> None:
-    watch = stood(CalibrationWatch(RIG, StereoSettings()))
-    turn = np.zeros(3)
-    turn[0] = np.radians(2.0)
-    for number in range(30):
-        query = look(number, parameters(), turn)
-        watch.handle(query)
+    watch = after(range(30), parameters(), np.radians([2.0, 0.0, 0.0]), stood())
     said = {drift.parameter.figure: drift for drift in watch.state.drifts}
     assert TILT.start == IMAGE
     assert said["camera_roll_deg"].is_drifted
@@ -134,7 +126,7 @@ def test_turned_cameras_are_told_from_a_tilted_map() -> None:
 def test_a_tilt_that_a_straight_drive_does_not_explain_is_held_by_the_covariance(
     roll_deg: float, is_held: bool
 ) -> None:
-    watch = stood(CalibrationWatch(RIG, StereoSettings()))
+    watch = stood()
     turn = np.array([np.radians(roll_deg), 0.0, 0.0])
     for number in range(25):
         watch.handle(replace(look(number, parameters(), turn, yaw_rad=0.0), is_confirmed=True))
@@ -192,8 +184,7 @@ def test_a_wrong_calibration_is_published() -> None:
     monitor = CalibrationMonitor(RIG, RelocalizerSettings())
     tracking = estimate(5.0)
     assert published(monitor, tracking, tracking.stamp_ns).status is Status.TRACKING
-    for number in range(25):
-        monitor.watch.handle(look(number, parameters(focal=-0.02)))
+    after(range(25), parameters(focal=-0.02), watch=monitor.watch)
     wrong = published(monitor, tracking, tracking.stamp_ns)
     assert (wrong.status, wrong.cause) == (Status.DEGRADED, Cause.CALIBRATION)
     assert np.sqrt(wrong.cov_rot_trans[5, 5]) > 0.03 > np.sqrt(tracking.cov_rot_trans[5, 5])
