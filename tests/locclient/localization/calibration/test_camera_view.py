@@ -184,27 +184,19 @@ def pair(disparity_px: int) -> tuple[Image, Image]:
     return left, right
 
 
-def order_of(left: Image, right: Image | None) -> PairOrder:
-    return pair_order(RectifiedFrame(0, left, right, None), SETTINGS)
+LEFT, RIGHT = pair(12)
+DARK = np.zeros_like(LEFT)
+PAIRS: dict[str, tuple[Image, Image | None, PairOrder]] = {
+    "good": (LEFT, RIGHT, PairOrder.RIGHT),
+    "exchanged": (RIGHT, LEFT, PairOrder.REVERSED),
+    "mirrored": (np.fliplr(LEFT).copy(), np.fliplr(RIGHT).copy(), PairOrder.REVERSED),
+    "dark": (DARK, DARK, PairOrder.UNKNOWN),
+    "far": (*pair(0), PairOrder.UNKNOWN),
+    "single": (LEFT, None, PairOrder.UNKNOWN),
+}
 
 
-def mirrored(image: Image) -> Image:
-    return np.ascontiguousarray(image[:, ::-1])
-
-
-def test_a_good_pair_is_right() -> None:
-    assert order_of(*pair(12)) is PairOrder.RIGHT
-
-
-def test_exchanged_and_mirrored_pairs_are_reversed() -> None:
-    left, right = pair(12)
-    assert order_of(right, left) is PairOrder.REVERSED
-    assert order_of(mirrored(left), mirrored(right)) is PairOrder.REVERSED
-
-
-@pytest.mark.parametrize("what", ["dark", "far", "single"])
-def test_what_shows_no_order_is_unknown(what: str) -> None:
-    left, right = pair(0) if what == "far" else pair(12)
-    if what == "dark":
-        left, right = np.zeros_like(left), np.zeros_like(right)
-    assert order_of(left, None if what == "single" else right) is PairOrder.UNKNOWN
+@pytest.mark.parametrize("what", PAIRS)
+def test_the_order_of_a_pair(what: str) -> None:
+    left, right, order = PAIRS[what]
+    assert pair_order(RectifiedFrame(0, left, right, None), SETTINGS) is order
