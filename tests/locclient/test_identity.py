@@ -157,14 +157,14 @@ def test_addresses(tmp_path: Path, server: Server) -> None:
     found = bare.resolve()
     assert (found.site, found.robot, found.server) == ("lab", "r1", identity.who.endpoint)
     assert found.root == folder / "root.json"
-    assert found.tls == TlsFiles(folder / "servers.ca", folder / "robot.pem")
+    assert found.identity.tls == TlsFiles(folder / "servers.ca", folder / "robot.pem")
     with pytest.raises(UsageError, match="robot r2 is asked for"):
         replace(bare, robot="r2").resolve()
     # On loopback and in a store's folder the identity is out of play.
     for other in (replace(GIVEN, server="tcp/127.0.0.1:7447"), replace(GIVEN, store="maps")):
         found = replace(other, site="yard", identity=str(folder)).resolve()
-        assert (found.site, found.tls, found.root) == ("yard", None, None)
-    assert replace(GIVEN, server="tcp/10.0.0.1:7447", insecure=True).resolve().tls is None
+        assert (found.site, found.identity, found.root) == ("yard", None, None)
+    assert replace(GIVEN, server="tcp/10.0.0.1:7447", insecure=True).resolve().identity is None
 
 
 def test_the_usual_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
