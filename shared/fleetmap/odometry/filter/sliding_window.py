@@ -67,6 +67,8 @@ class SlidingWindow:
         if kept not in self.filter.clone_ids:
             return None
         kept_from_now, covariance = self.filter.motion_since(kept)
+        if kept == frame_index:  # of nearly all frames
+            return kept_from_now, covariance
         carry = se3_adjoint(frame_from_kept)
         return frame_from_kept @ kept_from_now, carry @ covariance @ carry.T
 
