@@ -97,8 +97,8 @@ double cell_log_odds(const Cell& cell, const CellModel& model) {
 auto lookalikes(const Packed& packed_features, const Reals& heights, const Packed& packed_landmarks, const Points& points_map,
                 int64_t first, int64_t last, int64_t room) {
   const Descriptors features = packed_features, landmarks = packed_landmarks;
-  if (heights.shape(0) != features.count) throw nb::value_error("heights_m: one for each feature");
-  if (points_map.shape(0) != landmarks.count) throw nb::value_error("points_map: one for each landmark");
+  check_rows(features.count, "heights_m: one for each feature", heights);
+  check_rows(landmarks.count, "points_map: one for each landmark", points_map);
   if (first < 0 || last < first || last > int64_t(landmarks.count)) throw nb::value_error("first, last: of landmarks");
   if (room < 0) throw nb::value_error("room: not negative");
   const double* const heights_m = heights.data();
@@ -153,15 +153,15 @@ auto camera_votes(const Array<int32_t, -1, 2>& pairs, const Places& offsets_m, c
 // Landmarks of one place, at points_odom (count, 3), their descriptors, and flags to set.
 using Place = std::tuple<Points, Packed, Flags>;
 
-template <typename First, typename... Others>
-void check_rows(const std::tuple<First, Others...>& place) {
-  if (!std::apply([](const auto& first, const auto&... others) { return ((others.shape(0) == first.shape(0)) && ...); }, place))
-    throw nb::value_error("one, other: a row for each landmark");
+// Refuses columns of a place that differ in length.
+template <typename Place>
+void check_place(const Place& place) {
+  std::apply([](const auto&... columns) { check_rows((columns.shape(0), ...), "one, other: a row for each landmark", columns...); }, place);
 }
 
 // Marks landmarks of two places that have a look-alike of the other place within reach_m along each axis.
 void mark_shared(const Place& one, const Place& other, double reach_m, int max_bits) {
-  check_rows(one), check_rows(other);
+  check_place(one), check_place(other);
   const nb::gil_scoped_release others_run;
   const CountedStep counted;
   const auto& [points, packed, shared] = one;
@@ -221,7 +221,7 @@ std::vector<double> odds_of_blocks(const Evidence& one, const Evidence& other, c
 auto block_log_odds(const Evidence& one, const Evidence& other, const Array<double, -1, 2>& lattices,
                     const std::tuple<double, double, double, double, double>& model, double block_m, int room) {
   if (room < 0 || room > 1 << 20) throw nb::value_error("room: up to 2^20");
-  check_rows(one), check_rows(other);
+  check_place(one), check_place(other);
   return as_numpy<double>(
       unlocked([&] { return odds_of_blocks(one, other, lattices, std::make_from_tuple<CellModel>(model), block_m, size_t(room)); }));
 }
@@ -229,11 +229,10 @@ auto block_log_odds(const Evidence& one, const Evidence& other, const Array<doub
 }  // namespace
 
 void bind_aliases(nb::module_& module) {
-  const auto points_map = "points_map"_a, one = "one"_a, other = "other"_a;
-  module.def("lookalikes", &lookalikes, "features"_a, "heights_m"_a, "landmarks"_a, points_map, "first"_a, "last"_a, "room"_a);
-  module.def("camera_votes", &camera_votes, "pairs"_a, "offsets_m"_a, points_map, "low_m"_a, "cell_m"_a, "columns"_a, "rows"_a);
-  module.def("mark_shared", &mark_shared, one, other, "reach_m"_a, "max_bits"_a);
-  module.def("block_log_odds", &block_log_odds, one, other, "lattices"_a, "model"_a, "block_m"_a, "room"_a);
+  module.def("lookalikes", &lookalikes, "features"_a, "heights_m"_a, "landmarks"_a, "points_map"_a, "first"_a, "last"_a, "room"_a);
+  module.def("camera_votes", &camera_votes, "pairs"_a, "offsets_m"_a, "points_map"_a, "low_m"_a, "cell_m"_a, "columns"_a, "rows"_a);
+  module.def("mark_shared", &mark_shared, "one"_a, "other"_a, "reach_m"_a, "max_bits"_a);
+  module.def("block_log_odds", &block_log_odds, "one"_a, "other"_a, "lattices"_a, "model"_a, "block_m"_a, "room"_a);
 }
 
 }  // namespace fleetmap

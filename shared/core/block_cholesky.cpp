@@ -1,10 +1,7 @@
 #include "block_cholesky.h"
 #include "bindings/arrays.h"  // first: Python's header comes before the system's
 
-#include <algorithm>
 #include <cmath>
-
-#include "lapack.h"
 
 namespace fleetmap {
 namespace {
@@ -322,7 +319,7 @@ void make(BlockCholesky* self, const Indices& sizes, const Array<int64_t, -1, 2>
 auto places_of(const BlockCholesky& pattern, const Indices& rows, const Indices& cols) {
   const size_t count = rows.shape(0);
   const int64_t nodes = int64_t(pattern.nodes());
-  if (cols.shape(0) != count) throw nb::value_error("cols: one for each row");
+  check_rows(count, "cols: one for each row", cols);
   std::vector<BlockPlace> places;
   unlocked([&] {
     for (size_t n = 0; n < count; ++n) {

@@ -5,7 +5,6 @@
 #include <limits>
 
 #include "dense.h"
-#include "lapack.h"
 
 namespace fleetmap {
 namespace {

@@ -64,7 +64,7 @@ bool is_seen(const Sphere& lens, double reach, Vec3 point, double* image) {
 // The points (x, y) of the plane z = 1 that the lens maps to the goals: Newton's method with a numeric Jacobian, not checked.
 auto undistort(const Array<double, 8>& coefficients, const Reals& goals_x, const Reals& goals_y) {
   const size_t count = goals_x.shape(0);
-  if (goals_y.shape(0) != count) throw nb::value_error("goals_y: as many as goals_x");
+  check_rows(count, "goals_y: as many as goals_x", goals_y);
   auto found_x = zeros<double>(count), found_y = zeros<double>(count);
   const RadialTangential lens(coefficients.data());
   unlocked([&] {
@@ -121,7 +121,7 @@ auto register_depth(const Array<float, -1, -1>& depth, const Points& rays, const
                     const Reals& lens, double reach, int width, int height) {
   constexpr int64_t kMostPixels = 1 << 26;
   const size_t count = depth.size(), size = lens.shape(0);
-  if (rays.shape(0) != count) throw nb::value_error("rays: one for each pixel of depth");
+  check_rows(count, "rays: one for each pixel of depth", rays);
   if (size != 8 && size != 4 && size != 12)
     throw nb::value_error("lens: 8 coefficients, radial-tangential, 4, equidistant, or 12, a sphere's");
   if (width < 0 || height < 0 || int64_t(width) * height > kMostPixels) throw nb::value_error("width, height: up to 2^26 pixels");
@@ -142,9 +142,8 @@ auto register_depth(const Array<float, -1, -1>& depth, const Points& rays, const
 }  // namespace
 
 void bind_camera(nb::module_& module) {
-  const auto lens = "lens"_a;
-  module.def("undistort", &undistort, lens, "goals_x"_a, "goals_y"_a);
-  module.def("register_depth", &register_depth, "depth"_a, "rays"_a, "colour_from_depth"_a, "intrinsics"_a, lens, "reach"_a, "width"_a,
+  module.def("undistort", &undistort, "lens"_a, "goals_x"_a, "goals_y"_a);
+  module.def("register_depth", &register_depth, "depth"_a, "rays"_a, "colour_from_depth"_a, "intrinsics"_a, "lens"_a, "reach"_a, "width"_a,
              "height"_a);
 }
 

@@ -1,5 +1,5 @@
 #include "corners.h"
-#include "bindings/images.h"  // first: Python's header comes before the system's
+#include "bindings/arguments.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <bit>
@@ -331,11 +331,10 @@ auto centroid_angles_deg(const Image& grey, const Pixels& pixels, int radius) {
 }  // namespace
 
 void bind_corners(nb::module_& module) {
-  const auto image = "image"_a, pixels = "pixels"_a, count = "count"_a, distance_px = "distance_px"_a, taken = "taken"_a;
-  module.def("spread_corners", &spread_corners, image, count, distance_px, "threshold"_a, "border_px"_a, taken,
+  module.def("spread_corners", &spread_corners, "image"_a, "count"_a, "distance_px"_a, "threshold"_a, "border_px"_a, "taken"_a,
              "clearance_px"_a = nb::none(), "scale"_a = 1.0, "clear_px"_a = 0.0);
-  module.def("select_spread", &select_spread, pixels, "order"_a, taken, distance_px, count, "width"_a, "height"_a);
-  module.def("centroid_angles_deg", &centroid_angles_deg, image, pixels, "radius"_a);
+  module.def("select_spread", &select_spread, "pixels"_a, "order"_a, "taken"_a, "distance_px"_a, "count"_a, "width"_a, "height"_a);
+  module.def("centroid_angles_deg", &centroid_angles_deg, "image"_a, "pixels"_a, "radius"_a);
 }
 
 }  // namespace fleetmap

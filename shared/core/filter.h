@@ -12,7 +12,6 @@
 
 #include "dense.h"
 #include "lie.h"
-#include "observations.h"
 #include "preintegration.h"
 #include "track_constraints.h"
 

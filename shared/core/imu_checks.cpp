@@ -1,5 +1,5 @@
 // Checks of inertial samples before their use: spikes, gaps, steadiness of the body.
-#include "bindings/imu_samples.h"  // first: Python's header comes before the system's
+#include "bindings/arguments.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
@@ -23,8 +23,7 @@ int64_t difference(int64_t after_ns, int64_t before_ns) { return int64_t(uint64_
 size_t drop_spikes(const MutableArray<int64_t, -1>& stamps_ns, const MutableArray<double, -1, 3>& gyro_radps,
                    const MutableArray<double, -1, 3>& accel_mps2, size_t known) {
   const size_t end = stamps_ns.shape(0);
-  if (gyro_radps.shape(0) != end || accel_mps2.shape(0) != end)
-    throw nb::value_error("gyro_radps, accel_mps2: a row for each of stamps_ns");
+  check_rows(end, "gyro_radps, accel_mps2: a row for each of stamps_ns", gyro_radps, accel_mps2);
   if (known > end) throw nb::value_error("known: at most as many as stamps_ns");
   double *const gyro = gyro_radps.data(), *const accel = accel_mps2.data();
   const auto stands_out = [&](const double* values, size_t n, double limit) {
@@ -86,7 +85,7 @@ bool is_steady_window(const double* gyro, const double* accel, size_t count, con
 
 bool is_steady(const Points& gyro_radps, const Points& accel_mps2, const Limits& limits) {
   const size_t count = gyro_radps.shape(0);
-  if (accel_mps2.shape(0) != count) throw nb::value_error("accel_mps2: a row for each of gyro_radps");
+  check_rows(count, "accel_mps2: a row for each of gyro_radps", accel_mps2);
   return unlocked(
       [&] { return is_steady_window(gyro_radps.data(), accel_mps2.data(), count, std::make_from_tuple<SteadyLimits>(limits)); });
 }
@@ -118,11 +117,11 @@ int64_t latest_steady(const Indices& stamps_ns, const Points& gyro_radps, const 
 }  // namespace
 
 void bind_imu_checks(nb::module_& module) {
-  const auto stamps_ns = "stamps_ns"_a, gyro_radps = "gyro_radps"_a, accel_mps2 = "accel_mps2"_a;
-  module.def("drop_spikes", &drop_spikes, stamps_ns, gyro_radps, accel_mps2, "known"_a);
-  module.def("longest_gap_ns", &longest_gap_ns, stamps_ns, "start_ns"_a, "end_ns"_a);
-  module.def("is_steady", &is_steady, gyro_radps, accel_mps2, "limits"_a);
-  module.def("latest_steady", &latest_steady, stamps_ns, gyro_radps, accel_mps2, "first_ns"_a, "until_ns"_a, "window_ns"_a, "limits"_a);
+  module.def("drop_spikes", &drop_spikes, "stamps_ns"_a, "gyro_radps"_a, "accel_mps2"_a, "known"_a);
+  module.def("longest_gap_ns", &longest_gap_ns, "stamps_ns"_a, "start_ns"_a, "end_ns"_a);
+  module.def("is_steady", &is_steady, "gyro_radps"_a, "accel_mps2"_a, "limits"_a);
+  module.def("latest_steady", &latest_steady, "stamps_ns"_a, "gyro_radps"_a, "accel_mps2"_a, "first_ns"_a, "until_ns"_a, "window_ns"_a,
+             "limits"_a);
 }
 
 }  // namespace fleetmap

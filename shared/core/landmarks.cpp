@@ -1,4 +1,4 @@
-// Reduction of a finished survey: redundant keyframes, duplicate landmarks, landmarks chosen for robots.
+// Landmarks of a survey: matched features joined to tracks, redundant keyframes, duplicate landmarks, landmarks chosen for robots.
 #include "bindings/arrays.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
@@ -25,14 +25,44 @@ struct Lists {
   auto operator[](size_t n) const { return std::views::iota(starts[n], starts[n + 1]); }
 };
 
-template <typename Column>
-void check_indices(const Column& column, size_t size, const char* refusal) {
-  const auto is_inside = [&](auto index) { return index >= 0 && size_t(index) < size; };
-  if (!unlocked([&] { return std::all_of(column.begin(), column.end(), is_inside); })) throw nb::value_error(refusal);
+// The root of each of V nodes after joining first (L,) with second (L,) in their order; keyframes (V,): a link that would bring two nodes
+// of one keyframe into one group is left out. Sources: union-find, Tarjan 1975; tracks over unordered pairs, Moulon and Monasse 2012.
+std::vector<int32_t> joined(const Numbers& first, const Numbers& second, const Numbers& keyframes) {
+  const size_t nodes = keyframes.shape(0);
+  check_below(nodes, "first, second: numbers of nodes", first, second);
+  check_below(nodes, "keyframes: numbers below that of the nodes", keyframes);
+  // Groups are trees of parents, and lists of successors, which begin at the root.
+  std::vector<int32_t> parents(nodes), sizes(nodes, 1), following(nodes, -1), last(nodes), marks(nodes, -1);
+  std::iota(parents.begin(), parents.end(), 0);
+  std::iota(last.begin(), last.end(), 0);
+  const auto mark = [&](int32_t node) -> int32_t& { return marks[size_t(keyframes.begin()[node])]; };
+  const auto root = [&](int32_t node) {
+    while (parents[size_t(node)] != node) {
+      parents[size_t(node)] = parents[size_t(parents[size_t(node)])];
+      node = parents[size_t(node)];
+    }
+    return node;
+  };
+  for (int32_t link = 0; size_t(link) < first.size(); ++link) {
+    int32_t a = root(first.begin()[link]), b = root(second.begin()[link]);
+    if (a == b) continue;
+    if (sizes[size_t(a)] < sizes[size_t(b)]) std::swap(a, b);
+    for (int32_t node = a; node >= 0; node = following[size_t(node)]) mark(node) = link;
+    bool clashes = false;
+    for (int32_t node = b; node >= 0 && !clashes; node = following[size_t(node)]) clashes = mark(node) == link;
+    if (clashes) continue;
+    parents[size_t(b)] = a;
+    sizes[size_t(a)] += sizes[size_t(b)];
+    following[size_t(last[size_t(a)])] = b;
+    last[size_t(a)] = last[size_t(b)];
+  }
+  for (size_t node = 0; node < nodes; ++node) parents[node] = root(int32_t(node));
+  return parents;
 }
 
-void check_size(size_t size, size_t wanted, const char* refusal) {
-  if (size != wanted) throw nb::value_error(refusal);
+auto join_tracks(const Numbers& first, const Numbers& second, const Numbers& keyframes) {
+  check_rows(first.shape(0), "second: as many as first", second);
+  return as_numpy<int32_t>(unlocked([&] { return joined(first, second, keyframes); }));
 }
 
 // Marks keyframes that are spare, checked from the last to the second: a share of their tracks, and at least `least`, are seen equally
@@ -41,13 +71,9 @@ void check_size(size_t size, size_t wanted, const char* refusal) {
 auto spare_keyframes(const Indices& rows, const Indices& row_starts, const Indices& tracks, const Indices& starts, const Indices& keyframes,
                      const Array<int8_t, -1>& octaves, int64_t gap, int64_t visits, double share, int64_t least) {
   const size_t members = tracks.shape(0);
-  check_size(keyframes.shape(0), members, "keyframes: one for each member");
-  check_size(octaves.shape(0), members, "octaves: one for each member");
+  check_rows(members, "keyframes, octaves: one for each member", keyframes, octaves);
   const Lists by_keyframe(row_starts, rows.shape(0), "row_starts: rising, of rows");
   const Lists by_track(starts, members, "starts: rising, of members");
-  check_indices(rows, members, "rows: of members");
-  check_indices(tracks, by_track.count, "tracks: of starts");
-  check_indices(keyframes, by_keyframe.count, "keyframes: of row_starts");
   std::vector<uint8_t> spare(by_keyframe.count);
   const int64_t *const row_of = rows.data(), *const track_of = tracks.data(), *const keyframe_of = keyframes.data();
   const int8_t* const octave_of = octaves.data();
@@ -63,6 +89,9 @@ auto spare_keyframes(const Indices& rows, const Indices& row_starts, const Indic
     return found;
   };
   unlocked([&] {
+    check_below(members, "rows: of members", rows);
+    check_below(by_track.count, "tracks: of starts", tracks);
+    check_below(by_keyframe.count, "keyframes: of row_starts", keyframes);
     for (size_t k = by_keyframe.count; k-- > 1;) {
       int64_t repeated = 0;
       for (const int64_t at : by_keyframe[k]) repeated += other_visits(row_of[at]) >= visits;
@@ -77,11 +106,9 @@ auto spare_keyframes(const Indices& rows, const Indices& row_starts, const Indic
 auto duplicate_landmarks(const Array<int64_t, -1, 2>& near, const Points& points_map, const Reals& sigmas_m, const Indices& starts,
                          const Numbers& obs_keyframe, const Packed& packed, int most_bits) {
   const size_t count = points_map.shape(0);
-  check_size(sigmas_m.shape(0), count, "sigmas_m: one for each landmark");
-  check_size(packed.shape(0), count, "descriptors: one for each landmark");
+  check_rows(count, "sigmas_m, descriptors: one for each landmark", sigmas_m, packed);
+  check_rows(count + 1, "starts: one more than landmarks", starts);
   const Lists landmarks(starts, obs_keyframe.shape(0), "starts: rising, of obs_keyframe");
-  check_size(landmarks.count, count, "starts: one more than landmarks");
-  check_indices(near, count, "near: of landmarks");
   auto duplicate = zeros<uint8_t>(count);
   const Descriptors descriptors = packed;
   const double *const points = points_map.data(), *const sigmas = sigmas_m.data();
@@ -90,6 +117,7 @@ auto duplicate_landmarks(const Array<int64_t, -1, 2>& near, const Points& points
     return std::ranges::any_of(landmarks[a], [&](int64_t n) { return std::find(first, last, keyframe_of[n]) != last; });
   };
   unlocked([&, marks = duplicate.data(), first = near.begin(), last = near.end()] {
+    check_below(count, "near: of landmarks", near);
     for (const int64_t* pair = first; pair < last; pair += 2) {
       const size_t a = size_t(pair[0]), b = size_t(pair[1]);
       if (marks[a] || marks[b]) continue;
@@ -107,18 +135,17 @@ auto duplicate_landmarks(const Array<int64_t, -1, 2>& near, const Points& points
 auto redundant_keyframes(const Indices& order, const Indices& rows, const Indices& row_starts, const Numbers& obs_landmark,
                          const Numbers& obs_keyframe, const Indices& octaves, const Indices& starts, int observers, double share) {
   const size_t observed = obs_landmark.shape(0);
-  check_size(obs_keyframe.shape(0), observed, "obs_keyframe: one for each observation");
-  check_size(octaves.shape(0), observed, "octaves: one for each observation");
+  check_rows(observed, "obs_keyframe, octaves: one for each observation", obs_keyframe, octaves);
   const Lists keyframes(row_starts, rows.shape(0), "row_starts: rising, of rows");
   const Lists landmarks(starts, observed, "starts: rising, of observations");
-  check_indices(order, keyframes.count, "order: of keyframes");
-  check_indices(rows, observed, "rows: of observations");
-  check_indices(obs_landmark, landmarks.count, "obs_landmark: of starts");
-  check_indices(obs_keyframe, keyframes.count, "obs_keyframe: of row_starts");
   std::vector<uint8_t> gone(keyframes.count);
   const int32_t *const landmark_of = obs_landmark.data(), *const keyframe_of = obs_keyframe.data();
   const int64_t *const octave_of = octaves.data(), *const row_of = rows.data();
   unlocked([&] {
+    check_below(keyframes.count, "order: of keyframes", order);
+    check_below(observed, "rows: of observations", rows);
+    check_below(landmarks.count, "obs_landmark: of starts", obs_landmark);
+    check_below(keyframes.count, "obs_keyframe: of row_starts", obs_keyframe);
     for (const int64_t k : order) {
       int64_t repeated = 0;
       for (const int64_t at : keyframes[size_t(k)]) {
@@ -163,17 +190,12 @@ size_t choose_landmarks(const Indices& candidates, const Indices& starts, const 
                         const Counts& room, int64_t limit, const Counts& counts, const Flags& chosen, const Counts& needs,
                         int64_t bins_per_view) {
   const Lists landmarks(starts, bins.shape(0), "starts: rising, of bins");
-  check_size(weights.shape(0), landmarks.count, "weights: one for each landmark");
-  check_size(cells.shape(0), landmarks.count, "cells: one for each landmark");
-  check_size(chosen.shape(0), landmarks.count, "chosen: one for each landmark");
+  check_rows(landmarks.count, "weights, cells, chosen: one for each landmark", weights, cells, chosen);
   if (limit < 0 || bins_per_view < 1) throw nb::value_error("limit: not negative; bins_per_view: at least 1");
   constexpr int64_t kFarthest = int64_t(1) << 62;
   const auto is_far = [](int64_t number) { return number < -kFarthest || number > kFarthest; };
   for (const Counts* each : {&counts, &needs})
     if (unlocked([&] { return std::any_of(each->begin(), each->end(), is_far); })) throw nb::value_error("counts, needs: within 2^62");
-  check_indices(candidates, landmarks.count, "candidates: of landmarks");
-  check_indices(cells, room.shape(0), "cells: of room");
-  check_indices(bins, std::min(counts.shape(0), needs.shape(0) * size_t(bins_per_view)), "bins: of counts and needs");
   const int64_t* const bin_of = bins.data();
   int64_t *const count_of = counts.data(), *const need_of = needs.data();
   const auto gain = [&](int64_t n) {
@@ -184,6 +206,9 @@ size_t choose_landmarks(const Indices& candidates, const Indices& starts, const 
     return worth > 0.0 ? worth : 0.0;
   };
   return unlocked([&] {
+    check_below(landmarks.count, "candidates: of landmarks", candidates);
+    check_below(room.shape(0), "cells: of room", cells);
+    check_below(std::min(counts.shape(0), needs.shape(0) * size_t(bins_per_view)), "bins: of counts and needs", bins);
     using Bid = std::pair<double, int64_t>;  // less the gain, and the row: the least is the best
     std::vector<Bid> bids;
     bids.reserve(candidates.size());
@@ -218,7 +243,7 @@ size_t choose_landmarks(const Indices& candidates, const Indices& starts, const 
 // those; the others are compared with at most about `most` that stand equally high.
 auto twins(const Packed& packed, const Points& points_map, int reach, int most, int max_bits, double height_m, double own_m) {
   const size_t count = packed.shape(0);
-  check_size(points_map.shape(0), count, "points_map: one for each descriptor");
+  check_rows(count, "points_map: one for each descriptor", points_map);
   if (reach < 0 || most < 1) throw nb::value_error("reach: not negative; most: at least 1");
   auto repeated = zeros<uint8_t>(count);
   const Descriptors descriptors = packed;
@@ -253,18 +278,17 @@ auto twins(const Packed& packed, const Points& points_map, int reach, int most, 
 }  // namespace
 
 void bind_landmarks(nb::module_& module) {
-  const auto rows = "rows"_a, row_starts = "row_starts"_a, starts = "starts"_a, obs_keyframe = "obs_keyframe"_a, octaves = "octaves"_a;
-  const auto descriptors = "descriptors"_a, points_map = "points_map"_a, share = "share"_a;
-  module.def("spare_keyframes", &spare_keyframes, rows, row_starts, "tracks"_a, starts, "keyframes"_a, octaves, "gap"_a, "visits"_a, share,
-             "least"_a);
-  module.def("duplicate_landmarks", &duplicate_landmarks, "near"_a, points_map, "sigmas_m"_a, starts, obs_keyframe, descriptors,
-             "most_bits"_a);
-  module.def("redundant_keyframes", &redundant_keyframes, "order"_a, rows, row_starts, "obs_landmark"_a, obs_keyframe, octaves, starts,
-             "observers"_a, share);
-  module.def("medoids", &medoids, descriptors, starts);
-  module.def("choose_landmarks", &choose_landmarks, "candidates"_a, starts, "bins"_a, "weights"_a, "cells"_a, "room"_a, "limit"_a,
+  module.def("join_tracks", &join_tracks, "first"_a, "second"_a, "keyframes"_a);
+  module.def("spare_keyframes", &spare_keyframes, "rows"_a, "row_starts"_a, "tracks"_a, "starts"_a, "keyframes"_a, "octaves"_a, "gap"_a,
+             "visits"_a, "share"_a, "least"_a);
+  module.def("duplicate_landmarks", &duplicate_landmarks, "near"_a, "points_map"_a, "sigmas_m"_a, "starts"_a, "obs_keyframe"_a,
+             "descriptors"_a, "most_bits"_a);
+  module.def("redundant_keyframes", &redundant_keyframes, "order"_a, "rows"_a, "row_starts"_a, "obs_landmark"_a, "obs_keyframe"_a,
+             "octaves"_a, "starts"_a, "observers"_a, "share"_a);
+  module.def("medoids", &medoids, "descriptors"_a, "starts"_a);
+  module.def("choose_landmarks", &choose_landmarks, "candidates"_a, "starts"_a, "bins"_a, "weights"_a, "cells"_a, "room"_a, "limit"_a,
              "counts"_a, "chosen"_a, "needs"_a, "bins_per_view"_a);
-  module.def("twins", &twins, descriptors, points_map, "reach"_a, "most"_a, "max_bits"_a, "height_m"_a, "own_m"_a);
+  module.def("twins", &twins, "descriptors"_a, "points_map"_a, "reach"_a, "most"_a, "max_bits"_a, "height_m"_a, "own_m"_a);
 }
 
 }  // namespace fleetmap

@@ -4,8 +4,6 @@
 #include <algorithm>
 #include <numeric>
 
-#include "dispatch.h"
-
 namespace fleetmap {
 namespace {
 
@@ -157,21 +155,18 @@ Pairs mutual_pairs_within(Descriptors a, const int32_t* nodes_a, Descriptors b, 
 
 auto mutual_within(const Packed& a, const Array<int32_t, -1, 2>& nodes_a, const Packed& b, const Numbers& nodes_b, int max_distance,
                    double ratio) {
-  constexpr int32_t kMostNodes = 1 << 20;
+  constexpr size_t kMostNodes = 1 << 20;
   if (nodes_a.shape(0) != a.shape(0) || nodes_b.shape(0) != b.shape(0)) throw nb::value_error("a node for each descriptor is needed");
-  const auto is_node = [](int32_t node) { return node >= 0 && node < kMostNodes; };
-  if (!std::all_of(nodes_a.begin(), nodes_a.end(), is_node) || !std::all_of(nodes_b.begin(), nodes_b.end(), is_node))
-    throw nb::value_error("nodes are numbers from 0 to 2^20");
+  check_below(kMostNodes, "nodes are numbers from 0 to 2^20", nodes_a, nodes_b);
   return as_numpy<int64_t>(unlocked([&] { return mutual_pairs_within(a, nodes_a.data(), b, nodes_b.data(), max_distance, ratio); }));
 }
 
 }  // namespace
 
 void bind_matching(nb::module_& module) {
-  const auto a = "a"_a, b = "b"_a, max_distance = "max_distance"_a, ratio = "ratio"_a;
-  module.def("nearest_two", &nearest_two, a, b);
-  module.def("mutual", &mutual, a, b, max_distance, ratio);
-  module.def("mutual_within", &mutual_within, a, "nodes_a"_a, b, "nodes_b"_a, max_distance, ratio);
+  module.def("nearest_two", &nearest_two, "a"_a, "b"_a);
+  module.def("mutual", &mutual, "a"_a, "b"_a, "max_distance"_a, "ratio"_a);
+  module.def("mutual_within", &mutual_within, "a"_a, "nodes_a"_a, "b"_a, "nodes_b"_a, "max_distance"_a, "ratio"_a);
 }
 
 }  // namespace fleetmap

@@ -209,12 +209,11 @@ auto adjust_window(const Array<double, -1, 4, 4>& map_from_cam, size_t held, con
                    int iterations) {
   const size_t view_count = map_from_cam.shape(0), count = points.shape(0), seen = views.shape(0);
   if (view_count > 500) throw nb::value_error("map_from_cam: at most 500 views");
-  if (starts.shape(0) != count + 1) throw nb::value_error("starts: one more than points");
-  if (pixels.shape(0) != seen) throw nb::value_error("pixels: one for each of views");
+  check_rows(count + 1, "starts: one more than points", starts);
+  check_rows(seen, "pixels: one for each of views", pixels);
   if (starts(0) != 0 || starts(count) != int64_t(seen) || !std::is_sorted(starts.begin(), starts.end()))
     throw nb::value_error("starts: rows of views");
-  if (std::any_of(views.begin(), views.end(), [&](int64_t view) { return view < 0 || view >= int64_t(view_count); }))
-    throw nb::value_error("views: numbers of map_from_cam");
+  check_below(view_count, "views: numbers of map_from_cam", views);
   if (iterations < 0 || iterations > 1000) throw nb::value_error("iterations: 0 to 1000");
   MonoWindow window{{}, {}, {}, starts.data(), views.data(), pixels.data(), lens, sigma_px, huber_sigmas};
   for (size_t k = 0; k < view_count; ++k) {

@@ -1,5 +1,5 @@
 // Matching of two keyframes near a motion: prediction of one's features in the other, and the motion that fits them.
-#include "bindings/refinement.h"  // first: Python's header comes before the system's
+#include "bindings/arguments.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
@@ -33,9 +33,8 @@ struct KeyframeFeatures {
         disparities(std::get<3>(features).data()),
         points_cam(std::get<4>(features).data()),
         is_measured(std::get<5>(features)) {
-    if (std::get<0>(features).shape(0) != count() || std::get<1>(features).shape(0) != count() ||
-        std::get<3>(features).shape(0) != count() || std::get<4>(features).shape(0) != count())
-      throw nb::value_error("a, b: as many pixels, octaves, disparities and points as descriptors");
+    check_rows(count(), "a, b: as many pixels, octaves, disparities and points as descriptors", std::get<0>(features),
+               std::get<1>(features), std::get<3>(features), std::get<4>(features));
   }
   size_t count() const { return descriptors.count; }
 };
@@ -163,7 +162,7 @@ auto match_guided(const Features& a, const Features& b, const SE3& b_from_a, con
 // Share of a's points with a disparity in view of b, at a similar distance.
 double share_in_view(const SE3& b_from_a, const Points& points_a, const Places& disparities_a, const StereoLens& lens,
                      const Size& size_px) {
-  if (points_a.shape(0) != disparities_a.shape(0)) throw nb::value_error("disparities_a: one for each point");
+  check_rows(disparities_a.shape(0), "disparities_a: one for each point", points_a);
   return unlocked([&] {
     size_t known = 0, seen = 0;
     for (size_t n = 0; n < points_a.shape(0); ++n) {
@@ -180,10 +179,9 @@ double share_in_view(const SE3& b_from_a, const Points& points_a, const Places& 
 }  // namespace
 
 void bind_pair_matching(nb::module_& module) {
-  const auto b_from_a = "b_from_a"_a, lens = "lens"_a, size_px = "size_px"_a;
-  module.def("match_guided", &match_guided, "a"_a, "b"_a, b_from_a, lens, size_px, "sigma_px"_a, "refinement"_a, "max_distance"_a,
-             "radii_px"_a, "least_inliers"_a, "least_share"_a);
-  module.def("share_in_view", &share_in_view, b_from_a, "points_a"_a, "disparities_a"_a, lens, size_px);
+  module.def("match_guided", &match_guided, "a"_a, "b"_a, "b_from_a"_a, "lens"_a, "size_px"_a, "sigma_px"_a, "refinement"_a,
+             "max_distance"_a, "radii_px"_a, "least_inliers"_a, "least_share"_a);
+  module.def("share_in_view", &share_in_view, "b_from_a"_a, "points_a"_a, "disparities_a"_a, "lens"_a, "size_px"_a);
 }
 
 }  // namespace fleetmap

@@ -179,7 +179,7 @@ struct PatchFeatures {
 
   PatchFeatures(const Pyramid& images, const Places& places, const Octaves& of)
       : pyramid{std::get<0>(images), std::get<1>(images), std::get<2>(images)}, pixels(places.data()), octaves(of.data()) {
-    if (of.shape(0) != places.shape(0)) throw nb::value_error("octaves: one for each pixel");
+    check_rows(places.shape(0), "octaves: one for each pixel", of);
   }
 };
 
@@ -237,7 +237,7 @@ auto align_patches(const Pyramid& reference, const Places& reference_pixels, con
   const PatchLimits limits(half, max_shift_px, min_correlation);
   const PatchFeatures a(reference, reference_pixels, reference_octaves), b(current, pixels, octaves);
   const size_t count = pixels.shape(0);
-  if (reference_pixels.shape(0) != count || warps.shape(0) != count) throw nb::value_error("reference_pixels, warps: one for each pixel");
+  check_rows(count, "reference_pixels, warps: one for each pixel", reference_pixels, warps);
   Aligned found(count);
   unlocked([&] {
     const Warp* const warp_of = reinterpret_cast<const Warp*>(warps.data());
@@ -260,7 +260,7 @@ auto align_observations(const Features& reference, const Features& own, const Po
   const PatchFeatures a(pyramid_a, pixels_a, octaves_a), b(pyramid_b, pixels_b, octaves_b);
   const size_t count = chosen_b.shape(0);
   if (angles_a.shape(0) != pixels_a.shape(0) || angles_b.shape(0) != pixels_b.shape(0)) throw nb::value_error("angles: one for each pixel");
-  if (chosen_a.shape(0) != count || points_reference.shape(0) != count) throw nb::value_error("points_reference: one for each chosen");
+  check_rows(count, "points_reference: one for each chosen", chosen_a, points_reference);
   for (size_t n = 0; n < count; ++n)
     if (size_t(chosen_a(n)) >= pixels_a.shape(0) || size_t(chosen_b(n)) >= pixels_b.shape(0))
       throw nb::value_error("chosen: indices of pixels");
@@ -292,11 +292,10 @@ auto warps_from_motion(const Points& points_reference, const SE3& current_from_r
 }  // namespace
 
 void bind_patch_align(nb::module_& module) {
-  const auto reference = "reference"_a, half = "half"_a, max_shift_px = "max_shift_px"_a, min_correlation = "min_correlation"_a;
-  module.def("align_patches", &align_patches, reference, "reference_pixels"_a, "reference_octaves"_a, "current"_a, "pixels"_a, "octaves"_a,
-             "warps"_a, half, max_shift_px, min_correlation);
-  module.def("align_observations", &align_observations, reference, "own"_a, "points_reference"_a, "own_from_reference"_a, half,
-             max_shift_px, min_correlation);
+  module.def("align_patches", &align_patches, "reference"_a, "reference_pixels"_a, "reference_octaves"_a, "current"_a, "pixels"_a,
+             "octaves"_a, "warps"_a, "half"_a, "max_shift_px"_a, "min_correlation"_a);
+  module.def("align_observations", &align_observations, "reference"_a, "own"_a, "points_reference"_a, "own_from_reference"_a, "half"_a,
+             "max_shift_px"_a, "min_correlation"_a);
   module.def("warps_from_motion", &warps_from_motion, "points_reference"_a, "current_from_reference"_a);
 }
 

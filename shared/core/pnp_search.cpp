@@ -1,4 +1,4 @@
-#include "bindings/refinement.h"  // first: Python's header comes before the system's
+#include "bindings/arguments.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
@@ -230,8 +230,7 @@ std::optional<Resection> with_rotation(const Sightings& seen, const StereoLens& 
 }
 
 Sightings sightings_of(const Points& points, const Points& pixels, const Places& weights) {
-  if (pixels.shape(0) != points.shape(0) || weights.shape(0) != points.shape(0))
-    throw nb::value_error("pixels and weights: one row for each point");
+  check_rows(points.shape(0), "pixels and weights: one row for each point", pixels, weights);
   return {points.data(), pixels.data(), weights.data(), points.shape(0)};
 }
 
@@ -273,12 +272,11 @@ Result pnp_with_rotation_of(const Points& points, const Points& pixels, const Pl
 }  // namespace
 
 void bind_pnp(nb::module_& module) {
-  const auto points = "points"_a, pixels = "pixels"_a, weights = "weights"_a, lens = "lens"_a, refinement = "refinement"_a,
-             threshold_px = "threshold_px"_a, min_inliers = "min_inliers"_a;
-  module.def("refine_pnp", &refine_pnp_of, points, pixels, weights, lens, refinement, "cam_from_source"_a, "prior"_a);
-  module.def("ransac_pnp", &ransac_pnp_of, points, pixels, weights, lens, refinement, threshold_px, min_inliers, "draws"_a, "confidence"_a);
-  module.def("pnp_with_rotation", &pnp_with_rotation_of, points, pixels, weights, lens, refinement, threshold_px, min_inliers, "rotation"_a,
-             "rotation_sigma_rad"_a);
+  module.def("refine_pnp", &refine_pnp_of, "points"_a, "pixels"_a, "weights"_a, "lens"_a, "refinement"_a, "cam_from_source"_a, "prior"_a);
+  module.def("ransac_pnp", &ransac_pnp_of, "points"_a, "pixels"_a, "weights"_a, "lens"_a, "refinement"_a, "threshold_px"_a, "min_inliers"_a,
+             "draws"_a, "confidence"_a);
+  module.def("pnp_with_rotation", &pnp_with_rotation_of, "points"_a, "pixels"_a, "weights"_a, "lens"_a, "refinement"_a, "threshold_px"_a,
+             "min_inliers"_a, "rotation"_a, "rotation_sigma_rad"_a);
 }
 
 }  // namespace fleetmap

@@ -1,4 +1,4 @@
-#include "bindings/imu_samples.h"  // first: Python's header comes before the system's
+#include "bindings/arguments.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
@@ -254,10 +254,9 @@ auto preintegrate(const Indices& stamps_ns, const Points& gyro_radps, const Poin
 }  // namespace
 
 void bind_preintegration(nb::module_& module) {
-  const auto stamps_ns = "stamps_ns"_a, gyro_radps = "gyro_radps"_a, accel_mps2 = "accel_mps2"_a, start_ns = "start_ns"_a,
-             end_ns = "end_ns"_a;
-  module.def("imu_intervals", &imu_intervals_of, stamps_ns, gyro_radps, accel_mps2, start_ns, end_ns);
-  module.def("preintegrate", &preintegrate, stamps_ns, gyro_radps, accel_mps2, start_ns, end_ns, "gyro_bias"_a, "accel_bias"_a, "noise"_a);
+  module.def("imu_intervals", &imu_intervals_of, "stamps_ns"_a, "gyro_radps"_a, "accel_mps2"_a, "start_ns"_a, "end_ns"_a);
+  module.def("preintegrate", &preintegrate, "stamps_ns"_a, "gyro_radps"_a, "accel_mps2"_a, "start_ns"_a, "end_ns"_a, "gyro_bias"_a,
+             "accel_bias"_a, "noise"_a);
 }
 
 }  // namespace fleetmap

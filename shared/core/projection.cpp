@@ -122,10 +122,8 @@ void match_projected(const Projections& a, const SeenFeatures& b, int max_distan
 static auto match_projected_of(const Places& predicted, const Reals& radius_px, const Packed& a, const Array<int64_t, -1, 2>& octave_range,
                                const Places& pixels, const Array<int8_t, -1>& octaves, const Packed& b, int max_distance, double ratio) {
   const size_t count = a.shape(0);
-  if (predicted.shape(0) != count || radius_px.shape(0) != count || octave_range.shape(0) != count)
-    throw nb::value_error("predicted, radius_px, octave_range: one for each descriptor of a");
-  if (pixels.shape(0) != b.shape(0) || octaves.shape(0) != b.shape(0))
-    throw nb::value_error("pixels, octaves: one for each descriptor of b");
+  check_rows(count, "predicted, radius_px, octave_range: one for each descriptor of a", predicted, radius_px, octave_range);
+  check_rows(b.shape(0), "pixels, octaves: one for each descriptor of b", pixels, octaves);
   auto index = zeros<int64_t>(count);
   auto distances = zeros<int32_t>(count);
   unlocked([&] {

@@ -141,7 +141,7 @@ Hit BoxGrid::cast(Vec3 origin, Vec3 direction, double farthest, bool is_any_enou
 // Parameters of the nearest hits of rays, and their boxes and sides.
 auto cast(const BoxGrid& grid, const Vec3& origin, const Points& directions, const Reals& farthest) {
   const size_t count = directions.shape(0);
-  if (farthest.shape(0) != count) throw nb::value_error("farthest: one for each of directions");
+  check_rows(count, "farthest: one for each of directions", farthest);
   auto at = zeros<double>(count);
   auto hits = zeros<std::array<int64_t, 2>>(count);
   unlocked([&] {
@@ -161,7 +161,7 @@ void bake(const BoxGrid& grid, const Array<double, -1, 9>& quads, const Array<in
           int64_t owner_shift, const Array<double, -1, 5>& lamps, double reach_m, bool has_shadows,
           const MutableArray<float, -1, -1>& light) {
   const size_t count = quads.shape(0), samples = light.shape(1);
-  if (numbers.shape(0) != count || owners.shape(0) != count) throw nb::value_error("numbers, owners: one for each of quads");
+  check_rows(count, "numbers, owners: one for each of quads", numbers, owners);
   if (std::abs(double(owner_shift)) > double(1u << 31)) throw nb::value_error("owner_shift: within 2^31");
   const nb::gil_scoped_release others_run;
   for (size_t f = 0; f < count; ++f) {

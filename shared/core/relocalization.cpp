@@ -6,7 +6,6 @@
 #include <numbers>
 
 #include "dense.h"
-#include "dispatch.h"
 
 namespace fleetmap {
 namespace {

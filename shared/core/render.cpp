@@ -106,7 +106,7 @@ Surfaces surfaces_of(const Lit& lit, const Chunks& chunks, int64_t textures) {
   const auto& [ranges, bounds] = chunks;
   const size_t count = quads.shape(0);
   const int64_t samples = int64_t(light.shape(0));
-  if (values.shape(0) != count || numbers.shape(0) != count) throw nb::value_error("faces: columns of one length");
+  check_rows(count, "faces: columns of one length", values, numbers);
   for (size_t f = 0; f < count; ++f) {
     if (numbers(f, 2) < 0 || size_t(numbers(f, 2)) >= groups.shape(0)) throw nb::value_error("faces: lamp groups that have a strength");
     if (numbers(f, 0) == kLamp) continue;
@@ -115,7 +115,7 @@ Surfaces surfaces_of(const Lit& lit, const Chunks& chunks, int64_t textures) {
     if (first < 0 || columns < 2 || rows < 2 || first + columns * rows > samples)
       throw nb::value_error("faces: 2 x 2 light samples or more");
   }
-  if (bounds.shape(0) != ranges.shape(0)) throw nb::value_error("chunks: a range and bounds of each");
+  check_rows(ranges.shape(0), "chunks: a range and bounds of each", bounds);
   for (size_t c = 0; c < ranges.shape(0); ++c)
     if (ranges(c, 0) < 0 || ranges(c, 1) > int64_t(count)) throw nb::value_error("chunks: ranges of faces");
   return {quads.data(), values.data(), numbers.data(), light.data(), groups.data(), ranges.data(), bounds.data(), ranges.shape(0)};

@@ -1,4 +1,4 @@
-#include "bindings/images.h"  // first: Python's header comes before the system's
+#include "bindings/arguments.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
 #include <cmath>
@@ -240,7 +240,7 @@ auto match_rows(const Image& left, const Image& right, const Image& left_half, c
                 const Reals& prior_px, double max_disparity_px, double min_correlation, double uniqueness, int wide_half, int narrow_half,
                 double agreement_px) {
   if (!same_size(left, right) || !same_size(left_half, right_half)) throw nb::value_error("right: of the left image's size");
-  if (prior_px.shape(0) != pixels.shape(0)) throw nb::value_error("prior_px: one for each pixel");
+  check_rows(pixels.shape(0), "prior_px: one for each pixel", prior_px);
   const size_t count = pixels.shape(0);
   std::vector<double> found(2 * count);
   const StereoLimits limits = checked({max_disparity_px, min_correlation, uniqueness, wide_half, narrow_half, agreement_px});
@@ -260,10 +260,9 @@ auto match_depth_of(const Array<float, -1, -1>& disparity_px, const Places& pixe
 }  // namespace
 
 void bind_stereo(nb::module_& module) {
-  const auto pixels = "pixels"_a;
-  module.def("match_rows", &match_rows, "left"_a, "right"_a, "left_half"_a, "right_half"_a, pixels, "prior_px"_a, "max_disparity_px"_a,
+  module.def("match_rows", &match_rows, "left"_a, "right"_a, "left_half"_a, "right_half"_a, "pixels"_a, "prior_px"_a, "max_disparity_px"_a,
              "min_correlation"_a, "uniqueness"_a, "wide_half"_a, "narrow_half"_a, "agreement_px"_a);
-  module.def("match_depth", &match_depth_of, "disparity_px"_a, pixels, "sigma_px"_a);
+  module.def("match_depth", &match_depth_of, "disparity_px"_a, "pixels"_a, "sigma_px"_a);
 }
 
 }  // namespace fleetmap

@@ -110,9 +110,8 @@ int64_t voxel_key(double x, double y, double z, int level) {
 }
 
 void check_levels(const Levels& levels, size_t count) {
-  if (levels.shape(0) != count) throw nb::value_error("levels: one for each point");
-  if (unlocked([&] { return std::any_of(levels.begin(), levels.end(), [](uint8_t level) { return level >= kLevels; }); }))
-    throw nb::value_error("levels: numbers from 0 to 4");
+  check_rows(count, "levels: one for each point", levels);
+  unlocked([&] { check_below(kLevels, "levels: numbers from 0 to 4", levels); });
 }
 
 auto voxel_keys(const FloatPoints& points_map, const Levels& levels) {
@@ -323,7 +322,7 @@ void weigh(const FloatPoints& points_map, const Levels& levels, const Image32& n
            double log_exposure, const MutableArray<double, -1, 4>& sums) {
   const size_t count = points_map.shape(0);
   check_levels(levels, count);
-  if (sums.shape(0) != count) throw nb::value_error("sums: a row for each point");
+  check_rows(count, "sums: a row for each point", sums);
   const DepthPicture view = depth_picture(nearest_px, step_px, sigma_px, lens, clear_sigmas, clear_m);
   if (picture.shape(0) < 2 || picture.shape(1) < 2) return;
   const nb::gil_scoped_release others_run;
@@ -353,7 +352,7 @@ auto discs_before(const FloatPoints& points_map, const FloatPoints& normals_map,
                   const Array<double, 4>& pinhole, int width, int height) {
   constexpr double kRim = 0.1;  // of the width: discs whose centre is so far outside may reach in
   const size_t count = points_map.shape(0);
-  if (normals_map.shape(0) != count) throw nb::value_error("normals_map: one for each point");
+  check_rows(count, "normals_map: one for each point", normals_map);
   std::vector<int32_t> numbers;
   std::vector<Vec3> points_cam;
   std::vector<std::array<double, 2>> pixels;
@@ -489,12 +488,10 @@ auto draw_discs(const Numbers& numbers, const Points& points_cam, const Places& 
                 const FloatPoints& normals_map, const Levels& levels, const Levels& colours, double far_m, double radius_edges,
                 const Array<double, -1, -1, 3>& rays, const Image32& pixels_per_rad) {
   const size_t count = numbers.shape(0), surfels = normals_map.shape(0), rows = rays.shape(0), columns = rays.shape(1);
-  if (points_cam.shape(0) != count || pixels.shape(0) != count) throw nb::value_error("points_cam, pixels: one for each of numbers");
+  check_rows(count, "points_cam, pixels: one for each of numbers", points_cam, pixels);
   check_levels(levels, surfels);
-  if (colours.shape(0) != surfels) throw nb::value_error("colours: one for each normal");
-  const auto is_other = [&](int32_t n) { return n < 0 || size_t(n) >= surfels; };
-  if (unlocked([&] { return std::any_of(numbers.begin(), numbers.end(), is_other); }))
-    throw nb::value_error("numbers: of normals_map's rows");
+  check_rows(surfels, "colours: one for each normal", colours);
+  unlocked([&] { check_below(surfels, "numbers: of normals_map's rows", numbers); });
   if (pixels_per_rad.shape(0) != rows || pixels_per_rad.shape(1) != columns) throw nb::value_error("pixels_per_rad: one for each ray");
   auto weight = zeros<float>(rows * columns), colour = zeros<float>(rows * columns), depth = zeros<float>(rows * columns);
   const DiscImage image{ptrdiff_t(rows), ptrdiff_t(columns), weight.data(), colour.data(), depth.data()};
@@ -522,8 +519,7 @@ struct Gaussians {
         peaks(peaks.data()),
         greys(greys.data()),
         count(pixels.shape(0)) {
-    if (conics.shape(0) != count || reaches_px.shape(0) != count || peaks.shape(0) != count || greys.shape(0) != count)
-      throw nb::value_error("conics, reaches_px, peaks, greys: one for each of pixels");
+    check_rows(count, "conics, reaches_px, peaks, greys: one for each of pixels", conics, reaches_px, peaks, greys);
   }
 };
 
@@ -579,7 +575,7 @@ auto blend(const Places& pixels, const Points& conics, const Places& reaches_px,
 auto blend_backward(const Places& pixels, const Points& conics, const Places& reaches_px, const Reals& peaks, const Reals& greys,
                     const Reals& opacities, double blur_px2, const Image64& slopes, const Image64& whole) {
   const Gaussians gaussians(pixels, conics, reaches_px, peaks, greys);
-  if (opacities.shape(0) != gaussians.count) throw nb::value_error("opacities: one for each of pixels");
+  check_rows(gaussians.count, "opacities: one for each of pixels", opacities);
   if (slopes.shape(0) != whole.shape(0) || slopes.shape(1) != whole.shape(1)) throw nb::value_error("slopes: of the picture's size");
   auto gradients = zeros<std::array<double, 3>>(gaussians.count);
   unlocked([&] {
@@ -612,25 +608,23 @@ void bind_surfels(nb::module_& module) {
   module.attr("SURFEL_LEVELS") = kLevels;
   module.attr("SPLAT_LEAST_ALPHA") = kLeastAlpha;
   module.attr("SURFEL_RANGE_M") = std::tuple(kMinRangeM, kMaxRangeM);
-  const auto points_map = "points_map"_a, normals_map = "normals_map"_a, levels = "levels"_a, nearest_px = "nearest_px"_a,
-             step_px = "step_px"_a, sigma_px = "sigma_px"_a, lens = "lens"_a, cam_from_map = "cam_from_map"_a,
-             clear_sigmas = "clear_sigmas"_a, clear_m = "clear_m"_a, far_m = "far_m"_a, pixels = "pixels"_a, conics = "conics"_a,
-             reaches_px = "reaches_px"_a, peaks = "peaks"_a, greys = "greys"_a;
   module.def("surfel_stride_px", &stride_px, "focal_px"_a);
-  module.def("voxel_keys", &voxel_keys, points_map, levels);
+  module.def("voxel_keys", &voxel_keys, "points_map"_a, "levels"_a);
   nb::class_<Shared<VoxelTable>>(module, "VoxelTable")
       .def(nb::init<>())
-      .def("add", in_turn<PythonLock::kReleased>(&VoxelTable::add), "disparity_px"_a, sigma_px, lens, "map_from_cam"_a, "box_map"_a)
+      .def("add", in_turn<PythonLock::kReleased>(&VoxelTable::add), "disparity_px"_a, "sigma_px"_a, "lens"_a, "map_from_cam"_a, "box_map"_a)
       .def("surfels", in_turn(&surfels_of));
-  module.def("look_at", &look_at, points_map, levels, nearest_px, step_px, sigma_px, lens, cam_from_map, clear_sigmas, clear_m);
-  module.def("weigh", &weigh, points_map, levels, nearest_px, step_px, sigma_px, lens, cam_from_map, clear_sigmas, clear_m, "picture"_a,
-             "falloff"_a, "log_exposure"_a, "sums"_a);
-  module.def("discs_before", &discs_before, points_map, normals_map, cam_from_map, "cosine"_a, far_m, "pinhole"_a, "width"_a, "height"_a);
-  module.def("draw_discs", &draw_discs, "numbers"_a, "points_cam"_a, pixels, cam_from_map, normals_map, levels, "colours"_a, far_m,
-             "radius_edges"_a, "rays"_a, "pixels_per_rad"_a);
-  module.def("blend", &blend, pixels, conics, reaches_px, peaks, greys, "width"_a, "height"_a);
-  module.def("blend_backward", &blend_backward, pixels, conics, reaches_px, peaks, greys, "opacities"_a, "blur_px2"_a, "slopes"_a,
-             "whole"_a);
+  module.def("look_at", &look_at, "points_map"_a, "levels"_a, "nearest_px"_a, "step_px"_a, "sigma_px"_a, "lens"_a, "cam_from_map"_a,
+             "clear_sigmas"_a, "clear_m"_a);
+  module.def("weigh", &weigh, "points_map"_a, "levels"_a, "nearest_px"_a, "step_px"_a, "sigma_px"_a, "lens"_a, "cam_from_map"_a,
+             "clear_sigmas"_a, "clear_m"_a, "picture"_a, "falloff"_a, "log_exposure"_a, "sums"_a);
+  module.def("discs_before", &discs_before, "points_map"_a, "normals_map"_a, "cam_from_map"_a, "cosine"_a, "far_m"_a, "pinhole"_a,
+             "width"_a, "height"_a);
+  module.def("draw_discs", &draw_discs, "numbers"_a, "points_cam"_a, "pixels"_a, "cam_from_map"_a, "normals_map"_a, "levels"_a, "colours"_a,
+             "far_m"_a, "radius_edges"_a, "rays"_a, "pixels_per_rad"_a);
+  module.def("blend", &blend, "pixels"_a, "conics"_a, "reaches_px"_a, "peaks"_a, "greys"_a, "width"_a, "height"_a);
+  module.def("blend_backward", &blend_backward, "pixels"_a, "conics"_a, "reaches_px"_a, "peaks"_a, "greys"_a, "opacities"_a, "blur_px2"_a,
+             "slopes"_a, "whole"_a);
 }
 
 }  // namespace fleetmap

@@ -94,9 +94,8 @@ class InvertedFile {
 
  private:
   void check(const Numbers& word_ids, const Weights& weights) const {
-    if (weights.shape(0) != word_ids.shape(0)) throw nb::value_error("weights: one for each word");
-    for (const int32_t word : word_ids)
-      if (word < 0 || size_t(word) >= postings_.size()) throw nb::value_error("word_ids: of the vocabulary");
+    check_rows(word_ids.shape(0), "weights: one for each word", weights);
+    check_below(postings_.size(), "word_ids: of the vocabulary", word_ids);
   }
 
   struct Posting {
@@ -112,16 +111,15 @@ using SharedFile = Shared<InvertedFile>;
 }  // namespace
 
 void bind_vocabulary(nb::module_& module) {
-  const auto descriptors = "descriptors"_a, centres = "centres"_a, word_ids = "word_ids"_a, weights = "weights"_a;
-  module.def("descend", &descend, descriptors, centres, "first_child"_a, "child_count"_a, "word_of_node"_a);
-  module.def("two_nearest", &two_nearest, descriptors, centres);
+  module.def("descend", &descend, "descriptors"_a, "centres"_a, "first_child"_a, "child_count"_a, "word_of_node"_a);
+  module.def("two_nearest", &two_nearest, "descriptors"_a, "centres"_a);
   nb::class_<SharedFile>(module, "InvertedFile")
       .def(nb::init<int>(), "words"_a)
-      .def("add", in_turn<PythonLock::kReleased>(&InvertedFile::add), word_ids, weights)
+      .def("add", in_turn<PythonLock::kReleased>(&InvertedFile::add), "word_ids"_a, "weights"_a)
       .def("scores", in_turn(+[](SharedFile& index, const Numbers& words, const Weights& of_words) {
              return as_numpy<double>(unlocked([&] { return index.scores(words, of_words); }));
            }),
-           word_ids, weights);
+           "word_ids"_a, "weights"_a);
 }
 
 }  // namespace fleetmap

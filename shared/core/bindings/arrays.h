@@ -6,6 +6,7 @@
 #include <nanobind/stl/optional.h>
 #include <nanobind/stl/tuple.h>
 
+#include <algorithm>
 #include <array>
 #include <initializer_list>
 #include <type_traits>
@@ -126,6 +127,19 @@ auto unlocked(Compute&& compute) {
   nb::gil_scoped_release release;
   const fleetmap::CountedStep counted;
   return compute();
+}
+
+// Refuses columns that have not so many rows.
+template <typename... Columns>
+void check_rows(size_t count, const char* refusal, const Columns&... columns) {
+  if (((columns.shape(0) != count) || ...)) throw nb::value_error(refusal);
+}
+
+// Refuses columns with numbers that are not from 0 to below a count.
+template <typename... Columns>
+void check_below(size_t count, const char* refusal, const Columns&... columns) {
+  const auto is_below = [&](auto number) { return number >= 0 && size_t(number) < count; };
+  if (!(std::all_of(columns.begin(), columns.end(), is_below) && ...)) throw nb::value_error(refusal);
 }
 
 // So many zeros: those of pictures and maps are handed out page by page.

@@ -3,7 +3,6 @@
 #include <cmath>
 
 #include "bundle.h"
-#include "lapack.h"
 
 namespace fleetmap {
 namespace {
@@ -15,11 +14,6 @@ using Ends = Array<int64_t, -1, 2>;
 
 void check(bool holds, const char* message) {
   if (!holds) throw nb::value_error(message);
-}
-
-template <typename Column>
-void check_below(const Column& indices, size_t count, const char* message) {
-  for (const auto index : indices) check(index >= 0 && size_t(index) < count, message);
 }
 
 std::vector<double> numbers(const double* from, size_t count) { return {from, from + count}; }
@@ -100,28 +94,26 @@ void make(BundleSolver* self, const StereoLens& lens, const Poses& body_from_cam
   const bool inertial = free.shape(1) == 15;
   const size_t motion_size = inertial ? 9 : 0;
   check(inertial || free.shape(1) == 6, "free: 6 or 15 unknowns of each keyframe");
-  check(free.shape(0) == keyframes, "free: a row for each keyframe");
+  check_rows(keyframes, "free: a row for each keyframe", free);
   for (const auto* each : {&motions, &motion_mean, &motion_weight})
     check(each->shape(0) == keyframes && each->shape(1) == motion_size,
           "motions, motion_mean, motion_weight: 9 or no columns as free says");
   check(cameras > 0, "body_from_cams: at least one camera");
   check(keyframes * std::max<size_t>(15, cameras) < kMost && landmarks < kMost && observations < kMost,
         "points_map, obs_keyframe: fewer than 2^31");
-  for (const size_t count : {obs_camera.shape(0), obs_landmark.shape(0), obs_pixels.shape(0), obs_sigma_px.shape(0)})
-    check(count == observations, "obs_camera, obs_landmark, obs_pixels, obs_sigma_px: one for each of obs_keyframe");
-  check(i_from_j.shape(0) == relative_ends.shape(0) && relative_information.shape(0) == relative_ends.shape(0),
-        "i_from_j, relative_information: one for each of relative_ends");
-  check(prior_map_from_body.shape(0) == prior_keyframe.shape(0) && prior_information.shape(0) == prior_keyframe.shape(0),
-        "prior_map_from_body, prior_information: one for each of prior_keyframe");
-  check(increments.shape(0) == edge_ends.shape(0) && edge_information.shape(0) == edge_ends.shape(0),
-        "increments, edge_information: one for each of edge_ends");
+  check_rows(observations, "obs_camera, obs_landmark, obs_pixels, obs_sigma_px: one for each of obs_keyframe", obs_camera, obs_landmark,
+             obs_pixels, obs_sigma_px);
+  check_rows(relative_ends.shape(0), "i_from_j, relative_information: one for each of relative_ends", i_from_j, relative_information);
+  check_rows(prior_keyframe.shape(0), "prior_map_from_body, prior_information: one for each of prior_keyframe", prior_map_from_body,
+             prior_information);
+  check_rows(edge_ends.shape(0), "increments, edge_information: one for each of edge_ends", increments, edge_information);
   check(inertial || edge_ends.size() == 0, "edge_ends: of keyframes with motion");
-  check_below(obs_keyframe, keyframes, "obs_keyframe: keyframes");
-  check_below(obs_camera, cameras, "obs_camera: cameras");
-  check_below(obs_landmark, landmarks, "obs_landmark: landmarks");
-  check_below(relative_ends, keyframes, "relative_ends: keyframes");
-  check_below(prior_keyframe, keyframes, "prior_keyframe: keyframes");
-  check_below(edge_ends, keyframes, "edge_ends: keyframes");
+  check_below(keyframes, "obs_keyframe: keyframes", obs_keyframe);
+  check_below(cameras, "obs_camera: cameras", obs_camera);
+  check_below(landmarks, "obs_landmark: landmarks", obs_landmark);
+  check_below(keyframes, "relative_ends: keyframes", relative_ends);
+  check_below(keyframes, "prior_keyframe: keyframes", prior_keyframe);
+  check_below(keyframes, "edge_ends: keyframes", edge_ends);
 
   BundleProblem problem = {};
   problem.lens = lens;
@@ -212,7 +204,6 @@ auto inertial_residual(const Array<double, 2, 4, 4>& map_from_body, const Array<
 }  // namespace
 
 void bind_bundle(nb::module_& module) {
-  const auto damping = "damping"_a;
   nb::class_<BundleSolver>(module, "BundleSolver")
       .def("__init__", &make, "lens"_a, "body_from_cams"_a, "map_from_body"_a, "motions"_a, "points_map"_a, "free"_a, "points_held"_a,
            "obs_keyframe"_a, "obs_camera"_a, "obs_landmark"_a, "obs_pixels"_a, "obs_sigma_px"_a, "relative_ends"_a, "i_from_j"_a,
@@ -223,8 +214,8 @@ void bind_bundle(nb::module_& module) {
       .def("factorise_sparsely", &factorise_sparsely, "order"_a)
       .def("cost", [](BundleSolver& solver) { return unlocked([&] { return solver.cost(); }); })
       .def("optimize", &optimize, "lambda_start"_a, "max_iterations"_a, "relative_cost_tolerance"_a)
-      .def("reduced", &reduced, damping)
-      .def("step", &step_of, damping)
+      .def("reduced", &reduced, "damping"_a)
+      .def("step", &step_of, "damping"_a)
       .def("log_determinant", [](BundleSolver& solver) { return unlocked([&] { return solver.log_determinant(); }); })
       .def("map_from_body", [](const BundleSolver& solver) { return poses_of(solver.state()); })
       .def("motions", [](const BundleSolver& solver) { return motions_of(solver.state()); })

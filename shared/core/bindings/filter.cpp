@@ -1,4 +1,4 @@
-#include "imu_samples.h"  // first: Python's header comes before the system's
+#include "arguments.h"  // first: Python's header comes before the system's
 
 #include <nanobind/stl/vector.h>
 
@@ -109,14 +109,14 @@ void observe(SharedFilter& filter, int64_t frame_index, int64_t camera, const In
   if (size_t(camera) >= cameras)
     throw nb::value_error(
         ("camera: " + std::to_string(camera) + ", but the rig has " + std::to_string(cameras) + ", counted from 0").c_str());
-  if (ids.shape(0) != pixels.shape(0)) throw nb::value_error("pixels: one for each id");
+  check_rows(pixels.shape(0), "pixels: one for each id", ids);
   const CountedStep counted;
   filter.observe(frame_index, size_t(camera), ids.data(), pixels.data(), ids.shape(0));
 }
 
 auto update(SharedFilter& filter, const Indices& alive, const Array<bool, -1>& due, double first_depth_m, int iterations,
             const std::optional<SE3>& newest_odom_from_body, double sigma_scale) {
-  if (due.shape(0) != alive.shape(0)) throw nb::value_error("due: one for each alive");
+  check_rows(alive.shape(0), "due: one for each alive", due);
   if (iterations < 1 || iterations > 1000) throw nb::value_error("iterations: 1 to 1000");
   const LivingPoints living{alive.data(), due.data(), alive.shape(0)};
   const std::vector<int8_t>* const used =
@@ -156,8 +156,8 @@ struct Track {
   std::vector<Sighting> sightings;
 
   Track(const Transforms& odom_from_cam, const Lenses& lenses, const Indices& views, const Points& pixels) {
-    if (lenses.shape(0) != odom_from_cam.shape(0)) throw nb::value_error("lenses: one for each of odom_from_cam");
-    if (pixels.shape(0) != views.shape(0)) throw nb::value_error("pixels: one for each of views");
+    check_rows(odom_from_cam.shape(0), "lenses: one for each of odom_from_cam", lenses);
+    check_rows(views.shape(0), "pixels: one for each of views", pixels);
     cameras = cameras_of<PlacedCamera>(lenses, odom_from_cam);
     for (size_t n = 0; n < views.shape(0); ++n) {
       if (size_t(views(n)) >= cameras.size()) throw nb::value_error("views: numbers of cameras");
@@ -198,42 +198,41 @@ auto compose_pose(const SE3& map_from_body, const Covariance& covariance, const 
 }  // namespace
 
 void bind_filter(nb::module_& module) {
-  const auto clone_id = "clone_id"_a, gate = "gate"_a, sigma_mps = "sigma_mps"_a, pixels = "pixels"_a, lenses = "lenses"_a,
-             body_from_next = "body_from_next"_a, odom_from_cam = "odom_from_cam"_a, views = "views"_a, pixel_weight = "pixel_weight"_a,
-             disparity_weight = "disparity_weight"_a;
   constexpr PythonLock kReleased = PythonLock::kReleased;
   nb::class_<SharedFilter>(module, "Filter")
       .def("__init__", &make, "rotation"_a, "velocity"_a, "position"_a, "gyro_bias"_a, "accel_bias"_a, "nav_covariance"_a,
-           "nav_true_error"_a, lenses, "body_from_cams"_a, "settings"_a, "gate_quantile"_a, "gravity_mps2"_a)
+           "nav_true_error"_a, "lenses"_a, "body_from_cams"_a, "settings"_a, "gate_quantile"_a, "gravity_mps2"_a)
       .def("predict_inertial", in_turn(&predict_inertial), "stamps_ns"_a, "gyro_radps"_a, "accel_mps2"_a, "start_ns"_a, "end_ns"_a,
            "noise"_a, "true_noise"_a)
-      .def("predict_random_walk", in_turn(&predict_random_walk), body_from_next, "rotation_sigma_rad"_a, "translation_sigma_m"_a,
+      .def("predict_random_walk", in_turn(&predict_random_walk), "body_from_next"_a, "rotation_sigma_rad"_a, "translation_sigma_m"_a,
            "duration_s"_a = 0.0, "measured_cov"_a = nb::none())
-      .def("add_clone", in_turn(&add_clone), clone_id, "rate_body_radps"_a)
-      .def("remove_clone", in_turn(&remove_clone), clone_id)
-      .def("return_to_clone", in_turn(+[](SharedFilter& filter, int64_t id) { filter.return_to_clone(index_of(filter, id)); }), clone_id)
+      .def("add_clone", in_turn(&add_clone), "clone_id"_a, "rate_body_radps"_a)
+      .def("remove_clone", in_turn(&remove_clone), "clone_id"_a)
+      .def("return_to_clone", in_turn(+[](SharedFilter& filter, int64_t id) { filter.return_to_clone(index_of(filter, id)); }),
+           "clone_id"_a)
       .def("begin_frame_anew", in_turn(&begin_frame_anew))
-      .def("observe", in_turn(&observe), "frame_index"_a, "camera"_a, "ids"_a, pixels)
+      .def("observe", in_turn(&observe), "frame_index"_a, "camera"_a, "ids"_a, "pixels"_a)
       .def("update", in_turn(&update), "alive"_a, "due"_a, "first_depth_m"_a, "iterations"_a = 1, "newest_odom_from_body"_a = nb::none(),
            "sigma_scale"_a = 1.0)
-      .def("correct_by_wheels", in_turn<kReleased>(&Filter::correct_by_wheels), "velocity_base_mps"_a, "yaw_rate_radps"_a, sigma_mps,
-           "sigma_radps"_a, "gyro_radps"_a, "base_from_body"_a, gate)
-      .def("correct_by_rest", in_turn<kReleased>(&Filter::correct_by_rest), "gyro_mean_radps"_a, "gyro_sigma_radps"_a, gate)
-      .def("correct_by_speed", in_turn(&Filter::correct_by_speed), "velocity_odom_mps"_a, sigma_mps)
+      .def("correct_by_wheels", in_turn<kReleased>(&Filter::correct_by_wheels), "velocity_base_mps"_a, "yaw_rate_radps"_a, "sigma_mps"_a,
+           "sigma_radps"_a, "gyro_radps"_a, "base_from_body"_a, "gate"_a)
+      .def("correct_by_rest", in_turn<kReleased>(&Filter::correct_by_rest), "gyro_mean_radps"_a, "gyro_sigma_radps"_a, "gate"_a)
+      .def("correct_by_speed", in_turn(&Filter::correct_by_speed), "velocity_odom_mps"_a, "sigma_mps"_a)
       .def("inflate", in_turn(+[](SharedFilter& filter, int64_t id, const SE3& seen, double gap_s) {
              return filter.inflate(index_of(filter, id), seen.translation, gap_s);
            }),
-           clone_id, "seen_odom_from_body"_a, "gap_s"_a)
-      .def("inflate_velocity", in_turn(&Filter::inflate_velocity), sigma_mps)
+           "clone_id"_a, "seen_odom_from_body"_a, "gap_s"_a)
+      .def("inflate_velocity", in_turn(&Filter::inflate_velocity), "sigma_mps"_a)
       .def("motion_between", in_turn(+[](SharedFilter& filter, int64_t earlier, int64_t later) {
              return filter.motion_between(index_of(filter, earlier), index_of(filter, later));
            }),
            "earlier_id"_a, "later_id"_a)
       .def("body_since",
-           in_turn(+[](SharedFilter& filter, int64_t id) { return filter.motion_between(index_of(filter, id), newest(filter)); }), clone_id)
-      .def("motion_since", in_turn(&motion_since), clone_id)
-      .def("cam_from_earlier", in_turn(&cam_from_earlier), clone_id, "cam_from_body"_a, "camera"_a = 0)
-      .def("odom_from_clone", in_turn(+[](SharedFilter& filter, int64_t id) { return filter.clone(index_of(filter, id)); }), clone_id)
+           in_turn(+[](SharedFilter& filter, int64_t id) { return filter.motion_between(index_of(filter, id), newest(filter)); }),
+           "clone_id"_a)
+      .def("motion_since", in_turn(&motion_since), "clone_id"_a)
+      .def("cam_from_earlier", in_turn(&cam_from_earlier), "clone_id"_a, "cam_from_body"_a, "camera"_a = 0)
+      .def("odom_from_clone", in_turn(+[](SharedFilter& filter, int64_t id) { return filter.clone(index_of(filter, id)); }), "clone_id"_a)
       .def("odom_from_body", in_turn(+[](SharedFilter& filter) { return filter.state.body(); }))
       .def("body_covariance", in_turn(&body_covariance))
       .def("nav_state", in_turn(&nav_state))
@@ -246,10 +245,12 @@ void bind_filter(nb::module_& module) {
                    }))
       .def_prop_rw("imu_minus_cam_s", in_turn(+[](SharedFilter& filter) { return filter.imu_minus_cam_s; }),
                    in_turn(+[](SharedFilter& filter, double seconds) { filter.imu_minus_cam_s = seconds; }));
-  module.def("compose_pose", &compose_pose, "map_from_body"_a, "covariance"_a, body_from_next, "cov_step"_a);
+  module.def("compose_pose", &compose_pose, "map_from_body"_a, "covariance"_a, "body_from_next"_a, "cov_step"_a);
   module.def("share_that_passes", &share_that_passes, "limit"_a, "mean_square"_a);
-  module.def("linearise_track", &linearise_track_of, "point"_a, odom_from_cam, views, pixels, lenses, pixel_weight, disparity_weight);
-  module.def("triangulate", &triangulate_of, odom_from_cam, views, pixels, lenses, pixel_weight, disparity_weight, "start"_a);
+  module.def("linearise_track", &linearise_track_of, "point"_a, "odom_from_cam"_a, "views"_a, "pixels"_a, "lenses"_a, "pixel_weight"_a,
+             "disparity_weight"_a);
+  module.def("triangulate", &triangulate_of, "odom_from_cam"_a, "views"_a, "pixels"_a, "lenses"_a, "pixel_weight"_a, "disparity_weight"_a,
+             "start"_a);
 }
 
 }  // namespace fleetmap

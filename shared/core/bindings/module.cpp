@@ -14,7 +14,7 @@ namespace fleetmap {
 using Bind = void(nb::module_&);
 Bind bind_aliases, bind_block_cholesky, bind_bundle, bind_camera, bind_corners, bind_filter, bind_grid, bind_image_quality, bind_imu_checks,
     bind_landmarks, bind_matching, bind_mono_window, bind_pair_matching, bind_patch_align, bind_pnp, bind_preintegration, bind_projection,
-    bind_rays, bind_relocalization, bind_render, bind_stereo, bind_surfels, bind_track_joining, bind_tracking, bind_vocabulary;
+    bind_rays, bind_relocalization, bind_render, bind_stereo, bind_surfels, bind_tracking, bind_vocabulary;
 
 }  // namespace fleetmap
 
@@ -40,9 +40,9 @@ NB_MODULE(_core, module) {
   using namespace fleetmap;
   module.def("allocations", &step_allocations);
   for (Bind* const bind :
-       {bind_aliases,       bind_block_cholesky, bind_bundle,     bind_camera,    bind_corners,        bind_filter,        bind_grid,
-        bind_image_quality, bind_imu_checks,     bind_landmarks,  bind_matching,  bind_mono_window,    bind_pair_matching, bind_patch_align,
-        bind_pnp,           bind_preintegration, bind_projection, bind_rays,      bind_relocalization, bind_render,        bind_stereo,
-        bind_surfels,       bind_track_joining,  bind_tracking,   bind_vocabulary})
+       {bind_aliases,        bind_block_cholesky, bind_bundle,     bind_camera,         bind_corners,    bind_filter,
+        bind_grid,           bind_image_quality,  bind_imu_checks, bind_landmarks,      bind_matching,   bind_mono_window,
+        bind_pair_matching,  bind_patch_align,    bind_pnp,        bind_preintegration, bind_projection, bind_rays,
+        bind_relocalization, bind_render,         bind_stereo,     bind_surfels,        bind_tracking,   bind_vocabulary})
     bind(module);
 }

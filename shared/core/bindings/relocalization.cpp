@@ -1,11 +1,10 @@
-#include "images.h"  // first: Python's header comes before the system's
+#include "arguments.h"  // first: Python's header comes before the system's
 
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
 #include <numbers>
 
-#include "refinement.h"
 #include "relocalization.h"
 
 namespace fleetmap {
@@ -17,8 +16,7 @@ using Cones = std::tuple<Points, Array<float, -1, 3>, Floats, Floats>;
 ViewingCones cones_of(const Cones& cones) {
   const auto& [points, directions, half_angles, max_distances] = cones;
   const size_t count = points.shape(0);
-  if (directions.shape(0) != count || half_angles.shape(0) != count || max_distances.shape(0) != count)
-    throw nb::value_error("cones: a row for each landmark");
+  check_rows(count, "cones: a row for each landmark", directions, half_angles, max_distances);
   return {points.data(), directions.data(), half_angles.data(), max_distances.data(), count};
 }
 
@@ -90,16 +88,14 @@ class FixFinder {
         camera_(image_of(pinhole, clearance(clearance_px))),
         limits_(limits_of({fix}, {stereo}, min_inlier_share, octave_scale, distance_scale, camera_, refinement)) {
     const size_t count = landmarks().count, places = map_from_cam.shape(0);
-    if (sigmas_m.shape(0) != count || descriptors.shape(0) != count)
-      throw nb::value_error("sigmas_m, descriptors: a row for each landmark");
+    check_rows(count, "sigmas_m, descriptors: a row for each landmark", sigmas_m, descriptors);
     unlocked([&] {
       shown_.assign(shown.begin(), shown.end());
       shown_from_.assign(shown_from.begin(), shown_from.end());
       if (shown_from_.size() != places + 1 || shown_from_[0] != 0 || shown_from_[places] != int64_t(shown_.size()) ||
           !std::is_sorted(shown_from_.begin(), shown_from_.end()))
         throw nb::value_error("shown_from: one more than places, rising from 0 to all of shown");
-      for (const int64_t row : shown_)
-        if (row < 0 || row >= int64_t(count)) throw nb::value_error("shown: rows of landmarks");
+      check_below(count, "shown: rows of landmarks", shown_);
     });
   }
 
@@ -124,13 +120,12 @@ class FixFinder {
   static QueryFrame frame_of(const Features& features, const std::optional<Unmeasured>& unmeasured) {
     const auto& [pixels, left_pixels, octaves, descriptors] = features;
     const size_t count = pixels.shape(0);
-    if (left_pixels.shape(0) != count || octaves.shape(0) != count || descriptors.shape(0) != count)
-      throw nb::value_error("features: a row for each");
+    check_rows(count, "features: a row for each", left_pixels, octaves, descriptors);
     QueryFrame frame{{left_pixels.data(), octaves.data(), descriptors}, pixels.data(), {}};
     if (unmeasured) {
       const auto& [left, right, to, is_tried] = *unmeasured;
       if (!same_size(left, right)) throw nb::value_error("unmeasured: images of one size");
-      if (to.shape(0) != count || is_tried.shape(0) != count) throw nb::value_error("unmeasured: a row for each feature");
+      check_rows(count, "unmeasured: a row for each feature", to, is_tried);
       frame.unmeasured = {{left, right}, to.data(), is_tried.data()};
     }
     return frame;
@@ -166,7 +161,7 @@ auto nearest_cells_of(const Packed& descriptors, const Packed& centres, int cell
 auto near_descriptors_of(const Packed& descriptors, const Packed& centres, int cells, const Packed& held, const Indices& starts,
                          int max_bits) {
   const size_t asked = checked_cells(cells), count = held.shape(0);
-  if (starts.shape(0) != centres.shape(0) + 1) throw nb::value_error("starts: one more than centres");
+  check_rows(centres.shape(0) + 1, "starts: one more than centres", starts);
   for (size_t c = 0; c < starts.shape(0); ++c)
     if (starts(c) < (c ? starts(c - 1) : 0) || starts(c) > int64_t(count)) throw nb::value_error("starts: rising, of held");
   auto is_near = zeros<uint8_t>(count);
@@ -177,20 +172,18 @@ auto near_descriptors_of(const Packed& descriptors, const Packed& centres, int c
 }  // namespace
 
 void bind_relocalization(nb::module_& module) {
-  const auto map_from_cam = "map_from_cam"_a, cones = "cones"_a, descriptors = "descriptors"_a, centres = "centres"_a, cells = "cells"_a,
-             pinhole = "pinhole"_a, distance_scale = "distance_scale"_a, octave_scale = "octave_scale"_a;
   nb::class_<FixFinder>(module, "FixFinder")
       .def(nb::init<const Cones&, const Floats&, const Packed&, const Poses&, const Indices&, const Indices&, const Array<double, 6>&,
                     double, double, const nb::object&, const nb::object&, double, const Limits&, const std::optional<Image>&>(),
-           cones, "sigmas_m"_a, descriptors, map_from_cam, "shown"_a, "shown_from"_a, pinhole, distance_scale, octave_scale, "fix"_a,
-           "stereo"_a, "min_inlier_share"_a, "refinement"_a, "clearance_px"_a = nb::none())
-      .def("median_distance_m", &FixFinder::median_distance_m, map_from_cam)
-      .def("by_projection", &FixFinder::by_projection, "features"_a, "unmeasured"_a, map_from_cam, "radius_px"_a,
+           "cones"_a, "sigmas_m"_a, "descriptors"_a, "map_from_cam"_a, "shown"_a, "shown_from"_a, "pinhole"_a, "distance_scale"_a,
+           "octave_scale"_a, "fix"_a, "stereo"_a, "min_inlier_share"_a, "refinement"_a, "clearance_px"_a = nb::none())
+      .def("median_distance_m", &FixFinder::median_distance_m, "map_from_cam"_a)
+      .def("by_projection", &FixFinder::by_projection, "features"_a, "unmeasured"_a, "map_from_cam"_a, "radius_px"_a,
            "earlier"_a = nb::tuple());
-  module.def("visible_landmarks", &visible_landmarks_of, cones, map_from_cam, pinhole, distance_scale, "margin_px"_a,
-             "max_view_angle_rad"_a, octave_scale);
-  module.def("nearest_cells", &nearest_cells_of, descriptors, centres, cells);
-  module.def("near_descriptors", &near_descriptors_of, descriptors, centres, cells, "held"_a, "starts"_a, "max_bits"_a);
+  module.def("visible_landmarks", &visible_landmarks_of, "cones"_a, "map_from_cam"_a, "pinhole"_a, "distance_scale"_a, "margin_px"_a,
+             "max_view_angle_rad"_a, "octave_scale"_a);
+  module.def("nearest_cells", &nearest_cells_of, "descriptors"_a, "centres"_a, "cells"_a);
+  module.def("near_descriptors", &near_descriptors_of, "descriptors"_a, "centres"_a, "cells"_a, "held"_a, "starts"_a, "max_bits"_a);
 }
 
 }  // namespace fleetmap

@@ -1,11 +1,10 @@
-#include "images.h"  // first: Python's header comes before the system's
+#include "arguments.h"  // first: Python's header comes before the system's
 
 #include <nanobind/stl/vector.h>
 
 #include <algorithm>
 
 #include "in_turn.h"
-#include "refinement.h"
 #include "tracking.h"
 
 namespace fleetmap {
@@ -47,7 +46,7 @@ Images halvings(const Image& image, int count) {
 auto follow_pixels_of(const Image& before, const Image& now, const Places& pixels, const Places& predicted, int half, int levels,
                       double within_px, double margin_px) {
   const size_t count = pixels.shape(0);
-  if (predicted.shape(0) != count) throw nb::value_error("predicted: one for each pixel");
+  check_rows(count, "predicted: one for each pixel", predicted);
   Pyramid first, second;
   std::vector<double> places(predicted.data(), predicted.data() + 2 * count), back(2 * count);
   std::vector<uint8_t> found(count);
@@ -118,21 +117,21 @@ auto common_ways_px_of(const Indices& old_ids, const Points& old_pixels, const I
 }  // namespace
 
 void bind_tracking(nb::module_& module) {
-  const auto pixels = "pixels"_a, left = "left"_a;
   module.def("halvings", &halvings, "image"_a, "count"_a);
-  module.def("follow_pixels", &follow_pixels_of, "before"_a, "now"_a, pixels, "predicted"_a, "half"_a, "levels"_a, "within_px"_a,
+  module.def("follow_pixels", &follow_pixels_of, "before"_a, "now"_a, "pixels"_a, "predicted"_a, "half"_a, "levels"_a, "within_px"_a,
              "margin_px"_a);
   nb::class_<SharedTracker>(module, "Tracker")
       .def("__init__", &make_tracker, "lens"_a, "settings"_a, "stereo"_a, "max_disparity_px"_a, "refinement"_a)
-      .def("begin", in_turn(+[](SharedTracker& tracker, const Image& image) { unlocked([&] { tracker.begin(pictured(image)); }); }), left)
-      .def("add", in_turn(+[](SharedTracker& tracker, const Points& of) { return tracker.add(of.data(), of.shape(0)); }), pixels)
-      .def("track", in_turn(&track_of), left, "pair"_a, "disparity_px"_a, "cam_from_previous"_a, "is_predicted"_a, "points_cam"_a,
+      .def("begin", in_turn(+[](SharedTracker& tracker, const Image& image) { unlocked([&] { tracker.begin(pictured(image)); }); }),
+           "left"_a)
+      .def("add", in_turn(+[](SharedTracker& tracker, const Points& of) { return tracker.add(of.data(), of.shape(0)); }), "pixels"_a)
+      .def("track", in_turn(&track_of), "left"_a, "pair"_a, "disparity_px"_a, "cam_from_previous"_a, "is_predicted"_a, "points_cam"_a,
            "clearance_px"_a = nb::none())
       .def_prop_ro("ids", in_turn(+[](SharedTracker& tracker) { return as_numpy<int64_t>(std::vector(tracker.ids())); }),
                    nb::rv_policy::automatic)
       .def_prop_ro("pixels", in_turn(+[](SharedTracker& tracker) { return copied<2>(tracker.pixels().data(), {tracker.ids().size(), 3}); }),
                    nb::rv_policy::automatic);
-  module.def("common_ways_px", &common_ways_px_of, "old_ids"_a, "old_pixels"_a, "ids"_a, pixels);
+  module.def("common_ways_px", &common_ways_px_of, "old_ids"_a, "old_pixels"_a, "ids"_a, "pixels"_a);
 }
 
 }  // namespace fleetmap

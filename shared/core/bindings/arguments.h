@@ -1,7 +1,9 @@
-// Images among the arguments.
+// Arguments that several files take: images, limits of stereo and of corners, how poses are refined, inertial samples.
 #pragma once
 
 #include "arrays.h"  // first: Python's header comes before the system's
+#include "pnp.h"
+#include "preintegration.h"
 #include "stereo.h"
 
 // Distances of pixels from the robot's own body; not empty if given.
@@ -34,4 +36,23 @@ inline void check_corners(double distance_px, double width, double height) {
   if (!(distance_px >= 0.1)) throw nb::value_error("distance_px: at least 0.1");
   if (!((width / distance_px + 1.0) * (height / distance_px + 1.0) <= kMostCells))
     throw nb::value_error("width, height: up to 2^26 squares of distance_px");
+}
+
+// How poses are refined: width of the robust weight, squared gate, iterations on all and on inliers.
+using Limits = std::tuple<double, double, std::tuple<int, int>>;
+
+inline fleetmap::Refinement refinement_of(const Limits& limits) {
+  constexpr int kMostIterations = 1000;
+  const auto& [width, gate_squared, iterations] = limits;
+  const auto [of_all, of_inliers] = iterations;
+  if (of_all < 0 || of_inliers < 0 || of_all > kMostIterations || of_inliers > kMostIterations)
+    throw nb::value_error("refinement: 0 to 1000 iterations");
+  return {width, gate_squared, of_all, of_inliers};
+}
+
+inline fleetmap::ImuSamples imu_samples(const Indices& stamps_ns, const Points& gyro_radps, const Points& accel_mps2) {
+  const size_t count = stamps_ns.shape(0);
+  if (gyro_radps.shape(0) != count || accel_mps2.shape(0) != count)
+    throw nb::value_error("gyro_radps, accel_mps2: a row for each of stamps_ns");
+  return {stamps_ns.data(), gyro_radps.data(), accel_mps2.data(), count};
 }
