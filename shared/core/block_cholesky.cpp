@@ -202,7 +202,6 @@ BlockPlace BlockCholesky::place(int64_t row, int64_t col) const {
   int64_t step = front.own, here = offset_[size_t(late)];
   if (front_[size_t(late)] != front_[size_t(early)]) {
     const auto found = std::lower_bound(front.nodes.begin(), front.nodes.end(), late);
-    if (found == front.nodes.end() || *found != late) return {-1, 1, 1};
     step = front.below;
     here = int64_t(front.own) * front.own + front.offsets[size_t(found - front.nodes.begin())];
   }
@@ -241,7 +240,7 @@ double BlockCholesky::log_determinant(const double* values) const {
 }
 
 void BlockCholesky::solve(const double* values, double* b) const {
-  std::vector<double> x(unknowns()), gathered, pulled;
+  std::vector<double> x(order_.size()), gathered, pulled;
   for (size_t n = 0; n < x.size(); ++n) x[n] = b[order_[n]];
   for (const Front& front : fronts_) {
     const double *diagonal = values + front.start, *lower = diagonal + ptrdiff_t(front.own) * front.own;
@@ -268,15 +267,6 @@ void BlockCholesky::solve(const double* values, double* b) const {
   for (size_t n = 0; n < x.size(); ++n) b[order_[n]] = x[n];
 }
 
-void check_order(std::span<const int64_t> order, size_t count) {
-  std::vector<bool> seen(count, false);
-  for (const int64_t node : order) {
-    if (node < 0 || size_t(node) >= count || seen[size_t(node)]) throw nb::value_error("order: each node once");
-    seen[size_t(node)] = true;
-  }
-  if (order.size() != count) throw nb::value_error("order: each node once");
-}
-
 Lapack lapack;
 
 // scipy hands out its LAPACK as capsules, for Cython, of Fortran's interface with 32-bit integers.
@@ -294,69 +284,6 @@ void find_lapack() {
   found("scipy.linalg.cython_blas", "dgemv", lapack.dgemv);
   found("scipy.linalg.cython_lapack", "dpotrs", lapack.dpotrs);
   found("scipy.linalg.cython_lapack", "dpotrf", lapack.dpotrf);
-}
-
-namespace {
-
-void make(BlockCholesky* self, const Indices& sizes, const Array<int64_t, -1, 2>& pairs, const Indices& order) {
-  constexpr int64_t kMostEach = 1 << 12, kMost = 1 << 24;
-  const int64_t count = int64_t(sizes.shape(0));
-  find_lapack();
-  const nb::gil_scoped_release others_run;
-  int64_t total = 0;
-  for (const int64_t size : sizes)
-    if (size < 1 || size > kMostEach || (total += size) > kMost) throw nb::value_error("sizes: 1 to 4096, at most 2^24 in all");
-  std::vector<std::pair<int64_t, int64_t>> coupled;
-  for (size_t n = 0; n < pairs.shape(0); ++n) {
-    const int64_t a = pairs(n, 0), b = pairs(n, 1);
-    if (a < 0 || b < 0 || a >= count || b >= count) throw nb::value_error("pairs: of nodes");
-    coupled.emplace_back(a, b);
-  }
-  check_order({order.begin(), order.end()}, size_t(count));
-  new (self) BlockCholesky({sizes.begin(), sizes.end()}, coupled, {order.begin(), order.end()});
-}
-
-auto places_of(const BlockCholesky& pattern, const Indices& rows, const Indices& cols) {
-  const size_t count = rows.shape(0);
-  const int64_t nodes = int64_t(pattern.nodes());
-  check_rows(count, "cols: one for each row", cols);
-  std::vector<BlockPlace> places;
-  unlocked([&] {
-    for (size_t n = 0; n < count; ++n) {
-      if (rows(n) < 0 || cols(n) < 0 || rows(n) >= nodes || cols(n) >= nodes) throw nb::value_error("rows, cols: nodes");
-      places.push_back(pattern.place(rows(n), cols(n)));
-      if (places.back().first < 0) throw nb::value_error("rows, cols: nodes that are coupled");
-    }
-  });
-  return as_numpy<int64_t>(std::move(places));
-}
-
-bool factorise(const BlockCholesky& pattern, const MutableArray<double, -1>& values) {
-  if (values.size() != pattern.size()) throw nb::value_error("values: as many as size says");
-  return unlocked([&] { return pattern.factorise(values.data()); });
-}
-
-auto solve(const BlockCholesky& pattern, const Reals& values, const Reals& rhs) {
-  if (values.size() != pattern.size()) throw nb::value_error("values: as many as size says");
-  if (rhs.size() != pattern.unknowns()) throw nb::value_error("rhs: one for each unknown");
-  std::vector<double> x;
-  unlocked([&] {
-    x.assign(rhs.begin(), rhs.end());
-    pattern.solve(values.data(), x.data());
-  });
-  return as_numpy<double>(std::move(x));
-}
-
-}  // namespace
-
-void bind_block_cholesky(nb::module_& module) {
-  nb::class_<BlockCholesky>(module, "BlockCholesky")
-      .def("__init__", &make, "sizes"_a, "pairs"_a, "order"_a)
-      .def_prop_ro("size", &BlockCholesky::size)
-      .def("order", [](const BlockCholesky& pattern) { return as_numpy<int64_t>(unlocked([&] { return std::vector(pattern.order()); })); })
-      .def("places", &places_of, "rows"_a, "cols"_a)
-      .def("factorise", &factorise, "values"_a)
-      .def("solve", &solve, "values"_a, "rhs"_a);
 }
 
 }  // namespace fleetmap

@@ -8,7 +8,6 @@
 #include <algorithm>
 #include <cstddef>
 #include <cstdint>
-#include <span>
 #include <utility>
 #include <vector>
 
@@ -25,15 +24,11 @@ class BlockCholesky {
   // little fill-in; every subtree of their elimination tree is then made contiguous.
   BlockCholesky(const std::vector<int64_t>& sizes, const std::vector<std::pair<int64_t, int64_t>>& pairs, std::vector<int64_t> order);
 
-  size_t nodes() const { return position_.size(); }
-  size_t unknowns() const { return order_.size(); }
   // Number of values of a factor.
   size_t size() const { return size_; }
-  // The matrix's unknowns in elimination order.
-  const std::vector<int64_t>& order() const { return order_; }
 
-  // The place of the block of nodes (row, col); first is negative where they are not coupled. A block is added once; its mirror image
-  // must not be. Of blocks on the diagonal the lower triangle counts.
+  // The place of the block of coupled nodes (row, col). A block is added once; its mirror image must not be. Of blocks on the diagonal the
+  // lower triangle counts.
   BlockPlace place(int64_t row, int64_t col) const;
 
   // Values become those of the factor; false where the matrix is not positive definite.
@@ -57,15 +52,12 @@ class BlockCholesky {
     std::vector<int32_t> children;        // the fronts that update it
   };
 
-  std::vector<Front> fronts_;  // children first
-  std::vector<int64_t> order_;
+  std::vector<Front> fronts_;            // children first
+  std::vector<int64_t> order_;           // the matrix's unknowns in the order of elimination
   std::vector<int32_t> position_;        // (N,) of the nodes in the order of elimination
   std::vector<int32_t> front_, offset_;  // by position: front of a node, and where its unknowns begin there
   size_t size_ = 0;
 };
-
-// Refuses what is not an order of so many nodes.
-void check_order(std::span<const int64_t> order, size_t count);
 
 // Dense factorisation by LAPACK and BLAS, of the library that scipy carries. Matrices are column by column, as in Fortran.
 struct Lapack {

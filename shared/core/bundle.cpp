@@ -500,8 +500,9 @@ std::vector<std::pair<int64_t, int64_t>> BundleSolver::node_pairs() const {
   return pairs;
 }
 
-void BundleSolver::factorise_sparsely(std::vector<int64_t> order) {
+size_t BundleSolver::factorise_sparsely(std::vector<int64_t> order) {
   sparse_ = std::make_unique<BlockCholesky>(node_sizes(), node_pairs(), std::move(order));
+  return sparse_->size();
 }
 
 // Adds S to zeroed values. place(row, col): where the block of two nodes is.

@@ -110,7 +110,8 @@ class BundleSolver {
   std::vector<int64_t> node_sizes() const;
   std::vector<std::pair<int64_t, int64_t>> node_pairs() const;
   // Systems are factorised as sparse ones from now on; order: elimination order of the nodes with little fill-in.
-  void factorise_sparsely(std::vector<int64_t> order);
+  // Returns the number of values of a factor.
+  size_t factorise_sparsely(std::vector<int64_t> order);
 
   // Half the robust sum of squares of all residuals.
   double cost() { return cost_of(state_); }

@@ -271,10 +271,8 @@ auto spread_corners(const Image& image, int count, double distance_px, int thres
 auto select_spread(const Pixels& pixels, const Indices& order, const Pixels& taken, double distance_px, int count, int width, int height) {
   if (width < 0 || height < 0 || count < 0) throw nb::value_error("width, height, count: not negative");
   check_corners(distance_px, width, height);
-  const int64_t known = int64_t(pixels.shape(0));
-  for (const int64_t n : order)
-    if (n < 0 || n >= known) throw nb::value_error("order: indices of pixels");
-  for (int64_t n = 0; n < known; ++n)
+  check_below(pixels.shape(0), "order: indices of pixels", order);
+  for (size_t n = 0; n < pixels.shape(0); ++n)
     if (!(pixels(n, 0) >= 0.0f && pixels(n, 0) <= float(width) && pixels(n, 1) >= 0.0f && pixels(n, 1) <= float(height)))
       throw nb::value_error("pixels: of the image");
   std::vector<int64_t> chosen = unlocked([&] {

@@ -119,8 +119,7 @@ void fill_window(Picture<const float> disparity, Picture<const float> nearest, d
 
 auto cast_view(const Image32& disparity_px, const Image32& nearest_px, double sigma_px, const StereoLens& lens, const Mat3& map_from_cam,
                const Vec3& camera, const Image& was_free) {
-  if (nearest_px.shape(0) != disparity_px.shape(0) || nearest_px.shape(1) != disparity_px.shape(1))
-    throw nb::value_error("nearest_px: of the size of disparity_px");
+  if (!same_size(nearest_px, disparity_px)) throw nb::value_error("nearest_px: of the size of disparity_px");
   const size_t rows = was_free.shape(0), columns = was_free.shape(1), slices = kSlices;
   auto points = zeros<uint16_t>(rows * columns * slices);
   auto looks = zeros<uint8_t>(rows * columns * slices), heights = zeros<uint8_t>(2 * rows * columns);
@@ -143,13 +142,10 @@ void add_view(const MutableArray<uint16_t, -1, -1, kSlices>& points, const Voxel
               const MutableArray<uint8_t, -1, -1, 4>& tile_heights) {
   const ptrdiff_t first_row = at_row, first_column = at_column;
   const ptrdiff_t rows = ptrdiff_t(points.shape(0)), columns = ptrdiff_t(points.shape(1)), size = ptrdiff_t(hits.shape(0));
-  const auto is_of = [](const auto& array, ptrdiff_t height, ptrdiff_t width) {
-    return array.shape(0) == size_t(height) && array.shape(1) == size_t(width);
-  };
-  if (!is_of(looks, rows, columns) || !is_of(heights, rows, columns)) throw nb::value_error("looks, heights: of the size of points");
-  if (!is_of(hits, size, size) || !is_of(passes, size, size) || !is_of(hidden, size, size))
+  if (!same_size(looks, points) || !same_size(heights, points)) throw nb::value_error("looks, heights: of the size of points");
+  if (hits.shape(0) != hits.shape(1) || !same_size(passes, hits) || !same_size(hidden, hits))
     throw nb::value_error("hits, passes, hidden: of one square tile");
-  if (!is_of(tile_heights, size, size)) throw nb::value_error("tile_heights: of the tile's size");
+  if (!same_size(tile_heights, hits)) throw nb::value_error("tile_heights: of the tile's size");
   const Window window{rows, columns, points.data(), looks.data(), heights.data()};
   uint8_t *const views[] = {hits.data(), passes.data(), hidden.data()}, *const codes = tile_heights.data();
   const auto count = [](uint8_t& seen) { seen = uint8_t(seen + (seen < kMost)); };

@@ -80,18 +80,8 @@ auto nearest_two(const Packed& packed_a, const Packed& packed_b) {
   auto first = zeros<int32_t>(a.count), second = zeros<int32_t>(a.count);
   unlocked([&] {
     for (size_t i = 0; i < a.count; ++i) {
-      int best = kFar, runner_up = kFar;
-      int64_t found = -1;
-      for (size_t j = 0; j < b.count; ++j) {
-        const int distance = hamming(a[i], b[j]);
-        if (distance < best) {
-          runner_up = std::exchange(best, distance);
-          found = int64_t(j);
-        } else if (distance < runner_up) {
-          runner_up = distance;
-        }
-      }
-      index[i] = found, first[i] = best, second[i] = runner_up;
+      const TwoNearest found(a[i], b);
+      index[i] = found.first, first[i] = found.distance, second[i] = found.second_distance;
     }
   });
   return std::tuple(as_numpy<int64_t>(std::move(index)), as_numpy<int32_t>(std::move(first)), as_numpy<int32_t>(std::move(second)));

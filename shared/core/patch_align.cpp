@@ -261,9 +261,8 @@ auto align_observations(const Features& reference, const Features& own, const Po
   const size_t count = chosen_b.shape(0);
   if (angles_a.shape(0) != pixels_a.shape(0) || angles_b.shape(0) != pixels_b.shape(0)) throw nb::value_error("angles: one for each pixel");
   check_rows(count, "points_reference: one for each chosen", chosen_a, points_reference);
-  for (size_t n = 0; n < count; ++n)
-    if (size_t(chosen_a(n)) >= pixels_a.shape(0) || size_t(chosen_b(n)) >= pixels_b.shape(0))
-      throw nb::value_error("chosen: indices of pixels");
+  check_below(pixels_a.shape(0), "chosen: indices of pixels", chosen_a);
+  check_below(pixels_b.shape(0), "chosen: indices of pixels", chosen_b);
   Aligned found(count);
   unlocked([&] {
     for (size_t n = 0; n < count; ++n) {

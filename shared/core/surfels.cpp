@@ -492,7 +492,7 @@ auto draw_discs(const Numbers& numbers, const Points& points_cam, const Places& 
   check_levels(levels, surfels);
   check_rows(surfels, "colours: one for each normal", colours);
   unlocked([&] { check_below(surfels, "numbers: of normals_map's rows", numbers); });
-  if (pixels_per_rad.shape(0) != rows || pixels_per_rad.shape(1) != columns) throw nb::value_error("pixels_per_rad: one for each ray");
+  if (!same_size(pixels_per_rad, rays)) throw nb::value_error("pixels_per_rad: one for each ray");
   auto weight = zeros<float>(rows * columns), colour = zeros<float>(rows * columns), depth = zeros<float>(rows * columns);
   const DiscImage image{ptrdiff_t(rows), ptrdiff_t(columns), weight.data(), colour.data(), depth.data()};
   if (rows > 0 && columns > 0)
@@ -576,7 +576,7 @@ auto blend_backward(const Places& pixels, const Points& conics, const Places& re
                     const Reals& opacities, double blur_px2, const Image64& slopes, const Image64& whole) {
   const Gaussians gaussians(pixels, conics, reaches_px, peaks, greys);
   check_rows(gaussians.count, "opacities: one for each of pixels", opacities);
-  if (slopes.shape(0) != whole.shape(0) || slopes.shape(1) != whole.shape(1)) throw nb::value_error("slopes: of the picture's size");
+  if (!same_size(slopes, whole)) throw nb::value_error("slopes: of the picture's size");
   auto gradients = zeros<std::array<double, 3>>(gaussians.count);
   unlocked([&] {
     const double *const slope_of = slopes.data(), *const whole_of = whole.data();

@@ -48,18 +48,8 @@ auto two_nearest(const Packed& packed, const Packed& packed_centres) {
   auto found = zeros<std::array<int32_t, 2>>(descriptors.count);
   unlocked([&] {
     for (size_t i = 0; i < descriptors.count; ++i) {
-      int best = kFar, second = kFar + 1;
-      auto& [nearest, runner_up] = found[i];
-      for (size_t c = 0; c < centres.count; ++c) {
-        const int distance = hamming(descriptors[i], centres[c]);
-        if (distance < best) {
-          second = std::exchange(best, distance);
-          runner_up = std::exchange(nearest, int32_t(c));
-        } else if (distance < second) {
-          second = distance;
-          runner_up = int32_t(c);
-        }
-      }
+      const TwoNearest nearest(descriptors[i], centres);
+      found[i] = {int32_t(std::max<int64_t>(nearest.first, 0)), int32_t(std::max<int64_t>(nearest.second, 0))};
     }
   });
   return as_numpy<int32_t>(std::move(found));

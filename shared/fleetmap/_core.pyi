@@ -400,33 +400,6 @@ def preintegrate(
     noise: densities of gyro and accelerometer and of their biases' walks.
     """
 
-class BlockCholesky:
-    """Pattern of sparse matrices: N nodes with sizes (N,) unknowns each, coupled in pairs (B, 2).
-
-    order (N,): elimination order of the nodes with little fill-in.
-    """
-
-    def __init__(self, sizes: _Indices, pairs: _Indices, order: _Indices) -> None: ...
-    @property
-    def size(self) -> int:
-        """Number of values of a factor."""
-
-    def order(self) -> _Indices:
-        """(U,) the unknowns in elimination order."""
-
-    def places(self, rows: _Indices, cols: _Indices) -> _Indices:
-        """(B, 3) positions of the blocks of coupled nodes (row, col) among the values.
-
-        Number (a, b) of a block belongs at first + a * down + b * right of its row here. A block is added once; its mirror image must
-        not be. Of blocks on the diagonal the lower triangle counts.
-        """
-
-    def factorise(self, values: _Reals) -> bool:
-        """Replace values (size,) of a matrix by those of its factor; False if it is not positive definite."""
-
-    def solve(self, values: _Reals, rhs: _Reals) -> _Reals:
-        """x (U,) of A x = rhs (U,), by the values of the factor."""
-
 # --- surfels: lengths in metres, points, normals and pixels (N, ...) in `map` or the camera, poses (4, 4), lens (4,) as of StereoCamera ---
 SURFEL_EDGE_M: float
 SURFEL_LEVELS: int
@@ -725,8 +698,11 @@ class BundleSolver:
     def nodes(self) -> tuple[_Indices, _Indices]:
         """Sizes (N,) and couplings (B, 2) of the reduced system's blocks."""
 
-    def factorise_sparsely(self, order: _Indices) -> None:
-        """Use sparse factorisation from now on; order (N,): elimination order of the nodes with little fill-in."""
+    def factorise_sparsely(self, order: _Indices) -> int:
+        """Use sparse factorisation from now on and return the number of values of a factor.
+
+        order (N,): elimination order of the nodes with little fill-in.
+        """
 
     def cost(self) -> float:
         """Half the robust sum of squares of all residuals."""

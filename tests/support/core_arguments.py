@@ -143,8 +143,6 @@ TEXTURES = np.zeros(1 << 18, np.uint8), np.zeros((1, 14), np.int32), np.zeros((1
 PICTURE = np.zeros((4, 4)), np.zeros((4, 4), np.float32)
 # Arguments that hold together where those from signatures do not, of the object that a method belongs to.
 GIVEN: dict[str, Callable[[Any], tuple[object, ...]]] = {
-    "BlockCholesky.factorise": lambda pattern: (np.ones(pattern.size),),
-    "BlockCholesky.solve": lambda pattern: (np.ones(pattern.size), np.ones(len(pattern.order()))),
     "BoxGrid.bake": lambda _: (QUADS, FACES, FACES[:, :2].copy(), 0, np.ones((0, 5)), 1.0, True, np.zeros((1, 4), np.float32)),
     "BundleSolver.factorise_sparsely": lambda solver: (np.arange(len(solver.nodes()[0])),),
     "FixFinder": lambda _: (

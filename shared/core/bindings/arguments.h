@@ -12,10 +12,6 @@ inline fleetmap::Clearance clearance(const std::optional<Image>& px) {
   if (px->size() == 0) throw nb::value_error("clearance_px: not empty");
   return {*px};
 }
-template <typename A, typename B>
-bool same_size(const A& a, const B& b) {
-  return a.shape(0) == b.shape(0) && a.shape(1) == b.shape(1);
-}
 
 inline fleetmap::StereoLimits checked(const fleetmap::StereoLimits& limits) {
   if (!(limits.max_disparity_px >= 0.0 && limits.max_disparity_px <= 1e5)) throw nb::value_error("max_disparity_px: 0 to 100,000");

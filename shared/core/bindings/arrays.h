@@ -129,6 +129,11 @@ auto unlocked(Compute&& compute) {
   return compute();
 }
 
+template <typename A, typename B>
+bool same_size(const A& a, const B& b) {
+  return a.shape(0) == b.shape(0) && a.shape(1) == b.shape(1);
+}
+
 // Refuses columns that have not so many rows.
 template <typename... Columns>
 void check_rows(size_t count, const char* refusal, const Columns&... columns) {

@@ -1,6 +1,7 @@
 #include "arrays.h"  // first: Python's header comes before the system's
 
 #include <cmath>
+#include <ranges>
 
 #include "bundle.h"
 
@@ -68,10 +69,10 @@ ImageRows rows_at(const nb::callable& said, const BundleState& state, bool deriv
   check(nb::try_cast(answer, rows), "rows: residuals, derivatives by point and calibration, and positions");
   const auto& [residuals, by_point, by_calibration, positions] = rows;
   const size_t derived = derivatives ? observations : 0;
-  check(residuals.shape(0) == observations, "rows: residuals of each observation");
+  check_rows(observations, "rows: residuals of each observation", residuals);
   check(by_point.shape(0) >= derived && by_calibration.shape(0) >= derived && by_calibration.shape(2) == state.calibration.size(),
         "rows: derivatives of each observation, by all of the calibration");
-  check(positions.shape(0) == state.map_from_body.size(), "rows: a position for each keyframe");
+  check_rows(state.map_from_body.size(), "rows: a position for each keyframe", positions);
   return {residuals.data(), by_point.data(), by_calibration.data(), reinterpret_cast<const Vec3*>(positions.data()), kept(rows)};
 }
 
@@ -161,10 +162,12 @@ auto nodes_of(const BundleSolver& solver) {
   return std::tuple(as_numpy<int64_t>(std::move(sizes)), as_numpy<int64_t>(std::move(pairs)));
 }
 
-void factorise_sparsely(BundleSolver& solver, const Indices& order) {
-  unlocked([&] {
-    check_order({order.begin(), order.end()}, solver.node_sizes().size());
-    solver.factorise_sparsely({order.begin(), order.end()});
+size_t factorise_sparsely(BundleSolver& solver, const Indices& order) {
+  return unlocked([&] {
+    std::vector<int64_t> nodes(order.begin(), order.end());
+    std::ranges::sort(nodes);
+    check(std::ranges::equal(nodes, std::views::iota(int64_t(0), int64_t(solver.node_sizes().size()))), "order: each node once");
+    return solver.factorise_sparsely({order.begin(), order.end()});
   });
 }
 

@@ -1,6 +1,7 @@
-"""Sparse Cholesky over blocks against dense algebra and against SuperLU, on patterns of many shapes."""
+"""Sparse Cholesky over blocks against dense algebra and against SuperLU, on couplings of many shapes."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,15 +9,17 @@ import scipy.sparse
 import scipy.sparse.linalg
 
 from fleetmap import core
-from fleetmap.geometry import AnyArray, Array
-from mapserver.survey.bundle.bundle_adjustment import minimum_degree
+from fleetmap.geometry import AnyArray, Array, se3_exp, se3_inverse
+from mapserver.survey.bundle.bundle_adjustment import minimum_degree, solver_of
+from mapserver.survey.bundle.problem import BundleProblem, ImageRows, InertialTerms, MotionPrior, SelfCalibration
+from mapserver.survey.settings import BundleSettings
+from mapserver.survey.state import PriorTerm, RelativeTerm
+from support.worlds.bundle_scene import make_scene
 
 Pairs = Callable[[np.random.Generator], list[tuple[int, int]]]
 NODES = 60
-
-
-def block_cholesky(sizes: AnyArray, pairs: AnyArray) -> core.BlockCholesky:
-    return core.BlockCholesky(sizes, pairs, minimum_degree(len(sizes), pairs))
+SCENE = make_scene(keyframes=2, landmarks=50, step_s=0.4, seed=1, inertial=True).problem
+SPARSE = BundleSettings(dense_unknowns=0)
 
 
 def grid(width: int) -> list[tuple[int, int]]:
@@ -36,78 +39,75 @@ PATTERNS: dict[str, Pairs] = {
 }
 
 
-class Problem:
-    """A positive definite matrix with blocks of 1, 6 and 9 unknowns, as it is and as values of a factor."""
+def problem(pairs: Sequence[tuple[int, int]], kind: str = "poses", count: int = NODES) -> BundleProblem:
+    """Keyframes with priors, coupled in pairs: by relative poses, each second one also by an inertial edge, all by a calibration."""
+    rng = np.random.default_rng(1)
+    map_from_body = np.array([se3_exp(0.3 * step) for step in rng.normal(size=(count, 6))])
+    roots = rng.normal(size=(count + len(pairs), 6, 6))
+    relative = [
+        RelativeTerm(
+            i, j, se3_inverse(map_from_body[i]) @ map_from_body[j] @ se3_exp(0.1 * rng.normal(size=6)), root @ root.T
+        )
+        for (i, j), root in zip(pairs, roots[count:], strict=True)
+    ]
+    priors = [PriorTerm(k, map_from_body[k], roots[k] @ roots[k].T + np.eye(6)) for k in range(count)]
+    moved = {"map_from_body": map_from_body, "fixed": np.zeros(count, np.bool_), "relative": relative, "priors": priors}
+    terms = replace(SCENE.observed(np.zeros(len(SCENE.obs_pixels), np.bool_)), **moved, inertial=None)
+    if kind != "poses":
+        assert SCENE.inertial is not None
+        increment = replace(SCENE.inertial.edges[0][2], cov=np.eye(15))
+        told = [MotionPrior(k, np.zeros(9), np.ones(9)) for k in range(count)]
+        terms.inertial = InertialTerms(rng.normal(size=(count, 9)), [(i, j, increment) for i, j in pairs[::2]], told)
+    if kind == "calibration":
+        rows = ImageRows(np.zeros((0, 4)), np.zeros((0, 4, 3)), np.zeros((0, 4, 3)), map_from_body[:, :3, 3])
+        ways = rng.normal(size=(len(pairs), 3))
+        terms.calibration = SelfCalibration(np.zeros(3), np.ones(3), ways, 1, lambda *_: rows)
+    return terms
 
-    def __init__(self, pairs: list[tuple[int, int]], seed: int, shift: float = 1.0) -> None:
-        rng = np.random.default_rng(seed)
-        self.sizes = rng.choice([1, 6, 9], NODES)
-        self.pattern = block_cholesky(self.sizes, np.array(pairs, np.int64).reshape(-1, 2))
-        begins = np.cumsum(self.sizes) - self.sizes
-        self.matrix, self.values = np.zeros((self.sizes.sum(),) * 2), np.zeros(self.pattern.size)
-        for a, b in sorted({(max(p), min(p)) for p in pairs} - {(n, n) for n in range(NODES)}):
-            jacobian = rng.normal(size=(8, self.sizes[a] + self.sizes[b]))
-            whole, cut = jacobian.T @ jacobian, self.sizes[a]
-            row, col = slice(begins[a], begins[a] + self.sizes[a]), slice(begins[b], begins[b] + self.sizes[b])
-            self._add(a, a, row, row, whole[:cut, :cut])
-            self._add(b, b, col, col, whole[cut:, cut:])
-            self.matrix[col, row] += whole[cut:, :cut]
-            if rng.random() < 0.5:
-                self._add(a, b, row, col, whole[:cut, cut:])
-            else:  # the same, turned round
-                self.matrix[row, col] += whole[:cut, cut:]
-                self._place(b, a, whole[cut:, :cut])
-        for n, (begin, size) in enumerate(zip(begins, self.sizes, strict=True)):
-            here = slice(begin, begin + size)
-            self._add(n, n, here, here, shift * np.eye(size))
 
-    def _add(self, a: int, b: int, row: slice, col: slice, block: Array) -> None:
-        self.matrix[row, col] += block
-        self._place(a, b, block)
-
-    def _place(self, a: int, b: int, block: Array) -> None:
-        first, down, right = self.pattern.places(np.array([a]), np.array([b]))[0]
-        self.values[first + down * np.arange(block.shape[0])[:, None] + right * np.arange(block.shape[1])] += block
-
-    def solve(self, rhs: Array) -> Array | None:
-        values = self.values.copy()
-        return self.pattern.solve(values, rhs) if self.pattern.factorise(values) else None
+def matrix_of(solver: core.BundleSolver) -> Array:
+    lower, _ = solver.reduced(0.0)
+    return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
 
 
 def superlu(matrix: Array, rhs: Array) -> AnyArray:
     return scipy.sparse.linalg.splu(scipy.sparse.csc_array(matrix)).solve(rhs)
 
 
-@pytest.mark.parametrize("name", PATTERNS)
-@pytest.mark.parametrize("seed", [1, 2, 3])
-def test_solves_as_superlu_does(name: str, seed: int) -> None:
-    problem = Problem(PATTERNS[name](np.random.default_rng(seed)), seed)
-    rhs = np.random.default_rng(seed).normal(size=len(problem.matrix))
-    solution = problem.solve(rhs)
-    np.testing.assert_allclose(problem.matrix @ solution, rhs, atol=1e-10)
-    np.testing.assert_allclose(solution, superlu(problem.matrix, rhs), atol=1e-9)
+@pytest.fixture(params=PATTERNS)
+def pairs(request: pytest.FixtureRequest) -> list[tuple[int, int]]:
+    return [(i, j) for i, j in PATTERNS[request.param](np.random.default_rng(1)) if i != j]
 
 
-@pytest.mark.parametrize("name", PATTERNS)
-def test_refuses_what_is_not_positive_definite(name: str) -> None:
-    """Eigenvalues tell: shifted to just below its smallest one, a matrix is indefinite, though no diagonal number is negative."""
-    pairs = PATTERNS[name](np.random.default_rng(1))
-    smallest = np.linalg.eigvalsh(Problem(pairs, 1).matrix)[0]
-    assert Problem(pairs, 1, shift=1.0 - smallest + 1e-6).solve(np.zeros(Problem(pairs, 1).sizes.sum())) is not None
-    assert Problem(pairs, 1, shift=1.0 - smallest - 1e-6).solve(np.zeros(Problem(pairs, 1).sizes.sum())) is None
+@pytest.mark.parametrize("kind", ["poses", "motion", "calibration"])
+def test_solves_as_superlu_does(pairs: list[tuple[int, int]], kind: str) -> None:
+    solver = solver_of(problem(pairs, kind), SPARSE)
+    matrix, rhs, step = matrix_of(solver), solver.reduced(0.0)[1], solver.step(0.0)
+    np.testing.assert_allclose(matrix @ step, rhs, atol=1e-10 * np.abs(rhs).max())
+    np.testing.assert_allclose(step, superlu(matrix, rhs), atol=1e-9)
+    assert solver.log_determinant() == pytest.approx(np.linalg.slogdet(matrix)[1], rel=1e-10)
 
 
-@pytest.mark.parametrize("bad", [0.0, np.nan, np.inf])
-def test_refuses_unknowns_that_nothing_measures_and_numbers_that_are_none(bad: float) -> None:
-    problem = Problem(PATTERNS["nothing coupled"](np.random.default_rng(1)), 1)
-    first, *_ = problem.pattern.places(np.array([17]), np.array([17]))[0]
-    problem.values[first] = bad
-    assert problem.solve(np.ones(len(problem.matrix))) is None
+@pytest.mark.parametrize("kind", ["poses", "motion"])
+def test_refuses_what_is_not_positive_definite(pairs: list[tuple[int, int]], kind: str) -> None:
+    """Eigenvalues tell: with its diagonal less by just above the smallest, a matrix is indefinite, though no number there is negative."""
+    solver = solver_of(problem(pairs, kind), SPARSE)
+    scale = np.sqrt(np.diag(matrix_of(solver)))
+    smallest = np.linalg.eigvalsh(matrix_of(solver) / np.outer(scale, scale))[0]
+    assert solver.step(1e-6 - smallest) is not None
+    assert solver.step(-1e-6 - smallest) is None
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_refuses_numbers_that_are_none(bad: float) -> None:
+    spoilt = problem([])
+    spoilt.priors[17].information[0, 0] = bad
+    assert solver_of(spoilt, SPARSE).step(0.0) is None
 
 
 def test_a_chain_fills_in_nothing() -> None:
     """Whatever number its nodes have: a chain's factor has no more blocks than the chain, but for zeros taken in on purpose."""
     numbers = np.random.default_rng(1).permutation(5000)
-    pattern = block_cholesky(np.full(5000, 6), np.stack([numbers[:-1], numbers[1:]], axis=1))
-    assert pattern.size < 4 * 5000 * 2 * 36
-    assert sorted(pattern.order()) == list(range(30000))
+    chain = problem(list(zip(numbers[:-1].tolist(), numbers[1:].tolist(), strict=True)), count=5000)
+    solver = solver_of(chain, SPARSE)
+    assert solver.factorise_sparsely(minimum_degree(5000, solver.nodes()[1])) < 4 * 5000 * 2 * 36
