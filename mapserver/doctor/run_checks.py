@@ -152,7 +152,9 @@ def run_checks(
     axes, given = _accelerometer(recording, turns, soon)
     wheels, metres = judge_metres(seen.wheels, given, seen.images, has_imu=len(imu) > 0)
 
-    findings = [*sensors.stream_checks(recording), *soon, *gyro, axes, wheels, metres]
+    findings = [*sensors.camera_checks(recording.frame_stamps_ns), *sensors.imu_checks(imu.stamps_ns)]
+    findings += [sensors.stamp_order(recording.issues), *sensors.imu_noise(recording.calibration)]
+    findings += [*soon, *gyro, axes, wheels, metres]
     before_calibration(findings)
     calibration = MeasuredCalibration([], None)
     if has_pair and gyro_fit is not None and gyro_fit.is_unsteady:
@@ -165,7 +167,10 @@ def run_checks(
     findings += [*calibration.findings, images.sharpness([look.variance for look in seen.looks])]
     findings += [images.flicker_check(recording, frames.read), _readable(frames)]
     if len(imu):
-        findings.append(_repeats(frames, min(turn_frames, len(recording))))
+        repeats, count = frames.repeats, min(turn_frames, len(recording))
+        bad = f"an image repeats the previous one {repeats} times in {count} frames; record each image once, with its own stamp"
+        limits = Limits(0.02, 0.1, "of the frames")
+        findings.append(judge("repeated images", repeats / count, limits, "every frame has an image of its own", bad))
     known = {}
     if seen.wheels is not None and seen.wheels.size:
         known["the wheels"] = seen.wheels.size, seen.wheels.speed_sigma
@@ -183,12 +188,6 @@ def _accelerometer(recording: Recording, turns: CameraTurns, soon: Sequence[Find
     fits = fit_accelerometer(turns, recording.imu, shift_s) if has_gravity else []
     axes = accelerometer_axes(fits, recording.calibration.base_from_body if recording.wheel else None)
     return axes, next((fit for fit in fits if fit.is_given), None) if axes.verdict is Verdict.OK else None
-
-
-def _repeats(frames: _Frames, count: int) -> Finding:
-    bad = f"an image repeats the previous one {frames.repeats} times in {count} frames; record each image once, with its own stamp"
-    limits = Limits(0.02, 0.1, "of the frames")
-    return judge("repeated images", frames.repeats / count, limits, "every frame has an image of its own", bad)
 
 
 def run_cheap_checks(recording: Recording, sampled: int) -> list[Finding]:

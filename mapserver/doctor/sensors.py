@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fleetmap.recordings import Recording
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
 from fleetmap.sensors.samples import PAUSE_NS, DataIssue, ImuSamples, Stamps
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
@@ -37,17 +36,6 @@ _NOT_LOST = (
 def median_period_s(stamps_ns: Stamps) -> float:
     """Return the median step between stamps (N,); inf for fewer than two."""
     return float(np.median(np.diff(stamps_ns))) * 1e-9 if len(stamps_ns) > 1 else float("inf")
-
-
-def stream_checks(recording: Recording) -> list[Finding]:
-    """Check rates, gaps and order of the stamps, and whether the IMU's noise is known."""
-    frames_ns, imu_ns = recording.frame_stamps_ns, recording.imu.stamps_ns
-    return [
-        *camera_checks(frames_ns),
-        *imu_checks(imu_ns),
-        stamp_order(recording.issues),
-        *imu_noise(recording.calibration),
-    ]
 
 
 def camera_checks(stamps_ns: Stamps) -> tuple[Finding, Finding]:

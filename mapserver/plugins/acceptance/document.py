@@ -110,11 +110,9 @@ def _errors(report: Report, areas: Sequence[AreaFigures]) -> Section:
     rows = [(a.name, a.frames.text, str(a.wrong), *_quantiles_mm(a.errors_mm)) for a in areas if a.frames.tries]
     for drive in report.drives:
         errors = drive.errors_mm or {}
-        share, quantiles = (
-            f"{100 * drive.localised_share:.1f} % of {drive.frames}",
-            (errors.get("median"), errors.get("p99")),
-        )
-        rows.append((f"drive {drive.name}", share, str(drive.silent), _mm(quantiles[0]), _mm(quantiles[1])))
+        share = f"{100 * drive.localised_share:.1f} % of {drive.frames}"
+        quantiles = _mm(errors.get("median")), _mm(errors.get("p99"))
+        rows.append((f"drive {drive.name}", share, str(drive.silent), *quantiles))
         if drive.docks_mm:
             rows.append((f"docks of {drive.name}", str(len(drive.docks_mm)), "", *_quantiles_mm(drive.docks_mm)))
     words = [

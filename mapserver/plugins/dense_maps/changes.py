@@ -31,7 +31,6 @@ _LEAST_SHARE = 0.3  # of a voxel's face that its surfels cover
 _VIEW_PX = 96
 _CLEAR_PER_M = 0.01  # times the squared depth: three standard deviations of a consistent depth
 _MOST_CELLS = 1 << 24
-_UNJUDGED, _SAME, _CHANGED = 0, 1, 2
 _SHADES = {"same": (150, 150, 150), "not_seen": (218, 226, 232), VANISHED: (0, 94, 213), APPEARED: (178, 114, 0)}  # BGR
 
 
@@ -74,15 +73,15 @@ def changes_between(before: SeenSite, after: SeenSite) -> Changes:
     corner_m, shape = _plan(np.concatenate([before.surfels.points_map, after.surfels.points_map])[:, :2])
     patches, layers = list[Patch](), {name: np.zeros(shape, bool) for name in _SHADES}
     for kind, one, other in ((VANISHED, before, after), (APPEARED, after, before)):
-        voxels = _only_in(one.surfels, other.surfels)
-        verdicts = _verdicts(voxels, other)
-        _fill(layers["not_seen"], voxels.points_map[verdicts == _UNJUDGED], corner_m)
-        changed = _Voxels(*(column[verdicts == _CHANGED] for column in voxels))
-        for rows in _joined(changed.points_map):
-            if changed.areas_m2[rows].sum() >= _LEAST_AREA_M2:
-                points = changed.points_map[rows]
+        voxels_map, areas_m2 = _only_in(one.surfels, other.surfels)
+        through, seen = _counts(voxels_map, other)
+        changed = HIT * seen - through <= -AGAINST
+        _fill(layers["not_seen"], voxels_map[~changed & (seen == 0)], corner_m)
+        for rows in _joined(voxels_map[changed]):
+            points, area_m2 = voxels_map[changed][rows], float(areas_m2[changed][rows].sum())
+            if area_m2 >= _LEAST_AREA_M2:
                 box = np.stack([points.min(axis=0) - _VOXEL_M / 2, points.max(axis=0) + _VOXEL_M / 2])
-                patches.append(Patch(kind, box, float(changed.areas_m2[rows].sum())))
+                patches.append(Patch(kind, box, area_m2))
                 _fill(layers[kind], points, corner_m)
     both = np.zeros((2, *shape), bool)
     for layer, one in zip(both, (before, after), strict=True):
@@ -113,13 +112,6 @@ def changes_geojson(changes: Changes) -> dict[str, Any]:
     return {"type": "FeatureCollection", "frame": "map", "features": features}
 
 
-class _Voxels(NamedTuple):
-    """M voxels: mean positions (M, 3) of their surfels, and the surfels' areas (M,)."""
-
-    points_map: Array
-    areas_m2: Array
-
-
 def _plan(places_m: NDArray[np.float32]) -> tuple[Array, tuple[int, int]]:
     """Return the corner of a plan that contains places (N, 2), and its rows and columns."""
     low, high = np.floor(np.stack([places_m.min(axis=0), places_m.max(axis=0)]) / CELL_M).astype(np.int64)
@@ -134,8 +126,8 @@ def _fill(layer: NDArray[np.bool_], points_map: Array | NDArray[np.float32], cor
     layer[np.clip(rows, 0, layer.shape[0] - 1), np.clip(columns, 0, layer.shape[1] - 1)] = True
 
 
-def _only_in(one: Surfels, other: Surfels) -> _Voxels:
-    """Return voxels of fine surfels of `one` without a near surfel of `other`."""
+def _only_in(one: Surfels, other: Surfels) -> tuple[Array, Array]:
+    """Return mean positions (M, 3) and areas (M,) of voxels of fine surfels of `one` without a near surfel of `other`."""
     fine = one[one.levels <= _FINEST]
     keys = core.voxel_keys(fine.points_map, np.full(len(fine), _VOXEL_LEVEL, np.uint8))
     _, first, of_voxel = np.unique(keys, return_index=True, return_inverse=True)
@@ -147,18 +139,18 @@ def _only_in(one: Surfels, other: Surfels) -> _Voxels:
     means = np.stack([np.bincount(of_voxel, places[:, i], len(voxels)) for i in range(3)], axis=1)
     summed = np.bincount(of_voxel, areas, len(voxels))
     kept = summed >= _LEAST_SHARE * _VOXEL_M**2
-    return _Voxels(means[kept] / np.maximum(count[kept], 1)[:, None], summed[kept])
+    return means[kept] / np.maximum(count[kept], 1)[:, None], summed[kept]
 
 
-def _verdicts(voxels: _Voxels, other: SeenSite) -> NDArray[np.uint8]:
-    """Return (M,) verdicts of the other version's images on the voxels."""
-    through, seen = np.zeros((2, len(voxels.points_map)))
+def _counts(points_map: Array, other: SeenSite) -> Array:
+    """Return (2, M) how many of the other version's images saw through the points, and a surface there."""
+    through, seen = counts = np.zeros((2, len(points_map)))
     focal_px = 0.5 * _VIEW_PX / other.tangent
     centre_px = (_VIEW_PX - 1) / 2
     lens = np.array([focal_px, focal_px, centre_px, centre_px])
     camera = CameraCalibration("radial-tangential", _VIEW_PX, _VIEW_PX, lens, np.zeros(0), np.eye(4))
     for view in other.surfels.exposures:
-        rows = _shown(voxels.points_map, view, other.tangent)
+        rows = _shown(points_map, view, other.tangent)
         if not len(rows):
             continue
         # A camera with the view's position and direction, as level as possible
@@ -170,14 +162,13 @@ def _verdicts(voxels: _Voxels, other: SeenSite) -> NDArray[np.uint8]:
         is_known, around = np.isfinite(depth_m), np.ones((3, 3), np.uint8)
         nearest_m = np.asarray(cv2.erode(np.where(is_known, depth_m, np.float32(np.inf)), around))
         farthest_m = np.asarray(cv2.dilate(np.where(is_known, depth_m, np.float32(-np.inf)), around))
-        points_cam = voxels.points_map[rows] @ se3_inverse(map_from_cam)[:3, :3].T + se3_inverse(map_from_cam)[:3, 3]
+        points_cam = points_map[rows] @ se3_inverse(map_from_cam)[:3, :3].T + se3_inverse(map_from_cam)[:3, 3]
         columns, lines = np.round(camera.pixel_from_ray(points_cam)).astype(np.int64).clip(0, _VIEW_PX - 1).T
         distance_m, clear_m = np.linalg.norm(points_cam, axis=1), CELL_M + _CLEAR_PER_M * depth_m[lines, columns] ** 2
         near_m, far_m = nearest_m[lines, columns] - clear_m, farthest_m[lines, columns] + clear_m
         through[rows] += distance_m < near_m  # False for NaN, unknown pixels
         seen[rows] += (distance_m >= near_m) & (distance_m <= far_m)
-    score = HIT * seen - through
-    return np.where(score <= -AGAINST, _CHANGED, np.where(seen > 0, _SAME, _UNJUDGED)).astype(np.uint8)
+    return counts
 
 
 def _shown(points_map: Array, view: Array, tangent: float) -> NDArray[np.int64]:

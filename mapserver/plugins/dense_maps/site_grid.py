@@ -144,8 +144,3 @@ def height_map(tiles: Mapping[tuple[int, int], Counts]) -> tuple[Array, Occupanc
         known = codes.cells.view(np.uint8).astype(np.float64)
         layers.append(np.where(known > 0, LOWEST_M + (known - 0.5) * HEIGHT_STEP_M, np.nan))
     return np.stack(layers), codes
-
-
-def area_m2(grid: OccupancyGrid, state: int) -> float:
-    """Return the area in square metres of the cells in this state."""
-    return float((grid.cells == state).sum()) * grid.resolution_m**2

@@ -127,7 +127,7 @@ def test_a_wrong_recording_is_refused_before_its_drive_is_followed(
     recording: Recording, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     swapped = Finding("left and right", Verdict.FAIL, None, "", "the cameras are swapped")
-    monkeypatch.setattr(sensors, "stream_checks", lambda _: [swapped])
+    monkeypatch.setattr(sensors, "stamp_order", lambda _: swapped)
     checks = sys.modules[admission.run_checks.__module__]
     monkeypatch.setattr(checks, "measure_calibration", lambda *_: pytest.fail("was followed"))
     with pytest.raises(RecordingError, match="left and right: the cameras are swapped"):
