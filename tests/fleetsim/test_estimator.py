@@ -1,5 +1,6 @@
 """The run without pictures: its geometry against the rays and the painter's depth, its noise against its own statistics."""
 
+from contextlib import closing
 from functools import lru_cache
 
 import numpy as np
@@ -28,13 +29,10 @@ CLIP = Order("clip", robot="tote-1")
 
 
 def test_landmarks_lie_where_the_painter_sees_surfaces() -> None:
-    session = prepare(CLIP)
-    try:
+    session, frame = prepare(CLIP), 40
+    with closing(session.renderer):
         estimator = EstimatorSession(session)
-        frame = 40
         (shot, _), seen = session.renderer.shoot(session.frame_times_s[frame]), estimator.sighting(frame)
-    finally:
-        session.renderer.close()
     column, row = np.rint(seen.pixels[:, :2]).astype(int).T
     depth = estimator.camera.focal_px * estimator.camera.baseline_m / (seen.pixels[:, 0] - seen.pixels[:, 2])
     steps = np.arange(-2, 3)
@@ -159,11 +157,9 @@ def test_odometry_and_localizer_live_on_it() -> None:
 def test_a_person_hides_what_the_painter_no_longer_shows() -> None:
     order = Order("clip", robot="tote-1", faults=(Fault("person-in-front", 1.0, 3.0),))
     session, alone = prepare(order), _session(CLIP)
-    try:
+    with closing(session.renderer):
         crowded, frame = EstimatorSession(session), 30
         shot, _ = session.renderer.shoot(session.frame_times_s[frame])
-    finally:
-        session.renderer.close()
     before, seen, without = alone.sighting(frame), crowded.sighting(frame), _session(order).sighting(10)
     is_hidden = ~np.isin(before.ids, seen.ids)
     column, row = np.rint(before.pixels[:, :2]).astype(int).T

@@ -1,6 +1,7 @@
 """The commands: recordings that open, faults in the pictures, equal bytes for equal seeds."""
 
 import hashlib
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +75,7 @@ def test_equal_seeds_give_equal_bytes_and_others_do_not(tmp_path: Path) -> None:
 def test_hidden_errors_are_in_the_pictures_and_not_in_the_calibration(tmp_path: Path) -> None:
     plain, hidden = Order("clip"), Order("clip", hidden=HiddenErrors(0.02, 0.01, 0.005))
     one, other = prepare(plain), prepare(hidden)
-    try:
+    with closing(one.renderer), closing(other.renderer):
         for camera, same in zip(one.nominal.cameras, other.nominal.cameras, strict=True):
             np.testing.assert_array_equal(camera.body_from_cam, same.body_from_cam)
         for number in range(2):
@@ -84,9 +85,6 @@ def test_hidden_errors_are_in_the_pictures_and_not_in_the_calibration(tmp_path: 
         early = np.array(one.frame_stamps_ns()) - np.array(other.frame_stamps_ns())
         assert (early == 20_000_000).all()
         np.testing.assert_array_equal(one.imu.stamps_ns, other.imu.stamps_ns)
-    finally:
-        one.renderer.close()
-        other.renderer.close()
     folder = tmp_path / "hidden"
     folder.mkdir()
     arguments = ["--camera-delay-ms", "20", "--camera-turn-deg", "0.5", "--camera-shift-mm", "5"]
@@ -102,7 +100,7 @@ def test_camera_faults_are_in_the_pictures() -> None:
         Fault("person-in-front", 1.2, 1.3), Fault("frames-dropped", 1.4, 1.5), Fault("frames-late", 1.6, 1.7),
     )  # fmt: skip
     session = prepare(Order("clip", size_px=(160, 120), faults=faults))
-    try:
+    with closing(session.renderer):
         shoot = session.renderer.shoot
         plain, dark, glare = (shoot(time_s)[0].image.mean() for time_s in (0.45, 0.55, 1.05))
         assert dark < 0.2 * plain
@@ -119,8 +117,6 @@ def test_camera_faults_are_in_the_pictures() -> None:
         assert late.any()
         assert lateness[late] == pytest.approx(0.05, abs=1e-6)
         assert lateness[~late] == pytest.approx(0.0, abs=1e-6)
-    finally:
-        session.renderer.close()
 
 
 @pytest.mark.parametrize(

@@ -105,11 +105,11 @@ def test_exposures_of_views_and_drives_are_evened_out_and_shown_again() -> None:
 
 
 def test_one_camera_adds_nothing_and_says_so() -> None:
-    mono = StereoCamera(FOCAL, CAMERA.cx_px, CAMERA.cy_px, 0.0, WIDTH, HEIGHT)
-    first = grown(session_at(PLACES[:4], has_depth=True))
-    surfels, without = grown_surfels(first, [session_at(PLACES[:2], mono)])
-    assert surfels is first
-    assert "no depth" in without["ride"]
+    mono = session_at(PLACES[:3], StereoCamera(FOCAL, CAMERA.cx_px, CAMERA.cy_px, 0.0, WIDTH, HEIGHT))
+    first, (grid, _) = grown(session_at(PLACES[:4], has_depth=True)), grown_grid({}, [session_at(ride([0.8] * 6))])
+    for (after, without), before in ((grown_surfels(first, [mono]), first), (grown_grid(grid, [mono]), grid)):
+        assert after == before
+        assert "no depth" in without["ride"]
 
 
 def test_exposure_and_lens_are_told_apart() -> None:
@@ -148,14 +148,6 @@ def test_a_room_has_its_walls_and_nothing_behind_them(has_depth: bool) -> None:
     assert (grid.cells[rows.max() + 2 :] == UNKNOWN).all()
     again, _ = grown_grid({}, [session_at(ride([0.8] * 12), has_depth=has_depth)])
     assert all(np.array_equal(cells, again[place]) for place, cells in tiles.items())
-
-
-def test_a_camera_without_depth_keeps_what_was_known() -> None:
-    before, _ = grown_grid({}, [session_at(ride([0.8] * 6))])
-    mono = StereoCamera(FOCAL, CAMERA.cx_px, CAMERA.cy_px, 0.0, WIDTH, HEIGHT)
-    after, without = grown_grid(before, [session_at(ride([0.8] * 3), mono)])
-    assert after == before
-    assert "no depth" in without["ride"]
 
 
 def test_a_camera_that_is_carried_by_hand_has_no_floor() -> None:

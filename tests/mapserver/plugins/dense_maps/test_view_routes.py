@@ -11,10 +11,11 @@ import pytest
 from fleetmap.geometry import se3
 from fleetmap.messages import CameraNote, Placement
 from mapserver.fleet.fleet import Fleet
-from mapserver.store import FailureFilter
+from mapserver.store import FailureFilter, MapStore
+from support.fleet.asked_api import answers
 from support.fleet.reports import blindness
 from support.fleet.served_api import Server, check_problem, served_api
-from support.storage.dense_samples import save_session_pictures, save_surfel_draft, seen_wall, wall
+from support.storage.dense_samples import save_session_pictures, save_surfel_draft, seen_wall, surfel_extras, wall
 from support.storage.map_samples import save_grid_draft, save_sample_draft
 from support.storage.room_sessions import session_at
 
@@ -173,3 +174,29 @@ def test_planners_fetch_both_files(server: Server) -> None:
     assert (cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_UNCHANGED) == 0).sum() == 100
     again = server.client.get(f"{address}.pgm?robot_height_m=0.7", headers={"If-None-Match": answer.headers["ETag"]})
     assert again.status_code == 304
+
+
+# What the OpenAPI document says of dense maps holds.
+
+
+def fill(store: MapStore) -> None:
+    """Version 3 with grid and surfels, 4 with pictures."""
+    extras, said = surfel_extras(wall())
+    save_grid_draft(store, site="hall", extras=extras, surfels=said)
+    save_session_pictures(store, [session_at([np.eye(4)], has_depth=True)], site="hall")
+
+
+def chosen(label: str) -> dict[str, int]:
+    """The versions that have it; few questions would be answered otherwise."""
+    if "/changes." in label:
+        return {"before": 3, "after": 3}
+    return {"version": 4} if label.endswith("/pictures") else {}
+
+
+def test_no_question_breaks_the_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = answers(tmp_path, monkeypatch, fill, chosen, r"/(grid|view|changes|expected)\.|/pictures(/\{sha256\})?$")
+    assert len(asked) >= 8
+    for label, statuses in asked.items():
+        if label.endswith("/changes.geojson"):  # it shares a rate with changes.png, which was asked before
+            continue
+        assert "{sha256}" in label or 200 in statuses, f"{label}: {statuses}"

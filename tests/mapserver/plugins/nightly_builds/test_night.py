@@ -7,6 +7,7 @@ import io
 import json
 import os
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -75,10 +76,7 @@ def built(
             entries.append(entry)
     if not entries:
         raise SurveyError("nothing could be joined")
-    details = draft_details()
-    details = type(details)(
-        **{name: getattr(details, name) for name in details.__struct_fields__} | {"recordings": tuple(entries)}
-    )
+    details = msgspec.structs.replace(draft_details(), recordings=tuple(entries))
     tile = random_tile(np.random.default_rng(len(entries)), landmarks=landmarks, places=2)
     options = request.options
     content = DraftContent(tiles=[tile], vocabulary=b"words", details=details, job=options.job)
@@ -101,9 +99,9 @@ def hall(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def spend(folder: Path) -> str:
+def spend(folder: Path, **more: Any) -> str:
     """One night, some time after everything came in."""
-    order = NightRequest("hall", folder / "inbox", folder / "store", time.time_ns() + LATER_NS)
+    order = NightRequest("hall", folder / "inbox", folder / "store", time.time_ns() + LATER_NS, **more)
     return run_night(order, GateSettings(), Console(file=io.StringIO()))
 
 
@@ -120,9 +118,7 @@ def test_a_night_surveys_with_the_preset_of_the_sensors_as_a_build_does(
     config.write_text("[survey]\nseed = 5\n")
     monkeypatch.setattr(night, "build_draft", spied)
     monkeypatch.setattr("mapserver.library.sensor_set_of", lambda *_: SensorSet.MONO)
-    now_ns, options = time.time_ns() + LATER_NS, BuildOptions(config=config)
-    order = NightRequest("hall", hall / "inbox", hall / "store", now_ns, options=options)
-    run_night(order, GateSettings(), Console(file=io.StringIO()))
+    spend(hall, options=BuildOptions(config=config))
     assert used == [survey_settings(config, SensorSet.MONO)]
     assert used[0] != survey_settings(config, SensorSet.STEREO_INERTIAL)
     assert used[0].seed == 5
@@ -130,12 +126,9 @@ def test_a_night_surveys_with_the_preset_of_the_sensors_as_a_build_does(
 
 def test_a_night_removes_what_is_older_than_its_period(hall: Path) -> None:
     spend(hall)
-    now_ns, periods = time.time_ns() + LATER_NS, FleetRetention(recording_days=1e-9)
-    order = NightRequest("hall", hall / "inbox", hall / "store", now_ns, retention=periods)
-    assert run_night(order, GateSettings(), Console(file=io.StringIO())) == "site hall: nothing new"
+    assert spend(hall, retention=FleetRetention(recording_days=1e-9)) == "site hall: nothing new"
     assert names(hall / "inbox/done") == []
-    last = last_report(hall / "store", "hall")
-    assert last["expired"] == {"recordings of surveys": 2}
+    assert last_report(hall / "store", "hall")["expired"] == {"recordings of surveys": 2}
 
 
 def states(folder: Path) -> list[tuple[str, list[str]]]:
@@ -253,11 +246,6 @@ def test_a_name_that_cannot_be_used_goes_to_bad_and_the_night_goes_on(hall: Path
         assert reason == f"{name}.reason.txt"
         assert len((hall / "inbox/bad" / reason).read_text("utf-8").splitlines()) == 1
     assert states(hall) == [("current", ["monday", "tuesday"])]
-    for path in paths:  # the control: what the night did with such a name before
-        with pytest.raises((OSError, UnicodeEncodeError, AssertionError)):
-            (hall / f"{path.name}.reason.txt").write_text("why")
-            msgspec.json.encode({"name": path.name})
-            assert "\n" not in path.name
 
 
 def _socket(path: Path) -> None:
@@ -291,10 +279,6 @@ def _deep(path: Path) -> None:
             os.chdir("d" * 40)
 
 
-def _long_line(path: Path) -> None:
-    path.write_bytes(b"1" * (64 << 20))
-
-
 BAD_ENTRIES = {
     "a link that leads to itself": (lambda path: path.symlink_to(path.name), "symbolic link"),
     "a link to nothing": (lambda path: path.symlink_to("nowhere"), "symbolic link"),
@@ -306,7 +290,10 @@ BAD_ENTRIES = {
     "a FIFO as a table": (_in_recording(os.mkfifo, "mav0/imu0/data.csv"), "data.csv is a FIFO"),
     "folders without end": (_in_recording(_deep), "levels of folders"),
     "a table of terabytes": (_in_recording(_sparse(1 << 41), "mav0/imu0/data.csv"), "at most 1073741824 are read"),
-    "a table of one line": (_in_recording(_long_line, "mav0/imu0/data.csv"), "no row"),
+    "a table of one line": (
+        _in_recording(lambda path: path.write_bytes(b"1" * (64 << 20)), "mav0/imu0/data.csv"),
+        "no row",
+    ),
     "a calibration of terabytes": (
         _in_recording(_sparse(1 << 41), "mav0/cam0/sensor.yaml"),
         "at most 1048576 are read",
@@ -544,8 +531,6 @@ def test_one_night_at_a_time_and_a_dead_one_holds_nothing(hall: Path) -> None:
 @pytest.mark.parametrize("how", ["kill", "ENOSPC"])
 def test_a_night_that_was_killed_or_ran_out_of_space_is_gone_on_with(hall: Path, how: str, tmp_path_factory) -> None:
     """At every 23rd file-system call, SQLite's too: the next night makes one version of both recordings, and loses nothing."""
-    import shutil
-
     number, tries, resumed = 4 if how == "kill" else 7, 0, 0
     while True:
         folder = tmp_path_factory.mktemp("night")

@@ -1,5 +1,6 @@
-"""The grid of a version: on its way through the store, written for planners, and refused where there is none."""
+"""What commands write of a version's grid and surfels, read by other programs, and what they refuse."""
 
+import json
 from pathlib import Path
 
 import cv2
@@ -7,11 +8,16 @@ import numpy as np
 import pytest
 import yaml
 from numpy.typing import NDArray
+from plyfile import PlyData
 
+from fleetmap.geometry import quat_wxyz_from_rotation
+from fleetmap.sensors.samples import SensorSet
 from fleetmap.version_grid import TILE_CELLS
 from mapserver import releases
 from mapserver.store import MapStore, Retention
 from support.drawn_areas import geojson
+from support.recordings.painted_room import Ride, write_ride
+from support.storage.dense_samples import save_surfel_draft, seen_wall, wall
 from support.storage.map_samples import save_grid_draft, save_sample_draft
 
 
@@ -20,6 +26,14 @@ def site(tmp_path: Path) -> tuple[str, ...]:
     with MapStore.open(tmp_path / "store", create=True) as store:
         save_grid_draft(store)
         releases.publish(store, "lab")
+    return ("--site", "lab", "--store", str(tmp_path / "store"))
+
+
+@pytest.fixture
+def walled(tmp_path: Path) -> tuple[str, ...]:
+    with MapStore.open(tmp_path / "store", create=True) as store:
+        save_sample_draft(store)
+        save_surfel_draft(store, wall())
     return ("--site", "lab", "--store", str(tmp_path / "store"))
 
 
@@ -46,7 +60,7 @@ def test_a_grid_is_written_for_the_robots_height(run, site, tmp_path: Path) -> N
     assert np.isnan(heights["highest_m"]).sum() == TILE_CELLS**2 - 40 * 80
 
 
-def test_wrong_orders_are_told(run, site, tmp_path: Path) -> None:
+def test_wrong_orders_for_grids_are_told(run, site, tmp_path: Path) -> None:
     assert "has no version 7" in run("grid", "export", *site, tmp_path / "a.yaml", "--version", 7, status=2)
     assert "up to 2.10 m" in run("grid", "export", *site, tmp_path / "a.yaml", "--robot-height", "3", status=2)
     assert "above 0.1 m" in run("grid", "export", *site, tmp_path / "a.yaml", "--robot-height", "0.1", status=2)
@@ -117,3 +131,50 @@ def test_masks_over_half_a_country_are_refused(run, site, tmp_path: Path) -> Non
     (tmp_path / "masks.json").write_bytes(geojson(DOCK, far))
     run("areas", "import", tmp_path / "masks.json", *site)
     assert "100001 x 100001 cells" in run("areas", "export", *site, "--keep-out", tmp_path / "k.yaml", status=2)
+
+
+def test_another_reader_finds_the_wall(run, walled, tmp_path: Path) -> None:
+    assert f"{len(wall())} surfels of version 2" in run("map", "splats", *walled, 2, tmp_path / "a.ply")
+    vertices = PlyData.read(tmp_path / "a.ply")["vertex"]
+    assert len(vertices) == len(wall())
+    np.testing.assert_allclose(vertices["x"], 2.0, atol=1e-3)
+    assert set(np.round((0.5 + 0.28209479 * vertices["f_dc_1"]) * 255).astype(int)) == {120, 250}
+    np.testing.assert_allclose(1 / (1 + np.exp(-vertices["opacity"])), 0.98, atol=1e-4)
+    scales = np.exp(np.stack([vertices[f"scale_{i}"] for i in range(3)], axis=1))
+    assert (scales[:, 2] < 0.2 * scales[:, 0]).all()
+    # The thin axis of each Gaussian is the wall's normal: z of its rotation, up to the sign.
+    turned = np.array([[0.0, 0.0, -1.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]])
+    rotations = np.stack([vertices[f"rot_{i}"] for i in range(4)], axis=1)
+    wanted = quat_wxyz_from_rotation(turned)
+    assert np.abs(rotations @ wanted).min() == pytest.approx(1.0, abs=1e-4)
+
+
+def test_what_changed_is_written_as_a_plan_and_as_geojson(run, walled, tmp_path: Path) -> None:
+    with MapStore.open(tmp_path / "store") as store:
+        for with_board in (False, True):
+            save_surfel_draft(store, seen_wall(with_board=with_board))
+    said = run("map", "changes", *walled, 3, 4, tmp_path / "c.png")
+    assert "1 patches appeared" in said
+    assert "0 patches vanished" in said
+    run("map", "changes", *walled, 3, 4, tmp_path / "C.PNG")
+    assert all((tmp_path / name).read_bytes().startswith(b"\x89PNG") for name in ("c.png", "C.PNG"))
+    run("map", "changes", *walled, 4, 3, tmp_path / "c.geojson")
+    found = json.loads((tmp_path / "c.geojson").read_text())
+    assert [feature["properties"]["change"] for feature in found["features"]] == ["vanished"]
+    assert "must end in .png or .geojson" in run("map", "changes", *walled, 3, 4, tmp_path / "c.txt", status=2)
+    assert "surfel_map = true" in run("map", "changes", *walled, 1, 4, tmp_path / "d.png", status=2)
+    assert not list(tmp_path.glob("d.*"))
+
+
+def test_wrong_orders_for_surfels_are_told(run, walled, tmp_path: Path) -> None:
+    assert "surfel_map = true" in run("map", "splats", *walled, 1, tmp_path / "a.ply", status=2)
+    assert "has no version 7" in run("map", "splats", *walled, 7, tmp_path / "a.ply", status=2)
+    assert "must end in .ply" in run("map", "splats", *walled, 2, tmp_path / "a.obj", status=2)
+    write_ride(tmp_path / "other.mcap", Ride(), SensorSet.STEREO)
+    wanted = (*walled, 2, tmp_path / "other.mcap")
+    assert "must end in .ply" in run("map", "refine", *wanted, tmp_path / "a.obj", status=2)
+    assert "is not of version 2" in run("map", "refine", *wanted, tmp_path / "a.ply", status=2)
+    assert "surfel_map = true" in run(
+        "map", "refine", *walled, 1, tmp_path / "other.mcap", tmp_path / "a.ply", status=2
+    )
+    assert not list(tmp_path.glob("a.*"))
