@@ -1,4 +1,4 @@
-"""What PostgreSQL alone brings: a database that goes away and comes back, locks of several machines, files that servers share."""
+"""What PostgreSQL alone brings: a database that goes away and comes back, locks of several machines, servers that share a store."""
 
 import sqlite3
 import threading
@@ -8,6 +8,7 @@ from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
 
+import httpx
 import pytest
 from pg8000.dbapi import InterfaceError
 
@@ -26,7 +27,9 @@ from mapserver.trust import SignedLists, init_here
 from mapserver.trust.authorities import Authorities
 from mapserver.trust.enrolment import RobotRegister
 from mapserver.trust.signing import update_lists
+from support.fleet.dashboard_scene import serving
 from support.fleet.memory_bus import MemoryBus, MemoryHub
+from support.fleet.two_servers import run
 from support.storage.map_samples import publish_samples, save_sample_draft
 from support.storage.postgres_server import PostgresServer
 
@@ -406,3 +409,31 @@ def test_a_connection_by_tls_is_checked_when_asked_for(tmp_path: Path, postgres:
     finally:
         postgres.stop()
         postgres.start()
+
+
+def test_nothing_acknowledged_is_lost_and_nothing_is_counted_twice(postgres: PostgresServer, s3: str) -> None:
+    """One server after the other is killed while robots report and ask."""
+    found = run(postgres.database(), s3, robots=4, seconds=12.0, kill_every_s=4.0, every_s=0.2)
+    assert found["wrong"] == []
+    assert found["kills"] >= 2
+    assert found["acknowledged"] and found["questions"]
+
+
+def test_a_server_whose_database_is_away_says_so_and_goes_on(tmp_path: Path, postgres: PostgresServer) -> None:
+    with MapStore.open(tmp_path, create=True) as store:
+        publish_samples(store, 1)
+    MapStore.attach(tmp_path, Places(database=postgres.database()))
+
+    def statuses(http: str) -> list[int]:
+        pages = ("/readyz", "/v1/sites", "/metrics", "/dashboard/map")
+        return [httpx.get(f"{http}{page}", timeout=60, follow_redirects=True).status_code for page in pages]
+
+    with serving(tmp_path) as served:
+        assert statuses(served.http) == [200] * 4
+        postgres.stop()
+        try:
+            assert statuses(served.http) == [503] * 4
+            assert httpx.get(f"{served.http}/healthz", timeout=60).status_code == 200
+        finally:
+            postgres.start()
+        assert statuses(served.http) == [200] * 4

@@ -54,7 +54,6 @@ def problem(pairs: Sequence[tuple[int, int]], kind: str = "poses", count: int = 
     moved = {"map_from_body": map_from_body, "fixed": np.zeros(count, np.bool_), "relative": relative, "priors": priors}
     terms = replace(SCENE.observed(np.zeros(len(SCENE.obs_pixels), np.bool_)), **moved, inertial=None)
     if kind != "poses":
-        assert SCENE.inertial is not None
         increment = replace(SCENE.inertial.edges[0][2], cov=np.eye(15))
         told = [MotionPrior(k, np.zeros(9), np.ones(9)) for k in range(count)]
         terms.inertial = InertialTerms(rng.normal(size=(count, 9)), [(i, j, increment) for i, j in pairs[::2]], told)
