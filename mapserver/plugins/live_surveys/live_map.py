@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_adjoint, se3_inverse, skew
 from fleetmap.messages import Cause, EstimateMessage, Placement, Status, covariance_entries
-from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from mapserver.plugins.live_surveys.message import (
     MOST_PLACES,
     NO_PART,
@@ -21,7 +21,6 @@ from mapserver.plugins.live_surveys.message import (
     LivePart,
     LiveParts,
     LiveRevisit,
-    LiveRig,
     MapSketch,
     NewKeyframe,
     joined_imu,
@@ -60,13 +59,14 @@ _WIDE = 25.0  # factor on odometry's covariance where it only determines what pi
 class LiveMap:
     """Processes every keyframe in order; the result depends on nothing else."""
 
-    def __init__(self, options: SurveyConfig, rig: LiveRig) -> None:
-        """rig: with one camera, features get their depths from the keyframes of the window."""
-        self._options, self._settings, self._rig = options, options.settings, rig
-        kind = CameraKind.DEPTH if rig.is_depth_camera else CameraKind.STEREO
-        self._mounted = Rig.of_one(survey_camera(rig.camera), rig.body_from_cam, kind)
+    def __init__(self, options: SurveyConfig, rectifier: Rectifier) -> None:
+        """rectifier: of a single camera, features get their depths from the keyframes of the window."""
+        self._options, self._settings, self._rectifier = options, options.settings, rectifier
+        kind = CameraKind.DEPTH if rectifier.has_depth else CameraKind.STEREO
+        self._mounted = Rig.of_one(survey_camera(rectifier.camera), rectifier.body_from_cam, kind)
+        self._scale_known = rectifier.camera.baseline_m > 0 or rectifier.calibration.imu is not None
         self._depths = None
-        if rig.camera.baseline_m == 0:
+        if rectifier.camera.baseline_m == 0:
             self._depths = MonoDepths([], self._mounted.camera, options.settings)
         self._keyframes: list[Keyframe] = []
         self._news: list[NewKeyframe] = []
@@ -167,7 +167,10 @@ class LiveMap:
             return None
         label = int(parts.labels[newest])
         span = parts.spans[label] if label >= 0 else None
-        body_from_base, odom_from_body = se3_inverse(self._rig.base_from_body), self._news[newest].frame_from_body
+        body_from_base, odom_from_body = (
+            se3_inverse(self._rectifier.calibration.base_from_body),
+            self._news[newest].frame_from_body,
+        )
         if span is not None and not span.is_map:
             status = Status.LOST, Cause.NO_MATCH
         elif not parts.spans:
@@ -198,7 +201,7 @@ class LiveMap:
 
     def add(self, frame: RectifiedFrame, new: NewKeyframe) -> None:
         """Add one more keyframe: match and adjust it with its neighbours, and compare it with all earlier ones."""
-        keyframe = make_keyframe(frame, new.number, self._rig.camera, self._settings)
+        keyframe = make_keyframe(frame, new.number, self._rectifier.camera, self._settings)
         self._keyframes.append(keyframe)
         if len(self._keyframes) > _WINDOW:
             self._keyframes[-_WINDOW - 1] = self._keyframes[-_WINDOW - 1].without_pictures()
@@ -258,14 +261,14 @@ class LiveMap:
         """Compute depths of one camera's features, from the present poses of the window's keyframes."""
         if self._depths is not None:
             self._depths.grow(self._keyframes)
-            placed = np.array(self._chain_from_body) @ self._rig.body_from_cam
+            placed = np.array(self._chain_from_body) @ self._rectifier.body_from_cam
             self._keyframes[first:] = self._depths.keyframes_at(placed, first)
 
     def _step_cov(self, by_odometry: Array, found: Sequence[PairMatch]) -> Array:
         """Return (6, 6) of the step to the newest keyframe: common images may connect a frame lost by odometry to the previous one."""
         for pair in found:
             if pair.i == pair.j - 1:
-                edge = body_edge(pair, self._rig.body_from_cam)
+                edge = body_edge(pair, self._rectifier.body_from_cam)
                 carry = se3_adjoint(
                     se3_inverse(edge.i_from_j)
                 )  # from the axes of the newest to those of the previous one
@@ -319,15 +322,15 @@ class LiveMap:
 
     def _state(self, first: int) -> SurveyState:
         """Return the window as the state of an adjustment, upright."""
-        rig, news = self._rig, self._news[first:]
+        noise, news = self._rectifier.calibration.imu, self._news[first:]
         level_from_body = se3(self._level, np.zeros(3)) @ np.array(self._chain_from_body[first:])
-        inertial = rig.imu_noise is not None and all(new.inertial for new in news)
+        inertial = noise is not None and all(new.inertial for new in news)
         motions = [np.r_[new.velocity_body_mps, new.gyro_bias_radps, new.accel_bias_mps2] for new in news]
         motion = KeyframeMotion(
             inertial=inertial,
             imu=joined_imu([new.imu for new in news]),
-            noise=rig.imu_noise,
-            imu_minus_cam_s=rig.imu_minus_cam_s,
+            noise=noise,
+            imu_minus_cam_s=self._rectifier.imu_minus_cam_s,
             motions=turned(np.array(motions), level_from_body[:, :3, :3]),
             relative=[] if inertial else self._relative(first),
         )
@@ -378,17 +381,17 @@ class LiveMap:
 
     def _close(self) -> None:
         """Search revisits of the newest keyframe; with a new loop the pose graph updates all keyframes."""
-        newest, rig = len(self._keyframes) - 1, self._rig
+        newest = len(self._keyframes) - 1
         posed = RigImages.of(self._keyframes, self._map_from_body, self._mounted)
         matched = [(pair.i, pair.j) for pair in self._pairs if pair.j == newest]
         learned = [] if self._closer is None else self._closer.learned
         scale_walk = self._settings.monocular.scale_walk
-        known = self._chain if rig.scale_known else gate_covariances(self._chain, scale_walk)
+        known = self._chain if self._scale_known else gate_covariances(self._chain, scale_walk)
         marginals = GraphMarginals(self._map_from_body, [*known, *learned])
         self._marginals = marginals
         if self._closer is None:
             self._closer = LoopCloser(
-                posed, self._options, marginals, matched, self._joined, measures_scale=not rig.scale_known
+                posed, self._options, marginals, matched, self._joined, measures_scale=not self._scale_known
             )
             self._closer.close(0)
         else:
@@ -397,7 +400,7 @@ class LiveMap:
         edges = self._closer.loops.edges
         if len(edges) == len(self._loop_weights):
             return
-        if rig.scale_known:
+        if self._scale_known:
             solved = optimize_pose_graph(self._closer.begin, [*self._chain, *edges])
             self._map_from_body, self._loop_weights = solved.map_from_body, solved.loop_weights
         else:

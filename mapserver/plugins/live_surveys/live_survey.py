@@ -22,7 +22,7 @@ from mapserver.drafting.survey_recordings import read_zones
 from mapserver.library import BuiltMap, build_map
 from mapserver.plugins.live_surveys.drives import Drive, DueFrame
 from mapserver.plugins.live_surveys.mapping_process import MappingProcess
-from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, MOST_PLACES, LiveRig, LiveSurveyState, thinning
+from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, MOST_PLACES, LiveSurveyState, thinning
 from mapserver.plugins.live_surveys.tracking import LiveTracking, Tracked
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig
@@ -122,23 +122,13 @@ class _Survey:
         self._seen: Image | None = None  # the newest keyframe
         # Also with an IMU: odometry finds the scale, but in one recording the map's adjustment halved it.
         self._scale_known = drive.rectifier.camera.baseline_m > 0
-        rectifier, imu = drive.rectifier, drive.calibration.imu
-        self._rig = LiveRig(
-            rectifier.camera,
-            rectifier.body_from_cam,
-            drive.calibration.base_from_body,
-            imu,
-            rectifier.imu_minus_cam_s,
-            drive.has_depth,
-            scale_known=rectifier.camera.baseline_m > 0 or imu is not None,
-        )
-        self._mapping = MappingProcess(self._rig)
+        self._mapping = MappingProcess(drive.rectifier)
 
     def check(self) -> list[str]:
         """Return shortcomings before the start as text; FleetmapErrors for a survey certain to fail."""
         remarks, request = self._drive.check(), self._request
         self._config = SurveyConfig(request.settings, default_vocabulary(), read_zones(request.options.zones))
-        if not self._rig.scale_known:
+        if not self._scale_known and self._drive.calibration.imu is None:
             remarks.append(
                 "scale: unknown: one camera without an IMU shows no metres; the draft can be inspected, and published only if docks or "
                 "tags tell them. Record an IMU, a second camera or depths"

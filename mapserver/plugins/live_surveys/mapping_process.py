@@ -16,13 +16,12 @@ import numpy as np
 
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import Array
-from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from mapserver.plugins.live_surveys.live_map import LiveMap
 from mapserver.plugins.live_surveys.message import (
     COVERAGE_CELL_M,
     MAX_ARRAY_BYTES,
     LiveMissing,
-    LiveRig,
     MapSketch,
     NewKeyframe,
 )
@@ -46,12 +45,12 @@ _Item = tuple[RectifiedFrame, NewKeyframe]
 class MappingProcess:
     """The process and its communication threads, from `start` until `finish` or the end of a `with`."""
 
-    def __init__(self, rig: LiveRig) -> None:
+    def __init__(self, rectifier: Rectifier) -> None:
         context = multiprocessing.get_context("spawn")
         self._ours, theirs = context.Pipe()
         # Its arguments go through the pipe: larger process arguments would block for ever if the process dies.
         self._process = context.Process(target=_map, args=(theirs,), daemon=True, name="mapping")
-        self._theirs, self._rig = theirs, rig
+        self._theirs, self._rectifier = theirs, rectifier
         self._waiting: queue.Queue[_Item | None] = queue.Queue()
         self._sent = self.most_behind = 0
         self.sketch = NO_SKETCH  # after the newest processed keyframe
@@ -115,7 +114,7 @@ class MappingProcess:
 
     def _is_ready(self, config: SurveyConfig) -> bool:
         try:
-            self._ours.send((config, self._rig))
+            self._ours.send((config, self._rectifier))
             return self._ours.poll(_READY_WITHIN_S) and self._ours.recv() == "ready"
         except (EOFError, OSError):  # it ended before it was ready
             return False
@@ -153,9 +152,9 @@ def _map(pipe: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent process ends it
     os.nice(_NICENESS)
     cv2.setNumThreads(1)  # the other core is tracking's
-    config, rig = pipe.recv()
+    config, rectifier = pipe.recv()
     gc.freeze()
-    growing, quality, looked_s, shown_s = LiveMap(config, rig), (np.zeros((0, 3)), list[LiveMissing]()), 0.0, 0.0
+    growing, quality, looked_s, shown_s = LiveMap(config, rectifier), (np.zeros((0, 3)), list[LiveMissing]()), 0.0, 0.0
     try:
         pipe.send("ready")
         while (item := pipe.recv()) is not None:
@@ -164,10 +163,10 @@ def _map(pipe: Connection) -> None:
             if pipe.poll() and now_s - shown_s < _SHOW_WITHIN_S:
                 continue
             if now_s - looked_s >= _LOOK_EVERY_S:
-                looked_s, quality = now_s, _quality(growing, rig)
+                looked_s, quality = now_s, _quality(growing, rectifier)
             pipe.send(growing.sketch(*quality))
             shown_s = time.monotonic()
-        pipe.send(growing.sketch(*_quality(growing, rig)))
+        pipe.send(growing.sketch(*_quality(growing, rectifier)))
         pipe.send(None)
     except (EOFError, OSError):  # the survey was killed
         pass
@@ -175,11 +174,11 @@ def _map(pipe: Connection) -> None:
         pipe.send(f"mapping failed ({type(error).__name__}: {error})")
 
 
-def _quality(growing: LiveMap, rig: LiveRig) -> tuple[Array, list[LiveMissing]]:
+def _quality(growing: LiveMap, rectifier: Rectifier) -> tuple[Array, list[LiveMissing]]:
     labels = growing.parts().labels
     largest = np.bincount(labels[labels >= 0]).argmax() if (labels >= 0).any() else 0
     cells = covered_cells(growing.points_map(), MAX_ARRAY_BYTES // 12)
-    return cells, missing_directions(growing.map_from_body[labels == largest] @ rig.body_from_cam)
+    return cells, missing_directions(growing.map_from_body[labels == largest] @ rectifier.body_from_cam)
 
 
 def missing_directions(map_from_cam: Array) -> list[LiveMissing]:

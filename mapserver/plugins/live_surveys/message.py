@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from fleetmap.errors import LinkError
 from fleetmap.geometry import Array
 from fleetmap.messages import EstimateMessage, Name, Text, Version
-from fleetmap.sensors.calibration import ImuNoise
-from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
 
 MAX_ARRAY_BYTES = 64 << 10
@@ -152,20 +150,6 @@ def packed(rows: Array) -> bytes:
 def live_key(site: str) -> str:
     """Key of a site's running survey; '*' for any site."""
     return f"fleetmap/{site}/live/survey"
-
-
-@dataclass(frozen=True, slots=True)
-class LiveRig:
-    """Sensors of the survey: the rectified camera, its mount on the body, the IMU's noise (None if absent) and its clock; the body's pose
-    on the base."""
-
-    camera: StereoCamera
-    body_from_cam: Array
-    base_from_body: Array = field(default_factory=lambda: np.eye(4))
-    imu_noise: ImuNoise | None = None
-    imu_minus_cam_s: float = 0.0
-    is_depth_camera: bool = False
-    scale_known: bool = True  # False for one camera without an IMU
 
 
 @dataclass(frozen=True, slots=True)

@@ -155,13 +155,11 @@ class SeriesFrames:
         self.reader.close()
 
 
-def paired(
-    left: ImageSeries, partner: Mapping[str, ImageSeries], log: ReadLog, tolerance_ns: int | None = None
-) -> ViewImages:
+def paired(left: ImageSeries, partner: Mapping[str, ImageSeries], log: ReadLog) -> ViewImages:
     """A view of a camera's images, alone or with their `right` or `depth` by time; those without a partner are noted in `log`."""
     images = {"left": left}
     for field, second in partner.items():
-        most_ns = _TOLERANCES_NS[field] if tolerance_ns is None else tolerance_ns
+        most_ns = _TOLERANCES_NS[field]
         firsts, seconds = pair_stamps(left.stamps_ns, second.stamps_ns, most_ns)
         if len(left) + len(second) > 2 * len(firsts):
             alone = f"{len(left) + len(second) - 2 * len(firsts)} of {len(left)} and {len(second)}"

@@ -10,13 +10,13 @@ import numpy as np
 
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
-from fleetmap.sensors.rectification import RectifiedFrame
+from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
 from mapserver.drafting.survey_recordings import RecordingOptions
 from mapserver.plugins.live_surveys.drives import RecordedDrive
 from mapserver.plugins.live_surveys.live_map import LiveMap
 from mapserver.plugins.live_surveys.mapping_process import NO_SKETCH
-from mapserver.plugins.live_surveys.message import LiveRig, MapSketch, NewKeyframe
+from mapserver.plugins.live_surveys.message import MapSketch, NewKeyframe
 from mapserver.survey.survey_inputs import SurveyConfig
 from support.recordings.recording_samples import BODY_FROM_CAM0, Sample, calibration
 from support.worlds.box_room import depth_of
@@ -29,14 +29,14 @@ class MappingHere:
 
     made: "MappingHere"
 
-    def __init__(self, rig: LiveRig) -> None:
-        self._rig, self.sketch = rig, NO_SKETCH
+    def __init__(self, rectifier: Rectifier) -> None:
+        self._rectifier, self.sketch = rectifier, NO_SKETCH
         self.behind, self.most_behind, self.failed, self.longest_lag_s = 0, 0, "", 0.0
         self.after: dict[int, MapSketch] = {}  # by frame
         MappingHere.made = self
 
     def start(self, config: SurveyConfig) -> Self:
-        self.map = LiveMap(config, self._rig)
+        self.map = LiveMap(config, self._rectifier)
         return self
 
     def __enter__(self) -> Self:

@@ -124,7 +124,7 @@ def open_kitti(path: Path, options: OpenOptions) -> Recording:
         names = (f"P{row}" for row in (left_row, right_row))
         calibration = RigCalibration(tuple(_projected(file, _rows(file), name, size_px) for name in names))
         log.files.append(file)
-    view = paired(left, {"right": right}, log, 0)
+    view = paired(left, {"right": right}, log)
     truth = layout.optional_truth(path / "poses.txt", log, lambda file: _ground_truth(file, stamps_of_number, log))
     frames = SeriesFrames(layout.FileReader(path, log.files), (view,))
     return finalize(RecordingParts(path, "kitti", calibration, frames, ground_truth=truth), log)

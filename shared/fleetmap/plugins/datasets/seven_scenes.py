@@ -38,7 +38,7 @@ def recognises(path: Path) -> bool:
 def open_seven_scenes(path: Path, options: OpenOptions) -> Recording:
     """Open the recording in a 7-Scenes folder. The body is the colour camera; depth is returned registered to colour."""
     log = ReadLog()
-    view = paired(_files(path, "color", log), {"depth": _files(path, "depth", log)}, log, 0)
+    view = paired(_files(path, "color", log), {"depth": _files(path, "depth", log)}, log)
     colour, depth = (view.images[field] for field in ("left", "depth"))
     if len(colour) == 0:
         raise RecordingError(f"{path}: no colour image has its depth image; copy the recording again")

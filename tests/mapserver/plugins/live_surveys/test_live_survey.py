@@ -16,6 +16,7 @@ from fleetmap.errors import FleetmapError, UsageError
 from fleetmap.messages import MAX_MESSAGE_BYTES, encode_message
 from fleetmap.recordings import Topics, open_recording
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
+from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import SensorSet
 from fleetmap.sources.source import RecordingSource
 from mapserver.cli import app
@@ -26,12 +27,12 @@ from mapserver.plugins.live_surveys import live_survey
 from mapserver.plugins.live_surveys.drives import SensorDrive
 from mapserver.plugins.live_surveys.live_survey import LiveRequest, LiveResult, run_live
 from mapserver.plugins.live_surveys.mapping_process import MappingProcess
-from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, LiveRig, LiveSurveyState, NewKeyframe, packed
+from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, LiveSurveyState, NewKeyframe, packed
 from mapserver.store import MapStore
 from mapserver.survey.survey_inputs import SurveyConfig
 from support.recordings.live_drives import MappingHere, played
 from support.recordings.recording_samples import make_sample, write_mcap
-from support.worlds.textured_room import BODY_FROM_CAM, CAMERA, stereo_frame
+from support.worlds.textured_room import rig, stereo_frame
 
 FRAMES = 24
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
@@ -170,7 +171,7 @@ def test_what_a_killed_survey_has_recorded_can_be_read(recording: Path, tmp_path
 
 def test_pictures_that_do_not_change_at_all_are_mapped() -> None:
     """A robot that stands, under a camera without noise: every point is seen first by the first of them."""
-    mapping = MappingHere(LiveRig(CAMERA, BODY_FROM_CAM)).start(SurveyConfig(SETTINGS, default_vocabulary()))
+    mapping = MappingHere(Rectifier(rig(None))).start(SurveyConfig(SETTINGS, default_vocabulary()))
     still, step = np.zeros(3), np.diag([1e-4] * 6)
     for number in range(3):
         frame = replace(stereo_frame(50_000_000), stamp_ns=50_000_000 * (number + 1))
