@@ -271,7 +271,7 @@ class LiveMap:
                 edge = body_edge(pair, self._rectifier.body_from_cam)
                 carry = se3_adjoint(
                     se3_inverse(edge.i_from_j)
-                )  # from the axes of the newest to those of the previous one
+                )  # from the axes of the newest to those of the one before
                 tied = carry @ edge.cov_rot_trans @ carry.T
                 if np.trace(by_odometry[:3, :3]) > _LOST * np.trace(tied[:3, :3]):
                     return np.asarray(tied)
@@ -298,15 +298,10 @@ class LiveMap:
         state = apply_result(state, result)
         level_from_body = state.map_from_body
         chain_from_level = se3(self._level.T, np.zeros(3))
+        motions_body = turned(state.motion.motions, level_from_body[:, :3, :3].transpose(0, 2, 1))
         for n in np.flatnonzero(free).tolist():
-            k, (velocity_mps, gyro_bias, accel_bias) = first + n, np.split(state.motion.motions[n], 3)
-            self._chain_from_body[k] = chain_from_level @ level_from_body[n]
-            self._news[k] = replace(
-                self._news[k],
-                velocity_body_mps=level_from_body[n, :3, :3].T @ velocity_mps,
-                gyro_bias_radps=gyro_bias,
-                accel_bias_mps2=accel_bias,
-            )
+            self._chain_from_body[first + n] = chain_from_level @ level_from_body[n]
+            self._news[first + n] = replace(self._news[first + n], motion_body=motions_body[n])
         self._keep_points(first, state, keep)
 
     def _keep_points(self, first: int, state: SurveyState, keep: NDArray[np.bool_]) -> None:
@@ -325,13 +320,13 @@ class LiveMap:
         noise, news = self._rectifier.calibration.imu, self._news[first:]
         level_from_body = se3(self._level, np.zeros(3)) @ np.array(self._chain_from_body[first:])
         inertial = noise is not None and all(new.inertial for new in news)
-        motions = [np.r_[new.velocity_body_mps, new.gyro_bias_radps, new.accel_bias_mps2] for new in news]
+        motions_body = np.array([new.motion_body for new in news])
         motion = KeyframeMotion(
             inertial=inertial,
             imu=joined_imu([new.imu for new in news]),
             noise=noise,
             imu_minus_cam_s=self._rectifier.imu_minus_cam_s,
-            motions=turned(np.array(motions), level_from_body[:, :3, :3]),
+            motions=turned(motions_body, level_from_body[:, :3, :3]),
             relative=[] if inertial else self._relative(first),
         )
         posed = RigImages.of(self._keyframes[first:], level_from_body, self._mounted)

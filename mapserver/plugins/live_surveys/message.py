@@ -157,17 +157,16 @@ class NewKeyframe:
     """A frame chosen by the odometry.
 
     frame_from_body (4, 4) in odometry's continuous frame; level_from_frame (3, 3) makes that upright by the present gravity estimate.
-    step_cov (6, 6): of the motion since the previous keyframe, axes of that one, rotation first; None for the first. velocity_body_mps
-    and biases (3,); imu: samples since the previous keyframe. variance_m2: of the odometry's position, summed over the axes.
+    step_cov (6, 6): of the motion since the previous keyframe, axes of that one, rotation first; None for the first. motion_body (9,):
+    velocity in m/s, gyro and accelerometer bias; imu: samples since the previous keyframe. variance_m2: of the odometry's position,
+    summed over the axes.
     """
 
     number: int
     frame_from_body: Array
     level_from_frame: Array
     step_cov: Array | None
-    velocity_body_mps: Array
-    gyro_bias_radps: Array
-    accel_bias_mps2: Array
+    motion_body: Array
     inertial: bool = False
     imu: ImuSamples = field(default_factory=ImuSamples.empty)
     variance_m2: float = 0.0

@@ -80,7 +80,7 @@ class LiveTracking:
             step_cov = step_covariance(known, before.frame_from_body[:3, :3], step, least)
             if self._torn_m2 > before.torn_m2:
                 step_cov = step_cov + _TORN_M2 * np.eye(6)
-        rotation = estimate.odom_from_body[:3, :3]
+        velocity_body_mps = estimate.odom_from_body[:3, :3].T @ estimate.velocity_odom_mps
         self._before = _Before(covariance, frame_from_body, self._torn_m2)
         self._imu = []
         return NewKeyframe(
@@ -88,9 +88,7 @@ class LiveTracking:
             frame_from_body=frame_from_body,
             level_from_frame=self._run.chain.level_from_frame,
             step_cov=step_cov,
-            velocity_body_mps=rotation.T @ estimate.velocity_odom_mps,
-            gyro_bias_radps=estimate.gyro_bias_radps,
-            accel_bias_mps2=estimate.accel_bias_mps2,
+            motion_body=np.r_[velocity_body_mps, estimate.gyro_bias_radps, estimate.accel_bias_mps2],
             inertial=estimate.inertial,
             imu=imu,
             variance_m2=float(np.trace(covariance[3:, 3:])) + self._torn_m2,

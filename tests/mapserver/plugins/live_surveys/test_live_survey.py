@@ -172,10 +172,10 @@ def test_what_a_killed_survey_has_recorded_can_be_read(recording: Path, tmp_path
 def test_pictures_that_do_not_change_at_all_are_mapped() -> None:
     """A robot that stands, under a camera without noise: every point is seen first by the first of them."""
     mapping = MappingHere(Rectifier(rig(None))).start(SurveyConfig(SETTINGS, default_vocabulary()))
-    still, step = np.zeros(3), np.diag([1e-4] * 6)
+    step = np.diag([1e-4] * 6)
     for number in range(3):
         frame = replace(stereo_frame(50_000_000), stamp_ns=50_000_000 * (number + 1))
-        mapping.put(frame, NewKeyframe(number, np.eye(4), np.eye(3), step if number else None, still, still, still))
+        mapping.put(frame, NewKeyframe(number, np.eye(4), np.eye(3), step if number else None, np.zeros(9)))
     assert len(mapping.map.points_map()) > 100
     np.testing.assert_allclose(mapping.map_from_body[:, :3, 3], 0.0, atol=0.01)
 
