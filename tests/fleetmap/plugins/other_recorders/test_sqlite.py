@@ -88,10 +88,10 @@ def test_topics_are_named_as_the_message_says(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------------- what is no recording
 
 
-def database(path: Path, *commands: str) -> Path:
+def database(path: Path, *commands: str, **values: bytes) -> Path:
     with sqlite3.connect(path) as connection:
         for command in commands:
-            connection.execute(command)
+            connection.execute(command, values)
     connection.close()
     return path
 
@@ -99,6 +99,7 @@ def database(path: Path, *commands: str) -> Path:
 TOPICS = "CREATE TABLE topics (id INTEGER PRIMARY KEY, name, type, serialization_format)"
 MESSAGES = "CREATE TABLE messages (id INTEGER PRIMARY KEY, topic_id, timestamp, data)"
 TOPIC = "INSERT INTO topics VALUES (1, '/cam0/image_raw', 'sensor_msgs/msg/Image', 'cdr')"
+IMAGES = (TOPICS, MESSAGES, TOPIC)
 
 
 @pytest.mark.parametrize(
@@ -108,18 +109,9 @@ TOPIC = "INSERT INTO topics VALUES (1, '/cam0/image_raw', 'sensor_msgs/msg/Image
         (["CREATE TABLE topics (id)", "CREATE TABLE messages (id)"], r"cannot be read \(no such column"),
         ([TOPICS, "CREATE VIEW messages AS SELECT 1 AS topic_id, 2 AS timestamp, 3 AS data"], "not a rosbag2"),
         ([TOPICS, MESSAGES], r"no message that can be read \(it is empty\)"),
-        (
-            [TOPICS, MESSAGES, TOPIC, "INSERT INTO messages VALUES (1, 1, 'noon', x'00')"],
-            r"damaged messages: 1 rows left out",
-        ),
-        (
-            [TOPICS, MESSAGES, TOPIC, "INSERT INTO messages VALUES (1, 1, 5, x'28b52ffd00')"],
-            r"/cam0/image_raw: .*; the message is damaged",
-        ),
-        (
-            [TOPICS, MESSAGES, TOPIC, "INSERT INTO messages VALUES (1, 1, 5, x'0001')"],
-            r"/cam0/image_raw: .*; the message is damaged",
-        ),
+        ([*IMAGES, "INSERT INTO messages VALUES (1, 1, 'noon', x'00')"], "damaged messages: 1 rows left out"),
+        ([*IMAGES, "INSERT INTO messages VALUES (1, 1, 5, x'28b52ffd00')"], "/cam0/image_raw: .*message is damaged"),
+        ([*IMAGES, "INSERT INTO messages VALUES (1, 1, 5, x'0001')"], "/cam0/image_raw: .*message is damaged"),
     ],
     ids=["other tables", "other columns", "a view", "empty", "a stamp of words", "broken zstd", "a cut message"],
 )
@@ -129,19 +121,14 @@ def test_other_databases_get_words_of_their_own(tmp_path: Path, commands: list[s
 
 
 def test_values_that_are_made_while_reading_cost_no_memory(tmp_path: Path) -> None:
+    made = "CREATE TABLE messages (topic_id, timestamp, data AS (zeroblob(1000000000)))"
     bombs = {
-        "column": "CREATE TABLE messages (topic_id, timestamp, data AS (zeroblob(1000000000)))",
-        "packed": MESSAGES,
+        "column": (made, "INSERT INTO messages (topic_id, timestamp) VALUES (1, 5)"),
+        "packed": (MESSAGES, "INSERT INTO messages VALUES (1, 1, 5, :bomb)"),
     }
-    for name, table in bombs.items():
-        path = database(tmp_path / f"{name}.db3", TOPICS, table, TOPIC)
-        with sqlite3.connect(path) as connection:
-            if name == "packed":
-                bomb = zstandard.compress(bytes(400 << 20), 1)
-                connection.execute("INSERT INTO messages VALUES (1, 1, 5, ?)", (bomb,))
-            else:
-                connection.execute("INSERT INTO messages (topic_id, timestamp) VALUES (1, 5)")
-        connection.close()
+    for name, commands in bombs.items():
+        bomb = zstandard.compress(bytes(400 << 20), 1)
+        path = database(tmp_path / f"{name}.db3", TOPICS, TOPIC, *commands, bomb=bomb)
         with memory_at_most(300 << 20), pytest.raises(RecordingError, match=r"too big|rows left out"):
             open_recording(path)
 

@@ -10,7 +10,6 @@ from fleetmap.geometry import se3, so3_exp
 from fleetmap.recordings import Topics
 from fleetmap.recordings.images import (
     StoredFrame,
-    decode_depth,
     decode_frame,
     decode_grey,
     depth_image,
@@ -26,7 +25,7 @@ from fleetmap.recordings.ros2.messages import (
     encode_prior,
 )
 from fleetmap.sensors.calibration import RigCalibration
-from fleetmap.sensors.samples import ImuSamples, PositionPrior, WheelSample
+from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample
 from fleetmap.sources.intake import Intake
 from locclient.plugins.ros2_node.sensor_messages import RigFrames, SensorMessages
 from support.recordings.recording_samples import calibration
@@ -112,18 +111,16 @@ def rig() -> RigCalibration:
     return RigCalibration((*front, *rear))
 
 
-def sent(frames: RigFrames, index: int, numbers: tuple[int, ...]) -> list[StoredFrame]:
-    """Return the frames that the images of these cameras complete, whose rear pair is stamped a little later."""
-    stamp_ns = 1_000_000_000 + index * PERIOD_NS
-    return [done for n in numbers for done in frames.add(n, stamp_ns + LATE_NS * (n > 1), IMAGE)]
+def driven(
+    frames: RigFrames, indices: range, *numbers: int, late_ns: int = LATE_NS, later_ns: int = 0
+) -> list[StoredFrame]:
+    """Return the frames that the images of these cameras complete, the rear pair's a little later, its right one's even later."""
+    stamps_ns = {n: 10**9 + late_ns * (n > 1) + later_ns * (n > 2) for n in numbers or (0, 1, 2, 3)}
+    return [done for k in indices for n, ns in stamps_ns.items() for done in frames.add(n, ns + k * PERIOD_NS, IMAGE)]
 
 
 def black_in_front(frames: list[StoredFrame]) -> list[StoredFrame]:
     return [frame for frame in frames if not decode_grey(frame.left).any()]
-
-
-def driven(frames: RigFrames, indices: range, *numbers: int) -> list[StoredFrame]:
-    return [frame for index in indices for frame in sent(frames, index, numbers or (0, 1, 2, 3))]
 
 
 def test_each_frame_has_the_rear_pairs_images_although_they_come_later() -> None:
@@ -137,10 +134,8 @@ def test_each_frame_has_the_rear_pairs_images_although_they_come_later() -> None
 def test_a_rear_pair_that_is_dead_delays_one_frame_and_comes_back() -> None:
     frames = RigFrames(rig())
     driven(frames, range(3))
-    counts = [len(sent(frames, k, (0, 1))) for k in range(3, 7)]
-    assert counts == [0, 2, 1, 1]
-    done = sent(frames, 7, (0, 1, 2, 3)) + sent(frames, 8, (0, 1, 2, 3))
-    assert done[-1].others[0] is not None
+    assert [len(driven(frames, range(k, k + 1), 0, 1)) for k in range(3, 7)] == [0, 2, 1, 1]
+    assert driven(frames, range(7, 9))[-1].others[0] is not None
 
 
 def test_while_the_pair_in_front_is_dead_the_rear_pair_carries_on() -> None:
@@ -169,18 +164,12 @@ def test_of_two_views_beside_a_dead_one_the_first_gives_the_stamps() -> None:
     turned = se3(so3_exp(np.array([0.0, 0.0, np.pi / 2])), np.zeros(3))
     side = replace(rear, body_from_cam=turned @ rear.body_from_cam)
     frames = RigFrames(RigCalibration((*front, rear, side)))
-
-    def at(k: int, *numbers: int) -> list[StoredFrame]:
-        stamps = {n: 1_000_000_000 + k * PERIOD_NS + LATE_NS * max(n - 1, 0) for n in numbers}
-        return [done for n, stamp_ns in stamps.items() for done in frames.add(n, stamp_ns, IMAGE)]
-
-    for k in range(3):
-        at(k, 0, 1, 2, 3)
-    done = [frame for k in range(3, 24) for frame in at(k, 2, 3)]
+    driven(frames, range(3), later_ns=LATE_NS)
+    done = driven(frames, range(3, 24), 2, 3, later_ns=LATE_NS)
     black = black_in_front(done)
     assert len(black) == 24 - 13
     assert all(each is not None for frame in black[1:] for each in frame.others)
-    done += [frame for k in range(24, 28) for frame in at(k, 0, 1, 3)]  # now the first of them dies
+    done += driven(frames, range(24, 28), 0, 1, 3, later_ns=LATE_NS)  # now the first of them dies
     stamps = [frame.stamp_ns for frame in done]
     assert stamps == sorted(set(stamps))
     assert done[-1].others[0] is None and done[-1].others[1] is not None
@@ -188,12 +177,7 @@ def test_of_two_views_beside_a_dead_one_the_first_gives_the_stamps() -> None:
 
 def test_a_rear_pair_with_another_clock_does_not_blind_the_front() -> None:
     """An hour ahead, it belongs to no frame; the frames of the front are what they are."""
-    frames = RigFrames(rig())
-    done = []
-    for k in range(40):
-        stamp_ns = 1_000_000_000 + k * PERIOD_NS
-        for number in range(4):
-            done += frames.add(number, stamp_ns + 3600 * 10**9 * (number > 1), IMAGE)
+    done = driven(RigFrames(rig()), range(40), late_ns=3600 * 10**9)
     assert [frame.stamp_ns for frame in done] == [1_000_000_000 + k * PERIOD_NS for k in range(40)]
     assert not black_in_front(done) and not any(frame.others[0] for frame in done)
 
@@ -202,7 +186,7 @@ def test_images_of_half_the_rate_belong_to_every_second_frame_and_delay_no_other
     frames = RigFrames(rig())
     counts, done = [], list[StoredFrame]()
     for k in range(12):
-        found = [sent(frames, k, numbers) for numbers in ((0, 1), (2, 3) if k % 2 else ())]
+        found = [driven(frames, range(k, k + 1), 0, 1), driven(frames, range(k, k + 1), 2, 3) if k % 2 else []]
         counts.append([len(each) for each in found])
         done += [frame for each in found for frame in each]
     assert [frame.others[0] is not None for frame in done[4:]] == [k % 2 == 1 for k in range(4, 12)]
@@ -216,39 +200,22 @@ def test_a_clock_that_is_set_back_begins_anew() -> None:
     assert [frame.others[0] is not None for frame in done[-8:]] == [True] * 8
 
 
-def test_live_images_and_depth_make_one_view() -> None:
-    frames, stored = RigFrames(simulated("front-depth")[0]), store_frame(simulated("front-depth")[1][0])
-    (back,) = stored.others
-    assert back is not None and back.depth is not None and stored.right is not None
-    done = []
-    for k in range(4):
-        stamp_ns = 1_000_000_000 + k * 50_000_000
-        done += frames.add(2, stamp_ns, back.left)
-        done += frames.add(2, stamp_ns, back.depth, is_depth=True)
-        done += frames.add(0, stamp_ns, stored.left) + frames.add(1, stamp_ns, stored.right)
-    assert len(done) == 4
-    for frame in done:
-        (other,) = frame.others
-        assert other is not None and other.right is None and other.depth is back.depth and frame.depth is None
-
-
-def test_a_live_source_takes_the_topic_of_a_cameras_depth() -> None:
-    calibration, frames = simulated("front-depth")
+def test_a_live_source_takes_the_depth_of_another_camera() -> None:
+    rig, frames = simulated("front-depth")
     queue = Intake(frames=9, imu_minus_cam_s=0.0, has_imu=False, imu_wait_s=0.0)
     topics, stored = Topics(cam2_depth="/back/aligned_depth"), store_frame(frames[0])
     (back,) = stored.others
     assert back is not None
-    sensors = SensorMessages(topics, calibration)
-    for topic, image in (
-        (topics.cam2, back.left),
-        ("/back/aligned_depth", back.depth),
-        (topics.left, stored.left),
-        (topics.right, stored.right),
-    ):
-        assert image is not None
-        put(sensors, queue, topic, encode_image(stored.stamp_ns, "cam", image))
-    frame = queue.take(1.0).frame
-    assert frame is not None
-    decoded = decode_frame(frame)  # type: ignore[arg-type]
-    np.testing.assert_array_equal(decoded.others[0].depth_m, frames[0].others[0].depth_m)
-    assert decode_depth(back.depth).shape == (72, 96)  # type: ignore[arg-type]
+    sensors, decoded = SensorMessages(topics, rig), list[CameraFrame]()
+    sent = {topics.cam2: back.left, topics.cam2_depth: back.depth, topics.left: stored.left, topics.right: stored.right}
+    for k in range(4):
+        for topic, image in sent.items():
+            assert image is not None
+            put(sensors, queue, topic, encode_image(stored.stamp_ns + k * PERIOD_NS, "cam", image))
+        frame = queue.take(1.0).frame
+        assert isinstance(frame, StoredFrame)
+        decoded.append(decode_frame(frame))
+    for each in decoded:
+        (other,) = each.others
+        assert other is not None and other.right is None and each.depth_m is None
+        np.testing.assert_array_equal(other.depth_m, frames[0].others[0].depth_m)
