@@ -169,15 +169,14 @@ class PoseTracker:
         """Return the state with which another tracker of the same odometry can start."""
         prior = self.prior
         known = self.confirmed or (None if prior is None else prior.hypothesis)
-        start = Start(was_tracking=self.was_tracking, is_carried=self.is_carried, failed_queries=failed_queries)
+        state: dict[str, Any] = {"was_tracking": self.was_tracking, "is_carried": self.is_carried}
         if known is None:
-            return start
+            return Start(failed_queries=failed_queries, **state)
         if prior is not None:
-            start = replace(start, is_revisable=prior.is_revisable, is_told=prior.is_told)
-            start = replace(start, travelled_m=prior.travelled_m)
-        start = replace(start, frame_index=known.frame_index, stamp_ns=known.stamp_ns, support=known.support)
-        start = replace(start, **known.start._asdict(), has_broken=known.has_broken)
-        return replace(start, is_confirmed=self.confirmed is not None)
+            state |= {"is_revisable": prior.is_revisable, "is_told": prior.is_told, "travelled_m": prior.travelled_m}
+        state |= known.start._asdict() | {"is_confirmed": self.confirmed is not None, "has_broken": known.has_broken}
+        at = known.frame_index, known.stamp_ns, known.support
+        return Start(*at, failed_queries=failed_queries, **state)
 
     def begin(self, start: Start) -> None:
         """Continue from `start` with the next frame."""

@@ -196,11 +196,11 @@ class MapClient(MapSource):
         The server chooses no version for a robot of another site, so that it tries none there. Errors as of `fetch`, without an active one.
         """
         active = self.active()
-        if not asks and active is not None:
+        if not asks:
+            if active is None:
+                raise LinkError(f"the cache has no version of site {self.site} yet")
             return active
         try:
-            if not asks:
-                raise LinkError(f"the cache has no version of site {self.site} yet")
             if self.trust is None:
                 raise UntrustedError("signature", "this robot has no signed lists")
             wanted = self.trust.current()
