@@ -41,12 +41,12 @@ def _sourced() -> Iterator[None]:
 
 def open_topics(section: SourceSection, topics: Topics, map_frame: str, *, images: bool = True) -> Source:
     """Open ROS 2 topics as the source, or beside another one, which has the images."""
-    calibration, has_depth = rig_of(section), section.sensors == "rgbd"
-    messages = SensorMessages(topics, calibration, images=images, has_depth=has_depth, map_frame=map_frame)
+    has_depth = section.sensors == "rgbd"
+    messages = SensorMessages(topics, rig_of(section), images=images, has_depth=has_depth, map_frame=map_frame)
     with _sourced():
         from locclient.plugins.ros2_node.source import Ros2Source
 
-        return Ros2Source(messages, calibration, has_depth=has_depth, namespace=_checked[0][0].namespace)
+        return Ros2Source(messages, _checked[0][0].namespace)
 
 
 def topics_beside(section: SourceSection, topics: Topics, map_frame: str) -> Source | None:
@@ -64,10 +64,9 @@ def rig_of(section: SourceSection) -> RigCalibration:
     calibration = read_calibration(Path(section.calibration))
     if section.sensors != "stereo":
         return replace(calibration, cameras=calibration.cameras[:1])
-    if len(calibration.cameras) < 2:
-        count = len(calibration.cameras)
-        reason = f"{section.calibration} describes {count} camera; a stereo source needs a pair: or set [source] sensors to rgbd or mono"
-        raise UsageError(reason)
+    if (count := len(calibration.cameras)) < 2:
+        need = "a stereo source needs a pair: or set [source] sensors to rgbd or mono"
+        raise UsageError(f"{section.calibration} describes {count} camera; {need}")
     return calibration
 
 

@@ -1,17 +1,16 @@
 """From the messages of a robot's ROS 2 to frames of its rig and samples of its other sensors; without ROS itself."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import StoredFrame, Topics
 from fleetmap.recordings.images import StoredImage, grey_bits, grey_image, grey_peak, is_wide
-from fleetmap.recordings.ordering import DEPTH_TOLERANCE_NS, PAIR_TOLERANCE_NS
+from fleetmap.recordings.ordering import PAIR_TOLERANCE_NS
 from fleetmap.recordings.ros2 import messages
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import UNSAID_SIGMAS, ImuSamples, PositionPrior
@@ -23,6 +22,11 @@ _DEAD_NS, _NEVER_NS = 500_000_000, -(2**63)
 Take = Callable[[Intake, bool, bytes], None]
 
 
+def _nearest(frames: Iterable[StoredFrame], stamp_ns: int, within_ns: int) -> StoredFrame | None:
+    near = [frame for frame in frames if abs(frame.stamp_ns - stamp_ns) <= within_ns]
+    return min(near, key=lambda frame: abs(frame.stamp_ns - stamp_ns), default=None)
+
+
 class _View:
     """A view of a rig: images that wait for their partner of the same moment, and its last frames."""
 
@@ -30,8 +34,7 @@ class _View:
         self.numbers, self.recent = numbers, deque[StoredFrame](maxlen=_WAITING_IMAGES)
         self.used_ns = _NEVER_NS  # last stamp in a frame of the rig
         self.silent_since_ns: int | None = None  # first stamp since the first view's last frame
-        self._second = "depth" if has_depth else "right" if len(numbers) > 1 else ""
-        self._tolerance_ns = DEPTH_TOLERANCE_NS if has_depth else PAIR_TOLERANCE_NS
+        self._has_depth, self._is_paired = has_depth, has_depth or len(numbers) > 1
         self._unpaired = tuple(deque[StoredFrame](maxlen=_WAITING_IMAGES) for _ in range(2))  # of either side
 
     def add(self, side: int, stamp_ns: int, image: StoredImage) -> StoredFrame | None:
@@ -40,24 +43,20 @@ class _View:
         RecordingError if those of both sides find none.
         """
         frame = StoredFrame(stamp_ns, image)
-        if self._second:
+        if self._is_paired:
             own, others = self._unpaired[side], self._unpaired[1 - side]
-            partner = min(others, key=lambda item: abs(item.stamp_ns - stamp_ns), default=None)
-            if partner is None or abs(partner.stamp_ns - stamp_ns) > self._tolerance_ns:
-                is_full = len(own) == own.maxlen
+            partner = _nearest(others, stamp_ns, PAIR_TOLERANCE_NS)
+            if partner is None:
                 own.append(frame)
-                if is_full and others:  # both sides send
-                    within = f"within {self._tolerance_ns * 1e-6:g} ms"
-                    raise RecordingError(
-                        f"an image at {stamp_ns} has no partner {within}: are both triggered together?"
-                    )
+                if others and len(own) == own.maxlen:  # both sides send
+                    reason = f"has no partner within {PAIR_TOLERANCE_NS * 1e-6:g} ms: are both triggered together?"
+                    raise RecordingError(f"an image at {stamp_ns} {reason}")
                 return None
             for items in self._unpaired:
                 while items and items[0].stamp_ns <= max(partner.stamp_ns, stamp_ns):
                     items.popleft()
-            left, second = (partner, frame) if side else (frame, partner)
-            field: dict[str, Any] = {self._second: second.left}
-            frame = replace(left, **field)
+            frame, second = (partner, image) if side else (frame, partner.left)
+            frame = replace(frame, depth=second) if self._has_depth else replace(frame, right=second)
         if self.recent and frame.stamp_ns <= self.recent[-1].stamp_ns:  # its clock was set
             self.recent.clear()
             self.used_ns = _NEVER_NS
@@ -71,14 +70,9 @@ class _View:
 
     def take_near(self, stamp_ns: int, within_ns: int) -> StoredFrame | None:
         """Return the unused frame nearest to a stamp, None if there is none within."""
-        near = [
-            frame
-            for frame in self.recent
-            if frame.stamp_ns > self.used_ns and abs(frame.stamp_ns - stamp_ns) <= within_ns
-        ]
-        found = min(near, key=lambda frame: abs(frame.stamp_ns - stamp_ns), default=None)
-        self.used_ns = self.used_ns if found is None else found.stamp_ns
-        return found
+        near = _nearest([frame for frame in self.recent if frame.stamp_ns > self.used_ns], stamp_ns, within_ns)
+        self.used_ns = self.used_ns if near is None else near.stamp_ns
+        return near
 
 
 class RigFrames:
@@ -156,13 +150,16 @@ class SensorMessages:
 
         A calibration of one camera takes only left images. map_frame: the frame of priors; those in another frame are refused.
         """
+        self.calibration, self.has_depth = calibration, has_depth
         self._grey_peak = 0  # used bits of 16-bit images, until one has more than 12
-        self.topics: list[tuple[tuple[str, ...], str, Take]] = [
-            ((topics.wheel,), "wheel", lambda intake, _, data: intake.put_wheel(messages.decode_odometry(data))),
-            ((topics.prior,), "prior", lambda intake, _, data: intake.put_prior(_decode_prior(data, ("", map_frame)))),
-        ]
+        takes: dict[str, Take] = {
+            "wheel": lambda intake, _, data: intake.put_wheel(messages.decode_odometry(data)),
+            "prior": lambda intake, _, data: intake.put_prior(_decode_prior(data, ("", map_frame))),
+        }
         if calibration.imu is not None:
-            self.topics.append(((topics.imu,), "imu", _take_imu))
+            takes["imu"] = lambda intake, _, data: intake.put_imu(ImuSamples(*messages.decode_imu([data])[:3]))
+        self.topics: list[tuple[tuple[str, ...], str, Take]]
+        self.topics = [((getattr(topics, kind),), kind, take) for kind, take in takes.items()]
         if images:
             cameras = calibration.cameras[:1] if has_depth else calibration.cameras
             self._rig = RigFrames(replace(calibration, cameras=cameras), has_depth=has_depth)
@@ -181,11 +178,6 @@ class SensorMessages:
             image = replace(image, bits=grey_bits(self._grey_peak))
         for frame in self._rig.add(number, stamp_ns, image, is_depth=is_depth):
             intake.put_frame(frame)
-
-
-def _take_imu(intake: Intake, _is_compressed: bool, data: bytes) -> None:
-    stamps_ns, gyro_radps, accel_mps2, _ = messages.decode_imu([data])
-    intake.put_imu(ImuSamples(stamps_ns, gyro_radps, accel_mps2))
 
 
 def _decode_prior(data: bytes, frames: Sequence[str]) -> PositionPrior:

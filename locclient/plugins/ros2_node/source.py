@@ -8,7 +8,6 @@ from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image, Imu
 
 from fleetmap.errors import FleetmapError
-from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.source_settings import PACKED
 from fleetmap.sources.intake import Intake
 from locclient.plugins.ros2_node.node import Feed, MessageReader, keep_on, ros_started
@@ -22,17 +21,15 @@ _IMAGES, _SAMPLES = 30, 200  # messages that may wait: of a second
 class Ros2Source:
     """Subscribes to the topics, to those of images as image_transport sends them; a node of its own in the graph, fleetmap_sensors."""
 
-    def __init__(
-        self, messages: SensorMessages, calibration: RigCalibration, *, has_depth: bool, namespace: str
-    ) -> None:
+    def __init__(self, messages: SensorMessages, namespace: str) -> None:
         """See `open_topics`."""
-        self.calibration, self.has_depth, self._messages = calibration, has_depth, messages
+        self.calibration, self.has_depth, self._topics = messages.calibration, messages.has_depth, messages.topics
         with ros_started():
             own = ["--ros-args", "-r", "__node:=fleetmap_sensors"]  # a launch file's name is that of the localizer
             self._node = Node("fleetmap_sensors", namespace=namespace, cli_args=own, start_parameter_services=False)
 
     def run(self, intake: Intake, wait: Callable[[float], bool]) -> None:
-        reader = MessageReader(self._node, [_feed(*each, intake) for each in self._messages.topics if each[0][0]])
+        reader = MessageReader(self._node, [_feed(*each, intake) for each in self._topics if each[0][0]])
 
         def read() -> None:
             intake.source_faults = reader.faults

@@ -103,10 +103,7 @@ class _Stream(Generic[V]):
 
 
 class Intake:
-    """Queue with any number of producer threads and one consumer.
-
-    unreadable_why: reason for the last unreadable message or image. source_faults: why the source has nothing of a sensor now.
-    """
+    """Queue of any producer threads and one consumer. unreadable_why: of the last message; source_faults: why sensors send nothing now."""
 
     def __init__(self, *, frames: int, imu_minus_cam_s: float, has_imu: bool, imu_wait_s: float) -> None:
         """frames: capacity. imu_wait_s: longest wait of a frame for the inertial samples up to it."""

@@ -31,10 +31,7 @@ PACKAGE = REPOSITORY / "deploy/ros2/fleetmap_ros"
 NAV2 = Path("/nav2_bringup")  # whose files ROS has
 PARAMETERS = PACKAGE / "config/nav2_params.yaml"
 # Declared by nav2's nodes with these types; rclcpp ends a node whose parameter has another, also 4 for 4.0.
-NAV2_TYPES = {
-    "autostart": bool, "bond_timeout": float, "node_names": list, "global_frame": str, "robot_base_frame": str, "odom_topic": str,
-    "transform_tolerance": float,
-}  # fmt: skip
+NAV2_TYPES = {"autostart": bool, "bond_timeout": float, "node_names": list, "global_frame": str, "odom_topic": str}
 REFUSED = {
     "-p output.odom_topic:=/odom": "the robot would take its own odometry for that of its wheels",
     "-r visual_odom:=/odom": "the robot would take its own odometry for that of its wheels",
