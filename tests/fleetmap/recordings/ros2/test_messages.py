@@ -10,6 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 from fleetmap.geometry import quat_wxyz_from_rotation, se3, so3_exp
 from fleetmap.recordings.images import grey_image, png_image
 from fleetmap.recordings.ros2 import messages
+from fleetmap.recordings.ros2.cdr import pack
 from fleetmap.sensors.samples import PositionPrior, WheelSample
 from support.recordings.recording_samples import calibration
 
@@ -62,6 +63,11 @@ def written() -> list[Written]:
             pose__pose__orientation__w=xyzw[3], pose__covariance=np.diag([4.0, 5, 6, 1, 2, 3]).ravel(),
         ),
         stamped("geometry_msgs/msg/PoseStamped", messages.encode_pose(STAMP_NS, "map", PLACE), "map", pose__position__x=1.5),
+        stamped(
+            "nav_msgs/msg/OccupancyGrid",
+            pack("nav_msgs/OccupancyGrid", STAMP_NS, "map", STAMP_NS, 0.25, 3, 2, messages.position_quat_xyzw(PLACE), b"\xff" * 6),
+            "map", info__resolution=0.25, info__origin__position__y=-2.5, data=np.full(6, -1),
+        ),
         Written("tf2_msgs/msg/TFMessage", messages.encode_frame_links(STAMP_NS, [link]), {"transforms.0.child_frame_id": "odom"}),
     ]  # fmt: skip
 
