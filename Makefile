@@ -28,19 +28,22 @@ COMPILE := $(BIN)/python -m compileall -q shared mapserver locclient
 # What the compiled core is built with, beside a C++ compiler.
 CORE_TOOLS := cmake ninja nanobind scikit-build-core
 BUILD_CORE := shared/core/build.sh $(VENV)
-# Stamps: the time of the last install. Installing for development covers what the demo runs.
+# Stamps: the time of the last install. Installing for development covers what the demo runs, and takes a core while another compiles.
+CORE_STAMP := $(VENV)/.installed-core
 RUN_STAMP := $(VENV)/.installed-run
 DEV_STAMP := $(VENV)/.installed-dev
 INPUTS := pyproject.toml constraints.txt
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help core demo demo-recording test test-ci test-all ros2-env sanitizers sanitize check docs bench acceptance study clean
+.PHONY: help core compiled demo demo-recording test test-ci test-all ros2-env sanitizers sanitize check docs bench acceptance study clean
 
 help:
 	@sed -n '1,/^$$/s/^# \{0,1\}//p' Makefile
 
-core: $(DEV_STAMP)
+core: $(DEV_STAMP) compiled
+
+compiled: $(CORE_STAMP)
 	@$(BUILD_CORE)
 
 demo: demo-recording $(RUN_STAMP)
@@ -56,15 +59,15 @@ demo-recording:
 RUN_TESTS = $(BIN)/python -m pytest $(TESTS) --numprocesses=auto --dist=loadfile --no-loadscope-reorder $(PYTEST_ARGS)
 
 test: core
-	@$(COMPILE) tests
+	@$(COMPILE) tests/support
 	$(RUN_TESTS) -m "not long"
 
 test-ci: core
-	@$(COMPILE) tests
+	@$(COMPILE) tests/support
 	$(RUN_TESTS) -m "not long or ci"
 
 test-all: core
-	@$(COMPILE) tests
+	@$(COMPILE) tests/support
 	$(RUN_TESTS)
 
 # ROS itself, for tests of what speaks with it; they are skipped without.
@@ -127,14 +130,18 @@ $(BIN)/python:
 	@"$(PYTHON)" -m venv $(VENV) || { \
 	  rm -rf $(VENV); echo "fleetmap: $(PYTHON) cannot make virtual environments; install its venv module (python3-venv on Debian)" >&2; exit 1; }
 
-$(DEV_STAMP): $(INPUTS) | $(BIN)/python
+$(CORE_STAMP): $(INPUTS) | $(BIN)/python
+	@$(INSTALL) $(CORE_TOOLS)
+	@touch $(CORE_STAMP)
+
+$(DEV_STAMP): $(CORE_STAMP) | $(BIN)/python
 	@echo "installing fleetmap with everything that tests need into $(VENV)"
-	@$(INSTALL) -e ".[dev]" $(CORE_TOOLS)
+	@$(INSTALL) -e ".[dev]"
 	@$(COMPILE)
 	@touch $(RUN_STAMP) $(DEV_STAMP)
 
-$(RUN_STAMP): $(INPUTS) | $(BIN)/python
+$(RUN_STAMP): $(CORE_STAMP) | $(BIN)/python
 	@echo "installing fleetmap, server, client and simulator, into $(VENV)"
-	@$(INSTALL) -e ".[server,client,sim]" $(CORE_TOOLS)
+	@$(INSTALL) -e ".[server,client,sim]"
 	@$(COMPILE)
 	@touch $(RUN_STAMP)
