@@ -137,11 +137,11 @@ def test_over_the_network_the_same_comes_out_and_the_server_sees_the_robot(
         deadline_s, told = time.monotonic() + 10, False
         while not told:
             assert time.monotonic() < deadline_s, "the report on the whole ride did not come"
-            robots = httpx.get(f"{served.http}/v1/robots").json()["robots"]
+            robots = httpx.get(f"{served.http}/v1/robots", verify=False).json()["robots"]
             (robot,) = (each for each in robots if each["robot"] == "r7")
             metrics = (robot["last_health"] or {}).get("metrics", {})
             told = metrics.get("frames") == FRAMES
-            time.sleep(0.02)
+            time.sleep(0.1)
     assert (tmp_path / "r.tum").read_bytes() == (replayed[1] / "r.tum").read_bytes(), "in one process and in two"
     assert robot["version"] == 1
     assert robot["last_health"]["status"] == "TRACKING"
