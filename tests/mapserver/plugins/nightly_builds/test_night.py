@@ -44,7 +44,7 @@ from mapserver.store import DraftContent, FleetRetention, MapStore
 from mapserver.survey.settings import SurveySettings
 from support.command_line import status
 from support.fleet.contracts_documents import code_words, rows, section
-from support.recordings.recording_samples import make_sample, write_euroc
+from support.recordings.recording_samples import Sample, make_sample, write_euroc, write_mcap
 from support.storage.faulty_disk import Disk, in_child
 from support.storage.map_samples import draft_details, random_tile
 
@@ -53,11 +53,11 @@ READ = recordings._read
 Build = Callable[..., tuple[Draft, None]]
 
 
-def record(inbox: Path, name: str, number: int) -> Path:
+def record(inbox: Path, name: str, number: int, write: Callable[[Path, Sample], Path] = write_euroc) -> Path:
     """A small recording like no other number's."""
     sample = make_sample(3)
     sample.left[0][0, :8] = number
-    return write_euroc(inbox / name, sample)
+    return write(inbox / name, sample)
 
 
 def built(
@@ -93,9 +93,9 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def hall(tmp_path: Path) -> Path:
-    """A folder with an inbox of two recordings."""
-    for number, name in enumerate(("monday", "tuesday")):
-        record(tmp_path / "inbox", name, number)
+    """A folder with an inbox of two recordings, in two formats."""
+    record(tmp_path / "inbox", "monday", 0)
+    record(tmp_path / "inbox", "tuesday", 1, write_mcap)
     return tmp_path
 
 
