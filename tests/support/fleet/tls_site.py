@@ -125,7 +125,9 @@ class TlsSite:
     def robot(self, name: str) -> dict[str, Any]:
         """The server's entry of a robot; empty if unknown or without a reply."""
         try:
-            told = httpx.get(f"{self.http}/v1/robots", params={"site": self.name}, timeout=10, verify=False).json()["robots"]
+            told = httpx.get(f"{self.http}/v1/robots", params={"site": self.name}, timeout=10, verify=False).json()[
+                "robots"
+            ]
         except httpx.HTTPError:
             return {}
         return next((one for one in told if one["robot"] == name), {})
