@@ -166,9 +166,8 @@ void CornerFinder::fast(GreyImage image, const CornerLimits& limits, const uint8
   }
 }
 
-const std::vector<int64_t>& Suppression::operator()(const Pixel* pixels, const int64_t* order, size_t candidates, const Pixel* taken,
-                                                    size_t taken_count, double distance, size_t count, ptrdiff_t width, ptrdiff_t height) {
-  const ptrdiff_t columns = ptrdiff_t(double(width) / distance) + 1, rows = ptrdiff_t(double(height) / distance) + 1;
+void CornerFinder::spread(GreyImage image, size_t count, double distance, const Pixel* taken, size_t taken_count) {
+  const ptrdiff_t columns = ptrdiff_t(double(image.width) / distance) + 1, rows = ptrdiff_t(double(image.height) / distance) + 1;
   held_.clear(), chosen_.clear();
   newest_.assign(size_t(rows * columns), -1);
   auto hold = [&](double x, double y, ptrdiff_t column, ptrdiff_t row) {
@@ -181,8 +180,8 @@ const std::vector<int64_t>& Suppression::operator()(const Pixel* pixels, const i
     if (column >= 0.0 && column < double(columns) && row >= 0.0 && row < double(rows))
       hold(taken[n].x, taken[n].y, ptrdiff_t(column), ptrdiff_t(row));
   }
-  for (size_t k = 0; k < candidates && chosen_.size() < count; ++k) {
-    const double x = pixels[order[k]].x, y = pixels[order[k]].y;
+  for (size_t k = 0; k < order_.size() && chosen_.size() < count; ++k) {
+    const double x = candidates_[size_t(order_[k])].x, y = candidates_[size_t(order_[k])].y;
     const ptrdiff_t column = ptrdiff_t(x / distance), row = ptrdiff_t(y / distance);
     bool is_free = true;
     for (ptrdiff_t r = std::max<ptrdiff_t>(row - 1, 0); r < std::min(row + 2, rows); ++r)
@@ -193,9 +192,8 @@ const std::vector<int64_t>& Suppression::operator()(const Pixel* pixels, const i
         }
     if (!is_free) continue;
     hold(x, y, column, row);
-    chosen_.push_back(order[k]);
+    chosen_.push_back(order_[k]);
   }
-  return chosen_;
 }
 
 // Candidates by falling score: the best `most`, and all equal to the last of them. Of equals the first found comes first.
@@ -241,10 +239,9 @@ void CornerFinder::find(GreyImage image, size_t count, const CornerLimits& limit
   if (count == 0) return;
   for (const size_t most : {4 * count, shown}) {
     put_in_order(most);
-    const std::vector<int64_t>& chosen =
-        suppress_(candidates_.data(), order_.data(), order_.size(), taken, taken_count, limits.distance, count, image.width, image.height);
-    if (chosen.size() < count && order_.size() < shown) continue;
-    for (const int64_t n : chosen) corners.push_back(candidates_[size_t(n)]), scores.push_back(eigenvalues_[size_t(n)]);
+    spread(image, count, limits.distance, taken, taken_count);
+    if (chosen_.size() < count && order_.size() < shown) continue;
+    for (const int64_t n : chosen_) corners.push_back(candidates_[size_t(n)]), scores.push_back(eigenvalues_[size_t(n)]);
     return;
   }
 }
@@ -266,20 +263,6 @@ auto spread_corners(const Image& image, int count, double distance_px, int thres
   CornerFinder found;
   unlocked([&] { found.find(image, size_t(count), limits, first(taken), taken.shape(0)); });
   return std::tuple(as_numpy<float>(std::move(found.corners)), as_numpy<double>(std::move(found.scores)));
-}
-
-auto select_spread(const Pixels& pixels, const Indices& order, const Pixels& taken, double distance_px, int count, int width, int height) {
-  if (width < 0 || height < 0 || count < 0) throw nb::value_error("width, height, count: not negative");
-  check_corners(distance_px, width, height);
-  check_below(pixels.shape(0), "order: indices of pixels", order);
-  for (size_t n = 0; n < pixels.shape(0); ++n)
-    if (!(pixels(n, 0) >= 0.0f && pixels(n, 0) <= float(width) && pixels(n, 1) >= 0.0f && pixels(n, 1) <= float(height)))
-      throw nb::value_error("pixels: of the image");
-  std::vector<int64_t> chosen = unlocked([&] {
-    return Suppression()(first(pixels), order.data(), order.shape(0), first(taken), taken.shape(0), distance_px, size_t(count), width,
-                         height);
-  });
-  return as_numpy<int64_t>(std::move(chosen));
 }
 
 // The direction in degrees, 0 to 360, from each pixel to the intensity centroid of the disc around it; beyond the image's edge
@@ -331,7 +314,6 @@ auto centroid_angles_deg(const Image& grey, const Pixels& pixels, int radius) {
 void bind_corners(nb::module_& module) {
   module.def("spread_corners", &spread_corners, "image"_a, "count"_a, "distance_px"_a, "threshold"_a, "border_px"_a, "taken"_a,
              "clearance_px"_a = nb::none(), "scale"_a = 1.0, "clear_px"_a = 0.0);
-  module.def("select_spread", &select_spread, "pixels"_a, "order"_a, "taken"_a, "distance_px"_a, "count"_a, "width"_a, "height"_a);
   module.def("centroid_angles_deg", &centroid_angles_deg, "image"_a, "pixels"_a, "radius"_a);
 }
 

@@ -13,22 +13,6 @@ struct Pixel {
   float x, y;
 };
 
-// Indices of up to count pixels, best first as order says, no two within distance of each other or of taken: greedy suppression on
-// a grid of cells of that size. It keeps its memory.
-class Suppression {
- public:
-  const std::vector<int64_t>& operator()(const Pixel* pixels, const int64_t* order, size_t candidates, const Pixel* taken,
-                                         size_t taken_count, double distance, size_t count, ptrdiff_t width, ptrdiff_t height);
-
- private:
-  struct Held {
-    double x, y;
-    int64_t earlier;  // in the same cell
-  };
-  std::vector<Held> held_;
-  std::vector<int64_t> newest_, chosen_;
-};
-
 // Corners are whole pixels whose score exceeds that of all eight neighbours. The score is the smallest difference of the centre to nine
 // pixels in a row of the circle of sixteen, where that is largest; a corner's exceeds the threshold. Sources: Rosten and Drummond 2006;
 // Shi and Tomasi 1994 for how well a corner can be tracked: the smaller eigenvalue of the gradient matrix in a window of 7x7 around it.
@@ -54,12 +38,19 @@ class CornerFinder {
  private:
   void fast(GreyImage image, const CornerLimits& limits, const uint8_t* free, std::vector<Pixel>& found);
   void put_in_order(size_t most);
+  // Chooses up to count of the candidates in order, none within distance of another or of taken: greedy suppression on a grid of cells of
+  // that size.
+  void spread(GreyImage image, size_t count, double distance, const Pixel* taken, size_t taken_count);
 
+  struct Held {
+    double x, y;
+    int64_t earlier;  // in the same cell
+  };
   std::vector<Pixel> candidates_, whole_;
   std::vector<double> eigenvalues_, ordered_;
-  std::vector<int64_t> order_;
+  std::vector<Held> held_;
+  std::vector<int64_t> order_, newest_, chosen_;
   std::vector<uint8_t> free_, rows_;
-  Suppression suppress_;
 };
 
 }  // namespace fleetmap

@@ -351,11 +351,6 @@ def spread_corners(
     image of which this one is a copy reduced by `scale`; corners keep clear_px away from it, in pixels of this one.
     """
 
-def select_spread(
-    pixels: _Pixels, order: _Indices, taken: _Pixels, distance_px: float, count: int, width: int, height: int
-) -> _Indices:
-    """Indices of up to `count` pixels, no two within distance_px."""
-
 def centroid_angles_deg(image: _Grey, pixels: _Pixels, radius: int) -> NDArray[np.float32]:
     """(N,) direction from each pixel to the intensity centroid of its disc."""
 

@@ -3,11 +3,9 @@
 import cv2
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from fleetmap.core import centroid_angles_deg, select_spread, spread_corners
+from fleetmap.core import centroid_angles_deg, spread_corners
 from fleetmap.geometry import Array
 from support.worlds.synthetic_texture import picture, pixel_grid, smooth_texture
 
@@ -30,20 +28,6 @@ def brute_force(pixels: Array, order: Array, taken: Array, distance_px: float, c
     return chosen
 
 
-@settings(max_examples=60, deadline=None)
-@given(st.integers(0, 10_000), st.sampled_from([3.0, 7.5, 22.0, 60.0]), st.integers(0, 200), st.integers(1, 300))
-def test_spread_is_the_greedy_choice(seed: int, distance_px: float, taken_count: int, count: int) -> None:
-    """Also with many pixels taken in one place, as when tracked points run together."""
-    rng = np.random.default_rng(seed)
-    size = [WIDTH, HEIGHT]
-    pixels = rng.integers(0, size, (200, 2)).astype(np.float32)
-    near = rng.uniform(0, size, 2) + rng.normal(0, 10, (taken_count, 2))
-    taken = np.clip(near, 0, np.array(size) - 1).astype(np.float32)
-    order = rng.permutation(200)
-    chosen = select_spread(pixels, order, taken, distance_px, count, WIDTH, HEIGHT)
-    assert chosen.tolist() == brute_force(pixels.astype(float), order, taken.astype(float), distance_px, count)
-
-
 def scores_of(image: NDArray[np.uint8], pixels: Array) -> Array:
     """The smaller eigenvalue of the gradient matrix in 7x7 pixels."""
     grey = image.astype(np.int64)
@@ -60,16 +44,22 @@ def scores_of(image: NDArray[np.uint8], pixels: Array) -> Array:
 
 
 @pytest.mark.parametrize("size", [(WIDTH, HEIGHT), (39, 60), (36, 40), (70, 33), (5, 9)])
-@pytest.mark.parametrize("taken_count", [0, 3, 40])
+@pytest.mark.parametrize(("taken_count", "together_px"), [(0, 0.0), (3, 300.0), (40, 300.0), (200, 10.0)])
 @pytest.mark.parametrize(
-    ("threshold", "border_px", "count", "distance_px"), [(12, 8, 10, 9.0), (12, 3, 300, 9.0), (40, 3, 60, 4.0)]
+    ("threshold", "border_px", "count", "distance_px"),
+    [(12, 8, 10, 9.0), (12, 3, 300, 7.5), (40, 3, 60, 4.0), (12, 3, 80, 22.0), (12, 3, 20, 60.0)],
 )
 def test_corners_are_the_best_of_opencvs(
-    image: NDArray[np.uint8], size: tuple[int, int], taken_count: int, threshold: int, border_px: int, count: int, distance_px: float
+    image: NDArray[np.uint8], size: tuple[int, int], taken_count: int, together_px: float, threshold: int, border_px: int, count: int,
+    distance_px: float,
 ) -> None:  # fmt: skip
-    """To the bit: all of its corners, by half the threshold where they are few, best first, each far from those before and from taken."""
+    """To the bit: all of its corners, by half the threshold where they are few, best first, each far from those before and from taken.
+
+    Also with many taken in one place, as when tracked points run together.
+    """
     rng, (width, height) = np.random.default_rng(taken_count), size
-    taken = rng.uniform(0, [width - 1, height - 1], (taken_count, 2)).astype(np.float32)
+    near = rng.uniform(0, size, 2) + rng.uniform(-together_px, together_px, (taken_count, 2))
+    taken = (near % (np.array(size) - 1)).astype(np.float32)
     for part in (np.ascontiguousarray(image[:height, :width]), rng.integers(0, 256, (height, width), np.uint8)):
         found = [k.pt for k in cv2.FastFeatureDetector.create(threshold, True).detect(part)]
         if len(found) < 2 * count:

@@ -10,8 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
-from fleetmap import core
 from fleetmap.geometry import Array, se3, se3_inverse
 from fleetmap.sensors.rectification import RGBD_BASELINE_M, Rectifier, StereoCamera
 from fleetsim.recorder import Session
@@ -164,9 +164,12 @@ class EstimatorSession:
         room = np.minimum(pixels, (camera.width_px - 1, camera.height_px - 1) - pixels).min(axis=1)
         order = np.flatnonzero((room > _FLOW_BORDER_PX) & (seen.octaves < _FINEST_OCTAVES))
         order = order[np.argsort(seen.keys[order, 0], kind="stable")]
-        spots, near = pixels.astype(np.float32), np.ascontiguousarray(taken[:, :2], np.float32)
-        size_px = camera.width_px, camera.height_px
-        chosen = core.select_spread(spots, order, near, min_distance_px, count, *size_px)
+        if len(taken):
+            order = order[cKDTree(taken[:, :2]).query(pixels[order])[0] >= min_distance_px]
+        chosen = list[int]()
+        while len(order) and len(chosen) < count:
+            chosen.append(int(order[0]))
+            order = order[np.hypot(*(pixels[order] - pixels[order[0]]).T) >= min_distance_px]
         return seen.ids[chosen], pixels[chosen]
 
     def features(self, frame: int) -> Found:
