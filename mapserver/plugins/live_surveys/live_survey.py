@@ -139,7 +139,7 @@ class _Survey:
         """Track all frames, each when it is due; call `check` first."""
         drive, told_s = self._drive, 0.0
         # One thread per process, and no garbage collection of the survey's objects: both would delay frames.
-        with _one_thread(), self._mapping.start(self._config):
+        with _one_thread(), closing(self._mapping.start(self._config)):
             tracking = LiveTracking(drive.calibration, drive.rectifier, self._request.settings)
             with closing(drive.frames()) as frames:
                 for due in frames:
@@ -150,7 +150,6 @@ class _Survey:
                     if time.monotonic() - told_s >= _TELL_EVERY_S:
                         told_s = time.monotonic()
                         self.say("tracking")
-            self._mapping.finish()
 
     def _take(self, due: DueFrame, tracking: LiveTracking) -> None:
         tracked = tracking.handle(due.frame, due.imu, due.wheel)

@@ -43,7 +43,7 @@ _Item = tuple[RectifiedFrame, NewKeyframe]
 
 
 class MappingProcess:
-    """The process and its communication threads, from `start` until `finish` or the end of a `with`."""
+    """The process and its communication threads, from `start` until `close`."""
 
     def __init__(self, rectifier: Rectifier) -> None:
         context = multiprocessing.get_context("spawn")
@@ -63,7 +63,12 @@ class MappingProcess:
         """Start the process; FleetmapError if it is not ready in time."""
         self._process.start()
         self._theirs.close()
-        if not self._is_ready(config):
+        try:
+            self._ours.send((config, self._rectifier))
+            is_ready = self._ours.poll(_READY_WITHIN_S) and self._ours.recv() == "ready"
+        except (EOFError, OSError):  # it ended before it was ready
+            is_ready = False
+        if not is_ready:
             self._process.kill()
             raise FleetmapError(
                 "mapping did not start: see the messages of its process above; without any, check that the machine has a core and memory "
@@ -72,12 +77,6 @@ class MappingProcess:
         for thread in self._threads:
             thread.start()
         return self
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.finish()
 
     @property
     def behind(self) -> int:
@@ -100,7 +99,7 @@ class MappingProcess:
         self._put_s.append(time.monotonic())
         self._waiting.put((frame, keyframe))
 
-    def finish(self) -> None:
+    def close(self) -> None:
         """Wait for the queued keyframes, for a limited time, and end the process."""
         self._waiting.put(None)
         for thread in self._threads:
@@ -111,13 +110,6 @@ class MappingProcess:
             self._process.kill()
             self._process.join()
         self._ours.close()
-
-    def _is_ready(self, config: SurveyConfig) -> bool:
-        try:
-            self._ours.send((config, self._rectifier))
-            return self._ours.poll(_READY_WITHIN_S) and self._ours.recv() == "ready"
-        except (EOFError, OSError):  # it ended before it was ready
-            return False
 
     def _send(self) -> None:
         try:

@@ -21,12 +21,11 @@ _TORN_M2 = 100.0
 class Tracked(NamedTuple):
     """Tracking result of one frame.
 
-    frame_from_body (4, 4); quality: share of its consistent points, 0 while the odometry is lost; keyframe: its data for the map,
-    None if it is not one; pixels (N, 3), u_left v u_right, of the tracked points, None without any.
+    quality: share of its consistent points, 0 while the odometry is lost; keyframe: its data for the map, None if it is not one;
+    pixels (N, 3), u_left v u_right, of the tracked points, None without any.
     """
 
     frame: RectifiedFrame
-    frame_from_body: Array
     quality: float
     keyframe: NewKeyframe | None
     pixels: Array | None = None
@@ -59,7 +58,7 @@ class LiveTracking:
         if tracked.is_keyframe and self._has_place(estimate):
             keyframe = self._keyframe(tracked)
         quality = 0.0 if estimate.status is OdometryStatus.DEGRADED else float(estimate.inlier_share)
-        return Tracked(tracked.frame, tracked.frame_from_body, quality, keyframe, estimate.track_pixels)
+        return Tracked(tracked.frame, quality, keyframe, estimate.track_pixels)
 
     def _has_place(self, estimate: OdometryEstimate) -> bool:
         """True if the frame's pose relative to earlier ones is known: with one camera only after its start, with an IMU after scale."""

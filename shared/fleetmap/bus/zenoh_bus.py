@@ -181,7 +181,7 @@ class Bus:
                     return bytes(reply.ok.payload.to_bytes())
                 refusals.append(reply.err.payload.to_string())
             if (refusal := next((reason for reason in refusals if reason != "Timeout"), None)) is not None:
-                raise query_refused(key, refusal)
+                raise LinkError(f"{key} was refused: {refusal}")
             time.sleep(min(_RETRY_S, max(0.0, deadline - time.monotonic())))
         raise no_answer(key, self.endpoint, timeout_s, is_silenced=self._tls is not None and self.connected())
 
@@ -327,11 +327,6 @@ def no_answer(key: str, endpoint: str, timeout_s: float, *, is_silenced: bool = 
             "`mapserver robots list` shows it"
         )
     return UnreachableError(f"no reply for {key} from {endpoint} within {timeout_s:g} s; {why}")
-
-
-def query_refused(key: str, reason: str) -> LinkError:
-    """Error of a query that the other side refused."""
-    return LinkError(f"{key} was refused: {reason}")
 
 
 def _size(message: Any, key: str) -> int:

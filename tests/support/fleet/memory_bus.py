@@ -14,7 +14,6 @@ from fleetmap.bus.zenoh_bus import (
     check_size,
     deliver,
     no_answer,
-    query_refused,
 )
 from fleetmap.errors import LinkError
 
@@ -76,7 +75,7 @@ class MemoryBus(Bus):
             raise no_answer(key, self.endpoint, timeout_s, is_silenced=hub.access is not None and own is not None)
         data, reason = answer_query(answers[0], key, payload)
         if data is None:
-            raise query_refused(key, reason)
+            raise LinkError(f"{key} was refused: {reason}")
         return data
 
     def publish(self, key: str, payload: bytes, *, may_drop: bool = False) -> None:

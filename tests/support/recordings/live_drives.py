@@ -39,18 +39,12 @@ class MappingHere:
         self.map = LiveMap(config, self._rectifier)
         return self
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        pass
-
     def put(self, frame: RectifiedFrame, keyframe: NewKeyframe) -> None:
         """One more keyframe."""
         self.map.add(frame, keyframe)
         self.sketch = self.after[keyframe.number] = self.map.sketch(np.zeros((0, 3)), [])
 
-    def finish(self) -> None:
+    def close(self) -> None:
         """Nothing waits."""
 
     @property
