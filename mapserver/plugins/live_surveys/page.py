@@ -5,6 +5,7 @@ import time
 from base64 import b64encode
 from collections.abc import Callable
 from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
@@ -54,7 +55,7 @@ class LiveSurveys:
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._clock_s = clock_s
         self._states: dict[str, tuple[LiveSurveyState, float, int]] = {}
-        self._last_number = 0
+        self._numbers = count(1)
         self._lock = threading.Lock()
 
     def hear(self, key: str, payload: bytes) -> None:
@@ -66,9 +67,7 @@ class LiveSurveys:
         state.path(), state.part_numbers(), *map(state.rows, COLUMNS)
         with self._lock:
             before = self._states.pop(state.site, None)
-            is_new = before is None or before[0] != state
-            self._last_number += is_new
-            number = self._last_number if is_new or before is None else before[2]
+            number = before[2] if before is not None and before[0] == state else next(self._numbers)
             self._states[state.site] = state, self._clock_s(), number
             if len(self._states) > _MOST_SITES:
                 del self._states[next(iter(self._states))]
