@@ -114,7 +114,7 @@ class Ros2Localizer(Publisher, ManagedEntity):
         self._robot, self._calibration, self._intake = robot, calibration, intake
         self._grid: OccupancyGrid | None = None
         self._map_words = "none yet"
-        self._lifecycle = "unconfigured"
+        self._lifecycle, self._is_active = "unconfigured", False
         self._last: Localized | None = None
         self._fix_refused = ""  # by the newest finished query: most frames finish none
         self._refused = ""  # why the newest initial pose was
@@ -393,13 +393,8 @@ class Ros2Localizer(Publisher, ManagedEntity):
             return SetParametersResult(successful=False, reason=f"{given}: {error}")
         return SetParametersResult(successful=True)
 
-    @property
-    def _is_active(self) -> bool:
-        return self._lifecycle == "active"
-
     def _enter(self, lifecycle: str, _: object) -> TransitionCallbackReturn:
-        self._lifecycle = lifecycle
-        self._is_latched_due = True
+        self._lifecycle, self._is_active, self._is_latched_due = lifecycle, lifecycle == "active", True
         _log.info("the node is %s", lifecycle)
         return TransitionCallbackReturn.SUCCESS
 

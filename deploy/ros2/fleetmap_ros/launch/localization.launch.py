@@ -1,7 +1,4 @@
-"""Localization alone, in place of nav2_bringup's localization_launch.py.
-
-ros2 launch fleetmap_ros localization.launch.py config:=/etc/fleetmap/locclient.toml
-"""
+"""Localization alone, in place of nav2_bringup's localization_launch.py."""
 
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription

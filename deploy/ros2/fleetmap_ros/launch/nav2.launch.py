@@ -1,7 +1,4 @@
-"""Localization and nav2's navigation, in place of nav2_bringup's bringup_launch.py: the node, its lifecycle manager, and navigation.
-
-ros2 launch fleetmap_ros nav2.launch.py config:=/etc/fleetmap/locclient.toml params_file:=YOUR_PARAMS.yaml
-"""
+"""Localization and nav2's navigation, in place of nav2_bringup's bringup_launch.py: the node, its lifecycle manager, and navigation."""
 
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription

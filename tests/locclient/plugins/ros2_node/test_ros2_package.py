@@ -66,7 +66,7 @@ def test_colcon_builds_a_program_that_leaves_arguments_of_ros_to_rclpy(tmp_path:
     for name, value in {"identity": "store", "outbox": "outbox", "cache": "cache", "calibration": "rig.yaml"}.items():
         settings = re.sub(f"^{name} = .*$", f'{name} = "{value}"', settings, flags=re.MULTILINE)
     settings = settings.replace("identity =", 'site = "lab"\nrobot = "r1"\nstore =')
-    (tmp_path / "locclient.toml").write_text(settings)
+    (tmp_path / "locclient.toml").write_text(f'{settings}namespace = "r1"\n')
 
     def localizer(words: str) -> subprocess.Popen[str]:
         environment = ros_environment() | {"PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin"}
@@ -79,14 +79,14 @@ def test_colcon_builds_a_program_that_leaves_arguments_of_ros_to_rclpy(tmp_path:
         with localizer(words) as refused:
             assert reason in refused.communicate(timeout=60)[1] and refused.returncode == 2
     with (
-        localizer("-r __ns:=/r1 -r __node:=place -p output.autostart:=false") as running,
+        localizer("-r __node:=place -p output.autostart:=false") as running,
         ExitStack() as stack,
         ros_peer("lifecycle_manager_localization") as manager,
     ):
         stack.callback(running.terminate)
         state = manager.call("/r1/place/get_state", "lifecycle_msgs/srv/GetState")["current_state"]
         assert state["label"] == "unconfigured"
-        assert eventually(lambda: {"place", "fleetmap_sensors"} <= set(manager.nodes()))
+        assert eventually(lambda: "subscription /imu0" in manager.endpoints("fleetmap_sensors", "/r1"))
         manager.listen("/r1/amcl_pose", "std_msgs/msg/String")
         manager.listen("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
         silent = "no frames come; /r1/amcl_pose: /lifecycle_manager_localization does not receive from /r1/place: it is geometry_msgs"
