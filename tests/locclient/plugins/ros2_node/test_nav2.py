@@ -160,9 +160,9 @@ def test_nav2_starts_it_asks_it_and_stops_it(tmp_path: Path) -> None:
         # Another subscriber than ROS connects with it, and another publisher of its transform.
         navigator.listen("/localization/status", "std_msgs/msg/String", **LATCHED)
         pair = "/localization/status: /navigator does not receive from /fleetmap_localizer: Volatile publisher"
-        assert soon(lambda: pair in diagnosis(navigator)["message"])
         link = {"header": given["header"] | {"frame_id": "odom"}, "child_frame_id": "base_link"}
         navigator.publish("/tf", TF, transforms=[link])
+        assert soon(lambda: pair in diagnosis(navigator)["message"])
         assert soon(lambda: is_contradicted(navigator, NODE, "odom -> base_link"))
 
         assert change(0, "deactivate") and state() == "inactive"

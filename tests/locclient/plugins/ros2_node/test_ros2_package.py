@@ -86,7 +86,7 @@ def test_colcon_builds_a_program_that_leaves_arguments_of_ros_to_rclpy(tmp_path:
         stack.callback(running.terminate)
         state = manager.call("/r1/place/get_state", "lifecycle_msgs/srv/GetState")["current_state"]
         assert state["label"] == "unconfigured"
-        assert eventually(lambda: "subscription /imu0" in manager.endpoints("fleetmap_sensors", "/r1"))
+        assert eventually(lambda: "subscription /imu0" in manager.endpoints("fleetmap_sensors", "/r1"), PATIENCE_S)
         manager.listen("/r1/amcl_pose", "std_msgs/msg/String")
         manager.listen("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray")
         silent = "no frames come; /r1/amcl_pose: /lifecycle_manager_localization does not receive from /r1/place: it is geometry_msgs"
