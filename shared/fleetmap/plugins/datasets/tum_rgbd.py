@@ -52,8 +52,8 @@ def open_tum_rgbd(path: Path, options: OpenOptions) -> Recording:
 
     def read_truth(file: Path) -> Trajectory:
         written = read_tum_truth(file, log)
-        frame_from_cam = written.frame_from_body
-        return Trajectory(written.stamps_ns, frame_from_cam @ cam_from_body)
+        frame_from_body = [frame_from_cam @ cam_from_body for frame_from_cam in written.frame_from_body]
+        return Trajectory(written.stamps_ns, np.array(frame_from_body).reshape(-1, 4, 4))
 
     calibration = RigCalibration(calibration.cameras[:1], None, calibration.base_from_body)
     truth = layout.optional_truth(path / "groundtruth.txt", log, read_truth)
