@@ -6,6 +6,7 @@ ROS's own launch is in no wheel: stand-ins for its actions are called, and what 
 import json
 import re
 import runpy
+import shlex
 import subprocess
 import sys
 from contextlib import ExitStack
@@ -48,6 +49,18 @@ for full in sys.argv[2:]:
     node = rclpy.create_node(name, namespace=namespace, automatically_declare_parameters_from_overrides=True)
     print(json.dumps({name: parameter.value for name, parameter in node.get_parameters_by_prefix("").items()}))
 """
+# The package's program under each of the words in `sys.argv`, and its exit status, in one process.
+PROGRAM = """
+import sys, rclpy
+from fleetmap_ros import main
+for words in sys.argv[1:]:
+    sys.argv[1:] = ["--config", "locclient.toml", "--ros-args", *words.split()]
+    try:
+        main()
+    except SystemExit as end:
+        print("exit", end.code, file=sys.stderr, flush=True)
+    rclpy.try_shutdown()
+"""
 
 
 @needs_ros
@@ -56,8 +69,8 @@ def test_colcon_builds_a_program_that_leaves_arguments_of_ros_to_rclpy(tmp_path:
     subprocess.run(build, cwd=tmp_path, env=ros_environment(), check=True, capture_output=True)
     built = tmp_path / "install/fleetmap_ros"
     for folder in ("config", "launch", "rviz"):
-        installed = [path.name for path in sorted((built / "share/fleetmap_ros" / folder).iterdir())]
-        assert installed == [path.name for path in sorted((PACKAGE / folder).iterdir())]
+        files = [path.name for path in sorted((built / "share/fleetmap_ros" / folder).iterdir())]
+        assert files == [path.name for path in sorted((PACKAGE / folder).iterdir())]
     with MapStore.open(tmp_path / "store", create=True) as store:
         publish_samples(store, 1)
         init_here(store)
@@ -68,18 +81,19 @@ def test_colcon_builds_a_program_that_leaves_arguments_of_ros_to_rclpy(tmp_path:
     settings = settings.replace("identity =", 'site = "lab"\nrobot = "r1"\nstore =')
     (tmp_path / "locclient.toml").write_text(f'{settings}namespace = "r1"\n')
 
-    def localizer(words: str) -> subprocess.Popen[str]:
+    def installed(command: str) -> subprocess.Popen[str]:
         environment = ros_environment() | {"PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin"}
-        command = (
-            f". install/setup.sh && exec {built}/lib/fleetmap_ros/localizer --config locclient.toml --ros-args {words}"
-        )
-        return subprocess.Popen(["sh", "-c", command], cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
+        words = ["sh", "-c", f". install/setup.sh && exec {command}"]
+        return subprocess.Popen(words, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True)
 
-    for words, reason in REFUSED.items():
-        with localizer(words) as refused:
-            assert reason in refused.communicate(timeout=60)[1] and refused.returncode == 2
+    with installed(f"{sys.executable} -c {shlex.quote(PROGRAM)} {shlex.join(REFUSED)}") as refused:
+        told = refused.communicate(timeout=PATIENCE_S)[1].split("exit 2\n")
+    assert (told.pop(), refused.returncode) == ("", 0) and all(
+        reason in each for reason, each in zip(REFUSED.values(), told, strict=True)
+    ), told
+    localizer = f"{built}/lib/fleetmap_ros/localizer --config locclient.toml"
     with (
-        localizer("-r __node:=place -p output.autostart:=false") as running,
+        installed(f"{localizer} --ros-args -r __node:=place -p output.autostart:=false") as running,
         ExitStack() as stack,
         ros_peer("lifecycle_manager_localization") as manager,
     ):
