@@ -1,6 +1,6 @@
 """MCAP with Foxglove's protobuf schemas, made by Foxglove's own classes."""
 
-import builtins
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -32,15 +32,10 @@ def _imu_class() -> Any:
     file = FileDescriptorProto(name="test_imu.proto", package="fleetmap", syntax="proto3")
     file.dependency.extend(["google/protobuf/timestamp.proto", "foxglove/Vector3.proto"])
     message = file.message_type.add(name="Imu")
-    fields = (
-        ("timestamp", 11, ".google.protobuf.Timestamp"),
-        ("frame_id", 9, ""),
-        ("angular_velocity", 11, ".foxglove.Vector3"),
-    )
-    for number, (name, kind, type_name) in enumerate(
-        (*fields, ("linear_acceleration", 11, ".foxglove.Vector3")), start=1
-    ):
-        message.field.add(name=name, number=number, type=kind, label=1, type_name=type_name or None)
+    kinds = {"timestamp": ".google.protobuf.Timestamp", "frame_id": None}
+    kinds |= dict.fromkeys(("angular_velocity", "linear_acceleration"), ".foxglove.Vector3")
+    for number, (name, kind) in enumerate(kinds.items(), start=1):
+        message.field.add(name=name, number=number, type=11 if kind else 9, label=1, type_name=kind)
     pool = DefaultPool()
     pool.Add(file)
     return GetMessageClass(pool.FindMessageTypeByName("fleetmap.Imu"))
@@ -69,21 +64,16 @@ def write(path: Path) -> Path:
             turn(link.rotation, camera.body_from_cam[:3, :3])
             writer.write_message("/tf_static", link, 1, 1)
             fx, fy, cx, cy = camera.intrinsics_px
-            lens = CameraCalibration(
-                timestamp=stamp(1),
-                frame_id=f"cam{number}",
-                width=WIDTH,
-                height=HEIGHT,
-                distortion_model="plumb_bob",
-                D=[1e-9, 0, 0, 0, 0],
-                K=[fx, 0, cx, 0, fy, cy, 0, 0, 1],
+            lens = CameraCalibration(timestamp=stamp(1), frame_id=f"cam{number}", width=WIDTH, height=HEIGHT)
+            lens.distortion_model, lens.D[:], lens.K[:] = (
+                "plumb_bob",
+                [1e-9, 0, 0, 0, 0],
+                [fx, 0, cx, 0, fy, cy, 0, 0, 1],
             )
             writer.write_message(f"/cam{number}/camera_info", lens, 1, 1)
         for i, s in enumerate(SAMPLE.stamps_ns.tolist()):
-            left = RawImage(
-                timestamp=stamp(s), frame_id="cam0", width=WIDTH, height=HEIGHT, encoding="mono8", step=WIDTH
-            )
-            left.data = SAMPLE.left[i].tobytes()
+            left = RawImage(timestamp=stamp(s), frame_id="cam0", width=WIDTH, height=HEIGHT, encoding="mono8")
+            left.step, left.data = WIDTH, SAMPLE.left[i].tobytes()
             writer.write_message("/cam0/image_raw", left, s, s)
             png = cv2.imencode(".png", SAMPLE.right[i])[1].tobytes()
             right = CompressedImage(timestamp=stamp(s), frame_id="cam1", data=png, format="png")
@@ -117,13 +107,7 @@ def test_everything_is_read(tmp_path: Path) -> None:
 
 
 def test_without_the_library_it_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path, original = write(tmp_path / "a.mcap"), builtins.__import__
-
-    def no_protobuf(name: str, *rest: Any, **keywords: Any) -> Any:
-        if name.startswith("google.protobuf"):
-            raise ImportError(name)
-        return original(name, *rest, **keywords)
-
-    monkeypatch.setattr(builtins, "__import__", no_protobuf)
+    path = write(tmp_path / "a.mcap")
+    monkeypatch.setitem(sys.modules, "google.protobuf.message", None)
     with pytest.raises(RecordingError, match="pip install protobuf"):
         open_recording(path)
