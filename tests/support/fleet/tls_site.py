@@ -125,9 +125,8 @@ class TlsSite:
     def robot(self, name: str) -> dict[str, Any]:
         """The server's entry of a robot; empty if unknown or without a reply."""
         try:
-            told = httpx.get(f"{self.http}/v1/robots", params={"site": self.name}, timeout=10, verify=False).json()[
-                "robots"
-            ]
+            answer = httpx.get(f"{self.http}/v1/robots", params={"site": self.name}, timeout=10, verify=False)
+            told = answer.json()["robots"]
         except httpx.HTTPError:
             return {}
         return next((one for one in told if one["robot"] == name), {})
