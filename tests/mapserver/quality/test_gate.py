@@ -189,7 +189,7 @@ def beside_itself(archive: SurveyMap, tiles: list[Tile]) -> Evidence:
 def test_frames_that_choose_landmarks_do_not_judge_the_draft() -> None:
     done, own = sound()
     session = JudgedSession(done.map.trajectory, own, done)
-    _, evidence = verdict(done.map)
+    _, evidence = verdict(done.map, has_current=False)
     assert evidence.held_out.draft.frames + len(asked_views([session])) == len(own)
     assert {f.number for f in session.asked(1)}.isdisjoint(f.number for f in session.judging(1))
 
