@@ -6,6 +6,7 @@ with an IMU of 210 Hz while the robot publishes its estimates. CPU per frame is 
 
 import argparse
 import json
+import select
 import tempfile
 from dataclasses import replace
 from pathlib import Path
@@ -29,9 +30,10 @@ def measured(rig: Path, driver: dict[str, Any], robot: list[str]) -> dict[str, f
         with ros_program("-m", "support.ros2.camera_driver") as camera:
             camera.stdin.write(json.dumps(driver) + "\n")
             camera.stdin.close()
-            while camera.poll() is None:
+            camera.stdout.readline()
+            while not select.select([camera.stdout], [], [], 0)[0]:
                 lines.append(json.loads(process.stdout.readline()))
-            sent = len(json.loads(camera.stdout.read().splitlines()[-1]))
+            sent = len(json.loads(camera.stdout.readline()))
         process.stdin.close()
         lines += map(json.loads, process.stdout)
     running = [line for line in lines if line["frames"] > _SETTLED_S * _RATE_HZ]
