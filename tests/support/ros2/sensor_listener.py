@@ -49,7 +49,6 @@ def main() -> None:
     if publisher is not None:
         publisher.close()
     source.close()
-    print(json.dumps(figures(intake, publishing_s)), flush=True)
 
 
 def figures(intake: Intake, publishing_s: float) -> dict[str, float]:
