@@ -9,6 +9,7 @@ import numpy as np
 
 from fleetmap.errors import CalibrationError, RecordingError
 from fleetmap.geometry import Array, se3, se3_inverse
+from fleetmap.log_lines import printable
 from fleetmap.plugins.datasets import layout
 from fleetmap.recordings import OpenOptions, Recording, RecordingFormat
 from fleetmap.recordings.files import lines_of, natural_key
@@ -90,15 +91,18 @@ def _rows(file: Path) -> dict[str, Array]:
         raise CalibrationError(f"{file} is missing; add it or pass a calibration with --calibration FILE")
     rows: dict[str, Array] = {}
     for _, line in lines_of(layout.read_table(file), file):
-        label, words = line.split(":", 1) if ":" in line else (f"P{len(rows)}", line)
+        is_labelled = ":" in line
+        label, words = line.split(":", 1) if is_labelled else (f"P{len(rows)}", line)
         rows[label] = np.array([layout.number_or_nan(word) for word in words.split()])
+        if not is_labelled:
+            _numbers(file, rows, label, 12)  # any other line would count as a camera, and shift those after it
     return rows
 
 
 def _numbers(file: Path, rows: Mapping[str, Array], name: str, count: int) -> Array:
     """The finite numbers (count,) of a line."""
     if name not in rows:
-        raise CalibrationError(f"{file} has no {name}; it describes {', '.join(rows)[:200] or 'no camera'}")
+        raise CalibrationError(f"{file} has no {name}; it describes {printable(', '.join(rows))[:200] or 'no camera'}")
     if len(rows[name]) != count or not np.isfinite(rows[name]).all():
         raise CalibrationError(f"{file}: {name} are not {count} numbers; copy the file again")
     return rows[name]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from fleetmap.encoding import to_json
+from fleetmap.errors import CalibrationError
 from fleetmap.geometry import se3, se3_inverse, so3_exp, transform_points
 from fleetmap.plugins.datasets.euroc import read_camera
 from fleetmap.plugins.datasets.seven_scenes import DepthRegistration
@@ -155,6 +156,9 @@ def test_kitti_times_and_unlabelled_rows(tmp_path: Path) -> None:
     recording = open_recording(folder)
     np.testing.assert_array_equal(recording.frame_stamps_ns, [0, 103_700_000, 207_400_000, 311_000_000])
     assert recording.calibration.cameras[1].body_from_cam[0, 3] == pytest.approx(BASELINE_M)
+    (folder / "calib.txt").write_text("\n".join(["of monday", *lines]))
+    with pytest.raises(CalibrationError, match="P0 are not 12 numbers"):
+        open_recording(folder)
 
 
 def test_tumvi_chain_noise_and_16_bits(tmp_path: Path) -> None:
