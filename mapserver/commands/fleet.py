@@ -116,7 +116,7 @@ def replay(
     json: Json = False,
 ) -> None:
     """Replay a failure with the present localizer, in the robot's map or in another version."""
-    from mapserver.fleet.bounded_process import ProcessLimits, run_bounded
+    from mapserver.fleet.bounded_process import ProcessLimits, run_bounded, without_network
 
     if find_spec("locclient") is None:
         raise StateError("the robots' client is not installed; install the distribution `fleetmap` as a whole")
@@ -132,7 +132,7 @@ def replay(
         command = [sys.executable, "-m", "locclient.cli", "replay", str(path), *options]
         done = run_bounded(command, ProcessLimits(), f"the replay of failure {failure}")
         output = report.read_text("utf-8") if json and report.exists() else done.stdout
-    if done.args == command:
+    if not without_network():
         typer.echo("it ran with the network: this system has no `unshare --net` for this account", err=True)
     for text, is_error in ((done.stderr, True), (output, False)):
         for line in text.splitlines():

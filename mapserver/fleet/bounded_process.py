@@ -48,9 +48,9 @@ def without_network() -> list[str]:
 
 
 def run_bounded(command: list[str], limits: ProcessLimits, what: str) -> "subprocess.CompletedProcess[str]":
-    """Run a command within limits; FleetmapError, naming `what`, if it is killed by a limit or crashes.
+    """Run a command within limits, `without_network` where the system allows it.
 
-    The result's `args` are the command as it is if the system did not allow running without a network.
+    FleetmapError, naming `what`, if it is killed by a limit or crashes.
     """
     whole = [*without_network(), *command]
     with TemporaryFile() as output, TemporaryFile() as errors:

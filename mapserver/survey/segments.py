@@ -85,8 +85,9 @@ def in_segments(begin: Begin, inputs: SurveyInputs, settings: SurveySettings, to
         return begin(inputs, settings, tools)
     how = begin, settings
     tasks = (_task_of(segment, inputs, tools) for segment in segments)
-    made: list[_Made] = []
-    for segment, survey in zip(segments, tools.executor.map(_survey_segment, how, tasks), strict=True):
+    made, surveys = list[_Made](), tools.executor.map(_survey_segment, how, tasks)
+    for segment in segments:
+        survey = next(surveys)  # by zip, which holds what it gave last, it would stay until the next one came
         tools.at("odometry", segment.last + 1, inputs.frame_count)
         tools.release()
         made.append((segment, survey if isinstance(survey, str) else _stored(survey, tools.images)))

@@ -156,7 +156,8 @@ using Place = std::tuple<Points, Packed, Flags>;
 // Refuses columns of a place that differ in length.
 template <typename Place>
 void check_place(const Place& place) {
-  std::apply([](const auto&... columns) { check_rows((columns.shape(0), ...), "one, other: a row for each landmark", columns...); }, place);
+  const size_t count = std::get<0>(place).shape(0);
+  std::apply([&](const auto&... columns) { check_rows(count, "one, other: a row for each landmark", columns...); }, place);
 }
 
 // Marks landmarks of two places that have a look-alike of the other place within reach_m along each axis.

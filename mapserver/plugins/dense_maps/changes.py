@@ -77,9 +77,10 @@ def changes_between(before: SeenSite, after: SeenSite) -> Changes:
         through, seen = _counts(voxels_map, other)
         changed = HIT * seen - through <= -AGAINST
         _fill(layers["not_seen"], voxels_map[~changed & (seen == 0)], corner_m)
-        for rows in _joined(voxels_map[changed]):
-            points, area_m2 = voxels_map[changed][rows], float(areas_m2[changed][rows].sum())
-            if area_m2 >= _LEAST_AREA_M2:
+        changed_map, areas_m2 = voxels_map[changed], areas_m2[changed]
+        for rows in _joined(changed_map):
+            if (area_m2 := float(areas_m2[rows].sum())) >= _LEAST_AREA_M2:
+                points = changed_map[rows]
                 box = np.stack([points.min(axis=0) - _VOXEL_M / 2, points.max(axis=0) + _VOXEL_M / 2])
                 patches.append(Patch(kind, box, area_m2))
                 _fill(layers[kind], points, corner_m)
