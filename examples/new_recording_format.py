@@ -44,7 +44,7 @@ def open_numbered_pairs(path: Path, options: OpenOptions) -> Recording:
     calibration = read_calibration(options.calibration_file or path / "calibration.yaml")
     lefts, rights = (sorted(path.glob(f"*_{side}.png")) for side in ("left", "right"))
     left, right = (
-        ImageSeries(np.array([int(file.name[:3]) for file in files]) * PERIOD_NS, tuple(files))
+        ImageSeries(np.array([int(file.name[:3]) for file in files], np.int64) * PERIOD_NS, tuple(files))
         for files in (lefts, rights)
     )
     frames = SeriesFrames(FileReader([*lefts, *rights]), (paired(left, {"right": right}, log),))

@@ -126,7 +126,7 @@ def finalize(parts: RecordingParts, log: ReadLog) -> Recording:
 def _check_depths(parts: RecordingParts, cameras: tuple[CameraCalibration, ...]) -> None:
     """Raise CalibrationError for a camera of another view that should have depth and has none."""
     first, *others = parts.frames.views
-    firsts = [n for n, camera in enumerate(cameras) if camera.has_depth and n > ("right" in first.images)]
+    firsts = [n for n in range(1 + ("right" in first.images), len(cameras)) if cameras[n].has_depth]
     if len(firsts) > sum("depth" in other.images for other in others):
         names = " and ".join(f"cam{number} (--topic cam{number}_depth=/NAME)" for number in firsts)
         raise CalibrationError(

@@ -62,9 +62,8 @@ class ReplaySource:
     def samples_before_each(self) -> Iterator[SensorBundle]:
         """For each frame of the playback, the other samples that are handled before it; none backwards."""
         recording, since_ns = self.recording, _NEVER_NS
-        offset_ns = int(
-            recording.calibration.cameras[0].imu_minus_cam_s * 1e9
-        )  # to the clock of the IMU and the wheels
+        # To the clock of the IMU and the wheels
+        offset_ns = int(recording.calibration.cameras[0].imu_minus_cam_s * 1e9)
         for until_ns in recording.frame_stamps_ns[self.indices].tolist():
             if self.reverse:
                 yield SensorBundle()
