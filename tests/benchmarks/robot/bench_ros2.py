@@ -36,7 +36,7 @@ def measured(rig: Path, driver: dict[str, Any], robot: list[str]) -> dict[str, f
                 lines.append(json.loads(process.stdout.readline()))
             sent = len(json.loads(camera.stdout.readline()))
         last = [json.loads(process.stdout.readline()) for _ in range(_LATE_LINES)][-1]
-        process.stdin.close()
+        process.communicate()
     running = [line for line in lines if line["frames"] > _SETTLED_S * _RATE_HZ]
     first, final = running[0], running[-1]
     cpu_ms = 1e3 * (final["cpu_s"] - first["cpu_s"]) / (final["frames"] - first["frames"])
