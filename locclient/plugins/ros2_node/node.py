@@ -24,7 +24,7 @@ from fleetmap.errors import FleetmapError, LinkError, UsageError
 from fleetmap.log_lines import LogLimit
 
 LATCHED = QoSProfile(depth=1, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-_LOOK_S, _PAUSE_S = 0.5, 1.0
+_LOOK_S, _PAUSE_S = 1.0, 1.0
 _log = logging.getLogger(__name__)
 _limit = LogLimit(_log)
 

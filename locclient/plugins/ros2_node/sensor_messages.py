@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import pairwise
 
 import numpy as np
 
@@ -65,8 +66,8 @@ class _View:
 
     @property
     def period_ns(self) -> int | None:
-        stamps = [frame.stamp_ns for frame in self.recent]
-        return int(np.median(np.diff(stamps))) if len(stamps) > 1 else None
+        steps_ns = sorted(later.stamp_ns - earlier.stamp_ns for earlier, later in pairwise(self.recent))
+        return steps_ns[len(steps_ns) // 2] if steps_ns else None
 
     def take_near(self, stamp_ns: int, within_ns: int) -> StoredFrame | None:
         """Return the unused frame nearest to a stamp, None if there is none within."""
@@ -130,8 +131,11 @@ class RigFrames:
         return own_ns - leader_ns // 2 <= waiting.stamp_ns - view.recent[-1].stamp_ns < 1.5 * own_ns
 
     def _with_others(self, frame: StoredFrame) -> StoredFrame:
+        _, *others = self._views
+        if not others:
+            return frame
         within_ns = (self._leader.period_ns or _DEAD_NS) // 2
-        return replace(frame, others=tuple(view.take_near(frame.stamp_ns, within_ns) for view in self._views[1:]))
+        return replace(frame, others=tuple(view.take_near(frame.stamp_ns, within_ns) for view in others))
 
 
 class SensorMessages:

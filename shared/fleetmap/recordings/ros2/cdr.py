@@ -20,6 +20,7 @@ from fleetmap.recordings.ros2.definitions import DEFINITIONS
 
 _HEAD = b"\x00\x01\x00\x00"  # plain CDR, little endian
 _NUMBERS = {"bool": "B", "uint8": "B", "int32": "i", "uint32": "I", "float32": "f"}
+_FORMS = {order + code: struct.Struct(order + code) for order in "<>" for code in _NUMBERS.values()}
 _TIME, _BYTES = "builtin_interfaces/Time", ("uint8[]", "int8[]")
 Fields = tuple[Any, ...]  # types, counts of neighbouring float64, and Fields of the messages of a sequence
 
@@ -87,9 +88,9 @@ class _Reader:
         return np.frombuffer(self._take(8 * count), np.dtype(self._order + "f8")).astype(np.float64)
 
     def _number(self, code: str) -> Any:
-        size = struct.calcsize(code)
-        self._at += -(self._at - len(_HEAD)) % size
-        return struct.unpack(self._order + code, self._take(size))[0]
+        form = _FORMS[self._order + code]
+        self._at += -(self._at - len(_HEAD)) % form.size
+        return form.unpack(self._take(form.size))[0]
 
     def _take(self, count: int) -> bytes:
         if self._at + count > len(self._data):
@@ -128,4 +129,5 @@ def _put(out: bytearray, fields: Fields, values: Any) -> None:
 
 
 def _put_number(out: bytearray, code: str, value: float) -> None:
-    out += b"\0" * (-(len(out) - len(_HEAD)) % struct.calcsize(code)) + struct.pack("<" + code, value)
+    form = _FORMS["<" + code]
+    out += b"\0" * (-(len(out) - len(_HEAD)) % form.size) + form.pack(value)
