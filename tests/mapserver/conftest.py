@@ -1,7 +1,6 @@
 """Places of a store: its folder, an object store, PostgreSQL; a browser. Disks have room, whatever this machine's have."""
 
 import os
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from support.pages.browser import Chromium, running_chromium
 from support.storage.clock import Clock
 from support.storage.postgres_server import PostgresServer, postgres_server
 from support.storage.s3_server import KEYS, s3_server
+from support.waiting import eventually
 
 HAS_REMOTE = (Path(mapserver.__path__[0]) / "plugins" / "remote_stores").is_dir()
 expect.set_options(timeout=30_000)  # a busy machine answers late
@@ -94,10 +94,8 @@ def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Itera
     fill_store(folder)
     with serving(folder) as server:
         with talking(server.zenoh, ROBOTS):
-            deadline_s = time.monotonic() + 30
-            while len(httpx.get(f"{server.http}/v1/robots?limit=1000").json()["robots"]) < ROBOTS:
-                assert time.monotonic() < deadline_s
-                time.sleep(0.2)
+            here = lambda: httpx.get(f"{server.http}/v1/robots?limit=1000", verify=False).json()["robots"]  # noqa: E731
+            assert eventually(lambda: len(here()) >= ROBOTS, 30.0)
         yield server
     assert [line for line in server.log if "ERROR" in line or "Traceback" in line] == []
 

@@ -3,7 +3,6 @@
 import datetime
 import ipaddress
 import re
-import time
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
@@ -21,6 +20,7 @@ from mapserver.operators.operators import Operators
 from mapserver.store import Actor, MapStore
 from support.fleet.dashboard_scene import SITE, Served, failure, fill_store, serving, watch
 from support.pages.browser import Chromium, running_chromium
+from support.waiting import eventually
 
 PASSWORD = "a password of the test"
 SCRIPT = "<img src=x onerror='window.injected = 1'>"
@@ -205,10 +205,7 @@ def test_the_server_takes_it_without_a_restart(served: Served) -> None:
 
     assert number() == 1
     make_certificate(served.folder, 2)
-    deadline_s = time.monotonic() + 60
-    while number() != 2:
-        assert time.monotonic() < deadline_s
-        time.sleep(0.5)
+    assert eventually(lambda: number() == 2, 60.0)
     with httpx.Client(base_url=served.http, verify=False, headers={"Accept": "text/html"}) as client:
         assert client.get("/healthz").headers["strict-transport-security"]
         assert "<form" in client.get("/sign-in").text

@@ -32,6 +32,7 @@ from support.fleet.memory_bus import MemoryBus, MemoryHub
 from support.fleet.two_servers import run
 from support.storage.map_samples import publish_samples, save_sample_draft
 from support.storage.postgres_server import PostgresServer
+from support.waiting import eventually
 
 
 @pytest.fixture
@@ -82,9 +83,7 @@ def test_one_leads_until_it_is_gone(folders: tuple[Path, Path], postgres: Postgr
     with MapStore.open(folders[1]) as other:
         with MapStore.open(folders[0]) as store:
             assert [each.leads() for each in (store, other, store, other)] == [True, False, True, False]
-        until_s = time.monotonic() + 30  # the database ends a closed session by itself
-        while not other.leads():
-            assert time.monotonic() < until_s
+        assert eventually(other.leads, 30.0)  # the database ends a closed session by itself
         postgres.stop()
         postgres.start()
         assert other.leads(), "in a new session"
