@@ -57,37 +57,37 @@ class PoseHistory:
     """Poses of the last seconds by stamp; they may arrive out of order."""
 
     def __init__(self) -> None:
-        self.poses: list[tuple[int, Array]] = []  # stamps and odom_from_base (4, 4)
+        self.kept: list[tuple[int, Array]] = []  # stamps and odom_from_base (4, 4)
         self._strays = 0
 
     def add(self, stamp_ns: int, odom_from_base: Array) -> None:
         """Add a pose. Drop one that is much older than the newest, unless several are: then the clock was set back."""
-        poses = self.poses
-        if poses and stamp_ns < poses[-1][0] - _KEPT_NS:
+        kept = self.kept
+        if kept and stamp_ns < kept[-1][0] - _KEPT_NS:
             self._strays += 1
             if self._strays < _STRAYS:
                 return
-            poses.clear()
+            kept.clear()
         self._strays = 0
-        place = bisect_left(poses, (stamp_ns,))
-        if place == len(poses) or poses[place][0] != stamp_ns:  # tf2 keeps the first one as well
-            poses.insert(place, (stamp_ns, odom_from_base))
-            del poses[: max(bisect_left(poses, (poses[-1][0] - _KEPT_NS,)), len(poses) - _KEPT_POSES)]
+        place = bisect_left(kept, (stamp_ns,))
+        if place == len(kept) or kept[place][0] != stamp_ns:  # tf2 keeps the first one as well
+            kept.insert(place, (stamp_ns, odom_from_base))
+            del kept[: max(bisect_left(kept, (kept[-1][0] - _KEPT_NS,)), len(kept) - _KEPT_POSES)]
 
     def at(self, stamp_ns: int) -> Array | Missing:
         """Return the pose at a stamp, interpolated like tf2: position and rotation separately."""
-        poses, after = self.poses, bisect_left(self.poses, (stamp_ns,))
-        if not poses:
+        kept, after = self.kept, bisect_left(self.kept, (stamp_ns,))
+        if not kept:
             return Missing("none has come", may_come=True)
-        if after == len(poses):
-            late_s = (stamp_ns - poses[-1][0]) * 1e-9
+        if after == len(kept):
+            late_s = (stamp_ns - kept[-1][0]) * 1e-9
             return Missing(f"the newest one is stamped {late_s:.3f} s before the frame", may_come=True)
-        then_ns, b = poses[after]
+        then_ns, b = kept[after]
         if then_ns == stamp_ns:
             return b
         if after == 0:
             return Missing(f"the oldest one is stamped {(then_ns - stamp_ns) * 1e-9:.3f} s after the frame")
-        before_ns, a = poses[after - 1]
+        before_ns, a = kept[after - 1]
         gap_s, turn = (then_ns - before_ns) * 1e-9, so3_log(a[:3, :3].T @ b[:3, :3])
         if gap_s > _GAP_S:
             return Missing(f"none was stamped within {gap_s:.1f} s around the frame")
@@ -128,7 +128,7 @@ class DriverOdometry:
                     self._refused = ""
                     self._history.add(link.stamp_ns, link.parent_from_child @ child_from_base)
                     self._send_known()
-                elif not self._history.poses and (is_odom or link.child == self._base):
+                elif not self._history.kept and (is_odom or link.child == self._base):
                     way = ": set [output] odom_frame"
                     if is_odom:
                         way = ", and /tf_static has no chain from there to the base; set [output] base_frame, or publish the chain"

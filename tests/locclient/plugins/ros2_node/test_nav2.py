@@ -241,16 +241,16 @@ def driver_poses(truth: list[Array]) -> list[deque[tuple[int, Array]]]:
 
 def drive(driver: RosPeer, way: deque[tuple[int, Array]], until_ns: int) -> None:
     """Publish the driver's transforms up to then."""
-    transforms = []
+    told = []
     while way and way[0][0] <= until_ns:
         stamp_ns, odom_from_base = way.popleft()
         values = position_quat_xyzw(odom_from_base).tolist()
         place, turn = (dict(zip("xyzw", part, strict=False)) for part in (values[:3], values[3:]))
         header = {"stamp": {"sec": stamp_ns // 10**9, "nanosec": stamp_ns % 10**9}, "frame_id": "odom"}
-        transform = {"translation": place, "rotation": turn}
-        transforms.append({"header": header, "child_frame_id": "base_link", "transform": transform})
-    if transforms:
-        driver.publish("/wheels/tf", TF, transforms=transforms)
+        link = {"translation": place, "rotation": turn}
+        told.append({"header": header, "child_frame_id": "base_link", "transform": link})
+    if told:
+        driver.publish("/wheels/tf", TF, transforms=told)
 
 
 def links(peer: RosPeer, topic: str) -> list[tuple[str, str, int, Array]]:
@@ -291,8 +291,8 @@ def test_the_tree_holds_the_true_pose_at_every_frame(tmp_path: Path) -> None:
         sent = {name: links(listener, f"/{name}/tf") for name in is_own}
     begun_ns = int(robot_world.cycle().stamps_ns[0])
     for name, is_publisher in is_own.items():
-        odom_from_base = {stamp_ns: pose for _, child, stamp_ns, pose in sent[name] if child == "base_link"}
-        placed = {(ns - begun_ns) // FRAME_NS: (ns, pose) for parent, _, ns, pose in sent[name] if parent == "map"}
+        odom_from_base = {stamp_ns: link for _, child, stamp_ns, link in sent[name] if child == "base_link"}
+        placed = {(ns - begun_ns) // FRAME_NS: (ns, link) for parent, _, ns, link in sent[name] if parent == "map"}
         for life in LIVES:
             first = min(set(placed) & set(life))
             assert first < life.start + 75, "ROS has connected all before the driver's pose is not known"
