@@ -201,11 +201,11 @@ def _runs(stamps_ns: Sequence[int], flags: Sequence[bool]) -> list[tuple[int, in
 
 def _merged(stretches: list[tuple[int, int]], fine: list[tuple[int, bool]]) -> list[tuple[int, int]]:
     """Merge periods, sorted by begin, without 5 s of good tracking between them. fine: stamp and goodness of each frame."""
-    merged: list[tuple[int, int]] = []
-    for begin, end in stretches:
-        between = [each for each in fine if merged and merged[-1][1] <= each[0] <= begin]
+    merged = stretches[:1]
+    for begin, end in stretches[1:]:
+        between = [each for each in fine if merged[-1][1] <= each[0] <= begin]
         runs = _runs([stamp_ns for stamp_ns, _ in between], [is_fine for _, is_fine in between])
-        if merged and max((until - since for since, until in runs), default=0) < GOOD_S * 1e9:
+        if max((until - since for since, until in runs), default=0) < GOOD_S * 1e9:
             merged[-1] = (merged[-1][0], max(end, merged[-1][1]))
         else:
             merged.append((begin, end))

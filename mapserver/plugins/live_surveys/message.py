@@ -184,5 +184,5 @@ class LiveParts(NamedTuple):
 
 def joined_imu(parts: Sequence[ImuSamples]) -> ImuSamples:
     """Concatenate samples of consecutive parts."""
-    columns = zip(*((part.stamps_ns, part.gyro_radps, part.accel_mps2) for part in parts), strict=True)
-    return ImuSamples(*map(np.concatenate, columns))
+    columns = ("stamps_ns", "gyro_radps", "accel_mps2")
+    return ImuSamples(*(np.concatenate([getattr(part, column) for part in parts]) for column in columns))

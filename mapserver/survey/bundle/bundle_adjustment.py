@@ -22,7 +22,7 @@ from mapserver.survey.settings import BundleSettings
 # Lower bound of an increment's covariance: below is rounding error, and the bound keeps empty intervals invertible.
 FLOOR_SIGMA = np.repeat([1e-7, 1e-6, 1e-7, 1e-9, 1e-8], 3)
 
-# Parts of an increment for the core, in its order
+# Parts of an increment for the core, in its order, which is that of the record's fields
 _INCREMENTS = [f.name for f in fields(Preintegrated) if f.name not in {"start_ns", "end_ns", "cov", "max_gap_s"}]
 
 
