@@ -71,8 +71,10 @@ class Estimate:
     @property
     def views_in_words(self) -> str:
         """Return the state of each view, and which one is compared with the map; empty for a rig of one view."""
-        states = [f"view {number}: {cause.value or 'good'}" for number, cause in enumerate(self.view_causes)]
-        states[self.view] += " (compared with the map)"
+        states = [
+            f"view {number}: {cause.value or 'good'}" + " (compared with the map)" * (number == self.view)
+            for number, cause in enumerate(self.view_causes)
+        ]
         return ", ".join(states) if len(states) > 1 else ""
 
 

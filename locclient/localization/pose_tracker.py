@@ -169,14 +169,22 @@ class PoseTracker:
         """Return the state with which another tracker of the same odometry can start."""
         prior = self.prior
         known = self.confirmed or (None if prior is None else prior.hypothesis)
-        state: dict[str, Any] = {"was_tracking": self.was_tracking, "is_carried": self.is_carried}
         if known is None:
-            return Start(failed_queries=failed_queries, **state)
-        if prior is not None:
-            state |= {"is_revisable": prior.is_revisable, "is_told": prior.is_told, "travelled_m": prior.travelled_m}
-        state |= known.start._asdict() | {"is_confirmed": self.confirmed is not None, "has_broken": known.has_broken}
-        at = known.frame_index, known.stamp_ns, known.support
-        return Start(*at, failed_queries=failed_queries, **state)
+            return Start(was_tracking=self.was_tracking, is_carried=self.is_carried, failed_queries=failed_queries)
+        return Start(
+            frame_index=known.frame_index,
+            stamp_ns=known.stamp_ns,
+            support=known.support,
+            **known.start._asdict(),
+            was_tracking=self.was_tracking,
+            is_carried=self.is_carried,
+            failed_queries=failed_queries,
+            is_confirmed=self.confirmed is not None,
+            is_revisable=prior is not None and prior.is_revisable,
+            is_told=prior is None or prior.is_told,
+            travelled_m=0.0 if prior is None else prior.travelled_m,
+            has_broken=known.has_broken,
+        )
 
     def begin(self, start: Start) -> None:
         """Continue from `start` with the next frame."""

@@ -166,7 +166,7 @@ class _Survey:
             self._worst = 1.0
 
     def figures(self) -> LiveFigures:
-        latency = None
+        latency, sketch = None, self._mapping.sketch  # which the thread of mapping replaces
         if self._latencies_s:
             median, high = np.percentile(self._latencies_s, [50, 99]) * 1e3
             latency = round(float(median), 2), round(float(high), 2)
@@ -179,8 +179,8 @@ class _Survey:
             most_behind=self._mapping.most_behind,
             lag_s=round(self._mapping.longest_lag_s, 3),
             dropped=self._drive.dropped,
-            loops=self._mapping.sketch.loops,
-            parts=len(self._mapping.sketch.parts),
+            loops=sketch.loops,
+            parts=len(sketch.parts),
             mapping_failed=self._mapping.failed,
         )
 

@@ -26,7 +26,7 @@ class Preintegrated:
     cov (15, 15): rotation, velocity, position, gyro bias, accelerometer bias; the last six are the biases' walk since
     `start_ns`, with its correlation to the motion. d_*_d_* (3, 3): derivatives at the linearisation point
     gyro_bias_radps (3,), accel_bias_mps2 (3,), rotation as a right perturbation. max_gap_s: longest stretch without a
-    sample, one sample period in a healthy recording.
+    sample, one sample period in a healthy recording. The core's adjustment reads the fields in this order.
     """
 
     start_ns: int

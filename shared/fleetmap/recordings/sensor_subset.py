@@ -20,6 +20,8 @@ REDUCTIONS: dict[SensorSet, tuple[SensorSet, ...]] = {
     SensorSet.MONO_INERTIAL: (SensorSet.MONO_INERTIAL, SensorSet.MONO),
     SensorSet.MONO: (SensorSet.MONO,),
 }
+_INERTIAL = (SensorSet.STEREO_INERTIAL, SensorSet.MONO_INERTIAL)
+_SINGLE = (SensorSet.MONO, SensorSet.MONO_INERTIAL)
 
 
 def sensor_set_of(path: Path, options: OpenOptions | None = None) -> SensorSet:
@@ -49,12 +51,11 @@ def reduced(recording: Recording, use: SensorSet | None) -> Recording:
         fault = f"is {recording.sensor_set}, it cannot be used as {use}"
         raise RecordingError(f"{recording.path} {fault}; use it as {possible}")
     calibration, imu = recording.calibration, recording.imu
-    is_single = use.startswith("mono")
-    if not use.endswith("-inertial"):
+    if use not in _INERTIAL:
         calibration, imu = replace(calibration, imu=None), ImuSamples.empty()
-    if is_single:
+    if use in _SINGLE:
         calibration = replace(calibration, cameras=calibration.cameras[:1])
-    frames = _Reduced(recording.frames, is_single)
+    frames = _Reduced(recording.frames, use in _SINGLE)
     return replace(recording, sensor_set=use, calibration=calibration, imu=imu, frames=frames)
 
 
