@@ -18,7 +18,10 @@ from fleetmap.sensors.samples import UNSAID_SIGMAS, ImuSamples, PositionPrior
 from fleetmap.sensors.source_settings import CAMERA_ROLES, DEPTH_ROLES, transports
 from fleetmap.sources.intake import Intake
 
-_WAITING_IMAGES = 8  # images of each side waiting for their partner
+_RECENT = 8  # frames of a view, of which one may be added to another view's
+# Images of a side that wait for their partner: a second of them. Of two large images that a process sends, Fast DDS may have to send one
+# again, 0.3 s later.
+_UNPAIRED = 30
 _DEAD_NS, _NEVER_NS = 500_000_000, -(2**63)
 Take = Callable[[Intake, bool, bytes], None]
 
@@ -32,11 +35,11 @@ class _View:
     """A view of a rig: images that wait for their partner of the same moment, and its last frames."""
 
     def __init__(self, numbers: tuple[int, ...], has_depth: bool) -> None:
-        self.numbers, self.recent = numbers, deque[StoredFrame](maxlen=_WAITING_IMAGES)
+        self.numbers, self.recent = numbers, deque[StoredFrame](maxlen=_RECENT)
         self.used_ns = _NEVER_NS  # last stamp in a frame of the rig
         self.silent_since_ns: int | None = None  # first stamp since the first view's last frame
         self._has_depth, self._is_paired = has_depth, has_depth or len(numbers) > 1
-        self._unpaired = tuple(deque[StoredFrame](maxlen=_WAITING_IMAGES) for _ in range(2))  # of either side
+        self._unpaired = tuple(deque[StoredFrame](maxlen=_UNPAIRED) for _ in range(2))  # of either side
 
     def add(self, side: int, stamp_ns: int, image: StoredImage) -> StoredFrame | None:
         """Add an image; return the frame that it completes, None while its partner is missing. side: 1 for a right image or depth.

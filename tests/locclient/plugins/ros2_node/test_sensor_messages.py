@@ -73,10 +73,13 @@ def test_pairs_are_by_stamp_and_cameras_that_are_not_triggered_together_are_name
     rig, image, ms = RigFrames(calibration()), grey_image(LEFT), 1_000_000
     assert rig.add(0, 0, image) == rig.add(0, 50 * ms, image) == []
     assert [frame.stamp_ns for frame in rig.add(1, 51 * ms, image)] == [50 * ms]
-    for number in range(100, 120):  # of the right camera alone
+    for number in range(60, 72):  # the left camera's are sent again, by 0.3 s late and more
+        assert rig.add(1, number * 50 * ms, image) == []
+    assert all(len(rig.add(0, number * 50 * ms, image)) == 1 for number in range(60, 72))
+    for number in range(100, 140):  # of the right camera alone
         assert rig.add(1, number * 50 * ms, image) == []
     with pytest.raises(RecordingError, match=r"no partner within 5 ms: are both triggered together\?"):
-        for number in range(121, 130):
+        for number in range(140, 150):
             assert rig.add(0, (number * 50 + 20) * ms, image) == rig.add(1, number * 50 * ms, image) == []
 
 
