@@ -19,8 +19,7 @@ from fleetmap.sensors.source_settings import CAMERA_ROLES, DEPTH_ROLES, transpor
 from fleetmap.sources.intake import Intake
 
 _RECENT = 8  # frames of a view, of which one may be added to another view's
-# Images of a side that wait for their partner: a second of them. Of two large images that a process sends, Fast DDS may have to send one
-# again, 0.3 s later.
+# Images of a side that wait for their partner: a second of them. Over Fast DDS one of two large images was seen to come 0.3 s late.
 _UNPAIRED = 30
 _DEAD_NS, _NEVER_NS = 500_000_000, -(2**63)
 Take = Callable[[Intake, bool, bytes], None]
