@@ -1,8 +1,9 @@
 """`mapserver align`, `areas` and `building`: a site in its building, its named areas, and sites that are floors."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -23,10 +24,11 @@ if TYPE_CHECKING:
     from fleetmap.geometry import Array
     from fleetmap.mapformat.building import Building, FloorEntry
     from mapserver.floor_plan.alignment import Alignment
+    from mapserver.floor_plan.rmf import RmfLevel
     from mapserver.store import MapStore
 
 _Name = Annotated[str, typer.Argument(metavar="NAME", help="Name of the building.")]
-_FORM = "SITE=LEVEL@HEIGHT"
+_FORM, _RMF_FORM = "SITE=LEVEL@HEIGHT", "SITE=LEVEL"
 
 
 @expand_options
@@ -203,19 +205,26 @@ AREAS = Group(
 
 @expand_options
 def set_(
-    name: _Name,
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the building; default: the file's.")] = "",
     *,
     floor: Annotated[list[str], typer.Option(metavar=_FORM, help="A floor: site, its level's name, height in metres.")],
+    file: Annotated[
+        Path | None,
+        typer.Option("--from", metavar="FILE", help="Take heights and lifts from a *.building.yaml of Open-RMF."),
+    ] = None,
     store: StoreFolder,
     by: ActorOptions,
 ) -> None:
     """Make aligned sites the floors of a building; robots of each of them then know all of its floors."""
     from fleetmap.mapformat.building import Building
-    from mapserver.fleet.building import floors_of, keep_building, single_lifts
+    from mapserver.fleet.building import floors_of, keep_building, keep_rmf_building, single_lifts
+    from mapserver.floor_plan.rmf import read_rmf
 
-    building = Building(name=name, floors=tuple(map(_entry, floor)))
+    drawn_name, levels = ("", {}) if file is None else read_rmf(file)
+    building = Building(name=name or drawn_name, floors=tuple(_entry(text, levels) for text in floor))
     with open_store(store) as maps:
-        kept = keep_building(maps, building, by.named())
+        keep = partial(keep_rmf_building, levels=levels) if levels else keep_building
+        kept = keep(maps, building, actor=by.named())
         lifts = single_lifts(floors_of(maps, kept))
         _print(maps, kept)
     if lifts:
@@ -234,25 +243,43 @@ def remove_building(name: _Name, *, store: StoreFolder, by: ActorOptions) -> Non
 
 
 @expand_options
-def list_buildings(*, store: StoreFolder, json: Json = False) -> None:
+def list_buildings(
+    *,
+    store: StoreFolder,
+    json: Json = False,
+    form: Annotated[
+        Literal["rmf"] | None, typer.Option("--as", metavar="rmf", help="Print a *.building.yaml of Open-RMF.")
+    ] = None,
+) -> None:
     """List the buildings with their floors and lifts."""
-    from mapserver.fleet.building import buildings
+    from mapserver.fleet.building import buildings, floors_of
+    from mapserver.floor_plan.rmf import rmf_text
 
     with open_store(store, read_only=True) as maps:
         found = buildings(maps)
         if json:
             print_json(found)
             return
+        if form == "rmf":
+            typer.echo("---\n".join(rmf_text(building, floors_of(maps, building)) for building in found), nl=False)
+            return
         for building in found:
             _print(maps, building)
     typer.echo(f"buildings: {len(found)}")
 
 
-def _entry(text: str) -> "FloorEntry":
+def _entry(text: str, levels: "Mapping[str, RmfLevel]") -> "FloorEntry":
     from fleetmap.mapformat.building import FloorEntry
     from fleetmap.mapformat.names import check_name
 
     site, _, rest = text.partition("=")
+    if levels:
+        if rest not in levels:
+            named = ", ".join(levels)[:200]
+            raise UsageError(
+                f"--floor {text[:80]!r}: write {_RMF_FORM}, such as hall-1=L1; the file's levels are {named}"
+            )
+        return FloorEntry(site=check_name(site, "site"), level=rest, height_m=levels[rest].height_m)
     level, _, height = rest.rpartition("@")
     try:
         height_m = float(height)

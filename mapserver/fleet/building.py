@@ -6,7 +6,7 @@ each of their sites, which robots get with the site's signed list.
 
 import hashlib
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from math import degrees
@@ -23,6 +23,7 @@ from mapserver.floor_plan.areas import MAX_REASON, Area, Areas, Correction, Corr
 from mapserver.floor_plan.masks import check_masks_on_map
 from mapserver.floor_plan.pins import Fit, Pin, fit_pins
 from mapserver.floor_plan.plan_file import PlanFile, upwards
+from mapserver.floor_plan.rmf import RmfLevel
 from mapserver.floor_plan.survey_requests import ASKED, KIND, SurveyRequest
 from mapserver.store import Actor, MapStore
 from mapserver.store.map_store import AREAS_BEFORE
@@ -256,6 +257,24 @@ def keep_building(store: MapStore, building: Building, actor: Actor) -> Building
         words = f"{building.name}: level {floor.level}, {floor.height_m:g} m"
         store.keep_site_files(floor.site, {FLOORS: data}, words, actor=actor)
     return building
+
+
+def keep_rmf_building(store: MapStore, building: Building, levels: Mapping[str, RmfLevel], actor: Actor) -> Building:
+    """As `keep_building`, with the lifts of Open-RMF's levels, by name, in place of the sites' own. Errors of `RmfLevel.check_aligned` and
+    `keep_areas` too.
+    """
+    for floor in building.floors:
+        if (alignment := store.alignment(floor.site)) is not None:
+            levels[floor.level].check_aligned(floor.site, alignment)
+    kept = keep_building(store, building, actor)
+    for floor in kept.floors:
+        alignment, before = store.alignment(floor.site), store.areas(floor.site)
+        assert alignment is not None  # `keep_building` refuses it
+        areas = before.with_lifts(levels[floor.level].lifts, alignment.frame)
+        data = to_json(areas.geojson(floor.site, alignment.frame if areas.frame == "building" else None))
+        if before or areas:
+            keep_areas(store, floor.site, data if areas else None, f"lifts of {kept.name}", actor)
+    return kept
 
 
 def remove_building(store: MapStore, name: str, actor: Actor) -> Building:

@@ -4,8 +4,8 @@ GeoJSON (RFC 7946) uses degrees of WGS 84. Here coordinates are metres, and the 
 """
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from typing import Annotated, Any, Literal
 
@@ -137,7 +137,7 @@ class Area:
         """Return it as a feature of GeoJSON in another frame."""
         effects = {"mask": self.mask, "percent": self.percent} if self.mask else {}
         corrects = {"correction": to_plain(self.correction)} if self.correction else {}
-        polygons = [[_closed(_moved(ring, target_from_map)) for ring in polygon] for polygon in self.polygons]
+        polygons = [[_closed(moved(ring, target_from_map)) for ring in polygon] for polygon in self.polygons]
         geometry = {"type": "MultiPolygon", "coordinates": polygons}
         return {
             "type": "Feature",
@@ -215,6 +215,19 @@ class Areas:
         features = [area.feature(target_from_map) for area in self.areas]
         return {"type": "FeatureCollection", "site": site, "frame": frame, "units": "metres", "features": features}
 
+    def with_lifts(self, outlines: Mapping[str, Array], building: BuildingFrame) -> "Areas":
+        """Return them with other lifts: outlines (N, 2) in the building by name. A lift that there was keeps its area's name and effects,
+        and an area of a lift's name becomes the lift."""
+        map_from_building = se3_inverse(building.building_from_map)
+        known = {area.name: area for area in self.areas} | {area.lift: area for area in self.areas if area.lift}
+        lifts = [
+            replace(known.get(name, Area(name, ())), polygons=((moved(outline, map_from_building),),), lift=name)
+            for name, outline in outlines.items()
+        ]
+        taken = {area.name for area in lifts}
+        others = [area for area in self.areas if area.lift is None and area.name not in taken]
+        return Areas.of([*lifts, *others], self.frame if self else "building")
+
     def _near(self, box_m: tuple[float, ...]) -> list[Area]:
         """Return the areas whose boxes meet a box (low x, low y, high x, high y)."""
         low, high = self._boxes_m[:, :2], self._boxes_m[:, 2:]
@@ -276,7 +289,7 @@ def _area(feature: _Feature, map_from_drawn: Array) -> Area:
         raise UsageError(f"area {name!r}: mask {mask and mask.value} with percent {percent}; give {_MASK_WORDS}")
     geometry = feature.geometry
     drawn = [geometry.coordinates] if isinstance(geometry, _Polygon) else geometry.coordinates
-    polygons = [tuple(_moved(_ring(ring, f"area {name!r}"), map_from_drawn) for ring in rings) for rings in drawn]
+    polygons = [tuple(moved(_ring(ring, f"area {name!r}"), map_from_drawn) for ring in rings) for rings in drawn]
     if not polygons or not all(polygons):
         raise UsageError(f"area {name!r} has no corners; draw it as a polygon")
     return Area(name, tuple(polygons), mask, percent, correction, feature.properties.lift)
@@ -338,7 +351,8 @@ def _crossing(ring: Array) -> int | None:
     return None
 
 
-def _moved(ring: Array, target_from_source: Array) -> Array:
+def moved(ring: Array, target_from_source: Array) -> Array:
+    """Return corners (N, 2) of the ground in another frame."""
     return transform_points(target_from_source, np.c_[ring, np.zeros(len(ring))])[:, :2]
 
 

@@ -82,7 +82,7 @@ def fit_pins(pins: Sequence[Pin], metres_per_unit: float | None, map_corners_m: 
         )
     if max(abs(a - b) for a, b in combinations(drawn, 2)) <= 0:
         raise UsageError("all pins are the same point of the plan; choose them far apart")
-    rotation_scale, shift = _fitted(drawn, points, metres_per_unit)
+    rotation_scale, shift = similarity(drawn, points, metres_per_unit)
     scale = 1 / abs(rotation_scale)
     off_m = scale * np.abs(drawn - rotation_scale * points - shift)
     if off_m.max() > _MOST_OFF_M:
@@ -105,8 +105,8 @@ def fit_pins(pins: Sequence[Pin], metres_per_unit: float | None, map_corners_m: 
     return Fit(frame, scale, left, far_sigma_m, _spread_m(points) >= _LEAST_APART_M)
 
 
-def _fitted(drawn: _Complex, points: _Complex, metres_per_unit: float | None) -> tuple[complex, complex]:
-    """Fit drawn ~ rotation_scale * points + shift."""
+def similarity(drawn: _Complex, points: _Complex, metres_per_unit: float | None) -> tuple[complex, complex]:
+    """Fit drawn ~ rotation_scale * points + shift, and return both. metres_per_unit: of drawn, None to fit the scale too."""
     left, right = drawn - drawn.mean(), points - points.mean()
     correlation = complex(np.vdot(right, left))
     if metres_per_unit is None:
@@ -120,7 +120,7 @@ def _fitted(drawn: _Complex, points: _Complex, metres_per_unit: float | None) ->
 
 def _offs_m(drawn: _Complex, points: _Complex, metres_per_unit: float | None, chosen: NDArray[np.intp]) -> Array:
     """Return residuals at all points after a fit to the chosen ones."""
-    rotation_scale, shift = _fitted(drawn[chosen], points[chosen], metres_per_unit)
+    rotation_scale, shift = similarity(drawn[chosen], points[chosen], metres_per_unit)
     return np.asarray(np.abs(drawn - rotation_scale * points - shift) / abs(rotation_scale))
 
 
@@ -132,7 +132,7 @@ def _contradiction(names: list[str], drawn: _Complex, points: _Complex, metres_p
     if _spread_m(points) >= _LEAST_APART_M and _fits(np.conj(drawn), points, metres_per_unit, everything):
         return "the plan is mirrored: its points fit the map only mirrored; flip the picture, or check the order of x and y"
     if metres_per_unit is not None and _fits(drawn, points, None, everything):
-        fitting = 1 / abs(_fitted(drawn, points, None)[0])
+        fitting = 1 / abs(similarity(drawn, points, None)[0])
         return f"the pins fit at {fitting:.5g} metres per unit of the plan, not at {metres_per_unit:.5g}; correct the metres per pixel"
     agreeing = _largest_agreeing(drawn, points, metres_per_unit)
     if len(agreeing) >= max(3, len(names) // 2 + 1):

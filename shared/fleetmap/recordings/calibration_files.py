@@ -33,7 +33,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from fleetmap.errors import CalibrationError, RecordingError
+from fleetmap.errors import CalibrationError, FleetmapError, RecordingError
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.recordings.files import read_text
 from fleetmap.recordings.images import StoredImage, decode_grey
@@ -455,7 +455,7 @@ def _parse_yaml(text: str, where: str) -> dict[str, Any]:
         lines[0] = ""
     plain = "\n".join(lines)
     try:
-        _check_events(plain, where)
+        check_yaml(plain, where)
         values = yaml.load(plain, Loader=_Loader)
     except _RepeatedKeyError as error:
         raise CalibrationError(f"{where} has the key {error} twice; keep the one that is right") from error
@@ -470,18 +470,20 @@ def _parse_yaml(text: str, where: str) -> dict[str, Any]:
     return values
 
 
-def _check_events(text: str, where: str) -> None:
-    """CalibrationError for YAML that no calibration contains and that is expensive to load: aliases, tags, deep nesting, long scalars."""
+def check_yaml(
+    text: str, where: str, most_values: int = _MAX_EVENTS, error_type: type[FleetmapError] = CalibrationError
+) -> None:
+    """Raise error_type for YAML that no file of ours contains and that is expensive to load: aliases, tags, deep nesting, long scalars."""
     depth = 0
     for count, event in enumerate(yaml.parse(text, Loader=_SAFE_LOADER)):
-        if count > _MAX_EVENTS:
-            raise CalibrationError(f"{where} holds more than {_MAX_EVENTS} values; a calibration has some hundred")
+        if count > most_values:
+            raise error_type(f"{where} holds more than {most_values} values; check the file")
         if isinstance(event, yaml.AliasEvent) or getattr(event, "anchor", None) is not None:
-            raise CalibrationError(f"{where} uses YAML's aliases (& and *); write the values out")
+            raise error_type(f"{where} uses YAML's aliases (& and *); write the values out")
         if (tag := getattr(event, "tag", None)) is not None:
-            raise CalibrationError(f"{where} uses the YAML tag {_brief(tag)}; write plain values")
+            raise error_type(f"{where} uses the YAML tag {_brief(tag)}; write plain values")
         depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
         if depth > _MAX_DEPTH:
-            raise CalibrationError(f"{where} is nested deeper than {_MAX_DEPTH} levels; check the file")
+            raise error_type(f"{where} is nested deeper than {_MAX_DEPTH} levels; check the file")
         if isinstance(event, yaml.ScalarEvent) and len(event.value) > _MAX_WORD:
-            raise CalibrationError(f"{where} holds a value of {len(event.value)} characters; the limit is {_MAX_WORD}")
+            raise error_type(f"{where} holds a value of {len(event.value)} characters; the limit is {_MAX_WORD}")

@@ -1,10 +1,13 @@
 """Sites as the floors of a building: the command, what robots get, who may fetch what."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 from urllib.request import urlopen
 
 import numpy as np
 import pytest
+import yaml
 from msgspec.structs import replace
 
 from fleetmap.access import Access, Holder
@@ -28,6 +31,7 @@ from mapserver.store import NOBODY, MapStore
 from mapserver.trust.signing import admitted_versions
 from support.drawn_areas import geojson
 from support.fleet.dashboard_scene import serving
+from support.recordings.realdata import real_data
 from support.room_site import run
 from support.storage.map_samples import save_sample_draft
 
@@ -155,3 +159,89 @@ def test_a_lift_without_an_outline_is_refused(ring: str) -> None:
     data = f'{{"features":[{{"geometry":{{"type":"Polygon","coordinates":[{ring}]}},"properties":{{"lift":"A"}}}}]}}'
     with pytest.raises(MapFormatError, match="outline"):
         read_lifts(data.encode(), HERE)
+
+
+def hotel(folder: Path, change: Callable[[dict[str, Any]], object] = lambda _: None) -> Path:
+    """The file of Open-RMF's hotel, with a change."""
+    content = yaml.safe_load((real_data("rmf") / "hotel.building.yaml").read_text())
+    change(content)
+    (folder / "hotel.building.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
+    return folder / "hotel.building.yaml"
+
+
+def draw_lift_on_the_third_level(content: dict[str, Any]) -> None:
+    """Place it by its own vertex there, in another picture."""
+    x, y = next(v[:2] for v in content["levels"]["L3"]["vertices"] if v[4:] == [{"lift_cabin": [1, "Lift1"]}])
+    content["lifts"]["Lift1"] |= {"x": x, "y": y, "reference_floor_name": "L3"}
+
+
+@pytest.mark.parametrize("change", [lambda _: None, draw_lift_on_the_third_level])
+def test_a_building_of_open_rmf_comes_with_its_lifts_and_is_written_again(
+    house: Path, tmp_path: Path, change: Callable[[dict[str, Any]], object]
+) -> None:
+    file = hotel(tmp_path, change)
+    floors, in_store = ("--floor", "hall-1=L1", "--floor", "hall-2=L3"), ("--store", house)
+    said = run(app, "building", "set", "--from", file, *floors, *in_store)
+    assert said.splitlines()[1:] == [
+        "  L3  hall-2  16 m  lifts: Lift1, Lift2",
+        "  L1  hall-1  0 m  lifts: Lift1, Lift2",
+    ]
+    written = run(app, "building", "list", "--as", "rmf", *in_store)
+    content = yaml.safe_load(written)
+    assert content["levels"] == {"L1": {"elevation": 0.0}, "L3": {"elevation": 16.0}}
+    vertices = yaml.safe_load(file.read_text())["levels"]["L1"]["vertices"]
+    metres_per_px = 3.4 / np.hypot(*np.subtract(vertices[54][:2], vertices[53][:2]))  # its measurement
+    for name, x_px, y_px in (("Lift1", 355, 340), ("Lift2", 305, 435)):
+        lift = content["lifts"][name]
+        assert (lift["x"], lift["y"]) == pytest.approx((x_px * metres_per_px, -y_px * metres_per_px), abs=0.1)
+        assert (lift["width"], lift["depth"], abs(lift["yaw"])) == pytest.approx((2.7, 2.7, 0.0), abs=0.002)
+        assert (lift["lowest_floor"], lift["highest_floor"], [*lift["level_doors"]]) == ("L1", "L3", ["L1", "L3"])
+    with MapStore.open(house) as store:
+        map_2 = {area.lift: area.rings[0].mean(axis=0) for area in store.areas("hall-2").areas}
+    assert map_2["Lift2"] == pytest.approx(np.array([305, -435]) * metres_per_px - (10, 0), abs=0.01)
+    run(app, "areas", "correct", "Lift1", "never-use", "--site", "hall-1", *in_store, "--reason", "mirrors")
+    (tmp_path / "again.building.yaml").write_text(written)
+    run(app, "building", "set", "--from", tmp_path / "again.building.yaml", *floors, *in_store)
+    assert run(app, "building", "list", "--as", "rmf", *in_store) == written
+    with MapStore.open(house) as store:
+        assert [area.lift for area in store.areas("hall-1").corrections] == ["Lift1"]
+
+
+@pytest.mark.parametrize(
+    ("change", "floors", "words"),
+    [
+        (lambda c: None, ("hall-1=L1", "hall-2=L2@8"), "the file's levels are L1, L2, L3"),
+        (
+            lambda c: None,
+            ("hall-1=L1", "hall-2=L3"),
+            "aligned by hotel_L3.png, .* pixels of hotel_L1.png, with --metres-",
+        ),
+        (lambda c: c["levels"]["L1"].update(measurements=[]), (), "level L1: no measurement"),
+        (lambda c: c["levels"]["L1"].update(measurements=[[5, 999, {"distance": [3, 2.0]}]]), (), "level L1: no meas"),
+        (lambda c: c["levels"]["L3"].update(fiducials=[[1.0, 2.0, "ref1"]]), (), "level L3: two fiducials of level L1"),
+        (lambda c: c["levels"]["L3"]["fiducials"][0].__setitem__(0, 900.0), (), "fiducials are .* m off"),
+        (lambda c: c["lifts"]["Lift1"].update(reference_floor_name="L9"), (), "no level 'L9', but L1, L2, L3"),
+        (lambda c: c["lifts"]["Lift1"].update(x=float("nan")), (), "cannot be read"),
+        (lambda c: c.update(coordinate_system="wgs84"), (), "drawn on pictures or in metres"),
+        (lambda c: c.clear(), (), "cannot be read"),
+        (lambda c: c.update(graphs=[[[[[[[[[[[[[[[[1]]]]]]]]]]]]]]]]), (), "nested deeper"),
+    ],
+)
+def test_buildings_of_open_rmf_that_cannot_be(
+    house: Path, tmp_path: Path, change: Callable[[dict[str, Any]], object], floors: tuple[str, ...], words: str
+) -> None:
+    with MapStore.open(house) as store:
+        aligned = replace(store.alignment("hall-2"), plan="hotel_L3.png")
+        store.keep_site_files("hall-2", {"alignment": encode_alignment(aligned)}, "")
+    named = [f"--floor={floor}" for floor in floors or ("hall-1=L1", "hall-2=L3")]
+    with pytest.raises(UsageError, match=words):
+        run(app, "building", "set", "--from", hotel(tmp_path, change), *named, "--store", house)
+    with MapStore.open(house) as store:
+        assert store.building("hall-1") is None
+        assert [area.lift for area in store.areas("hall-1").areas] == ["A"]
+
+
+def test_a_building_of_one_level_is_a_site(house: Path) -> None:
+    with pytest.raises(UsageError, match="'building': two floors or more make a building"):
+        office = real_data("rmf") / "office.building.yaml"
+        run(app, "building", "set", "--from", office, "--floor", "hall-1=L1", "--store", house)

@@ -9,7 +9,7 @@ DATA = Path(__file__).resolve().parents[4] / "shared" / "data"
 
 def real_data(name: str) -> Path:
     """The folder of one real recording; skips the test, loudly, where it is missing, or the plug-in that reads it."""
-    if not name.startswith(("conformance", "pose_graphs")):
+    if not name.startswith(("conformance", "pose_graphs", "rmf")):
         pytest.importorskip("fleetmap.plugins.datasets")
     folder = DATA / name
     if not folder.exists():
