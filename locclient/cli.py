@@ -39,7 +39,9 @@ def run(
     context: typer.Context,
     config: Annotated[Path, typer.Option(help="TOML file with the robot, its sensors, map and outputs.")],
     insecure: Insecure = False,
-    verbose: Annotated[bool, typer.Option("--verbose", help="Log successes too.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Log changes of status, versions, drops and deliveries too.")
+    ] = False,
 ) -> None:
     """Localize a robot from its live sensors; ends with status 0 on SIGTERM or SIGINT, or with its recording."""
     import logging

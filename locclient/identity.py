@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 _LIFE, _RENEW_AFTER = timedelta(days=365), timedelta(days=30)  # a robot parked for eleven months can reconnect
 _ANSWER_S = 20.0
+_FILES = ("robot.pem", "identity.json", "servers.ca", "root.json")
 _ENROL = "enrol it: `mapserver robots enrol ROBOT --site SITE` on the server, `locclient enrol ROBOT.fleetmap` here"
 
 
@@ -46,11 +47,17 @@ class RobotIdentity:
         self.folder, self.who = folder, who
 
     @classmethod
-    def load(cls, folder: Path) -> Self | None:
-        """Load the identity in a folder, None if the robot is not enrolled; UsageError if it cannot be read."""
+    def load(cls, folder: Path, *, may_be_begun: bool = False) -> Self | None:
+        """Load the identity in a folder, None if the robot is not enrolled; UsageError if it cannot be read, or is half of one.
+
+        may_be_begun: None, too, after an enrolment that did not end."""
         with disk_errors(f"the identity in {folder} cannot be read", "check whose account this is", UsageError):
-            if not (folder / "robot.pem").is_file():
+            lacking = [name for name in _FILES if not (folder / name).is_file()]
+            if len(lacking) == len(_FILES) or (may_be_begun and "robot.pem" in lacking):
                 return None
+            if lacking:
+                why = "its enrolment did not end" if "robot.pem" in lacking else "remove the folder"
+                raise UsageError(f"{folder} holds half an identity, without {', '.join(lacking)}: {why}; {_ENROL}")
             data = (folder / "identity.json").read_bytes()
         try:
             return cls(folder, msgspec.json.decode(data, type=Identity))
@@ -95,7 +102,7 @@ class RobotIdentity:
             robot=check_name(given.robot, "robot"),
             endpoint=check_endpoint(given.endpoint),
         )
-        before = cls.load(folder)
+        before = cls.load(folder, may_be_begun=True)
         if before is not None:
             raise StateError(
                 f"{folder} holds the identity of {before.who.robot} at {before.who.site}; remove it if the robot is to be "
@@ -199,7 +206,8 @@ class GivenAddress:
         if self.server is not None and self.store is not None:
             raise UsageError(f"give either {self.sign}server, such as tls/HOST:7447, or {self.sign}store, a folder")
         folder = identity_folder(self.identity)
-        identity = None if self.store is not None else RobotIdentity.load(folder)
+        has_use = self.store is None and (self.server is None or has_tls(self.server))
+        identity = RobotIdentity.load(folder) if has_use else None
         if identity is None:
             self._named("site", None, None)  # first error of an empty configuration
         server = self.server or (None if identity is None else identity.who.endpoint)

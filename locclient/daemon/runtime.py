@@ -41,6 +41,7 @@ _SILENT_S = 1.0
 _DRAIN_S = 5.0
 _DELIVERED_WITHIN_S = 30.0  # after the end of a recording
 _MAX_PENDING = 100
+_RECEIVED = ("frames", "imu_samples")  # among the counts of the intake; the others count what is lost
 _log = logging.getLogger(__name__)
 
 
@@ -83,7 +84,8 @@ class Runtime:
         self._bound_tracker = PositionBoundTracker(parts.tile_loader.settings)
         self._last_frame_s = time.monotonic()
         self._health_s, self._pose_ns = 0.0, -(2**62)
-        self._refusals, self._unreadable = LogLimit(_log), 0
+        self._refusals = LogLimit(_log)
+        self._counts: dict[str, int] = {}  # of the intake, when losses were told last
         self._cache_faults, self._outbox_counts = 0, dict[str, Figure]()
         # Owned by the disk thread.
         self._offers = {} if parts.first is None else {parts.first.manifest_sha256 or "": parts.first}
@@ -136,7 +138,10 @@ class Runtime:
             thread.join(_DRAIN_S)
         for link in self._links:
             link.stop()
-        _log.info("stopped: %s", self._health())
+        self._tell_losses()
+        total = self._health().metrics
+        words = "stopped after %s frames and %s failures: %s reports are delivered, %s wait"
+        _log.info(words, *(total.get(name) for name in ("frames", "failures", "spool_delivered", "spool_waiting")))
         if words := self._figures.search.words:
             _log.warning("stopped: %s", words)
 
@@ -191,8 +196,10 @@ class Runtime:
         for link in self._links:
             held = frozenset(loaded.version for loaded in self._robot.held)
             link.after_frame(outcome, held, self._robot.building, self._robot.visited_versions)
-        was_lost = self._figures.search.is_long
-        before = {} if self._figures.last is None else self._figures.last.left_out
+        was_lost, last = self._figures.search.is_long, self._figures.last
+        if last is None or (estimate.status, estimate.floor) != (last.estimate.status, last.estimate.floor):
+            _log.info("status %s", estimate.in_words)
+        before = {} if last is None else last.left_out
         for flag in outcome.left_out.keys() - before.keys():
             _log.warning("%s", outcome.left_out[flag])
         self._figures.handle(outcome)
@@ -217,9 +224,7 @@ class Runtime:
         if now_s - self._health_s < _HEALTH_EVERY_S:
             return
         self._health_s = now_s
-        if self._parts.intake.counts.unreadable > self._unreadable:
-            self._unreadable = self._parts.intake.counts.unreadable
-            self._refusals.warning("message", "a sensor's message is not used: %s", self._parts.intake.unreadable_why)
+        self._tell_losses()
         is_silent = self._is_silent()
         for link in self._links if is_silent else ():
             link.silence()
@@ -230,6 +235,15 @@ class Runtime:
         last = self._figures.last
         status = "no frame yet" if last is None else last.estimate.status.value
         self._manager.alive("no frames come" if is_silent else status)
+
+    def _tell_losses(self) -> None:
+        """Log the frames and samples that were lost since the last time."""
+        before, self._counts = self._counts, asdict(self._parts.intake.counts)
+        new = {name: count - before.get(name, 0) for name, count in self._counts.items() if name not in _RECEIVED}
+        if lost := [f"{count} {name.replace('_', ' ')}" for name, count in new.items() if count]:
+            _log.info("lost: %s", ", ".join(lost))
+        if new["unreadable"]:
+            self._refusals.warning("message", "a sensor's message is not used: %s", self._parts.intake.unreadable_why)
 
     def _is_silent(self) -> bool:
         return time.monotonic() - self._last_frame_s > _SILENT_S

@@ -161,6 +161,7 @@ class ServerSync:
             # Again, for a restarted server or a lost message.
             self._acknowledge("" if self._last_ack is None and self._running is not None else None)
         elif self._fetches(wanted, sha256):
+            _log.info("version %s is fetched", wanted.version)
             self._offered.add(sha256)
             self.fetched.append(wanted)
 
@@ -209,11 +210,12 @@ class ServerSync:
                 if change.change is Change.POSTPONED:
                     self._offered.discard(sha256)
                     self._not_before_s[sha256] = self._clock_s() + self._retry_s
-                self._refuse(change.wanted, change.reason)
+                self._refuse(change.wanted, change.reason, how=change.change)
             for link in self.links:
                 link.changed_version(change)
 
     def _adopt(self, wanted: WantedVersion) -> None:
+        _log.info("version %s is adopted", wanted.version)
         self._running, fault = wanted, ""
         try:
             self.client.activate(self.client.manifest(wanted), wanted)
@@ -223,9 +225,11 @@ class ServerSync:
             _log.warning("version %s runs but is not kept: %s", wanted.version, fault)
         self._acknowledge(fault)
 
-    def _refuse(self, wanted: WantedVersion, reason: str, is_untrusted: bool = False) -> None:
+    def _refuse(
+        self, wanted: WantedVersion, reason: str, is_untrusted: bool = False, how: Change = Change.REFUSED
+    ) -> None:
         """is_untrusted: the reason begins with the kind of attack, and is reported to the server unchanged."""
-        _log.warning("version %s is refused: %s", wanted.version, reason)
+        _log.warning("version %s is %s: %s", wanted.version, how, reason)
         self._acknowledge(reason if is_untrusted else f"version {wanted.version}: {reason}")
 
     def _acknowledge(self, refused: str | None) -> None:

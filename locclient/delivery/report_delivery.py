@@ -68,6 +68,7 @@ def deliver_replay_part(client: MapClient, outbox: Outbox, received_bytes: dict[
         _log.warning("the server will not keep the recording of failure %s: %s", replay.id, ack.refused or ack.id)
         outbox.refused(replay.id)
     elif ack.received_bytes >= len(replay.payload):
+        _log.info("the recording of failure %s is delivered: %d bytes", replay.id, len(replay.payload))
         outbox.done(replay.id)
     elif ack.received_bytes == offset:
         return False  # the server accepted nothing
@@ -109,6 +110,7 @@ def deliver(client: MapClient, outbox: Outbox) -> bool:
             _log.warning("the server will not keep failure %s: %s", report.id, ack.refused)
             outbox.refused(report.id)
         else:
+            _log.info("the report of failure %s is delivered", report.id)
             outbox.done(report.id)
     return is_open
 

@@ -69,6 +69,17 @@ class Estimate:
         return not self.floor
 
     @property
+    def in_words(self) -> str:
+        """Return status, cause, version and uncertainty of the position."""
+        cause = f" ({self.cause.value})" if self.cause.value else ""
+        version = "no map" if self.map_version is None else f"version {self.map_version}"
+        of_floor = f" of {self.floor}" if self.floor else ""
+        known = (
+            "" if self.map_from_body is None else f", position known to {radius_95_m(self.cov_rot_trans):.2f} m (95 %)"
+        )
+        return f"{self.status.value}{cause}, {version}{of_floor}{known}"
+
+    @property
     def views_in_words(self) -> str:
         """Return the state of each view, and which one is compared with the map; empty for a rig of one view."""
         states = [

@@ -144,6 +144,17 @@ def test_image_unit_and_configuration_agree(image: str, unit: str) -> None:
     compile(exec_form(last("server", "HEALTHCHECK"))[-1], "HEALTHCHECK", "exec")
 
 
+def test_examples_agree_on_ports() -> None:
+    """deploy/mapserver.toml says why."""
+    pages = [path.read_text("utf-8") for path in (*DEPLOY.rglob("*.toml"), *(REPOSITORY / "docs").glob("*.md"))]
+    zenoh, web = (
+        {port for page in pages for port in re.findall(rf"{before}(?:0|127|maps)\.[\w.]+:(\d+)", page)}
+        for before in ("(?:tcp|tls)/", r"(?<![/\w.])(?:http://)?")
+    )
+    assert zenoh == {"7447", "7448"}
+    assert web == {"8080", "8443", "443"}  # 443 is of a proxy before the server
+
+
 def test_versions_are_those_of_this_tree() -> None:
     version = tomllib.loads(text("pyproject.toml"))["project"]["version"]
     files = [path for path in DEPLOY.rglob("*") if path.is_file() and path.suffix != ".lock"]

@@ -4,6 +4,7 @@ Rows 1, 3, 6, 7 and 30 of the list of attacks in docs/security.md.
 """
 
 import json
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -14,7 +15,7 @@ import pytest
 import zenoh
 
 from fleetmap.access import Access, Act, Direction, Holder, Purpose
-from fleetmap.bus.endpoints import TlsFiles, handshake_fault
+from fleetmap.bus.endpoints import TlsFiles, handshake_fault, with_free_port
 from fleetmap.bus.zenoh_bus import Bus, _config
 from fleetmap.errors import LinkError, UnreachableError
 from mapserver.trust.authorities import Authorities
@@ -301,7 +302,14 @@ def test_certificates_of_others(keys: Keys, tmp_path: Path) -> None:
             fake.queryable("fleetmap/**", lambda *_: b"EVIL")
             victim = stack.enter_context(Bus(fake.endpoint, tls=robot).open())
             assert victim.get(OTHERS + "blobs/00ff") == b"EVIL"
-    assert "cannot be reached" in handshake_fault(endpoint, keys.robot("a.1"))
+    with pytest.raises(UnreachableError, match="nothing listens at"):
+        handshake_fault(endpoint, keys.robot("a.1"))
+    late = Bus(with_free_port("tcp/127.0.0.1:0"), is_server=True)
+    start = threading.Timer(0.3, late.open)
+    start.start()
+    assert handshake_fault(late.endpoint, None, patience_s=20.0) == "", "a server that starts is waited for"
+    start.join()
+    late.close()
 
 
 @pytest.mark.parametrize("protocol", ["tls", "quic"])

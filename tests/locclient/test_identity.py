@@ -77,7 +77,9 @@ def test_enrolment_and_renewal(tmp_path: Path, server: Server) -> None:
         RobotIdentity.enrol(folder, bundle)
     with pytest.raises(LinkError, match="the bundle was already used"):
         RobotIdentity.enrol(tmp_path / "thief", bundle)
-    assert RobotIdentity.load(tmp_path / "thief") is None
+    with pytest.raises(UsageError, match=r"half an identity, without robot\.pem: its enrolment did not end; enrol it"):
+        replace(GIVEN, identity=tmp_path / "thief").resolve()
+    assert replace(GIVEN, identity=tmp_path / "thief", server="tcp/127.0.0.1:7447").resolve().robot == "r1"
     before = identity.certificate()
     now = datetime.now(UTC)
     assert not identity.is_renewal_due(now)
@@ -96,7 +98,8 @@ def test_lost_answers_do_no_harm(tmp_path: Path, server: Server) -> None:
     server.answers = False
     with pytest.raises(LinkError, match="lost on its way"):
         RobotIdentity.enrol(folder, bundle)
-    assert RobotIdentity.load(folder) is None
+    with pytest.raises(UsageError, match="half an identity"):
+        RobotIdentity.load(folder)
     server.answers = True
     identity = RobotIdentity.enrol(folder, bundle)
     server.answers = False
@@ -119,7 +122,7 @@ def test_a_server_that_is_not_the_bundles(tmp_path: Path, server: Server, monkey
         RobotIdentity.enrol(tmp_path / "a", b"PK\x03\x04")
     with pytest.raises(UsageError, match="robot name"):
         RobotIdentity.enrol(tmp_path / "b", msgspec.json.encode({**bundle, "robot": "../r1"}))
-    with pytest.raises(LinkError, match="cannot be reached"):
+    with pytest.raises(UnreachableError, match=r"nothing listens at tls/127\.0\.0\.1:1: is the server running"):
         RobotIdentity.enrol(tmp_path / "c", msgspec.json.encode({**bundle, "endpoint": "tls/127.0.0.1:1"}))
     server.register.revoke("lab", ["r1"])
     server.bus.reopen(server.register.access())
@@ -189,8 +192,9 @@ def test_row_37_estimates_to_another_machine() -> None:
 
 
 def test_a_damaged_identity_is_told(tmp_path: Path) -> None:
-    (tmp_path / "robot.pem").write_text("x")
-    with pytest.raises(UsageError, match="cannot be read"):
+    for name in ("robot.pem", "servers.ca", "root.json"):
+        (tmp_path / name).write_text("x")
+    with pytest.raises(UsageError, match=r"half an identity, without identity\.json: remove the folder"):
         RobotIdentity.load(tmp_path)
     (tmp_path / "identity.json").write_text("{")
     with pytest.raises(UsageError, match="is damaged"):

@@ -5,6 +5,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
 
 from fleetmap.bus.endpoints import handshake_fault
@@ -20,14 +21,14 @@ from fleetmap.sources.source import Source, open_source
 from locclient.config import LocclientConfig
 from locclient.daemon.daemon import check_run, configured_outbox
 from locclient.delivery.outbox import Outbox
-from locclient.identity import MapAddress
+from locclient.identity import MapAddress, RobotIdentity
 from locclient.localization.calibration.monitor import FAULTS, PairOrder, pair_order
 from locclient.maps.map_client import cache_folder, map_client, open_bus
 from locclient.maps.map_source import LocalMapSource
 from locclient.maps.tile_cache import TileCache
 
 OK, WARN, FAIL = "ok", "warn", "fail"
-_ANSWER_S = 5.0
+_ANSWER_S = 5.0  # of a server, also of one that starts
 _BASELINE_M = (0.03, 0.6)
 _MIN_FREE_BYTES = 200_000_000
 _OLD_NS = 1_700_000_000_000_000_000  # an earlier time is a wrong clock
@@ -61,7 +62,7 @@ def run_preflight(config: LocclientConfig, listen_s: float) -> Iterator[Finding]
         yield from _guarded("store", lambda: _store(address))
         return
     if address.identity is not None:
-        yield from _guarded("identity", lambda: _identity(address, datetime.now(UTC)))
+        yield from _guarded("identity", partial(_identity, address.identity, datetime.now(UTC)))
     yield from _guarded("cache", lambda: _cache_and_server(config, address))
 
 
@@ -194,18 +195,12 @@ def _store(address: MapAddress) -> Iterator[Finding]:
     yield _pieces("store", wanted.version, len(fetched.tiles), list(fetched.refused.values()))
 
 
-def _identity(address: MapAddress, now: datetime) -> Iterator[Finding]:
-    identity = address.identity
-    assert identity is not None
+def _identity(identity: RobotIdentity, now: datetime) -> Iterator[Finding]:
     about = identity.certificate()
     days = (about.ends - now).total_seconds() / 86_400
-    text = f"{about.name}, certificate for {days:.0f} days"
-    if fault := handshake_fault(str(address.server), identity.tls):
-        yield Finding(FAIL, "identity", f"{text}; {address.server}: {fault}")
-    elif days < _CERTIFICATE_DAYS:
-        yield Finding(WARN, "identity", f"{text}; the running robot renews it, let it reach its server")
-    else:
-        yield Finding(OK, "identity", f"{text}, accepted by {address.server}")
+    is_old = days < _CERTIFICATE_DAYS
+    hint = "; the running robot renews it, let it reach its server" if is_old else ""
+    yield Finding(WARN if is_old else OK, "identity", f"{about.name}, certificate for {days:.0f} days{hint}")
 
 
 def _cache_and_server(config: LocclientConfig, address: MapAddress) -> Iterator[Finding]:
@@ -226,6 +221,10 @@ def _cache_and_server(config: LocclientConfig, address: MapAddress) -> Iterator[
     if address.server is None:
         return
     try:
+        tls = None if address.identity is None else address.identity.tls
+        if fault := handshake_fault(address.server, tls, _ANSWER_S):
+            yield Finding(FAIL, "connection", f"{address.server}: {fault}")
+            return
         with open_bus(address) as bus:
             client = map_client(bus, cache, address, timeout_s=_ANSWER_S)
             wanted = client.wanted()

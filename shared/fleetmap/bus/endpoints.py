@@ -3,12 +3,13 @@
 import re
 import socket
 import ssl
+import time
 from dataclasses import dataclass
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, Literal
 
-from fleetmap.errors import UsageError
+from fleetmap.errors import UnreachableError, UsageError
 
 
 def check_endpoint(endpoint: str) -> str:
@@ -76,7 +77,7 @@ class TlsFiles:
         return ""
 
 
-_HANDSHAKE_S = 3.0
+_HANDSHAKE_S, _RETRY_S = 3.0, 0.2
 _ALERT = re.compile(r"^(TLSV1|TLSV13|SSLV3)_ALERT_")  # before some reasons, by the version of TLS
 _WORDS = {
     "CERTIFICATE_REQUIRED": "the server demands a certificate; enrol this robot",
@@ -87,23 +88,38 @@ _WORDS = {
 }
 
 
-def handshake_fault(endpoint: str, files: TlsFiles) -> str:
-    """Reason why a connection fails, by a TLS handshake of the standard library; empty if the server accepts it.
+def handshake_fault(endpoint: str, files: TlsFiles | None, patience_s: float = 0.0) -> str:
+    """Reason why the server refuses a connection, by a TLS handshake of the standard library; empty if it accepts it.
 
-    Only for tls/HOST:PORT; empty for QUIC, whose handshake the standard library lacks.
+    files: None without TLS. patience_s: how long a server that starts is waited for. UnreachableError if nothing answers there. Only for
+    tls/HOST:PORT and tcp/HOST:PORT; empty for QUIC, whose handshake the standard library lacks.
     """
-    host, port = _host_and_port(endpoint)
-    if not endpoint.startswith("tls/"):
+    if not endpoint.startswith(("tls/", "tcp/")):
         return ""
-    if fault := files.fault():
+    if files is not None and (fault := files.fault()):
         return fault
+    host, port = _host_and_port(endpoint)
+    until_s = time.monotonic() + patience_s
+    while True:
+        try:
+            raw = socket.create_connection((host, int(port)), _HANDSHAKE_S)
+            break
+        except ConnectionRefusedError:
+            if time.monotonic() >= until_s:
+                words = "is the server running? One that starts answers when its output says `ready`"
+                raise UnreachableError(f"nothing listens at {endpoint}: {words}") from None
+            time.sleep(_RETRY_S)
+        except OSError as error:
+            raise UnreachableError(f"{endpoint} cannot be reached ({error}); check name and network") from error
+    with raw:
+        return "" if files is None else _refusal(raw, host, files)
+
+
+def _refusal(raw: socket.socket, host: str, files: TlsFiles) -> str:
     context = ssl.create_default_context(cafile=str(files.authority))
     context.load_cert_chain(str(files.own))
     try:
-        with (
-            socket.create_connection((host, int(port)), _HANDSHAKE_S) as raw,
-            context.wrap_socket(raw, server_hostname=host) as connection,
-        ):
+        with context.wrap_socket(raw, server_hostname=host) as connection:
             connection.settimeout(0.5)
             try:
                 connection.recv(1)  # with TLS 1.3 the server's verdict comes after the handshake
@@ -115,4 +131,4 @@ def handshake_fault(endpoint: str, files: TlsFiles) -> str:
     except ssl.SSLError as error:
         return _WORDS.get(_ALERT.sub("", str(error.reason)), f"TLS fails: {error.reason}")
     except OSError as error:
-        return f"{host}:{port} cannot be reached ({error})"
+        return f"the connection broke during the handshake ({error})"

@@ -1,9 +1,11 @@
 """The daemon's threads together: what the network does changes nothing of what the robot knows, and nothing is lost."""
 
+import re
 import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
+from itertools import groupby
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -153,7 +155,10 @@ def world(tmp_path: Path) -> Iterator[World]:
         service.close()
 
 
-def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(world: World) -> None:
+def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(
+    world: World, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
     """Without a network from frame 30 to 120, dark from 60 to 100: the estimates are to the bit those of a robot alone."""
     bundles = list(robot_world.bundles(130, dark=range(60, 100)))
     folder = LocalMapSource(world.folder / "store", "room")
@@ -185,6 +190,12 @@ def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(world:
     assert len(world.table) == len(set(world.table)) == 1
     assert waiting in ([], world.table)
     assert world.fleet.robots("room")[0].last_ack["version"] == 1
+    told = [record.getMessage() for record in caplog.records if record.name.startswith("locclient")]
+    assert [line for line in told if line.startswith("version")] == ["version 1 is fetched", "version 1 is adopted"]
+    statuses = [status for status, _ in groupby(estimate.status for estimate in listener.estimates)]
+    assert [line.split()[1].rstrip(",") for line in told if line.startswith("status")] == statuses
+    assert any(re.fullmatch(r"status TRACKING, version 1, position known to 0\.\d\d m \(95 %\)", line) for line in told)
+    assert f"the report of failure {world.table[0]} is delivered" in told
 
 
 @dataclass
@@ -205,8 +216,11 @@ class CrowdedSource(ScriptedSource):
                 intake.put_imu(bundle.imu)
 
 
-def test_a_robot_that_is_too_slow_for_its_frames_stays_exact_and_people_see_it(world: World) -> None:
-    """On its page, in the metrics, as an alert, and as the cause once nothing in the pictures is known any more."""
+def test_a_robot_that_is_too_slow_for_its_frames_stays_exact_and_people_see_it(
+    world: World, caplog: pytest.LogCaptureFixture
+) -> None:
+    """On its page, in the metrics, as an alert, in its log, and as the cause once nothing in the pictures is known any more."""
+    caplog.set_level("INFO")
     robot, listener, rng = robot_world.new_robot(), Listener(), np.random.default_rng(3)
     bundles = list(robot_world.bundles(240))
     for number, bundle in enumerate(bundles[160:], 160):
@@ -220,6 +234,8 @@ def test_a_robot_that_is_too_slow_for_its_frames_stays_exact_and_people_see_it(w
         assert off_m @ np.linalg.solve(one.cov_rot_trans[3:, 3:], off_m) < 16.27, "0.999 of chi-square"
     assert Cause.OVERLOADED in {one.cause for one in listener.estimates[40:]}
     (status,) = world.fleet.robots("room")
+    lines = [record.getMessage() for record in caplog.records]
+    assert sum(int(n) for line in lines for n in re.findall(r"^lost: (\d+) frames dropped", line)) == 180
     told = "75% of its frames are dropped"
     assert told in " ".join(remarks(live_robot(status)))
     alerts = active_alerts(world.store, world.fleet, AlertSettings(), world.store.now_ns())

@@ -146,13 +146,14 @@ def test_a_version_is_active_only_once_it_was_adopted(world: World) -> None:
     assert not world.sync.fetched, "refused is refused"
 
 
-def test_what_was_put_off_is_offered_again_later(world: World) -> None:
+def test_what_was_put_off_is_offered_again_later(world: World, caplog: pytest.LogCaptureFixture) -> None:
     world.step()
     adopt(world)
     world.publish(seed=1)
     world.step(61.0)
     world.sync.changes.append(VersionChange(world.sync.fetched.popleft(), Change.POSTPONED, "dark"))
     world.step(61.0)
+    assert [record.getMessage() for record in caplog.records] == ["version 2 is postponed: dark"]
     assert not world.sync.fetched
     world.step(600.0)
     assert [wanted.version for wanted in world.sync.fetched] == [2]
