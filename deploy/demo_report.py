@@ -71,7 +71,7 @@ def table_of(titles: Sequence[str], reports: Sequence[Report], rows: Sequence[tu
 def robots_at(url: str) -> list[Report]:
     """Return what the server tells of its robots."""
     with urlopen(url, timeout=10) as answer:  # an address that the server itself has printed
-        return json.load(answer)["robots"]
+        return json.load(answer)["items"]
 
 
 def wait_for_drive(url: str) -> None:

@@ -11,10 +11,10 @@ from fleetmap.hooks import plugins
 from mapserver.commands.build import build
 from mapserver.commands.building import AREAS, BUILDING, align
 from mapserver.commands.fleet import FLEET
-from mapserver.commands.operators import OPERATORS
+from mapserver.commands.operation_commands import with_operations
+from mapserver.commands.people import OPERATORS, ROBOTS
 from mapserver.commands.recordings import convert, doctor
-from mapserver.commands.releases import diff, inspect, promote, publish, rollback, versions
-from mapserver.commands.robots import ROBOTS
+from mapserver.commands.releases import diff, inspect, versions
 from mapserver.commands.serve import serve
 from mapserver.commands.store import attach, audit, export, gc, import_, retention, verify
 from mapserver.commands.trust import TRUST
@@ -22,11 +22,8 @@ from mapserver.commands.trust import TRUST
 if TYPE_CHECKING:
     from mapserver.config import MapserverConfig
 
-COMMANDS: Commands = {
+_COMMANDS: Commands = {
     "build": build,
-    "publish": publish,
-    "promote": promote,
-    "rollback": rollback,
     "versions": versions,
     "inspect": inspect,
     "diff": diff,
@@ -49,6 +46,7 @@ COMMANDS: Commands = {
     "trust": TRUST,
     **plugins("mapserver.commands"),
 }
+COMMANDS = with_operations(_COMMANDS)
 
 
 def mapserver(config: ConfigFile = None, version: Version = False) -> None:

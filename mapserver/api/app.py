@@ -29,9 +29,10 @@ from mapserver.api import building_routes, fleet_routes, inbox_routes, people_ro
 from mapserver.api import parameters as p
 from mapserver.api.guard import Guard, Sender
 from mapserver.api.metrics import CONTENT_TYPE, Metrics
+from mapserver.api.operation_routes import router_of_operations
 from mapserver.api.request_limits import RequestLimits
 from mapserver.api.views import Problem
-from mapserver.fleet.alerts import active_alerts
+from mapserver.fleet.alerts import Alert, active_alerts
 from mapserver.fleet.fleet import Fleet
 from mapserver.operators.operators import Operators
 from mapserver.serving.server_health import ServerHealth, server_health
@@ -61,6 +62,7 @@ def create_app(
         responses=problems.PROBLEM_RESPONSES,
         dependencies=[Depends(p.known_parameters)],
         default_response_class=ExactJson,
+        generate_unique_id_function=lambda route: route.name,
     )
     problems.install(app)
     operators = settings.guard.operators or Operators(store)
@@ -68,9 +70,10 @@ def create_app(
     app.add_middleware(RequestLimits)
     app.add_middleware(_Measured, metrics=metrics)
     app.state.served = p.Served(store, fleet, metrics, bus, settings, operators, set())
-    app.include_router(router)
+    app.include_router(router, tags=["server"])
     for routes in (version_routes, people_routes, inbox_routes, fleet_routes, building_routes):
-        app.include_router(routes.router)
+        app.include_router(routes.router, tags=[routes.__name__.rpartition(".")[2].removesuffix("_routes")])
+    app.include_router(router_of_operations())
     for install in plugins("mapserver.routes").values():
         install(app, store, partial(version_routes.offered_file, store))
     app.openapi = cache(partial(_described, app))  # type: ignore[method-assign]  # made at the first request
@@ -95,7 +98,7 @@ def readyz(service: p.Service) -> views.ServiceState:
 
 
 @router.get("/version")
-def version() -> views.ServerVersion:
+def server_version() -> views.ServerVersion:
     """Version and formats of the server."""
     return views.ServerVersion(
         fleetmap=str(fleetmap.__version__), tile_format=TILE_FORMAT, manifest_format=MANIFEST_FORMAT
@@ -115,15 +118,15 @@ def server(service: p.Service) -> ServerHealth:
     return server_health(service.store, service.fleet, settings.config.ingest, settings.certificate)
 
 
-@router.get("/v1/alerts", response_model=views.AlertList)
-def alerts(service: p.Service, page: p.NamePage) -> Any:
+@router.get("/v1/alerts")
+def alerts(service: p.Service, page: p.NamePage) -> views.Page[Alert]:
     """Active alerts, by site, name and subject."""
     found = active_alerts(service.store, service.fleet, service.settings.config.alerts, time.time_ns())
-    return page.of(views.AlertList, found, lambda alert: f"{alert.site}/{alert.name}/{alert.about}")
+    return page.of(found, lambda alert: f"{alert.site}/{alert.name}/{alert.about}")
 
 
 @router.post("/v1/alerts/test")
-def test(service: p.Service, sender: Sender, act: views.Act) -> views.AlertTest:
+def test_alert(service: p.Service, sender: Sender, act: views.Act) -> views.AlertTest:
     """Send a test alert to the webhook and wait for its answer; 502 if it is not accepted, 409 without a webhook."""
     actor, webhook = sender.of(act), service.settings.webhook
     if webhook is None:

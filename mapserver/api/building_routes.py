@@ -13,9 +13,8 @@ from starlette.exceptions import HTTPException
 from fleetmap.encoding import to_plain
 from mapserver.api import parameters as p
 from mapserver.api import views
-from mapserver.api.guard import By, Sender
-from mapserver.api.problems import refused_with
-from mapserver.fleet.building import align, estimate_alignment, forget_alignment, keep_areas, replace_areas, undo_areas
+from mapserver.api.guard import By
+from mapserver.fleet import building
 from mapserver.floor_plan.pins import MAX_PINS, parse_pin
 from mapserver.floor_plan.plan_file import decode_plan
 from mapserver.store import MapStore
@@ -65,28 +64,21 @@ def areas(response: Response, store: p.Store, site: p.Site) -> dict[str, Any]:
 
 
 @router.put("/v1/sites/{site}/areas", openapi_extra=p.file_body("application/geo+json"))
-def replace(
+def replace_areas(
     response: Response, store: p.Store, site: p.Site, by: By, data: File, if_match: IfMatch = None
 ) -> dict[str, Any]:
     """Replace the areas of a site by those of a file, as `mapserver areas import`. Areas drawn in the building stay in its frame."""
     store.current(site)
-    with refused_with(422):
-        kept = replace_areas(store, site, data, by, tag=_given(if_match))
+    kept = building.replace_areas(store, site, data, by, tag=_given(if_match))
     _tag(response, store, site)
     return kept.geojson(site)
 
 
 @router.delete("/v1/sites/{site}/areas")
-def remove(store: p.Store, site: p.Site, by: By, if_match: IfMatch = None) -> views.ServiceState:
+def remove_areas(store: p.Store, site: p.Site, by: By, if_match: IfMatch = None) -> views.ServiceState:
     """Remove the areas of a site; their past counts stay."""
-    keep_areas(store, site, None, "no areas", by, tag=_given(if_match))
+    building.keep_areas(store, site, None, "no areas", by, tag=_given(if_match))
     return views.OK
-
-
-@router.post("/v1/sites/{site}/areas/undo")
-def undo(store: p.Store, sender: Sender, site: p.Site, act: views.Act) -> dict[str, Any]:
-    """Bring back the areas and corrections of a site as before their last change; once more, and they are as now."""
-    return undo_areas(store, site, sender.of(act)).geojson(site)
 
 
 @router.get("/v1/sites/{site}/alignment")
@@ -113,27 +105,24 @@ def set_alignment(
     store.current(site)
     if bool(data) != (plan is not None):
         raise HTTPException(422, "send a picture as the body with its name as `plan`, or neither of them")
-    with refused_with(422):
-        drawing = None if plan is None else decode_plan(plan, data)
-        found, _ = align(store, site, [parse_pin(text) for text in pin], drawing, metres_per_pixel, by)
+    drawing = None if plan is None else decode_plan(plan, data)
+    found, _ = building.align(store, site, [parse_pin(text) for text in pin], drawing, metres_per_pixel, by)
     return dict(to_plain(found))
 
 
 @router.get("/v1/sites/{site}/alignment/estimate")
-def estimate(store: p.Store, site: p.Site, pin: Pins, metres_per_pixel: Scale = None) -> dict[str, Any]:
+def estimate_alignment(store: p.Store, site: p.Site, pin: Pins, metres_per_pixel: Scale = None) -> dict[str, Any]:
     """The pose of the map that these pins would give, with what is left at each; nothing is kept."""
     store.current(site)
-    with refused_with(422):
-        found, fit = estimate_alignment(store, site, [parse_pin(text) for text in pin], None, metres_per_pixel)
+    found, fit = building.estimate_alignment(store, site, [parse_pin(text) for text in pin], None, metres_per_pixel)
     return dict(to_plain(found)) | {"far_sigma_m": fit.far_sigma_m, "is_checked": fit.is_checked}
 
 
 @router.delete("/v1/sites/{site}/alignment")
-def forget(store: p.Store, site: p.Site, by: By) -> views.ServiceState:
+def forget_alignment(store: p.Store, site: p.Site, by: By) -> views.ServiceState:
     """Remove the alignment of a site and its floor plan; 409 while areas are drawn in the building."""
     store.current(site)
-    with refused_with(409):
-        forget_alignment(store, site, by)
+    building.forget_alignment(store, site, by)
     return views.OK
 
 

@@ -15,11 +15,13 @@ from mapserver.api import views
 from mapserver.api.bytes_response import PICTURE_HEADERS, bytes_response
 from mapserver.api.guard import Sender
 from mapserver.fleet.building import ask_for_survey, end_request
+from mapserver.fleet.fleet import RobotStatus
 from mapserver.fleet.resurvey_list import ResurveyList, resurvey_list
 from mapserver.fleet_statistics.kpis import HOUR_NS, hour_of, kpis
 from mapserver.fleet_statistics.resurvey_decision import route_geojson
 from mapserver.floor_plan.survey_requests import SurveyRequest
 from mapserver.serving.bus_service import place_robot
+from mapserver.store import FailureRow
 
 _MAX_PAGE_BYTES = 4_000_000
 
@@ -41,8 +43,8 @@ Asked = Annotated[Span, Depends(_span)]
 router = APIRouter()
 
 
-@router.get("/v1/robots", response_model=views.RobotList)
-def robots(service: p.Service, page: p.NamePage, site: p.SiteFilter = None) -> Any:
+@router.get("/v1/robots")
+def robots(service: p.Service, page: p.NamePage, site: p.SiteFilter = None) -> views.Page[RobotStatus]:
     """Robots (of a site) by site and name: the version that each runs and should run, and its last messages.
 
     A page ends early where these are long.
@@ -50,11 +52,11 @@ def robots(service: p.Service, page: p.NamePage, site: p.SiteFilter = None) -> A
     robots, name = service.fleet.robots(site), lambda robot: f"{robot.site}/{robot.robot}"
     sizes = accumulate(len(to_json(robot)) for robot in page.cut(robots, name)[0])
     fitting = max(1, sum(size <= _MAX_PAGE_BYTES for size in sizes))
-    return replace(page, limit=min(page.limit, fitting)).of(views.RobotList, robots, name)
+    return replace(page, limit=min(page.limit, fitting)).of(robots, name)
 
 
 @router.post("/v1/sites/{site}/robots/{robot}/initial_pose")
-def initial_pose(
+def set_initial_pose(
     service: p.Service, sender: Sender, site: p.Site, robot: p.Robot, act: views.PlaceAct
 ) -> views.ServiceState:
     """Send an operator's pose to a robot: it overrides the tracked pose until fixes outweigh it. `ok`: the robot was notified."""
@@ -64,10 +66,10 @@ def initial_pose(
     return views.OK
 
 
-@router.get("/v1/fleet/measures", response_model=views.KpisList)
+@router.get("/v1/fleet/measures")
 def fleet_measures(
     store: p.Store, span: Asked, page: p.NamePage, by: p.Axis = "site", site: p.SiteFilter = None
-) -> Any:
+) -> views.Page[views.KpisView]:
     """Failures per robot-day with interval, availability and the rest, by site, robot, version, tile, area or cause.
 
     Whole hours are counted, including those that contain `since` and `until`.
@@ -75,27 +77,27 @@ def fleet_measures(
     found = store.fleet.counters(site, by, since_hour=span.first, until_hour=span.end)
     shown, following = page.cut(found.items(), lambda item: "/".join(item[0]))
     measures = [views.KpisView(site=site, key=key, measures=kpis(counts)) for (site, key), counts in shown]
-    return views.KpisList(by=by, measures=measures, next=following)
+    return views.Page(items=measures, next=following)
 
 
-@router.get("/v1/sites/{site}/hours", response_model=views.HourList)
+@router.get("/v1/sites/{site}/hours")
 def fleet_hours(
     store: p.Store, site: p.Site, span: Asked, page: p.NumberPage, by: p.Axis = "site", key: p.KeyFilter = None
-) -> Any:
+) -> views.Page[views.HourView]:
     """The same figures hour by hour, of a site or of one of its robots, versions, tiles, areas or causes."""
     store.current(site)  # raises for an unknown site
     first = max(span.first, -1 if page.cursor is None else page.cursor + 1)
     found = store.fleet.hours(site, by, key=key, since_hour=first, until_hour=span.end)
     shown, following = page.cut(found.items(), lambda item: item[0])
     hours = [views.HourView(hour_ns=hour * HOUR_NS, measures=kpis(counts)) for hour, counts in shown]
-    return views.HourList(hours=hours, next=following)
+    return views.Page(items=hours, next=following)
 
 
-@router.get("/v1/failures", response_model=views.FailureList)
-def failures(store: p.Store, query: Annotated[p.FailureQuery, Query()]) -> Any:
+@router.get("/v1/failures")
+def failures(store: p.Store, query: Annotated[p.FailureQuery, Query()]) -> views.Page[FailureRow]:
     """Failures, latest arrival first; kind `suspected` marks estimated silent failures."""
     found = store.fleet.failures(query.filter(), before=query.cursor, limit=query.limit + 1)
-    return query.page.of(views.FailureList, found, lambda failure: failure.number)
+    return query.page.of(found, lambda failure: failure.number)
 
 
 @router.get("/v1/failures/{number}")
@@ -106,14 +108,14 @@ def failure(store: p.Store, number: p.Number) -> views.FailureView:
 
 
 @router.get("/v1/failures/{number}/pictures/{place}", response_class=Response)
-def picture(store: p.Store, number: p.Number, place: p.PictureNumber) -> Response:
+def failure_picture(store: p.Store, number: p.Number, place: p.PictureNumber) -> Response:
     """A picture of a failure, as JPEG."""
     headers = {"Cache-Control": "private, max-age=86400", **PICTURE_HEADERS}
     return Response(store.fleet.picture(number, place), media_type="image/jpeg", headers=headers)
 
 
 @router.get("/v1/failures/{number}/replay.mcap", response_class=Response)
-def replay(request: Request, store: p.Store, number: p.Number) -> Response:
+def failure_recording(request: Request, store: p.Store, number: p.Number) -> Response:
     """The recording of the seconds around a failure, as MCAP: `mapserver fleet replay` and Foxglove open it."""
     data = store.fleet.replay(number)
     response = bytes_response(request, data, sha256_hex(data), "application/octet-stream", immutable=False)
@@ -128,13 +130,15 @@ def resurvey(service: p.Service, site: p.Site) -> ResurveyList:
 
 
 @router.post("/v1/sites/{site}/resurvey/requests")
-def ask(store: p.Store, sender: Sender, site: p.Site, act: views.SurveyAct) -> SurveyRequest:
+def request_survey(store: p.Store, sender: Sender, site: p.Site, act: views.SurveyAct) -> SurveyRequest:
     """Request a survey of a polygon; its tiles stay on the list until the request is closed."""
     return ask_for_survey(store, site, act.corners_map_m, sender.of(act))
 
 
 @router.post("/v1/sites/{site}/resurvey/requests/{asked}/end")
-def end(store: p.Store, sender: Sender, site: p.Site, asked: p.RequestId, act: views.Act) -> views.ServiceState:
+def end_survey_request(
+    store: p.Store, sender: Sender, site: p.Site, asked: p.RequestId, act: views.Act
+) -> views.ServiceState:
     """Remove a request from the list because it was surveyed or is no longer wanted."""
     end_request(store, site, asked, sender.of(act))
     return views.OK

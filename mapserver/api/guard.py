@@ -5,7 +5,6 @@ With sign-in on, every request except those in `_OPEN` needs a scope; an unliste
 
 import logging
 import re
-from collections.abc import Iterable
 from dataclasses import dataclass
 from html import escape
 from ipaddress import ip_address
@@ -21,6 +20,7 @@ from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from fleetmap.errors import StoreError
+from mapserver.api.operations import OPERATIONS
 from mapserver.api.problems import problem
 from mapserver.api.sign_in_proxy import SignInProxy, proxied_name
 from mapserver.api.views import Act
@@ -33,10 +33,10 @@ from mapserver.store import Actor
 _log = logging.getLogger(__name__)
 SIGN_IN, SIGN_OUT, STYLE = "/sign-in", "/sign-out", "/dashboard/static/style.css"
 _OPEN = {"/healthz", "/readyz", SIGN_IN, SIGN_OUT, STYLE}
-_RIGHTS = (  # needed for reading, too
+_RIGHTS = (  # needed for reading, too; operations say their own
     (re.compile(r"/metrics$"), Right.METRICS),
     (re.compile(r"/v1/(operators|tokens)(/|$)|/dashboard/administration/people(/|$)"), Right.OPERATORS),
-    (re.compile(r"/v1/sites/[^/]+/(enrolled(/|$)|robots/[^/]+/remove(/|$))"), Right.ROBOTS),
+    (re.compile(r"/v1/sites/[^/]+/enrolled(/|$)"), Right.ROBOTS),
 )
 _FORWARDED = {"forwarded", "x-forwarded-for", "x-real-ip"}
 _FORBIDDEN = Path(__file__).with_name("forbidden.html").read_text("utf-8")
@@ -101,12 +101,6 @@ class _Sender:
             raise HTTPException(403, words)
         return self.who.actor(act.reason)
 
-    def check_has(self, scopes: Iterable[str]) -> None:
-        """Raise 403 for rights that the sender lacks."""
-        if self.who is not None and (beyond := set(scopes) - self.who.scopes):
-            words = f"{self.who.name} cannot give the right to {sorted(beyond)[0]!r} without having it"
-            raise HTTPException(403, words)
-
 
 Sender = Annotated[_Sender, Depends()]
 
@@ -145,6 +139,9 @@ class Guard:
 
     def __init__(self, app: ASGIApp, settings: GuardSettings) -> None:
         self._app, self._settings = app, settings
+        asked = (one for one in OPERATIONS.values() if one.needs is not Right.CHANGE)
+        paths = ((re.compile(re.sub(r"{\w+}", "[^/]+", one.path) + "(/|$)"), one.needs) for one in asked)
+        self._rights = (*_RIGHTS, *paths)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "websocket":  # nothing here speaks it
@@ -188,7 +185,7 @@ class Guard:
 
     def _refused_person(self, scope: Scope) -> Response | None:
         """Refuse requests without a session or token, or with insufficient rights."""
-        right = _needed(scope)
+        right = self._needed(scope)
         if right is None:
             return None
         if not self._settings.is_sign_in_on:
@@ -220,6 +217,15 @@ class Guard:
         scope.setdefault("state", {})["operator"] = who
         return None
 
+    def _needed(self, scope: Scope) -> Right | None:
+        path = scope["path"].removeprefix(scope.get("root_path", "").rstrip("/"))  # as routes are found
+        if path in _OPEN:
+            return None
+        for pattern, right in self._rights:
+            if pattern.match(path):
+                return right
+        return Right.READ if scope["method"] in {"GET", "HEAD", "OPTIONS"} else Right.CHANGE
+
 
 def _with_ours(scope: Scope, headers: Any) -> list[tuple[bytes, bytes]]:
     """Return the headers of a response with those common to all; pictures have their own stricter policy."""
@@ -231,16 +237,6 @@ def _with_ours(scope: Scope, headers: Any) -> list[tuple[bytes, bytes]]:
     if b"content-security-policy" not in dict(kept):
         kept.append((b"content-security-policy", _POLICY))
     return kept + fixed
-
-
-def _needed(scope: Scope) -> Right | None:
-    path = scope["path"].removeprefix(scope.get("root_path", "").rstrip("/"))  # as routes are found
-    if path in _OPEN:
-        return None
-    for pattern, right in _RIGHTS:
-        if pattern.match(path):
-            return right
-    return Right.READ if scope["method"] in {"GET", "HEAD", "OPTIONS"} else Right.CHANGE
 
 
 def _is_for_a_page(scope: Scope) -> bool:

@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import time
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Request, Response
 from starlette.exceptions import HTTPException
@@ -12,7 +12,6 @@ from fleetmap.errors import StateError, UsageError
 from mapserver.api import parameters as p
 from mapserver.api import views
 from mapserver.api.guard import By, Sender
-from mapserver.api.problems import refused_with
 from mapserver.drafting.job_lock import log_path
 from mapserver.nightly.inbox import Inbox, contents, put_back, sites_of
 from mapserver.nightly.upload import Upload
@@ -57,7 +56,7 @@ def inbox(runs: Runs, store: p.Store, site: p.Site) -> Inbox:
     status_code=201,
     openapi_extra=p.file_body("application/octet-stream", required=True),
 )
-async def upload(
+async def upload_recording(
     request: Request, runs: Runs, service: p.Service, site: p.Site, name: p.RecordingName, who: By
 ) -> views.Uploaded:
     """Upload a recording as the request's body; it is there once all of it is. The first one of a site makes its inbox."""
@@ -68,20 +67,19 @@ async def upload(
         raise HTTPException(429, f"{_MOST_UPLOADS} uploads go on; try again when one has ended", {"Retry-After": "30"})
     uploads.add(folder / name)
     try:
-        with refused_with(422):
-            stated = request.headers.get("content-length")
-            part = await asyncio.to_thread(Upload, folder, name, None if stated is None else int(stated))
-            try:
-                data = bytearray()
-                async for chunk in request.stream():
-                    data += chunk
-                    if len(data) >= _WRITTEN_BYTES:
-                        await asyncio.to_thread(part.write, bytes(data))
-                        data.clear()
-                await asyncio.to_thread(part.write, bytes(data))
-                await asyncio.to_thread(part.end)
-            finally:
-                await asyncio.to_thread(part.discard)
+        stated = request.headers.get("content-length")
+        part = await asyncio.to_thread(Upload, folder, name, None if stated is None else int(stated))
+        try:
+            data = bytearray()
+            async for chunk in request.stream():
+                data += chunk
+                if len(data) >= _WRITTEN_BYTES:
+                    await asyncio.to_thread(part.write, bytes(data))
+                    data.clear()
+            await asyncio.to_thread(part.write, bytes(data))
+            await asyncio.to_thread(part.end)
+        finally:
+            await asyncio.to_thread(part.discard)
         words = f"{name}, {part.size_bytes} bytes"
         await asyncio.to_thread(_logged, service.store, "recording_uploaded", words, site, who)
         return views.Uploaded(name=name, size_bytes=part.size_bytes)
@@ -90,7 +88,7 @@ async def upload(
 
 
 @router.post("/v1/sites/{site}/inbox/{box}/{name}/retry")
-def retry(
+def retry_recording(
     runs: Runs, store: p.Store, sender: Sender, site: p.Site, box: p.Box, name: p.RecordingName, act: views.Act
 ) -> Inbox:
     """Move a held or bad recording back into the inbox, for the next build."""
@@ -101,7 +99,7 @@ def retry(
 
 
 @router.post("/v1/sites/{site}/build", status_code=202)
-def build(runs: Runs, store: p.Store, sender: Sender, site: p.Site, act: views.Act) -> JobInfo:
+def build_now(runs: Runs, store: p.Store, sender: Sender, site: p.Site, act: views.Act) -> JobInfo:
     """Build, judge and publish what waits in the inbox of a site, as `mapserver nightly` does; the answer is its job, which goes on."""
     who = sender.of(act)
     if site not in sites_of(runs.inbox):
@@ -109,11 +107,11 @@ def build(runs: Runs, store: p.Store, sender: Sender, site: p.Site, act: views.A
     return runs.start(site, lambda: _logged(store, "build_started", "of what waits in the inbox", site, who))
 
 
-@router.get("/v1/jobs", response_model=views.JobList)
-def jobs(store: p.Store, within: p.TimeRange, page: p.NumberPage, site: p.SiteFilter = None) -> Any:
+@router.get("/v1/jobs")
+def jobs(store: p.Store, within: p.TimeRange, page: p.NumberPage, site: p.SiteFilter = None) -> views.Page[JobInfo]:
     """Jobs (of a site) that began within a range of time, newest first."""
     found = store.jobs(site, within, before=page.cursor, limit=page.limit + 1)
-    return page.of(views.JobList, found, lambda job: job.id)
+    return page.of(found, lambda job: job.id)
 
 
 @router.get("/v1/jobs/{job}")

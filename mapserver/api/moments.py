@@ -4,7 +4,7 @@ import re
 from datetime import UTC, date, datetime, timedelta, tzinfo
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
-from fleetmap.errors import UsageError
+from fleetmap.errors import InvalidValueError
 
 _LATEST_YEAR = 2200
 _HOUR_NS = 3_600_000_000_000
@@ -40,7 +40,7 @@ def read_moment(text: str | None, name: str, zone: tzinfo | None = None, *, is_e
     """Return nanoseconds since 1970 of ISO 8601 text; without an offset it is in the zone (None: the machine's). None for no text.
 
     A day alone is its beginning, or its end with `is_end`. A time that a clock change repeats is its first one, or its last with
-    `is_end`. Raises UsageError for other text, naming the parameter.
+    `is_end`. Raises InvalidValueError for other text, naming the parameter.
     """
     if not text:
         return None
@@ -54,7 +54,7 @@ def read_moment(text: str | None, name: str, zone: tzinfo | None = None, *, is_e
     except (ValueError, OverflowError):
         at = None
     if at is None or not 1970 < at.year < _LATEST_YEAR:
-        raise UsageError(
+        raise InvalidValueError(
             f"{name} {text[:40]!r} is an invalid time; write 2026-01-31T14:03, with +01:00 or Z if it is not local"
         )
     if at.tzinfo is not None:
@@ -97,8 +97,10 @@ def _stamp_ns(at: datetime) -> int:
 
 
 def read_range(since: str | None, until: str | None, zone: tzinfo | None = None) -> tuple[int | None, int | None]:
-    """Return both ends of a range. Raises UsageError for an invalid time and for an end before the start."""
+    """Return both ends of a range. Raises InvalidValueError for an invalid time and for an end before the start."""
     start_ns, end_ns = read_moment(since, "since", zone), read_moment(until, "until", zone, is_end=True)
     if start_ns is not None and end_ns is not None and end_ns <= start_ns:
-        raise UsageError(f"until {(until or '')[:40]!r} is not after since {(since or '')[:40]!r}; exchange them")
+        raise InvalidValueError(
+            f"until {(until or '')[:40]!r} is not after since {(since or '')[:40]!r}; exchange them"
+        )
     return start_ns, end_ns

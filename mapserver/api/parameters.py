@@ -6,7 +6,7 @@ A page has `limit` items behind `cursor`; `next` is the following page's cursor.
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path as File
-from typing import Annotated, Any, Literal, NamedTuple, cast
+from typing import Annotated, Any, Literal, NamedTuple, TypeVar, cast
 
 from fastapi import Depends, Path, Query, Request
 from fastapi.dependencies.utils import get_flat_params
@@ -21,7 +21,7 @@ from fleetmap.mapformat.names import NAME_PATTERN, SHA256_PATTERN
 from mapserver.api.guard import GuardSettings
 from mapserver.api.metrics import Metrics
 from mapserver.api.moments import read_range
-from mapserver.api.problems import refused_with
+from mapserver.api.views import Page
 from mapserver.config import MapserverConfig
 from mapserver.fleet.fleet import Fleet
 from mapserver.operators.operators import Operators
@@ -29,6 +29,8 @@ from mapserver.operators.roles import OPERATOR_PATTERN
 from mapserver.serving.night_runs import NightRuns
 from mapserver.store import FailureFilter, MapStore
 from mapserver.trust.http_certificate import HttpCertificate
+
+T = TypeVar("T")
 
 
 class ApiSettings(NamedTuple):
@@ -101,8 +103,7 @@ Until = Annotated[str | None, Query(max_length=40, description=f"before: {_TIME}
 
 def time_range(since: Since = None, until: Until = None) -> tuple[int | None, int | None]:
     """Return nanoseconds since 1970, None for an open end; 422 for an invalid time or an end before the start."""
-    with refused_with(422):
-        return read_range(since, until)
+    return read_range(since, until)
 
 
 TimeRange = Annotated[tuple[int | None, int | None], Depends(time_range)]
@@ -158,16 +159,16 @@ class FailureQuery(BaseModel):
 class _Page:
     limit: Limit = 100
 
-    def cut(self, items: Iterable[Any], key: Callable[[Any], Any]) -> tuple[list[Any], str | None]:
+    def cut(self, items: Iterable[T], key: Callable[[T], Any]) -> tuple[list[T], str | None]:
         """The first `limit` items and the next page's cursor, of items behind this one's cursor, one more if there are more."""
         found = list(items)
         shown = found[: self.limit]
         return shown, str(key(shown[-1])) if len(found) > self.limit else None
 
-    def of(self, kind: type[BaseModel], items: Iterable[Any], key: Callable[[Any], Any]) -> Any:
-        """The items of this page as one of the lists of `views`."""
+    def of(self, items: Iterable[T], key: Callable[[T], Any]) -> Page[T]:
+        """This page of a list."""
         shown, following = self.cut(items, key)
-        return kind(**{next(iter(kind.model_fields)): shown, "next": following})
+        return Page(items=shown, next=following)
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,7 +184,7 @@ class _ByName(_Page):
 
     cursor: NameCursor = None
 
-    def cut(self, items: Iterable[Any], key: Callable[[Any], Any]) -> tuple[list[Any], str | None]:
+    def cut(self, items: Iterable[T], key: Callable[[T], Any]) -> tuple[list[T], str | None]:
         behind = (item for item in items if self.cursor is None or str(key(item)) > self.cursor)
         return _Page.cut(self, sorted(behind, key=key), key)
 

@@ -1,8 +1,6 @@
 """Errors of the HTTP API as RFC 9457 problem documents."""
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 from http import HTTPStatus
 from typing import Any
 
@@ -14,7 +12,9 @@ from starlette.exceptions import HTTPException
 from fleetmap.errors import (
     ChangedError,
     FleetmapError,
+    ForbiddenError,
     GateRefusedError,
+    InvalidValueError,
     MapFormatError,
     StateError,
     StoreError,
@@ -26,6 +26,8 @@ _log = logging.getLogger(__name__)
 _STATUS: tuple[tuple[type[FleetmapError], HTTPStatus], ...] = (
     (ChangedError, HTTPStatus.PRECONDITION_FAILED),
     (StateError, HTTPStatus.CONFLICT),
+    (ForbiddenError, HTTPStatus.FORBIDDEN),
+    (InvalidValueError, HTTPStatus.UNPROCESSABLE_ENTITY),
     (UsageError, HTTPStatus.NOT_FOUND),  # the path names an unknown site or version
     (GateRefusedError, HTTPStatus.CONFLICT),
     (StoreError, HTTPStatus.SERVICE_UNAVAILABLE),
@@ -52,17 +54,6 @@ def install(app: FastAPI) -> None:
     """Make every error of `app` a problem document."""
     for kind in (FleetmapError, HTTPException, RequestValidationError, Exception):
         app.add_exception_handler(kind, _answer)
-
-
-@contextmanager
-def refused_with(status: int) -> Iterator[None]:
-    """Answer a UsageError of the block with this status: it is not about the path."""
-    try:
-        yield
-    except StateError:
-        raise
-    except UsageError as error:
-        raise HTTPException(status, str(error)) from error
 
 
 def _answer(request: Request, error: Exception) -> Response:

@@ -1,11 +1,9 @@
-"""Endpoints of sites, versions and their bytes, and of releases: quality, publishing, promoting, rolling back, canaries."""
+"""Endpoints of sites, versions and their bytes, of their quality and of canaries."""
 
 import base64
 import hashlib
 import shlex
-import time
 from functools import lru_cache
-from typing import Any, cast
 
 from fastapi import APIRouter, Request, Response
 from starlette.exceptions import HTTPException
@@ -17,35 +15,33 @@ from mapserver import releases
 from mapserver.api import parameters as p
 from mapserver.api import views
 from mapserver.api.bytes_response import bytes_response
-from mapserver.api.guard import Sender
-from mapserver.fleet.canary_controller import find
-from mapserver.fleet_statistics.canary_decision import CanarySettings, number_of
 from mapserver.releases import Difference
-from mapserver.store import CanaryRow, MapStore, VersionInfo
+from mapserver.store import Event, MapStore, SiteInfo
 
 _DIGESTS_KEPT = 256
 router = APIRouter()
 
 
-@router.get("/v1/sites", response_model=views.SiteList)
-def sites(store: p.Store, page: p.NamePage) -> Any:
+@router.get("/v1/sites")
+def sites(store: p.Store, page: p.NamePage) -> views.Page[SiteInfo]:
     """Sites by name."""
-    return page.of(views.SiteList, store.sites(), lambda info: info.site)
+    return page.of(store.sites(), lambda info: info.site)
 
 
-@router.get("/v1/sites/{site}/versions", response_model=views.VersionList)
-def versions(store: p.Store, site: p.Site, page: p.NumberPage) -> Any:
+@router.get("/v1/sites/{site}/versions")
+def versions(service: p.Service, site: p.Site, page: p.NumberPage) -> views.Page[views.VersionView]:
     """Versions of a site, oldest first, drafts too."""
-    found = store.versions(site, after=page.cursor or 0, limit=page.limit + 1)
-    return page.of(views.VersionList, [views.version_view(store, info) for info in found], lambda info: info.version)
+    found = service.store.versions(site, after=page.cursor or 0, limit=page.limit + 1)
+    shown = [views.VersionView.of(service, info) for info in found]
+    return page.of(shown, lambda info: info.version)
 
 
-@router.get("/v1/sites/{site}/events", response_model=views.EventList)
-def events(store: p.Store, site: p.Site, within: p.TimeRange, page: p.NumberPage) -> Any:
+@router.get("/v1/sites/{site}/events")
+def events(store: p.Store, site: p.Site, within: p.TimeRange, page: p.NumberPage) -> views.Page[Event]:
     """Events of a site, oldest first: actor, action, time and reason."""
     store.current(site)  # raises for an unknown site
     found = store.events(site, within, after=page.cursor or 0, limit=page.limit + 1)
-    return page.of(views.EventList, found, lambda event: event.id)
+    return page.of(found, lambda event: event.id)
 
 
 @router.get("/v1/sites/{site}/versions/{version}", response_class=Response)
@@ -56,16 +52,16 @@ def manifest(request: Request, store: p.Store, site: p.Site, version: p.Version)
 
 
 @router.get("/v1/sites/{site}/current")
-def current(store: p.Store, site: p.Site) -> views.VersionView:
+def current(service: p.Service, site: p.Site) -> views.VersionView:
     """The current version of a site."""
-    info = store.current(site)
+    info = service.store.current(site)
     if info is None:
         raise HTTPException(
             404,
             f"site {site} has no published version; "
-            f"publish one with `mapserver publish --site {site} --store {shlex.quote(str(store.folder))}`",
+            f"publish one with `mapserver publish --site {site} --store {shlex.quote(str(service.store.folder))}`",
         )
-    return views.version_view(store, info)
+    return views.VersionView.of(service, info)
 
 
 @router.head("/v1/tiles/{sha256}", response_class=Response, include_in_schema=False)
@@ -107,7 +103,7 @@ def offered_file(store: MapStore, site: str, version: int) -> tuple[ExportHead, 
 
 @router.head("/v1/sites/{site}/versions/{version}/file", response_class=Response, include_in_schema=False)
 @router.get("/v1/sites/{site}/versions/{version}/file", response_class=Response)
-def file(request: Request, store: p.Store, site: p.Site, version: p.Version) -> Response:
+def version_file(request: Request, store: p.Store, site: p.Site, version: p.Version) -> Response:
     """A published version as one file, byte by byte the same every time; its SHA-256 is the ETag."""
     head, sha256 = offered_file(store, site, version)
     headers = {
@@ -140,35 +136,9 @@ def quality(store: p.Store, site: p.Site, version: p.Version) -> views.QualityVi
 
 
 @router.get("/v1/sites/{site}/versions/{before}/diff/{after}")
-def diff(store: p.Store, site: p.Site, before: p.Version, after: p.Version) -> Difference:
+def difference(store: p.Store, site: p.Site, before: p.Version, after: p.Version) -> Difference:
     """Difference between two versions: tiles, landmarks, bytes to fetch, quality side by side."""
     return releases.difference(store, site, before, after)
-
-
-@router.post("/v1/sites/{site}/versions/{version}/publish")
-def publish(
-    service: p.Service, sender: Sender, site: p.Site, version: p.Version, act: views.PublishAct
-) -> views.VersionView:
-    """Check a draft by the gate and make it current."""
-    store, gate = service.store, service.settings.config.gate
-    releases.publish(
-        store, site, version, actor=sender.of(act), trust_calibration=act.trust_calibration, force=act.force, gate=gate
-    )
-    return views.version_view(store, store.version(site, version))
-
-
-@router.post("/v1/sites/{site}/versions/{version}/promote")
-def promote(store: p.Store, sender: Sender, site: p.Site, version: p.Version, act: views.Act) -> views.VersionView:
-    """Make an earlier published version current."""
-    releases.promote(store, site, version, actor=sender.of(act))
-    return views.version_view(store, store.version(site, version))
-
-
-@router.post("/v1/sites/{site}/rollback")
-def rollback(store: p.Store, sender: Sender, site: p.Site, act: views.RollbackAct) -> views.VersionView:
-    """Make the previous current version current again; the present one retires. A running canary is withdrawn instead."""
-    releases.roll_back(store, site, to=act.to, canary=act.canary, actor=sender.of(act))
-    return views.version_view(store, cast(VersionInfo, store.current(site)))
 
 
 @router.get("/v1/sites/{site}/canary")
@@ -183,24 +153,4 @@ def canary(service: p.Service, site: p.Site) -> views.CanaryView:
             f"site {site} never had a canary; `mapserver promote VERSION "
             f"--canary 5% --site {site} --store {shlex.quote(str(store.folder))}` starts one",
         )
-    return _view(store, found[0], service.settings.config.canary)
-
-
-@router.post("/v1/sites/{site}/versions/{version}/canary")
-def start_canary(
-    service: p.Service, sender: Sender, site: p.Site, version: p.Version, act: views.CanaryAct
-) -> views.CanaryView:
-    """Let a share of the robots run a version before the others; a draft goes through the gate first.
-
-    `rollback` withdraws it, promoting it ends it early; otherwise the server decides by the failures of both groups.
-    """
-    store, settings = service.store, service.settings
-    share = settings.config.canary.share if act.share is None else act.share
-    releases.start_canary(store, site, version, share, actor=sender.of(act), gate=settings.config.gate)
-    return _view(store, store.canaries(site)[0], settings.config.canary)
-
-
-def _view(store: MapStore, row: CanaryRow, settings: CanarySettings) -> views.CanaryView:
-    robots = (robot.robot for robot in store.robots(row.site))
-    members = [name for name in robots if number_of(row.site, row.version, name) < row.threshold]
-    return views.CanaryView(canary=row, finding=find(store, row, settings, time.time_ns()), robots=members)
+    return views.CanaryView.of(service, found[0])

@@ -1,32 +1,30 @@
 """Response and request bodies of the API."""
 
-from typing import Annotated, Any, Self
+import time
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Self, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, create_model, model_validator
+from fastapi import Response
+from pydantic import BaseModel, ConfigDict, Field, JsonValue
 
 from fleetmap.encoding import MOST
-from fleetmap.mapformat.names import NAME_PATTERN
-from mapserver.fleet.alerts import Alert
 from mapserver.fleet.building import MOST_CORNERS
-from mapserver.fleet.fleet import RobotStatus
-from mapserver.fleet_statistics.canary_decision import CanaryFinding
+from mapserver.fleet.canary_controller import find
+from mapserver.fleet_statistics.canary_decision import CanaryFinding, number_of
 from mapserver.fleet_statistics.kpis import Kpis
-from mapserver.operators.operators import MAX_TOKEN_DAYS
-from mapserver.operators.roles import OPERATOR_PATTERN, Role, Scope
 from mapserver.quality.figures import TrustedCalibration
 from mapserver.serving.bus_service import MOST_SIGMA_M
 from mapserver.store import (
     CanaryRow,
-    Event,
     FailureRow,
-    JobInfo,
-    MapStore,
     PictureRow,
-    SiteInfo,
     VerdictRow,
     VersionInfo,
 )
-from mapserver.trust.enrolment import EnrolledRobot
+
+if TYPE_CHECKING:
+    from mapserver.api.parameters import Served
+
+T = TypeVar("T")
 
 
 class VersionView(BaseModel):
@@ -49,10 +47,10 @@ class VersionView(BaseModel):
     vocabulary_bytes: int
     trusted_calibrations: list[TrustedCalibration] = []
 
-
-def version_view(store: MapStore, info: VersionInfo) -> VersionView:
-    """Return the API's view of a version."""
-    return VersionView.model_validate(info).model_copy(update={"trusted_calibrations": store.trusted(info)})
+    @classmethod
+    def of(cls, service: "Served", info: VersionInfo) -> Self:
+        trusted = service.store.trusted(info)
+        return cls.model_validate(info).model_copy(update={"trusted_calibrations": trusted})
 
 
 class Uploaded(BaseModel):
@@ -103,6 +101,13 @@ class CanaryView(BaseModel):
     finding: CanaryFinding
     robots: list[str]
 
+    @classmethod
+    def of(cls, service: "Served", row: CanaryRow) -> Self:
+        robots = (robot.robot for robot in service.store.robots(row.site))
+        members = [name for name in robots if number_of(row.site, row.version, name) < row.threshold]
+        finding = find(service.store, row, service.settings.config.canary, time.time_ns())
+        return cls(canary=row, finding=finding, robots=members)
+
 
 class TokenView(BaseModel):
     """A valid token: its number, its scopes and its end. The token itself is not stored."""
@@ -122,6 +127,16 @@ class OperatorView(BaseModel):
     tokens: list[TokenView]
 
 
+class Bundle(Response):
+    """The bundle of a robot as a file, a secret until it is used."""
+
+    @classmethod
+    def of(cls, _: "Served", bundles: dict[str, bytes]) -> Self:
+        ((robot, data),) = bundles.items()
+        headers = {"Content-Disposition": f'attachment; filename="{robot}.fleetmap"', "Cache-Control": "no-store"}
+        return cls(data, headers=headers, media_type="application/octet-stream")
+
+
 class Secret(BaseModel):
     """A new password or token; no other answer has it."""
 
@@ -139,44 +154,9 @@ def _body(**example: JsonValue) -> ConfigDict:
 class Act(BaseModel):
     """Reason and author of a change; with a session or token, the author is its name."""
 
-    model_config = _body(actor="ada", reason="robots lose themselves in aisle 3")
-    actor: Annotated[str | None, Field(min_length=1, max_length=200)] = None
-    reason: Annotated[str, Field(max_length=2000)] = ""
-
-
-class PublishAct(Act):
-    """Author and reason of publishing; `force` also publishes what the gate refuses, except beyond hard limits.
-
-    With `trust_calibration` the author confirms the calibration although no recording judged it.
-    """
-
-    model_config = _body(actor="ada", reason="hall 2 was emptied", force=True)
-    force: bool = False
-    trust_calibration: bool = False
-
-    @model_validator(mode="after")
-    def _choice_has_a_reason(self) -> Self:
-        if (self.force or self.trust_calibration) and not self.reason:
-            raise ValueError(f"publishing {'by force' if self.force else 'with trust_calibration'} needs a reason")
-        return self
-
-
-class RollbackAct(Act):
-    """Author and reason of a rollback.
-
-    With `to` only where that version becomes current again, with `canary` only where it ends the trial of that `id`: else it is 409.
-    """
-
-    model_config = _body(actor="ada", reason="robots lose themselves in aisle 3", to=2)
-    to: int | None = None
-    canary: int | None = None
-
-
-class CanaryAct(Act):
-    """Author and reason of a canary; share of the robots, by default the setting's."""
-
-    model_config = _body(actor="ada", reason="the nightly map", share=0.05)
-    share: Annotated[float | None, Field(gt=0, lt=1)] = None
+    model_config = ConfigDict(extra="forbid")
+    actor: Annotated[str | None, Field(min_length=1, max_length=200, examples=["ada"])] = None
+    reason: Annotated[str, Field(max_length=2000, examples=["robots lose themselves in aisle 3"])] = ""
 
 
 class PlaceAct(Act):
@@ -194,37 +174,6 @@ class SurveyAct(Act):
 
     model_config = _body(actor="ada", reason="racks were moved", corners_map_m=[[0, 0], [4, 0], [4, 3]])
     corners_map_m: Annotated[list[tuple[Decimal, Decimal]], Field(min_length=3, max_length=MOST_CORNERS)]
-
-
-class RoleAct(Act):
-    """Author and reason of another role."""
-
-    model_config = _body(actor="ada", reason="she leads the shift", role="operator")
-    role: Role
-
-
-class OperatorAct(RoleAct):
-    """Author and reason of a new operator, with name and role."""
-
-    model_config = _body(actor="ada", reason="a new colleague", name="bob", role="operator")
-    name: Annotated[str, Field(pattern=OPERATOR_PATTERN)]
-
-
-class TokenAct(Act):
-    """Author and reason of a token, its scopes and days. A name without an operator becomes a program's."""
-
-    model_config = _body(actor="ada", reason="metrics", name="prometheus", scopes=["metrics"], days=90)
-    name: Annotated[str, Field(pattern=OPERATOR_PATTERN)]
-    scopes: Annotated[list[Scope], Field(min_length=1, max_length=len(Scope))]
-    days: Annotated[float, Field(gt=0, le=MAX_TOKEN_DAYS)] = 90
-
-
-class EnrolAct(Act):
-    """Author and reason of an enrolment. endpoint: of the server as robots reach it, by default with the first name of its certificate."""
-
-    model_config = _body(actor="ada", reason="a new robot", robot="tug-7")
-    robot: Annotated[str, Field(pattern=NAME_PATTERN)]
-    endpoint: Annotated[str | None, Field(max_length=300, pattern=r"^(tls|quic)/\S+:[0-9]{1,5}$")] = None
 
 
 _NOT_FOUND: dict[str, JsonValue] = {
@@ -265,31 +214,11 @@ class ServiceState(BaseModel):
 
 
 OK = ServiceState(status="ok")
+GeoJson = dict[str, Any]
 
 
-def _list(name: str, words: str, **fields: Any) -> Any:
-    """The model of a part of a list: its items, what they are, and the cursor of the following part."""
-    return create_model(name, __doc__=words, **fields, next=str | None)
+class Page(BaseModel, Generic[T]):
+    """A part of a list, and the cursor of the following part, None after the last one."""
 
-
-SiteList = _list("SiteList", "Sites by name.", sites=list[SiteInfo])
-VersionList = _list("VersionList", "Versions of a site, oldest first.", versions=list[VersionView])
-RobotList = _list("RobotList", "Robots that ever reported, by site and name.", robots=list[RobotStatus])
-EventList = _list(
-    "EventList",
-    "Events of a site, oldest first: actor, action, time (nanoseconds since 1970) and reason.",
-    events=list[Event],
-)
-JobList = _list("JobList", "Jobs, newest first.", jobs=list[JobInfo])
-KpisList = _list("KpisList", "Figures by site and key.", by=str, measures=list[KpisView])
-HourList = _list(
-    "HourList", "Figures by the hour, oldest first; hours without reports are left out.", hours=list[HourView]
-)
-FailureList = _list("FailureList", "Failures, the last to arrive first.", failures=list[FailureRow])
-OperatorList = _list("OperatorList", "Operators and programs by name.", operators=list[OperatorView])
-EnrolledList = _list("EnrolledList", "Enrolled robots of a site, by name.", robots=list[EnrolledRobot])
-AlertList = _list(
-    "AlertList",
-    "Active alerts, by site, name and subject. since_ns: start; the time of the answer if it is unknown.",
-    alerts=list[Alert],
-)
+    items: list[T]
+    next: str | None

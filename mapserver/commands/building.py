@@ -128,36 +128,6 @@ def remove_areas(where: SiteOptions, by: ActorOptions) -> None:
 
 
 @expand_options
-def correct(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="An area of the site.")],
-    kind: Annotated[str, typer.Argument(metavar="forget|never-use|freeze|nothing", help="What maps do there.")],
-    where: SiteOptions,
-    by: ActorOptions,
-) -> None:
-    """Let an area correct the map, from the next build on, with --reason; `nothing` ends that."""
-    from mapserver.fleet.building import correct_area
-    from mapserver.floor_plan.areas import CorrectionKind
-
-    kinds = {kind.value: kind for kind in CorrectionKind}
-    if kind not in (*kinds, "nothing"):
-        raise UsageError(f"{kind!r} is none of {', '.join(kinds)} and nothing")
-    with open_store(where.store) as maps:
-        areas = correct_area(maps, where.site, name, kinds.get(kind), by.named())
-    (changed,) = (area for area in areas.areas if area.name == name)
-    typer.echo(f"{name}: {changed.size_m2:.1f} m2{changed.effects}")
-
-
-@expand_options
-def undo(where: SiteOptions, by: ActorOptions) -> None:
-    """Bring back the areas and corrections as before their last change; once more, and they are as now."""
-    from mapserver.fleet.building import undo_areas
-
-    with open_store(where.store) as maps:
-        names = undo_areas(maps, where.site, by.named()).names
-    typer.echo(f"site {where.site}: {len(names)} areas, as before the last change")
-
-
-@expand_options
 def list_areas(where: SiteOptions, json: Json = False) -> None:
     """List the areas of a site; as JSON it is GeoJSON, in the frame `map`."""
     with open_store(where.store, read_only=True) as maps:
@@ -199,7 +169,7 @@ def export(
 
 AREAS = Group(
     "Named areas of a site.",
-    {"import": import_, "list": list_areas, "remove": remove_areas, "export": export, "correct": correct, "undo": undo},
+    {"import": import_, "list": list_areas, "remove": remove_areas, "export": export},
 )
 
 

@@ -7,6 +7,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from fleetmap.encoding import to_json
+from mapserver.api.operations import OPERATIONS
 from mapserver.fleet_statistics.kpis import Rate, driven_words, format_rate
 
 
@@ -58,6 +59,7 @@ def _counted(found: Rate) -> str:
 
 _LOADER = FileSystemLoader(Path(__file__).parent / "templates")
 TEMPLATES = Environment(loader=_LOADER, autoescape=True, undefined=StrictUndefined)
+TEMPLATES.globals["operations"] = OPERATIONS
 TEMPLATES.filters |= {
     "script_json": script_json,
     "age": age,

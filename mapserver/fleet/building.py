@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from fleetmap.encoding import to_json
-from fleetmap.errors import MapFormatError, StateError, UsageError
+from fleetmap.errors import InvalidValueError, MapFormatError, StateError, UsageError
 from fleetmap.geometry import Array
 from fleetmap.mapformat.building import ALIGNMENT, AREAS, FLOORS, Building, Floor, read_building, read_lifts
 from mapserver.floor_plan.alignment import PLAN, Alignment, encode_alignment, map_corners_m
@@ -101,7 +101,7 @@ def _dated(data: bytes, areas: Areas, before: Areas, actor: Actor, now_ns: int) 
         known = next((old.correction for old in before.corrections if _is_same(old, area)), None)
         reason = area.correction.reason.strip() or (known.reason if known else _one_line(actor.reason))
         if not reason:
-            raise UsageError(f"area {area.name!r}: a correction of the map needs a reason; add it, or --reason")
+            raise InvalidValueError(f"area {area.name!r}: a correction of the map needs a reason; add it, or --reason")
         since_ns = known.since_ns if known else now_ns + number  # each has another one, by which versions know it
         feature["properties"]["correction"] = {"kind": area.correction.kind, "reason": reason, "since_ns": since_ns}
     return to_json(collection)
@@ -164,7 +164,7 @@ def forget_alignment(store: MapStore, site: str, actor: Actor) -> None:
     """Remove the alignment and the drawing of a site; robots use the alignment of their version. UsageError while areas or a building
     need it."""
     if store.site_file_sha256(site, FLOORS) is not None:
-        raise UsageError(
+        raise StateError(
             f"site {site} is a floor of a building, which needs its pose; remove the building's floors first"
         )
     store.keep_site_files(site, {ALIGNMENT: None, PLAN: None}, "forgotten", actor=actor)
@@ -196,7 +196,7 @@ def ask_for_survey(store: MapStore, site: str, corners_map_m: Corners, actor: Ac
     if len(store.survey_requests(site)) >= MOST_REQUESTS:
         raise StateError(f"site {site} has {MOST_REQUESTS} open requests; close some first")
     if not 3 <= len(corners_map_m) <= MOST_CORNERS:
-        raise UsageError(f"{len(corners_map_m)} corners; draw the polygon with 3 to {MOST_CORNERS}")
+        raise InvalidValueError(f"{len(corners_map_m)} corners; draw the polygon with 3 to {MOST_CORNERS}")
     ring = [[round(float(x), 2), round(float(y), 2)] for x, y in corners_map_m]
     asked_ns = store.now_ns()
     who = {"name": "survey", "asked_ns": asked_ns, "actor": actor.name, "reason": actor.reason}
@@ -206,7 +206,9 @@ def ask_for_survey(store: MapStore, site: str, corners_map_m: Corners, actor: Ac
     (area,) = read_areas(data, None).areas  # refuses polygons that are not simple
     sides_m = np.ptp(np.array(ring), axis=0)
     if sides_m.max() > MOST_SIDE_M:
-        raise UsageError(f"{sides_m[0]:.0f} x {sides_m[1]:.0f} m; draw several of at most {MOST_SIDE_M:g} m each way")
+        raise InvalidValueError(
+            f"{sides_m[0]:.0f} x {sides_m[1]:.0f} m; draw several of at most {MOST_SIDE_M:g} m each way"
+        )
     made = SurveyRequest(hashlib.sha256(data).hexdigest()[:8], asked_ns, actor.name, actor.reason, ring)
     middle = np.array(ring).mean(axis=0)
     named = store.areas(site).at(*middle.tolist())

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.encoding import decode_json, to_plain
-from fleetmap.errors import UsageError
+from fleetmap.errors import InvalidValueError, StateError
 from fleetmap.geometry import Array, Rings, inside_any, inside_rings, se3_inverse, transform_points
 from fleetmap.mapformat.building import BuildingFrame
 
@@ -238,37 +238,37 @@ class Areas:
 def read_areas(data: bytes, building: BuildingFrame | None) -> Areas:
     """Read the areas of a file. building: the map's pose in it, for areas drawn there.
 
-    Raises UsageError, naming the area, for polygons that are not closed or simple, repeated names and exceeded limits.
+    Raises InvalidValueError, naming the area, for polygons that are not closed or simple, repeated names and exceeded limits.
     """
     if len(data) > MAX_AREAS_BYTES:
-        raise UsageError(f"areas of more than {MAX_AREAS_BYTES} bytes; draw them with fewer corners")
+        raise InvalidValueError(f"areas of more than {MAX_AREAS_BYTES} bytes; draw them with fewer corners")
     wanted = f"give a GeoJSON FeatureCollection of polygons with properties.name, and {_MASK_WORDS}"
-    collection = decode_json(data, _Collection, f"areas: {{}}; {wanted}", UsageError)
+    collection = decode_json(data, _Collection, f"areas: {{}}; {wanted}", InvalidValueError)
     if collection.frame is None:
         words = 'add "frame": "map" or "frame": "building" beside "features", and write metres'
-        raise UsageError(
+        raise InvalidValueError(
             f"areas: the file does not name the frame of its coordinates (plain GeoJSON means degrees); {words}"
         )
     map_from_drawn = np.eye(4)
     if collection.frame == "building":
         if building is None:
-            raise UsageError(
+            raise StateError(
                 "areas drawn in the building need the map's pose in it; run `mapserver align --plan FILE --pin ...` first"
             )
         map_from_drawn = se3_inverse(building.building_from_map)
     if not 1 <= len(collection.features) <= _MAX_AREAS:
-        raise UsageError(f"areas: {len(collection.features)} features; give 1 to {_MAX_AREAS}")
+        raise InvalidValueError(f"areas: {len(collection.features)} features; give 1 to {_MAX_AREAS}")
     areas: dict[str, Area] = {}
     corners = 0
     for feature in collection.features:
         area = _area(feature, map_from_drawn)
         corners += sum(len(ring) for ring in area.rings)
         if area.name in areas:
-            raise UsageError(
+            raise InvalidValueError(
                 f"area {area.name!r} occurs twice; give each its own name, or make one MultiPolygon of them"
             )
         if corners > _MAX_CORNERS:
-            raise UsageError(f"areas of more than {_MAX_CORNERS} corners; draw them with fewer")
+            raise InvalidValueError(f"areas of more than {_MAX_CORNERS} corners; draw them with fewer")
         areas[area.name] = area
     return Areas.of(list(areas.values()), collection.frame)
 
@@ -276,44 +276,48 @@ def read_areas(data: bytes, building: BuildingFrame | None) -> Areas:
 def _area(feature: _Feature, map_from_drawn: Array) -> Area:
     name = feature.properties.name.strip()
     if not 1 <= len(name) <= _MAX_NAME or not name.isprintable() or name == OUTSIDE:
-        raise UsageError(
+        raise InvalidValueError(
             f"area {name[:80]!r}: a name has 1 to {_MAX_NAME} printable characters, and is not {OUTSIDE!r}"
         )
     correction = feature.properties.correction
     if correction is not None and not correction.reason.isprintable():
-        raise UsageError(
+        raise InvalidValueError(
             f"area {name!r}: the reason of its correction has characters that cannot be shown; write one line"
         )
     mask, percent = feature.properties.mask, feature.properties.percent
     if (percent is None) == (mask is MaskKind.SPEED):
-        raise UsageError(f"area {name!r}: mask {mask and mask.value} with percent {percent}; give {_MASK_WORDS}")
+        raise InvalidValueError(f"area {name!r}: mask {mask and mask.value} with percent {percent}; give {_MASK_WORDS}")
     geometry = feature.geometry
     drawn = [geometry.coordinates] if isinstance(geometry, _Polygon) else geometry.coordinates
     polygons = [tuple(moved(_ring(ring, f"area {name!r}"), map_from_drawn) for ring in rings) for rings in drawn]
     if not polygons or not all(polygons):
-        raise UsageError(f"area {name!r} has no corners; draw it as a polygon")
+        raise InvalidValueError(f"area {name!r} has no corners; draw it as a polygon")
     return Area(name, tuple(polygons), mask, percent, correction, feature.properties.lift)
 
 
 def _ring(positions: list[list[float]], where: str) -> Array:
     """Return (V, 2) without the repeated end."""
     if len(positions) < 4 or any(len(position) not in (2, 3) for position in positions):
-        raise UsageError(f"{where}: a ring has 4 or more positions [x, y], the last one as the first")
+        raise InvalidValueError(f"{where}: a ring has 4 or more positions [x, y], the last one as the first")
     if len(positions) > _MAX_RING:
-        raise UsageError(f"{where}: a ring of {len(positions)} corners, the limit is {_MAX_RING}; draw it with fewer")
+        raise InvalidValueError(
+            f"{where}: a ring of {len(positions)} corners, the limit is {_MAX_RING}; draw it with fewer"
+        )
     ring = np.array([position[:2] for position in positions], float)
     if not (np.abs(ring) <= _MAX_M).all():
-        raise UsageError(f"{where}: a corner further than {_MAX_M:g} m from the origin; write metres")
+        raise InvalidValueError(f"{where}: a corner further than {_MAX_M:g} m from the origin; write metres")
     if (ring[0] != ring[-1]).any():
-        raise UsageError(f"{where} is not closed: it begins at {ring[0].tolist()} and ends at {ring[-1].tolist()}")
+        raise InvalidValueError(
+            f"{where} is not closed: it begins at {ring[0].tolist()} and ends at {ring[-1].tolist()}"
+        )
     ring = ring[:-1]
     if (ring == np.roll(ring, 1, axis=0)).all(axis=1).any():
-        raise UsageError(f"{where}: two corners one after the other are the same; remove one")
+        raise InvalidValueError(f"{where}: two corners one after the other are the same; remove one")
     crossing = _crossing(ring)
     if crossing is not None:
-        raise UsageError(f"{where}: its outline crosses itself near {ring[crossing].tolist()}; redraw it there")
+        raise InvalidValueError(f"{where}: its outline crosses itself near {ring[crossing].tolist()}; redraw it there")
     if abs(_doubled_area(ring)) < 2e-4:
-        raise UsageError(f"{where} is a line without any area; give it a width")
+        raise InvalidValueError(f"{where} is a line without any area; give it a width")
     return ring
 
 

@@ -12,7 +12,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.errors import UsageError
+from fleetmap.errors import InvalidValueError
 from fleetmap.failure_definition import ERROR_LIMIT_M
 from fleetmap.geometry import Array
 from fleetmap.mapformat.building import BuildingFrame
@@ -51,10 +51,10 @@ class Fit:
 
 
 def parse_pin(text: str) -> Pin:
-    """Parse NAME=px,py:mx,my. UsageError for invalid text."""
+    """Parse NAME=px,py:mx,my. InvalidValueError for invalid text."""
     match = _PIN.fullmatch(text)
     if match is None or not match[1].isprintable() or any(abs(float(value)) > _MOST for value in match.groups()[1:]):
-        raise UsageError(
+        raise InvalidValueError(
             f"pin {text[:120]!r}: write NAME=px,py:mx,my, a point of the plan and the same in the map, each at most {_MOST:.0f}"
         )
     px, py, mx, my = (float(value) for value in match.groups()[1:])
@@ -64,35 +64,37 @@ def parse_pin(text: str) -> Pin:
 def fit_pins(pins: Sequence[Pin], metres_per_unit: float | None, map_corners_m: Array) -> Fit:
     """Fit a rotation, a shift and, without metres_per_unit, a scale by least squares. Source: Umeyama 1991, in the plane.
 
-    map_corners_m: (N, 2) extent of the map. UsageError for too few, too close or contradictory pins, naming
+    map_corners_m: (N, 2) extent of the map. InvalidValueError for too few, too close or contradictory pins, naming
     the wrong one if possible, and for a mirrored drawing.
     """
     if not 2 <= len(pins) <= MAX_PINS:
-        raise UsageError(f"{len(pins)} pins: give 2 to {MAX_PINS}, three or four in the corners of the hall")
+        raise InvalidValueError(f"{len(pins)} pins: give 2 to {MAX_PINS}, three or four in the corners of the hall")
     names = [pin.name for pin in pins]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
-        raise UsageError(f"two pins have the name {twice[0]!r}; give each its own")
+        raise InvalidValueError(f"two pins have the name {twice[0]!r}; give each its own")
     points = np.array([complex(*pin.map_m) for pin in pins])
     drawn = np.array([complex(*pin.drawing) for pin in pins])
     apart_m = max(abs(a - b) for a, b in combinations(points, 2))
     if apart_m < _LEAST_APART_M:
-        raise UsageError(
+        raise InvalidValueError(
             f"the pins lie within {apart_m:.2f} m in the map; choose them far apart, in corners of the hall"
         )
     if max(abs(a - b) for a, b in combinations(drawn, 2)) <= 0:
-        raise UsageError("all pins are the same point of the plan; choose them far apart")
+        raise InvalidValueError("all pins are the same point of the plan; choose them far apart")
     rotation_scale, shift = similarity(drawn, points, metres_per_unit)
     scale = 1 / abs(rotation_scale)
     off_m = scale * np.abs(drawn - rotation_scale * points - shift)
     if off_m.max() > _MOST_OFF_M:
-        raise UsageError(_contradiction([pin.name for pin in pins], drawn, points, metres_per_unit))
+        raise InvalidValueError(_contradiction([pin.name for pin in pins], drawn, points, metres_per_unit))
     cov, sigma_m = _covariance(drawn, points, (rotation_scale, metres_per_unit is None), off_m)
     turn = rotation_scale / abs(rotation_scale)
     far_sigma_m = max(_position_sigma_m(cov, turn, complex(*corner)) for corner in map_corners_m)
     if far_sigma_m > _MOST_OFF_M:
         words = f"at the far end of the map positions would be uncertain by {far_sigma_m:.2f} m"
-        raise UsageError(f"the pins lie within {apart_m:.1f} m and {words}; choose them further apart, or add some")
+        raise InvalidValueError(
+            f"the pins lie within {apart_m:.1f} m and {words}; choose them further apart, or add some"
+        )
     origin = scale * shift
     frame = BuildingFrame(
         x_m=float(origin.real),
@@ -114,7 +116,9 @@ def similarity(drawn: _Complex, points: _Complex, metres_per_unit: float | None)
     else:
         rotation_scale = correlation / max(abs(correlation), 1e-300) / metres_per_unit
     if abs(rotation_scale) < 1e-9:
-        raise UsageError("no rotation brings the plan's points to the map's; are the pins' numbers in the right order?")
+        raise InvalidValueError(
+            "no rotation brings the plan's points to the map's; are the pins' numbers in the right order?"
+        )
     return rotation_scale, complex(drawn.mean() - rotation_scale * points.mean())
 
 

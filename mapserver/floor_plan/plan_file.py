@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.errors import UsageError, disk_errors
+from fleetmap.errors import InvalidValueError, disk_errors
 from fleetmap.recordings.images import image_size
 from mapserver.floor_plan.pins import Pin
 
@@ -24,12 +24,12 @@ class PlanFile:
     grey: NDArray[np.uint8]
 
     def drawn(self, pins: list[Pin]) -> list[Pin]:
-        """Convert pins to axes right and up. UsageError for a pin outside the picture."""
+        """Convert pins to axes right and up. InvalidValueError for a pin outside the picture."""
         height, width = self.grey.shape
         for pin in pins:
             if not (0 <= pin.drawing[0] <= width and 0 <= pin.drawing[1] <= height):
                 x, y = pin.drawing
-                raise UsageError(
+                raise InvalidValueError(
                     f"pin {pin.name}: {x:g},{y:g} is not in {self.name}, which has {width}x{height} pixels"
                 )
         return upwards(pins)
@@ -43,7 +43,7 @@ def upwards(pins: list[Pin]) -> list[Pin]:
 def read_plan(path: Path) -> PlanFile:
     """Read the plan in a file; errors as of `decode_plan`."""
     with (
-        disk_errors(f"--plan {path} cannot be read", "check the path and its rights", UsageError),
+        disk_errors(f"--plan {path} cannot be read", "check the path and its rights", InvalidValueError),
         path.open("rb") as file,
     ):
         data = file.read(MAX_PLAN_BYTES + 1)
@@ -51,16 +51,18 @@ def read_plan(path: Path) -> PlanFile:
 
 
 def decode_plan(name: str, data: bytes) -> PlanFile:
-    """Decode the plan in a file's bytes. UsageError for an unknown format, a too large or a damaged file."""
+    """Decode the plan in a file's bytes. InvalidValueError for an unknown format, a too large or a damaged file."""
     if len(data) > MAX_PLAN_BYTES:
-        raise UsageError(f"plan {name} has more than {MAX_PLAN_BYTES} bytes; save it smaller")
+        raise InvalidValueError(f"plan {name} has more than {MAX_PLAN_BYTES} bytes; save it smaller")
     if name.lower().endswith(".dxf"):
-        raise UsageError(f"plan {name}: DXF is not supported; save the drawing as PNG and align it by pins")
+        raise InvalidValueError(f"plan {name}: DXF is not supported; save the drawing as PNG and align it by pins")
     size = image_size(data)
     if size is None:
-        raise UsageError(f"plan {name} is not a PNG, JPEG, TIFF, BMP or PGM picture; save it as one of these")
+        raise InvalidValueError(f"plan {name} is not a PNG, JPEG, TIFF, BMP or PGM picture; save it as one of these")
     if not 0 < size[0] * size[1] <= MAX_PLAN_PIXELS:
-        raise UsageError(f"plan {name} has {size[0]}x{size[1]} pixels, the limit is {MAX_PLAN_PIXELS}; save it smaller")
+        raise InvalidValueError(
+            f"plan {name} has {size[0]}x{size[1]} pixels, the limit is {MAX_PLAN_PIXELS}; save it smaller"
+        )
     try:
         grey = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
         is_png = data.startswith(b"\x89PNG")
@@ -72,5 +74,5 @@ def decode_plan(name: str, data: bytes) -> PlanFile:
     except cv2.error:
         grey = None
     if grey is None or grey.shape != (size[1], size[0]):
-        raise UsageError(f"plan {name} cannot be decoded; it is damaged, save it again")
+        raise InvalidValueError(f"plan {name} cannot be decoded; it is damaged, save it again")
     return PlanFile(name, data, np.asarray(grey, np.uint8))

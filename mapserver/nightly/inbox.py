@@ -22,7 +22,15 @@ from dataclasses import dataclass
 from itertools import chain, count
 from pathlib import Path
 
-from fleetmap.errors import FleetmapError, RecordingError, StateError, StoreError, UsageError, disk_errors
+from fleetmap.errors import (
+    FleetmapError,
+    InvalidValueError,
+    RecordingError,
+    StateError,
+    StoreError,
+    UsageError,
+    disk_errors,
+)
 from fleetmap.files import sync_path, write_atomically
 from fleetmap.log_lines import printable
 from fleetmap.mapformat.names import is_name
@@ -270,13 +278,13 @@ def put_back(inbox: Path, where: str, name: str) -> None:
 
 
 def check_upload_name(inbox: Path, name: str) -> Path:
-    """Return where an uploaded recording belongs. Raises UsageError for an invalid name, StateError for one that exists."""
+    """Return where an uploaded recording belongs. Raises InvalidValueError for an invalid name, StateError for one that exists."""
     path = inbox / name
     is_short, suffixes = is_safe_name(name) and len(os.fsencode(name)) <= _UPLOAD_NAME_BYTES, file_suffixes()
     if not is_short or path.suffix not in suffixes:
         known = f"{', '.join(suffixes[:-1])} or {suffixes[-1]}"
         words = f"{printable(name)[:80]!r} is an invalid name of a recording; use at most {_UPLOAD_NAME_BYTES} bytes that end in {known}"
-        raise UsageError(f"{words} (`mapserver convert FOLDER OUT.mcap` makes one of a folder)")
+        raise InvalidValueError(f"{words} (`mapserver convert FOLDER OUT.mcap` makes one of a folder)")
     if os.path.lexists(path):
         raise StateError(f"the inbox has a recording {name} already; rename one of them")
     return path

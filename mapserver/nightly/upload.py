@@ -7,7 +7,7 @@ import threading
 from contextlib import suppress
 from pathlib import Path
 
-from fleetmap.errors import StateError, UsageError, disk_errors
+from fleetmap.errors import InvalidValueError, StateError, disk_errors
 from fleetmap.files import OWN_FILE, sync_path
 from mapserver.nightly.inbox import check_upload_name
 from mapserver.store.files import make_folder
@@ -27,7 +27,7 @@ def remove_unfinished(folder: Path) -> None:
 
 
 class Upload:
-    """Writes one recording. Thread-safe; `end` or `discard` is called in any case. Errors are StateError, UsageError and StoreError."""
+    """Writes one recording. Thread-safe; `end` or `discard` is called in any case. Errors: StateError, InvalidValueError, StoreError."""
 
     def __init__(self, inbox: Path, name: str, stated_bytes: int | None) -> None:
         """inbox: of the site, made if it is missing. stated_bytes: as the client says, None if it does not."""
@@ -57,10 +57,10 @@ class Upload:
             self.size_bytes += len(data)
 
     def end(self) -> None:
-        """Give it its name. UsageError if it is not as long as stated or empty, StateError if there is one of this name meanwhile."""
+        """Give it its name. InvalidValueError if it is empty or not as long as stated, StateError if there is one of this name now."""
         if self.size_bytes == 0 or self.size_bytes != (self._stated_bytes or self.size_bytes):
             stated = "" if self._stated_bytes is None else f", {self._stated_bytes} were announced"
-            raise UsageError(f"{self._path.name} came with {self.size_bytes} bytes{stated}; upload it again")
+            raise InvalidValueError(f"{self._path.name} came with {self.size_bytes} bytes{stated}; upload it again")
         with self._lock, disk_errors(*self._words):
             assert self._descriptor is not None
             os.fsync(self._descriptor)

@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from fleetmap.encoding import to_plain
-from fleetmap.errors import GateRefusedError, StateError, UsageError
+from fleetmap.errors import GateRefusedError, InvalidValueError, StateError, UsageError
 from fleetmap.mapformat.manifest import decode_manifest
 from fleetmap.mapformat.tile_codec import decode_tile
 from mapserver.fleet_statistics.canary_decision import threshold_for
@@ -61,7 +61,7 @@ def publish(
     if trust_calibration:
         draft = confirm_calibration(store, draft, actor)
     if force and not (actor.name and actor.reason):
-        raise UsageError("publishing by force needs an actor and a reason; add --reason")
+        raise InvalidValueError("publishing by force needs an actor and a reason; add --reason")
     judged_against = _pass_gate(store, draft, actor, gate, force=force)
     with _releasing(store, site) as release:
         left = None if release.rows.current is None else release.rows.current.version
@@ -85,7 +85,7 @@ def confirm_calibration(store: MapStore, draft: VersionInfo, actor: Actor) -> Ve
     Raises UsageError without a name and a reason, StateError for a version that is not a draft, StoreError on a disk error.
     """
     if not (actor.name and actor.reason):
-        raise UsageError("trusting a calibration needs an actor and a reason; add --reason")
+        raise InvalidValueError("trusting a calibration needs an actor and a reason; add --reason")
     manifest, evidence = decode_manifest(store.blob(draft.manifest_sha256)), store.evidence(draft.site, draft.version)
     known = trusted_calibrations(manifest)
     new = [

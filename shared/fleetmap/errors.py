@@ -21,6 +21,14 @@ class UsageError(FleetmapError):
     exit_status = 2
 
 
+class InvalidValueError(UsageError):
+    """A value that cannot be, beside those that name what is asked for."""
+
+
+class ForbiddenError(UsageError):
+    """A request beyond the rights of whoever sends it."""
+
+
 class StateError(UsageError):
     """A request that does not fit the current state, such as promoting a draft."""
 

@@ -136,7 +136,7 @@ def test_over_the_network_the_same_comes_out_and_the_server_sees_the_robot(
         assert done.returncode == 0, done.stderr
 
         def health() -> dict[str, Any]:
-            robots = httpx.get(f"{served.http}/v1/robots", verify=False).json()["robots"]
+            robots = httpx.get(f"{served.http}/v1/robots", verify=False).json()["items"]
             (robot,) = (each for each in robots if each["robot"] == "r7")
             assert robot["version"] == 1
             return robot["last_health"] or {"metrics": {}}

@@ -94,7 +94,7 @@ def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Itera
     fill_store(folder)
     with serving(folder) as server:
         with talking(server.zenoh, ROBOTS):
-            here = lambda: httpx.get(f"{server.http}/v1/robots?limit=1000", verify=False).json()["robots"]  # noqa: E731
+            here = lambda: httpx.get(f"{server.http}/v1/robots?limit=1000", verify=False).json()["items"]  # noqa: E731
             assert eventually(lambda: len(here()) >= ROBOTS, 30.0)
         yield server
     assert [line for line in server.log if "ERROR" in line or "Traceback" in line] == []

@@ -9,16 +9,16 @@ from ipaddress import ip_address
 from pathlib import Path
 from typing import Any, Literal
 
-from fleetmap.errors import UnreachableError, UsageError
+from fleetmap.errors import InvalidValueError, UnreachableError
 
 
 def check_endpoint(endpoint: str) -> str:
-    """Return `endpoint`; raise UsageError unless it has the form tcp/HOST:PORT (also tls, quic, udp)."""
+    """Return `endpoint`; raise InvalidValueError unless it has the form tcp/HOST:PORT (also tls, quic, udp)."""
     written = re.fullmatch(r"(tcp|tls|quic|udp)/.+:([0-9]+)", endpoint)
     if written is None:
-        raise UsageError(f"endpoint {endpoint!r}: write it like tcp/127.0.0.1:7447")
+        raise InvalidValueError(f"endpoint {endpoint!r}: write it like tcp/127.0.0.1:7447")
     if int(written[2]) > 65535:
-        raise UsageError(f"endpoint {endpoint!r}: port {written[2]} is above 65535")
+        raise InvalidValueError(f"endpoint {endpoint!r}: port {written[2]} is above 65535")
     return endpoint
 
 

@@ -131,7 +131,7 @@ def measure_load(folder: Path, robots: int, seconds: int) -> dict[str, Any]:
             answers = [said.get() for _ in fleets]
         time.sleep(6.0)  # the last flush and the last look for robots
         text = httpx.get(f"{served.http}/metrics", timeout=30).text
-        present = httpx.get(f"{served.http}/v1/robots?limit=1000", timeout=30).json()["robots"]
+        present = httpx.get(f"{served.http}/v1/robots?limit=1000", timeout=30).json()["items"]
         end.set()
         for fleet in fleets:
             fleet.join()

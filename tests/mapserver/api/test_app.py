@@ -24,9 +24,9 @@ from support.storage.map_samples import draft_details, random_tile, save_sample_
 
 
 def test_lists(server: Server) -> None:
-    sites = server.client.get("/v1/sites").json()["sites"]
+    sites = server.client.get("/v1/sites").json()["items"]
     assert [(site["site"], site["current_version"], site["versions"]) for site in sites] == [("lab", 1, 2)]
-    versions = server.client.get("/v1/sites/lab/versions").json()["versions"]
+    versions = server.client.get("/v1/sites/lab/versions").json()["items"]
     assert [(v["version"], v["state"], v["parent"]) for v in versions] == [(1, "current", None), (2, "draft", 1)]
     current = server.client.get("/v1/sites/lab/current").json()
     assert current == versions[0]
@@ -139,14 +139,14 @@ def test_an_unexpected_fault_is_a_problem_too(server: Server, monkeypatch: pytes
 
 
 def test_robots(server: Server) -> None:
-    assert server.client.get("/v1/robots").json() == {"robots": [], "next": None}
+    assert server.client.get("/v1/robots").json() == {"items": [], "next": None}
     server.fleet.take_ack("lab", "r1", RobotAck(site="lab", robot="r1", stamp_ns=1, version=1))
     server.fleet.take_health("lab", "r1", RobotHealth(site="lab", robot="r1", stamp_ns=2, version=1, status="TRACKING"))
-    (robot,) = server.client.get("/v1/robots").json()["robots"]
+    (robot,) = server.client.get("/v1/robots").json()["items"]
     assert (robot["robot"], robot["site"], robot["version"], robot["wanted_version"]) == ("r1", "lab", 1, 1)
     assert robot["last_health"]["status"] == "TRACKING"
     assert 0 <= robot["seconds_since"] < 60
-    assert server.client.get("/v1/robots?site=other").json() == {"robots": [], "next": None}
+    assert server.client.get("/v1/robots?site=other").json() == {"items": [], "next": None}
 
 
 def test_service_endpoints(server: Server) -> None:
@@ -191,9 +191,9 @@ def test_alerts_come_in_pages(server: Server) -> None:
         server.store.update_job(server.store.begin_job(site, "nightly"), "failed", "the disk is full", {})
     first = server.client.get("/v1/alerts?limit=1").json()
     rest = server.client.get(f"/v1/alerts?cursor={first['next']}").json()
-    assert [alert["site"] for page in (first, rest) for alert in page["alerts"] if alert["site"]] == ["hall", "lab"]
+    assert [alert["site"] for page in (first, rest) for alert in page["items"] if alert["site"]] == ["hall", "lab"]
     assert rest["next"] is None
-    assert "the night of hall failed" in first["alerts"][0]["words"] + rest["alerts"][0]["words"]
+    assert "the night of hall failed" in first["items"][0]["words"] + rest["items"][0]["words"]
 
 
 def test_readyz_says_when_reports_cannot_be_stored(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -227,7 +227,7 @@ def test_a_page_of_robots_has_a_bounded_size(server: Server, monkeypatch: pytest
     while cursor is not None:
         answer = server.client.get("/v1/robots?limit=1000" + (f"&cursor={cursor}" if cursor else ""))
         assert len(answer.content) < 4_500_000
-        names += [robot["robot"] for robot in answer.json()["robots"]]
+        names += [robot["robot"] for robot in answer.json()["items"]]
         cursor, pages = answer.json()["next"], pages + 1
     assert names == [f"r{number:03d}" for number in range(120)]
     assert pages == 2
@@ -264,7 +264,7 @@ def test_an_operator_publishes_promotes_and_rolls_back(server: Server) -> None:
     assert post("/v1/sites/lab/versions/1/promote", json=ADA).json()["state"] == "current"
     assert server.store.current("lab").version == 1
     assert post("/v1/sites/lab/rollback", json=ADA).json()["version"] == 2
-    events = server.client.get("/v1/sites/lab/events").json()["events"]
+    events = server.client.get("/v1/sites/lab/events").json()["items"]
     told = [(event["kind"], event["version"]) for event in events[-3:]]
     assert told == [("published", 2), ("promoted", 1), ("rolled_back", 2)]
     assert {(event["actor"], event["reason"]) for event in events[-3:]} == {("ada", "aisle 3")}
@@ -301,7 +301,7 @@ def test_an_operator_trusts_a_calibration_over_http(server: Server) -> None:
     choice = {"rig": "a1", "subjects": ["metric scale"], "actor": "ada", "reason": "aisle 3"}
     assert (published["state"], published["trusted_calibrations"]) == ("current", [choice])
     assert server.client.get(f"{url}/quality").json()["trusted_calibrations"] == [choice]
-    (listed,) = server.client.get("/v1/sites/yard/versions").json()["versions"]
+    (listed,) = server.client.get("/v1/sites/yard/versions").json()["items"]
     assert listed["trusted_calibrations"] == server.client.get(url).json()["configuration"]["trusted_calibrations"]
 
 
@@ -311,27 +311,27 @@ def test_lists_come_in_pages(server: Server) -> None:
     save_sample_draft(server.store, site="hall")
     for number in range(3):
         server.store.update_job(server.store.begin_job("lab", "nightly"), "done", f"night {number}", {})
-    for name, path in (("sites", "/v1/sites"), ("versions", "/v1/sites/lab/versions"), ("jobs", "/v1/jobs")):
+    for path in ("/v1/sites", "/v1/sites/lab/versions", "/v1/jobs"):
         whole = server.client.get(path).json()
         assert whole["next"] is None
         got, cursor = [], None
         while cursor is not None or not got:
             question = {"limit": 2} | ({} if cursor is None else {"cursor": cursor})
             answer = server.client.get(path, params=question).json()
-            assert len(answer[name]) <= 2
-            got += answer[name]
+            assert len(answer["items"]) <= 2
+            got += answer["items"]
             cursor = answer["next"]
-        assert got == whole[name]
-    jobs = server.client.get("/v1/jobs?site=lab").json()["jobs"]
+        assert got == whole["items"]
+    jobs = server.client.get("/v1/jobs?site=lab").json()["items"]
     assert [job["message"] for job in jobs] == ["night 2", "night 1", "night 0"]
     assert server.client.get(f"/v1/jobs/{jobs[0]['id']}").json() == jobs[0]
     check_problem(server.client.get("/v1/jobs/99"), 404, "job 99 does not exist")
     begun = jobs[0]["started"]
-    assert server.client.get("/v1/jobs", params={"since": begun}).json()["jobs"][0] == jobs[0]
-    assert server.client.get("/v1/jobs", params={"until": jobs[-1]["started"]}).json()["jobs"] == []
+    assert server.client.get("/v1/jobs", params={"since": begun}).json()["items"][0] == jobs[0]
+    assert server.client.get("/v1/jobs", params={"until": jobs[-1]["started"]}).json()["items"] == []
     later = f"{datetime.fromisoformat(begun) + timedelta(seconds=1):%Y-%m-%dT%H:%M:%SZ}"
-    assert server.client.get("/v1/jobs", params={"since": later}).json()["jobs"] == []
-    assert server.client.get("/v1/jobs", params={"until": later}).json()["jobs"][0] == jobs[0]
+    assert server.client.get("/v1/jobs", params={"since": later}).json()["items"] == []
+    assert server.client.get("/v1/jobs", params={"until": later}).json()["items"][0] == jobs[0]
     check_problem(server.client.get("/v1/jobs?since=soon"), 422, "is an invalid time")
     check_problem(server.client.get("/v1/sites?limit=0"), 422, "limit")
 

@@ -32,7 +32,7 @@ def test_failures_are_found_by_what_they_are(server: Server) -> None:
         ("?site=other", []),
     ):
         body = server.client.get(f"/v1/failures{query}").json()
-        assert [f["number"] for f in body["failures"]] == wanted, query
+        assert [f["number"] for f in body["items"]] == wanted, query
     assert server.client.get("/v1/failures?limit=2").json()["next"] == "3"
     one = server.client.get("/v1/failures/2").json()
     assert (one["failure"]["cause"], one["report"]["id"], one["pictures"][0]["kind"]) == ("blur", "f2", "frame")
@@ -60,11 +60,11 @@ def test_figures_by_what_they_are_counted_by(server: Server) -> None:
     for number in range(3):
         server.fleet.take_failure("lab", f"r{number}", failure(number, robot=f"r{number}"))
     body = server.client.get("/v1/fleet/measures?by=robot&limit=2").json()
-    told = [(row["site"], row["key"], row["measures"]["failures"]["events"]) for row in body["measures"]]
+    told = [(row["site"], row["key"], row["measures"]["failures"]["events"]) for row in body["items"]]
     assert told == [("lab", "r0", 1), ("lab", "r1", 1)]
     rest = server.client.get(f"/v1/fleet/measures?by=robot&cursor={body['next']}").json()
-    assert [row["key"] for row in rest["measures"]] == ["r2"] and rest["next"] is None
-    (hour,) = server.client.get("/v1/sites/lab/hours?by=tile&key=0,0").json()["hours"]
+    assert [row["key"] for row in rest["items"]] == ["r2"] and rest["next"] is None
+    (hour,) = server.client.get("/v1/sites/lab/hours?by=tile&key=0,0").json()["items"]
     assert hour["measures"]["failures"]["events"] == 3
     assert hour["measures"]["failures"]["per_robot_day"] is None  # nobody drove
     check_problem(server.client.get("/v1/sites/none/hours"), 404, "no site none")
@@ -81,7 +81,7 @@ def test_a_canary_begins_and_ends_over_http(server: Server) -> None:
     assert (begun.json()["canary"]["version"], begun.json()["canary"]["base_version"]) == (2, 1)
     shown = server.client.get("/v1/sites/lab/canary").json()
     assert shown["finding"]["action"] == "wait" and shown["robots"] == ["r1"]
-    (robot,) = server.client.get("/v1/robots").json()["robots"]
+    (robot,) = server.client.get("/v1/robots").json()["items"]
     assert (robot["wanted_version"], robot["is_canary"], robot["version"]) == (2, True, 1)
     check_problem(server.client.post(canary, json={"actor": "ada"}), 409, "has a canary of version 2")
     check_problem(server.client.post(canary, json={"actor": "ada", "share": 7}), 422, "share")
@@ -135,10 +135,10 @@ def test_row_29_quotes_in_every_filter(server: Server, words: str) -> None:
             answer = server.client.get(f"/v1/{path}", params={name: words})
             assert answer.status_code < 500, (path, name)
             if path == "failures" and name in ("site", "robot", "cause", "kind") and answer.status_code == 200:
-                assert answer.json()["failures"] == [], name
+                assert answer.json()["items"] == [], name
     for path in (f"/v1/sites/{quote(words)}/versions", f"/v1/failures/{quote(words)}", f"/v1/tiles/{quote(words)}"):
         assert server.client.get(path).status_code in (404, 422)
-    found = server.client.get("/v1/failures").json()["failures"]
+    found = server.client.get("/v1/failures").json()["items"]
     assert [row["robot"] for row in found] == ["r1"]
     # The control: where the words become part of the statement, they find it.
     if "OR 1=1" in words:
@@ -151,16 +151,16 @@ def test_a_range_of_time_is_kept_to_and_nothing_is_ignored(server: Server) -> No
     hour = timedelta(hours=1)
     now = datetime.now(UTC)
     before, after = ((now + step).isoformat() for step in (-hour, hour))
-    (shown,) = server.client.get("/v1/failures", params={"since": before, "until": after}).json()["failures"]
+    (shown,) = server.client.get("/v1/failures", params={"since": before, "until": after}).json()["items"]
     assert isinstance(shown["happened_ns"], str), "a number above 2^53 is another one to many programs"
     assert abs(int(shown["happened_ns"]) - time.time_ns()) < 60 * 10**9
-    assert server.client.get("/v1/failures", params={"since": after}).json()["failures"] == []
-    for address, items in (("/v1/fleet/measures", "measures"), ("/v1/sites/lab/hours", "hours")):
-        assert len(server.client.get(address, params={"since": before, "until": after}).json()[items]) == 1
+    assert server.client.get("/v1/failures", params={"since": after}).json()["items"] == []
+    for address in ("/v1/fleet/measures", "/v1/sites/lab/hours"):
+        assert len(server.client.get(address, params={"since": before, "until": after}).json()["items"]) == 1
         old = {"since": (now - 50 * hour).isoformat(), "until": (now - 48 * hour).isoformat()}
-        assert server.client.get(address, params=old).json()[items] == []
-    assert server.client.get("/v1/sites/lab/events", params={"until": before}).json()["events"] == []
-    events = server.client.get("/v1/sites/lab/events", params={"since": before}).json()["events"]
+        assert server.client.get(address, params=old).json()["items"] == []
+    assert server.client.get("/v1/sites/lab/events", params={"until": before}).json()["items"] == []
+    events = server.client.get("/v1/sites/lab/events", params={"since": before}).json()["items"]
     assert events
     assert all(isinstance(event["stamp_ns"], str) for event in events)
     check_problem(server.client.get("/v1/failures?since=soon"), 422, "since 'soon' is an invalid time")

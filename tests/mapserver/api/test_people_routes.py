@@ -69,10 +69,10 @@ def test_each_address_asks_for_its_right(server: Server, named: dict[str, dict[s
         assert client.post(path, json=body | WHY, headers=named["ada"]).status_code == 200, path
         last = server.store.audit_lines()[-1]
         assert (last.actor, last.operator, last.reason) == ("ada", "ada", "monday"), path
-    assert {row["name"]: row["is_disabled"] for row in client.get("/v1/operators", headers=named["ada"]).json()["operators"]} == {
+    assert {row["name"]: row["is_disabled"] for row in client.get("/v1/operators", headers=named["ada"]).json()["items"]} == {
         "ada": False, "bob": False, "ci": False, "olga": True, "program": False, "vic": False,
     }  # fmt: skip
-    enrolled = client.get("/v1/sites/lab/enrolled", headers=named["ada"]).json()["robots"]
+    enrolled = client.get("/v1/sites/lab/enrolled", headers=named["ada"]).json()["items"]
     assert enrolled == server.store.robots("lab") == []
 
 
@@ -91,7 +91,7 @@ def test_the_first_operator_is_an_admin(server: Server) -> None:
     first = {"name": "bob", "role": "operator"}
     check_problem(client.post("/v1/operators", json=first | act), 409, "begin with an admin")
     check_problem(client.post("/v1/tokens", json={"name": "ci", "scopes": ["operators"]} | act), 409, "an admin before")
-    assert client.get("/v1/operators").json() == {"operators": [], "next": None}
+    assert client.get("/v1/operators").json() == {"items": [], "next": None}
     answer = client.post("/v1/operators", json=first | {"role": "admin"} | act)
     assert (answer.status_code, answer.headers["cache-control"]) == (200, "no-store")
     assert client.get("/v1/operators").status_code == 401, "at once"
@@ -157,7 +157,7 @@ def test_one_of_two_tokens_is_revoked(server: Server, named: dict[str, dict[str,
     client, (first, second) = server.client, (token(server, "read", name="ci") for _ in range(2))
 
     def tokens() -> list[str]:
-        rows = client.get("/v1/operators", headers=named["ada"]).json()["operators"]
+        rows = client.get("/v1/operators", headers=named["ada"]).json()["items"]
         return [one["number"] for row in rows if row["name"] == "ci" for one in row["tokens"]]
 
     for number in tokens():
@@ -192,7 +192,7 @@ def test_secrets_are_in_one_answer_alone(
     kept = [path.read_bytes().decode("latin-1") for path in tmp_path.rglob("*") if path.is_file()]
     for secret in secrets:
         assert not [text for text in (*told, *kept, caplog.text, str(server.store.audit_lines())) if secret in text]
-    (shown,) = [row for row in client.get("/v1/operators", headers=ada).json()["operators"] if row["name"] == "olga"]
+    (shown,) = [row for row in client.get("/v1/operators", headers=ada).json()["items"] if row["name"] == "olga"]
     assert (shown["role"], shown["sessions"], [row["scopes"] for row in shown["tokens"]]) == ("operator", 1, [["read"]])
 
 
@@ -201,7 +201,7 @@ def test_a_bundle_names_the_endpoint_of_the_server(server: Server, named: dict[s
     bundle = enrolment.decode_bundle(answer.content)
     assert bundle.endpoint == "tls/127.0.0.1:7447"
     RobotRegister(server.store).renew("lab", "r2", enrolment.renewal_request(bundle.own.encode(), enrolment.new_key()))
-    (row,) = server.client.get("/v1/sites/lab/enrolled", headers=named["ada"]).json()["robots"]
+    (row,) = server.client.get("/v1/sites/lab/enrolled", headers=named["ada"]).json()["items"]
     assert (row["robot"], row["is_used"], row["state"]) == ("r2", True, "certificate for 365 days")
     again = server.client.post("/v1/sites/lab/enrolled", json={"robot": "r2"}, headers=named["ada"])
     check_problem(again, 409, "robots revoke r2")
@@ -224,7 +224,7 @@ def test_without_operators_other_machines_manage_nobody(server: Server) -> None:
     headers = {"X-Forwarded-For": "10.0.0.9"}
     proxied = server.client.post("/v1/operators", json=ACTS[0][1] | {"actor": "eve"}, headers=headers)
     check_problem(proxied, 403, "only the server's own machine")
-    assert server.client.get("/v1/operators").json()["operators"] == []
+    assert server.client.get("/v1/operators").json()["items"] == []
 
 
 def test_under_a_prefix_the_same_rights_are_needed(server: Server, named: dict[str, dict[str, str]]) -> None:

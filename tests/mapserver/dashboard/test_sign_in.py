@@ -182,7 +182,7 @@ def injected(context: BrowserContext, served: Served) -> bool:
     assert page.evaluate("window.injected") is None, "pages escape them"
     page.evaluate(
         """async () => {
-        const words = (await (await fetch('/v1/failures')).json()).failures.map(failure => failure.cause).join();
+        const words = (await (await fetch('/v1/failures')).json()).items.map(failure => failure.cause).join();
         const box = document.createElement('div'); box.innerHTML = words; document.body.append(box);
         const script = document.createElement('script'); script.textContent = 'window.written = 1'; document.body.append(script);
         }"""

@@ -78,12 +78,12 @@ def test_a_report_that_cannot_be_read_hides_no_other_and_a_command_removes_it(se
     with server.store._database.write() as change:
         change.execute("UPDATE failures SET report = substr(report, 1, 40) WHERE number = 1")
     check_pages(server)
-    listed = server.client.get("/v1/failures").json()["failures"]
+    listed = server.client.get("/v1/failures").json()["items"]
     assert [(row["number"], row["x_map_m"]) for row in listed] == [(2, 0.0), (1, 0.0)]
     store, out = str(server.folder), server.folder.parent
     for command in (["export", str(out / "a.jsonl")], ["report", str(out / "a.html"), "--site", "lab"]):
         assert CliRunner().invoke(app, ["fleet", *command, "--store", store]).exit_code == 0
     assert "mapserver fleet remove 1" in server.client.get("/dashboard/failures/1").text
     assert CliRunner().invoke(app, ["fleet", "remove", "1", "--store", store]).exit_code == 0
-    assert [row["number"] for row in server.client.get("/v1/failures").json()["failures"]] == [2]
+    assert [row["number"] for row in server.client.get("/v1/failures").json()["items"]] == [2]
     assert server.client.get("/dashboard/failures/1").status_code == 404

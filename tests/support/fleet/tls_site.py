@@ -126,7 +126,7 @@ class TlsSite:
         """The server's entry of a robot; empty if unknown or without a reply."""
         try:
             answer = httpx.get(f"{self.http}/v1/robots", params={"site": self.name}, timeout=10, verify=False)
-            told = answer.json()["robots"]
+            told = answer.json()["items"]
         except httpx.HTTPError:
             return {}
         return next((one for one in told if one["robot"] == name), {})

@@ -67,7 +67,7 @@ def test_thirty_robots_report_to_a_restored_server(tmp_path: Path) -> None:
             assert ada.post("/sign-in", data={"name": "ada", "password": password}).headers["location"] == "/"
 
             def heard() -> list[str]:
-                rows = ada.get("/v1/robots").json()["robots"]
+                rows = ada.get("/v1/robots").json()["items"]
                 failed = {row.robot for row in store.fleet.failures(FailureFilter(site=SITE))}
                 return sorted(row["robot"] for row in rows if row["last_health"] and row["robot"] in failed)
 
