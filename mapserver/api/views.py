@@ -1,7 +1,7 @@
 """Response and request bodies of the API."""
 
 import time
-from typing import TYPE_CHECKING, Annotated, Any, Generic, Self, TypeVar
+from typing import Annotated, Any, Generic, Self, TypeVar
 
 from fastapi import Response
 from pydantic import BaseModel, ConfigDict, Field, JsonValue
@@ -20,9 +20,6 @@ from mapserver.store import (
     VerdictRow,
     VersionInfo,
 )
-
-if TYPE_CHECKING:
-    from mapserver.api.parameters import Served
 
 T = TypeVar("T")
 
@@ -48,7 +45,7 @@ class VersionView(BaseModel):
     trusted_calibrations: list[TrustedCalibration] = []
 
     @classmethod
-    def of(cls, service: "Served", info: VersionInfo) -> Self:
+    def of(cls, service: Any, info: VersionInfo) -> Self:
         trusted = service.store.trusted(info)
         return cls.model_validate(info).model_copy(update={"trusted_calibrations": trusted})
 
@@ -102,7 +99,7 @@ class CanaryView(BaseModel):
     robots: list[str]
 
     @classmethod
-    def of(cls, service: "Served", row: CanaryRow) -> Self:
+    def of(cls, service: Any, row: CanaryRow) -> Self:
         robots = (robot.robot for robot in service.store.robots(row.site))
         members = [name for name in robots if number_of(row.site, row.version, name) < row.threshold]
         finding = find(service.store, row, service.settings.config.canary, time.time_ns())
@@ -131,7 +128,7 @@ class Bundle(Response):
     """The bundle of a robot as a file, a secret until it is used."""
 
     @classmethod
-    def of(cls, _: "Served", bundles: dict[str, bytes]) -> Self:
+    def of(cls, _: Any, bundles: dict[str, bytes]) -> Self:
         ((robot, data),) = bundles.items()
         headers = {"Content-Disposition": f'attachment; filename="{robot}.fleetmap"', "Cache-Control": "no-store"}
         return cls(data, headers=headers, media_type="application/octet-stream")

@@ -14,7 +14,6 @@ from fleetmap.errors import ForbiddenError
 from mapserver.operators.roles import Identity, Scope
 
 if TYPE_CHECKING:
-    from mapserver.api.parameters import Served
     from mapserver.config import MapserverConfig
     from mapserver.operators.operators import Operators
     from mapserver.store import Actor, MapStore
@@ -28,12 +27,12 @@ class Done(NamedTuple):
 
 
 class Caller(NamedTuple):
-    """Who asks, of an open store. served: the server, None for a command; who: None for a command, and while nobody signs in."""
+    """Who asks, of an open store. served: `Served` of the server, None for a command; who: None for one, and while nobody signs in."""
 
     store: "MapStore"
     actor: "Actor"
     config: "MapserverConfig"
-    served: "Served | None" = None
+    served: Any = None
     who: Identity | None = None
 
     @property
@@ -45,7 +44,8 @@ class Caller(NamedTuple):
     def operators(self) -> "Operators":
         from mapserver.operators.operators import Operators
 
-        return Operators(self.store) if self.served is None else self.served.operators
+        found: Operators = Operators(self.store) if self.served is None else self.served.operators
+        return found
 
     def check_has(self, scopes: Iterable[str]) -> None:
         """Raise ForbiddenError for rights that the caller lacks; whoever has the store's folder has all."""
