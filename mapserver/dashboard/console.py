@@ -158,8 +158,8 @@ class Console:
         """Adds a page. fill: what its template needs beside `context`, of the services, it and the parts of `path` in braces; may block.
 
         A FleetmapError becomes a notice within the frame. link: title and icon by which all pages link to it; under: the page that
-        leads to it. knows: query parameters beside the site. under_way: sites that the page knows though the store has no version of
-        them. of_site: False for a page that shows the same whatever site its address names.
+        leads to it. knows: query parameters beside those of the frame. under_way: sites that the page knows though the store has no
+        version of them. of_site: False for a page that shows the same whatever site its address names.
         """
         if link is not None:
             self.links[path] = link
@@ -214,8 +214,9 @@ class Console:
                 site = site if site in sites else next(iter(sites), "")
             elif site not in growing:
                 site = await load(self.services.maps.chosen_site, site)
-            if unknown := [name for name in request.query_params if name not in {"site", *page.knows}]:
-                names = ", ".join(("site", *page.knows))
+            known = ("site", "find", *page.knows)
+            if unknown := [name for name in request.query_params if name not in known]:
+                names = ", ".join(known)
                 raise UsageError(f"unknown parameter {unknown[0][:40]!r}; this page knows {names}")
             zone = zone_of(request.cookies.get(_ZONE_COOKIE))
             context = PageContext(root, site, zone, request.query_params)
@@ -234,6 +235,7 @@ class Console:
             "sites": sites,
             "elsewhere": listed if request.path_params or page.under not in self.links else None,
             "site": site,
+            "find": request.query_params.get("find", ""),
             "look": look if look in _THEMES else "",
             "theme": _THEMES.get(look, "print"),
             "person": who,

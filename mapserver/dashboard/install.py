@@ -86,10 +86,10 @@ def _link(title: str) -> tuple[str, str]:
 def _install_pages(console: Console) -> None:
     """What a page is asked with beside its site, and what it follows."""
     span = ("since", "until")
-    console.page("", "overview.html", overview.page, link=_link("Overview"), knows=("find",))
+    console.page("", "overview.html", overview.page, link=_link("Overview"))
     console.stream("now", overview.now)
     console.page("trends", "trends.html", overview.trends, link=_link("Trends"), knows=span)
-    console.page("robots", "robots.html", robots.page, link=_link("Robots"), knows=("find", "state", "without"))
+    console.page("robots", "robots.html", robots.page, link=_link("Robots"), knows=("state", "without"))
     console.page("robots/{robot}", "robot.html", robot.page, knows=span)
     console.stream("robots/{robot}/now", robot.now)
     console.page("map", "map.html", map_page.page, link=_link("Map"), knows=("version", "before", "after", *span))

@@ -29,8 +29,7 @@ _MANY = 20  # robots, whose places say better than the map's tiles what to show 
 
 def page(services: Services, context: PageContext) -> dict[str, object]:
     """What the template needs."""
-    data = {"scene": _scene(services, context), "now": now(services, context)}
-    return {"data": data, "find": context.query.get("find", "")}
+    return {"data": {"scene": _scene(services, context), "now": now(services, context)}}
 
 
 def _scene(services: Services, context: PageContext) -> dict[str, object] | None:
@@ -205,4 +204,16 @@ def trends(services: Services, context: PageContext) -> dict[str, object]:
         "cameras": cameras,
         "parameters": {name: words for name, words in PARAMETERS.items() if any(name in told for _, told in cameras)},
         "concerns": health.resurvey,
+        "outlines": _outlines(services, context.site),
     }
+
+
+def _outlines(services: Services, site: str) -> dict[str, list[tuple[float, float]]]:
+    """Corners of each tile of the current version by its name, within it: on its edge a request would take its neighbours, too."""
+    version = services.maps.current_version(site)
+    if version is None:
+        return {}
+    manifest = services.maps.store.manifest(site, version)
+    corners = ((0.1, 0.1), (0.9, 0.1), (0.9, 0.9), (0.1, 0.9))
+    size_m = manifest.tile_size_m
+    return {f"{t.x},{t.y}": [((t.x + i) * size_m, (t.y + j) * size_m) for i, j in corners] for t in manifest.tiles}

@@ -1,4 +1,4 @@
-"""The page of all robots: which need somebody, and what is different about them? Filters and columns are kept in the address."""
+"""The page of all robots: which need somebody, and what is different about them? State and columns are kept in the address."""
 
 from collections import Counter
 from typing import NamedTuple
@@ -51,19 +51,16 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
             raise UsageError(f"there is no column {name[:40]!r}; without names some of {', '.join(_COLUMNS)}")
     rows = [_row(context, robot, health, areas) for robot in live.robots]
     rows.sort(key=lambda row: (ORDER.get(row.tone, 1), not row.cells["remarks"]))
-    found = [row for row in rows if find.lower() in " ".join([row.name, *row.cells.values()]).lower()]
-    counts = Counter(row.cells["state"] for row in found)
+    counts = Counter(row.cells["state"] for row in rows)
     if state:
         counts[state] += 0
 
     def to(**changed: str) -> str:
         return context.to("robots", **{"find": find, "state": state, "without": ",".join(without)} | changed)
 
-    shown = [row for row in found if state in ("", row.cells["state"])]
+    shown = [row for row in rows if state in ("", row.cells["state"])]
     return {
         "line": site_line(live),
-        "find": find,
-        "counted": f"{len(shown)} of {len(rows)} robots",
         "states": [
             _Choice(f"{words} ({count})", words == state, to(state="" if words == state else words))
             for words, count in counts.items()

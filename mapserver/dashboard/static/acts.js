@@ -2,6 +2,7 @@
 // data-act: the address; data-body: more of the request's body, which a page may set; data-explains: what would change.
 // A template, behind the button or of the id data-fields, has fields for more of the body, filled from the button's data.
 // data-tells: the answer is shown in the dialog, where the page shows nothing of it; its words explain a secret or a file.
+// data-each: a request for each row that is chosen in the table of the page; "*" in address and body is the row's.
 // data-needs-reason: without a reason nothing is sent. data-lacks: set by a page while something is missing; the dialog then says that instead.
 // Events: `asked` as the dialog opens, where a page may set `send` of the button to make another request; `acted` once it is done.
 const dialog = document.createElement("dialog");
@@ -18,13 +19,16 @@ const form = dialog.querySelector("form");
 const [title, explanation, notice, asks, fields, output] = ["h2", "p", ".notice", "fieldset", "fieldset > div", "output"].map((found) => form.querySelector(found));
 const [confirm, refuse] = form.querySelectorAll("button");
 const isNamed = document.body.dataset.named === "true";
-let asked;
+let asked, rows;
 
 const say = (words, tone) => ((notice.textContent = words), (notice.hidden = !words), (notice.className = `notice ${tone}`));
 
-function post({ dataset }, told) {
-  const body = JSON.stringify({ ...JSON.parse(dataset.body || "{}"), ...told });
-  return fetch(dataset.act, { method: "POST", headers: { "Content-Type": "application/json" }, body });
+const chosenRows = () => [...document.querySelectorAll("tr:not([hidden]) [name=chosen]:checked")];
+
+function post({ dataset }, told, row) {
+  const given = (dataset.body || "{}").replace('"*"', row?.dataset.body ?? JSON.stringify(row?.value));
+  const body = JSON.stringify({ ...JSON.parse(given), ...told });
+  return fetch(dataset.act.replace("*", row?.value), { method: "POST", headers: { "Content-Type": "application/json" }, body });
 }
 
 document.addEventListener("click", ({ target }) => {
@@ -32,8 +36,11 @@ document.addEventListener("click", ({ target }) => {
   if (!button) return;
   asked = button;
   const words = button.textContent.trim();
-  const { lacks, needsReason } = button.dataset;
-  [title.textContent, explanation.textContent] = [`${words}?`, lacks || button.dataset.explains];
+  const { each, needsReason } = button.dataset;
+  rows = each === undefined ? [undefined] : chosenRows();
+  const lacks = rows.length ? button.dataset.lacks : "Choose rows of the table first.";
+  const names = each === undefined ? "" : `${rows.map(({ value }) => value).join(", ")}: `;
+  [title.textContent, explanation.textContent] = [`${words}?`, lacks || `${names}${button.dataset.explains}`];
   confirm.textContent = `Yes: ${words}`;
   refuse.textContent = "No, change nothing";
   confirm.hidden = confirm.disabled = Boolean(lacks);
@@ -41,6 +48,7 @@ document.addEventListener("click", ({ target }) => {
   fields.replaceChildren((!lacks && more?.content?.cloneNode(true)) || "");
   for (const field of fields.querySelectorAll("[name]")) field.value = button.dataset[field.name] ?? field.value;
   [asks.hidden, output.hidden] = [false, true];
+  output.replaceChildren();
   form.reason.value = "";
   form.reason.required = needsReason !== undefined;
   form.actor.parentElement.hidden = form.actor.disabled = isNamed;
@@ -56,14 +64,21 @@ form.addEventListener("submit", async (event) => {
   const act = asked;
   const told = { ...given(), ...(isNamed ? {} : { actor: form.actor.value }), reason: form.reason.value };
   confirm.disabled = refuse.disabled = true;
-  const answer = await (act.send ?? post)(act, told).catch(() => undefined);
+  let answer;
+  for (const row of rows) {
+    answer = await (act.send ?? post)(act, told, row).catch(() => undefined);
+    if (!answer?.ok) break;
+    if (row) row.checked = false; // not again, where a later one is refused
+    if (act.dataset.tells !== undefined) await tell(act, answer);
+  }
   confirm.disabled = refuse.disabled = false;
   if (answer?.ok) {
     act.dispatchEvent(new Event("acted", { bubbles: true }));
-    return act.dataset.tells === undefined ? location.reload() : tell(act, answer);
+    return act.dataset.tells === undefined && location.reload();
   }
   const found = await answer?.json().catch(() => undefined);
   if (asked !== act) return; // a browser may close the dialog all the same
+  rows = rows.filter((row) => !row || row.checked);
   say(found?.detail ?? "The server does not answer; try again.", "bad");
 });
 
@@ -82,7 +97,7 @@ async function tell(act, answer) {
   say(detail ?? "", "good");
   [confirm.hidden, asks.hidden, output.hidden, refuse.textContent] = [true, true, !name, "Close"];
   if (name) [title.textContent, explanation.textContent] = [`${act.textContent.trim()}: ${name}`, act.dataset.tells];
-  output.textContent = secret ?? "";
+  output.append(secret ?? "");
   if (file) {
     const link = Object.assign(document.createElement("a"), { href: URL.createObjectURL(await answer.blob()), download: file, textContent: file });
     output.append(link);

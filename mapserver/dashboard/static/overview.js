@@ -1,6 +1,7 @@
 // The Overview: the map, and beside it the robots; the server's stream keeps both up to date.
 import { SiteMap } from "./map/index.js";
 import { follow } from "./stream.js";
+import { arrange } from "./table.js";
 
 const NEAR_ZOOM = 5;
 const { scene, now } = JSON.parse(document.getElementById("data").textContent);
@@ -9,7 +10,6 @@ const map = scene && new SiteMap(element, scene, { fillsPage: true });
 if (!map) element.replaceWith(made("p", "notice", "No map is published yet: robots cannot be shown on it."));
 const line = document.getElementById("line");
 const list = document.getElementById("robots");
-const search = document.getElementById("search");
 const rows = new Map();
 const shownNow = new Map();
 let state = now;
@@ -80,9 +80,7 @@ function update() {
   say(state.line);
   show("figures", state.figures, keyFigure);
   show("notices", state.notices, notice);
-  const wanted = search.value.toLowerCase();
-  const shown = state.robots.filter((robot) => `${robot.name} ${robot.state} ${robot.about}`.toLowerCase().includes(wanted));
-  const items = shown.map((robot) => {
+  const items = state.robots.map((robot) => {
     if (!rows.has(robot.name)) rows.set(robot.name, row(robot));
     refresh(rows.get(robot.name), robot);
     return rows.get(robot.name);
@@ -90,11 +88,11 @@ function update() {
   // What stands in its place already stays: a click or a focus is not lost to a report.
   items.forEach((item, n) => list.children[n] !== item && list.insertBefore(item, list.children[n] ?? null));
   while (list.children.length > items.length) list.lastChild.remove();
+  arrange(document);
   map?.show("Robots", state.marks);
 }
 
 update();
-search.addEventListener("input", update);
 follow(
   "now",
   (told) => {

@@ -1,6 +1,7 @@
 // Shows what is marked `data-renew` anew every 5 or so many seconds, as it would be loaded,
 // unless somebody writes into it; and what lies on maps.
 import { isSignedOut, loaded } from "./stream.js";
+import { arrange } from "./table.js";
 
 const EVERY_MS = 1000 * (document.querySelector("[data-renew]")?.dataset.renew || 5);
 
@@ -53,9 +54,10 @@ export async function renew() {
   if (!answer?.ok) return;
   tag = answer.headers.get("ETag");
   const fresh = new DOMParser().parseFromString(await answer.text(), "text/html");
+  arrange(fresh);
   for (const part of document.querySelectorAll("[data-renew]")) {
     const other = fresh.getElementById(part.id);
-    const writes = part.contains(document.activeElement) && document.activeElement.matches("input, select, textarea");
+    const writes = part.contains(document.activeElement) && document.activeElement.matches("input:not([type=checkbox]), select, textarea");
     if (writes) tag = undefined; // what is not shown yet is asked for again
     else if (other) morph(part, other);
   }

@@ -13,11 +13,12 @@ from typer.testing import CliRunner
 
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.encoding import to_json
-from fleetmap.messages import InitialPoseMessage, decode_message, robot_key
+from fleetmap.messages import InitialPoseMessage, RobotHealth, decode_message, robot_key
 from locclient.identity import RobotIdentity
 from mapserver import releases
 from mapserver.cli import app
 from mapserver.fleet.building import ask_for_survey, end_request, replace_areas
+from mapserver.fleet.fleet import Fleet
 from mapserver.store import Actor, DraftContent, MapStore
 from mapserver.trust import init_here
 from mapserver.trust.enrolment import RobotRegister
@@ -76,7 +77,17 @@ def test_a_survey_is_asked_for_by_drawing_it_and_ended(page: Page, served: Serve
     expect(asked).to_contain_text(re.compile("asked by ada at .*robots lose themselves in aisle 3"))
     expect(page.locator(".site-map path.area")).to_have_count(1)
     opened(page, served, "trends")
-    expect(page.get_by_role("table", name="Tiles to survey again")).to_contain_text("ada asked for it", timeout=15_000)
+    again = page.get_by_role("table", name="Tiles to survey again")
+    expect(again).to_contain_text("ada asked for it", timeout=15_000)
+    tiles = again.get_by_label(re.compile(r"^Choose \d")).count()
+    page.get_by_label("Choose all").check()
+    change(page, "Request a survey of the chosen tiles")
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    with MapStore.open(served.folder) as store:
+        _, *more = store.survey_requests(SITE)
+        assert len(more) == tiles > 0
+        for request in more:
+            end_request(store, SITE, request.id, Actor("ada"))
     opened(page, served, "map")
     change(page, page.get_by_role("button", name=re.compile("^Survey .* is done")).inner_text())
     expect(asked).to_have_count(0)
@@ -330,6 +341,9 @@ def test_operators_tokens_and_robots_begin_and_end(page: Page, tmp_path: Path) -
     with MapStore.open(tmp_path) as store:
         init_here(store)
         RobotRegister(store).authorities.init(["127.0.0.1"], None, None)
+        fleet = Fleet(store)
+        fleet.take_health(SITE, "tug-8", RobotHealth(site=SITE, robot="tug-8", stamp_ns=1, version=2, status="TRACKING"))
+        fleet.flush()
 
     def ask(words: str, name: str | None = None, **fields: str) -> None:
         page.get_by_role("button", name=words, exact=True).click()
@@ -359,7 +373,7 @@ def test_operators_tokens_and_robots_begin_and_end(page: Page, tmp_path: Path) -
         page.get_by_label("Password").fill(password)
         page.get_by_role("button", name="Sign in").click()
         people = page.get_by_role("list", name="Operators and programs")
-        robots = page.get_by_role("list", name="Robots, problems first")
+        robots = page.get_by_role("table", name="Robots, problems first").locator("tbody")
         expect(people.locator("li", has_text="bob")).to_contain_text("signed in")
 
         ask("Disable bob")
@@ -382,9 +396,13 @@ def test_operators_tokens_and_robots_begin_and_end(page: Page, tmp_path: Path) -
             expect(grafanas).to_contain_text("disabled program")
             assert grafana.get("/metrics").status_code == 401
 
-        tug = robots.locator("li", has_text="tug-7")
+        tug = robots.locator("tr", has_text="tug-7")
         expect(tug).to_contain_text("not enrolled")
-        ask("Enrol tug-7")
+        ask("Enrol the chosen")
+        expect(dialog).to_contain_text("Choose rows of the table first.")
+        dialog.get_by_role("button", name="No, change nothing").click()
+        page.get_by_label("Choose tug-7").check()
+        ask("Enrol the chosen")
         with page.expect_download() as download:
             assert told() == "tug-7.fleetmap"
         bundle = Path(download.value.path()).read_bytes()
@@ -393,17 +411,20 @@ def test_operators_tokens_and_robots_begin_and_end(page: Page, tmp_path: Path) -
         identity = RobotIdentity.enrol(tmp_path / "robot", bundle)
         assert (identity.who.site, identity.who.robot) == (SITE, "tug-7")
         expect(tug).to_contain_text("certificate for 365 days")
-        ask("Revoke tug-7")
-        dialog.get_by_role("button", name="Yes: Revoke tug-7").click()
+        page.get_by_label("Choose tug-7").check()
+        ask("Revoke the chosen")
+        expect(dialog).to_contain_text("tug-7: Within two seconds")
+        dialog.get_by_role("button", name="Yes: Revoke the chosen").click()
         expect(tug).to_contain_text("not enrolled")
-        ask("Remove tug-7")
-        dialog.get_by_role("button", name="Yes: Remove tug-7").click()
-        expect(tug).to_have_count(0)
+        page.get_by_label("Choose all").check()
+        ask("Remove the chosen")
+        dialog.get_by_role("button", name="Yes: Remove the chosen").click()
+        expect(robots).to_contain_text("No robot was ever heard here")
         assert seen.faults == []
 
         with MapStore.open(tmp_path) as store:
             kinds = [line.kind for line in store.audit_lines() if line.actor == "bob" and line.reason == "a new shift"]
-            assert kinds == ["token made", "operator disabled", "robot enrolled", "robot revoked", "robot removed"]
+            assert kinds == ["token made", "operator disabled", "robot enrolled", "robot revoked", "robot removed", "robot removed"]
             store.operators.set_role("bob", "viewer", Actor("root"))
         opened(page, served, "administration/people", site=SITE)
         expect(page.get_by_role("alert")).to_have_text("bob (viewer) may not open this page; an admin may.")
