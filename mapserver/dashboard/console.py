@@ -36,6 +36,10 @@ T = TypeVar("T")
 
 PATH = "/dashboard"
 _LOOK_COOKIE, _ZONE_COOKIE = "fleetmap_look", "fleetmap_zone"
+RANGE = ("since", "until")
+"""The parameters by which every address keeps a range of time."""
+
+_ONE_OF_RANGE = ("older", "job")  # chosen in a range, and perhaps not in another one
 _WEEK_NS = 7 * 24 * HOUR_NS
 _EVERY_S = 1.0
 _THEMES = {"dark": "body--dark", "light": ""}  # else as the system has it
@@ -79,25 +83,45 @@ class PageContext:
         """`since` and `until` of the address; UsageError for what is no time."""
         return read_range(self.query.get("since"), self.query.get("until"), self.zone)
 
-    def range_fields(self) -> list[tuple[str, str, str]]:
-        """Label, name and value of the fields to choose that range by."""
-        since, until = ("" if ns is None else self.written(ns)[:16] for ns in self.time_range())
-        return [("From", "since", since), ("Until", "until", until)]
+    def range_fields(self) -> dict[str, str]:
+        """Values of the fields to choose that range by."""
+        both = zip(RANGE, self.time_range(), strict=True)
+        return {name: "" if ns is None else self.written(ns)[:16] for name, ns in both}
 
-    def range_presets(self) -> list[tuple[str, str]]:
-        """Ranges of one click: their words and `since`."""
+    def range_words(self, usual: str) -> str:
+        """That range in words; usual: those without one."""
+        since, until = (value.replace("T", " ") for value in self.range_fields().values())
+        if since and until:
+            return f"{since} to {until[11:] if since[:10] == until[:10] else until}"
+        return f"since {since}" if since else f"until {until}" if until else usual
+
+    def range_presets(self, usual: str) -> list[tuple[str, str]]:
+        """Ranges of one click: their words and addresses. usual: words of none."""
         now_ns = time.time_ns()
-        hour, today, week = self.written(now_ns - HOUR_NS), self.written(now_ns)[:10], self.written(now_ns - _WEEK_NS)
+        day, today = self.written(now_ns - 24 * HOUR_NS), self.written(now_ns)[:10]
+        hour, week = self.written(now_ns - HOUR_NS), self.written(now_ns - _WEEK_NS)
         monday = self.written(now_ns - 24 * HOUR_NS * date.fromisoformat(today).weekday())[:10]
-        return [("Last hour", hour), ("Today", today), ("Since Monday", monday), ("Last 7 days", week)]
+        found = {"Last hour": hour, "Today": today, "Last 24 h": day, "Since Monday": monday, "Last 7 days": week}
+        kept = self.kept_in_range()
+        return [(words, address("", **kept, since=since)) for words, since in (found | {usual: None}).items()]
+
+    def kept_in_range(self) -> dict[str, str]:
+        """The parameters of the address that stay when another range is chosen."""
+        kept = {name: value for name, value in self.query.items() if name not in (*RANGE, *_ONE_OF_RANGE)}
+        return {"site": self.site} | kept
 
     def written(self, stamp_ns: int) -> str:
         """A stamp as `since` and `until` of an address take it."""
         return written(stamp_ns, self.zone)
 
     def to(self, path: str, **query: object) -> str:
-        """The address of a page of the same site."""
-        return address(f"{self.root}/{path}", site=self.site, **query)
+        """The address of a page of the same site, in the same time unless `query` has another."""
+        return address(f"{self.root}/{path}", **{"site": self.site} | self.range_kept | query)
+
+    @property
+    def range_kept(self) -> dict[str, str | None]:
+        """Both ends of the range as the address has them."""
+        return {name: self.query.get(name) for name in RANGE}
 
     @property
     def api(self) -> str:
@@ -116,6 +140,7 @@ class _Page(NamedTuple):
     template: str | Template
     fill: Callable[..., dict[str, object]]
     knows: Sequence[str]
+    usual: str = ""
     under_way: Callable[[], list[str]] = list
     of_site: bool = True
 
@@ -152,18 +177,20 @@ class Console:
         link: tuple[str, str] | None = None,
         under: str | None = None,
         knows: Sequence[str] = (),
+        usual: str = "",
         under_way: Callable[[], list[str]] = list,
         of_site: bool = True,
     ) -> None:
         """Adds a page. fill: what its template needs beside `context`, of the services, it and the parts of `path` in braces; may block.
 
         A FleetmapError becomes a notice within the frame. link: title and icon by which all pages link to it; under: the page that
-        leads to it. knows: query parameters beside those of the frame. under_way: sites that the page knows though the store has no
+        leads to it. knows: query parameters beside those of the frame. usual: what is shown of a page over time where
+        its address has no range, in words. under_way: sites that the page knows though the store has no
         version of them. of_site: False for a page that shows the same whatever site its address names.
         """
         if link is not None:
             self.links[path] = link
-        page = _Page(under or path.partition("/")[0], template, fill, knows, under_way, of_site)
+        page = _Page(under or path.partition("/")[0], template, fill, knows, usual, under_way, of_site)
 
         @self.app.get(f"/{path}", include_in_schema=False)
         async def shown(request: Request) -> Response:
@@ -214,7 +241,7 @@ class Console:
                 site = site if site in sites else next(iter(sites), "")
             elif site not in growing:
                 site = await load(self.services.maps.chosen_site, site)
-            known = ("site", "find", *page.knows)
+            known = ("site", "find", *RANGE, *page.knows)
             if unknown := [name for name in request.query_params if name not in known]:
                 names = ", ".join(known)
                 raise UsageError(f"unknown parameter {unknown[0][:40]!r}; this page knows {names}")
@@ -225,12 +252,15 @@ class Console:
             template, found = "problem.html", {"words": str(error)}
             status = 503 if isinstance(error, StoreError) else 404
             site = site if site in sites else None  # links lead somewhere
+        kept = PageContext(root, "", query=request.query_params).range_kept if status == 200 else {}
         listed = f"{root}/{page.under if page.under in self.links else ''}"  # what is of one site is not looked for in another
         look, who = request.cookies.get(_LOOK_COOKIE, ""), getattr(request.state, "operator", None)
         frame = {
             "root": root,
             "api": PageContext(root, "").api,
-            "pages": self.links,
+            "pages": {path: (*link, address(f"{root}/{path}", site=site, **kept)) for path, link in self.links.items()},
+            "kept": {name: value for name, value in kept.items() if value},
+            "usual": page.usual,
             "page": page.under,
             "sites": sites,
             "elsewhere": listed if request.path_params or page.under not in self.links else None,

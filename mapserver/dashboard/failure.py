@@ -23,6 +23,7 @@ from mapserver.store import FailureDetail, FailureFilter, FailureRow, PictureRow
 
 _NEAR_M = 5.0
 _LISTED = 6
+_SILENT_S = 2.0  # what was between is not known
 _JUMP_M, _JUMP_MPS = 0.3, 3.0  # beyond both an estimate was corrected: no robot drives so
 _FARTHEST_M = 1e5
 
@@ -170,6 +171,8 @@ def believed_path(moments: Sequence[Moment], clock: FailureClock) -> list[Line]:
         if there is None or here is None:
             continue
         step_m, step_s = hypot(here[0] - there[0], here[1] - there[1]), (each.stamp_ns - last.stamp_ns) * 1e-9
+        if step_s > _SILENT_S:
+            continue
         if step_m > max(_JUMP_M, _JUMP_MPS * step_s):
             words = f"its position was corrected by {step_m:.1f} m at {clock.at(each.stamp_ns)}"
             found.append(Line([there, here], "quiet", words, 1.2))

@@ -65,7 +65,7 @@ ADVICE: dict[str, str] = {
 
 def page(services: Services, context: PageContext) -> dict[str, object]:
     """What the template needs."""
-    kept = {name: value for name, value in context.query.items() if name not in {"site", "before"}}
+    kept = {name: value for name, value in context.query.items() if name not in {"site", "older"}}
     if kept.get("sort") not in (None, "happened"):
         raise UsageError(
             f"sort={kept['sort'][:40]!r} is unknown; write sort=happened, or leave it out for the last to arrive first"
@@ -77,7 +77,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     since_ns, until_ns = context.time_range()
     in_time = FailureFilter(site=context.site, since_ns=since_ns, until_ns=until_ns)
     wanted = replace(in_time, **{**chosen, "version": version})  # type: ignore[arg-type]  # the others are texts
-    before, kept_failures = number(context.query.get("before"), "failure"), services.maps.store.fleet
+    before, kept_failures = number(context.query.get("older"), "failure"), services.maps.store.fleet
     rows = kept_failures.failures(in_time, limit=MANY_FAILURES)
     matching = [row for row in rows if _fits(row, chosen)]
     if kept.get("sort") == "happened":
@@ -97,7 +97,6 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
             for value, words in ((None, "arrived"), ("happened", "happened"))
             for is_chosen in [kept.get("sort") == value]
         ],
-        "chosen": chosen,
         "facets": facets,
         "shades": shades,
         "advice": ADVICE,
@@ -105,7 +104,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         "scene": _scene(services, context, shown, matching, version),
         "rows": shown,
         "pictures": kept_failures.first_pictures(row.number for row in shown),
-        "older": context.to("failures", **kept, before=shown[-1].number) if len(found) > len(shown) else None,
+        "older": context.to("failures", **kept, older=shown[-1].number) if len(found) > len(shown) else None,
     }
 
 
@@ -182,7 +181,7 @@ def _chart(
         words = f"{context.moment(start_ns)}, {_STEPS_NS[step_ns]}: {told or 'none'}"
         bars.append({"words": words, "parts": parts, "to": context.to("failures", **{**chosen, **span})})
     ends = [context.written(ns)[:16].replace("T", " ") for ns in (edges[0], end_ns)]
-    return {"bars": bars, "most": most, "step": _STEPS_NS[step_ns], "ends": ends}
+    return {"bars": bars, "most": most, "step": _STEPS_NS[step_ns], "ends": ends, "span": (edges[0], edges[-1])}
 
 
 def _scene(

@@ -85,18 +85,18 @@ def _link(title: str) -> tuple[str, str]:
 
 def _install_pages(console: Console) -> None:
     """What a page is asked with beside its site, and what it follows."""
-    span = ("since", "until")
     console.page("", "overview.html", overview.page, link=_link("Overview"))
     console.stream("now", overview.now)
-    console.page("trends", "trends.html", overview.trends, link=_link("Trends"), knows=span)
+    console.page("trends", "trends.html", overview.trends, link=_link("Trends"), usual="Last 24 h")
     console.page("robots", "robots.html", robots.page, link=_link("Robots"), knows=("state", "without"))
-    console.page("robots/{robot}", "robot.html", robot.page, knows=span)
+    console.page("robots/{robot}", "robot.html", robot.page, usual="Last drive")
     console.stream("robots/{robot}/now", robot.now)
-    console.page("map", "map.html", map_page.page, link=_link("Map"), knows=("version", "before", "after", *span))
-    asked = (*failures.AXES, *span, "before", "sort")
-    console.page("failures", "failures.html", failures.page, link=_link("Failures"), knows=asked)
+    compared = ("version", "before", "after")
+    console.page("map", "map.html", map_page.page, link=_link("Map"), knows=compared, usual="Last 14 days")
+    filters = (*failures.AXES, "older", "sort")
+    console.page("failures", "failures.html", failures.page, link=_link("Failures"), knows=filters, usual="All")
     console.page("failures/{failure}", "failure.html", failure.page, of_site=False)
-    console.page("surveys", "surveys.html", survey_jobs.page, link=_link("Surveys"), knows=("job", *span))
+    console.page("surveys", "surveys.html", survey_jobs.page, link=_link("Surveys"), knows=("job",), usual="All jobs")
 
 
 def _install_files(pages: FastAPI, services: Services) -> None:

@@ -114,7 +114,6 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         "areas": sorted(maps.store.areas(site).areas, key=lambda area: area.name),
         "requests": requests,
         "courses": courses((e.stamp_ns, e.kind, e.detail) for e in lately),
-        "kept": {"version": asked},
         "events": events if span_ns == EVER else maps.store.events(site, span_ns)[::-1][:_EVENTS_SHOWN],
         "no_events": "No events yet." if span_ns == EVER else "Nothing happened in this time.",
     }

@@ -199,7 +199,7 @@ def trends(services: Services, context: PageContext) -> dict[str, object]:
         "is_chosen": span_ns != EVER,
         "has_areas": health.has_areas,
         "outside": OUTSIDE,
-        "kept": {"since": context.written(span_ns[0] or health.week_since_ns), "until": context.query.get("until")},
+        "since": context.written(span_ns[0] or health.week_since_ns),
         "days": Bars("Failures per robot-day", bars),
         "cameras": cameras,
         "parameters": {name: words for name, words in PARAMETERS.items() if any(name in told for _, told in cameras)},

@@ -9,6 +9,7 @@ from typing import NamedTuple
 
 from fleetmap.errors import UsageError
 from mapserver.dashboard.console import PageContext, Services, scene_of
+from mapserver.dashboard.data import EVER
 from mapserver.dashboard.failures import failure_marks, tone_of
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN
 from mapserver.dashboard.live import ORDER, SILENT, LiveRobot, words_of
@@ -35,6 +36,7 @@ GAP_NS = 45_000_000_000
 
 _COLUMNS = 300  # of a curve
 _STEP_M = 0.5
+_PAUSE_NS, _AROUND_NS = 600_000_000_000, 60_000_000_000
 Range = tuple[int, int]
 """From when until before when, nanoseconds since 1970."""
 
@@ -116,6 +118,22 @@ def way(rows: Sequence[TraceRow], parts: Sequence[Stretch], every_s: float = 10.
     return sorted((line for line in found if len(line.points) > 1), key=lambda line: -ORDER[line.tone])
 
 
+def last_drive(rows: Sequence[TraceRow]) -> Range | None:
+    """The last time in which it moved without a pause of ten minutes, and a minute around it; None where it never moved."""
+    begin_ns = end_ns = None
+    before: tuple[float, float] | None = None
+    for row in rows:
+        if row.x_map_m is None or row.y_map_m is None:
+            continue
+        here = (row.x_map_m, row.y_map_m)
+        if before is None or dist(before, here) >= _STEP_M:
+            if before is not None:
+                begin_ns = row.heard_ns if end_ns is None or row.heard_ns - end_ns > _PAUSE_NS else begin_ns
+                end_ns = row.heard_ns
+            before = here
+    return None if begin_ns is None or end_ns is None else (begin_ns - _AROUND_NS, end_ns + _AROUND_NS)
+
+
 def curve(rows: Sequence[TraceRow], name: str, shown: Range) -> tuple[float, float, str] | None:
     """How a figure of the traces went, in means of equal parts of a range: lowest, highest, and the path of an SVG 1000 wide and 100 high.
 
@@ -142,21 +160,27 @@ def page(services: Services, context: PageContext, robot: str) -> dict[str, obje
     live = services.robots.look(context.site).robot(robot)
     if live is None:
         raise UsageError(f"site {context.site} never heard of a robot {robot[:40]!r}; the page Robots lists them")
-    (since_ns, end_ns), now_ns = context.time_range(), time.time_ns()
+    (since_ns, end_ns), now_ns, ingest = context.time_range(), time.time_ns(), services.settings.config.ingest
     until_ns = min(now_ns, end_ns or now_ns)
+    kept_ns = until_ns - max(_USUAL_NS, round(ingest.trace_days * _USUAL_NS))
+    traced = services.health.trace(context.site, robot, min(since_ns or kept_ns, until_ns - 1), until_ns)
+    rows = sorted(traced, key=lambda row: row.heard_ns)
+    drive = last_drive(rows) if (since_ns, end_ns) == EVER else None
+    if drive is not None:
+        since_ns, until_ns = drive[0], min(drive[1], now_ns)
     since_ns = until_ns - _USUAL_NS if since_ns is None else min(since_ns, until_ns - 1)
     span_ns = until_ns - since_ns
-    rows = sorted(services.health.trace(context.site, robot, since_ns, until_ns), key=lambda row: row.heard_ns)
+    rows = [row for row in rows if since_ns <= row.heard_ns < until_ns]
     parts = stretches(rows, until_ns)
     shown = band(parts, span_ns // _BAND_PARTS)
     wanted = FailureFilter(site=context.site, robot=robot, until_ns=end_ns)
     failures = services.maps.store.fleet.failures(wanted, limit=FAILURES_SHOWN)
-    within = [row for row in failures if row.happened_ns >= since_ns]
+    within = [row for row in failures if since_ns <= row.happened_ns < until_ns]
     curves = [(words, form, curve(rows, name, (since_ns, until_ns))) for words, name, form in _CURVES]
     version = live.status.version or services.maps.current_version(context.site)
     drawn = None
     if version is not None and services.maps.has_version(context.site, version):
-        trail = way(rows, shown, services.settings.config.ingest.trace_every_s)
+        trail = way(rows, shown, ingest.trace_every_s)
         layers = [
             Layer("Way", trail),
             Layer("Failures", failure_marks(context, within)),
@@ -166,6 +190,7 @@ def page(services: Services, context: PageContext, robot: str) -> dict[str, obje
         places = [place for line in trail for place in line.points] + ([] if live.place_m is None else [live.place_m])
         drawn = scene_of(services, context, version, layers, places_m=places)
     return {
+        "usual": "Last drive" if drive else "Last 24 h",
         "robot": robot,
         "now": now(services, context, robot),
         "scene": drawn,

@@ -57,7 +57,7 @@ function bars(days) {
   const drawn = made("span", "bars", "");
   drawn.setAttribute("role", "img");
   drawn.setAttribute("aria-label", `failures per robot-day of the last ${days.length} days`);
-  for (const day of days) drawn.append(Object.assign(document.createElement("i"), { style: `height: ${Math.round((100 * (day ?? 0)) / most)}%` }));
+  for (const day of days) drawn.append(Object.assign(document.createElement("i"), { style: day === null ? "" : `height: max(2px, ${Math.round((100 * day) / most)}%)` }));
   return drawn;
 }
 

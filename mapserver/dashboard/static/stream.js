@@ -7,12 +7,13 @@ export const isSignedOut = (answer) => answer?.redirected || answer?.status === 
 
 // Follows what the server says every second, until the session ends. Hidden pages do not: a browser has six connections for all of them.
 export function follow(path, take, fail = () => {}) {
-  const address = `${path}?site=${encodeURIComponent(document.querySelector("header select[name=site]").value)}`;
+  const asked = new URLSearchParams(location.search);
+  asked.set("site", document.querySelector("header select[name=site]").value);
   let stream;
   function open() {
     stream?.close();
     if (document.hidden) return;
-    stream = new EventSource(address);
+    stream = new EventSource(`${path}?${asked}`);
     stream.onmessage = ({ data }) => take(JSON.parse(data));
     stream.addEventListener("ended", ({ data }) => location.assign(data));
     stream.onerror = async ({ target }) => {

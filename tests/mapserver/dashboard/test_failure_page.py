@@ -125,7 +125,7 @@ def test_causes_over_time_are_all_in_the_bars_and_a_bar_leads_to_its_time() -> N
     assert (len(chart["bars"]), chart["most"], chart["step"]) == (14, 3, "a day")
     first, second, *_, last = chart["bars"]
     assert [(p["shade"], round(p["top"]), round(p["height"])) for p in first["parts"]] == [(0, 33, 67), (1, 0, 33)]
-    assert first["to"] == "/failures?site=hall&robot=r&since=2026-09-21T00%3A00&until=2026-09-22T00%3A00"
+    assert first["to"] == "/failures?site=hall&since=2026-09-21T00%3A00&until=2026-09-22T00%3A00&robot=r"
     assert second["parts"][0]["shade"] == 5, "a cause without a shade of its own"
     assert last["words"] == "2026-10-04 00:00:00 EEST, a day: 1 dark"
 

@@ -5,7 +5,7 @@ import re
 from datetime import datetime, timedelta
 from io import StringIO
 from pathlib import Path
-from urllib.parse import urlsplit
+from urllib.parse import parse_qs, urlsplit
 from zoneinfo import ZoneInfo
 
 import httpx
@@ -15,7 +15,8 @@ from playwright.sync_api import Locator, Page, expect
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.mapformat.names import blob_path
 from fleetmap.messages import FailureAck, decode_message, encode_message, robot_key
-from mapserver.store import MapStore
+from mapserver.fleet_statistics.kpis import HOUR_NS, hour_of
+from mapserver.store import FleetBatch, MapStore, TraceRow
 from support.fleet.dashboard_scene import (
     ROBOTS,
     SITE,
@@ -44,6 +45,7 @@ PAGES = {
     "administration": "Administration",
     "administration/people": "Administration",
 }
+SPAN = ("since", "until")
 
 
 def test_every_page_is_whole_in_both_looks_and_loads_nothing_from_elsewhere(page: Page, served: Served) -> None:
@@ -249,6 +251,50 @@ def test_a_job_shows_the_doctor_and_its_loops(page: Page, served: Served) -> Non
     assert seen.faults == []
 
 
+def test_a_time_is_dragged_in_a_chart_and_kept_on_other_pages(page: Page, served: Served) -> None:
+    seen = opened(page, served, "failures")
+    chart = page.locator("#chart")
+    first_ms, end_ms = (float(chart.get_attribute(f"data-{name}")) for name in ("since", "until"))
+    box = box_of(chart)
+    for share, act in ((0.25, page.mouse.down), (0.75, page.mouse.up)):
+        page.mouse.move(box["x"] + share * box["width"], box["y"] + 40, steps=4)
+        act()
+    page.wait_for_url(re.compile("since=.*until="))
+    asked = parse_qs(urlsplit(page.url).query)
+    for name, share in (("since", 0.25), ("until", 0.75)):
+        chosen_ms = 1000 * datetime.fromisoformat(asked[name][0]).timestamp()
+        assert chosen_ms == pytest.approx(first_ms + share * (end_ms - first_ms), abs=62_000)
+    page.get_by_role("navigation", name="Pages").get_by_role("link", name="Robots").click()
+    expect(page.locator("h1")).to_have_text("Robots of hall")
+    page.get_by_role("navigation", name="Pages").get_by_role("link", name="Trends").click()
+    expect(page.locator("h1")).to_have_text("Trends of hall")
+    assert {name: asked[name] for name in ("since", "until")}.items() <= parse_qs(urlsplit(page.url).query).items()
+    expect(page.locator("main")).to_contain_text("What got worse in the chosen time")
+    page.locator(".range summary").click()
+    page.get_by_role("link", name="Last 24 h", exact=True).click()
+    expect(page.locator("main")).to_contain_text("What got worse this week")
+    assert seen.faults == []
+
+
+def test_a_robots_page_opens_on_its_last_drive(page: Page, tmp_path: Path) -> None:
+    fill_store(tmp_path)
+    with MapStore.open(tmp_path) as store:
+        begin_ns, batch = store.now_ns() - 30 * HOUR_NS, FleetBatch()
+        for at_s in (*range(0, 600, 10), *range(900, 1200, 10), 4000):  # silent for five minutes, then it stands
+            stamp_ns = begin_ns + at_s * 10**9
+            place_m = 10.0 + 0.02 * min(at_s, 1190), 6.0
+            row = TraceRow(SITE, "tug-7", hour_of(stamp_ns), stamp_ns, "TRACKING", 2, *place_m, 0.1, heard_ns=stamp_ns)
+            batch.traces.append(row)
+        store.fleet.add(batch)
+    with serving(tmp_path) as served:
+        seen = opened(page, served, "robots/tug-7")
+        expect(page.locator(".range summary")).to_have_text("Last drive")
+        shown_ms = [int(page.locator("#band").get_attribute(f"data-{name}")) for name in SPAN]
+        assert [ms / 1000 - begin_ns / 1e9 for ms in shown_ms] == pytest.approx([0.0, 1220.0], abs=60)
+        expect(page.locator(".site-map path.line.good")).to_have_count(2)
+        assert seen.faults == []
+
+
 def test_versions_are_compared(page: Page, served: Served) -> None:
     seen = opened(page, served, "map", before=1, after=3)
     expect(page.locator("path.cell.added")).to_have_count(2)
@@ -284,13 +330,13 @@ def test_wrong_addresses_are_answered_in_words(served: Served) -> None:
         ("surveys?job=99", "job 99 does not exist"),
         ("robots/nobody", "never heard of a robot"),
         ("robots?without=colour", "there is no column &#39;colour&#39;"),
-        ("failures?sinc=2026-01-01", "this page knows site, cause"),
+        ("failures?sinc=2026-01-01", "this page knows site, find, since, until, cause"),
         ("failures?since=soon", "is an invalid time; write"),
         ("robots/tug-7?since=2026-01-02&until=2026-01-01T00:00", "is not after since"),
         ("surveys?since=soon", "is an invalid time; write"),
         ("map?until=soon", "is an invalid time; write"),
         ("trends?since=soon", "is an invalid time; write"),
-        ("trends?sinc=2026-01-01", "this page knows site, since, until"),
+        ("trends?sinc=2026-01-01", "this page knows site, find, since, until"),
         ("?site=nowhere", "no site nowhere"),
         ("nowhere?at=all", "There is no such page here"),
         ("map/nowhere?site=nowhere", "no site nowhere"),

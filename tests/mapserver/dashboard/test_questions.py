@@ -152,12 +152,15 @@ def test_what_failed_in_aisle_2_today(operator: Operator) -> None:
     operator.click(week.get_by_role("link", name="aisle 2"))
     operator.clicks = 0
     chosen = page.get_by_role("list", name="Area").locator(".chosen")
+    operator.click(page.locator(".range summary"))
     operator.click(page.get_by_role("link", name="Today", exact=True))
     expect(chosen).to_contain_text("aisle 2")
-    expect(page.locator("input[name=since]")).to_have_value(re.compile(r"^\d{4}-\d\d-\d\dT00:00$"))
+    expect(page.locator(".range [name=since]")).to_have_value(re.compile(r"^\d{4}-\d\d-\d\dT00:00$"))
     operator.clicks = 0
     operator.click(page.get_by_role("list", name="Area").get_by_role("link", name="aisle 1"))
     expect(chosen).to_contain_text("aisle 1")
+    operator.clicks = 0
+    operator.click(page.locator(".range summary"))
     operator.click(page.get_by_role("link", name="Last 7 days", exact=True))
     listed_in(page, "aisle 1")
 

@@ -299,6 +299,7 @@ export const MarkSet = L.Layer.extend({
       const moves = !still && !far && (item.x !== mark.x || item.y !== mark.y);
       mark.from = moves ? { x: mark.x, y: mark.y, since: performance.now() } : undefined;
       if (!moves) [mark.x, mark.y] = [item.x, item.y];
+      if (far) mark.path = []; // nobody saw how it came here
       mark.path.push([item.x, item.y]);
       if (mark.path.length > TRAIL) mark.path.shift();
       this.marks.set(key, mark);
