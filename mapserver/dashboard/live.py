@@ -55,6 +55,11 @@ class LiveRobot:
         return self.status.robot
 
     @property
+    def floor(self) -> str:
+        """The site of the floor on which it is, empty for its own."""
+        return str(self.metrics.get("floor") or "")
+
+    @property
     def refused(self) -> str:
         """Why it does not run the wanted version, empty if it does."""
         return str((self.status.last_ack or {}).get("refused", ""))
@@ -66,6 +71,8 @@ class LiveRobot:
 
     def where(self, areas: Areas) -> str:
         """Where it was last, as people know it; empty where it never said."""
+        if self.floor:
+            return f"on the floor {self.floor}"
         if self.place_m is None:
             return ""
         return areas.at(*self.place_m) or "at {:.1f}, {:.1f} m".format(*self.place_m)
@@ -126,7 +133,8 @@ def live_robot(status: RobotStatus) -> LiveRobot:
     # A robot that withdraws its liveliness token has left; one without a token is judged by its messages.
     if status.seconds_since > (SILENT_S if status.is_present is not False else _LEFT_S):
         words, tone = SILENT
-    place = estimate.get("position_map_m")
+    metrics = health.get("metrics") or {}
+    place = None if metrics.get("floor") else estimate.get("position_map_m")  # on another floor it tells none
     return LiveRobot(
         status,
         words,
@@ -134,7 +142,7 @@ def live_robot(status: RobotStatus) -> LiveRobot:
         (float(place[0]), float(place[1])) if place is not None and None not in place else None,
         _heading(estimate.get("quat_wxyz")),
         tuple(health.get("flags", ())),
-        health.get("metrics") or {},
+        metrics,
         calibration_figures(health),
     )
 

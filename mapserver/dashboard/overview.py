@@ -3,6 +3,8 @@ pages; the Overview is kept up to date by a stream of server-sent events.
 """
 
 import time
+from collections import Counter
+from dataclasses import replace
 
 from fleetmap.messages import Flag
 from mapserver.dashboard import fleet_parts
@@ -50,14 +52,43 @@ def now(services: Services, context: PageContext) -> dict[str, object]:
     """What changes from second to second."""
     live, health = services.robots.look(context.site), services.health.site(context.site)
     areas = services.maps.store.areas(context.site)
+    floors, guests = _floors(services, context)
     robots = sorted(live.robots, key=lambda robot: robot.tone in {"good", "quiet"} and not _is_troubled(robot))
     return {
         "line": site_line(live),
         "notices": _notices(services, context, health),
         "figures": _figures(live, health),
-        "robots": [_robot(context, robot, health, areas) for robot in robots],
+        "robots": [_robot(context, robot, health, areas) for robot in robots] + guests,
         "marks": _marks(context, live),
+        "floors": floors,
     }
+
+
+def _floors(services: Services, context: PageContext) -> tuple[list[dict[str, object]], list[dict[str, object]]]:
+    """The floors of the site's building with the robots on each, the highest first; and the robots of other floors that are on this one."""
+    site = context.site
+    building = services.maps.store.building(site) if services.maps.is_mapped(site) else None
+    if building is None:
+        return [], []
+    robots = [robot for floor in building.floors for robot in services.robots.look(floor.site).robots]
+    counts = Counter(robot.floor or robot.status.site for robot in robots if robot.tone != "quiet")
+    floors: list[dict[str, object]] = [
+        {
+            "words": f"{floor.level} ({counts[floor.site]})",
+            "to": context.to("", site=floor.site),
+            "is_chosen": floor.site == site,
+        }
+        for floor in reversed(building.floors)
+    ]
+    guests = []
+    for robot in robots:
+        if robot.floor == site:
+            own = replace(context, site=robot.status.site)
+            row = _robot(own, robot, services.health.site(own.site), Areas())
+            guests.append(
+                row | {"name": f"{robot.name} of {own.site}", "about": "on this floor: it tells no position here"}
+            )
+    return floors, guests
 
 
 def site_line(live: LiveSite) -> dict[str, str]:
@@ -202,6 +233,7 @@ def trends(services: Services, context: PageContext) -> dict[str, object]:
         "since": context.written(span_ns[0] or health.week_since_ns),
         "days": Bars("Failures per robot-day", bars),
         "cameras": cameras,
+        "drifting": sum(any(one.is_drifted for one in told.values()) for _, told in cameras),
         "parameters": {name: words for name, words in PARAMETERS.items() if any(name in told for _, told in cameras)},
         "concerns": health.resurvey,
         "outlines": _outlines(services, context.site),

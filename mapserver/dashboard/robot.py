@@ -8,13 +8,14 @@ from statistics import fmean
 from typing import NamedTuple
 
 from fleetmap.errors import UsageError
+from fleetmap.messages import Flag
 from mapserver.dashboard.console import PageContext, Services, scene_of
 from mapserver.dashboard.data import EVER
-from mapserver.dashboard.failures import failure_marks, tone_of
+from mapserver.dashboard.failures import ADVICE, failure_marks, tone_of
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN
 from mapserver.dashboard.live import ORDER, SILENT, LiveRobot, words_of
 from mapserver.dashboard.map_layers import Layer, Line
-from mapserver.dashboard.overview import since_words
+from mapserver.dashboard.overview import remarks, since_words
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.store import FailureFilter, TraceRow
 
@@ -31,6 +32,14 @@ _FIGURES = (
     ("Failure reports that wait", "spool_waiting", "{:.0f}"),
 )
 _CURVES = (("CPU of a frame", "frame_ms", "{:.1f} ms"), *_FIGURES[3:5])  # and brightness and sharpness
+# What to do, by what it reports, else by its state in words.
+_ADVICE = ADVICE | {
+    Flag.OFF_MAP: "The map has no tile where it is: survey this place, or drive it back.",
+    "lost": "Drive it to where the map was surveyed, or say where it stands.",
+    "several places fit": "Drive it some metres, or say where it stands.",
+    "starting": "Drive it a metre, or say where it stands.",
+    "offline": "Look whether it is switched on and reaches this server; `locclient check` on it says what is missing.",
+}
 GAP_NS = 45_000_000_000
 """A row is kept at least each ten seconds: after so long without one the robot was silent."""
 
@@ -205,6 +214,8 @@ def page(services: Services, context: PageContext, robot: str) -> dict[str, obje
         "pictures": services.maps.store.fleet.first_pictures(row.number for row in failures),
         "within": within,
         "tone_of": tone_of,
+        "cameras": [(PARAMETERS[figure.name], figure.words) for figure in live.calibration],
+        "drifts": [PARAMETERS[figure.name] for figure in live.calibration if figure.is_drifted],
     }
 
 
@@ -212,16 +223,20 @@ def now(services: Services, context: PageContext, robot: str) -> dict[str, objec
     """What changes from second to second."""
     live = services.robots.look(context.site).robot(robot)
     if live is None:
-        return {"line": {"tone": "quiet", "words": "It is not known any more.", "exact": ""}, "facts": [], "marks": []}
+        line = {"tone": "quiet", "words": "It is not known any more.", "exact": "", "advice": ""}
+        return {"line": line, "facts": [], "marks": []}
     where = live.where(services.maps.store.areas(context.site))
     state, (since, exact) = live.words.capitalize(), since_words(context, live)
     if live.tone == "quiet":
         state += f", last heard {since} ago"
     elif since:
         state += f" for {since}"
-    flags = f" It reports: {', '.join(live.flags)}.".replace("_", " ") if live.flags else ""
-    words = f"{', '.join(filter(None, [state, where]))}.{flags}"
-    line = {"tone": live.tone, "words": words, "exact": exact and f"since {exact}"}
+    is_offline = live.tone == "quiet"
+    why = "" if is_offline else ", ".join(remarks(live))
+    words = f"{': '.join(filter(None, [', '.join(filter(None, [state, where])), why]))}."
+    told = [live.words] if is_offline else [*live.flags, live.words]
+    advice = next((_ADVICE[name] for name in told if name in _ADVICE), "")
+    line = {"tone": live.tone, "words": words, "exact": exact and f"since {exact}", "advice": advice}
     return {"line": line, "facts": _facts(live), "marks": live.marks()}
 
 
@@ -239,6 +254,5 @@ def _facts(robot: LiveRobot) -> list[tuple[str, str]]:
         ),
         ("Cameras", str(robot.metrics.get("views") or "")),
         ("Clock against the server's", "" if clock_s is None else f"{clock_s:+.2f} s"),
-        ("Cameras against the map", "; ".join(f"{PARAMETERS[f.name]} {f.words}" for f in robot.calibration)),
     ]
     return [(words, value) for words, value in found if value]

@@ -1,5 +1,6 @@
 """The page of surveys: what was built, what failed? Inbox, jobs with progress and log, what became of every recording, loops on the map."""
 
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -20,6 +21,7 @@ from mapserver.store import JobInfo
 _TELLING_S = 4.0  # of a stage, before what is left of it can be said
 _LONG_H = 12.0  # a job that is killed cannot say so
 _LEFT_OUT = {"foreign": "another place", "undecided": "held", "bad": "refused"}
+_WAITS = "waits"
 MOST_LOOPS = 3000
 VERDICTS = {
     "accepted": ("good", "accepted"),
@@ -91,7 +93,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     if chosen is not None:
         context = replace(context, site=chosen.site)  # whatever site the address names, or none
     jobs = services.maps.store.jobs(context.site, context.time_range(), limit=JOBS_SHOWN)
-    chosen = chosen or next((job for job in jobs if job.state != "running" and _recordings(job)), None)
+    chosen = chosen or next((job for job in jobs if job.state != "running" and _did_something(job)), None)
     shown: dict[str, object] = {
         "context": context,
         "site": context.site,
@@ -104,6 +106,11 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     if chosen is None:
         return shown
     return shown | _loops(services, context, builds_of(chosen.report)[-1]) | {"recordings": _recordings(chosen)}
+
+
+def _did_something(job: JobInfo) -> bool:
+    """Whether a recording was built or refused in it: a night in which all of them wait was none."""
+    return any(row.result != _WAITS for row in _recordings(job))
 
 
 def _state(job: JobInfo) -> str:
@@ -132,11 +139,11 @@ def _recordings(job: JobInfo) -> list[_Recording]:
             found, checks = ((build.get(key) or {}).get(name) for key in ("findings", "checks"))
             said = checks, _figures(session.get("evidence")), *_remarks(found or ())
             rows[name] = _Recording(name, tone, result, session.get("reason"), *said)
-    waiting = [entry | {"fate": "waits"} for entry in dicts(job.report.get("waiting"))]
+    waiting = [entry | {"fate": _WAITS} for entry in dicts(job.report.get("waiting"))]
     for entry in [*dicts(job.report.get("recordings")), *waiting]:
         name, fate = str(entry.get("name")), str(entry.get("fate"))
         if fate != "done":
-            tone = "quiet" if fate == "waits" else "bad"
+            tone = "quiet" if fate == _WAITS else "bad"
             rows.setdefault(PurePath(name).stem, _Recording(name, tone, _LEFT_OUT.get(fate, fate), entry.get("reason")))
     return sorted(rows.values(), key=lambda row: row.tone != "bad")
 
@@ -168,20 +175,25 @@ def _loops(services: Services, context: PageContext, build: dict[str, Any]) -> d
     version: Any = build.get("version")
     if found and not services.maps.has_version(context.site, version):
         version = services.maps.current_version(context.site)
-    items: list[Item] = []
-    for loop in reversed(found):  # accepted ones on top
+    items: dict[bool, list[Item]] = {False: [], True: []}
+    for loop in found:
         tone, words = _told(loop)
         ends = [loop.start_map_m, loop.end_map_m]
-        items += [Line(ends, tone, words), *(Mark(*end, tone, "circle", words) for end in ends if loop.is_accepted)]
+        marks = [Mark(*end, tone, "circle", words) for end in ends if loop.is_accepted]
+        items[loop.is_accepted] += [Line(ends, tone, words), *marks]
+    layers = [Layer("Refused loops", items[False], shown=False), Layer("Accepted loops", items[True])]
     refused = [(loop, *_told(loop)) for loop in found if not loop.is_accepted]
-    drawn = None if not found or version is None else scene_of(services, context, version, [Layer("Loops", items)])
+    reasons = (
+        re.sub(r"\d+(\.\d+)?", "…", loop.reason or words) for loop, _, words in refused
+    )  # the same but for figures
+    drawn = None if not found or version is None else scene_of(services, context, version, layers)
     return {
         "scene": drawn,
         "version": version,
         "counts": build.get("loops"),
         "loops": found,
         "refused": refused,
-        "reasons": Counter(loop.reason or words for loop, _, words in refused).most_common(),
+        "reasons": Counter(reasons).most_common(),
     }
 
 

@@ -52,6 +52,10 @@ function say({ words, tone }) {
   line.className = `line ${tone}`;
 }
 
+function floor({ words, to, is_chosen }) {
+  return Object.assign(made("a", is_chosen ? "chosen" : "", words), { href: to, ariaCurrent: is_chosen ? "true" : null });
+}
+
 function bars(days) {
   const most = Math.max(...days, 1e-9);
   const drawn = made("span", "bars", "");
@@ -80,6 +84,7 @@ function update() {
   say(state.line);
   show("figures", state.figures, keyFigure);
   show("notices", state.notices, notice);
+  show("floors", state.floors, floor);
   const items = state.robots.map((robot) => {
     if (!rows.has(robot.name)) rows.set(robot.name, row(robot));
     refresh(rows.get(robot.name), robot);

@@ -6,14 +6,16 @@ import { follow } from "./stream.js";
 const element = document.getElementById("map");
 const map = element?.map;
 const line = document.getElementById("line");
+const advice = document.getElementById("advice");
 const facts = document.getElementById("facts");
 const place = document.getElementById("place");
 const robot = document.querySelector("h1").textContent;
 const made = (tag, text) => Object.assign(document.createElement(tag), { textContent: text }); // robots choose their words: never markup
 
-function say({ tone, words, exact }) {
+function say({ tone, words, exact, advice: what = "" }) {
   Object.assign(line, { className: `notice ${tone}`, title: exact });
   if (line.textContent !== words) line.textContent = words;
+  advice.textContent = what;
 }
 
 function show({ line: told, facts: known, marks }) {

@@ -342,7 +342,9 @@ def test_operators_tokens_and_robots_begin_and_end(page: Page, tmp_path: Path) -
         init_here(store)
         RobotRegister(store).authorities.init(["127.0.0.1"], None, None)
         fleet = Fleet(store)
-        fleet.take_health(SITE, "tug-8", RobotHealth(site=SITE, robot="tug-8", stamp_ns=1, version=2, status="TRACKING"))
+        fleet.take_health(
+            SITE, "tug-8", RobotHealth(site=SITE, robot="tug-8", stamp_ns=1, version=2, status="TRACKING")
+        )
         fleet.flush()
 
     def ask(words: str, name: str | None = None, **fields: str) -> None:
@@ -424,7 +426,14 @@ def test_operators_tokens_and_robots_begin_and_end(page: Page, tmp_path: Path) -
 
         with MapStore.open(tmp_path) as store:
             kinds = [line.kind for line in store.audit_lines() if line.actor == "bob" and line.reason == "a new shift"]
-            assert kinds == ["token made", "operator disabled", "robot enrolled", "robot revoked", "robot removed", "robot removed"]
+            assert kinds == [
+                "token made",
+                "operator disabled",
+                "robot enrolled",
+                "robot revoked",
+                "robot removed",
+                "robot removed",
+            ]
             store.operators.set_role("bob", "viewer", Actor("root"))
         opened(page, served, "administration/people", site=SITE)
         expect(page.get_by_role("alert")).to_have_text("bob (viewer) may not open this page; an admin may.")

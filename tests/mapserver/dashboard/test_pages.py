@@ -78,6 +78,7 @@ def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> 
         expect(page.locator("h1")).to_have_text(lost)
         expect(page.get_by_role("status")).to_contain_text(re.compile(r"^Lost for \d+ "))
         expect(page.get_by_role("status")).to_have_attribute("title", re.compile(r"^since \d{4}-"))
+        expect(page.locator("#advice")).to_have_text(re.compile("or say where it stands"))
         assert [mark["name"] for mark in marks(page)] == [lost]
         states = page.get_by_role("list", name="States, the last one first")
         expect(states).to_contain_text("lost", timeout=90_000)  # since seconds, and renewed each 30 s
@@ -215,6 +216,9 @@ def test_a_new_failure_appears_by_itself(page: Page, served: Served) -> None:
 
 
 def test_a_job_shows_the_doctor_and_its_loops(page: Page, served: Served) -> None:
+    with MapStore.open(served.folder) as store:  # a later night, in which nothing happened
+        waiting = {"waiting": [{"name": "friday.mcap", "reason": "it is not whole yet"}]}
+        store.update_job(store.begin_job(SITE, "nightly"), "done", "nothing to build", waiting)
     seen = opened(page, served, "surveys")
     jobs, recordings = page.get_by_role("list", name="Jobs"), page.get_by_role("list", name="Recordings")
     expect(jobs).to_contain_text("recording tuesday: cameras are swapped")
@@ -231,6 +235,9 @@ def test_a_job_shows_the_doctor_and_its_loops(page: Page, served: Served) -> Non
     expect(recordings.get_by_text("camera 1 is blurred")).to_be_visible()
     page.get_by_text("Why 2 candidates were refused").click()
     expect(page.get_by_role("table", name="Refused loops")).to_contain_text("its neighbours disagree")
+    assert page.locator(".line").count() == 1
+    page.locator(".leaflet-control-layers").hover()
+    page.get_by_role("checkbox", name="Refused loops").check()
     assert [page.locator(f".line.{tone}").count() for tone in ("good", "bad", "quiet")] == [1, 1, 1]
     with MapStore.open(served.folder) as store:
         job = store.begin_job(SITE, "convert")

@@ -3,14 +3,15 @@
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
-from urllib.request import urlopen
 
+import httpx
 import numpy as np
 import pytest
 import yaml
 from msgspec.structs import replace
 
 from fleetmap.access import Access, Holder
+from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.encoding import to_json
 from fleetmap.errors import MapFormatError, UsageError
 from fleetmap.mapformat.building import (
@@ -23,6 +24,7 @@ from fleetmap.mapformat.building import (
     read_building,
     read_lifts,
 )
+from fleetmap.messages import RobotHealth, encode_message, robot_key
 from mapserver.cli import app
 from mapserver.fleet.building import floors_of, forget_alignment, keep_areas, keep_building
 from mapserver.floor_plan.alignment import Alignment, encode_alignment
@@ -34,6 +36,7 @@ from support.fleet.dashboard_scene import serving
 from support.recordings.realdata import real_data
 from support.room_site import run
 from support.storage.map_samples import save_sample_draft
+from support.waiting import eventually
 
 HERE = BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0)
 TOWER = Building(
@@ -119,12 +122,25 @@ def test_a_site_is_a_floor_of_one_building_and_leaves_it(house: Path) -> None:
         assert store.areas("hall-1").areas[0].lift == "A", "it survives a change of the areas by a page"
 
 
-def test_the_page_of_maps_leads_to_the_other_floors(house: Path) -> None:
+def test_pages_lead_to_the_other_floors_and_list_robots_where_they_are(house: Path) -> None:
     with MapStore.open(house) as store:
         keep_building(store, TOWER, NOBODY)
-    with serving(house) as served, urlopen(f"{served.http}/dashboard/map?site=hall-1") as answer:
-        text = answer.read().decode()
-    assert '<p id="floors">tower: <a href="/dashboard/map?site=hall-2">L2</a> · <strong>L1</strong></p>' in text
+    with serving(house) as served, Bus(served.zenoh).open() as bus:
+
+        def shown(path: str) -> str:
+            return httpx.get(f"{served.http}/dashboard/{path}", timeout=60).text
+
+        links = '<p id="floors">tower: <a href="/dashboard/map?site=hall-2">L2</a> · <strong>L1</strong></p>'
+        assert links in shown("map?site=hall-1")
+        health = RobotHealth(
+            site="hall-1", robot="r1", stamp_ns=1, version=1, status="TRACKING", metrics={"floor": "hall-2"}
+        )
+        bus.publish(robot_key("hall-1", "r1", "health"), encode_message(health))
+        assert eventually(
+            lambda: '"name":"r1 of hall-1","to":"/dashboard/robots/r1?site=hall-1"' in shown("?site=hall-2")
+        )
+        assert '"words":"L2 (1)"' in shown("?site=hall-2")
+        assert '"about":"on the floor hall-2"' in shown("?site=hall-1")
 
 
 def test_lifts_drawn_in_the_building_come_back_in_the_map(house: Path) -> None:
