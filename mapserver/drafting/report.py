@@ -133,7 +133,7 @@ def report_details(
         "point_sigma_median_m": float(np.median(survey_map.point_sigma_m)),
         "ate_max_m": None if found.rigid is None else found.rigid.max_m,
         "sim3_scale": None if found.similarity is None else found.similarity.scale,
-        "pair_turn": [to_plain(s.survey.stereo_yaw) for s in surveyed],
+        "pair_turn": [to_plain(s.survey.stereo_yaws[0]) for s in surveyed],
         "pair_turn_of_views": [to_plain(s.survey.stereo_yaws) for s in surveyed],
         "stage_s": {stage: round(seconds, 3) for stage, seconds in stage_s.items()},
         "parts": [to_plain(s.survey.components) for s in surveyed],

@@ -452,8 +452,8 @@ def _aligned(done: Survey, recording: Recording) -> tuple[Survey, Array | None]:
     aligned = aligned_by_priors(done.map, recording.priors, recording.calibration.base_from_body)
     if aligned is None:
         return done, None
-    in_metres = replace(done, map=done.map.scaled(aligned.scale), state=done.state.scaled(aligned.scale))
-    return in_metres, aligned.map_from_survey
+    map_from_survey, scale = aligned
+    return replace(done, map=done.map.scaled(scale), state=done.state.scaled(scale)), map_from_survey
 
 
 def survey_all(

@@ -5,6 +5,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import repeat, takewhile
 from typing import Any, TypeVar
 
 import cv2
@@ -74,13 +75,7 @@ def single_threaded_libraries() -> Iterator[None]:
 
 def read_ahead(items: Iterable[Item], ahead: int = 4) -> Iterator[Item]:
     """Yield the items of a generator, fetched ahead by a thread. Errors are raised at the position of their item."""
-    source = iter(items)
-    end = object()
+    source, end = iter(items), object()
     with ThreadPoolExecutor(1, thread_name_prefix="reader") as pool:
-        waiting = deque(pool.submit(next, source, end) for _ in range(ahead))
-        while True:
-            item = waiting.popleft().result()
-            if item is end:
-                return
-            waiting.append(pool.submit(next, source, end))
-            yield item  # type: ignore[misc]
+        fetched = in_order(lambda _: pool.submit(next, source, end), Future.result, repeat(None), ahead)
+        yield from takewhile(lambda item: item is not end, fetched)

@@ -41,15 +41,6 @@ class Segment:
 
 
 @dataclass(frozen=True, slots=True)
-class _Task:
-    """A segment with its part of the inputs. images: store for the pictures of its keyframes."""
-
-    segment: Segment
-    inputs: SurveyInputs
-    images: ImageStore
-
-
-@dataclass(frozen=True, slots=True)
 class SegmentSurvey:
     """Odometry of a segment's frames and state of its keyframes, including those at both ends.
 
@@ -84,12 +75,12 @@ def in_segments(begin: Begin, inputs: SurveyInputs, settings: SurveySettings, to
     if len(segments) == 1:
         return begin(inputs, settings, tools)
     how = begin, settings
-    tasks = (_task_of(segment, inputs, tools) for segment in segments)
+    tasks = ((segment, _part(segment, inputs), tools.images) for segment in segments)
     made, surveys = list[_Made](), tools.executor.map(_survey_segment, how, tasks)
     for segment in segments:
         survey = next(surveys)  # by zip, which holds what it gave last, it would stay until the next one came
         tools.at("odometry", segment.last + 1, inputs.frame_count)
-        tools.release()
+        tools.images.release()
         made.append((segment, survey if isinstance(survey, str) else _stored(survey, tools.images)))
         del survey  # with its pictures, which are in the survey's own store now
     refused: dict[int, str] = {}
@@ -97,7 +88,7 @@ def in_segments(begin: Begin, inputs: SurveyInputs, settings: SurveySettings, to
         refused |= wrong
         made = [
             # In this process: it may be long, and the survey's own store keeps its pictures out of memory.
-            known or (whole, _survey_segment(how, _task_of(whole, inputs, tools), tools))
+            known or (whole, _survey_segment(how, (whole, _part(whole, inputs), tools.images), tools))
             for whole, known in _regrouped(made, refused)
         ]
     cuts = tuple(
@@ -144,8 +135,8 @@ def _kept(keyframe: Keyframe, images: ImageStore, numbers: dict[int, int]) -> Ke
     return set_aside(kept, images)
 
 
-def _task_of(segment: Segment, inputs: SurveyInputs, tools: SurveyTools) -> _Task:
-    """Return the segment with its part of the inputs, and with the store of its pictures.
+def _part(segment: Segment, inputs: SurveyInputs) -> SurveyInputs:
+    """Return a segment's part of the inputs.
 
     Samples before its first frame are excluded: IMU data without a picture would look like rest during constant motion.
     """
@@ -154,7 +145,7 @@ def _task_of(segment: Segment, inputs: SurveyInputs, tools: SurveyTools) -> _Tas
     since_ns = int(stamps_ns[segment.lead]) + offset_ns if segment.lead else -(2**62)
     until_ns = int(stamps_ns[segment.last]) + offset_ns + _MARGIN_NS
     ends = {segment.begin, segment.last} - {0, len(stamps_ns) - 1}
-    part = replace(
+    return replace(
         inputs,
         frames=inputs.parts.part(segment.lead, segment.last + 1),
         frame_count=segment.last - segment.lead + 1,
@@ -163,17 +154,21 @@ def _task_of(segment: Segment, inputs: SurveyInputs, tools: SurveyTools) -> _Tas
         parts=None,
         keyframes_at=frozenset(frame - segment.lead for frame in ends),
     )
-    return _Task(segment, part, tools.images)
 
 
-def _survey_segment(how: _How, task: _Task, tools: SurveyTools | None = None) -> SegmentSurvey | str:
-    """Return the survey of one segment in any process, or the text of the reason if there is none."""
-    begin, settings = how
+def _survey_segment(
+    how: _How, task: tuple[Segment, SurveyInputs, ImageStore], tools: SurveyTools | None = None
+) -> SegmentSurvey | str:
+    """Return the survey of one segment in any process, or the text of the reason if there is none.
+
+    task: the segment with its part of the inputs, and a store for the pictures of its keyframes.
+    """
+    (begin, settings), (segment, inputs, images) = how, task
     try:
-        chain = begin(task.inputs, settings, tools or SurveyTools(images=task.images))
+        chain = begin(inputs, settings, tools or SurveyTools(images=images))
     except SurveyError as error:
         return str(error)
-    return _without_lead(chain, task.segment)
+    return _without_lead(chain, segment)
 
 
 def _without_lead(chain: AdjustedChain, segment: Segment) -> SegmentSurvey:

@@ -87,11 +87,6 @@ class Survey:
     components: list[Component]
     seen: NDArray[np.bool_]
 
-    @property
-    def stereo_yaw(self) -> StereoYaw:
-        """Return that of the first camera."""
-        return self.stereo_yaws[0]
-
 
 def survey(inputs: SurveyInputs, config: SurveyConfig, tools: SurveyTools | None = None) -> Survey:
     """Map one recording. Raises SurveyError if it contains too little to map."""
@@ -173,7 +168,7 @@ def _with_neighbours(
     odometry: OdometryPass, state: SurveyState, settings: SurveySettings, tools: SurveyTools
 ) -> tuple[SurveyState, set[tuple[int, int]]]:
     """Return the state with the landmarks that the first camera sees in neighbouring keyframes, and the matched pairs of them."""
-    allowed_m = drift_allowance_m(odometry.covariances[odometry.keyframe_frames], state.map_from_body[:, :3, 3])
+    allowed_m = drift_allowance_m(odometry.keyframe_variances_m2, state.map_from_body[:, :3, 3])
     posed = _posed(odometry, state)
     finder = PairFinder(posed, settings.pairs, tools.executor, tools.at)
     candidates = finder.candidates(max(settings.loops.min_gap_keyframes, settings.pairs.previous))
@@ -306,7 +301,7 @@ def _adjusted(
     state: SurveyState, redundant: Mask, settings: SurveySettings, tools: SurveyTools, rounds: int
 ) -> SurveyState:
     """Return the adjusted state; priors that contradict it are then no longer believed."""
-    tools.release()
+    tools.images.release()
     state = adjust_visits(state, settings, redundant, rounds)
     priors, same = judged_priors(state.priors, state.map_from_body)
     return state if same else adjust_visits(replace(state, priors=priors), settings, redundant, rounds=2)

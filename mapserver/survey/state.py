@@ -242,6 +242,11 @@ class OdometryPass:
         return [k.frame_index for k in self.keyframes]
 
     @property
+    def keyframe_variances_m2(self) -> Array:
+        """(K,) of the keyframes' positions, summed over the axes."""
+        return np.asarray(np.trace(self.covariances[self.keyframe_frames, 3:, 3:], axis1=1, axis2=2))
+
+    @property
     def stamps_ns(self) -> Indices:
         """(F,) of all frames."""
         return np.array([e.stamp_ns for e in self.estimates], np.int64)

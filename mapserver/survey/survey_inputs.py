@@ -117,11 +117,7 @@ class SurveyTools:
         """Report progress; features of keyframes leave memory periodically, and at the end of the stage."""
         self.progress(stage, done, total)
         if done == total or done % _RELEASED_EVERY == 0:
-            self.release()
-
-    def release(self) -> None:
-        """Allow features of keyframes to leave memory until they are read again."""
-        self.images.release()
+            self.images.release()
 
 
 @dataclass(frozen=True)

@@ -228,32 +228,12 @@ Warp warp_from_features(int octave_reference, double angle_reference_deg, int oc
   return {cosine, -sine, 0.0, sine, cosine, 0.0};
 }
 
-// Places (N, 3) x, y, sigma_px of aligned features.
-using Aligned = std::vector<std::array<double, 3>>;
-
-auto align_patches(const Pyramid& reference, const Places& reference_pixels, const Octaves& reference_octaves, const Pyramid& current,
-                   const Places& pixels, const Octaves& octaves, const Array<double, -1, 2, 3>& warps, int half, double max_shift_px,
-                   double min_correlation) {
-  const PatchLimits limits(half, max_shift_px, min_correlation);
-  const PatchFeatures a(reference, reference_pixels, reference_octaves), b(current, pixels, octaves);
-  const size_t count = pixels.shape(0);
-  check_rows(count, "reference_pixels, warps: one for each pixel", reference_pixels, warps);
-  Aligned found(count);
-  unlocked([&] {
-    const Warp* const warp_of = reinterpret_cast<const Warp*>(warps.data());
-    for (size_t n = 0; n < count; ++n) {
-      const Alignment at = align_feature(a, int64_t(n), b, int64_t(n), warp_of[n], limits);
-      found[n] = {at.x, at.y, at.sigma_px};
-    }
-  });
-  return as_numpy<double>(std::move(found));
-}
-
 // Those of an image: pyramid, pixels (M, 2), octaves (M,), angles in degrees (M,), and the chosen ones (N,).
 using Features = std::tuple<Pyramid, Places, Octaves, Array<float, -1>, Indices>;
 
-auto align_observations(const Features& reference, const Features& own, const Points& points_reference, const SE3& own_from_reference,
-                        int half, double max_shift_px, double min_correlation) {
+// Places (N, 3) x, y, sigma_px in the own image; the warps are those of the motion, or of octaves and angles where it is degenerate.
+auto align_features(const Features& reference, const Features& own, const Points& points_reference, const SE3& own_from_reference,
+                    int half, double max_shift_px, double min_correlation) {
   const PatchLimits limits(half, max_shift_px, min_correlation);
   const auto& [pyramid_a, pixels_a, octaves_a, angles_a, chosen_a] = reference;
   const auto& [pyramid_b, pixels_b, octaves_b, angles_b, chosen_b] = own;
@@ -263,7 +243,7 @@ auto align_observations(const Features& reference, const Features& own, const Po
   check_rows(count, "points_reference: one for each chosen", chosen_a, points_reference);
   check_below(pixels_a.shape(0), "chosen: indices of pixels", chosen_a);
   check_below(pixels_b.shape(0), "chosen: indices of pixels", chosen_b);
-  Aligned found(count);
+  std::vector<std::array<double, 3>> found(count);
   unlocked([&] {
     for (size_t n = 0; n < count; ++n) {
       const int64_t i = chosen_a(n), j = chosen_b(n);
@@ -278,24 +258,11 @@ auto align_observations(const Features& reference, const Features& own, const Po
   return as_numpy<double>(std::move(found));
 }
 
-auto warps_from_motion(const Points& points_reference, const SE3& current_from_reference) {
-  const size_t count = points_reference.shape(0);
-  std::vector<Warp> warps(count, {kNaN, kNaN, kNaN, kNaN, kNaN, kNaN});
-  unlocked([&] {
-    for (size_t n = 0; n < count; ++n)
-      if (const auto warp = warp_from_motion(vec3(&points_reference(n, 0)), current_from_reference)) warps[n] = *warp;
-  });
-  return as_numpy<double, 3>(std::move(warps), {count, 2, 3});
-}
-
 }  // namespace
 
 void bind_patch_align(nb::module_& module) {
-  module.def("align_patches", &align_patches, "reference"_a, "reference_pixels"_a, "reference_octaves"_a, "current"_a, "pixels"_a,
-             "octaves"_a, "warps"_a, "half"_a, "max_shift_px"_a, "min_correlation"_a);
-  module.def("align_observations", &align_observations, "reference"_a, "own"_a, "points_reference"_a, "own_from_reference"_a, "half"_a,
+  module.def("align_features", &align_features, "reference"_a, "own"_a, "points_reference"_a, "own_from_reference"_a, "half"_a,
              "max_shift_px"_a, "min_correlation"_a);
-  module.def("warps_from_motion", &warps_from_motion, "points_reference"_a, "current_from_reference"_a);
 }
 
 }  // namespace fleetmap

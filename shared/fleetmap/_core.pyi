@@ -553,21 +553,7 @@ class Tracker:
 def common_ways_px(old_ids: _Indices, old_pixels: _Reals, ids: _Indices, pixels: _Reals) -> _Reals:
     """Distances moved by the pixels (N, 3) of ids in both lists, which ascend."""
 
-def align_patches(
-    reference: _Pyramid,
-    reference_pixels: _Reals,
-    reference_octaves: _Octaves,
-    current: _Pyramid,
-    pixels: _Reals,
-    octaves: _Octaves,
-    warps: _Reals,
-    half: int,
-    max_shift_px: float,
-    min_correlation: float,
-) -> _Reals:
-    """(N, 3) x, y, sigma_px at which patches, warped (N, 2, 3), from pixels (N, 2) on match the reference's; NaN without agreement."""
-
-def align_observations(
+def align_features(
     reference: tuple[_Pyramid, _Reals, _Octaves, _Pixels, _Indices],
     own: tuple[_Pyramid, _Reals, _Octaves, _Pixels, _Indices],
     points_reference: _Reals,
@@ -576,10 +562,7 @@ def align_observations(
     max_shift_px: float,
     min_correlation: float,
 ) -> _Reals:
-    """As align_patches, of chosen features (N,) of pyramid, pixels, octaves, angles, with warps from the motion if available."""
-
-def warps_from_motion(points_reference: _Reals, current_from_reference: _Reals) -> _Reals:
-    """(N, 2, 3) warps of pixel offsets for align_patches, NaN where degenerate."""
+    """(N, 3) x, y, sigma_px of chosen features (N,) of pyramid, pixels, octaves, angles, NaN where patches do not agree."""
 
 def match_guided(
     a: _Features,

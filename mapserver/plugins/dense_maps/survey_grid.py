@@ -67,7 +67,7 @@ def depth_view(session: MappedSession, settings: StereoSettings, keyframe: Keyfr
     """Return a keyframe of a session, densely matched."""
     survey, camera = session.survey, session.survey.state.rig.camera
     columns = np.arange(camera.width_px, dtype=np.float64)[:, None]
-    yaw_px = (survey.stereo_yaw.correction_px * disparity_shift(camera, columns)).astype(np.float32)
+    yaw_px = (survey.stereo_yaws[0].correction_px * disparity_shift(camera, columns)).astype(np.float32)
     disparity_px, sigma_px = dense_disparity(keyframe.frame, camera, settings)
     map_from_cam = session.map_from_body[keyframe.frame_index] @ survey.state.rig.body_from_cam[0]
     return DepthView(keyframe, disparity_px - yaw_px, sigma_px, map_from_cam)

@@ -40,7 +40,7 @@ from mapserver.survey.pose_graph.sim3_pose_graph import gate_covariances, solve_
 from mapserver.survey.rig import CameraKind, Rig, survey_camera
 from mapserver.survey.state import Keyframe, KeyframeMotion, RelativeTerm, RigImages, SurveyState, turned
 from mapserver.survey.survey_inputs import SurveyConfig
-from mapserver.survey.tracks.matching import PairFinder
+from mapserver.survey.tracks.matching import PairFinder, drift_allowance_m
 from mapserver.survey.tracks.mono_depths import MonoDepths
 from mapserver.survey.tracks.pairs import PairMatch
 from mapserver.survey.tracks.tracks import build_landmarks, tracks_of
@@ -248,11 +248,7 @@ class LiveMap:
         finder = PairFinder(RigImages.of(window, chain_from_body, self._mounted), settings)
         wanted = [pair for pair in finder.candidates() if pair[1] == newest - first]
 
-        def allowed_m(i: int, j: int) -> float:
-            gained = self._walked_m2[first + j] - self._walked_m2[first + i]
-            least = 0.05 + 0.03 * float(np.linalg.norm(chain_from_body[j, :3, 3] - chain_from_body[i, :3, 3]))
-            return 3.0 * float(np.sqrt(gained + least**2))
-
+        allowed_m = drift_allowance_m(np.array(self._walked_m2[first:]), chain_from_body[:, :3, 3])
         sigma = _ROTATION_SIGMA_RAD if self._news[-1].inertial else None
         found = finder.match(wanted, allowed_m, sigma)
         return [replace(pair, i=pair.i + first, j=pair.j + first) for pair in found]

@@ -18,7 +18,7 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 
 from fleetmap.errors import RecordingError
-from fleetmap.features.matching import hamming_knn2
+from fleetmap.features.matching import match_mutual
 from fleetmap.features.orb import Features, detect
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log
@@ -135,12 +135,10 @@ def _matched(first: Features, second: Features) -> Array:
     """(N, 4) raw pixels of mutual nearest descriptors that one epipolar geometry explains to 3 px."""
     if min(len(first.pixels), len(second.pixels)) < 30:
         return np.zeros((0, 4))
-    there, distance, _ = hamming_knn2(first.descriptors, second.descriptors)
-    back, _, _ = hamming_knn2(second.descriptors, first.descriptors)
-    mutual = np.flatnonzero((back[there] == np.arange(len(there))) & (distance < 45))
-    if len(mutual) < 30:
+    a, b = match_mutual(first.descriptors, second.descriptors, 44, np.inf).T
+    if len(a) < 30:
         return np.zeros((0, 4))
-    matches = np.column_stack([first.pixels[mutual], second.pixels[there[mutual]]]).astype(np.float64)
+    matches = np.column_stack([first.pixels[a], second.pixels[b]]).astype(np.float64)
     cv2.setRNGSeed(0)
     _, fits = cv2.findFundamentalMat(matches[:, :2], matches[:, 2:], cv2.FM_RANSAC, 3.0, 0.99)
     return matches[fits.ravel() > 0] if fits is not None else np.zeros((0, 4))

@@ -79,24 +79,6 @@ def best_clock_shift(estimate: Trajectory, truth: Trajectory) -> tuple[float, fl
     return float(found.x), float(found.fun)
 
 
-def unaligned_errors(estimate: Trajectory, truth: Trajectory) -> tuple[Array, Array]:
-    """Return metres and radians (P,) between estimate and truth without alignment, both in one frame, at common stamps."""
-    mine, true = paired(estimate, truth)
-    return _split_errors(se3_inverse(true.frame_from_body) @ mine.frame_from_body)
-
-
-def relative_trajectory_error(estimate: Trajectory, truth: Trajectory, *, step: int = 1) -> tuple[float, float]:
-    """Return root mean squares, metres and radians, of the errors of the motion over `step` matched stamps, for every start.
-
-    Needs no alignment. Raises SurveyError if no pair of stamps has a truth. Source: Sturm et al. 2012 (RPE).
-    """
-    mine, true = paired(estimate, truth)
-    if len(mine) <= step:
-        raise SurveyError(f"{len(mine)} matched stamps are too few for relative errors over {step}; check the clocks")
-    errors_m, errors_rad = _split_errors(_motion_errors(mine, true, np.arange(len(mine) - step), step))
-    return rms(errors_m), rms(errors_rad)
-
-
 def drift(estimate: Trajectory, truth: Trajectory) -> Summary:
     """Return mean errors over segments of the path, as shares of their length and radians per metre; None for paths below a metre.
 
@@ -134,10 +116,8 @@ def _segment_errors(
 
 
 def at_first_stamp(estimate: Trajectory, truth: Trajectory) -> Trajectory:
-    """Return the estimate moved to the truth's frame by the first common stamp, as usual for odometry."""
+    """Return the estimate moved to the truth's frame by the first common stamp, of which there is one, as usual for odometry."""
     mine, true = paired(estimate, truth)
-    if len(mine) == 0:
-        raise SurveyError("no stamp of the estimate has a truth; check that both are on the same clock")
     frame_from_estimate = true.frame_from_body[0] @ se3_inverse(mine.frame_from_body[0])
     return Trajectory(estimate.stamps_ns, frame_from_estimate @ estimate.frame_from_body)
 
@@ -186,15 +166,18 @@ def summary(
 
     ate_*: after a rigid alignment; ate_sim3_rmse_m and scale: after one with scale; clock_shift_s, ate_at_clock_shift_m: of
     `best_clock_shift`; unaligned_*: without alignment, or with `from_first` after aligning the first stamp; rpe_*: of the motion
-    between consecutive stamps; drift_*: of `drift`; nees_*: of the unaligned errors by their covariances, of `consistency`.
+    between consecutive matched stamps (Sturm et al. 2012); drift_*: of `drift`; nees_*: of the unaligned errors by their covariances, of
+    `consistency`.
     frames: expected number of estimated frames, the base of evaluated_share.
     """
     rigid = absolute_trajectory_error(estimate, truth, frames=frames)
     similarity = absolute_trajectory_error(estimate, truth, with_scale=True)
     shift_s, shifted_m = best_clock_shift(estimate, truth) or (None, None)
-    rpe_m, rpe_rad = relative_trajectory_error(estimate, truth)
+    mine, true = paired(estimate, truth)
+    rpe_m, rpe_rad = map(rms, _split_errors(_motion_errors(mine, true, np.arange(len(mine) - 1), 1)))
     placed = at_first_stamp(estimate, truth) if from_first else estimate
-    errors_m, errors_rad = unaligned_errors(placed, truth)
+    at_stamps = paired(placed, truth)[0].frame_from_body
+    errors_m, errors_rad = _split_errors(se3_inverse(true.frame_from_body) @ at_stamps)
     return {
         "stamps": len(estimate),
         "matched": rigid.matched,

@@ -122,8 +122,7 @@ def bridges(
 
 def sigma_between(odometry: OdometryPass) -> SigmaBetween:
     """Return the standard deviation, in metres, of keyframe b relative to keyframe a by odometry: the growth of its variance."""
-    covariances = odometry.covariances[odometry.keyframe_frames]
-    return grown_sigma(np.trace(covariances[:, 3:, 3:], axis1=1, axis2=2))
+    return grown_sigma(odometry.keyframe_variances_m2)
 
 
 def grown_sigma(variances_m2: Array) -> SigmaBetween:

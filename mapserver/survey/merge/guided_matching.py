@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.features import patch_align
 from fleetmap.features.orb import SCALE_FACTOR
+from fleetmap.features.patch_align import Patches, halvings, refine_matches
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.relocalization.landmark_visibility import Rows
@@ -121,28 +121,24 @@ def match_keyframe(
 def _aligned(
     base: BaseMap, keyframe: Keyframe, rows: Rows, features: Rows, cam_from_map: Array, settings: SurveySettings
 ) -> Array:
-    """Return (P, 3) as patch_align.refine_matches, against the landmarks' patches instead of whole pictures."""
-    octaves = base.map.obs_octave[base.references[rows]]
-    sizes = 2.0 ** patch_align.halvings(octaves)[:, None]
-    exact = base.map.obs_pixels[base.references[rows], :2] / sizes
+    """Return (P, 3) as `refine_matches`, against the landmarks' patches instead of whole pictures."""
+    references = base.references[rows]
+    octaves, owners = base.map.obs_octave[references], base.map.obs_keyframe[references]
+    sizes = 2.0 ** halvings(octaves)[:, None]
+    exact = base.map.obs_pixels[references, :2] / sizes
     side = base.map.patches.shape[1]
     mosaic = np.ascontiguousarray(base.map.patches[rows].reshape(-1, side))
     centres = exact - np.rint(exact) + side // 2
     # Patches are stacked vertically: a window that leaves its patch sideways would also leave it up or down.
     centres[:, 1] += side * np.arange(len(rows))
-    # Each patch was cut at its own level, which is the level of the mosaic.
-    reference = patch_align.Patches((mosaic, mosaic, mosaic), centres * sizes, octaves)
-    seen = keyframe.features.take(features)
-    current = patch_align.Patches(keyframe.pyramid, seen.pixels, seen.octaves)
-    return patch_align.refine_matches(reference, current, _warps(base, rows, cam_from_map), settings.align)
-
-
-def _warps(base: BaseMap, rows: Rows, cam_from_map: Array) -> Array:
-    """Return (P, 2, 3) warps for `patch_align.refine_matches`; NaN if degenerate."""
-    warps = np.empty((len(rows), 2, 3))
-    order = base.map.obs_keyframe[base.references[rows]]
-    for k in np.unique(order):
-        own, map_from_reference = np.flatnonzero(order == k), base.map_from_cam[k]
+    # Each patch was cut at its own level, which is the level of the mosaic. Without its angle only the motion can warp it.
+    known = (mosaic, mosaic, mosaic), centres * sizes, octaves, np.full(len(rows), np.nan, np.float32)
+    aligned = np.empty((len(rows), 3))
+    for k in np.unique(owners):
+        own, map_from_reference = np.flatnonzero(owners == k), base.map_from_cam[k]
         points = transform_points(se3_inverse(map_from_reference), base.points_map[rows[own]])
-        warps[own] = patch_align.warps_from_motion(points, cam_from_map @ map_from_reference)
-    return warps
+        seen = Patches.of(keyframe.pyramid, keyframe.features, features[own])
+        aligned[own] = refine_matches(
+            Patches(*known, own), seen, settings.align, points, cam_from_map @ map_from_reference
+        )
+    return aligned

@@ -27,7 +27,6 @@ from mapserver.survey.merge.session_alignment import (
     alignments,
     count_places,
     find_fixes,
-    fixes_around,
     follow_fixes,
 )
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
@@ -159,10 +158,7 @@ class MembershipTest:
         if by_priors is not None:  # plus as many that priors put near a place of the map
             beside = np.flatnonzero(self._beside_the_map(by_priors).any(axis=1)).tolist()
             ks = sorted({*ks, *_spread(beside, settings.fix_keyframes)})
-        fixes = find_fixes(self._relocalizer, session.images, ks, session.body_from_cams)
-        if by_priors is not None:
-            expected = {k: by_priors[k] for k in ks}
-            fixes += fixes_around(self._relocalizer, session.images, expected, session.body_from_cams)
+        fixes = find_fixes(self._relocalizer, session.images, ks, session.body_from_cams, by_priors)
         self.tried = len(ks)
         found = alignments(fixes, session.survey_from_body, GraphMarginals(session.survey_from_body, session.chain))
         enough = [p for p in found if len(p.fixes) >= settings.min_fixes and p.places >= settings.min_places]

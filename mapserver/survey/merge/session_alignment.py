@@ -43,17 +43,19 @@ class Alignment:
 Images = Sequence[Sequence[FrameFeatures]]
 
 
-def find_fixes(relocalizer: Relocalizer, images: Images, ks: Sequence[int], body_from_cams: Array) -> list[SessionFix]:
+def find_fixes(
+    relocalizer: Relocalizer, images: Images, ks: Sequence[int], body_from_cams: Array, expected: Array | None
+) -> list[SessionFix]:
     """Return all fixes of keyframes ks by each of their images, several for one image if places of the map look alike.
 
-    images: of each keyframe by the cameras at body_from_cams (V, 4, 4).
+    images: of each keyframe by the cameras at body_from_cams (V, 4, 4). expected: map_from_body (K, 4, 4), near which fixes are also
+    searched, and put behind the others; None if unknown.
     """
-    return [
-        _at_body(k, fix, body_from_cam)
-        for k in ks
-        for image, body_from_cam in zip(images[k], body_from_cams, strict=True)
-        for fix in finished(relocalizer.anywhere(image))
-    ]
+    looks = [(k, *each) for k in ks for each in zip(images[k], body_from_cams, strict=True)]
+    found = [(k, fix, mount) for k, image, mount in looks for fix in finished(relocalizer.anywhere(image))]
+    for k, image, mount in looks if expected is not None else ():
+        found.append((k, relocalizer.by_projection(image, expected[k] @ mount, _WIDEST_PX), mount))
+    return [_at_body(k, fix, mount) for k, fix, mount in found if fix is not None]
 
 
 def _at_body(k: int, fix: Fix, body_from_cam: Array) -> SessionFix:
@@ -62,18 +64,6 @@ def _at_body(k: int, fix: Fix, body_from_cam: Array) -> SessionFix:
     return SessionFix(
         k, fix.map_from_cam @ se3_inverse(body_from_cam), carry @ fix.cov_rot_trans @ carry.T, fix.inliers
     )
-
-
-def fixes_around(
-    relocalizer: Relocalizer, images: Images, places: dict[int, Array], body_from_cams: Array
-) -> list[SessionFix]:
-    """Return fixes of keyframes near their expected poses, map_from_body (4, 4) by keyframe; images as of `find_fixes`."""
-    found = (
-        (k, body_from_cam, relocalizer.by_projection(image, place @ body_from_cam, _WIDEST_PX))
-        for k, place in places.items()
-        for image, body_from_cam in zip(images[k], body_from_cams, strict=True)
-    )
-    return [_at_body(k, fix, body_from_cam) for k, body_from_cam, fix in found if fix is not None]
 
 
 def alignments(fixes: Sequence[SessionFix], survey_from_body: Array, chain: GraphMarginals) -> list[Alignment]:

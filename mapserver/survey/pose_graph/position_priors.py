@@ -7,7 +7,7 @@ error: each visit is one term with the covariance of one sample.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -241,21 +241,13 @@ _MAX_SCALE_SIGMA_SHARE = 0.01  # limit for the scale by priors: beyond it the sc
 _MAX_DOCK_GAP_NS = 2_000_000_000
 
 
-@dataclass(frozen=True, slots=True)
-class DockAlignment:
-    """map_from_survey (4, 4) without the scale, metres per unit of the survey, and its relative standard deviation."""
-
-    map_from_survey: Array
-    scale: float
-    scale_sigma_share: float
-
-
 def aligned_by_priors(
     survey_map: SurveyMap, priors: Sequence[PositionPrior], base_from_body: Array
-) -> DockAlignment | None:
-    """Return pose and scale of a survey of unknown scale, by the docks and tags along its path with position and direction.
+) -> tuple[Array, float] | None:
+    """Return the pose of a survey of unknown scale, map_from_survey (4, 4) without the scale, and the metres per unit of the survey.
 
-    None with fewer than two such priors, or with a scale less accurate than 1 %. Gauss-Newton on seven unknowns.
+    By the docks and tags along its path with position and direction; None with fewer than two, or with a scale less accurate than 1 %.
+    Gauss-Newton on seven unknowns.
     """
     usable = []
     for prior in priors:
@@ -289,4 +281,4 @@ def aligned_by_priors(
         turn, scale = so3_exp(np.asarray(step[:3], np.float64)) @ turn, scale * float(np.exp(step[6]))
         shift = shift + step[3:6]
     sigma = float(np.sqrt(np.linalg.inv(hessian)[6, 6]))
-    return DockAlignment(se3(turn, shift), scale, sigma) if sigma <= _MAX_SCALE_SIGMA_SHARE else None
+    return (se3(turn, shift), scale) if sigma <= _MAX_SCALE_SIGMA_SHARE else None

@@ -111,14 +111,14 @@ class NearPlaces:
         return found[: np.searchsorted(found, until)]
 
 
-def drift_allowance_m(covariances: NDArray[np.float64], positions_m: Array) -> Callable[[int, int], float]:
+def drift_allowance_m(variances_m2: Array, positions_m: Array) -> Callable[[int, int], float]:
     """Return the allowed difference of measured and predicted motion before loop closure: three sigmas of odometry, and a least one.
 
-    covariances (K, 6, 6) of the keyframes' odometry; the growth between two of them is their relative uncertainty.
+    variances_m2 (K,): of the keyframes' positions by odometry, summed over the axes; the growth is that of their relative position.
     """
 
     def allowed_m(i: int, j: int) -> float:
-        gained = max(float(np.trace(covariances[j][3:, 3:] - covariances[i][3:, 3:])), 0.0)
+        gained = max(float(variances_m2[j] - variances_m2[i]), 0.0)
         least = 0.05 + 0.03 * float(np.linalg.norm(positions_m[j] - positions_m[i]))
         return 3.0 * float(np.sqrt(gained + least**2))
 

@@ -7,15 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.features import patch_align
+from fleetmap.features.patch_align import Patches, refine_matches
 from fleetmap.geometry import Array, se3_inverse, transform_points
 from mapserver.survey.executor import SERIAL, Executor, in_batches
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Indices, Keyframe, Landmarks, RigImages, of_features
 from mapserver.survey.tracks.pairs import PairMatch
 
-# Of an image: its pyramid, pixels (M, 2), octaves (M,) and angles (M,) of features, and which of them are chosen (N,).
-_PatchFeatures = tuple[patch_align.Pyramid, Array, NDArray[np.int8], NDArray[np.float32], NDArray[np.int64]]
 _SAME_WARP = 0.01  # isotropic change of a patch's shape that moves its rim by less than 0.05 px
 _ROWS = 2**18  # observations per comparison of warps
 _BATCH = 16  # images: their sources overlap, so that few pictures are sent twice
@@ -194,7 +192,6 @@ class _ObservationBatch:
 def _observe_batch(settings: SurveySettings, batch: _ObservationBatch) -> tuple[Array, Array]:
     """Return pixels (M, 3) and sigmas (M, 2) of one batch."""
     noise, align = settings.noise, settings.align
-    limits = align.half_window_px, align.max_shift_px, align.min_correlation
     pixels, sigmas = np.empty((len(batch.table), 3)), np.empty((len(batch.table), 2))
     for k in np.unique(batch.table[:, 0]).tolist():
         rows = np.flatnonzero(batch.table[:, 0] == k)
@@ -209,9 +206,10 @@ def _observe_batch(settings: SurveySettings, batch: _ObservationBatch) -> tuple[
                 continue
             other, map_from_source = batch.images[source]
             points_source = transform_points(se3_inverse(map_from_source), points_map[inner])
-            theirs, ours = _patch_features(other, references[inner, 2]), _patch_features(own, features[inner])
+            theirs = Patches.of(other.pyramid, other.features, references[inner, 2])
+            ours = Patches.of(own.pyramid, own.features, features[inner])
             cam_from_source = se3_inverse(map_from_cam) @ map_from_source
-            refined = core.align_observations(theirs, ours, points_source, cam_from_source, *limits)
+            refined = refine_matches(theirs, ours, align, points_source, cam_from_source)
             sure = np.isfinite(refined[:, 0])
             left[inner[sure]] = refined[sure, :2]
             sigma[inner[sure]] = np.hypot(noise.aligned_sigma_px, refined[sure, 2])
@@ -219,9 +217,3 @@ def _observe_batch(settings: SurveySettings, batch: _ObservationBatch) -> tuple[
         pixels[rows] = np.column_stack([left, left[:, 0] - disparities])
         sigmas[rows] = np.column_stack([sigma, np.hypot(noise.disparity_sigma_px, np.nan_to_num(its_sigmas, nan=1.0))])
     return pixels, sigmas
-
-
-def _patch_features(keyframe: Keyframe, chosen: NDArray[np.int64]) -> _PatchFeatures:
-    own = keyframe.features
-    pixels, octaves = np.ascontiguousarray(own.pixels, np.float64), np.ascontiguousarray(own.octaves, np.int8)
-    return keyframe.pyramid, pixels, octaves, np.ascontiguousarray(own.angles_deg, np.float32), chosen

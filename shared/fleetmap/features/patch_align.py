@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.features.orb import SCALE_FACTOR
+from fleetmap.features.orb import SCALE_FACTOR, Features
 from fleetmap.features.settings import AlignSettings
 from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Image
@@ -20,49 +20,39 @@ def half_pyramid(image: Image) -> Pyramid:
     return image, half, quarter
 
 
-def warps_from_features(
-    octaves_reference: NDArray[np.int8],
-    angles_reference_deg: NDArray[np.floating],
-    octaves_current: NDArray[np.int8],
-    angles_current_deg: NDArray[np.floating],
-) -> Array:
-    """(N, 2, 3) warps for `refine_matches`, from two features' octaves and orientations; the surface's slant is unknown."""
-    scale = SCALE_FACTOR ** (octaves_reference.astype(np.float64) - octaves_current)
-    angle = np.radians(angles_reference_deg.astype(np.float64) - angles_current_deg)
-    cosine, sine, none = scale * np.cos(angle), scale * np.sin(angle), np.zeros(len(scale))
-    return np.stack([np.stack([cosine, -sine, none], -1), np.stack([sine, cosine, none], -1)], 1)
-
-
-def warps_from_motion(points_reference: Array, current_from_reference: Array) -> Array:
-    """(N, 2, 3) warps for `refine_matches` around points (N, 3) of the reference camera. NaN where degenerate."""
-    return core.warps_from_motion(
-        np.ascontiguousarray(points_reference, np.float64), np.ascontiguousarray(current_from_reference, np.float64)
-    )
-
-
 class Patches(NamedTuple):
-    """Features of an image: its `half_pyramid`, pixels (N, 2) at level 0, octaves (N,)."""
+    """Chosen features (N,) of an image: its `half_pyramid`; of all, pixels (M, 2) at level 0, octaves (M,) and angles (M,)."""
 
     pyramid: Pyramid
     pixels: Array
     octaves: NDArray[np.int8]
+    angles_deg: NDArray[np.float32]
+    chosen: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, pyramid: Pyramid, features: Features, chosen: NDArray[np.int64]) -> "Patches":
+        """Return the chosen features (N,) of an image."""
+        kinds = (features.pixels, np.float64), (features.octaves, np.int8), (features.angles_deg, np.float32)
+        return cls(pyramid, *(np.ascontiguousarray(*each) for each in kinds), chosen)
 
 
-def refine_matches(reference: Patches, current: Patches, warps: Array, settings: AlignSettings) -> Array:
+def refine_matches(
+    reference: Patches,
+    current: Patches,
+    settings: AlignSettings,
+    points_reference: Array | None = None,
+    current_from_reference: Array | None = None,
+) -> Array:
     """(N, 3) x, y, sigma_px in level-0 pixels of the current image; NaN where the patches do not agree.
 
-    warps (N, 2, 3): the first two columns are reference_from_current of offsets on a surface that faces the camera, the third one is
-    the way of a pixel, for a slant of 1 and an offset of 1 (shared/core/patch_align.cpp). Each feature is aligned on the halving of the
-    pyramid nearest to the scale at which it was found.
+    The patches are warped as by the motion around points (N, 3) of the reference camera; where that is degenerate or not known, None,
+    by the features' octaves and orientations, whose surface's slant is unknown (shared/core/patch_align.cpp). Each feature is aligned on
+    the halving of the pyramid nearest to the scale at which it was found.
     """
+    points = np.full((len(reference.chosen), 3), np.nan) if points_reference is None else points_reference
+    motion = np.eye(4) if current_from_reference is None else current_from_reference
     limits = settings.half_window_px, settings.max_shift_px, settings.min_correlation
-    both = *_as_core(reference), *_as_core(current)
-    return core.align_patches(*both, np.ascontiguousarray(warps, np.float64), *limits)
-
-
-def _as_core(patches: Patches) -> tuple[Pyramid, Array, NDArray[np.int8]]:
-    pixels = np.ascontiguousarray(patches.pixels, np.float64)
-    return patches.pyramid, pixels, np.ascontiguousarray(patches.octaves, np.int8)
+    return core.align_features(reference, current, points, motion, *limits)
 
 
 def halvings(octaves: NDArray[np.int8]) -> NDArray[np.int64]:

@@ -69,11 +69,11 @@ def test_disparities_patches_and_flow_are_right_whatever_the_camera_makes_of_it(
     assert right is not None
     _check(stereo.disparities(RectifiedFrame(0, left, right, None), CAMERA, PIXELS, StereoSettings())[:, 0])
     there = np.column_stack([PIXELS[:, 0] - np.rint(TRUE), PIXELS[:, 1]])
-    plane = np.array([[1.0 - 0.012, -0.006], [0.0, 1.0]])
-    warps = np.tile(np.column_stack([np.linalg.inv(plane), np.zeros(2)]), (len(PIXELS), 1, 1))
-    octaves = np.zeros(len(PIXELS), np.int8)
-    seen = Patches(half_pyramid(left), PIXELS, octaves), Patches(half_pyramid(right), there, octaves)
-    aligned = refine_matches(*seen, warps, AlignSettings(min_correlation=0.0))
+    points, right_from_left = CAMERA.point_from_pixel(PIXELS, TRUE), np.eye(4)
+    right_from_left[0, 3] = -CAMERA.baseline_m
+    finest = np.zeros(len(PIXELS), np.int8), np.zeros(len(PIXELS), np.float32), np.arange(len(PIXELS))
+    seen = Patches(half_pyramid(left), PIXELS, *finest), Patches(half_pyramid(right), there, *finest)
+    aligned = refine_matches(*seen, AlignSettings(min_correlation=0.0), points, right_from_left)
     _check(PIXELS[:, 0] - aligned[:, 0])
     places, found = core.follow_pixels(left, right, PIXELS, there, 6, 1, np.inf, -np.inf)
     _check(np.where(found, PIXELS[:, 0] - places[:, 0], np.nan))

@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.features import orb, patch_align, stereo
+from fleetmap.features import orb, stereo
 from fleetmap.features.extraction import extract
 from fleetmap.features.matching import match_mutual
+from fleetmap.features.patch_align import Patches, Pyramid, half_pyramid, refine_matches
 from fleetmap.features.settings import AlignSettings, OrbSettings, StereoSettings
 from fleetmap.geometry import Array, transform_points
 from fleetmap.odometry.settings import TrackerSettings
@@ -68,7 +69,7 @@ class Tracked:
 @dataclass(frozen=True, slots=True)
 class _Remembered:
     frame_index: int
-    pyramid: patch_align.Pyramid
+    pyramid: Pyramid
     features: orb.Features
     disparities: Array
     points_cam: Array
@@ -181,7 +182,7 @@ class Tracker:
         features = extract(frame.left, self._orb, self._camera.clearance_px)
         depth = stereo.disparities(frame, self._camera, features.pixels, self._stereo)[:, 0]
         points = self._camera.point_from_pixel(features.pixels, depth)
-        return _Remembered(frame_index, patch_align.half_pyramid(frame.left), features, depth, points)
+        return _Remembered(frame_index, half_pyramid(frame.left), features, depth, points)
 
     def _match_pair(
         self,
@@ -201,11 +202,8 @@ class Tracker:
         if found is None:
             return None
         a, b = a[found.inliers], b[found.inliers]
-        before, now = old.features.take(a), current.features.take(b)
-        warp = patch_align.warps_from_features(before.octaves, before.angles_deg, now.octaves, now.angles_deg)
-        reference = patch_align.Patches(old.pyramid, before.pixels, before.octaves)
-        patches = patch_align.Patches(current.pyramid, now.pixels, now.octaves)
-        refined = patch_align.refine_matches(reference, patches, warp, AlignSettings())
+        before, now = (Patches.of(of.pyramid, of.features, chosen) for of, chosen in ((old, a), (current, b)))
+        refined = refine_matches(before, now, AlignSettings())
         sure = np.isfinite(refined[:, 0])
         a, b = a[sure], b[sure]
         if len(a) < self._settings.min_inliers_known_rotation:
