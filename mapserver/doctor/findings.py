@@ -32,19 +32,20 @@ class Finding:
 
 
 class Limits(NamedTuple):
-    """Values above which a check warns and fails, and their unit as text."""
+    """Values above which a check warns and fails, their unit as text, and both as text if they are of something else than the value."""
 
     warn_above: float
     fail_above: float
-    unit: str
+    unit: str = ""
+    words: str = ""
 
 
 def judge(name: str, value: float, limits: Limits, good: str, bad: str) -> Finding:
     """Return a finding on a value that should be small. `good` is its sentence if it is, `bad` (with the next step) if not."""
-    warn_above, fail_above, unit = limits
+    warn_above, fail_above, unit, words = limits
     verdict = Verdict.FAIL if value > fail_above else Verdict.WARN if value > warn_above else Verdict.OK
-    limit = f"warn above {warn_above:g} {unit}, fail above {fail_above:g} {unit}".replace(" ,", ",").strip()
-    return Finding(name, verdict, value, limit, good if verdict is Verdict.OK else bad)
+    both = f"warn above {warn_above:g} {unit}, fail above {fail_above:g} {unit}".replace(" ,", ",").strip()
+    return Finding(name, verdict, value, words or both, good if verdict is Verdict.OK else bad)
 
 
 def not_judged(name: str, reason: str, missing: str) -> Finding:

@@ -1,6 +1,6 @@
 """The gyro against the images: time offset, scale and axes of their rotation rates."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -197,14 +197,11 @@ def _offset_finding(fit: GyroFit, imu_minus_cam_s: float) -> Finding:
 
 
 def _scale_finding(fit: GyroFit) -> Finding:
-    error = abs(fit.scale - 1)
-    verdict = Verdict.OK if error < 0.1 else Verdict.WARN if error < 0.3 else Verdict.FAIL
     words = f"the gyro turns {fit.scale:.3f} times as fast as the images"
-    if 40 < fit.scale < 80:
-        words += "; it is in degrees per second, multiply it by pi/180"
-    elif verdict is not Verdict.OK:
-        words += "; check its unit, and the focal length in the calibration"
-    return Finding(SCALE, verdict, fit.scale, "warn 0.1, fail 0.3 from 1", words)
+    is_degrees, limits = 40 < fit.scale < 80, Limits(0.1, 0.3, words="warn 0.1, fail 0.3 from 1")
+    advice = "it is in degrees per second, multiply it by pi/180"
+    advice = advice if is_degrees else "check its unit, and the focal length in the calibration"
+    return replace(judge(SCALE, abs(fit.scale - 1), limits, words, f"{words}; {advice}"), value=fit.scale)
 
 
 def _axes_finding(fit: GyroFit) -> Finding:

@@ -272,7 +272,6 @@ def _look(rig: tuple[StereoCamera, Array], moment: _Moment) -> _Look:
 
 def _readable(frames: _Frames) -> Finding:
     tried, errors = len(frames.tried), list(frames.errors.values())
-    verdict, sentence = Verdict.OK, f"all {tried} checked frames are readable"
-    if errors:
-        verdict, sentence = Verdict.FAIL, f"{len(errors)} of {tried} cannot be read; {errors[0]}"
-    return Finding("images", verdict, float(len(errors)), "every checked frame must be readable", sentence)
+    bad = f"{len(errors)} of {tried} cannot be read; {''.join(errors[:1])}"
+    limits = Limits(0, 0, words="every checked frame must be readable")
+    return judge("images", float(len(errors)), limits, f"all {tried} checked frames are readable", bad)

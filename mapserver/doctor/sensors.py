@@ -1,6 +1,7 @@
 """Checks of stamps and samples alone: rates, gaps, order, overlap of camera and IMU, gravity, and a rolling shutter."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -99,11 +100,9 @@ def imu_noise(calibration: RigCalibration) -> list[Finding]:
 def stamp_order(issues: Sequence[DataIssue]) -> Finding:
     """Report stamps that do not increase and were dropped when the recording was opened."""
     found = [f"{issue.what}, {issue.detail}" for issue in issues if _DISORDER in issue.what]
-    verdict, sentence = Verdict.OK, "all stamps increase"
-    if found:
-        advice = "check for a clock that is set while recording, or for a driver that sends late"
-        verdict, sentence = Verdict.FAIL, "; ".join([*found, advice])
-    return Finding("stamp order", verdict, float(len(found)), "none may be out of order", sentence)
+    bad = "; ".join([*found, "check for a clock that is set while recording, or for a driver that sends late"])
+    limits = Limits(0, 0, words="none may be out of order")
+    return judge("stamp order", float(len(found)), limits, "all stamps increase", bad)
 
 
 def other_issues(issues: Sequence[DataIssue]) -> list[Finding]:
@@ -153,14 +152,11 @@ def gravity_magnitude(imu: ImuSamples) -> Finding:
     unrest = accel.std(axis=1).sum(axis=1)
     calm = np.argsort(unrest, kind="stable")[: max(1, count // 10)]
     magnitude = float(np.median(np.linalg.norm(accel[calm].mean(axis=1), axis=1)))
-    error = abs(magnitude - _GRAVITY_MPS2)
-    verdict = Verdict.OK if error < 0.25 else Verdict.WARN if error < 0.8 else Verdict.FAIL
-    sentence = f"{magnitude:.2f} m/s^2 when calm"
-    if verdict is not Verdict.OK:
-        known = (words for value, words in _ODD_GRAVITIES.items() if abs(magnitude - value) < max(0.1 * value, 0.3))
-        advice = next(known, "check the accelerometer's unit, scale and calibration")
-        sentence += f" instead of {_GRAVITY_MPS2}; {advice}"
-    return Finding(GRAVITY, verdict, magnitude, "warn 0.25, fail 0.8 m/s^2 from 9.81", sentence)
+    known = (words for value, words in _ODD_GRAVITIES.items() if abs(magnitude - value) < max(0.1 * value, 0.3))
+    advice = next(known, "check the accelerometer's unit, scale and calibration")
+    good, limits = f"{magnitude:.2f} m/s^2 when calm", Limits(0.25, 0.8, words="warn 0.25, fail 0.8 m/s^2 from 9.81")
+    bad = f"{good} instead of {_GRAVITY_MPS2}; {advice}"
+    return replace(judge(GRAVITY, abs(magnitude - _GRAVITY_MPS2), limits, good, bad), value=magnitude)
 
 
 def rolling_shutter(camera: CameraCalibration, imu: ImuSamples) -> list[Finding]:
@@ -174,8 +170,5 @@ def rolling_shutter(camera: CameraCalibration, imu: ImuSamples) -> list[Finding]
     rate_radps = float(np.percentile(np.linalg.norm(imu.gyro_radps, axis=1), 95))
     skew_px = rate_radps * readout_s * float(camera.focal_px[0])
     words = f"{told}: at the turns of this recording (95 %: {rate_radps:.2f} rad/s) a row is shifted by {skew_px:.1f} px against the first"
-    verdict = Verdict.OK
-    if skew_px > 1.0:
-        verdict = Verdict.WARN
-        words += "; turn more slowly, or use a camera with a global shutter"
-    return [Finding("rolling shutter", verdict, skew_px, "warn above 1 px", words)]
+    bad = f"{words}; turn more slowly, or use a camera with a global shutter"
+    return [judge("rolling shutter", skew_px, Limits(1.0, np.inf, words="warn above 1 px"), words, bad)]

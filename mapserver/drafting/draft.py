@@ -22,8 +22,8 @@ from fleetmap.recordings import Topics
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.drafting.area_corrections import AreaCorrections, driven_since
-from mapserver.drafting.draft_evidence import Before, DraftMap, JudgedSession, examine_draft, replayed_probes
-from mapserver.drafting.extras import ChosenDraft, Extra, MappedSession
+from mapserver.drafting.draft_evidence import Before, DraftMap, MappedSession, examine_draft, replayed_probes
+from mapserver.drafting.extras import ChosenDraft, Extra
 from mapserver.drafting.job_lock import Job, JobProgress, recorded_job
 from mapserver.drafting.mapped_images import MappedImageStore
 from mapserver.drafting.progress import ProgressView, StageTimes
@@ -254,24 +254,20 @@ def _survey(
 def _keep(run: _Run, built: BuildResult, parent: Before | None, maps: MapStore) -> Draft:
     """Cut the map into tiles, measure them, store the draft and write the requested files."""
     site, survey_map = run.request.site, built.joined.map
-    judged = [
-        JudgedSession(trajectory, s.probed, s.survey, s.entry.name)
+    sessions = [
+        MappedSession(trajectory, s.probed, s.survey, s.entry.name)
         for trajectory, s in zip(map_trajectories(built.joined), built.taken, strict=True)
     ]
     run.times.begin("choosing")
     wanted = None if parent is None else parent.wanted_ids(survey_map)
     frozen = built.corrections.frozen(survey_map.points_map)
     chooser = TileChooser(survey_map, run.settings.budget, wanted, default_vocabulary(), frozen)
-    tiles, views = chooser.choose(asked_views(judged))
+    tiles, views = chooser.choose(asked_views(sessions))
     run.times.begin("extras")
-    sessions = [
-        MappedSession(s.entry.name, s.survey, session.trajectory.frame_from_body)
-        for s, session in zip(built.taken, judged, strict=True)
-    ]
     before = None if parent is None else parent.manifest
     extras = _extras(ChosenDraft(sessions, run.settings, built.corrections, before, maps))
     run.times.begin("examining")
-    evidence = msgspec.structs.replace(_evidence(run, built, judged, tiles, parent), views=views)
+    evidence = msgspec.structs.replace(_evidence(run, built, sessions, tiles, parent), views=views)
     run.times.begin("storing")
     known_m = None if before is None else before.report.get("alias_step_m")
     report = make_report(
@@ -341,7 +337,7 @@ def covered_requests(maps: MapStore, site: str, joined: MergedMap) -> dict[str, 
 
 
 def _evidence(
-    run: _Run, built: BuildResult, sessions: list[JudgedSession], tiles: list[Tile], before: Before | None
+    run: _Run, built: BuildResult, sessions: list[MappedSession], tiles: list[Tile], before: Before | None
 ) -> Evidence:
     options, camera = run.request.options, built.joined.map.camera
     replayed = []

@@ -64,13 +64,18 @@ class ProbedFrame:
         return Probe(self.camera, self.features, map_from_body[self.number] @ self.body_from_cam)
 
 
-class JudgedSession(NamedTuple):
+class MappedSession(NamedTuple):
     """A recording in the map: poses of its frames in `map`, its probed frames, its survey, and its name."""
 
     trajectory: Trajectory
     probed: Sequence[ProbedFrame]
     survey: Survey
     name: str = ""
+
+    @property
+    def map_from_body(self) -> Array:
+        """(F, 4, 4) of its frames."""
+        return self.trajectory.frame_from_body
 
     def asked(self, recordings: int) -> list[ProbedFrame]:
         """Return the frames for which landmarks are chosen: every second held-out one of one of so many recordings, and both ends."""
@@ -84,7 +89,7 @@ class JudgedSession(NamedTuple):
 
     def probes(self, frames: Iterable[ProbedFrame]) -> list[Probe]:
         """Return frames of the recording as probes."""
-        return [frame.probe(self.trajectory.frame_from_body) for frame in frames]
+        return [frame.probe(self.map_from_body) for frame in frames]
 
     def _held_out(self, recordings: int, first: int) -> list[ProbedFrame]:
         """Return the images of every second held-out frame of one of so many recordings."""
@@ -215,7 +220,7 @@ class DraftMap(NamedTuple):
 def examine_draft(
     drafted: DraftMap,
     before: Before | None,
-    sessions: Sequence[JudgedSession],
+    sessions: Sequence[MappedSession],
     replayed: Sequence[Probe],
     executor: Executor = SERIAL,
 ) -> Evidence:
@@ -244,7 +249,7 @@ def examine_draft(
     return found
 
 
-def _breaks(sessions: Sequence[JudgedSession]) -> TrajectoryBreaks | None:
+def _breaks(sessions: Sequence[MappedSession]) -> TrajectoryBreaks | None:
     """Return the breaks of all recordings together; a single camera's odometry has no scale to compare."""
     found = []
     for trajectory, _, survey, _ in sessions:

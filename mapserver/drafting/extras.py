@@ -6,20 +6,11 @@ from typing import NamedTuple
 
 import msgspec
 
-from fleetmap.geometry import Array
 from fleetmap.mapformat.manifest import Manifest
 from mapserver.drafting.area_corrections import AreaCorrections
+from mapserver.drafting.draft_evidence import MappedSession
 from mapserver.store import MapStore
 from mapserver.survey.settings import SurveySettings
-from mapserver.survey.stages import Survey
-
-
-class MappedSession(NamedTuple):
-    """A recording in the map: its name, its survey, and map_from_body (F, 4, 4) of its frames in the final frame."""
-
-    name: str
-    survey: Survey
-    map_from_body: Array
 
 
 @dataclass(frozen=True)

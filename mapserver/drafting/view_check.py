@@ -16,7 +16,7 @@ from fleetmap.relocalization.landmark_visibility import places_around
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Fix, is_reliable
 from fleetmap.relocalization.settings import FixSettings
-from mapserver.drafting.draft_evidence import JudgedSession
+from mapserver.drafting.draft_evidence import MappedSession
 from mapserver.quality.figures import BlindView, SurveyedViews
 from mapserver.quality.probes import PRIOR_RADIUS_M, SAME_WAY_COSINE, Probe, place_xy, relocalized
 from mapserver.survey.settings import BudgetSettings
@@ -31,7 +31,7 @@ class AskedView(NamedTuple):
     path_m: float
 
 
-def asked_views(sessions: Sequence[JudgedSession]) -> list[AskedView]:
+def asked_views(sessions: Sequence[MappedSession]) -> list[AskedView]:
     """Return held-out frames of all recordings that judge no draft, and both ends of every recording."""
     found = []
     for session in sessions:

@@ -26,7 +26,7 @@ _Counts = NDArray[np.uint16]
 _Rows = Callable[[_Reals, _Reals, _Reals, _Reals, bool], tuple[_Reals, _Reals, _Reals, _Reals]]
 
 def nearest_two(a: _Descriptors, b: _Descriptors) -> tuple[_Indices, _Numbers, _Numbers]:
-    """For each of a: (A,) index of the nearest of b, its distance, the second smallest distance."""
+    """For each of a: (A,) index of the nearest of b, -1 for none, its distance, the second smallest one. Ties go to the lower index."""
 
 def mutual(a: _Descriptors, b: _Descriptors, max_distance: int, ratio: float) -> _Indices:
     """(P, 2) pairs that are each other's nearest."""

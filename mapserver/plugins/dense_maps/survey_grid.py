@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.version_grid import Counts, Tiles
-from mapserver.drafting.extras import MappedSession
+from mapserver.drafting.draft_evidence import MappedSession
 from mapserver.plugins.dense_maps.dense_stereo import dense_disparity, floor_distance_m, nearest_around
 from mapserver.plugins.dense_maps.site_grid import FREE, REACH_PX, SessionViews, updated
 from mapserver.survey.bundle.stereo_yaw_check import disparity_shift

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fleetmap.encoding import to_json
 from fleetmap.geometry import Array
 from fleetmap.mapformat.names import sha256_hex
-from mapserver.drafting.extras import MappedSession
+from mapserver.drafting.draft_evidence import MappedSession
 from mapserver.store.survey_pictures import MOST, PictureIndex, PicturesReport, SurveyPicture
 
 _LARGEST_PX, _QUALITIES, _MOST_BYTES = 320, (75, 50, 25, 5), 20_000

@@ -14,7 +14,7 @@ from fleetmap import core
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.version_grid import CELL_M
-from mapserver.drafting.extras import MappedSession
+from mapserver.drafting.draft_evidence import MappedSession
 from mapserver.plugins.dense_maps.exposure import Exposure, Sample, estimate_exposure, squared_tangent
 from mapserver.plugins.dense_maps.site_grid import AGAINST, HIT, OCCUPIED
 from mapserver.plugins.dense_maps.surfel_map import (

@@ -11,11 +11,9 @@ import typer
 
 from fleetmap.cli_options import ConfigFile, TopicNames, config_path
 from fleetmap.errors import RecordingError, UsageError, disk_errors
-from mapserver.commands.options import Calibration, check_output, topics_of
+from mapserver.commands.options import Calibration, check_output, print_table, topics_of
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from fleetmap.recordings import Recording, Topics
     from fleetmap.sensors.calibration import RigCalibration
     from mapserver.calibration import CalibrationEstimate, ParameterEstimate
@@ -52,7 +50,6 @@ def calibrate(
     if guess is not None:
         _from_guess(recordings, out, guess, config_path(context), topics)
         return
-    from fleetmap.console import plain_console
     from mapserver.calibration import estimate_calibration
     from mapserver.config import survey_settings
 
@@ -63,7 +60,10 @@ def calibrate(
         settings = survey_settings(config_path(context), sources[0].sensor_set)
         estimate = estimate_calibration(sources, settings, opened.enter_context(_shown()))
         rig = recorded[0].calibration
-    _print(plain_console(), estimate)
+    title = f"{estimate.keyframes} keyframes, {estimate.observations} observations; corrections to the calibration"
+    verdicts = ("measured" if p.is_judged else f"not judged: {p.reason}" for p in estimate.parameters)
+    rows = ((p.name.value, *_in_words(p), said) for p, said in zip(estimate.parameters, verdicts, strict=True))
+    print_table(("parameter", "correction", "sigma", "verdict"), rows, title)
     if out is None:
         return
     if not any(p.is_judged for p in estimate.parameters):
@@ -157,19 +157,3 @@ def corrected_file(estimate: "CalibrationEstimate", rig: "RigCalibration", names
         )
     lines.append("# The wheels' scale and the IMU's noise are for information: this file keeps the noise that it had.")
     return "\n".join(lines) + "\n" + format_calibration(estimate.corrected(rig))
-
-
-def _print(console: "Console", estimate: "CalibrationEstimate") -> None:
-    from rich.table import Table
-    from rich.text import Text
-
-    table = Table(
-        title=f"{estimate.keyframes} keyframes, {estimate.observations} observations; corrections to the calibration"
-    )
-    for column in ("parameter", "correction", "sigma", "verdict"):
-        table.add_column(column, overflow="fold")
-    for p in estimate.parameters:
-        value, sigma = _in_words(p)
-        verdict = Text("measured", "green") if p.is_judged else Text(f"not judged: {p.reason}", "dim")
-        table.add_row(Text(p.name.value), Text(value), Text(sigma), verdict)
-    console.print(table)

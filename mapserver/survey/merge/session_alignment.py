@@ -52,10 +52,13 @@ def find_fixes(
     searched, and put behind the others; None if unknown.
     """
     looks = [(k, *each) for k in ks for each in zip(images[k], body_from_cams, strict=True)]
-    found = [(k, fix, mount) for k, image, mount in looks for fix in finished(relocalizer.anywhere(image))]
-    for k, image, mount in looks if expected is not None else ():
-        found.append((k, relocalizer.by_projection(image, expected[k] @ mount, _WIDEST_PX), mount))
-    return [_at_body(k, fix, mount) for k, fix, mount in found if fix is not None]
+    found = [_at_body(k, fix, mount) for k, image, mount in looks for fix in finished(relocalizer.anywhere(image))]
+    if expected is not None:
+        near = [
+            (k, relocalizer.by_projection(image, expected[k] @ mount, _WIDEST_PX), mount) for k, image, mount in looks
+        ]
+        found += [_at_body(k, fix, mount) for k, fix, mount in near if fix is not None]
+    return found
 
 
 def _at_body(k: int, fix: Fix, body_from_cam: Array) -> SessionFix:

@@ -15,7 +15,7 @@ Indices = NDArray[np.int64]
 Distances = NDArray[np.int32]
 FAR = 257  # more than any two descriptors can differ by
 
-__all__ = ["FAR", "Projected", "hamming_knn2", "match_by_projection", "match_mutual", "packed"]
+__all__ = ["FAR", "Projected", "match_by_projection", "match_mutual", "packed"]
 
 
 def packed(descriptors: Descriptors) -> Packed:
@@ -25,14 +25,6 @@ def packed(descriptors: Descriptors) -> Packed:
     assert descriptors.dtype == np.uint8
     # Bytes of a tile may be unaligned; words must not be.
     return np.require(np.ascontiguousarray(descriptors).view(np.uint64), requirements=["C", "A"])
-
-
-def hamming_knn2(descriptors_a: Descriptors, descriptors_b: Descriptors) -> tuple[Indices, Distances, Distances]:
-    """For every descriptor of a (A, 32): index of the nearest of b (B, 32), its distance, the second smallest distance.
-
-    Index -1 and distance FAR where b holds too few. Ties go to the lower index.
-    """
-    return core.nearest_two(packed(descriptors_a), packed(descriptors_b))
 
 
 def match_mutual(

@@ -32,8 +32,11 @@ class Patches(NamedTuple):
     @classmethod
     def of(cls, pyramid: Pyramid, features: Features, chosen: NDArray[np.int64]) -> "Patches":
         """Return the chosen features (N,) of an image."""
-        kinds = (features.pixels, np.float64), (features.octaves, np.int8), (features.angles_deg, np.float32)
-        return cls(pyramid, *(np.ascontiguousarray(*each) for each in kinds), chosen)
+        pixels, octaves = (
+            np.ascontiguousarray(features.pixels, np.float64),
+            np.ascontiguousarray(features.octaves, np.int8),
+        )
+        return cls(pyramid, pixels, octaves, np.ascontiguousarray(features.angles_deg, np.float32), chosen)
 
 
 def refine_matches(

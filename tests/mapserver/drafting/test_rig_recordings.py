@@ -16,7 +16,7 @@ from fleetmap.sensors.rectification import RGBD_BASELINE_M, Rectifier
 from fleetmap.sensors.samples import SensorSet
 from mapserver.doctor import Finding
 from mapserver.drafting.admission import CheckedRecording
-from mapserver.drafting.draft_evidence import JudgedSession, ProbedFrame
+from mapserver.drafting.draft_evidence import MappedSession, ProbedFrame
 from mapserver.drafting.survey_recordings import OpenRecordings, RecordingOptions, _admission
 from mapserver.quality.figures import RigEvidence
 from mapserver.survey.keyframes.keyframes import make_keyframes
@@ -122,7 +122,7 @@ def test_all_views_of_a_frame_either_judge_a_draft_or_choose_its_landmarks(recor
         for number in range(20)
         for view in (0, 1)
     ]
-    session = JudgedSession(nothing, probed, nothing)
+    session = MappedSession(nothing, probed, nothing)
     parts = session.asked(recordings), session.judging(recordings)
     asked, judging = ([(f.number, f.view) for f in part] for part in parts)
     assert not {number for number, _ in asked} & {number for number, _ in judging}

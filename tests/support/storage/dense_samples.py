@@ -6,7 +6,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from mapserver.drafting.extras import MappedSession
+from mapserver.drafting.draft_evidence import MappedSession
 from mapserver.plugins.dense_maps.surfel_map import (
     EDGE_M,
     TILE_SIZE_M,

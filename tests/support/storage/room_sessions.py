@@ -9,8 +9,9 @@ import numpy as np
 from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
+from fleetmap.sensors.samples import Trajectory
 from fleetmap.version_grid import Tiles
-from mapserver.drafting.extras import MappedSession
+from mapserver.drafting.draft_evidence import MappedSession
 from mapserver.plugins.dense_maps.surfel_map import SurfelTiles
 from mapserver.plugins.dense_maps.survey_grid import GridGrower, grow
 from mapserver.plugins.dense_maps.survey_surfels import SurfelGrower
@@ -41,9 +42,10 @@ def session_at(places: list[Array], camera: StereoCamera = CAMERA, *, has_depth:
     survey = SimpleNamespace(
         odometry=SimpleNamespace(keyframes=keyframes),
         state=SimpleNamespace(rig=Rig.of_one(camera, BODY_FROM_CAM0)),
-        stereo_yaw=SimpleNamespace(correction_px=0.0),
+        stereo_yaws=[SimpleNamespace(correction_px=0.0)],
     )
-    return MappedSession("ride", survey, np.array(places))  # type: ignore[arg-type]
+    trajectory = Trajectory(np.arange(len(places)), np.array(places))
+    return MappedSession(trajectory, (), survey, "ride")  # type: ignore[arg-type]
 
 
 def ride(height_m: list[float]) -> list[Array]:

@@ -8,7 +8,7 @@ import pytest
 from fleetmap.errors import UsageError
 from fleetmap.geometry import se3_inverse
 from fleetmap.sensors.rectification import RectifiedFrame
-from mapserver.drafting.extras import MappedSession
+from mapserver.drafting.draft_evidence import MappedSession
 from mapserver.plugins.dense_maps.changes import APPEARED, VANISHED, SeenSite, changes_between
 from mapserver.plugins.dense_maps.surfel_map import Surfels, SurfelTiles
 from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT

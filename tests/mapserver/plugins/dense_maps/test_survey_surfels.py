@@ -10,7 +10,7 @@ from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import so3_exp
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.version_grid import CELL_M, FREE, OCCUPIED, UNKNOWN, occupancy
-from mapserver.drafting.extras import MappedSession
+from mapserver.drafting.draft_evidence import MappedSession
 from mapserver.plugins.dense_maps.expected_view import expected_view, pinhole
 from mapserver.plugins.dense_maps.exposure import Sample, estimate_exposure, lens_factor
 from mapserver.plugins.dense_maps.site_grid import FREE as FREE_VIEWS
