@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from fleetmap.geometry import Array
 from mapserver.quality.figures import TileDirections, first_of
@@ -16,13 +17,9 @@ _UPRIGHT = 0.3  # horizontal part of an axis below which a camera looks at the c
 _LEAST_M = 3.0  # one-way places within a smaller extent are a turn, not an aisle
 
 
-def tile_directions(places: Mapping[tuple[int, int], Array]) -> list[TileDirections]:
-    """Return the seen headings of each tile with places, map_from_cam (K, 4, 4), in their order; places that look up or down are left out.
-
-    One-way is judged for every place by its neighbours, across the borders of tiles: in a tile with two aisles, driven in
-    opposite directions, both are one-way.
-    """
-    map_from_cam = np.concatenate([np.zeros((0, 4, 4)), *places.values()])
+def headings_of(map_from_cam: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Return of places (K, 4, 4) the numbers of their HEADINGS, which look neither up nor down, and which of these none near them looks
+    the other way."""
     axes_map = map_from_cam[:, :2, 2]
     lengths = np.linalg.norm(axes_map, axis=1)
     level = lengths > _UPRIGHT
@@ -35,7 +32,22 @@ def tile_directions(places: Mapping[tuple[int, int], Array]) -> list[TileDirecti
         first, second = pairs.reshape(-1, 2).T
         opposed = level[first] & level[second] & ((headings[first] * headings[second]).sum(axis=1) < _OTHER_WAY)
         met[first[opposed]] = met[second[opposed]] = True
-    one_way = level & ~met
+    return sectors, level, level & ~met
+
+
+def opposite(sector: int) -> str:
+    """Return the heading opposite to the one of a number."""
+    return HEADINGS[(sector + len(HEADINGS) // 2) % len(HEADINGS)]
+
+
+def tile_directions(places: Mapping[tuple[int, int], Array]) -> list[TileDirections]:
+    """Return the seen headings of each tile with places, map_from_cam (K, 4, 4), in their order; places that look up or down are left out.
+
+    One-way is judged for every place by its neighbours, across the borders of tiles: in a tile with two aisles, driven in
+    opposite directions, both are one-way.
+    """
+    map_from_cam = np.concatenate([np.zeros((0, 4, 4)), *places.values()])
+    sectors, level, one_way = headings_of(map_from_cam)
     owners = np.repeat(np.arange(len(places)), [len(of_tile) for of_tile in places.values()])
     found = []
     for number, tile in enumerate(places):
@@ -46,8 +58,8 @@ def tile_directions(places: Mapping[tuple[int, int], Array]) -> list[TileDirecti
         missing = {}
         for sector in sorted(seen):
             alone = mine & one_way & (sectors == sector)
-            if alone.any() and np.linalg.norm(np.ptp(positions_map[alone, :2], axis=0)) >= _LEAST_M:
-                missing[HEADINGS[(sector + 4) % len(HEADINGS)]] = int(alone.sum())
+            if alone.any() and np.linalg.norm(np.ptp(map_from_cam[alone, :2, 3], axis=0)) >= _LEAST_M:
+                missing[opposite(sector)] = int(alone.sum())
         found.append(TileDirections(tile, {HEADINGS[sector]: seen[sector] for sector in sorted(seen)}, missing))
     return found
 
@@ -62,6 +74,6 @@ def one_way_words(found: Sequence[TileDirections]) -> str:
 def missing_words(tile: TileDirections) -> str:
     """Return the missing headings as text."""
     return ", ".join(
-        f"{count} places face {HEADINGS[(HEADINGS.index(heading) + 4) % len(HEADINGS)]} and none near them {heading}"
+        f"{count} places face {opposite(HEADINGS.index(heading))} and none near them {heading}"
         for heading, count in tile.missing.items()
     )

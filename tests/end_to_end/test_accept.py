@@ -27,11 +27,11 @@ def test_a_room_is_accepted_signed_and_equal_to_itself(site: RoomSite, tmp_path:
         assert ("nothing is better or worse than in version 1 of lab" in told.output) == bool(more)
         assert first.startswith("ACCEPTED" if told.exit_code == 0 else "NOT ACCEPTED")
         assert first in (out / "acceptance.html").read_text()
-        assert (out / "acceptance.pdf").read_bytes().startswith(b"%PDF")
         assert "unchanged" in run(mapserver_app, "trust", "verify", out, "--store", maps)
     replay = site.replay(tmp_path)
     (drive,) = report["drives"]
-    for name in ("median", "p95", "p99", "max"):
+    assert drive["errors_mm"]["p99"] is None  # of 50 frames
+    for name in ("median", "max"):
         assert drive["errors_mm"][name] == pytest.approx(1e3 * replay["error_m"][name], abs=0.02)
     assert (drive["failures"], drive["silent"]) == (replay["position_failures"], replay["silent_failures"])
     assert sum(area["starts"]["found"] for area in report["areas"]) >= 0.9 * sum(

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from matplotlib.figure import Figure
 
-from mapserver.plugins.acceptance.day_rate import DayRate, Stratum, day_rate
+from studies.robot_days.day_rate import DayRate, Stratum, day_rate
 from studies.robot_days.drives import CONFIGURATIONS, FULL, row_of
 from studies.robot_days.situations import SITUATIONS
 from studies.study import Column, Row, publish, results, table

@@ -14,6 +14,7 @@ from mapserver.commands.options import Calibration, SiteOptions, open_store, top
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from mapserver.plugins.acceptance.document import SitePlan
     from mapserver.plugins.acceptance.figures import Report
     from mapserver.store import MapStore
 
@@ -24,7 +25,7 @@ EXIT_STATUS_NOT_ACCEPTED = 1
 class AcceptOptions(SiteOptions):
     """The drives, and the operator's statements about the robots."""
 
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for acceptance.html, .pdf, .json and .sig.")]
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for acceptance.html, .json and .sig.")]
     version: Annotated[int | None, typer.Option(min=1, help="Version to judge; default: the current one.")] = None
     before: Annotated[
         str | None,
@@ -57,7 +58,7 @@ def accept(
     The first line is the verdict. Status 1 if the site is not accepted.
     """
     from fleetmap.encoding import to_json
-    from mapserver.plugins.acceptance.document import html_page, pdf, sections
+    from mapserver.plugins.acceptance.document import html_page
     from mapserver.plugins.acceptance.verdict import compared
     from mapserver.trust.signing import sign_files
 
@@ -65,19 +66,15 @@ def accept(
         raise UsageError(f"--out {options.out}: the folder does not exist; make it first")
     with open_store(options.store, read_only=True) as maps:
 
-        def report_of(version: int) -> "tuple[Report, bytes]":
+        def report_of(version: int) -> "tuple[Report, SitePlan]":
             return _report(context, maps, version, recordings, options)
 
         before = None if options.before is None else _before(options.before, options.site, report_of)
-        report, picture = report_of(version_named(maps, options.site, options.version))
+        report, plan = report_of(version_named(maps, options.site, options.version))
         if before is not None:
             report = compared(report, before)
-        shown = sections(report)
-        files = {
-            "acceptance.json": to_json(report, indent=2) + b"\n",
-            "acceptance.html": html_page(report, shown, picture).encode(),
-            "acceptance.pdf": pdf(report, shown, picture),
-        }
+        page = html_page(report, plan).encode()
+        files = {"acceptance.json": to_json(report, indent=2) + b"\n", "acceptance.html": page}
         signature = sign_files(maps, files)
     for name, data in files.items():
         write_output(options.out / name, data)
@@ -99,7 +96,7 @@ def accept(
 
 def _report(
     context: typer.Context, maps: "MapStore", version: int, recordings: list[Path], options: AcceptOptions
-) -> "tuple[Report, bytes]":
+) -> "tuple[Report, SitePlan]":
     from fleetmap.recordings import OpenOptions
     from mapserver.fleet.resurvey_list import resurvey_list
     from mapserver.plugins.acceptance.drives import DriveRequest
@@ -110,15 +107,15 @@ def _report(
     starts, pictures = (-(-number // len(recordings)) for number in (STARTS, PICTURES))
     drives = [DriveRequest(path, options.frames, opening, starts, pictures) for path in recordings]
     promises = [words for words, given in ((ONE_WAY, options.one_way), (KNOWN_STARTS, options.known_starts)) if given]
-    report, picture = examine(maps, options.site, version, drives, promises)
+    report, plan = examine(maps, options.site, version, drives, promises)
     fleet = [
         f"{c.name}: {'; '.join(c.reasons)}"
         for c in resurvey_list(maps, options.site, settings.resurvey, time.time_ns()).tiles
     ]
-    return judged(report, settings.gate, maps.evidence(options.site, version), fleet), picture
+    return judged(report, settings.gate, maps.evidence(options.site, version), fleet), plan
 
 
-def _before(named: str, site: str, report_of: "Callable[[int], tuple[Report, bytes]]") -> "Report":
+def _before(named: str, site: str, report_of: "Callable[[int], tuple[Report, SitePlan]]") -> "Report":
     """Return the earlier report: that of a file, or of the same drives in an earlier version."""
     import msgspec
 

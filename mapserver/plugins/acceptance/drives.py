@@ -19,7 +19,6 @@ from fleetmap.failure_definition import SILENT_S, is_wrong
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
 from fleetmap.mapformat.manifest import Manifest, RecordingEntry
-from fleetmap.mapformat.tile import Tile
 from fleetmap.mapformat.tile_codec import decode_tile
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, open_recording
 from fleetmap.recordings.tum import read_tum
@@ -29,7 +28,7 @@ from fleetmap.sensors.samples import CameraFrame, SensorSet, Trajectory
 from mapserver.doctor import Finding, Verdict, run_checks
 from mapserver.drafting.admission import fingerprint, rig_evidence
 from mapserver.drafting.draft_evidence import Before
-from mapserver.plugins.acceptance.figures import DriveFigures
+from mapserver.plugins.acceptance.figures import QUANTILES, DriveFigures, quantile
 from mapserver.plugins.acceptance.ladders import ladders
 from mapserver.quality.probes import Probe, probe_features, relocalized, spread
 from mapserver.store import MapStore
@@ -66,7 +65,6 @@ class MapUnderTest:
 
     store: Path
     manifest: Manifest
-    tiles: list[Tile]
     view: MapView
     built: Before | None
     truth_in_map: bool
@@ -75,11 +73,11 @@ class MapUnderTest:
     def of(cls, maps: MapStore, site: str, version: int) -> "MapUnderTest":
         """Read a version; errors as of the store."""
         manifest, archive = maps.manifest(site, version), maps.archive(site, version)
-        tiles = [decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles]
+        tiles = (decode_tile(maps.blob(tile.sha256)) for tile in manifest.tiles)
         view = MapView(tiles, decode_vocabulary(maps.blob(manifest.vocabulary.sha256)), manifest.camera.focal_px)
         built = None if archive is None else Before.of(maps, manifest, decode_archive(archive))
         truth_in_map = bool(manifest.configuration.get("frame_from_ground_truth"))
-        return cls(maps.folder, manifest, tiles, view, built, truth_in_map)
+        return cls(maps.folder, manifest, view, built, truth_in_map)
 
 
 @dataclass(frozen=True)
@@ -127,11 +125,15 @@ class Drive:
 
 
 class Reference(NamedTuple):
-    """Poses of a drive with the name of their source, and the mask (F,) of selected frames that did not make the map."""
+    """Poses of a drive with the name of their source, and the mask (F,) of selected frames that did not make the map.
+
+    is_surveyed: True if the drive itself made it.
+    """
 
     source: str
     trajectory: Trajectory
     free: NDArray[np.bool_]
+    is_surveyed: bool
 
 
 def replayed(request: DriveRequest, version: MapUnderTest) -> tuple[ReplayReport, Trajectory]:
@@ -167,7 +169,7 @@ def examined(
     report, localised = replay
     with open_recording(request.path, request.opening) as opened:
         recording, selected = opened.readable(FrameSelection.parse(request.frames).apply(opened))
-        reference, is_surveyed = _reference(recording, selected, version, localised)
+        reference = _reference(recording, selected, version, localised)
         truths = [reference.trajectory.at(int(stamp)) for stamp in recording.frame_stamps_ns[selected]]
         known = np.array([truth is not None for truth in truths], bool)
         numbers = spread(np.flatnonzero(known & reference.free), request.pictures)
@@ -180,9 +182,8 @@ def examined(
         }
         errors_mm = None
         if off and reference.trajectory is not localised:
-            quantiles = np.percentile([error_m for error_m, _ in off.values()], [50, 95, 99, 100])
-            named_m = zip(("median", "p95", "p99", "max"), quantiles.tolist(), strict=True)
-            errors_mm = {name: round(1e3 * error_m, 2) for name, error_m in named_m}
+            all_mm = [round(1e3 * error_m, 2) for error_m, _ in off.values()]
+            errors_mm = {name: quantile(all_mm, share) for name, share in QUANTILES.items()} | {"max": max(all_mm)}
         docks_mm = [
             1e3 * float(np.linalg.norm((there @ se3_inverse(recording.calibration.base_from_body) - prior.map_from_base)[:2, 3]))
             for prior in recording.priors
@@ -193,10 +194,11 @@ def examined(
         figures = DriveFigures(
             name=recording.name,
             sha256=recording.content_hash(),
+            day=day if (day := str(stamps_ns[0].astype("M8[ns]").astype("M8[D]"))) > "2000" else None,
             frames=report.frames,
             hours=round(float(stamps_ns[-1] - stamps_ns[0]) / 3.6e12, 6),
             reference=reference.source,
-            is_surveyed=is_surveyed,
+            is_surveyed=reference.is_surveyed,
             localised_share=round(report.localised_share_of_all or 0.0, 4),
             failures=report.position_failures,
             silent=_silent_runs((stamp, is_wrong(*error)) for stamp, error in off.items()),
@@ -211,7 +213,7 @@ def examined(
 
 def _reference(
     recording: Recording, selected: NDArray[np.int64], version: MapUnderTest, localised: Trajectory
-) -> tuple[Reference, bool]:
+) -> Reference:
     """Return the best known poses: ground truth in the map's frame, the version's own survey, or the localized frames themselves."""
     entry = RecordingEntry(name=recording.name, sha256=recording.content_hash(), frames=len(selected))
     known = None if version.built is None else version.built.trajectory_of(entry)
@@ -222,7 +224,7 @@ def _reference(
         source = f"the survey of version {version.manifest.version}"
         trajectory = Trajectory(recording.frame_stamps_ns[selected], known[0])
     is_surveyed = any(entry.sha256 == each.sha256 for each in version.manifest.recordings)
-    return Reference(source, trajectory, np.ones(len(selected), bool) if known is None else known[1]), is_surveyed
+    return Reference(source, trajectory, np.ones(len(selected), bool) if known is None else known[1], is_surveyed)
 
 
 def _off(map_from_body: Array, truth: Array) -> tuple[float, float]:

@@ -5,46 +5,40 @@ from collections import defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from importlib import metadata
 
 import numpy as np
 
 from fleetmap.geometry import Array
+from fleetmap.mapformat.tile_codec import decode_tile
 from fleetmap.relocalization.map_view import MapView
+from mapserver.dashboard.plan import make_plan
 from mapserver.drafting.draft_evidence import PROBES
 from mapserver.drafting.worker import single_threaded_libraries
-from mapserver.fleet_statistics.kpis import ROBOT_DAY_S, Counters, format_rate, rate
+from mapserver.fleet_statistics.kpis import Counters, format_rate, rate
 from mapserver.floor_plan.areas import Areas
-from mapserver.plugins.acceptance.day_rate import Stratum, day_rate
-from mapserver.plugins.acceptance.document import drawn
+from mapserver.plugins.acceptance.document import SitePlan
 from mapserver.plugins.acceptance.drives import Drive, DriveRequest, MapUnderTest, checked, examined, replayed
-from mapserver.plugins.acceptance.figures import UNKNOWN_PLACE, AreaFigures, Count, Incidents, Report, Similar
+from mapserver.plugins.acceptance.figures import UNKNOWN_PLACE, AreaFigures, Count, Report, Similar, StartCounts
 from mapserver.plugins.acceptance.ladders import darkest_grey
-from mapserver.quality.directions import tile_directions
+from mapserver.quality.directions import headings_of, opposite, tile_directions
 from mapserver.quality.figures import merged
 from mapserver.quality.probes import Probe, aliases, spread
 from mapserver.store import MapStore
 
 STARTS, PICTURES = 40, 80  # of all drives: with 40 starts and none lost, fewer than 8 % of starts are lost
-_DAY_H = ROBOT_DAY_S / 3600
-_RESTARTS_PER_DAY = 0.2
-_ASSUMPTIONS = [
-    f"a robot-day is {_DAY_H:g} h of driving with as much in its way, and as much light, as in these drives",
-    f"{_RESTARTS_PER_DAY:g} restarts a day at a place of these drives, about which the robot is told nothing; each one that is not "
-    "TRACKING after 3 s counts as an incident, although a robot that drives on may find itself",
-    "blackouts, collisions, robots that are carried and works on the site are not in it",
-]
-
-
+_STRIDE_M = 4.0  # from one arrow of the plan to the next
 Where = Callable[[Array], str]
 """Names the area of a place (2,) in `map`."""
 
 
 def examine(
     maps: MapStore, site: str, version: int, drives: Sequence[DriveRequest], promises: Sequence[str]
-) -> tuple[Report, bytes]:
-    """Return the figures of a version, without verdict, and a picture. promises: the operator's statements about the robots."""
+) -> tuple[Report, SitePlan]:
+    """Return the figures of a version, without verdict, and its plan. promises: the operator's statements about the robots."""
     under_test = MapUnderTest.of(maps, site, version)
-    where = partial(area_name, maps.areas(site), under_test.manifest.tile_size_m)
+    areas = maps.areas(site)
+    where = partial(area_name, areas, under_test.manifest.tile_size_m)
     with single_threaded_libraries(), ThreadPoolExecutor(os.cpu_count()) as pool:
         begun = [
             (request, pool.submit(replayed, request, under_test), pool.submit(checked, request)) for request in drives
@@ -61,11 +55,14 @@ def examine(
     pictures = [picture for drive in found for picture in drive.pictures]
     rungs = [rung for picture in pictures for rung in picture.rungs["darkness"].values()]
     levels = [*((picture.grey, picture.is_fixed) for picture in pictures), *rungs]
+    counts = maps.fleet.counters(site, "version", key=str(version)).get((site, str(version)), Counters())
+    reported = rate(counts.position_failures, counts.robot_days)
     report = Report(
         site=site,
         version=version,
         manifest_sha256=maps.version(site, version).manifest_sha256,
         created=under_test.manifest.created,
+        program=metadata.version("fleetmap"),
         promises=list(promises),
         areas=areas_of(under_test.view, where, found),
         drives=[drive.figures for drive in found],
@@ -73,10 +70,15 @@ def examine(
         similar_of=len(probes),
         darkest_grey=darkest_grey(*map(np.array, zip(*levels, strict=True))) if levels else None,
         calibrations=merged([*known, *built, *(drive.figures.calibration for drive in found)]),
-        incidents=incidents(maps, site, version, found),
+        fleet=None if reported.low is None else format_rate(reported),
     )
-    starts = [(start.place_m, start.outcome) for drive in found for start in drive.starts]
-    return report, drawn(under_test.view.map_from_cam[:, :2, 3], starts)
+    tried = [start for drive in found for start in drive.starts]
+    starts = {
+        name: np.array([start.place_m for start in tried if start.outcome == name])
+        for name in StartCounts.__struct_fields__
+    }
+    seen = make_plan(under_test.manifest, lambda tile: decode_tile(maps.blob(tile.sha256)))
+    return report, SitePlan(seen, areas, starts, drives_to_add(under_test.view, where, report.areas))
 
 
 def area_name(named: Areas, size_m: float, place_m: Array) -> str:
@@ -138,21 +140,12 @@ def areas_of(view: MapView, where: Where, drives: Sequence[Drive]) -> list[AreaF
     return [figures[name] for name in sorted(figures)]
 
 
-def incidents(maps: MapStore, site: str, version: int, drives: Sequence[Drive]) -> Incidents:
-    """Return the expected incidents of a robot-day: position failures of the drives, and restarts without a guess that fail."""
-    outcomes = [start.outcome for drive in drives for start in drive.starts]
-    hours = sum(drive.figures.hours for drive in drives)
-
-    def of(failures: Sequence[int], bad: Sequence[str]) -> list[Stratum]:
-        strata = [Stratum(_DAY_H, max(hours, 1e-6), tuple(failures))]
-        if outcomes:
-            strata.append(Stratum(_RESTARTS_PER_DAY, len(outcomes), tuple(int(each in bad) for each in outcomes)))
-        return strata
-
-    every = day_rate(of([max(d.figures.failures, d.figures.silent) for d in drives], ("ambiguous", "lost", "silent")))
-    silent = day_rate(of([d.figures.silent for d in drives], ("silent",)))
-    counts = maps.fleet.counters(site, "version", key=str(version)).get((site, str(version)), Counters())
-    reported = rate(counts.position_failures, counts.robot_days)
-    per_day, low, high, silent_high = (round(value, 5) for value in (every.rate, every.low, every.high, silent.high))
-    fleet = None if reported.low is None else format_rate(reported)
-    return Incidents(per_day, low, high, silent_high, fleet, _ASSUMPTIONS)
+def drives_to_add(view: MapView, where: Where, areas: Sequence[AreaFigures]) -> list[tuple[Array, str]]:
+    """Return places (2,) of the map, a few metres apart, with the heading in which nobody drove there."""
+    missing = {area.name: area.missing for area in areas}
+    found: dict[tuple[object, ...], tuple[Array, str]] = {}
+    for map_from_cam, sector, _, is_alone in zip(view.map_from_cam, *headings_of(view.map_from_cam), strict=True):
+        place_m, heading = map_from_cam[:2, 3], opposite(int(sector))
+        if is_alone and heading in missing[where(place_m)]:
+            found.setdefault((heading, *np.floor(place_m / _STRIDE_M)), (place_m, heading))
+    return list(found.values())

@@ -1,13 +1,17 @@
 """Figures of an acceptance report; docs/acceptance.md lists them. Pure."""
 
+import math
+from collections.abc import Sequence
+
 import msgspec
 import numpy as np
 
 from mapserver.fleet_statistics.kpis import Share, share
 from mapserver.quality.figures import RigEvidence
 
-FORMAT = 1
+FORMAT = 2
 UNKNOWN_PLACE, ALL = "unknown place", "all areas"
+QUANTILES = {"median": 0.5, "p95": 0.95, "p99": 0.99}
 
 
 class Count(msgspec.Struct):
@@ -80,13 +84,15 @@ class Similar(msgspec.Struct, frozen=True):
 class DriveFigures(msgspec.Struct, frozen=True):
     """A drive through the site, played by the robots' localizer.
 
-    reference: source of its poses. is_surveyed: True if the version was made of it. failures and silent: position failures by
-    `fleetmap.failure_definition`. errors_mm: median, p95, p99 and max of localised frames. docks_mm: distance of the estimate at each dock
-    from the dock's place. calibration: evidence of this drive on its rig; remarks: the doctor's findings that are not good.
+    day: of its first frame in UTC, None for a clock that does not count from 1970. reference: source of its poses. is_surveyed: True if
+    the version was made of it. failures and silent: position failures by `fleetmap.failure_definition`. errors_mm: max, and the quantiles
+    that its number of frames can give. docks_mm: distance of the estimate at each dock from the dock's place. calibration: evidence of this
+    drive on its rig; remarks: the doctor's findings that are not good.
     """
 
     name: str
     sha256: str
+    day: str | None
     frames: int
     hours: float
     reference: str
@@ -94,29 +100,28 @@ class DriveFigures(msgspec.Struct, frozen=True):
     localised_share: float
     failures: int
     silent: int
-    errors_mm: dict[str, float] | None
+    errors_mm: dict[str, float | None] | None
     docks_mm: list[float]
     calibration: RigEvidence
     remarks: list[str]
 
 
-class Incidents(msgspec.Struct, frozen=True):
-    """Expected incidents per robot-day with their 95 % interval; silent_high: upper end of the silent ones alone. fleet: failures that the
-    robots reported, as text, None if they drove too little."""
+class Figure(msgspec.Struct, frozen=True):
+    """A line of the table: of the site, of its weakest area or drive, and its limit; is_met: None without a limit."""
 
-    per_day: float
-    low: float
-    high: float
-    silent_high: float
-    fleet: str | None
-    assumptions: list[str]
+    name: str
+    site: str
+    weakest: str
+    limit: str
+    is_met: bool | None
 
 
 class Report(msgspec.Struct, kw_only=True):
     """The report.
 
-    promises: the operator's statements. reasons: against the site. similar: places that look alike, of similar_of frames. darkest_grey:
-    grey level at which pictures of this site give no fix any more. better and worse: against an earlier report.
+    program: version of fleetmap. promises: the operator's statements. reasons: against the site. figures: the table. similar: places that
+    look alike, of similar_of frames. darkest_grey: grey level at which pictures of this site give no fix any more. fleet: failures a
+    robot-day that the robots reported in this version, None if they drove too little. better and worse: against an earlier report.
     """
 
     format: int = FORMAT
@@ -126,20 +131,27 @@ class Report(msgspec.Struct, kw_only=True):
     version: int
     manifest_sha256: str
     created: str
+    program: str = ""
     promises: list[str]
     reasons: list[str] = []
     survey_again: list[str] = []
     not_judged: list[str] = []
+    figures: list[Figure] = []
     areas: list[AreaFigures]
     drives: list[DriveFigures]
     similar: list[Similar]
     similar_of: int
     darkest_grey: float | None
     calibrations: list[RigEvidence]
-    incidents: Incidents
+    fleet: str | None = None
     compared_with: str | None = None
     better: list[str] = []
     worse: list[str] = []
+
+    @property
+    def remarks(self) -> list[str]:
+        """What the doctor says of the drives."""
+        return [f"{drive.name}: {words}" for drive in self.drives for words in drive.remarks]
 
     @property
     def whole(self) -> AreaFigures:
@@ -157,6 +169,11 @@ class Report(msgspec.Struct, kw_only=True):
         return sums
 
 
-def percentile(values: list[float], share_: float) -> float | None:
-    """Return a percentile, None without values."""
-    return float(np.percentile(values, share_)) if values else None
+def fewest(share_: float) -> int:
+    """Return the fewest values of which the largest is beyond a quantile with 95 %: fewer do not give it. Source: Wilks 1941."""
+    return math.ceil(math.log(0.05) / math.log(share_))
+
+
+def quantile(values: Sequence[float], share_: float) -> float | None:
+    """Return a quantile, to 0.01; None of too few values for it."""
+    return round(float(np.quantile(values, share_)), 2) if len(values) >= fewest(share_) else None

@@ -1,13 +1,24 @@
-"""Verdict on a site, the list to survey again, and the comparison with an earlier report, from the figures of a report. Pure."""
+"""Verdict on a site: its figures beside their limits, what to survey again, and the comparison with an earlier report. Pure."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import msgspec
 import numpy as np
 import scipy
 
-from mapserver.plugins.acceptance.figures import ALL, UNKNOWN_PLACE, AreaFigures, Count, Report, percentile
+from mapserver.plugins.acceptance.figures import (
+    ALL,
+    QUANTILES,
+    UNKNOWN_PLACE,
+    AreaFigures,
+    Count,
+    Figure,
+    Report,
+    fewest,
+    quantile,
+)
+from mapserver.plugins.acceptance.ladders import BLUR_PX, STOPS
 from mapserver.quality.directions import missing_words
 from mapserver.quality.figures import Evidence, TileDirections, first_of
 from mapserver.quality.gate import GateSettings
@@ -26,100 +37,201 @@ class Reason(NamedTuple):
     again: str = ""
 
 
+class Row(NamedTuple):
+    """A figure of the site, of its weakest area or drive, its limit, empty for none, and the reasons if it is beyond."""
+
+    name: str
+    site: str
+    weakest: str = ""
+    limit: str = ""
+    reasons: Sequence[Reason] = ()
+
+
+Part = tuple[float, str, str]
+"""How bad a figure of an area or drive is, its name, and the figure."""
+Found = tuple[str, str, Reason]
+"""The area, drive or rig where something was found that must not be, what, and the reason."""
+
+
 def judged(report: Report, settings: GateSettings, evidence: Evidence | None, fleet: Sequence[str]) -> Report:
-    """Return the report with verdict, reasons, what was not judged and what to survey again.
+    """Return the report with verdict, reasons, table, what was not judged and what to survey again.
 
     A share counts against a limit if its 95 % interval lies below it. evidence: of the version's build. fleet: tiles that the robots'
     failures put on the list, as text.
     """
-    found = [*_of_areas(report, settings), *_of_site(report, settings)]
+    rows = [*_of_frames(report, settings), *_of_robots(report, settings), *_of_site(report, settings)]
+    found = [reason for row in rows for reason in row.reasons]
     reasons, again = [reason.words for reason in found], [reason.again for reason in found if reason.again]
     if evidence is not None and evidence.views is not None and evidence.views.warning:
         again.append(evidence.views.warning)
-    whole, sentence = report.whole, f"{report.site}, version {report.version}"
-    if reasons:
-        verdict = f"NOT ACCEPTED: {sentence}: {first_of(reasons)}."
-    else:
-        median, p99 = percentile(whole.errors_mm, 50), percentile(whole.errors_mm, 99)
-        promised = f", if {' and '.join(report.promises)}" if report.promises else ""
-        verdict = (
-            f"ACCEPTED{promised}: {sentence}: {whole.starts.found_of_all.text} starts without a guess found their place and none "
-            f"was silently wrong, {whole.frames.text} frames are localized, median error {median:.0f} mm, p99 {p99:.0f} mm."
-        )
+    site = f"{report.site}, version {report.version}"
+    promised = f", if {' and '.join(report.promises)}" if report.promises else ""
+    accepted = f"ACCEPTED{promised}: {site}: every figure is within its limit."
     return msgspec.structs.replace(
         report,
-        verdict=verdict,
+        verdict=f"NOT ACCEPTED: {site}: {first_of(reasons, 1)}." if reasons else accepted,
         is_accepted=not reasons,
         reasons=reasons,
+        figures=[Figure(*row[:4], not row.reasons if row.limit else None) for row in rows],
         survey_again=list(dict.fromkeys([*again, *fleet])),
         not_judged=list(_not_judged(report)),
     )
 
 
-def _of_areas(report: Report, settings: GateSettings) -> Iterator[Reason]:
-    for area in report.areas:
-        if area.starts.silent:
-            yield Reason(f"{area.name}: {area.starts.silent} starts without a guess are silently wrong")
-        if area.name == UNKNOWN_PLACE:
-            continue
-        dark = report.darkest_grey is not None and area.grey is not None and area.grey <= report.darkest_grey
-        if _is_below(area.frames, settings):
-            why = f"too dark (grey level {area.grey:.0f} of 255)" if dark else "not localized"
-            light = " with more light" if dark else ""
-            yield Reason(f"{area.name} is {why}: {area.frames.text} frames get a fix", f"{area.name}: survey it{light}")
-        elif _is_below(area.darkness.get("1", Count()), settings):
-            half = f"with half its light {area.darkness['1'].text} frames get a fix"
-            yield Reason(f"{area.name} is nearly too dark: {half}", f"{area.name}: survey it with more light")
-        if not area.places and not _is_below(area.frames, settings):
-            yield Reason(f"{area.name} was driven through, and is not in the map", f"{area.name}: survey it")
-        if area.missing and ONE_WAY not in report.promises:
-            ways = ", ".join(area.missing)
-            words = missing_words(TileDirections((0, 0), area.seen, area.missing))
-            one_way = f"{area.name} was surveyed in one direction only, nobody drove it facing {ways}"
-            yield Reason(one_way, f"{area.name}: drive it facing {ways} ({words})")
-        starts = area.starts.found_of_all
-        if KNOWN_STARTS not in report.promises and _is_below(starts, settings):
+def _of_frames(report: Report, settings: GateSettings) -> Iterator[Row]:
+    whole, tries = report.whole, report.whole.frames.tries
+
+    def unlocalized(area: AreaFigures) -> Reason:
+        is_dark = report.darkest_grey is not None and area.grey is not None and area.grey <= report.darkest_grey
+        why = f"too dark (grey level {area.grey:.0f} of 255)" if is_dark else "not localized"
+        words = f"{area.name} is {why}: {area.frames.text} frames get a fix"
+        return Reason(words, f"{area.name}: survey it{' with more light' if is_dark else ''}")
+
+    def half(area: AreaFigures) -> Count:
+        return Count() if _is_below(area.frames, settings) else area.darkness.get("1", Count())
+
+    def dim(area: AreaFigures) -> Reason:
+        words = f"{area.name} is nearly too dark: with half its light {half(area).text} frames get a fix"
+        return Reason(words, f"{area.name}: survey it with more light")
+
+    few = f"only {tries} frames at a known place judge it, {settings.min_frames} are needed: record a longer drive"
+    reasons = [Reason(few)] if tries < settings.min_frames else []
+    yield Row("Frames at a known place", str(tries), "", f"at least {settings.min_frames}", reasons)
+    yield _share("Frames localized, each by itself", report, settings, lambda area: area.frames, unlocalized)
+    yield _share("the same with half the light", report, settings, half, dim)
+    for words, levels, ladder in (
+        (f"with 1/{', 1/'.join(str(2**stop) for stop in STOPS[1:])} of the light", STOPS[1:], whole.darkness),
+        (f"with a blur of {', '.join(map(str, BLUR_PX))} px", BLUR_PX, whole.blur),
+    ):
+        yield Row(f"the same {words}", ", ".join(ladder.get(str(level), Count()).text for level in levels))
+    wrong = [(area.wrong / area.frames.tries, area.name, str(area.wrong)) for area in report.areas if area.frames.tries]
+    words = f"{whole.wrong} of {tries} frames are localized at a wrong place"
+    reasons = [Reason(words)] if whole.wrong > settings.max_wrong_share * tries else []
+    limit = f"at most {100 * settings.max_wrong_share:g} %"
+    yield Row("Frames localized at a wrong place", f"{whole.wrong} of {tries}", _worst(wrong), limit, reasons)
+    limit_mm, median_mm = 1e3 * settings.max_median_error_m, float(np.median(whole.errors_mm or [0.0]))
+    words = f"the median error is {median_mm:.0f} mm, the limit is {limit_mm:.0f} mm"
+    reasons = [Reason(words)] if median_mm > limit_mm else []
+    medians = _worst(_errors((area.name, quantile(area.errors_mm, 0.5)) for area in report.areas))
+    yield Row(
+        "Error of these frames, median", _mm(whole.errors_mm, "median"), medians, f"at most {limit_mm:g} mm", reasons
+    )
+    yield Row("Error of these frames, 95 %", _mm(whole.errors_mm, "p95"))
+
+
+def _of_robots(report: Report, settings: GateSettings) -> Iterator[Row]:
+    whole, drives, least = report.whole.starts, report.drives, settings.min_localised_share
+
+    def unfound(area: AreaFigures) -> Reason:
+        starts, tries = area.starts, area.starts.found_of_all.tries
+        if starts.ambiguous > starts.lost:
             alike = ", ".join([alike.other for alike in report.similar if alike.area == area.name][:_NAMED])
-            if area.starts.ambiguous > area.starts.lost:
-                stay = f"{area.starts.ambiguous} of {starts.tries} starts stay AMBIGUOUS"
-                yield Reason(f"{area.name} looks like {alike or 'another place'}: {stay}")
-            else:
-                stay = f"{area.starts.lost} of {starts.tries} starts without a guess stay lost"
-                yield Reason(f"{area.name}: {stay}", f"{area.name}: survey it")
+            stay = f"{starts.ambiguous} of {tries} starts stay AMBIGUOUS"
+            return Reason(f"{area.name} looks like {alike or 'another place'}: {stay}")
+        return Reason(
+            f"{area.name}: {starts.lost} of {tries} starts without a guess stay lost", f"{area.name}: survey it"
+        )
+
+    row = _share(
+        "Starts without a guess that find their place", report, settings, lambda area: area.starts.found_of_all, unfound
+    )
+    if not whole.found_of_all.tries:
+        row = row._replace(reasons=[Reason("no start without a guess was tried: record a longer drive")])
+    yield row._replace(limit="", reasons=()) if KNOWN_STARTS in report.promises else row
+    yield Row("Starts that stay AMBIGUOUS, or lost", f"{whole.ambiguous}, {whole.lost}")
+    silent = [(area.name, area.starts.silent) for area in report.areas if area.starts.silent]
+    wrong = [(area, f"{n}", Reason(f"{area}: {n} starts without a guess are silently wrong")) for area, n in silent]
+    yield _none("Starts that are silently wrong", wrong, whole.silent)
+    frames = sum(drive.frames for drive in drives)
+    hits = sum(drive.localised_share * drive.frames for drive in drives)
+    shares = [(-drive.localised_share, drive.name, f"{100 * drive.localised_share:.1f} %") for drive in drives]
+    words = [Reason(f"{text} of drive {name} is localized") for share, name, text in shares if -share < least]
+    localized = f"{100 * hits / max(1, frames):.1f} % of {frames}"
+    yield Row("Frames localized while driving", localized, _worst(shares), f"at least {100 * least:g} %", words)
+    for name, share in (("median", "median"), ("p99", "99 %")):
+        known = _errors((drive.name, (drive.errors_mm or {}).get(name)) for drive in drives)
+        yield Row(
+            f"Error while driving, {share}, of the worst drive", max(known)[2] if known else "not known", _worst(known)
+        )
+    silent = [(drive.name, drive.silent) for drive in drives if drive.silent]
+    wrong = [(drive, f"{n}", Reason(f"{drive}: {n} silent failures while driving")) for drive, n in silent]
+    yield _none("Silent failures while driving", wrong, sum(drive.silent for drive in drives))
+    failures = [(drive.failures, drive.name, str(drive.failures)) for drive in drives]
+    yield Row("Position failures while driving", str(sum(drive.failures for drive in drives)), _worst(failures))
+    docks_mm = [off_mm for drive in drives for off_mm in drive.docks_mm]
+    yield Row(
+        "Largest distance at a dock passed", f"{max(docks_mm):.0f} mm, of {len(docks_mm)}" if docks_mm else "none"
+    )
 
 
-def _of_site(report: Report, settings: GateSettings) -> Iterator[Reason]:
-    whole = report.whole
-    median = percentile(whole.errors_mm, 50)
-    if silent := sum(drive.silent for drive in report.drives):
-        yield Reason(f"{silent} silent failures while driving")
-    # Of areas with few tries each, which judge none of them, all together may be below.
-    if _is_below(whole.frames, settings) and not any(_is_below(area.frames, settings) for area in report.areas):
-        yield Reason(f"only {whole.frames.text} frames get a fix", "all areas: survey them")
-    if KNOWN_STARTS not in report.promises:
-        starts = whole.starts.found_of_all
-        if not starts.tries:
-            yield Reason("no start without a guess was tried: record a longer drive")
-        elif _is_below(starts, settings) and not any(_is_below(a.starts.found_of_all, settings) for a in report.areas):
-            yield Reason(f"only {starts.text} starts without a guess found their place", "all areas: survey them")
-    if whole.frames.tries and whole.wrong / whole.frames.tries > settings.max_wrong_share:
-        yield Reason(f"{whole.wrong} of {whole.frames.tries} frames are localized at a wrong place")
-    if median is not None and median > 1e3 * settings.max_median_error_m:
-        yield Reason(f"the median error is {median:.0f} mm, the limit is {1e3 * settings.max_median_error_m:.0f} mm")
-    for drive in report.drives:
-        if drive.localised_share < settings.min_localised_share:
-            yield Reason(f"{100 * drive.localised_share:.0f} % of drive {drive.name} is localized")
-    for rig in report.calibrations:
-        for subject, words in rig.doubted.items():
-            yield Reason(f"the calibration {rig.rig} is in doubt: {subject}: {words}")
-    if whole.frames.tries < settings.min_frames:
-        needed = f"{settings.min_frames} are needed: record a longer drive"
-        yield Reason(f"only {whole.frames.tries} frames at a known place judge it, {needed}")
+def _of_site(report: Report, settings: GateSettings) -> Iterator[Row]:
+    strays, one_way = list[Found](), list[Found]()
+    for area in report.areas:
+        if area.name != UNKNOWN_PLACE and not area.places and not _is_below(area.frames, settings):
+            words = f"{area.name} was driven through, and is not in the map"
+            strays.append((area.name, "no place", Reason(words, f"{area.name}: survey it")))
+        if area.missing:
+            ways, counts = ", ".join(area.missing), missing_words(TileDirections((0, 0), area.seen, area.missing))
+            words = f"{area.name} was surveyed in one direction only, nobody drove it facing {ways}"
+            one_way.append((area.name, ways, Reason(words, f"{area.name}: drive it facing {ways} ({counts})")))
+    yield _none("Areas driven through, and not in the map", strays)
+    row = _none("Areas surveyed in one direction only", one_way)
+    yield row._replace(limit="", reasons=()) if ONE_WAY in report.promises else row
+    alike = [f"{one.area}: {one.frames} like {one.other}" for one in report.similar]
+    yield Row(f"Areas that look alike, by {report.similar_of} frames", str(len(alike)), first_of(alike, 1))
+    doubts = [(rig.rig, subject, words) for rig in report.calibrations for subject, words in rig.doubted.items()]
+    doubted = [
+        (rig, subject, Reason(f"the calibration {rig} is in doubt: {subject}: {words}"))
+        for rig, subject, words in doubts
+    ]
+    yield _none("Calibrations in doubt", doubted)
+    yield Row("Failures a robot-day that the fleet reported", report.fleet or "too little driving")
+
+
+def _share(
+    name: str,
+    report: Report,
+    settings: GateSettings,
+    of: Callable[[AreaFigures], Count],
+    reason: Callable[[AreaFigures], Reason],
+) -> Row:
+    """Return a share's row; of areas with few tries each, which judge none of them, all together may be below the limit."""
+    count, areas = of(report.whole), [area for area in report.areas if area.name != UNKNOWN_PLACE and of(area).tries]
+    reasons = [reason(area) for area in areas if _is_below(of(area), settings)]
+    if not reasons and _is_below(count, settings):
+        reasons = [Reason(f"{name}: only {count.text}", "all areas: survey them")]
+    low, high = count.share.low, count.share.high
+    between = "" if low is None or high is None else f" ({100 * low:.0f} to {100 * high:.0f} % with 95 %)"
+    parts = [(-of(area).hits / of(area).tries, area.name, of(area).text) for area in areas]
+    return Row(name, count.text + between, _worst(parts), f"at least {100 * settings.min_localised_share:g} %", reasons)
+
+
+def _none(name: str, found: Sequence[Found], number: int | None = None) -> Row:
+    """Return the row of what must not be. number: default that of the places where it was found."""
+    named = first_of([f"{where}: {words}" for where, words, _ in found], 1)
+    reasons = [reason for _, _, reason in found]
+    return Row(name, str(len(found) if number is None else number), named, "none", reasons)
 
 
 def _is_below(count: Count, settings: GateSettings) -> bool:
     high = count.share.high
     return high is not None and high < settings.min_localised_share
+
+
+def _errors(named_mm: Iterable[tuple[str, float | None]]) -> list[Part]:
+    return [(error_mm, name, f"{error_mm:.1f} mm") for name, error_mm in named_mm if error_mm is not None]
+
+
+def _mm(values: Sequence[float], name: str) -> str:
+    """Return a quantile as text, or that there are too few values for it."""
+    found, least = quantile(values, QUANTILES[name]), fewest(QUANTILES[name])
+    return f"too few: {len(values)} of {least}" if found is None else f"{found:.1f} mm"
+
+
+def _worst(parts: Sequence[Part]) -> str:
+    """Return the worst part as text; empty if all are alike."""
+    worst = max(parts, default=(0.0, "", ""))
+    return f"{worst[1]}: {worst[2]}" if any(part[0] < worst[0] for part in parts) else ""
 
 
 def _not_judged(report: Report) -> Iterator[str]:
@@ -177,7 +289,7 @@ def _tests(now: AreaFigures, old: AreaFigures) -> Iterator[tuple[str, float, boo
             p = float(scipy.stats.fisher_exact(table).pvalue)
             is_better = mine.hits * other.tries > other.hits * mine.tries
             yield f"{now.name}: {mine.text} {name}, {other.text} before", p, is_better
-    medians = percentile(now.errors_mm, 50), percentile(old.errors_mm, 50)
+    medians = quantile(now.errors_mm, 0.5), quantile(old.errors_mm, 0.5)
     if medians[0] is not None and medians[1] is not None:
         p = float(scipy.stats.mannwhitneyu(now.errors_mm, old.errors_mm).pvalue)
         yield f"{now.name}: median error {medians[0]:.1f} mm, {medians[1]:.1f} mm before", p, medians[0] < medians[1]

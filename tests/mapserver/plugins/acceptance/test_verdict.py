@@ -13,9 +13,10 @@ import pytest
 from fleetmap.errors import UsageError
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.sensors.samples import CameraFrame
+from mapserver.dashboard.plan import Plan
 from mapserver.floor_plan.areas import Area, Areas
 from mapserver.plugins.acceptance.command import _before
-from mapserver.plugins.acceptance.document import drawn, html_page, pdf, sections
+from mapserver.plugins.acceptance.document import SitePlan, html_page
 from mapserver.plugins.acceptance.drives import Drive, Picture, Start
 from mapserver.plugins.acceptance.examine import area_name, areas_of, similar
 from mapserver.plugins.acceptance.figures import (
@@ -23,9 +24,9 @@ from mapserver.plugins.acceptance.figures import (
     AreaFigures,
     Count,
     DriveFigures,
-    Incidents,
     Report,
     StartCounts,
+    quantile,
 )
 from mapserver.plugins.acceptance.ladders import BLUR_PX, STOPS, blurred, darker, darkest_grey, ladders, noise_sigma
 from mapserver.plugins.acceptance.verdict import KNOWN_STARTS, ONE_WAY, compared, judged
@@ -71,12 +72,12 @@ def report(seen: Aisle, surveyed: Array, driven: Array, *, dark: str = "") -> Re
         outcome = "lost" if fix is None else "ambiguous" if aliases(view, probe) else "found"
         starts.append(Start(place[:2, 3], outcome))
     known = "ground truth", False, 1.0, 0, 0, None, [20.0], CALIBRATION, []
-    figures = DriveFigures("drive", "00", len(driven), 0.01, *known)
+    figures = DriveFigures("drive", "00", "2026-11-29", len(driven), 0.01, *known)
     ride = Drive(figures, starts, pictures, driven[:, :2, 3])
     return Report(
         site="hall", version=3, manifest_sha256="ab" * 32, created="2026-11-28", promises=[], areas=areas_of(view, where, [ride]),
         drives=[figures], similar=similar(view, where, [picture.probe for picture in pictures]), similar_of=len(pictures),
-        darkest_grey=DARK, calibrations=[CALIBRATION], incidents=Incidents(0.0, 0.0, 300.0, 300.0, None, ["a"]),
+        darkest_grey=DARK, calibrations=[CALIBRATION],
     )  # fmt: skip
 
 
@@ -103,7 +104,11 @@ def good() -> Report:
 def test_a_good_site_is_accepted_with_its_figures(good: Report) -> None:
     found = verdict(good)
     assert found.is_accepted
-    assert found.verdict.startswith("ACCEPTED: hall, version 3: 16 of 16 starts without a guess found their place")
+    assert found.verdict == "ACCEPTED: hall, version 3: every figure is within its limit."
+    lines = {line.name: line for line in found.figures}
+    assert lines["Starts without a guess that find their place"].site == "16 of 16 (83 to 100 % with 95 %)"
+    assert lines["Error of these frames, 95 %"].site == "too few: 16 of 59"
+    assert all(line.is_met for line in found.figures if line.limit)
     assert found.reasons == found.survey_again == []
     assert any("48 h" in words for words in found.not_judged)
     assert [area.name for area in found.areas] == ["aisle 1", "aisle 2"]
@@ -150,7 +155,7 @@ DOUBTED = RigEvidence("rig", [], {}, {"pair geometry": "0.3 degrees off"})
     [
         (lambda r: r.areas[1].darkness.update({"1": Count(0, 8)}), "aisle 2 is nearly too dark: with half its light 0"),
         (lambda r: change_drive(r, silent=1), "1 silent failures while driving"),
-        (lambda r: change_drive(r, localised_share=0.3), "30 % of drive drive is localized"),
+        (lambda r: change_drive(r, localised_share=0.3), "30.0 % of drive drive is localized"),
         (lambda r: setattr(r.areas[0].starts, "silent", 1), "aisle 1: 1 starts without a guess are silently wrong"),
         (lambda r: setattr(r, "calibrations", [DOUBTED]), "rig is in doubt: pair geometry: 0.3 degrees off"),
         (lambda r: r.areas.pop(), "only 8 frames at a known place judge it, 12 are needed"),
@@ -168,11 +173,11 @@ def test_many_areas_of_few_tries_are_judged_together(good: Report) -> None:
     bad.areas = [copy.deepcopy(good.areas[0]) for _ in range(20)]
     for number, area in enumerate(bad.areas):
         area.name, area.starts, area.frames = f"tile {number},0", StartCounts(lost=2), Count(2, 2)
-    assert "only 0 of 40 starts without a guess found their place" in verdict(bad).verdict
+    assert "Starts without a guess that find their place: only 0 of 40" in verdict(bad).verdict
     assert verdict(bad, KNOWN_STARTS).is_accepted
     for area in bad.areas:
         area.frames, area.errors_mm = Count(0, 2), []
-    assert "only 0 of 40 frames get a fix" in verdict(bad, KNOWN_STARTS).verdict
+    assert "Frames localized, each by itself: only 0 of 40" in verdict(bad, KNOWN_STARTS).verdict
 
 
 def test_what_was_not_tried_is_not_accepted(good: Report) -> None:
@@ -196,19 +201,29 @@ def test_a_larger_error_is_worse_and_chance_is_not(good: Report) -> None:
     assert (same.better, same.worse) == ([], [])
 
 
-def test_documents_begin_with_the_verdict_and_are_the_same_each_time(good: Report) -> None:
+PLAN = SitePlan(
+    Plan((-10.0, -5.0), (40.0, 20.0), 20.0, (), 3, b"", ()), HALVES, {"found": ONE[:, :2, 3], "lost": np.full((1, 2), np.nan)},
+    [(np.array([5.0, 1.0]), "W")],
+)  # fmt: skip
+
+
+def test_the_document_begins_with_the_verdict_and_is_the_same_each_time(good: Report) -> None:
     views = Evidence(views=SurveyedViews(40, 0, []))
     found = judged(good, GateSettings(), views, ["tile 1,2: three failures a day"])
     assert found.survey_again == ["tile 1,2: three failures a day"]
-    shown = sections(compared(found, found))
-    assert next(part for part in shown if part.title == "Better and worse").words[-1] == "Nothing."
-    picture = drawn(np.zeros((3, 2)), [(np.zeros(2), "found")])
-    page = html_page(found, shown, picture)
+    page = html_page(compared(found, found), PLAN)
     assert page.index("ACCEPTED: hall") < page.index("<h1>")
-    assert "tile 1,2: three failures a day" in page
-    one = pdf(found, shown, picture)
-    assert one.startswith(b"%PDF")
-    assert one == pdf(found, shown, picture)
+    assert page == html_page(compared(found, found), PLAN)
+    for words in (
+        "tile 1,2: three failures a day",
+        "Nothing, beyond chance.",
+        "counter(page)",
+        "lost (0)",
+        "drives to add",
+        "Signature",
+    ):
+        assert words in page
+    assert "drives to add" not in html_page(verdict(good, ONE_WAY), PLAN)
     assert msgspec.json.decode(msgspec.json.encode(found), type=Report) == found
 
 
@@ -217,11 +232,18 @@ def test_names_from_outside_break_no_document(good: Report, name: str) -> None:
     bad = copy.deepcopy(good)
     bad.areas[0].name = name
     bad = verdict(msgspec.structs.replace(bad, drives=[msgspec.structs.replace(good.drives[0], name=name)]))
-    picture = drawn(np.zeros((3, 2)), [])
-    page = html_page(bad, sections(bad), picture)
+    page = html_page(bad, PLAN)
     assert "<b>" not in page
     assert page.encode()
-    assert pdf(bad, sections(bad), picture).startswith(b"%PDF")
+
+
+@pytest.mark.parametrize(("share", "number"), [(0.5, 5), (0.95, 59), (0.99, 299)])
+def test_a_quantile_is_given_by_as_many_values_as_it_needs(share: float, number: int) -> None:
+    values = list(range(number))
+    assert (quantile(values[1:], share), quantile(values, share)) == (
+        None,
+        pytest.approx(share * (number - 1), abs=0.01),
+    )
 
 
 def test_a_report_is_compared_with_one_of_its_site(good: Report, tmp_path: Path) -> None:
