@@ -81,8 +81,9 @@ def accept(
     if signature is not None:
         write_output(options.out / "acceptance.sig", signature)
     typer.echo(report.verdict)
-    for words in (*report.worse, *report.better):
-        typer.echo(f"{'worse' if words in report.worse else 'better'}: {words}")
+    for what, found in (("also", report.reasons[1:]), ("worse", report.worse), ("better", report.better)):
+        for words in found:
+            typer.echo(f"{what}: {words}")
     if report.compared_with is not None and not report.worse and not report.better:
         typer.echo(f"nothing is better or worse than in {report.compared_with}, beyond chance")
     typer.echo(str(options.out / "acceptance.html"))
