@@ -1,7 +1,7 @@
 """A robot's estimate of its pose, frame by frame, and its assembly: status, pose with covariance, cause. Pure."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -43,16 +43,16 @@ class Estimate:
     """
 
     stamp_ns: int
-    status: Status
-    map_from_body: Array | None
-    cov_rot_trans: Array | None
-    map_version: int | None
-    fix: Fix | None
-    refused: str
-    innovation: float | None
-    hypotheses: tuple[Hypothesis, ...]
     odometry: OdometryEstimate
-    stage_s: dict[str, float]
+    map_version: int | None
+    status: Status = Status.INITIALISING
+    map_from_body: Array | None = None
+    cov_rot_trans: Array | None = None
+    fix: Fix | None = None
+    refused: str = ""
+    innovation: float | None = None
+    hypotheses: tuple[Hypothesis, ...] = ()
+    stage_s: dict[str, float] = field(default_factory=dict)
     cause: Cause = Cause.NONE
     image: ImageQuality = GOOD_IMAGE
     fix_stamp_ns: int | None = None

@@ -51,11 +51,6 @@ class HeldMaps:
         held = self.by_floor.get(floor)
         return None if held is None else held.version
 
-    def relocalizer(self, floor: str, view: int) -> Relocalizer | None:
-        """Return that of a camera on a floor; None if the robot does not hold its map."""
-        held = self.by_floor.get(floor)
-        return None if held is None else held.relocalizers[view]
-
     def _compare(self) -> None:
         known = [held.lookalikes for held in self.by_floor.values() if held.lookalikes is not None]
         self.lookalikes = None

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 from fleetmap.geometry import se3_inverse
 from fleetmap.mapformat.building import Floor
-from fleetmap.messages import Cause, Status
+from fleetmap.messages import Cause
 from fleetmap.odometry.estimate import is_away
 from fleetmap.relocalization.map_view import LookAlikes, MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
@@ -20,14 +20,13 @@ from locclient.localization.perception import Percept, Perception
 from locclient.localization.pose_tracker import PoseTracker, QueryResult, Start
 from locclient.localization.priors.given import GivenPrior
 from locclient.localization.priors.lift_ride import LiftRide
-from locclient.localization.priors.prior import PriorSource
 from locclient.localization.settings import LocalizerSettings
 
 
 class Localizer:
     """Localizes one robot in one map version; a new version is adopted without losing the pose.
 
-    `Perception` makes a `Percept` of a frame; `PoseTracker` propagates the pose; `PriorSource`s tell where the robot may be; the fixes of
+    `Perception` makes a `Percept` of a frame; `PoseTracker` propagates the pose; `priors` tell where the robot may be; the fixes of
     `MapQuery` correct it; `CalibrationMonitor` judges the cameras by them.
     """
 
@@ -43,7 +42,6 @@ class Localizer:
         self._tracker.on_restart.append(self._calibration.give_up)
         self._given = GivenPrior(self._tracker)
         self._lift = LiftRide(self._tracker, self.perception.gauge)
-        self._sources: tuple[PriorSource, ...] = (self._given, self._lift)
         self._last_ns: int | None = None
 
     def handle_imu(self, samples: ImuSamples) -> None:
@@ -80,7 +78,8 @@ class Localizer:
         lookalikes: similarity of unmapped places to the map; None if not measured. alias_step_m: smallest distance at which its
         places look alike. site: of another one's map in the building, see `handle_building`; empty for the robot's own.
         """
-        relocalizers = tuple(Relocalizer(view, camera, self._settings.relocalizer) for camera, _ in self._rig.mounted)
+        settings, mounted = self._settings.relocalizer, self._rig.mounted
+        relocalizers = tuple(Relocalizer(view, camera, settings, site) for camera, _ in mounted)
         self.maps.use(site, HeldMap(version, relocalizers, lookalikes, alias_step_m))
         self._query.begin_anew()
         self._calibration.give_up()
@@ -121,7 +120,7 @@ class Localizer:
             tracker.forget(is_carried=odometry.is_lifted)
         self._last_ns = odometry.stamp_ns
         tracker.propagate(odometry, percept.motions, has_broken=percept.has_broken)
-        for source in self._sources:
+        for source in (self._given, self._lift):  # each tells what it has not told before
             if (prior := source.prior(percept)) is not None:
                 tracker.take(prior)
         if frame is not None:
@@ -149,13 +148,8 @@ class Localizer:
         cause = percept.image.cause or (Cause.CARRIED if tracker.is_carried else Cause.NONE)
         estimate = Estimate(
             stamp_ns=percept.odometry.stamp_ns,
-            status=Status.INITIALISING,
-            map_from_body=None,
-            cov_rot_trans=None,
-            map_version=self.maps.version_on(tracker.floor),
-            hypotheses=(),
             odometry=percept.odometry,
-            stage_s={},
+            map_version=self.maps.version_on(tracker.floor),
             cause=Cause.RIDING if is_riding else cause,
             image=percept.image,
             view_causes=percept.view_causes,

@@ -2,10 +2,10 @@
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import permutations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from fleetmap.errors import RecordingError
 from fleetmap.failure_definition import radius_95_m
@@ -200,7 +200,8 @@ class MapQuery:
 
     def _on(self, floor: str) -> Relocalizer | None:
         """Return the relocalizer of the queried view on a floor; None if the robot does not hold its map."""
-        return self._maps.relocalizer(floor, self.view)
+        held = self._maps.by_floor.get(floor)
+        return None if held is None else held.relocalizers[self.view]
 
     def _any_relocalizer(self) -> Relocalizer:
         return next(iter(self._maps.by_floor.values())).relocalizers[self.view]
@@ -225,8 +226,9 @@ class MapQuery:
         fixes = [] if near is None else [near]
         if near is None and (is_sparse or self.failed + 1 >= self._track.search_after_failed):
             yield
-            fixes = yield from self._anywhere(confirmed.now.floor, features, None, self._rotation(confirmed))
-            fixes = [fix for fix in fixes if fix.inliers >= self._settings.fix.min_inliers]
+            if (relocalizer := self._on(confirmed.now.floor)) is not None:
+                found = yield from relocalizer.anywhere(features, None, self._rotation(confirmed))
+                fixes = [fix for fix in found if fix.inliers >= self._settings.fix.min_inliers]
         return tracker.update(fixes, confirmed, is_near=near is not None)
 
     def _near(
@@ -236,13 +238,11 @@ class MapQuery:
         earlier: Sequence[EarlierFrame] = (),
     ) -> Fix | None:
         """Return the fix near a hypothesis at the frame of the query, by that frame and earlier ones."""
-        floor = hypothesis.now.floor
-        relocalizer = self._on(floor)
+        relocalizer = self._on(hypothesis.now.floor)
         if relocalizer is None:
             return None
         map_from_cam, covariance, _ = hypothesis.then.of_point(self._tracker.body_from_cam)
-        fix = relocalizer.near(features, map_from_cam, covariance, earlier)
-        return None if fix is None else _at_floor([fix], floor)[0]
+        return relocalizer.near(features, map_from_cam, covariance, earlier)
 
     def _rotation(self, hypothesis: PoseHypothesis) -> Array:
         return (hypothesis.then.map_from_body @ self._tracker.body_from_cam)[:3, :3]
@@ -265,11 +265,11 @@ class MapQuery:
         only = candidates[0] if len(candidates) == 1 else None
         prior, fixes, floors = tracker.prior, list[Fix](), self._floors_of_prior()
         for floor in floors:
-            places = self._maps.by_floor[floor].relocalizers[self.view].view.map_from_cam[:, :3, 3]
-            near = None if prior is None else prior.is_near(places, floor)
+            relocalizer = self._maps.by_floor[floor].relocalizers[self.view]
+            near = None if prior is None else prior.is_near(relocalizer.view.map_from_cam[:, :3, 3], floor)
             rotation = self._rotation(only) if only is not None and only.now.floor == floor else None
             here, failed = [fix for fix in found if fix.floor == floor], self._failed_places[self.view][floor]
-            fixes += yield from self._anywhere(floor, features, near, rotation, here, failed)
+            fixes += yield from relocalizer.anywhere(features, near, rotation, here, failed)
         fixes += yield from self._counterparts(features, fixes, floors)
         fixes = tracker.believed(sorted(fixes, key=lambda fix: -fix.inliers))
         prior = tracker.prior
@@ -284,26 +284,10 @@ class MapQuery:
             return fixes if is_open else within, len(within) < len(fixes)
         yield
         fixes = []
-        for floor in self._maps.by_floor:
-            fixes += yield from self._anywhere(floor, features)
+        for held in self._maps.by_floor.values():
+            fixes += yield from held.relocalizers[self.view].anywhere(features)
         fixes = [fix for fix in sorted(fixes, key=lambda fix: -fix.inliers) if tracker.is_reliable(fix)]
         return fixes if tracker.drops_prior(fixes) else [], bool(fixes)
-
-    def _anywhere(
-        self,
-        floor: str,
-        features: FrameFeatures,
-        near: NDArray[np.bool_] | None = None,
-        rotation: Array | None = None,
-        found: Sequence[Fix] = (),
-        failed: list[Array] | None = None,
-    ) -> TimeSliced[list[Fix]]:
-        """Return the fixes on one floor; arguments as of `Relocalizer.anywhere`."""
-        relocalizer = self._on(floor)
-        if relocalizer is None:
-            return []
-        fixes = yield from relocalizer.anywhere(features, near, rotation, found, failed)
-        return _at_floor(fixes, floor)
 
     def _counterparts(
         self, features: FrameFeatures, fixes: Sequence[Fix], floors: Sequence[str]
@@ -312,26 +296,20 @@ class MapQuery:
         that fails on the robot's own must not leave another one without competitors."""
         added: list[Fix] = []
         known = self._maps.plan_from_map
-        for floor in floors if len(floors) > 1 else ():
+        for floor, other in permutations(floors, 2):
             best = next((fix for fix in fixes if fix.floor == floor), None)
-            relocalizer = self._on(floor)
-            for other in floors if best is not None and relocalizer is not None else ():
-                there = self._on(other)
-                if other == floor or best is None or there is None or not {floor, other} <= known.keys():
-                    continue
-                place = se3_inverse(known[other]) @ known[floor] @ best.map_from_cam
-                here = [fix for fix in (*fixes, *added) if fix.floor == other]
-                if any(np.linalg.norm(fix.map_from_cam[:2, 3] - place[:2, 3]) < _COUNTERPART_M for fix in here):
-                    continue
-                near = np.linalg.norm(there.view.map_from_cam[:, :2, 3] - place[:2, 3], axis=1) < _COUNTERPART_M
-                yield
-                new = yield from self._anywhere(other, features, near, place[:3, :3], here)
-                added += [fix for fix in new if not any(fix.map_from_cam is each.map_from_cam for each in here)]
+            if best is None or not {floor, other} <= known.keys():
+                continue
+            place = se3_inverse(known[other]) @ known[floor] @ best.map_from_cam
+            here = [fix for fix in (*fixes, *added) if fix.floor == other]
+            if any(np.linalg.norm(fix.map_from_cam[:2, 3] - place[:2, 3]) < _COUNTERPART_M for fix in here):
+                continue
+            there = self._maps.by_floor[other].relocalizers[self.view]
+            near = np.linalg.norm(there.view.map_from_cam[:, :2, 3] - place[:2, 3], axis=1) < _COUNTERPART_M
+            yield
+            new = yield from there.anywhere(features, near, place[:3, :3], here)
+            added += [fix for fix in new if not any(fix.map_from_cam is each.map_from_cam for each in here)]
         return added
-
-
-def _at_floor(fixes: list[Fix], floor: str) -> list[Fix]:
-    return [fix if fix.floor == floor else replace(fix, floor=floor) for fix in fixes]
 
 
 def _extract(query: QueryInput, frame: RectifiedFrame | None, relocalizer: Relocalizer) -> TimeSliced[FrameFeatures]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fleetmap import core
-from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log, turn_both
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log, transport_cov, turn_both
 
 
 def boxminus(measured: Array, predicted: Array) -> Array:
@@ -34,13 +34,6 @@ def kalman_update(map_from_body: Array, covariance: Array, error: Array, cov_mea
     rest = np.eye(6) - gain
     updated = rest @ covariance @ rest.T + gain @ cov_measured @ gain.T  # (I - K) P (I - K)^T + K R K^T
     return boxplus(map_from_body, gain @ error), updated
-
-
-def transport_cov(cov_rot_trans: Array, lever_m: Array) -> Array:
-    """Return the covariance about a point of the same rigid body at `lever_m` (map axes) from the point of `cov_rot_trans`."""
-    adjoint = np.eye(6)
-    adjoint[3:, :3] = -skew(lever_m)
-    return np.asarray(adjoint @ cov_rot_trans @ adjoint.T)
 
 
 def bounded_turn(covariance: Array) -> Array:

@@ -13,7 +13,7 @@ from locclient.localization.place import ORIGIN, Place, bounded_turn, boxminus
 from locclient.localization.settings import TrackSettings
 
 # Sigmas of one step: radians, metres, share of the distance.
-_MEASURED_DRIFT, _RESTARTED = (0.0005, 0.001, 0.02), (0.02, 0.05, 0.1)
+MEASURED_DRIFT, RESTARTED = (0.0005, 0.001, 0.02), (0.02, 0.05, 0.1)
 _VISION_ONLY = (0.005, 0.02, 0.1)  # without an IMU a few wrong points can rotate the motion
 
 
@@ -141,16 +141,17 @@ class PoseHypothesis:
                 and odometry.status is not OdometryStatus.DEGRADED
                 and odometry.scale_known
             )
-            self.now = self.now.moved(step, _step_cov(_MEASURED_DRIFT if is_sure else _RESTARTED, step_m))
+            self.now = self.now.moved(step, step_cov(MEASURED_DRIFT if is_sure else RESTARTED, step_m))
         else:
             distance_m = length(motion.body_from_now[:3, 3])
             drift = _VISION_ONLY if self.is_by_vision else (0.0, settings.drift_floor_m, settings.drift_share)
-            self.now = self.start.moved(motion.body_from_now, motion.cov_rot_trans + _step_cov(drift, distance_m))
+            self.now = self.start.moved(motion.body_from_now, motion.cov_rot_trans + step_cov(drift, distance_m))
         if motion is None or motion.is_last:
             self.frame_index, self.is_by_vision = odometry.frame_index, False
             self.start = self.now._replace(cov_rot_trans=bounded_turn(self.now.cov_rot_trans))
 
 
-def _step_cov(sigmas: tuple[float, float, float], distance_m: float) -> Array:
+def step_cov(sigmas: tuple[float, float, float], distance_m: float) -> Array:
+    """Return the covariance (6, 6) of a step, rotation first, by sigmas in radians, metres, and as a share of the distance."""
     turn_rad, floor_m, share = sigmas
     return np.diag([turn_rad**2] * 3 + [(floor_m + share * distance_m) ** 2] * 3)

@@ -25,6 +25,7 @@ from locclient.localization.settings import LocalizerSettings
 
 _OWN_FIX_M = 0.3  # between a fix and the hypothesis that it supports
 _EARLIER = 3  # frames that a query may pool with its own: of a metre of a drive
+_OF_PRIOR = ("is_revisable", "is_told", "travelled_m")  # what a start keeps of it
 _MISSED_STEPS = 1.5  # shortest steps between frames: a longer one missed some
 
 
@@ -167,24 +168,13 @@ class PoseTracker:
 
     def start(self, failed_queries: int) -> Start:
         """Return the state with which another tracker of the same odometry can start."""
-        prior = self.prior
-        known = self.confirmed or (None if prior is None else prior.hypothesis)
+        start = Start(was_tracking=self.was_tracking, is_carried=self.is_carried, failed_queries=failed_queries)
+        known = self.confirmed or (None if self.prior is None else self.prior.hypothesis)
         if known is None:
-            return Start(was_tracking=self.was_tracking, is_carried=self.is_carried, failed_queries=failed_queries)
-        return Start(
-            frame_index=known.frame_index,
-            stamp_ns=known.stamp_ns,
-            support=known.support,
-            **known.start._asdict(),
-            was_tracking=self.was_tracking,
-            is_carried=self.is_carried,
-            failed_queries=failed_queries,
-            is_confirmed=self.confirmed is not None,
-            is_revisable=prior is not None and prior.is_revisable,
-            is_told=prior is None or prior.is_told,
-            travelled_m=0.0 if prior is None else prior.travelled_m,
-            has_broken=known.has_broken,
-        )
+            return start
+        of_pose = {name: getattr(known, name) for name in ("frame_index", "stamp_ns", "support", "has_broken")}
+        how = {} if self.prior is None else {name: getattr(self.prior, name) for name in _OF_PRIOR}
+        return replace(start, **known.start._asdict(), **of_pose, **how, is_confirmed=self.confirmed is not None)
 
     def begin(self, start: Start) -> None:
         """Continue from `start` with the next frame."""
@@ -198,8 +188,7 @@ class PoseTracker:
         if start.is_confirmed:
             self.confirmed = known
         else:
-            how = {"is_revisable": start.is_revisable, "is_told": start.is_told, "travelled_m": start.travelled_m}
-            self.prior = self.prior_at(known, **how)
+            self.prior = self.prior_at(known, **{name: getattr(start, name) for name in _OF_PRIOR})
 
     # --- propagation --------------------------------------------------------------------------------------------------
 

@@ -2,10 +2,9 @@
 
 from dataclasses import dataclass
 
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, se3_inverse, transport_cov
 from fleetmap.odometry.estimate import ContinuousFrame
 from locclient.localization.estimate import Estimate
-from locclient.localization.place import transport_cov
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,14 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse, so3_log
+from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse, so3_log, transport_cov
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.odometry.tracking.tracker import Tracker
 from fleetmap.sensors.rectification import RectifiedFrame, StereoCamera
 from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.keyframes.keyframes import KeyframePolicy, sharpness
 from mapserver.survey.odometry_pass import TrackedFrame, followed
-from mapserver.survey.pose_graph.odometry_factors import carried
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import OdometryPass
 from mapserver.survey.survey_inputs import SurveyInputs, SurveyTools
@@ -108,7 +107,7 @@ def _covariances(odom_from_body: Array) -> Array:
     steps_m = np.diff(odom_from_body[:, :3, 3], axis=0, prepend=odom_from_body[:1, :3, 3])
     of_a_metre, found = np.diag(np.repeat([_WALK_RAD**2, _WALK_M**2], 3)), [np.zeros((6, 6))]
     for step_m in steps_m:
-        found.append(carried(found[-1] + (np.linalg.norm(step_m) + 1e-4) * of_a_metre, step_m))
+        found.append(transport_cov(found[-1] + (np.linalg.norm(step_m) + 1e-4) * of_a_metre, step_m))
     return np.array(found[1:])
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse
+from fleetmap.geometry import Array, rotation_between_vectors, se3, se3_inverse, transport_cov
 from fleetmap.odometry.estimate import ContinuousFrame, OdometryEstimate, OdometryStatus, is_away
 from fleetmap.odometry.lift_check import WINDOW_NS
 from fleetmap.odometry.mono.mono_modes import make_odometry
@@ -14,7 +14,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import MountedRig, RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import ImuSamples, WheelSample, wheel_between
 from mapserver.survey.keyframes.keyframes import KeyframePolicy, make_keyframes, sharpness
-from mapserver.survey.pose_graph.odometry_factors import carried, odometry_factors
+from mapserver.survey.pose_graph.odometry_factors import odometry_factors
 from mapserver.survey.rig import rig_of, used_cameras
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import FrameTracks, Keyframe, KeyframeMotion, Landmarks, OdometryPass, SurveyState, turned
@@ -193,12 +193,12 @@ class FrameChain:
             away_m = _AWAY_MPS * (estimate.stamp_ns - last_ns) * 1e-9
             reached = reached + np.diag([_AWAY_RAD**2] * 3 + [away_m**2] * 3)
         if step_covariance is None or estimate.status is OdometryStatus.DEGRADED:
-            values, vectors = np.linalg.eigh(carried(self._own, -lever_m) - own_before)
+            values, vectors = np.linalg.eigh(transport_cov(self._own, -lever_m) - own_before)
             gained = (vectors * np.abs(values)) @ vectors.T
         else:
             carry = np.kron(np.eye(2), first[:3, :3])
             gained = carry @ step_covariance @ carry.T
-        return carried(reached + gained, lever_m)
+        return transport_cov(reached + gained, lever_m)
 
     @property
     def level_from_frame(self) -> Array:

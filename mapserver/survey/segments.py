@@ -11,11 +11,11 @@ from itertools import pairwise
 import numpy as np
 
 from fleetmap.errors import SurveyError
-from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log, transport_cov
 from fleetmap.sensors.samples import ImuSamples, Stamps, wheel_between
 from mapserver.survey.keyframes.keyframes import set_aside
 from mapserver.survey.odometry_pass import initial_state
-from mapserver.survey.pose_graph.odometry_factors import blackout_factors, carried, edge_covariance
+from mapserver.survey.pose_graph.odometry_factors import blackout_factors, edge_covariance
 from mapserver.survey.settings import SegmentSettings, SurveySettings
 from mapserver.survey.state import Cut, FrameTracks, ImageStore, Keyframe, Landmarks, OdometryPass, SurveyState
 from mapserver.survey.survey_inputs import AdjustedChain, SurveyInputs, SurveyTools
@@ -310,7 +310,7 @@ def _joined_odometry(placed: Sequence[_Placed]) -> OdometryPass:
         gained = reached - turn @ odometry.covariances[0] @ turn.T
         levers_m = (odometry.odom_from_body[:, :3, 3] - odometry.odom_from_body[0, :3, 3]) @ turn[:3, :3].T
         own = turn @ odometry.covariances @ turn.T
-        covariances.append(own + np.array([carried(gained, lever_m) for lever_m in levers_m]))
+        covariances.append(own + np.array([transport_cov(gained, lever_m) for lever_m in levers_m]))
         reached = covariances[-1][-1]
         tracks = odometry.tracks
         # A shared frame ends after its rows of the later segment.

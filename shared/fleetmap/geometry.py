@@ -113,6 +113,13 @@ def se3_adjoint(target_from_source: Array) -> Array:
     return adjoint
 
 
+def transport_cov(cov_rot_trans: Array, lever_m: Array) -> Array:
+    """(6, 6) about a point of the same rigid body at lever_m (3,) from that of `cov_rot_trans`: uncertainty of rotation also moves it."""
+    adjoint = np.eye(6)
+    adjoint[3:, :3] = -skew(lever_m)
+    return np.asarray(adjoint @ cov_rot_trans @ adjoint.T)
+
+
 def turn_both(rotation: Array) -> Array:
     """(6, 6) matrix that turns both halves of a tangent vector by a rotation (3, 3)."""
     turn = np.zeros((6, 6))

@@ -4,8 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.geometry import Array, turn_both
-from locclient.localization.place import transport_cov
+from fleetmap.geometry import Array, transport_cov, turn_both
 
 DRIFT_SIGMAS = 5.0
 """Drift limit in sigmas of a parameter: p = 6e-7 for one test. Ten parameters and three windows, corrected by Bonferroni's inequality,

@@ -8,7 +8,7 @@ import numpy as np
 
 from fleetmap.features import stereo
 from fleetmap.features.settings import StereoSettings
-from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transport_cov
 from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.pnp.pnp import Correspondences
 from locclient.localization.calibration import mounting
@@ -29,7 +29,6 @@ from locclient.localization.calibration.parameters import (
     Drift,
 )
 from locclient.localization.map_query import FinishedQuery
-from locclient.localization.place import transport_cov
 
 _STEP_M, _FIRST_STEP_M, _STEP_RAD = 1.0, 0.5, 0.35  # between two looks, and between the first ones
 _MIN_NEW_SHARE = 0.1  # weight of a look without landmarks new to the window

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,7 +13,6 @@ from fleetmap.odometry.estimate import OdometryEstimate
 from fleetmap.relocalization.map_view import LookAlikes
 from fleetmap.sensors.samples import PositionPrior
 from locclient.localization.hypothesis_set import HypothesisSet, Observations
-from locclient.localization.perception import Percept
 from locclient.localization.place import Place
 from locclient.localization.pose_hypothesis import PoseHypothesis
 from locclient.localization.settings import TrackSettings
@@ -37,13 +36,6 @@ def agrees(prior: PositionPrior, confirmed: Place, base_from_body: Array) -> boo
     turn_rad = so3_log(prior.map_from_base[:3, :3].T @ map_from_base[:3, :3])[2]
     is_near = off_m @ np.linalg.solve(covariance[3:5, 3:5] + _SIGMA_M**2 * np.eye(2), off_m) < _CHI2_999
     return bool(is_near and abs(turn_rad) < _BOUND_SIGMAS * np.sqrt(covariance[2, 2]))
-
-
-class PriorSource(Protocol):
-    """Something that tells a robot where it is; asked with every frame, after those before it in `Localizer`."""
-
-    def prior(self, percept: Percept) -> "Prior | None":
-        """Return what it tells at this frame that it has not told before."""
 
 
 @dataclass(eq=False)

@@ -11,15 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, so3_log, transport_cov
 from fleetmap.odometry.estimate import OdometryStatus
 from fleetmap.recordings.ros2.messages import HALVES_SWAPPED, FrameLink, decode_frame_links
 from locclient.localization.estimate import Estimate
-from locclient.localization.place import transport_cov
+from locclient.localization.pose_hypothesis import MEASURED_DRIFT, RESTARTED, step_cov
 from locclient.robot.continuous_odom import PublishedPose
 
-# Odometry sigmas between two frames, tracking and not: radians, metres, share of the distance.
-_MEASURED, _GUESSED = (0.0005, 0.001, 0.02), (0.02, 0.05, 0.1)
 _KEPT_NS, _KEPT_POSES = 10_000_000_000, 20_000  # as tf2 keeps them
 _GAP_S = 1.0
 _STRAYS, _WAITING = 5, 64
@@ -35,9 +33,8 @@ def motion_between(before: Localized, after: Localized, base_from_body: Array) -
     odometry, seconds = estimate.odometry, (estimate.stamp_ns - earlier.stamp_ns) * 1e-9
     step = se3_inverse(then.odom_from_base) @ now.odom_from_base
     twist = np.concatenate([step[:3, 3], so3_log(step[:3, :3])]) / seconds
-    turn_rad, floor_m, share = _GUESSED if odometry.status is OdometryStatus.DEGRADED else _MEASURED
-    sigma_m = floor_m + share * float(np.linalg.norm(step[:3, 3]))
-    twist_cov = np.diag([(sigma_m / seconds) ** 2] * 3 + [(turn_rad / seconds) ** 2] * 3)
+    sigmas = RESTARTED if odometry.status is OdometryStatus.DEGRADED else MEASURED_DRIFT
+    twist_cov = step_cov(sigmas, float(np.linalg.norm(step[:3, 3])))[HALVES_SWAPPED] / seconds**2
     # The odometry's frame may be rotated against the published one.
     published_from_odometry = (now.odom_from_base @ base_from_body)[:3, :3] @ odometry.odom_from_body[:3, :3].T
     both = np.kron(np.eye(2), published_from_odometry)

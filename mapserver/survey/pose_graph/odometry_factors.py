@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, skew
+from fleetmap.geometry import Array, rotation_angle_rad, se3_inverse, transport_cov
 from fleetmap.odometry.sensor_buffer import is_pause
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.settings import MIN_SEEN
@@ -73,13 +73,6 @@ def _factor(k: int, i_from_j: Array, covariance: Array) -> RelativeTerm:
     return RelativeTerm(k, k + 1, i_from_j, np.linalg.inv(covariance).astype(np.float64))
 
 
-def carried(covariance: Array, lever_m: Array) -> Array:
-    """Return (6, 6) of a body at lever_m (3,) from one with this covariance: uncertainty of rotation also moves it."""
-    about = np.eye(6)
-    about[3:, :3] = -skew(lever_m)
-    return np.asarray(about @ covariance @ about.T)
-
-
 def edge_covariance(odometry: OdometryPass, a: int, b: int, least: Floor = FLOOR) -> Array:
     """Return (6, 6) of i_from_j between frames a and b, axes of a: the growth of the odometry's uncertainty, with a least one."""
     first, last = odometry.odom_from_body[[a, b]]
@@ -93,7 +86,7 @@ def step_covariance(known: tuple[Array, Array], odom_from_first: Array, first_fr
     An initial error of direction also moves the last pose, and is contained in its covariance at every step. About the position of
     the first pose, where it has no effect, the last covariance is larger by the step's own part: such steps are independent.
     """
-    gained = carried(known[1], -odom_from_first @ first_from_last[:3, 3]) - known[0]
+    gained = transport_cov(known[1], -odom_from_first @ first_from_last[:3, 3]) - known[0]
     values, vectors = np.linalg.eigh(0.5 * (gained + gained.T))
     gained = (vectors * np.maximum(values, 0.0)) @ vectors.T  # one camera's first frames may have moved since
     carry = np.kron(np.eye(2), odom_from_first.T)

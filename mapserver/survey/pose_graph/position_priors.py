@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log
+from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log, transport_cov
 from fleetmap.sensors.samples import PositionPrior
 from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, GraphMarginals
-from mapserver.survey.pose_graph.odometry_factors import carried, edge_covariance
+from mapserver.survey.pose_graph.odometry_factors import edge_covariance
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.state import OdometryPass, PriorTerm
 from mapserver.survey.survey_map import SurveyMap
@@ -88,9 +88,9 @@ def learn_priors(marginals: GraphMarginals, priors: Sequence[PriorTerm]) -> list
 def prior_edges(map_from_body: Array, priors: Sequence[PriorTerm]) -> tuple[Array, list[PoseEdge]]:
     """Return keyframes (K, 4, 4) with the frame `map` as a node behind them, and the edges from there: its level, then the priors."""
     count = len(map_from_body)
-    edges = [PoseEdge(count, 0, map_from_body[0], carried(_LEVEL, -map_from_body[0, :3, 3]), is_loop=False)]
+    edges = [PoseEdge(count, 0, map_from_body[0], transport_cov(_LEVEL, -map_from_body[0, :3, 3]), is_loop=False)]
     for term in priors:
-        covariance = carried(_covariance(term), -term.map_from_body[:3, 3])
+        covariance = transport_cov(_covariance(term), -term.map_from_body[:3, 3])
         edges.append(PoseEdge(count, term.k, term.map_from_body, covariance, is_loop=True))
     return np.concatenate([map_from_body, np.eye(4)[None]]), edges
 
@@ -160,7 +160,7 @@ def _terms(
         if not np.sqrt(prior.cov_rot_trans[2, 2]) <= _HEADING_KNOWN_RAD:
             map_from_base = se3((map_from_body[k] @ se3_inverse(base_from_k))[:3, :3], map_from_base[:3, 3])
         map_from_k = map_from_base @ base_from_k
-        covariance = carried(_finite(prior) + _UNEVEN, map_from_k[:3, 3] - map_from_base[:3, 3])
+        covariance = transport_cov(_finite(prior) + _UNEVEN, map_from_k[:3, 3] - map_from_base[:3, 3])
         if frames[k] != frame:
             first, last = sorted((frame, int(frames[k])))
             turned = np.kron(np.eye(2), map_from_k[:3, :3])
@@ -225,7 +225,7 @@ def _edge(reference: PriorTerm, term: PriorTerm) -> PoseEdge:
     """Return the pose of a term's keyframe relative to the reference's."""
     apart_m = term.map_from_body[:3, 3] - reference.map_from_body[:3, 3]
     i_from_map = np.kron(np.eye(2), reference.map_from_body[:3, :3].T)
-    both = _covariance(reference) + carried(_covariance(term), -apart_m)
+    both = _covariance(reference) + transport_cov(_covariance(term), -apart_m)
     i_from_j = se3_inverse(reference.map_from_body) @ term.map_from_body
     return PoseEdge(reference.k, term.k, i_from_j, i_from_map @ both @ i_from_map.T, is_loop=True)
 

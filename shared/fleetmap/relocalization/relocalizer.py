@@ -64,10 +64,10 @@ class EarlierFrame:
 
 
 class Relocalizer:
-    """Finds fixes of frames in one map view."""
+    """Finds fixes of frames in one map view. floor: as of `Fix`."""
 
-    def __init__(self, view: MapView, camera: StereoCamera, settings: RelocalizerSettings) -> None:
-        self.view = view
+    def __init__(self, view: MapView, camera: StereoCamera, settings: RelocalizerSettings, floor: str = "") -> None:
+        self.view, self.floor = view, floor
         self._camera = camera
         self._settings = settings
         self._finder = view.fix_finder(camera, settings)
@@ -173,6 +173,7 @@ class Relocalizer:
             landmark_recall=seen / max(len(covisible), 1),
             expected=len(covisible),
             seen=seen,
+            floor=self.floor,
         )
         if earlier:
             return fix

@@ -33,7 +33,7 @@ def estimate(
     covariance = np.diag([1e-4] * 3 + [sigma_m**2] * 3) if known else None
     own = Fix(np.eye(4), 1e-4 * np.eye(6), 40, 12) if fix else None
     others = tuple(Hypothesis(se3(np.eye(3), np.array([float(n), 0, 0])), 3) for n in range(hypotheses))
-    return Estimate(stamp_ns, status, place, covariance, version, own, refused, innovation, others, odometry, {})
+    return Estimate(stamp_ns, odometry, version, status, place, covariance, own, refused, innovation, others)
 
 
 def inputs(bus: MemoryBus) -> tuple[MemoryBus, str, str, RigCalibration, Intake]:

@@ -176,7 +176,8 @@ class LiftWorld:
         map_from_body[:3, 3] += self.rng.normal(0.0, 0.01, 3)
         covariance = np.diag([0.002**2] * 3 + [0.01**2] * 3)
         inliers = max(1, round(share * self.rng.normal(60, 8)))
-        fix = Fix(map_from_body @ BODY_FROM_CAM, covariance, inliers, 20, alias_ratio=0.1, landmark_recall=0.6 * share)
+        place, floor = map_from_body @ BODY_FROM_CAM, self.keys[number]
+        fix = Fix(place, covariance, inliers, 20, alias_ratio=0.1, landmark_recall=0.6 * share, floor=floor)
         if not self.has_stock:
             return fix
         points, body = self._stock[number], self.plan_from_body[:3, 3]
