@@ -1,7 +1,6 @@
 """Assembly of the parts of `locclient run` from its configuration."""
 
 import logging
-import shlex
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -13,7 +12,7 @@ from pathlib import Path
 import cv2
 
 from fleetmap.bus.zenoh_bus import Bus
-from fleetmap.errors import LinkError, UsageError
+from fleetmap.errors import UsageError
 from fleetmap.free_memory import gc_frozen, give_back_free_memory
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.calibration import RigCalibration
@@ -33,7 +32,7 @@ from locclient.identity import GivenAddress, MapAddress, check_reach
 from locclient.localization.priors.given import parse_prior
 from locclient.maps.building_maps import BuildingMaps
 from locclient.maps.map_client import cache_folder, map_client, open_bus, outbox_path
-from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource
+from locclient.maps.map_source import CachedMap, LocalMapSource, MapSource, address_of
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
 from locclient.outputs import Publisher
@@ -96,10 +95,12 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         stack.enter_context(gc_frozen())
         caches: tuple[TileCache, ...] = ()
         server: ServerSync | None = None
+        first: WantedVersion | None
         maps: MapSource
         if bus is None:
             maps = LocalMapSource(Path(run.store or ""), address.site)
-            first: WantedVersion | None = _published(maps, run)
+            first = maps.wanted()
+            address_of(first)  # LinkError without one
         else:
             # Two caches of the same folder, because one is not thread-safe; the second only reads.
             caches = tuple(TileCache(cache_folder(run.cache), max_bytes=run.cache_bytes) for _ in range(2))
@@ -127,7 +128,7 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
             first=first,
             failures_folder=None if run.failures is None else Path(run.failures),
             caches=caches,
-            building=_building_maps(address, bus, caches, server, maps, publisher),
+            building=_building_maps(address, caches, server, maps),
             drives=None if server is None else server.drives,
         )
 
@@ -175,25 +176,18 @@ def _opened_publisher(
 
 
 def _building_maps(
-    address: MapAddress,
-    bus: Bus | None,
-    caches: tuple[TileCache, ...],
-    server: ServerSync | None,
-    maps: MapSource,
-    publisher: Publisher | None,
+    address: MapAddress, caches: tuple[TileCache, ...], server: ServerSync | None, maps: MapSource
 ) -> BuildingMaps:
     """Return the maps of the other sites of the robot's building, as far as its disk has them."""
-    grid_height_m = None if publisher is None else publisher.grid_height_m
 
     def opened(site: str) -> MapSource:
-        if bus is None:
+        if server is None:
             return LocalMapSource(Path(address.store or ""), site)
-        client = map_client(bus, caches[0], replace(address, site=site))
-        client.takes_grids = grid_height_m is not None
+        client = map_client(server.client.bus, caches[0], replace(address, site=site))
+        client.takes_grids = server.client.takes_grids
         return client
 
     building = BuildingMaps(maps if server is None else server.client, opened)
-    building.grid_height_m = grid_height_m
     building.refresh(asks=server is None)
     if server is not None:
         server.building = building
@@ -234,14 +228,3 @@ def _server(
 def configured_outbox(run: RunSection, address: MapAddress) -> Path:
     """Return the file of the spool: as set, else beside the default cache."""
     return outbox_path(address.site, address.robot) if run.outbox is None else Path(run.outbox)
-
-
-def _published(source: LocalMapSource, run: RunSection) -> WantedVersion:
-    """Return the current version of a store's site; LinkError without one."""
-    wanted = source.wanted()
-    if wanted.version is None:
-        raise LinkError(
-            f"site {source.site} has no published version in {run.store}; "
-            f"publish one with `mapserver publish --site {source.site} --store {shlex.quote(run.store or '')}`"
-        )
-    return wanted

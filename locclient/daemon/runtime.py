@@ -14,6 +14,8 @@ from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from fleetmap.errors import FleetmapError, LinkError, RecordingError, StoreError
 from fleetmap.free_memory import give_back_free_memory
 from fleetmap.log_lines import LogLimit
@@ -21,12 +23,13 @@ from fleetmap.messages import RobotHealth, WantedVersion, encode_message
 from fleetmap.sources.intake import Intake
 from fleetmap.sources.source import Source
 from fleetmap.threads import Jobs, ended_by_threads
+from fleetmap.version_grid import UNKNOWN, OccupancyGrid
 from locclient.daemon.server_sync import ServerSync
 from locclient.daemon.service_manager import ServiceManager
 from locclient.delivery.outbox import Outbox, QueuedReport
 from locclient.delivery.report_delivery import ReplayQueue, write_failure
 from locclient.delivery.survey_drives import SurveyDrives
-from locclient.maps.building_maps import NO_GRID, BuildingMaps
+from locclient.maps.building_maps import BuildingMaps
 from locclient.maps.loaded_map import Cell, LoadedMap, PositionBound, PositionBoundTracker
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
@@ -42,6 +45,7 @@ _DRAIN_S = 5.0
 _DELIVERED_WITHIN_S = 30.0  # after the end of a recording
 _MAX_PENDING = 100
 _RECEIVED = ("frames", "imu_samples")  # among the counts of the intake; the others count what is lost
+_NO_GRID = OccupancyGrid(np.full((1, 1), UNKNOWN, np.int8), 0.05, np.eye(4))  # for planners on a floor without one
 _log = logging.getLogger(__name__)
 
 
@@ -163,8 +167,6 @@ class Runtime:
         while self._loaded:
             robot.use(self._loaded.popleft())
             give_back_free_memory()  # of the previous version and of loading this one; takes 0.5 ms
-        while server is not None and server.frames:
-            robot.align(server.frames.popleft())
         while self._parts.building is not None and self._parts.building.changes:
             robot.use_building(*self._parts.building.changes.popleft())
             give_back_free_memory()
@@ -301,7 +303,7 @@ class Runtime:
                 continue
             if loaded is not None:
                 self._loaded.append(replace(loaded, is_offer=version not in held))
-            self._note_refused_tiles(version)
+                self._note_refused_tiles(version, loaded.refused)
         if held:
             self._show_grid(held[0])
         loader.keep_only(wanted)
@@ -319,14 +321,11 @@ class Runtime:
         was_elsewhere = self._shown_grid is not None and self._shown_grid[0] != site
         self._shown_grid, grid, why = (site, version), None, ""
         try:
-            if site and building is not None:
-                grid = building.grid(site)
-            else:
-                grid = self._parts.tile_loader.grid(version, height_m)
+            grid = self._parts.tile_loader.grid(version, height_m)
         except FleetmapError as error:
             why = str(error)
             if was_elsewhere:  # a planner must not use the grid of where the robot was
-                _send(partial(publisher.show_grid, version.version or 0, NO_GRID, ""))
+                _send(partial(publisher.show_grid, version.version or 0, _NO_GRID, ""))
             if not site and isinstance(error, LinkError) and self._fetches_again(version, "grid"):
                 return
         _send(partial(publisher.show_grid, version.version or 0, grid, why))
@@ -339,9 +338,8 @@ class Runtime:
         self._server.refetch.append(version)
         return True
 
-    def _note_refused_tiles(self, version: WantedVersion) -> None:
+    def _note_refused_tiles(self, version: WantedVersion, refused: dict[Cell, str]) -> None:
         """Log refused tiles once, and request them again."""
-        refused = self._parts.tile_loader.refused(version)
         if refused == self._refused_tiles.get(version, {}):
             return
         self._refused_tiles[version] = refused

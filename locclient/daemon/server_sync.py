@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 
 from fleetmap.errors import FleetmapError, LinkError, MapFormatError, StoreError, UnreachableError, UntrustedError
 from fleetmap.log_lines import LogLimit
-from fleetmap.mapformat.building import BuildingFrame
 from fleetmap.messages import InitialPoseMessage, RobotHealth, WantedVersion
 from fleetmap.sensors.samples import PositionPrior
 from fleetmap.threads import Jobs
@@ -66,9 +65,6 @@ class ServerSync:
         self.changes: deque[VersionChange] = deque()
         self.fetched: deque[WantedVersion] = deque()
         self.refetch: deque[WantedVersion] = deque(maxlen=1)
-        self.frames: deque[BuildingFrame | None] = deque()  # changes of the map's pose in the building
-        self._frame: BuildingFrame | None = None
-        self._learn_frame()  # from the cache
         self._offered: set[str] = set()
         self._running = client.active()
         if self._running is not None:
@@ -145,7 +141,6 @@ class ServerSync:
         """Fetch what the server wants, and all that belongs to it."""
         if self.drives is not None:
             self.drives.requests = self.client.surveys
-        self._learn_frame()
         if self.building is not None:
             self.building.refresh()
         sha256 = wanted.manifest_sha256
@@ -179,19 +174,6 @@ class ServerSync:
             self._refuse(wanted, str(error), is_untrusted)
             return self._running is None and not is_untrusted
         return True
-
-    def _learn_frame(self) -> None:
-        """Update the building's frame: a site may be realigned while its version stays. On an error the frame stays."""
-        try:
-            frame = self.client.building_frame()
-        except UnreachableError:
-            raise
-        except FleetmapError as error:
-            _log.warning("the building's frame stays as it was: %s", error)
-            return
-        if frame != self._frame:
-            self._frame = frame
-            self.frames.append(frame)
 
     def _fetch_again(self) -> None:
         """Fetch damaged or missing pieces of a version that the robot holds."""

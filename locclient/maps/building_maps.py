@@ -1,14 +1,12 @@
-"""The floors of a robot's building and the maps of the others than its own site's: followed, and held whole in memory."""
+"""The pose of a robot's map in its building, the floors there, and the maps of the others than its own site's, held whole in memory."""
 
 import logging
 from collections import deque
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numpy as np
-
 from fleetmap.bow.vocabulary import decode_vocabulary
-from fleetmap.errors import FleetmapError, MapFormatError, StateError, UnreachableError
+from fleetmap.errors import FleetmapError, MapFormatError, UnreachableError
 from fleetmap.mapformat.building import (
     ALIGNMENT,
     AREAS,
@@ -21,21 +19,23 @@ from fleetmap.mapformat.building import (
     read_lifts,
 )
 from fleetmap.messages import WantedVersion
-from fleetmap.version_grid import UNKNOWN, OccupancyGrid, grid_of, occupancy
 from locclient.maps.loaded_map import LoadedMap
 from locclient.maps.map_source import MapSource
 
 _MAX_ALIGNMENT_BYTES, _MAX_AREAS_BYTES = 1 << 20, 8 << 20
-NO_GRID = OccupancyGrid(np.full((1, 1), UNKNOWN, np.int8), 0.05, np.eye(4))  # for planners on a floor without one
 _UNKNOWN = BuildingFrame(x_m=0.0, y_m=0.0, yaw_rad=0.0)  # of a floor whose files are missing, and so its map
 _log = logging.getLogger(__name__)
 
 
 class BuildingChange(NamedTuple):
-    """The building as of `Localizer.handle_building`, all of it, and new versions of the other floors."""
+    """The building as of `Localizer.handle_building`, all of it, and new versions of the other floors.
+
+    frame: of a site without floors; None if each version's manifest defines it.
+    """
 
     building: dict[str, Floor]
     maps: list[LoadedMap]
+    frame: BuildingFrame | None
 
 
 class BuildingMaps:
@@ -50,8 +50,6 @@ class BuildingMaps:
         self._sources: dict[str, MapSource] = {}
         self._floors: dict[str, Floor] = {}
         self.held: dict[str, WantedVersion] = {}  # of the others
-        self.grid_height_m: float | None = None  # of the robot, if planners need grids
-        self._grids: dict[str, OccupancyGrid | str] = {}  # or why there is none
         self._made_of = b""  # the record and the files of the floors
         self._faults: dict[str, str] = {}
         self.changes: deque[BuildingChange] = deque()
@@ -63,6 +61,8 @@ class BuildingMaps:
             entries = () if data is None else read_building(data).floors
             if entries and self._own.site not in {entry.site for entry in entries}:
                 raise MapFormatError(f"the building of site {self._own.site} has no such floor; set it again")
+            alone = None if entries else self._own.site_file(ALIGNMENT, _MAX_ALIGNMENT_BYTES)
+            frame_alone = None if alone is None else aligned_frame(alone)
         except UnreachableError:
             raise
         except FleetmapError as error:
@@ -92,22 +92,18 @@ class BuildingMaps:
                 if asks and isinstance(error, UnreachableError):
                     raise
                 self._note(entry.site, str(error))
-        made_of = repr([(key, floor.entry) for key, floor in floors.items()] + files).encode() if floors else b""
+        made_of = (
+            repr([(key, floor.entry) for key, floor in floors.items()] + files).encode() if floors else alone or b""
+        )
         if made_of != self._made_of or maps:
-            floors = self._floors if made_of == self._made_of else floors  # the same object: a ride goes on
+            if made_of == self._made_of or not (floors or self._floors):
+                floors = self._floors  # the same object: a ride goes on
             self._floors, self._made_of = floors, made_of
             self._sources = {site: source for site, source in self._sources.items() if site in floors}
             held = {site: wanted for site, wanted in self.held.items() if site in floors}
             self.held = held | {loaded.wanted.site: loaded.wanted for loaded in maps}
-            self.changes.append(BuildingChange(floors, maps))
+            self.changes.append(BuildingChange(floors, maps, frame_alone))
         return None
-
-    def grid(self, site: str) -> OccupancyGrid:
-        """Return the grid of another floor for planners; StateError with the reason without one. Thread-safe."""
-        grid = self._grids.get(site, "its map is not here yet")
-        if isinstance(grid, str):
-            raise StateError(f"floor {site} has no grid: {grid}")
-        return grid
 
     def _newest(self, source: MapSource, *, asks: bool) -> LoadedMap | None:
         """Return the current version with all of its usable tiles; None if the robot holds it already."""
@@ -118,14 +114,9 @@ class BuildingMaps:
         tiles = source.tiles(manifest)
         for reason in tiles.refused.values():
             _log.warning("floor %s: a tile is left out: %s", source.site, reason)
-        if self.grid_height_m is not None:
-            try:
-                self._grids[source.site] = occupancy(grid_of(manifest, source.blob), self.grid_height_m)
-            except FleetmapError as error:
-                self._grids[source.site] = str(error)
         return LoadedMap(wanted, manifest, decode_vocabulary(source.vocabulary(manifest)), tiles.tiles)
 
     def _note(self, site: str, fault: str) -> None:
         if fault and fault != self._faults.get(site):
-            _log.warning("floor %s stays as it was: %s", site, fault)
+            _log.warning("site %s stays as it was in its building: %s", site, fault)
         self._faults[site] = fault

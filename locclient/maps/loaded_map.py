@@ -8,7 +8,7 @@ from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.config import Section
 from fleetmap.geometry import Array
 from fleetmap.mapformat.manifest import Manifest
-from fleetmap.mapformat.tile import Tile
+from fleetmap.mapformat.tile import Tile, off_tile_m
 from fleetmap.messages import Status, WantedVersion
 from fleetmap.relocalization.map_view import ALIAS_STEP_M, LookAlikes, MapView
 from locclient.localization.estimate import Estimate
@@ -64,14 +64,9 @@ class PositionBoundTracker:
 
 def tiles_within(manifest: Manifest, position_map_m: Array, reach_m: float) -> frozenset[Cell]:
     """Return tiles of the version within reach_m of a position (3,)."""
-    size_m = manifest.tile_size_m
-    near = set()
-    for entry in manifest.tiles:
-        low = np.array([entry.x, entry.y]) * size_m
-        off = np.maximum(np.maximum(low - position_map_m[:2], position_map_m[:2] - low - size_m), 0.0)
-        if float(np.hypot(off[0], off[1])) <= reach_m:
-            near.add((entry.x, entry.y))
-    return frozenset(near)
+    cells = np.array([(entry.x, entry.y) for entry in manifest.tiles], np.int64).reshape(-1, 2)
+    near = cells[off_tile_m(cells, manifest.tile_size_m, position_map_m) <= reach_m]
+    return frozenset((x, y) for x, y in near.tolist())
 
 
 def select_tiles(
@@ -95,13 +90,17 @@ def select_tiles(
 
 @dataclass(frozen=True)
 class LoadedMap:
-    """Some tiles of one version. is_offer: a version to start with or to try, not only other tiles of a held one."""
+    """Some tiles of one version. is_offer: a version to start with or to try, not only other tiles of a held one.
+
+    refused: the reasons of tiles that cannot be read.
+    """
 
     wanted: WantedVersion
     manifest: Manifest
     vocabulary: Vocabulary
     tiles: dict[Cell, Tile]
     is_offer: bool = True
+    refused: dict[Cell, str] = field(default_factory=dict)
 
     @property
     def version(self) -> int:

@@ -22,7 +22,6 @@ from fleetmap.errors import (
     UsageError,
     disk_errors,
 )
-from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame, aligned_frame
 from fleetmap.mapformat.manifest import MAX_MANIFEST_BYTES, Manifest, TileEntry
 from fleetmap.mapformat.names import check_name, sha256_hex, verified
 from fleetmap.messages import (
@@ -116,7 +115,6 @@ class ChunkReader:
                 time.sleep(_RETRY_S)
 
 
-_MAX_ALIGNMENT_BYTES = 1 << 20
 _log = logging.getLogger(__name__)
 
 
@@ -312,11 +310,6 @@ class MapClient(MapSource):
             data = verified(self.chunks.read(self._key(f"blobs/{sha256}"), max_bytes=max_bytes), sha256)
         self._cache.keep_file(self.site, kind, data)
         return data
-
-    def building_frame(self) -> BuildingFrame | None:
-        """Return the pose of the site's map in its building, by `site_file`; None if each version's manifest defines it."""
-        data = self.site_file(ALIGNMENT, _MAX_ALIGNMENT_BYTES)
-        return None if data is None else aligned_frame(data)
 
     # --- reports ------------------------------------------------------------------------------------------------------
 

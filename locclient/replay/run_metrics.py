@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -91,14 +92,9 @@ def first_fix_s(frames: Frames) -> float | None:
     return None if start is None else (frames[start].stamp_ns - frames[0].stamp_ns) * 1e-9
 
 
-def frame_ms(frames: Frames) -> dict[str, float] | None:
-    """Return CPU milliseconds of the whole process per frame, after the warm-up frames."""
-    return spread([1e3 * f.cpu_s for f in frames[WARM_UP_FRAMES:]], ("mean", "p50", "p99", "max"))
-
-
-def frame_wall_ms(frames: Frames) -> dict[str, float] | None:
-    """Return wall-clock milliseconds per frame, after the warm-up frames."""
-    return spread([1e3 * f.wall_s for f in frames[WARM_UP_FRAMES:]], ("mean", "p50", "p99", "max"))
+def frame_ms(frames: Frames, clock: str = "cpu_s") -> dict[str, float] | None:
+    """Return milliseconds per frame, after the warm-up frames: CPU of the whole process, or by the wall clock ("wall_s")."""
+    return spread([1e3 * getattr(f, clock) for f in frames[WARM_UP_FRAMES:]], ("mean", "p50", "p99", "max"))
 
 
 def stage_ms(frames: Frames) -> dict[str, float]:
@@ -227,7 +223,7 @@ METRICS: dict[str, Callable[[Frames], object]] = {
     "first_fix_s": first_fix_s,
     "not_localised_share": not_localised_share,
     "frame_ms": frame_ms,
-    "frame_wall_ms": frame_wall_ms,
+    "frame_wall_ms": partial(frame_ms, clock="wall_s"),
     "stage_ms": stage_ms,
     "error_m": error_m,
     "error_deg": error_deg,

@@ -33,17 +33,15 @@ class DockCheck:
         self._last_m: Array | None = None
         self._path_m = np.inf
 
-    def handle(self, priors: Iterable[PositionPrior], estimate: Estimate) -> float | None:
+    def handle(self, priors: Iterable[PositionPrior], estimate: Estimate, odom_from_body: Array) -> float | None:
         """Return the horizontal distance between the estimate of a frame and the dock among its priors.
 
-        None without a dock, if the robot was not TRACKING, and for repeated reports while it stands.
+        None without a dock, if the robot was not TRACKING, and for repeated reports while it stands. odom_from_body (4, 4): in an odometry
+        frame that is not redefined once the robot is localized.
         """
-        # The distance travelled, also when the odometry redefines its frame
-        now_m, change = estimate.odometry.odom_from_body[:3, 3], estimate.odometry.new_odom_from_old_odom
         if self._last_m is not None:
-            last_m = self._last_m if change is None else change[:3, :3] @ self._last_m + change[:3, 3]
-            self._path_m += float(np.linalg.norm(now_m - last_m))
-        self._last_m = now_m
+            self._path_m += dist(odom_from_body[:3, 3], self._last_m)
+        self._last_m = odom_from_body[:3, 3]
         was_tracking, self._was_tracking = self._was_tracking, estimate.status is Status.TRACKING
         exact = [prior for prior in priors if _is_exact(prior) and prior.floor in (None, estimate.floor)]
         if not exact:

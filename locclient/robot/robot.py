@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
-from fleetmap.failure_definition import may_be_mapped, radius_95_m
+from fleetmap.failure_definition import radius_95_m
 from fleetmap.geometry import Array
 from fleetmap.mapformat.building import BuildingFrame, Floor
 from fleetmap.mapformat.manifest import building_frame
@@ -17,7 +17,7 @@ from fleetmap.sources.sensor_bundle import SensorBundle
 from locclient.localization.estimate import Estimate
 from locclient.localization.localizer import Localizer
 from locclient.localization.settings import LocalizerSettings
-from locclient.maps.loaded_map import LoadedMap
+from locclient.maps.loaded_map import LoadedMap, tiles_within
 from locclient.robot.continuous_odom import ContinuousOdom, PublishedPose
 from locclient.robot.failure_monitor import Failure, FailureMonitor
 from locclient.robot.failure_onset import Evidence, Onset, OnsetRecorder, refined_cause
@@ -153,11 +153,15 @@ class Robot:
         """Use other tiles of a held version, or a new version: the first one is adopted at once, any other is put on trial."""
         self._versions.use(loaded)
 
-    def use_building(self, building: Mapping[str, Floor], maps: Sequence[LoadedMap]) -> None:
+    def use_building(
+        self, building: Mapping[str, Floor], maps: Sequence[LoadedMap], frame: BuildingFrame | None = None
+    ) -> None:
         """Use the robot's building, as `Localizer.handle_building`, and new versions of its other sites.
 
-        Those are used without a trial: they are current on their own site, where its robots have tried them.
+        Those are used without a trial: they are current on their own site, where its robots have tried them. frame: the pose of the map of
+        a site without floors, which overrides that of versions.
         """
+        self._aligned = frame
         if building is not self.building:  # it changes less often than maps
             self.building = building
             self._visited = {site: held for site, held in self._visited.items() if site in building}
@@ -165,10 +169,6 @@ class Robot:
         for loaded in maps:
             self._visited[loaded.wanted.site] = loaded
             loaded.show(self.localizer, loaded.wanted.site)
-
-    def align(self, frame: BuildingFrame | None) -> None:
-        """Set the pose of the site's map in its building, which overrides that of versions; None: each version defines it."""
-        self._aligned = frame
 
     def handle(self, bundle: SensorBundle) -> Outcome | None:
         """Return results of a bundle with a frame; None without one that the localizer uses. RecordingError for unreadable images."""
@@ -222,7 +222,7 @@ class Robot:
             self.ring.handle(percept, frame, estimate, self.localizer.start(), self.monitor.begun_ns)
         context = None if failure is None else self._context(failure, odom_from_body)
         self._onsets.handle(estimate, frame, odom_from_body, self.monitor.begun_ns)
-        dock_error_m = self._docks.handle(bundle.priors, estimate)
+        dock_error_m = self._docks.handle(bundle.priors, estimate, odom_from_body)
         return Outcome(
             estimate, published, cpu_s, stage_s, context, dock_error_m, speed_mps, is_covered,
             {**self._left_out(), **refused, **bundle.left_out}, self._load.dropped_share,
@@ -261,11 +261,13 @@ class Robot:
         return context
 
     def _may_be_mapped(self, estimate: Estimate) -> bool:
+        """Return True if the map covers the robot's place, or may cover it."""
         if estimate.status is Status.TRACKING or estimate.map_from_body is None or self.running is None:
             return True
-        manifest, (x_m, y_m) = self.running.manifest, estimate.map_from_body[:2, 3]
-        cells = ((tile.x, tile.y) for tile in manifest.tiles)
-        return may_be_mapped(x_m, y_m, radius_95_m(estimate.cov_rot_trans), cells, manifest.tile_size_m)
+        # From farther away than the size of a tile, the survey did not observe its landmarks.
+        manifest = self.running.manifest
+        reach_m = radius_95_m(estimate.cov_rot_trans) + manifest.tile_size_m
+        return bool(tiles_within(manifest, estimate.map_from_body[:3, 3], reach_m))
 
     def _context(self, failure: Failure, odom_from_body: Array | None) -> FailureContext:
         """Return the context of a failure. odom_from_body: of the frame of its detection, None without one."""

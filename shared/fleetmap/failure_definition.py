@@ -11,9 +11,6 @@ A position failure begins when
 it ends after 5 s of good tracking. A lasting failure counts once. docs/reports.md has the definition for users.
 """
 
-from collections.abc import Iterable
-from math import hypot
-
 import numpy as np
 
 from fleetmap.geometry import Array
@@ -57,18 +54,6 @@ def is_localised(status: str, has_fix: bool, radius_95_m: float, gap_s: float) -
 def is_found(is_localised: bool, has_fix: bool, status: str, radius_95_m: float) -> bool:
     """True if a frame or report shows that the robot knows its place: localised, or a fix behind a reliable position."""
     return is_localised or (has_fix and is_usable(status, radius_95_m))
-
-
-def may_be_mapped(x_m: float, y_m: float, radius_95_m: float, cells: Iterable[tuple[int, int]], size_m: float) -> bool:
-    """True if a map with tiles of size_m at `cells` may cover a position: a tile is within radius_95_m plus the size of a tile.
-
-    From farther away, the survey did not observe the tile's landmarks. An infinite radius admits every place.
-    """
-
-    def away_m(at_m: float, cell: int) -> float:
-        return max(cell * size_m - at_m, 0.0, at_m - (cell + 1) * size_m)
-
-    return any(hypot(away_m(x_m, x), away_m(y_m, y)) <= radius_95_m + size_m for x, y in cells)
 
 
 class SearchClock:

@@ -14,7 +14,6 @@ from fleetmap.failure_definition import (
     is_found,
     is_outside_bound,
     is_usable,
-    may_be_mapped,
     radius_95_m,
 )
 from fleetmap.messages import Status
@@ -31,9 +30,6 @@ def test_a_position_is_usable_or_blind_or_neither(status: str, radius_m: float) 
 def test_where_there_is_no_map_nobody_searches() -> None:
     clock = SearchClock()
     assert not any(clock.handle(n * 10**9, is_found=False, is_driving=True, may_be_mapped=False) for n in range(100))
-    near, far = (may_be_mapped(x, 5.0, 1.0, [(0, 0), (1, 0)], 10.0) for x in (30.9, 31.1))
-    assert (near, far) == (True, False), "the radius and a tile's size beyond the last one, which ends at 20 m"
-    assert may_be_mapped(500.0, 5.0, np.inf, [(0, 0)], 10.0), "whoever may be anywhere may be on the map"
 
 
 def test_a_speed_that_nobody_knows_is_driving() -> None:

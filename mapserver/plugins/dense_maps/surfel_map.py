@@ -17,6 +17,7 @@ from fleetmap.geometry import AnyArray, Array
 from fleetmap.mapformat.container import pack, unpack
 from fleetmap.mapformat.manifest import Manifest, Positive, Sha256, TileEntry, manifest_entry
 from fleetmap.mapformat.names import sha256_hex
+from fleetmap.mapformat.tile import off_tile_m
 from fleetmap.version_grid import decode_index
 from mapserver.plugins.dense_maps.exposure import FALLOFF
 
@@ -173,12 +174,6 @@ def surfels_of(
     return known_surfels(manifest, blob, near).joined()
 
 
-def off_tile_m(place: tuple[int, int], positions_map: Array) -> Array:
-    """Return the horizontal distances (...,) of positions (..., 2 or 3) from a tile, 0 inside."""
-    off = np.array(place) * TILE_SIZE_M - positions_map[..., :2]
-    return np.asarray(np.linalg.norm(np.maximum(np.maximum(off, -off - TILE_SIZE_M), 0.0), axis=-1))
-
-
 def known_surfels(
     manifest: Manifest, blob: Callable[[str], bytes], near: tuple[float, float, float] | None = None
 ) -> SurfelTiles:
@@ -191,7 +186,7 @@ def known_surfels(
     tiles = {
         (entry.x, entry.y): SurfelTile(blob(entry.sha256), entry.landmarks)
         for entry in index.tiles
-        if near is None or off_tile_m((entry.x, entry.y), np.array(near[:2])) <= near[2]
+        if near is None or off_tile_m(np.array([entry.x, entry.y]), TILE_SIZE_M, np.array(near[:2])) <= near[2]
     }
     return SurfelTiles(tiles, index.falloff, np.array(index.exposures, np.float64).reshape(-1, EXPOSURE))
 

@@ -12,6 +12,7 @@ from scipy.spatial import cKDTree
 
 from fleetmap import core
 from fleetmap.geometry import Array, se3_inverse
+from fleetmap.mapformat.tile import off_tile_m
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.version_grid import CELL_M
 from mapserver.drafting.draft_evidence import MappedSession
@@ -27,7 +28,6 @@ from mapserver.plugins.dense_maps.surfel_map import (
     Surfels,
     SurfelTiles,
     encode_tile,
-    off_tile_m,
 )
 from mapserver.plugins.dense_maps.survey_grid import DepthView
 from mapserver.survey.state import ImageStore
@@ -213,7 +213,7 @@ class _Images:
 
     def near(self, place: _Place) -> bool:
         """Return True if a view may see the tile."""
-        return bool((off_tile_m(place, self._places) < MAX_RANGE_M).any())
+        return bool((off_tile_m(np.array(place), TILE_SIZE_M, self._places) < MAX_RANGE_M).any())
 
     def seeing(self, points_map: NDArray[np.float32]) -> list[int]:
         """Return the numbers of the images that may see some of these points (N, 3)."""

@@ -51,6 +51,12 @@ class Tile:
         return np.array([self.tile_x * self.size_m, self.tile_y * self.size_m])
 
 
+def off_tile_m(cells: NDArray[np.int64], size_m: float, positions_map_m: Array) -> Array:
+    """Return the horizontal distances (...,) of positions (..., 2 or 3) from tiles of size_m at cells (..., 2), 0 inside."""
+    off = cells * size_m - positions_map_m[..., :2]
+    return np.asarray(np.linalg.norm(np.maximum(np.maximum(off, -off - size_m), 0.0), axis=-1))
+
+
 def check_tile(tile: Tile) -> Tile:
     """Return `tile`; raise MapFormatError naming the first field that violates Tile's docstring."""
     count, places = len(tile.landmark_ids), len(tile.place_ids)

@@ -467,7 +467,6 @@ def test_planners_get_the_grid_of_the_floor(tmp_path: Path, has_grid: bool) -> N
     with house(tmp_path / "store", robot_world.tiles(), robot_world.tiles(), has_grid=has_grid) as store:
         source = LocalMapSource(store.folder, "low")
         floors = BuildingMaps(source, lambda site: LocalMapSource(store.folder, site))
-        floors.grid_height_m = 0.5
         floors.refresh()
         low, listener = robot_world.wanted(store, "low"), Listener(grid_height_m=0.5)
         parts = SimpleNamespace(

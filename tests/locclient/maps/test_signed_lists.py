@@ -1,7 +1,7 @@
 """Attacks on a robot's map: by any participant of the bus, by a thief of the server, by replay. Each with its control."""
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
@@ -11,12 +11,13 @@ import pytest
 from tuf.api.metadata import MetaFile, Snapshot, Timestamp
 
 from fleetmap.errors import FleetmapError, LinkError, UntrustedError
-from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame
+from fleetmap.mapformat.building import ALIGNMENT, BuildingFrame, aligned_frame
 from fleetmap.mapformat.names import blob_path
 from fleetmap.messages import PART_BYTES, RobotAck, WantedVersion, decode_message, encode_message, part_of, robot_key
 from fleetmap.trust.trusted_map import TrustedMap, ask_over
 from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.outbox import Outbox
+from locclient.maps.building_maps import BuildingMaps
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from locclient.robot.version_trial import Change, VersionChange
@@ -291,8 +292,16 @@ def align(world: World, x_m: float) -> None:
 def learned(client: MapClient) -> float | None:
     """Where the robot takes the origin of the map to be in the building, in x."""
     client.wanted()
-    frame = client.building_frame()
-    return None if frame is None else frame.x_m
+    data = client.site_file(ALIGNMENT, 10**6)
+    return None if data is None else aligned_frame(data).x_m
+
+
+def followed(world: World, client: MapClient) -> tuple[ServerSync, Callable[[], list[float]]]:
+    """The exchange with the server, and what the robot itself has been told of that origin."""
+    sync = ServerSync(client, Outbox(world.folder / "spool", max_bytes=10**6), retry_s=1.0)
+    sync.building = building = BuildingMaps(client, lambda _: client)
+    building.refresh(asks=False)
+    return sync, lambda: [change.frame.x_m for change in building.changes if change.frame is not None]
 
 
 def test_a_robot_learns_an_alignment_without_another_version(world: World) -> None:
@@ -310,13 +319,13 @@ def test_a_robot_learns_an_alignment_without_another_version(world: World) -> No
         client.blob(plan, 1000)
     # It is there at the next start, before the server answers, and goes to the robot itself.
     world.hub.reachable = False
-    sync = ServerSync(world.client(), Outbox(world.folder / "spool", max_bytes=10**6), retry_s=1.0)
-    assert sync.frames[0].x_m == 7.0
+    sync, places = followed(world, world.client())
+    assert places() == [7.0]
     world.hub.reachable = True
     align(world, 8.0)
     update_lists(world.store)
     sync.step()
-    assert [frame.x_m for frame in sync.frames if frame is not None] == [7.0, 8.0]
+    assert places() == [7.0, 8.0]
     world.store.keep_site_files(SITE, {ALIGNMENT: None}, "forgotten")
     update_lists(world.store)
     assert learned(client) is None
@@ -340,7 +349,7 @@ def test_an_alignment_that_nobody_signed_or_that_is_damaged_changes_nothing(
     (entry,) = [e for e in SignedLists(world.store.folder).served(SITE).admitted if e.about.state == "current"]  # type: ignore[union-attr]
     path = world.store.folder / blob_path(entry.about.files[ALIGNMENT])
     path.write_bytes(path.read_bytes()[:-1] + b" ")
-    sync = ServerSync(client, Outbox(world.folder / "spool", max_bytes=10**6), retry_s=1.0)
+    sync, places = followed(world, client)
     sync.step()
-    assert [frame.x_m for frame in sync.frames if frame is not None] == [7.0]
+    assert places() == [7.0]
     assert "stays as it was" in caplog.text

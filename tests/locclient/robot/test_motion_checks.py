@@ -68,10 +68,14 @@ def at(stamp_s: float, x_m: float, status: Status = Status.TRACKING, speed_mps: 
     return replace(said, odometry=replace(said.odometry, velocity_odom_mps=np.array([speed_mps, 0.0, 0.0])))
 
 
+def seen(watch: DockCheck, said: Estimate, *docks: PositionPrior) -> float | None:
+    return watch.handle(docks, said, said.odometry.odom_from_body)
+
+
 def arrived(watch: DockCheck, stamp_s: float, x_m: float, *docks: PositionPrior) -> float | None:
     """What two frames at a place bring, the second with what docks say."""
-    watch.handle([], at(stamp_s - 0.1, x_m))
-    return watch.handle(docks, at(stamp_s, x_m))
+    seen(watch, at(stamp_s - 0.1, x_m))
+    return seen(watch, at(stamp_s, x_m), *docks)
 
 
 def test_the_error_is_that_of_the_base() -> None:
@@ -108,25 +112,15 @@ def test_zones_and_operators_are_no_docks() -> None:
 def test_who_had_claimed_nothing_was_not_wrong(before: Status) -> None:
     """A robot that is told its place by the dock agrees with it afterwards."""
     watch = DockCheck(np.eye(4))
-    watch.handle([], at(0.9, 0.0, before))
-    assert watch.handle([dock(1.0, 0.5)], at(1.0, 0.0)) is None
+    seen(watch, at(0.9, 0.0, before))
+    assert seen(watch, at(1.0, 0.0), dock(1.0, 0.5)) is None
 
 
 def test_a_word_that_is_old_is_not_compared_while_the_robot_drives() -> None:
     for speed_mps, expected in ((0.0, pytest.approx(0.1)), (1.0, None)):
         watch = DockCheck(np.eye(4))
-        watch.handle([], at(0.9, 0.0, speed_mps=speed_mps))
-        assert watch.handle([dock(0.9, 0.1)], at(1.0, 0.0, speed_mps=speed_mps)) == expected
-
-
-def test_odometry_that_begins_anew_is_no_way() -> None:
-    watch, change = DockCheck(np.eye(4)), se3(np.eye(3), np.array([50.0, 0.0, 0.0]))
-    assert arrived(watch, 1.0, 0.0, dock(1.0, 0.1)) == pytest.approx(0.1)
-    said = at(1.1, 0.0)
-    redefined = replace(
-        said.odometry, odom_from_body=change @ said.odometry.odom_from_body, new_odom_from_old_odom=change
-    )
-    assert watch.handle([dock(1.1, 0.1)], replace(said, odometry=redefined)) is None
+        seen(watch, at(0.9, 0.0, speed_mps=speed_mps))
+        assert seen(watch, at(1.0, 0.0, speed_mps=speed_mps), dock(0.9, 0.1)) == expected
 
 
 def drive(

@@ -57,7 +57,7 @@ def test_a_robot_knows_where_its_map_lies_in_the_building(store: MapStore) -> No
     assert found[0] is found[2] is None
     robot.use(replace(loaded, manifest=aligned))
     for frame_of_site in (BuildingFrame(x_m=9.0, y_m=8.0, yaw_rad=0.0), None):  # aligned anew, and that forgotten
-        robot.align(frame_of_site)
+        robot.use_building({}, [], frame_of_site)
         outcome = robot.handle(next(iter(robot_world.bundles(1))))
         found.append(outcome.published.building_from_map)
     assert found[3][:2, 3].tolist() == [9.0, 8.0]
