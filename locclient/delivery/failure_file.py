@@ -9,7 +9,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 
-import cv2
 import msgspec
 import numpy as np
 import zstandard
@@ -22,7 +21,7 @@ from fleetmap.features import stereo
 from fleetmap.geometry import Array, se3
 from fleetmap.messages import FailureReport
 from fleetmap.recordings.failure_recording import LOCALIZER, SUMMARY, attachments_of
-from fleetmap.recordings.images import StoredFrame, StoredImage
+from fleetmap.recordings.images import StoredFrame, StoredImage, jpeg_image
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.relocalization.frame_features import FrameFeatures
 from fleetmap.sensors.calibration import CameraCalibration, RigCalibration
@@ -210,9 +209,4 @@ def _jpeg(image: Image, pictures: str) -> StoredImage:
     small = reduced(image, _WIDTH_PX)
     if pictures == "blurred":
         small = without_detail(small)
-    data = b""
-    for quality in _QUALITIES:
-        data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
-        if len(data) <= _PICTURE_BYTES:
-            break
-    return StoredImage("file", data)
+    return jpeg_image(small, *_QUALITIES, most_bytes=_PICTURE_BYTES)

@@ -12,6 +12,7 @@ from fleetmap.features.extraction import extract
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import MAX_THUMBNAIL_BYTES, CameraNote, Cause, FailureReport, Placement, Thumbnail
+from fleetmap.recordings.images import jpeg_image
 from fleetmap.relocalization.landmark_visibility import cones_of_tiles, match_visible, visible_landmarks
 from fleetmap.sensors.rectification import MountedRig, StereoCamera
 from fleetmap.sensors.samples import Image
@@ -89,10 +90,9 @@ def small_jpeg(image: NDArray[np.uint8], width_px: int, max_bytes: int) -> bytes
         scale = min(1.0, width_px / image.shape[1])
         size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-        for quality in (80, 60, 40, 20):
-            _, data = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])
-            if len(data) <= max_bytes:
-                return data.tobytes()
+        jpeg = jpeg_image(small, 80, 60, 40, 20, most_bytes=max_bytes).data
+        if len(jpeg) <= max_bytes:
+            return jpeg
         width_px = max(1, min(width_px, image.shape[1]) // 2)
 
 

@@ -19,6 +19,7 @@ from starlette.requests import cookie_parser
 from starlette.responses import HTMLResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from fleetmap.bus.endpoints import is_loopback_name
 from fleetmap.errors import StoreError
 from mapserver.api.operations import OPERATIONS
 from mapserver.api.problems import problem
@@ -27,7 +28,6 @@ from mapserver.api.views import Act
 from mapserver.operators.operators import LIFE_S, Operators
 from mapserver.operators.roles import Identity
 from mapserver.operators.roles import Scope as Right
-from mapserver.serving.http_connections import is_loopback_name
 from mapserver.store import Actor
 
 _log = logging.getLogger(__name__)

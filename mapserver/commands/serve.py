@@ -79,9 +79,10 @@ class HttpOptions:
         """Return the access settings. warning: another warning for every page.
 
         UsageError for an insecure configuration."""
+        from fleetmap.bus.endpoints import is_loopback_name
         from mapserver.api.guard import GuardSettings
         from mapserver.operators.operators import Operators
-        from mapserver.serving.http_connections import binding_fault, is_loopback_name
+        from mapserver.serving.http_connections import binding_fault
 
         given, host = tuple(name.lower() for name in self.http_name or ()), self.host_and_port()[0]
         has_operators = proxy is not None or store.operators.may_sign_in()

@@ -13,6 +13,7 @@ from ipaddress import ip_address
 from operator import itemgetter
 from typing import Any, NoReturn
 
+from fleetmap.bus.endpoints import is_loopback_name
 from fleetmap.log_lines import LogLimit
 
 MAX_CONNECTIONS, MAX_OF_ADDRESS = 512, 64
@@ -163,11 +164,3 @@ def binding_fault(
         return ""
     where = f"--http {address}" if not is_local else f"--http-name {beyond[0]}"
     return f"{where} can be reached from other machines; {', and '.join(steps)} (or allow everyone with --insecure)"
-
-
-def is_loopback_name(host: str) -> bool:
-    """True if a host name or address is the machine itself."""
-    try:
-        return host == "localhost" or ip_address(host).is_loopback
-    except ValueError:
-        return False

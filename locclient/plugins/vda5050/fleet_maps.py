@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO
 from urllib.parse import SplitResult, urlsplit
 
-from fleetmap.bus.endpoints import is_loopback
+from fleetmap.bus.endpoints import is_loopback_name
 from fleetmap.errors import LinkError, MapFormatError, StateError, StoreError, UnreachableError, UsageError, disk_errors
 from fleetmap.mapformat.version_file import ExportReader, open_export
 from fleetmap.messages import WantedVersion
@@ -57,7 +57,7 @@ class Origins:
             origin = _origin(urlsplit(text))
             if origin is None or urlsplit(text).path not in {"", "/"}:
                 raise UsageError(f"{text!r} is not like https://HOST or https://HOST:PORT")
-            if origin[0] == "http" and not (self.insecure or is_loopback(f"tcp/{origin[1]}:{origin[2]}")):
+            if origin[0] == "http" and not (self.insecure or is_loopback_name(origin[1])):
                 raise UsageError(f"{text} is on another machine and without TLS; use https, or --insecure")
 
     def admit(self, link: str) -> SplitResult:

@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from fleetmap.bus.endpoints import is_loopback
+from fleetmap.bus.endpoints import is_loopback_name
 from fleetmap.config import Section
 from fleetmap.errors import UsageError, disk_errors
 
@@ -74,7 +74,7 @@ def check_section(section: Vda5050Section, *, insecure: bool) -> Broker:
             '[vda5050] version = "2.0.0" has no actions on maps: set versions = "map server", or version = "2.1.0"'
         )
     scheme, host, port = match[1], match[2].strip("[]"), int(match[3] or (8883 if match[1] == "mqtts" else 1883))
-    if scheme == "mqtt" and not insecure and not is_loopback(f"tcp/{host}:{port}"):
+    if scheme == "mqtt" and not insecure and not is_loopback_name(host):
         raise UsageError(
             f"[vda5050] broker = {section.broker!r} is on another machine and without TLS; use mqtts://, or --insecure"
         )

@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+from fleetmap.bus.endpoints import is_loopback_name
 from fleetmap.encoding import to_json
 from fleetmap.errors import StateError, UsageError, disk_errors
 from fleetmap.log_lines import LogLimit
 from mapserver.fleet.alerts import Alert, AlertSettings
-from mapserver.serving.http_connections import is_loopback_name
 
 _ATTEMPT_S = 5.0
 _PAUSES_S = (2.0, 10.0, 60.0)  # between four attempts

@@ -100,35 +100,25 @@ LEAST, MOST = parameters_of(Splats(_PLACES, _PLACES, *map(np.array, (_SIGMAS_M, 
 """The smallest and the largest parameters (3,)."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Flat:
-    """M splats in a picture, near to far: numbers, pixels (M, 2), and xx, xy, yy (M, 3) of their covariances for a sigma of 1 m."""
-
-    numbers: NDArray[np.int64]
-    pixels: Array
-    shapes: Array
-
-
 def draw(splats: Splats, parameters: Array, camera: CameraCalibration, map_from_cam: Array) -> Drawn:
     """Render splats, of which only positions and normals are used, with parameters (N, 3), by a camera without distortion, on the CPU.
 
     Both sides of a splat are visible. A splat smaller than a pixel is more transparent in proportion.
     """
-    flat = _projected(splats, camera, se3_inverse(map_from_cam))
-    chosen = parameters[flat.numbers]
-    own = flat.shapes * np.exp(2 * chosen[:, SIZE])[:, None]
+    numbers, pixels, shapes = _projected(splats, camera, se3_inverse(map_from_cam))
+    chosen = parameters[numbers]
+    own = shapes * np.exp(2 * chosen[:, SIZE])[:, None]
     blurred = own + BLUR_PX2 * np.array([1.0, 0.0, 1.0])
     opacities = 1.0 / (1.0 + np.exp(-chosen[:, OPACITY]))
     peaks = np.sqrt(np.maximum(_determinant(own), 0.0) / _determinant(blurred)) * opacities
     reaches_px = np.sqrt(2 * np.log(np.maximum(peaks / LEAST_ALPHA, 1.0)))[:, None] * np.sqrt(blurred[:, [0, 2]])
     size_px = np.array([camera.width_px, camera.height_px])
-    is_seen = (peaks >= LEAST_ALPHA) & (
-        (flat.pixels + reaches_px >= 0) & (flat.pixels - reaches_px <= size_px - 1)
-    ).all(axis=1)
+    is_inside = ((pixels + reaches_px >= 0) & (pixels - reaches_px <= size_px - 1)).all(axis=1)
+    is_seen = (peaks >= LEAST_ALPHA) & is_inside
     conics = blurred[is_seen][:, [2, 1, 0]] * (1.0, -1.0, 1.0) / _determinant(blurred[is_seen])[:, None]
     reaches_px = np.ascontiguousarray(reaches_px[is_seen])
-    gaussians = flat.pixels[is_seen], np.ascontiguousarray(conics), reaches_px, peaks[is_seen], chosen[is_seen, GREY]
-    numbers, opacities = flat.numbers[is_seen], opacities[is_seen]
+    gaussians = pixels[is_seen], np.ascontiguousarray(conics), reaches_px, peaks[is_seen], chosen[is_seen, GREY]
+    numbers, opacities = numbers[is_seen], opacities[is_seen]
     through, picture = core.blend(*gaussians, camera.width_px, camera.height_px)
 
     def backward(slopes: Array) -> tuple[NDArray[np.int64], Array]:
@@ -141,8 +131,13 @@ def _determinant(shapes: Array) -> Array:
     return np.asarray(shapes[:, 0] * shapes[:, 2] - shapes[:, 1] ** 2)
 
 
-def _projected(splats: Splats, camera: CameraCalibration, cam_from_map: Array) -> _Flat:
-    """Project by EWA splatting: a Gaussian through the projection's derivative at its middle. Source: Zwicker et al. 2001."""
+def _projected(
+    splats: Splats, camera: CameraCalibration, cam_from_map: Array
+) -> tuple[NDArray[np.int64], Array, Array]:
+    """Return M splats in a picture, near to far: numbers, pixels (M, 2), and xx, xy, yy (M, 3) of their covariances for a sigma of 1 m.
+
+    By EWA splatting: a Gaussian through the projection's derivative at its middle. Source: Zwicker et al. 2001.
+    """
     points = splats.points_map @ cam_from_map[:3, :3].T + cam_from_map[:3, 3]
     fx, fy, cx, cy = camera.intrinsics_px
     reach = _BEYOND * np.array([max(cx, camera.width_px - cx) / fx, max(cy, camera.height_px - cy) / fy])
@@ -162,4 +157,4 @@ def _projected(splats: Splats, camera: CameraCalibration, cam_from_map: Array) -
             down**2 * (1 + (y / z) ** 2) - flattened * along_v**2,
         ]
     )
-    return _Flat(numbers, np.column_stack([fx * x / z + cx, fy * y / z + cy]), shapes)
+    return numbers, np.column_stack([fx * x / z + cx, fy * y / z + cy]), shapes

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from fleetmap.encoding import to_json
 from fleetmap.geometry import Array
 from fleetmap.mapformat.names import sha256_hex
+from fleetmap.recordings.images import jpeg_image
 from mapserver.drafting.draft_evidence import MappedSession
 from mapserver.store.survey_pictures import MOST, PictureIndex, PicturesReport, SurveyPicture
 
@@ -78,9 +79,4 @@ def _jpeg(picture: NDArray[np.uint8]) -> bytes:
     """Return a small JPEG, of lower quality where much is to be seen."""
     scale = min(1.0, _LARGEST_PX / max(picture.shape))
     small = cv2.resize(picture, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    jpeg = b""
-    for quality in _QUALITIES:
-        jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
-        if len(jpeg) <= _MOST_BYTES:
-            break
-    return jpeg
+    return jpeg_image(small, *_QUALITIES, most_bytes=_MOST_BYTES).data

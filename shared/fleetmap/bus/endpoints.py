@@ -29,7 +29,11 @@ def has_tls(endpoint: str) -> bool:
 
 def is_loopback(endpoint: str) -> bool:
     """True if only this machine can reach the endpoint."""
-    host = _host_and_port(endpoint)[0]
+    return is_loopback_name(_host_and_port(endpoint)[0])
+
+
+def is_loopback_name(host: str) -> bool:
+    """True if a host name or address is the machine itself."""
     try:
         return host == "localhost" or ip_address(host).is_loopback
     except ValueError:

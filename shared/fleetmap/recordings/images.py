@@ -262,9 +262,14 @@ def png_image(image: Image | NDArray[np.uint16]) -> StoredImage:
     return StoredImage("file", cv2.imencode(".png", image, _FAST_PNG)[1].tobytes())
 
 
-def jpeg_image(image: Image, quality: int) -> StoredImage:
-    """Store a grey (H, W) uint8 image as JPEG: small, lossy."""
-    return StoredImage("file", cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes())
+def jpeg_image(image: AnyArray, *qualities: int, most_bytes: int = 0) -> StoredImage:
+    """Store a uint8 image, grey (H, W) or (H, W, 3), as JPEG, small and lossy: of the first quality with so few bytes, or the last one."""
+    data = b""
+    for quality in qualities:
+        data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, quality])[1].tobytes()
+        if len(data) <= most_bytes:
+            break
+    return StoredImage("file", data)
 
 
 def depth_image(depth_m: NDArray[np.float32]) -> StoredImage:
