@@ -25,35 +25,31 @@ from fleetmap.messages import (
 from fleetmap.sensors.samples import PositionPrior
 from locclient.daemon.server_sync import ServerSync
 from locclient.delivery.outbox import Outbox, QueuedReport
-from locclient.maps.map_client import MapClient
-from locclient.maps.tile_cache import TileCache
 from locclient.robot.version_trial import Change, VersionChange
 from mapserver import releases
-from mapserver.fleet.fleet import Fleet
-from mapserver.serving.bus_service import BusService
-from mapserver.store import MapStore
-from support.fleet.memory_bus import MemoryBus, MemoryHub
+from support.fleet import served_world
+from support.fleet.memory_bus import MemoryBus
 from support.fleet.reports import blindness
 from support.storage.map_samples import publish_samples, save_sample_draft
 
 
 @dataclass
-class World:
+class World(served_world.World):
     """A server, the robot's synchronization with it, and the table of failures that the server keeps."""
 
-    hub: MemoryHub
-    store: MapStore
-    folder: Path
-    fleet: Fleet
-    sync: ServerSync
-    client: MapClient
-    outbox: Outbox
-    clock: dict[str, float]
     table: list[str] = field(default_factory=list)
     lose_answers: bool = False
     refuse: str = ""
     takes_parts: bool = False
     parts: list[int] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.client, self.clock = self.link, {"s": 1000.0}
+        self.outbox = Outbox(self.folder.parent / "outbox", max_bytes=10**6)
+        self.sync = ServerSync(self.client, self.outbox, retry_s=600.0, clock_s=lambda: self.clock["s"])
+        # Before the service's own table: what arrives is looked at here.
+        for name, take in (("failures", self.take_failure), ("replays", self.take_part)):
+            self.hub.queryables.insert(0, (robot_key("*", "*", name), take, None))
 
     def take_failure(self, key: str, payload: bytes) -> bytes:
         report = decode_message(payload, FailureReport)
@@ -81,7 +77,7 @@ class World:
     def ack(self) -> dict[str, object]:
         return self.fleet.robots("lab")[0].last_ack or {}
 
-    def publish(self, seed: int) -> int:
+    def publish_sample(self, seed: int) -> int:
         number = save_sample_draft(self.store, seed=seed)
         releases.publish(self.store, "lab")
         return number
@@ -89,29 +85,10 @@ class World:
 
 @pytest.fixture
 def world(tmp_path: Path) -> Iterator[World]:
-    hub, clock = MemoryHub(), {"s": 1000.0}
-    with MapStore.open(tmp_path / "store", create=True) as store, MemoryBus(hub) as bus, MemoryBus(hub) as robot_bus:
-        publish_samples(store, 1)
-        fleet = Fleet(store)
-        made_late: list[World] = []
-
-        def take(key: str, payload: bytes) -> bytes:  # before the service's own table: what arrives is looked at here
-            return made_late[0].take_failure(key, payload)
-
-        def take_part(key: str, payload: bytes) -> bytes:
-            return made_late[0].take_part(key, payload)
-
-        bus.queryable(robot_key("*", "*", "failures"), take)
-        bus.queryable(robot_key("*", "*", "replays"), take_part)
-        service = BusService(store, fleet, bus, lambda *_: None)
-        client = MapClient(robot_bus, TileCache(tmp_path / "cache"), "lab", "r1")
-        outbox = Outbox(tmp_path / "outbox", max_bytes=10**6)
-        sync = ServerSync(client, outbox, retry_s=600.0, clock_s=lambda: clock["s"])
-        made = World(hub, store, tmp_path / "store", fleet, sync, client, outbox, clock)
-        made_late.append(made)
+    with served_world.served_world(tmp_path) as served:
+        made = World(**vars(served))
         yield made
-        sync.close()
-        service.close()
+        made.sync.close()
 
 
 def report(name: str) -> QueuedReport:
@@ -133,7 +110,7 @@ def test_a_version_is_active_only_once_it_was_adopted(world: World) -> None:
     assert adopt(world).version == 1
     assert world.client.active() == world.client.wanted()
     assert world.ack()["version"] == 1
-    world.publish(seed=1)
+    world.publish_sample(seed=1)
     world.step(61.0)
     assert [wanted.version for wanted in world.sync.fetched] == [2]
     assert world.client.active().version == 1
@@ -149,7 +126,7 @@ def test_a_version_is_active_only_once_it_was_adopted(world: World) -> None:
 def test_what_was_put_off_is_offered_again_later(world: World, caplog: pytest.LogCaptureFixture) -> None:
     world.step()
     adopt(world)
-    world.publish(seed=1)
+    world.publish_sample(seed=1)
     world.step(61.0)
     world.sync.changes.append(VersionChange(world.sync.fetched.popleft(), Change.POSTPONED, "dark"))
     world.step(61.0)
@@ -163,7 +140,7 @@ def test_what_was_put_off_is_offered_again_later(world: World, caplog: pytest.Lo
 def test_a_version_with_a_bad_tile_is_refused_and_the_good_one_goes_on(world: World, damage: str) -> None:
     world.step()
     adopt(world)
-    number = world.publish(seed=1)
+    number = world.publish_sample(seed=1)
     victim = world.folder / blob_path(world.store.manifest("lab", number).tiles[0].sha256)
     data = bytearray(victim.read_bytes())
     victim.chmod(0o644)
@@ -345,7 +322,7 @@ def test_a_spool_that_refuses_holds_up_neither_maps_nor_health(world: World, mon
     asked: list[None] = []
     monkeypatch.setattr(world.outbox, "waiting", lambda *_: asked.append(None) or refuse())
     world.sync.replays = world.outbox
-    number = world.publish(seed=8)
+    number = world.publish_sample(seed=8)
     for _ in range(5):
         world.step()
     assert [version.version for version in world.sync.fetched] == [number]
