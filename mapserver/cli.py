@@ -12,7 +12,7 @@ from mapserver.commands.build import build
 from mapserver.commands.building import AREAS, BUILDING, align
 from mapserver.commands.fleet import FLEET
 from mapserver.commands.operation_commands import with_operations
-from mapserver.commands.people import OPERATORS, ROBOTS
+from mapserver.commands.people import INCIDENTS, OPERATORS, ROBOTS
 from mapserver.commands.recordings import convert, doctor
 from mapserver.commands.releases import diff, inspect, versions
 from mapserver.commands.serve import serve
@@ -40,6 +40,7 @@ _COMMANDS: Commands = {
     "areas": AREAS,
     "building": BUILDING,
     "fleet": FLEET,
+    "incidents": INCIDENTS,
     "robots": ROBOTS,
     "operators": OPERATORS,
     "audit": audit,

@@ -32,7 +32,7 @@ StageHook = Callable[[Any], dict[str, Any]]
 """Makes more of a draft's surveys than tiles: of a `ChosenDraft` each `Extra` by the key of its report (`mapserver/drafting/extras.py`)."""
 
 AlertHook = Callable[[Any], Any]
-"""Opens the receiver that `AlertSettings` name (`mapserver/fleet/alerts.py`), with `host`, `tell` of the active alerts, `test`, `close`."""
+"""Opens the receiver that `AlertSettings` name (`mapserver/fleet/alerts.py`), with `host`, `tell` (of alerts, acts), `test`, `close`."""
 
 ObjectsHook = Callable[[str], Any]
 """Opens the `Objects` (`mapserver/store/blobs.py`) under a URL."""

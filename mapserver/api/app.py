@@ -28,12 +28,14 @@ from fleetmap.mapformat.tile_codec import TILE_FORMAT
 from mapserver.api import building_routes, fleet_routes, inbox_routes, people_routes, problems, version_routes, views
 from mapserver.api import parameters as p
 from mapserver.api.guard import Guard, Sender
+from mapserver.api.incidents import incidents
 from mapserver.api.metrics import CONTENT_TYPE, Metrics
 from mapserver.api.operation_routes import router_of_operations
 from mapserver.api.request_limits import RequestLimits
 from mapserver.api.views import Problem
-from mapserver.fleet.alerts import Alert, active_alerts
+from mapserver.fleet.alerts import active_alerts
 from mapserver.fleet.fleet import Fleet
+from mapserver.fleet.incidents import Incident
 from mapserver.operators.operators import Operators
 from mapserver.serving.server_health import ServerHealth, server_health
 from mapserver.store import MapStore
@@ -119,10 +121,18 @@ def server(service: p.Service) -> ServerHealth:
 
 
 @router.get("/v1/alerts")
-def alerts(service: p.Service, page: p.NamePage) -> views.Page[Alert]:
+def alerts(service: p.Service, page: p.NamePage) -> views.Page[Incident]:
     """Active alerts, by site, name and subject."""
     found = active_alerts(service.store, service.fleet, service.settings.config.alerts, time.time_ns())
     return page.of(found, lambda alert: f"{alert.site}/{alert.name}/{alert.about}")
+
+
+@router.get("/v1/incidents")
+def list_incidents(service: p.Service, page: p.NamePage, site: p.SiteFilter = None) -> views.Page[Incident]:
+    """Incidents (of a site) that are not closed: state, who has each, and what people did."""
+    settings = service.settings
+    found = incidents(service.store, service.fleet, settings.config.alerts, settings.inbox, site)
+    return page.of(found, lambda one: one.id)
 
 
 @router.post("/v1/alerts/test")

@@ -42,6 +42,11 @@ class ApiSettings(NamedTuple):
     webhook: Any = None
     nights: NightRuns | None = None
 
+    @property
+    def inbox(self) -> File | None:
+        """The folder with an inbox for each site."""
+        return None if self.nights is None else self.nights.inbox
+
 
 class Served(NamedTuple):
     """What endpoints work with. bus: None if the server has none; uploads: the files that are being uploaded."""

@@ -1,19 +1,18 @@
-"""`mapserver robots` and `operators`: the robots and the accounts of a store, beside the operations on them."""
+"""`mapserver robots`, `operators` and `incidents`: the robots, accounts and incidents of a store, beside the operations on them."""
 
 from datetime import UTC, datetime
 from typing import Annotated
 
 import typer
 
-from fleetmap.cli_options import Group
+from fleetmap.cli_options import ConfigFile, Group, settings_of
+from mapserver.api.operations.incidents import InboxFolder
 from mapserver.commands.options import Json, StoreFolder, open_store, print_json, print_table
 
+Site = Annotated[str | None, typer.Option(help="Name of the site; default: all sites.")]
 
-def list_robots(
-    store: StoreFolder,
-    site: Annotated[str | None, typer.Option(help="Name of the site; default: all sites.")] = None,
-    json: Json = False,
-) -> None:
+
+def list_robots(store: StoreFolder, site: Site = None, json: Json = False) -> None:
     """Show the enrolled robots, the names in their certificates, and the days until they expire."""
     from mapserver.trust.enrolment import RobotRegister
 
@@ -41,5 +40,26 @@ def list_operators(store: StoreFolder, json: Json = False) -> None:
     print_table(("name", "role", "sessions", "tokens", ""), rows)
 
 
+def list_incidents(
+    context: typer.Context,
+    store: StoreFolder,
+    site: Site = None,
+    inbox: InboxFolder = None,
+    json: Json = False,
+    config: ConfigFile = None,
+) -> None:
+    """List alerts, refused drafts, recordings that are held or bad, and failures in work, with their state and who has them."""
+    from mapserver.api.incidents import incidents
+    from mapserver.fleet.fleet import Fleet
+
+    with open_store(store, read_only=True) as maps:
+        found = incidents(maps, Fleet(maps), settings_of(context).alerts, inbox, site)
+    if json:
+        print_json(found)
+        return
+    print_table(("incident", "state", "who", "what"), ((i.id, i.state, i.assignee, i.words) for i in found))
+
+
 ROBOTS = Group("Known robots of a store, and those enrolled at its server.", {"list": list_robots})
+INCIDENTS = Group("Alerts, held recordings, refused drafts and failures in work.", {"list": list_incidents})
 OPERATORS = Group("Accounts of operators and programs.", {"list": list_operators})

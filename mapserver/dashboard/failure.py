@@ -15,7 +15,7 @@ from fleetmap.failure_summary import Moment
 from fleetmap.messages import Cause, FailureReport, Status
 from mapserver.api.moments import clock_text
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
-from mapserver.dashboard.failures import ADVICE, failure_marks, tone_of
+from mapserver.dashboard.failures import ADVICE, failure_marks, held, tone_of
 from mapserver.dashboard.fleet_health import MANY_FAILURES, NEAR_NS
 from mapserver.dashboard.live import words_of
 from mapserver.dashboard.map_layers import Layer, Line, Mark
@@ -211,6 +211,8 @@ def page(services: Services, context: PageContext, failure: str) -> dict[str, ob
         "steps": first_looks(moments, began_ns),
         "scene": _scene(services, context, row, report, believed_path(moments, clock)),
         "nearby": near[:_LISTED],
+        "held": (incidents := held(services, [row, *near[:_LISTED]])),
+        "incident": incidents[str(row.number)],
         "nearby_words": words,
         "nearby_pictures": services.maps.store.fleet.first_pictures(other.number for other in near[:_LISTED]),
         "facts": _facts(context, row, report),

@@ -3,17 +3,19 @@
 import time
 from bisect import bisect
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
 from typing import NamedTuple
 
 from fleetmap.errors import UsageError
 from fleetmap.messages import Cause, FailureKind
+from mapserver.api.incidents import incidents, of_failure
 from mapserver.api.moments import steps
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN, MANY_FAILURES
 from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
+from mapserver.fleet.incidents import Incident, with_acts
 from mapserver.store import FailureFilter, FailureRow
 
 AXES = {"cause": "Cause", "area": "Area", "tile": "Tile", "version": "Map version", "robot": "Robot"}
@@ -77,7 +79,8 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     since_ns, until_ns = context.time_range()
     in_time = FailureFilter(site=context.site, since_ns=since_ns, until_ns=until_ns)
     wanted = replace(in_time, **{**chosen, "version": version})  # type: ignore[arg-type]  # the others are texts
-    before, kept_failures = number(context.query.get("older"), "failure"), services.maps.store.fleet
+    before, maps = number(context.query.get("older"), "failure"), services.maps
+    kept_failures = maps.store.fleet
     rows = kept_failures.failures(in_time, limit=MANY_FAILURES)
     matching = [row for row in rows if _fits(row, chosen)]
     if kept.get("sort") == "happened":
@@ -87,6 +90,8 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         found = kept_failures.failures(wanted, before=before, limit=FAILURES_SHOWN + 1)
     shown = found[:FAILURES_SHOWN]
     facets = _facets(context, rows, chosen, kept, services.maps.store.areas(context.site).names)
+    settings = services.settings.config.alerts
+    found_open = incidents(maps.store, services.robots.fleet, settings, maps.inbox, context.site)
     causes = next((facet.choices for facet in facets if facet.axis == "cause"), [])
     shades = {cause.value: min(n, _SHADES - 1) for n, cause in enumerate(causes)}
     return {
@@ -103,9 +108,16 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         "chart": _chart(context, matching, shades, chosen) if matching else None,
         "scene": _scene(services, context, shown, matching, version),
         "rows": shown,
+        "held": held(services, shown),
+        "incidents": sorted(found_open, key=lambda one: one.state != "open"),
         "pictures": kept_failures.first_pictures(row.number for row in shown),
         "older": context.to("failures", **kept, older=shown[-1].number) if len(found) > len(shown) else None,
     }
+
+
+def held(services: Services, rows: Iterable[FailureRow]) -> dict[str, Incident]:
+    """Failures as incidents, by number."""
+    return {one.about: one for one in with_acts(services.maps.store, map(of_failure, rows))}
 
 
 def _value(row: FailureRow, axis: str) -> str:

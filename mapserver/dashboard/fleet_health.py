@@ -11,8 +11,8 @@ from fleetmap.failure_summary import Moment, decode_summary
 from fleetmap.messages import CameraNote
 from mapserver.dashboard.data import MANY_SITES, Kept
 from mapserver.dashboard.fleet_parts import Trial, trial_of
-from mapserver.fleet.alerts import Alert
 from mapserver.fleet.canary_controller import find
+from mapserver.fleet.incidents import Incident
 from mapserver.fleet.resurvey_list import resurvey_list
 from mapserver.fleet_statistics.area_trend import AreaTrend, area_trends
 from mapserver.fleet_statistics.canary_decision import CanarySettings
@@ -49,7 +49,7 @@ class SiteHealth:
     areas: tuple[AreaTrend, ...]
     has_areas: bool
     week_since_ns: int
-    alerts: tuple[Alert, ...]
+    alerts: tuple[Incident, ...]
 
 
 class HealthData:
@@ -57,7 +57,7 @@ class HealthData:
 
     def __init__(
         self, store: MapStore, canary: CanarySettings, resurvey: ResurveySettings, clock_ns: Callable[[], int],
-        alerts: Callable[[int], Iterable[Alert]],
+        alerts: Callable[[int], Iterable[Incident]],
     ) -> None:  # fmt: skip
         self._store, self._canary, self._resurvey, self._clock_ns = store, canary, resurvey, clock_ns
         self._alerts, self._sites = alerts, Kept[SiteHealth](MANY_SITES, _CACHED_NS, clock_ns)

@@ -50,10 +50,9 @@ def install_dashboard(
     app: FastAPI, store: MapStore, fleet: Fleet, settings: ApiSettings, hear: Hear | None = None
 ) -> None:
     """Adds the pages to `app`, and the parts that plug-ins have."""
-    inbox = None if settings.nights is None else settings.nights.inbox
     alerts = partial(active_alerts, store, fleet, settings.config.alerts)
     services = Services(
-        MapData(store, settings.config.gate, settings.config.canary.share, inbox),
+        MapData(store, settings.config.gate, settings.config.canary.share, settings.inbox),
         HealthData(store, settings.config.canary, settings.config.resurvey, time.time_ns, alerts),
         LiveRobots(fleet, time.monotonic),
         settings,

@@ -6,12 +6,14 @@ from typing import Any
 
 from fleetmap.bow.vocabulary import shipped_vocabulary
 from fleetmap.errors import FleetmapError
+from mapserver.api.incidents import of_drafts
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.data import EVER, MapData
 from mapserver.dashboard.map_layers import Layer, Outline, Picture, box_of, heat, squares
 from mapserver.dashboard.plan import Plan
 from mapserver.dashboard.rendering import begun, share, size
 from mapserver.drafting.area_corrections import AreaCorrections
+from mapserver.fleet.incidents import with_acts
 from mapserver.floor_plan.alignment import Alignment
 from mapserver.floor_plan.areas import Area, Areas
 from mapserver.floor_plan.survey_requests import courses
@@ -73,6 +75,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         return {"shown": None}
     rows, events = maps.store.releases(site), maps.store.last_events(site, _EVENTS_SHOWN)
     verdicts = maps.store.last_verdicts(site)
+    refused = {one.about: one for one in with_acts(maps.store, of_drafts(maps.store, site))}
     robots = [robot.status.version for robot in services.robots.look(site).robots]
     asked, before, after = (number(context.query.get(name), name) for name in ("version", "before", "after"))
     known = (asked, after, maps.current_version(site), max(rows.versions, default=None))
@@ -98,6 +101,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         "building": maps.store.building(site),
         "versions": [
             _card(maps, rows, events, verdicts.get(info.version), info, robots, shown)
+            | {"incident": refused.get(str(info.version))}
             for info in reversed(rows.versions.values())
         ],
         "shown": shown,

@@ -4,6 +4,7 @@ pages; the Overview is kept up to date by a stream of server-sent events.
 
 import time
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 
 from fleetmap.messages import Flag
@@ -17,6 +18,7 @@ from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
 from mapserver.dashboard.map_page import verdict_words
 from mapserver.dashboard.rendering import age, begun, share
 from mapserver.fleet.alerts import dropped_words
+from mapserver.fleet.incidents import Incident, with_acts
 from mapserver.fleet_statistics.area_trend import trend_sentence
 from mapserver.fleet_statistics.kpis import figure
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
@@ -53,12 +55,14 @@ def now(services: Services, context: PageContext) -> dict[str, object]:
     live, health = services.robots.look(context.site), services.health.site(context.site)
     areas = services.maps.store.areas(context.site)
     floors, guests = _floors(services, context)
+    alerts = [one for one in with_acts(services.maps.store, health.alerts) if one.state != "closed"]
+    own = {one.about: one for one in sorted(alerts, key=lambda one: one.state == "open") if one.name not in _ALERTS}
     robots = sorted(live.robots, key=lambda robot: robot.tone in {"good", "quiet"} and not _is_troubled(robot))
     return {
         "line": site_line(live),
-        "notices": _notices(services, context, health),
+        "notices": _notices(services, context, health, alerts),
         "figures": _figures(live, health),
-        "robots": [_robot(context, robot, health, areas) for robot in robots] + guests,
+        "robots": [_robot(context, robot, health, areas, own.get(robot.name)) for robot in robots] + guests,
         "marks": _marks(context, live),
         "floors": floors,
     }
@@ -145,9 +149,12 @@ def since_words(context: PageContext, robot: LiveRobot) -> tuple[str, str]:
     return age(max(0.0, time.time() - since_ns / 1e9)), context.moment(since_ns) or ""
 
 
-def _robot(context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Areas) -> dict[str, object]:
-    """One row of the list."""
+def _robot(
+    context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Areas, alert: Incident | None = None
+) -> dict[str, object]:
+    """One row of the list. alert: of the robot."""
     words, own = remarks(robot), health.robots.get(robot.name)
+    words += [f"{alert.assignee} has it"] if alert is not None and alert.assignee else []
     failures = 0 if own is None else own.failures.events + own.failures_running
     words += [f"{failures} failure{'s' if failures > 1 else ''} in 24 h"] if failures else []
     if own is not None and own.silent_estimated.events:
@@ -163,7 +170,13 @@ def _robot(context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Ar
         "exact": exact,
         "about": " · ".join(filter(None, [robot.where(areas), ", ".join(words)])),
         "place": robot.place_m,
+        "incident": _incident(alert),
     }
+
+
+def _incident(alert: Incident | None) -> dict[str, object] | None:
+    """What the page needs to act on it."""
+    return None if alert is None else {"id": alert.id, "is_open": alert.state == "open"}
 
 
 def _marks(context: PageContext, live: LiveSite) -> list[Mark]:
@@ -185,10 +198,12 @@ def _figures(live: LiveSite, health: SiteHealth) -> list[dict[str, object]]:
     return found
 
 
-def _notices(services: Services, context: PageContext, health: SiteHealth) -> list[dict[str, str]]:
+def _notices(
+    services: Services, context: PageContext, health: SiteHealth, alerts: Sequence[Incident]
+) -> list[dict[str, object]]:
     """Alerts, a draft that waits, trials, running or just ended, and what got worse this week, each with a page that says more."""
     store, site = services.maps.store, context.site
-    told = [("bad", f"{begun(one.words)}.", _ALERTS[one.name]) for one in health.alerts if one.name in _ALERTS]
+    told = []
     versions = store.releases(site).versions if services.maps.is_mapped(site) else {}
     newest = next(reversed(versions.values()), None)
     if newest is not None and newest.state == "draft":
@@ -198,7 +213,18 @@ def _notices(services: Services, context: PageContext, health: SiteHealth) -> li
         tone, words, said = fleet_parts.trial_words(trial, context.moment)
         verdict, stop, _ = said.partition(". ")  # the page of trends has the rates
         told.append((tone, f"{words} {verdict}{stop}", "trends"))
-    found = [{"tone": tone, "words": words, "to": context.to(page), "more": begun(page)} for tone, words, page in told]
+    found: list[dict[str, object]] = [
+        {
+            "tone": "bad" if one.state == "open" else "quiet",
+            "words": f"{begun(one.words)}.{f' {one.assignee} has it.' if one.assignee else ''}",
+            "to": context.to(_ALERTS[one.name]),
+            "more": begun(_ALERTS[one.name]),
+            "incident": _incident(one),
+        }
+        for one in alerts
+        if one.name in _ALERTS
+    ]
+    found += [{"tone": tone, "words": words, "to": context.to(page), "more": begun(page)} for tone, words, page in told]
     if health.areas:
         words = f"This week: {trend_sentence(list(health.areas))}."
         found.append({"tone": "quiet", "words": words, "to": f"{context.to('trends')}#worse", "more": "Area by area"})

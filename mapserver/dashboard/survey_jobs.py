@@ -13,9 +13,11 @@ import msgspec
 
 from fleetmap.recordings import file_suffixes
 from mapserver.api.inbox_routes import NO_INBOX
+from mapserver.api.incidents import of_inbox
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.data import JOBS_SHOWN
 from mapserver.dashboard.map_layers import Item, Layer, Line, Mark
+from mapserver.fleet.incidents import with_acts
 from mapserver.store import JobInfo
 
 _TELLING_S = 4.0  # of a stage, before what is left of it can be said
@@ -94,12 +96,15 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         context = replace(context, site=chosen.site)  # whatever site the address names, or none
     jobs = services.maps.store.jobs(context.site, context.time_range(), limit=JOBS_SHOWN)
     chosen = chosen or next((job for job in jobs if job.state != "running" and _did_something(job)), None)
+    inbox = services.maps.inbox_of(context.site)
+    held = () if inbox is None else with_acts(services.maps.store, of_inbox(inbox, services.maps.store.now_ns()))
     shown: dict[str, object] = {
         "context": context,
         "site": context.site,
         "jobs": [(job, _state(job), _progress(job)) for job in jobs],
         "chosen": chosen,
-        "inbox": services.maps.inbox_of(context.site),
+        "inbox": inbox,
+        "held": {one.about: one for one in held},
         "no_inbox": NO_INBOX,
         "suffixes": file_suffixes(),
     }

@@ -1,18 +1,18 @@
 """Alerts for operators: robots fail too often, one stays lost, a nightly run failed, a version was rolled back."""
 
 import shlex
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 
 from fleetmap.config import Positive, Section
 from fleetmap.errors import StateError
 from fleetmap.messages import Flag, Status
 from mapserver.fleet.fleet import Fleet, RobotStatus
+from mapserver.fleet.incidents import Incident, with_acts
 from mapserver.fleet_statistics.kpis import HOUR_NS, TOO_MANY_PER_ROBOT_DAY, Counters, format_rate, hour_of, kpis
-from mapserver.store import MapStore
+from mapserver.store import INCIDENT, MapStore
 
-_HEARD_WITHIN_S = 60.0
+HEARD_WITHIN_S = 60.0
 # Of a large disk less than a tenth is enough for some nights.
 _LEAST_FREE_SHARE, _LEAST_FREE_BYTES = 0.1, 50_000_000_000
 _RATE_HOURS = 24
@@ -33,26 +33,7 @@ class AlertSettings(Section, frozen=True):
     lost_s: Positive = 300.0
 
 
-@dataclass(frozen=True, slots=True)
-class Alert:
-    """A present condition. name: FleetmapFailureRate, FleetmapRobotLost, FleetmapRobotCopied, FleetmapRobotOverloaded,
-    FleetmapNightFailed, FleetmapCanaryRolledBack, FleetmapDiskFills or FleetmapTrustFault.
-
-    about: its robot, job or version, empty for a site as a whole; since_ns: start, nanoseconds since 1970, now if it is unknown.
-    """
-
-    name: str
-    site: str
-    about: str
-    since_ns: int
-    words: str
-
-    @property
-    def key(self) -> tuple[str, str, str]:
-        return self.name, self.site, self.about
-
-
-def active_alerts(store: MapStore, fleet: Fleet, settings: AlertSettings, now_ns: int) -> list[Alert]:
+def active_alerts(store: MapStore, fleet: Fleet, settings: AlertSettings, now_ns: int) -> list[Incident]:
     """Return all active alerts, by site, then those of the disk, lists and certificates; errors are the store's."""
     from mapserver.trust.status import trust_status  # late: it needs zenoh, and builds, which read the settings, do not
 
@@ -63,16 +44,24 @@ def active_alerts(store: MapStore, fleet: Fleet, settings: AlertSettings, now_ns
             f"the store's disk is nearly full: {disk.free_bytes / 1e9:.1f} of {disk.total_bytes / 1e9:.0f} GB are free; "
             f"`mapserver gc --store {shlex.quote(str(store.folder))}` removes old versions"
         )
-        found.append(Alert("FleetmapDiskFills", "", "", now_ns, words))
+        found.append(Incident("FleetmapDiskFills", "", "", now_ns, words))
     with suppress(StateError):  # an unsigned store
         found += [
-            Alert("FleetmapTrustFault", "", fault.partition(":")[0], now_ns, fault)
+            Incident("FleetmapTrustFault", "", fault.partition(":")[0], now_ns, fault)
             for fault in trust_status(store).faults
         ]
-    return found
+    return with_acts(store, found)
 
 
-def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site: str, now_ns: int) -> Iterator[Alert]:
+def end_absent(store: MapStore, alerts: Iterable[Incident]) -> None:
+    """Log the end of alerts that people did something about and that are no more: when one begins anew it is open."""
+    present = {alert.id for alert in alerts}
+    for incident, acts in store.incident_acts().items():
+        if incident.startswith("Fleetmap") and incident not in present and not acts[-1].detail.startswith("ended"):
+            store.audit(INCIDENT, f"ended: {incident}", site=acts[-1].site)
+
+
+def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site: str, now_ns: int) -> Iterator[Incident]:
     counters = store.fleet.counters_of(site, "site", hour_of(now_ns) + 1 - _RATE_HOURS)
     failures = kpis(counters.get("", Counters())).failures
     if failures.low is not None and failures.low > settings.failures_per_robot_day:
@@ -80,28 +69,28 @@ def _of_site(store: MapStore, fleet: Fleet, settings: AlertSettings, site: str, 
             f"robots of {site} failed {failures.events} times in {_RATE_HOURS} h: {format_rate(failures)} per robot-day, "
             f"more than {settings.failures_per_robot_day:g}"
         )
-        yield Alert("FleetmapFailureRate", site, "", now_ns, words)
+        yield Incident("FleetmapFailureRate", site, "", now_ns, words)
     for robot in fleet.robots(site):
         health = robot.last_health or {}
         since_ns = lost_since_ns(robot, settings, now_ns)
         if since_ns is not None:
             words = f"has had no known position for {(now_ns - since_ns) / 60e9:.0f} min ({health.get('status')})"
-            yield Alert("FleetmapRobotLost", site, robot.robot, since_ns, f"{robot.robot} of {site} {words}")
-        if Flag.OVERLOADED in health.get("flags", ()) and robot.seconds_since <= _HEARD_WITHIN_S:
+            yield Incident("FleetmapRobotLost", site, robot.robot, since_ns, f"{robot.robot} of {site} {words}")
+        if Flag.OVERLOADED in health.get("flags", ()) and robot.seconds_since <= HEARD_WITHIN_S:
             words = f"{robot.robot} of {site} is too slow: {dropped_words(health.get('metrics', {}))}"
-            yield Alert("FleetmapRobotOverloaded", site, robot.robot, now_ns, words)
+            yield Incident("FleetmapRobotOverloaded", site, robot.robot, now_ns, words)
         if robot.is_copied:
             ends = f"`mapserver robots revoke {robot.robot} --site {site}` stops the copy"
             words = f"{robot.robot} of {site} is there twice; has another robot its name, or was its certificate copied? {ends}"
-            yield Alert("FleetmapRobotCopied", site, robot.robot, now_ns, words)
+            yield Incident("FleetmapRobotCopied", site, robot.robot, now_ns, words)
     night = store.last_night(site)
     if night is not None and night.state == "failed":
         words = f"the night of {site} failed (job {night.id}): {night.message}"
-        yield Alert("FleetmapNightFailed", site, f"job {night.id}", now_ns, words)
+        yield Incident("FleetmapNightFailed", site, f"job {night.id}", now_ns, words)
     for row in store.canaries(site):
         if row.state == "rolled_back" and row.ended_ns is not None and now_ns - row.ended_ns < _TOLD_NS:
             words = f"version {row.version} of {site} was rolled back: {row.outcome}"
-            yield Alert("FleetmapCanaryRolledBack", site, f"version {row.version}", row.ended_ns, words)
+            yield Incident("FleetmapCanaryRolledBack", site, f"version {row.version}", row.ended_ns, words)
 
 
 def dropped_words(metrics: Mapping[str, object]) -> str:
@@ -114,6 +103,6 @@ def dropped_words(metrics: Mapping[str, object]) -> str:
 def lost_since_ns(robot: RobotStatus, settings: AlertSettings, now_ns: int) -> int | None:
     """Return since when a robot has not known its position, None unless it reports that, and for longer than the limit."""
     status, since_ns = (robot.last_health or {}).get("status"), robot.state_since_ns
-    if status not in _LOST or since_ns is None or robot.seconds_since > _HEARD_WITHIN_S:
+    if status not in _LOST or since_ns is None or robot.seconds_since > HEARD_WITHIN_S:
         return None
     return since_ns if now_ns - since_ns >= settings.lost_s * 1e9 else None

@@ -11,9 +11,10 @@ from typing import Any
 from fleetmap.errors import BusyError, FleetmapError
 from fleetmap.log_lines import LogLimit
 from mapserver.drafting.job_lock import end_interrupted
-from mapserver.fleet.alerts import AlertSettings, active_alerts
+from mapserver.fleet.alerts import HEARD_WITHIN_S, AlertSettings, active_alerts, end_absent
 from mapserver.fleet.canary_controller import review
 from mapserver.fleet.fleet import Fleet
+from mapserver.fleet.incidents import acts_after
 from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.serving.bus_access import BusGuard
 from mapserver.serving.bus_service import BusService
@@ -66,13 +67,20 @@ def server_tasks(
 
 
 def alert_tasks(store: MapStore, fleet: Fleet, settings: AlertSettings, receiver: Any) -> list[BackgroundTask]:
-    """Return the task that tells a receiver of alerts (`AlertHook` of `mapserver/hooks.py`); empty without one."""
-    if receiver is None:
-        return []
+    """Return the task that ends incidents of alerts and tells a receiver of alerts and acts (`AlertHook` of `mapserver/hooks.py`)."""
+    begun_s, last = time.monotonic(), max((act.id for act in acts_after(store, 0)), default=0)
 
     def look() -> None:
-        if store.leads():
-            receiver.tell(active_alerts(store, fleet, settings, now_ns := time.time_ns()), now_ns)
+        nonlocal last
+        now_ns, acts = time.time_ns(), acts_after(store, last)
+        last = max((act.id for act in acts), default=last)
+        if not store.leads():
+            return
+        alerts = active_alerts(store, fleet, settings, now_ns)
+        if time.monotonic() - begun_s > HEARD_WITHIN_S:
+            end_absent(store, alerts)
+        if receiver is not None:
+            receiver.tell(alerts, acts, now_ns)
 
     return [BackgroundTask("looking for alerts", 10.0, look)]
 

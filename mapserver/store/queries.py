@@ -1,6 +1,7 @@
 """Queries of a store, and writes that change no version: robots' reports, jobs, the log."""
 
 import json
+import threading
 from collections.abc import Callable, Sequence, Set
 from contextlib import closing
 from datetime import UTC, datetime
@@ -24,6 +25,7 @@ from mapserver.store.fleet_queries import FleetQueries, keep_last_reports
 from mapserver.store.operators import OperatorQueries
 from mapserver.store.places import open_database, open_objects, read_places
 from mapserver.store.rows import (
+    INCIDENT,
     NOBODY,
     Actor,
     CanaryRow,
@@ -63,6 +65,7 @@ class StoreQueries:
         self.disk_space: Callable[[], DiskSpace] = DiskMeter(root, clock_ns).look
         self.usage: Callable[[], StoreUsage | None] = UsageMeter(root, self._database, self._blobs).look
         self._areas: dict[str, tuple[list[str], Areas]] = {}  # by the addresses of their source files
+        self._acts, self._acts_read, self._acts_lock = dict[str, list[Event]](), 0, threading.Lock()
         self._requests: dict[str, dict[tuple[str, str], SurveyRequest]] = {}  # by the addresses of their files
 
     # ---------------------------------------------------------------------------------------------- sites and versions
@@ -254,7 +257,18 @@ class StoreQueries:
         return self._database.select(Event, "events", wanted, "id", limit)
 
     def last_events(self, site: str, limit: int) -> list[Event]:
-        return self._database.select(Event, "events", {"site": site}, "id DESC", limit)
+        """Return the last events of a site, the newest first, without what people did about incidents."""
+        return self._database.select(Event, "events", {"site": site, "kind <>": INCIDENT}, "id DESC", limit)
+
+    def incident_acts(self) -> dict[str, list[Event]]:
+        """Return what people did about each incident, by its id, oldest first. Only new lines are read: the log goes back for ever."""
+        with self._acts_lock:
+            last = self._database.value("SELECT max(id) FROM events") or 0
+            wanted = {"id >": self._acts_read, "id <=": last, "kind": INCIDENT}
+            for act in self._database.select(Event, "events", wanted, "id"):
+                self._acts.setdefault(act.detail.partition(": ")[2], []).append(act)
+            self._acts_read = last
+            return dict(self._acts)
 
     def note_restored(self, detail: str, ahead: int, actor: Actor) -> None:
         """Log the restoration of this store, and let its sites' versions go on `ahead` numbers later: the lost store gave the next ones."""

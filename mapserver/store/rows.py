@@ -14,6 +14,9 @@ from mapserver.quality.figures import Evidence
 UNLIMITED = 1 << 62
 """As limit of a number of rows: all."""
 
+INCIDENT = "incident"
+"""Kind of an event: what somebody does about an incident. Its detail: what, and behind `: ` the incident's id."""
+
 AXES = ("site", "robot", "version", "tile", "area", "cause", "arm")
 """Keys of the sums, each separate: never robot and tile together, so that they stay few."""
 

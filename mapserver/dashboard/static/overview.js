@@ -21,14 +21,23 @@ function made(tag, className, text) {
   return node;
 }
 
+// The first act is to acknowledge it.
+function acts({ id, is_open }) {
+  const found = document.getElementById("incident-acts").content.cloneNode(true);
+  const buttons = [...found.querySelectorAll("[data-act]")];
+  for (const button of buttons) button.dataset.body = JSON.stringify({ incident: id });
+  if (!is_open) buttons[0]?.remove();
+  return found;
+}
+
 function row({ name, to }) {
   const item = made("li", "", "");
   const link = made("a", "name", name);
   link.href = to;
-  item.append(link, ...["state", "since", "about"].map((part) => made("span", part, "")));
+  item.append(link, ...["state", "since", "about"].map((part) => made("span", part, "")), made("div", "acts", ""));
   item.addEventListener("click", ({ target }) => {
     const place = state.robots.find((robot) => robot.name === name)?.place;
-    if (target !== link && place && map) map.map.setView([place[1], place[0]], NEAR_ZOOM);
+    if (!target.closest("a, button") && place && map) map.map.setView([place[1], place[0]], NEAR_ZOOM);
   });
   return item;
 }
@@ -38,11 +47,16 @@ function refresh(item, robot) {
   const [, now, since, about] = item.children;
   for (const [part, text] of [[now, robot.state], [since, robot.since], [about, robot.about]]) if (part.textContent !== text) part.textContent = text;
   since.title = robot.exact;
+  const incident = JSON.stringify(robot.incident ?? null);
+  if (item.dataset.incident === incident) return;
+  item.dataset.incident = incident;
+  item.lastChild.replaceChildren(...(robot.incident ? [acts(robot.incident)] : []));
 }
 
-function notice({ tone, words, to, more }) {
+function notice({ tone, words, to, more, incident }) {
   const box = made("p", `notice ${tone}`, `${words} `);
   box.append(Object.assign(made("a", "", more), { href: to }));
+  if (incident) box.append(acts(incident));
   return box;
 }
 

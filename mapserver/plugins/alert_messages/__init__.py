@@ -21,7 +21,9 @@ from fleetmap.bus.endpoints import is_loopback_name
 from fleetmap.encoding import to_json
 from fleetmap.errors import StateError, UsageError, disk_errors
 from fleetmap.log_lines import LogLimit
-from mapserver.fleet.alerts import Alert, AlertSettings
+from mapserver.fleet.alerts import AlertSettings
+from mapserver.fleet.incidents import Incident
+from mapserver.store import Event
 
 _ATTEMPT_S = 5.0
 _PAUSES_S = (2.0, 10.0, 60.0)  # between four attempts
@@ -42,7 +44,7 @@ class Webhook:
         self._headers = {"Content-Type": "application/json", "User-Agent": "fleetmap"}
         if settings.token_file is not None:
             self._headers["Authorization"] = f"Bearer {_token(Path(settings.token_file))}"
-        self._known: dict[tuple[str, str, str], Alert] = {}
+        self._known, self._rung = dict[str, Incident](), dict[str, Incident]()
         self._waiting: queue.Queue[bytes] = queue.Queue(_MOST_WAITING)
         self._ended = threading.Event()
         self._refusals = LogLimit(_log)
@@ -50,13 +52,16 @@ class Webhook:
         self._thread = threading.Thread(target=self._run, name="webhook", daemon=True)
         self._thread.start()
 
-    def tell(self, alerts: Sequence[Alert], now_ns: int) -> None:
-        """Send what is new among the active alerts, and what has ended. After a restart of the server active ones are sent again."""
-        now = {alert.key: alert for alert in alerts}
-        begun = [alert for key, alert in now.items() if key not in self._known]
+    def tell(self, alerts: Sequence[Incident], acts: Sequence[Event], now_ns: int) -> None:
+        """Send what is new among the active alerts, what has ended, and what people did about incidents. After a restart of the server
+        active ones are sent again, but for those that somebody acknowledged or closed.
+        """
+        now = {alert.id: self._known.get(alert.id, alert) for alert in alerts}
+        rings = {alert.id: now[alert.id] for alert in alerts if alert.state == "open"}
+        begun = [alert for key, alert in rings.items() if key not in self._rung]
         ended = [alert for key, alert in self._known.items() if key not in now]
-        self._known = {key: self._known.get(key, alert) for key, alert in now.items()}
-        for status, changed in (("firing", begun), ("resolved", ended)):
+        self._known, self._rung = now, rings
+        for status, changed in (("firing", begun), ("resolved", [*ended, *map(_told, acts)])):
             if changed:
                 self.put(message(changed[:_MOST_ALERTS], status, now_ns))
             if len(changed) > _MOST_ALERTS:
@@ -70,7 +75,7 @@ class Webhook:
 
     def test(self, now_ns: int) -> tuple[bool, str]:
         """Send a test alert once, and wait: whether the receiver accepted it, and its answer. StateError while another is under way."""
-        test = Alert("FleetmapTest", "", "", now_ns, "A test of the webhook. Nothing is wrong.")
+        test = Incident("FleetmapTest", "", "", now_ns, "A test of the webhook. Nothing is wrong.")
         if not self._testing.acquire(blocking=False):
             raise StateError("another test alert is on its way; wait for its answer")
         try:
@@ -124,7 +129,14 @@ class Webhook:
         return 200 <= status < 300, f"status {status}"
 
 
-def message(alerts: Sequence[Alert], status: str, now_ns: int) -> Body:
+def _told(act: Event) -> Incident:
+    """An act as an alert that is over: nobody is called for it."""
+    done, _, incident = act.detail.partition(": ")
+    words = f"{incident} {done} by {act.actor}{f': {act.reason}' if act.reason else ''}"
+    return Incident("FleetmapIncident", act.site, incident, act.stamp_ns, words)
+
+
+def message(alerts: Sequence[Incident], status: str, now_ns: int) -> Body:
     """Return alerts of one status, in the format of Alertmanager's webhooks."""
     told = [
         {

@@ -211,6 +211,16 @@ def test_questions_that_a_page_answers(operator: Operator) -> None:
         answer = operator.page.locator(where).filter(has_text=re.compile(words, re.DOTALL)).first
         expect(answer, question).to_be_in_viewport()
     operator.begin()
+    night = operator.page.locator("#notices p", has_text="The night of hall failed")
+    night.get_by_role("button", name="Hand over").press("Enter")  # by the keyboard alone: as many keys as clicks
+    operator.count()
+    operator.page.keyboard.type("bob")
+    operator.page.keyboard.press("Tab")
+    operator.page.keyboard.type("ada")
+    operator.page.keyboard.press("Enter")
+    operator.count()
+    expect(night).to_contain_text("bob has it.")
+    operator.begin()
     operator.go("Map")
     operator.click(operator.page.get_by_role("button", name="Publish draft 3", exact=True))
     expect(operator.page.get_by_role("dialog")).to_contain_text("The trial of version 1 ends.")

@@ -16,8 +16,9 @@ from fleetmap.errors import UsageError
 from mapserver.api.app import create_app
 from mapserver.api.metrics import Metrics
 from mapserver.api.parameters import ApiSettings
-from mapserver.fleet.alerts import Alert, AlertSettings
+from mapserver.fleet.alerts import AlertSettings
 from mapserver.fleet.fleet import Fleet
+from mapserver.fleet.incidents import Incident
 from mapserver.plugins import alert_messages
 from mapserver.plugins.alert_messages import Webhook, check_address
 from mapserver.store import MapStore
@@ -34,12 +35,12 @@ def store(tmp_path: Path) -> Iterator[MapStore]:
 
 
 def test_it_is_told_once_and_once_more_when_it_is_over(tmp_path: Path) -> None:
-    held = [Alert("FleetmapRobotLost", "lab", "r1", NOW_NS, "r1 of lab has had no known position for 5 min")]
+    held = [Incident("FleetmapRobotLost", "lab", "r1", NOW_NS, "r1 of lab has had no known position for 5 min")]
     (tmp_path / "token").write_text("secret\n")
     with receiver() as (address, got):
         sender = Webhook(AlertSettings(webhook=address, token_file=str(tmp_path / "token")))
         for active in (held, held, held, [], [], []):
-            sender.tell(active, NOW_NS)
+            sender.tell(active, [], NOW_NS)
         assert eventually(lambda: len(got) == 2)
         sender.close()
     assert {headers["Authorization"] for headers, _ in got} == {"Bearer secret"}

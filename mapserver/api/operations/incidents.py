@@ -1,0 +1,68 @@
+"""Operations on incidents. What is done is a line of the log, from which the incident's state follows."""
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fleetmap.errors import InvalidValueError
+from mapserver.api.operations.operation import Caller, Done, operation
+
+Id = Annotated[
+    str,
+    {"max_length": 500, "examples": ["failure/hall/1"]},
+    typer.Argument(metavar="INCIDENT", help="The incident, as `incidents list` shows it."),
+]
+_NAME = r"^[^\s:]+([ :][^\s:]+)*$"
+Owner = Annotated[
+    str,
+    {"pattern": _NAME, "max_length": 64, "examples": ["bob"]},
+    typer.Option("--to", metavar="NAME", help="Who has it from now on."),
+]
+InboxFolder = Annotated[Path | None, typer.Option(metavar="DIR", help="Folder of the inboxes, for recordings.")]
+
+
+@operation("/v1/incidents/acknowledge", "incidents acknowledge")
+def acknowledge(caller: Caller, incident: Id, *, inbox: InboxFolder = None) -> Done:
+    """Take an incident on. Its alert is sent no more, until it ends and begins anew."""
+    return _noted(caller, incident, "acknowledged", inbox)
+
+
+@operation("/v1/incidents/assign", "incidents assign")
+def assign(caller: Caller, incident: Id, to: Owner, *, inbox: InboxFolder = None) -> Done:
+    """Hand an incident to somebody, who has it from now on; nobody needs to acknowledge it any more."""
+    if not re.match(_NAME, to):
+        raise InvalidValueError(f"{to[:80]!r} is no name; write one such as bob")
+    return _noted(caller, incident, f"handed to {to}", inbox)
+
+
+@operation("/v1/incidents/comment", "incidents comment")
+def comment(caller: Caller, incident: Id, *, inbox: InboxFolder = None) -> Done:
+    """Add the reason to what is known of an incident; its state stays."""
+    if not caller.actor.reason:
+        raise InvalidValueError("a comment is the `reason` of its act; write one")
+    return _noted(caller, incident, "commented", inbox)
+
+
+@operation("/v1/incidents/close", "incidents close")
+def close(caller: Caller, incident: Id, *, inbox: InboxFolder = None) -> Done:
+    """Close an incident that needs nobody any more: lists leave it out."""
+    return _noted(caller, incident, "closed", inbox)
+
+
+@operation("/v1/incidents/reopen", "incidents reopen")
+def reopen(caller: Caller, incident: Id, *, inbox: InboxFolder = None) -> Done:
+    """Open an incident again, for anybody; if it is an alert that goes on, it is sent again."""
+    return _noted(caller, incident, "reopened", inbox)
+
+
+def _noted(caller: Caller, incident: str, act: str, inbox: Path | None) -> Done:
+    from mapserver.api.incidents import find, present
+    from mapserver.fleet.fleet import Fleet
+
+    store, served = caller.store, caller.served
+    fleet, inbox = (Fleet(store), inbox) if served is None else (served.fleet, served.settings.inbox)
+    found = find(store, present(store, fleet, caller.config.alerts, inbox), incident)
+    found.noted(store, act, caller.actor)
+    return Done(f"{found.id} is {act}")

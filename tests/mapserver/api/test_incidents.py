@@ -1,0 +1,120 @@
+"""Incidents: what somebody must look after is acknowledged, handed over, commented, closed and reopened by route, command and webhook."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fleetmap.errors import InvalidValueError
+from fleetmap.messages import RobotHealth
+from mapserver.cli import app
+from mapserver.fleet.alerts import AlertSettings
+from mapserver.plugins.alert_messages import Webhook
+from mapserver.serving.background_tasks import alert_tasks
+from mapserver.store import DraftContent, MapStore
+from support.fleet.reports import blindness
+from support.fleet.served_api import Server, check_problem, served_api
+from support.fleet.webhook_receiver import receiver
+from support.room_site import invoke, run
+from support.storage.map_samples import draft_details, random_tile
+from support.waiting import eventually
+
+ALERT, DRAFT, RECORDING, FAILURE = (
+    "FleetmapNightFailed/lab/job 1",
+    "draft/lab/3",
+    "recording/lab/held/0a-monday.mcap",
+    "failure/lab/1",
+)
+
+
+SLOW, HELD = ("overloaded",), "resolved FleetmapRobotOverloaded/lab/r1"
+# What a robot reports, what is done, whether the server starts anew before that, and what the receiver is told.
+STEPS = (
+    (SLOW, "", True, "firing r1 of lab is too slow"),
+    (SLOW, "acknowledge", False, f"{HELD} acknowledged by dan: on it"),
+    (SLOW, "", True),
+    (SLOW, "reopen", False, "firing r1 of lab is too slow", f"{HELD} reopened by dan: on it"),
+    (SLOW, "close", False, f"{HELD} closed by dan: on it"),
+    ((), "", False, "resolved r1 of lab is too slow"),
+    (SLOW, "", False, "firing r1 of lab is too slow"),
+)
+
+
+def act(server: Server, name: str, incident: str, **more: str) -> None:
+    answer = server.client.post(f"/v1/incidents/{name}", json={"incident": incident, "actor": "dan"} | more)
+    assert answer.json() == {"status": "ok"}
+
+
+def states(server: Server) -> dict[str, tuple[str, str]]:
+    items = server.client.get("/v1/incidents?site=lab").json()["items"]
+    return {one["id"]: (one["state"], one["assignee"]) for one in items if one["site"]}
+
+
+def night(store: MapStore, state: str) -> None:
+    store.update_job(store.begin_job("lab", "nightly"), state, "the disk is full", {})
+
+
+def test_each_kind_by_route_and_command(tmp_path: Path) -> None:
+    held = tmp_path / "inbox" / "lab" / "held"
+    held.mkdir(parents=True)
+    (held / "0a-monday.mcap").touch()
+    (held / "0a-monday.mcap.reason.txt").write_text("it saw another hall")
+    folder = tmp_path / "store"
+    with served_api(folder, tmp_path / "inbox") as server:
+        night(server.store, "failed")
+        assert not server.fleet.take_failure("lab", "r1", blindness("f1")).refused
+        thin = random_tile(np.random.default_rng(5), landmarks=10, cell=(0, 0))
+        server.store.save("lab", DraftContent(tiles=[thin], vocabulary=b"words" * 50, details=draft_details()))
+        assert server.client.post("/v1/sites/lab/versions/3/publish", json={"actor": "dan"}).status_code == 409
+        assert states(server) == dict.fromkeys((ALERT, DRAFT, RECORDING), ("open", "")), "failures once somebody acts"
+        command = ("--store", folder, "--actor", "carl", "--inbox", tmp_path / "inbox")
+        for incident in (ALERT, DRAFT, RECORDING, FAILURE):
+            act(server, "acknowledge", incident)
+            assert states(server)[incident] == ("acknowledged", "dan")
+            run(app, "incidents", "assign", incident, "--to", "Bob B", *command, "--reason", "your shift")
+            act(server, "comment", incident, reason="seen it")
+            assert states(server)[incident] == ("acknowledged", "Bob B")
+            listed = run(app, "incidents", "list", "--json", "--store", folder, "--inbox", tmp_path / "inbox")
+            (found,) = (one for one in json.loads(listed) if one["id"] == incident)
+            told = [(one["actor"], one["reason"]) for one in found["acts"]]
+            assert told == [("dan", ""), ("carl", "your shift"), ("dan", "seen it")]
+            run(app, "incidents", "close", incident, *command)
+            assert incident not in states(server)
+            act(server, "reopen", incident)
+            assert states(server).get(incident, ("open", "")) == ("open", "")
+        assert [line.detail for line in server.store.audit_lines()][-5:] == [
+            f"{done}: {FAILURE}" for done in ("acknowledged", "handed to Bob B", "commented", "closed", "reopened")
+        ]
+        for name, told, status in (
+            ("comment", {"incident": DRAFT}, 422),
+            ("close", {"incident": "failure/lab/9"}, 404),
+            ("close", {"incident": "draft/lab/1"}, 404),
+            ("assign", {"incident": DRAFT, "to": "a: b"}, 422),
+        ):
+            check_problem(server.client.post(f"/v1/incidents/{name}", json=told | {"actor": "dan"}), status, "")
+        refused = invoke(app, "incidents", "assign", DRAFT, "--to", "a: b", *command)
+        assert isinstance(refused.exception, InvalidValueError)
+
+
+def test_an_acknowledged_alert_is_silent_until_it_begins_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mapserver.serving.background_tasks.HEARD_WITHIN_S", 0.0)
+    slow, expected = "FleetmapRobotOverloaded/lab/r1", list[str]()
+    with served_api(tmp_path) as server, receiver() as (address, got):
+
+        def told() -> list[str]:
+            alerts = [one for _, body in got for one in json.loads(body)["alerts"] if one["labels"]["site"] == "lab"]
+            return [f"{one['status']} {one['annotations']['summary']}".partition(": many")[0] for one in alerts]
+
+        for step, (flag, done, restarts, *words) in enumerate(STEPS):
+            if restarts:
+                sender = Webhook(AlertSettings(webhook=address))
+                (task,) = alert_tasks(server.store, server.fleet, AlertSettings(), sender)
+            report = RobotHealth(site="lab", robot="r1", stamp_ns=step, version=1, status="TRACKING", flags=flag)
+            server.fleet.take_health("lab", "r1", report)
+            if done:
+                act(server, done, slow, reason="on it")
+            task.act()
+            expected += words
+            assert eventually(lambda wanted=expected: told() == wanted), told()
+        sender.close()
