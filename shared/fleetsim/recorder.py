@@ -38,6 +38,7 @@ from fleetsim.sensors.measurements import (
 from fleetsim.sensors.robots import HiddenErrors, RobotKind, nominal_calibration, true_calibration
 
 _TRUTH_STEP_S = 0.02
+_SEEDS_PER_FLOOR = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,7 +117,7 @@ def _generator(order: Order, robot: str, purpose: str) -> np.random.Generator:
 def drive(run: Run, kind: RobotKind, layout: Layout, rng: np.random.Generator) -> Motion:
     """The run's motion; UsageError if it comes too near to an obstacle."""
     pieces = [RouteMotion(route, kind.limits, kind.body_height_m, kind.shake, rng) for route in run.routes]
-    motion: Motion = pieces[0] if len(pieces) == 1 else CarriedMotion(pieces)
+    motion: Motion = pieces[0] if len(pieces) == 1 else CarriedMotion(pieces, rides=len(run.floors) > 1)
     check_clear(motion.map_from_body(sample_times(motion.duration_s, 20.0))[:, :2, 3], layout, kind.clearance_m)
     return motion
 
@@ -134,15 +135,20 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
         kind = replace(kind, width_px=order.size_px[0], height_px=order.size_px[1])
     nominal, true = nominal_calibration(kind), true_calibration(kind, _generator(order, name, "mounting"))
     motion = drive(run, kind, scenario.layout, _generator(order, name, "motion"))
-    plan, key = FaultPlan((*run.faults, *order.faults)), zlib.crc32(name.encode())
+    rides_s = motion.rides_s if isinstance(motion, CarriedMotion) else []
+    dark = [Fault("camera-dark", *ride_s) for ride_s in rides_s]
+    plan, key = FaultPlan((*run.faults, *order.faults, *dark)), zlib.crc32(name.encode())
     light, movers, has_blur = order.light, scenario.movers, not run.is_sharp
     every_time = [float(t) for t in sample_times(motion.duration_s, run.rate_hz)]
     times = [t for t in every_time if not plan.has("frames-dropped", t)][: order.frames]
     end_s = times[-1] + 0.1 if times else motion.duration_s
-    world = World(scenario.layout, seed=order.seed, day=order.day, workers=workers)
-    renderer = RigRenderer(
-        world, true, motion, light=light, movers=movers, faults=plan.faults, key=key, has_blur=has_blur
-    )
+    seeds = [order.seed + _SEEDS_PER_FLOOR * floor for floor in run.floors]
+    worlds = [World(scenario.layout, seed=seed, day=order.day, workers=workers) for seed in seeds]
+    renderer, *above = [
+        RigRenderer(world, true, motion, light=light, movers=movers, faults=plan.faults, key=key, has_blur=has_blur)
+        for world in worlds
+    ]
+    renderer.above = list(zip([end_s for _, end_s in rides_s], above, strict=True))
     wheel = measure_wheels(motion, kind.body_height_m, kind.wheels, _generator(order, name, "wheels"))
     priors = measure_priors(motion, nominal.base_from_body, run.zone_period_s, _generator(order, name, "priors"))
     last_ns = int(stamps_from_s(np.array([end_s]))[0])
@@ -151,7 +157,7 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
     truth_s = np.unique(np.rint(np.concatenate([grid_s, times]) * 1e9)) * 1e-9
     return Session(
         order=order,
-        world=world,
+        world=worlds[0],
         nominal=nominal,
         true=true,
         renderer=renderer,

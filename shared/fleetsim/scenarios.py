@@ -17,7 +17,7 @@ from fleetsim.sensors.robots import ROBOTS, RobotKind
 class Run:
     """One robot's drive. Several routes: the robot is carried from the end of one to the start of the next.
 
-    is_sharp: without motion blur, as a survey at leisure with a short exposure.
+    floors: of each route, if it is not on the first one; between two of them the robot rides a lift, which is dark. is_sharp: without motion blur, as a survey at leisure with a short exposure.
     """
 
     robot: str
@@ -26,6 +26,7 @@ class Run:
     is_sharp: bool = False
     faults: tuple[Fault, ...] = ()
     zone_period_s: float = 0.0
+    floors: tuple[int, ...] = (0,)
 
     @property
     def kind(self) -> RobotKind:
@@ -169,6 +170,21 @@ def _marked_ends() -> Scenario:
     return replace(alike, description="the same with different signs, posters and pallets at their ends", layout=marked)
 
 
+def _two_floors() -> Scenario:
+    """Two small loops above each other; the lift stands between the aisles at their right end."""
+    loop = _small_loop()
+    first = loop.runs["tote-1"].routes[0].way_points_map
+    lift = (first[1][0], loop.layout.width_m / 2)
+    ride = Route((*first[:2], lift)), Route((lift, *first[2:]))
+    survey = loop.runs["survey"]
+    runs = {
+        "ground": survey,
+        "upper": replace(survey, floors=(1,)),
+        "tote-1": Run("tote", ride, floors=(0, 1)),
+    }
+    return replace(loop, description="two small loops above each other, and a lift that the robot rides", runs=runs)
+
+
 def _faulty() -> Scenario:
     base = _small_loop()
     loop = base.runs["tote-1"].routes
@@ -208,6 +224,7 @@ SCENARIOS = {
     "small-loop": _small_loop,
     "faults": _faulty,
     "marker-loop": _marker_loop,
+    "two-floors": _two_floors,
     "five-aisles": _five_aisles,
     "busy": _busy,
     "identical-aisles": _identical,

@@ -1,12 +1,14 @@
 """Splines against scipy, rates against numeric derivatives, the IMU integrated back, routes within limits."""
 
+from contextlib import closing
+
 import numpy as np
 import pytest
 
 from fleetmap.errors import UsageError
-from fleetsim.motion.body_motion import GRAVITY_MPS2, LIFT_M, LIFT_S, CarriedMotion, RouteMotion, Shake
+from fleetsim.motion.body_motion import GRAVITY_MPS2, LIFT_M, LIFT_S, STOREY_M, CarriedMotion, RouteMotion, Shake
 from fleetsim.motion.routes import Limits, Route, check_clear, time_path
-from fleetsim.recorder import drive
+from fleetsim.recorder import Order, drive, prepare
 from fleetsim.scenarios import SCENARIOS
 from fleetsim.scene.layout import Layout
 
@@ -41,6 +43,20 @@ def test_limits_stops_and_rest_are_kept() -> None:
     assert standing[-100:].all()
     middle = standing[300:-300].sum() * 0.01
     assert 1.5 < middle < 3.0  # the stop of two seconds
+
+
+def test_a_lift_takes_a_robot_up_a_storey_in_the_dark_to_another_hall() -> None:
+    session = prepare(Order("two-floors", robot="tote-1"))
+    with closing(session.renderer):
+        assert isinstance(session.motion, CarriedMotion)
+        ((start_s, end_s),) = session.motion.rides_s
+        heights_m = session.motion.map_from_body(np.array([start_s, end_s - 1e-6, end_s]))[:, 2, 3]
+        np.testing.assert_allclose(np.diff(heights_m), [STOREY_M, -STOREY_M], atol=2e-3)
+        assert session.renderer.faults.has("camera-dark", end_s - 0.1)
+        assert not session.renderer.faults.has("camera-dark", end_s)
+        ((from_s, above),) = session.renderer.above
+        assert from_s == end_s
+        assert above._world.seed != session.world.seed
 
 
 def test_a_carried_robot_is_lifted_between_its_rests_and_feels_it() -> None:

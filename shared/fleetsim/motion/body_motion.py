@@ -119,18 +119,22 @@ class RouteMotion:
 
 
 LIFT_M, LIFT_S = 0.5, 1.0
+STOREY_M, STOREY_S = 4.0, 8.0
 
 
 class CarriedMotion:
     """Several motions in sequence. Between two of them the robot is lifted by hand by LIFT_M within LIFT_S, and set down as fast at the
-    start of the next: its sensors measure both, but nothing of the transport between. Its wheels stand still."""
+    start of the next: its sensors measure both, but nothing of the transport between. Or it rides a lift to the next floor, where heights
+    begin at 0 again. Its wheels stand still."""
 
-    def __init__(self, motions: Sequence[RouteMotion]) -> None:
+    def __init__(self, motions: Sequence[RouteMotion], *, rides: bool = False) -> None:
         self._motions = list(motions)
         last = len(motions) - 1
-        lifts_s = [LIFT_S * ((number > 0) + (number < last)) for number in range(len(motions))]
+        self._up_m, self._up_s, self._down_s = (STOREY_M, STOREY_S, 0.0) if rides else (LIFT_M, LIFT_S, LIFT_S)
+        lifts_s = [self._down_s * (n > 0) + self._up_s * (n < last) for n in range(len(motions))]
         self._ends_s = np.cumsum([m.duration_s + lift_s for m, lift_s in zip(motions, lifts_s, strict=True)])
         self.duration_s = float(self._ends_s[-1])
+        self.rides_s = [(float(end_s) - STOREY_S, float(end_s)) for end_s in self._ends_s[:-1] if rides]
 
     def map_from_body(self, times_s: Array) -> Array:
         """(N, 4, 4); jumps where one piece ends."""
@@ -151,18 +155,18 @@ class CarriedMotion:
     def _local(self, times_s: Array) -> tuple[NDArray[np.int64], Array]:
         """(N,) the piece in force, and the time since the robot stood on the ground, which is negative before."""
         piece = np.minimum(np.searchsorted(self._ends_s, times_s, side="right"), len(self._motions) - 1)
-        return piece, times_s - np.concatenate([[0.0], self._ends_s[:-1] + LIFT_S])[piece]
+        return piece, times_s - np.concatenate([[0.0], self._ends_s[:-1] + self._down_s])[piece]
 
     def _height(self, times_s: Array, derivative: int) -> Array:
         """(N,) above the ground, or a derivative; the fifth-order curve that begins and ends at rest."""
         piece, local_s = self._local(times_s)
         ends_s = np.array([motion.duration_s for motion in self._motions])[piece]
-        before, after = -local_s / LIFT_S, (local_s - ends_s) / LIFT_S
+        before, after = -local_s / self._up_s, (local_s - ends_s) / self._up_s
         after = np.where(piece < len(self._motions) - 1, after, 0.0)
         share = np.clip(np.maximum(before, after), 0.0, 1.0)
         curve = np.polynomial.Polynomial([0.0, 0.0, 0.0, 10.0, -15.0, 6.0]).deriv(derivative)
         sign = np.where(before > after, -1.0, 1.0) ** derivative
-        return np.asarray(LIFT_M / LIFT_S**derivative * sign * curve(share))
+        return np.asarray(self._up_m / self._up_s**derivative * sign * curve(share))
 
     def _pick(self, times_s: Array, ask: Callable[[RouteMotion, Array], Array]) -> Array:
         piece, local_s = self._local(times_s)

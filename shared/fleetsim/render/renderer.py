@@ -48,10 +48,15 @@ class RigRenderer:
         ]
         self._workers = ThreadPoolExecutor(len(self._painters))
         self._last_right: Image | None = None
+        self.above: list[
+            tuple[float, RigRenderer]
+        ] = []  # of the floors above, with the time from which the robot is there
 
     def close(self) -> None:
         """End the threads."""
         self._workers.shutdown()
+        for _, renderer in self.above:
+            renderer.close()
 
     def path(self, camera: int) -> Callable[[float], Array]:
         """t_s -> map_from_cam."""
@@ -70,6 +75,9 @@ class RigRenderer:
 
     def shoot(self, t_s: float) -> list[Shot]:
         """Every camera's picture, whose exposure is centred at t."""
+        for from_s, renderer in self.above[::-1]:
+            if t_s >= from_s:
+                return renderer.shoot(t_s)
         place = self._motion.map_from_body(np.array([t_s]))[0][:3, 3]
         scene = self._world.scene_around(float(place[0]), float(place[1]))
         exposure = self.exposure(t_s)
