@@ -17,7 +17,8 @@ from fleetsim.sensors.robots import ROBOTS, RobotKind
 class Run:
     """One robot's drive. Several routes: the robot is carried from the end of one to the start of the next.
 
-    floors: of each route, if it is not on the first one; between two of them the robot rides a lift, which is dark. is_sharp: without motion blur, as a survey at leisure with a short exposure.
+    floors: on which the routes are; from one to the next the robot rides a lift, which is dark. is_sharp: without motion blur, as
+    a survey at leisure with a short exposure.
     """
 
     robot: str
