@@ -10,7 +10,7 @@ from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, date, tzinfo
 from pathlib import Path
-from typing import NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from fastapi import FastAPI, Request, Response
 from fastapi.responses import HTMLResponse, StreamingResponse
@@ -198,11 +198,16 @@ class Console:
             return await self._shown(request, page)
 
     def stream(
-        self, path: str, one: Callable[..., dict[str, object]], *, under_way: Callable[[], list[str]] = list
+        self,
+        path: str,
+        one: Callable[..., dict[str, Any]],
+        *,
+        shows: Sequence[str] = (),
+        under_way: Callable[[], list[str]] = list,
     ) -> None:
         """Adds what a page follows: looked at every second and told when it has changed, for as long as the session lasts.
 
-        one: as `fill` of a page.
+        one: as `fill` of a page. shows: macros of `now.html` that make parts of the page of it, beside the marks on its map.
         """
 
         @self.app.get(f"/{path}", include_in_schema=False)
@@ -217,7 +222,12 @@ class Console:
                 is_signed_in = getattr(request.state, "operator", None) is not None
                 if is_signed_in and guard.identify(request.scope, uses=False) is None:
                     return ended
-                return b"data: %s\n\n" % to_json(one(self.services, context, **request.path_params))
+                found = one(self.services, context, **request.path_params)
+                if shows:
+                    made: Any = TEMPLATES.get_template("now.html").make_module({**_rights(request), "context": context})
+                    parts = (str(getattr(made, name)(found)) for name in shows)
+                    found = {"html": "".join(parts), "marks": found["marks"]}
+                return b"data: %s\n\n" % to_json(found)
 
             async def events() -> AsyncIterator[bytes]:
                 told = b""
@@ -254,10 +264,10 @@ class Console:
             site = site if site in sites else None  # links lead somewhere
         kept = PageContext(root, "", query=request.query_params).range_kept if status == 200 else {}
         listed = f"{root}/{page.under if page.under in self.links else ''}"  # what is of one site is not looked for in another
-        look, who = request.cookies.get(_LOOK_COOKIE, ""), getattr(request.state, "operator", None)
+        look = request.cookies.get(_LOOK_COOKIE, "")
         frame = {
+            **_rights(request),
             "root": root,
-            "api": PageContext(root, "").api,
             "pages": {path: (*link, address(f"{root}/{path}", site=site, **kept)) for path, link in self.links.items()},
             "kept": {name: value for name, value in kept.items() if value},
             "usual": page.usual,
@@ -268,10 +278,7 @@ class Console:
             "find": request.query_params.get("find", ""),
             "look": look if look in _THEMES else "",
             "theme": _THEMES.get(look, "print"),
-            "person": who,
             "sign_out": SIGN_OUT,
-            "may_change": who is None or Scope.CHANGE in who.scopes,
-            "may_administer": who is None or Scope.OPERATORS in who.scopes,
             "warning": self.services.settings.guard.warning,
         }
         text = TEMPLATES.get_template(template).render(frame | found)
@@ -311,6 +318,17 @@ def scene_of(
     layers = [*ground(plan, picture, areas, below, shows_coverage=shows_coverage), *over]
     box = box_around(places_m, box_of(plan))
     return {"label": f"Map of {context.site}, version {version}", "box": box, "layers": layers, "follows": False}
+
+
+def _rights(request: Request) -> dict[str, object]:
+    """Who looks, what they may do, and where the API is."""
+    who = getattr(request.state, "operator", None)
+    return {
+        "api": PageContext(_root(request), "").api,
+        "person": who,
+        "may_change": who is None or Scope.CHANGE in who.scopes,
+        "may_administer": who is None or Scope.OPERATORS in who.scopes,
+    }
 
 
 def _root(request: Request) -> str:

@@ -116,6 +116,11 @@ class MapData:
             raise UsageError(f"the store has no site {site[:64]}; it has: {', '.join(known)}")
         return site or known[0]
 
+    def levels(self, site: str) -> dict[str, str]:
+        """Names of the floors in a site's building by their sites, the highest last; none where it is in no building."""
+        building = self.store.building(site) if self.is_mapped(site) else None
+        return {} if building is None else {floor.site: floor.level for floor in building.floors}
+
     def current_version(self, site: str) -> int | None:
         """The number of the current version, None before the first."""
         current = self.store.current(site) if self.is_mapped(site) else None

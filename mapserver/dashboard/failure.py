@@ -138,11 +138,12 @@ def first_looks(moments: Sequence[Moment], began_ns: int) -> dict[str, int]:
 def instants(moments: Sequence[Moment], pictures: Sequence[PictureRow], clock: FailureClock) -> list[dict[str, object]]:
     """All moments as the page shows them; pictures: the oldest first.
 
-    x, y, heading_rad: None without a pose; picture: number of the last one until then, -1 for none.
+    at_ms: since the first; x, y, heading_rad: None without a pose; picture: number of the last one until then, -1 for none. Where the robot
+    was silent, a further one says so.
     """
     found: list[dict[str, object]] = []
     picture = -1
-    for each in moments:
+    for each, next_ns in zip(moments, [*(later.stamp_ns for later in moments[1:]), 0], strict=False):
         while picture + 1 < len(pictures) and pictures[picture + 1].stamp_ns <= each.stamp_ns:
             picture += 1
         status, tone = words_of(each.status)
@@ -151,9 +152,18 @@ def instants(moments: Sequence[Moment], pictures: Sequence[PictureRow], clock: F
         belief = "no position" if x is None else f"at {x:.2f}, {y:.2f} m"
         belief += "" if each.radius_95_m is None else f", within {each.radius_95_m:.2f} m with 95 %"
         place = {"x": x, "y": y, "heading_rad": each.heading_rad, "belief": belief}
-        times = {"clock": clock.at(each.stamp_ns), "since": clock.since(each.stamp_ns)}
+        at_ms = _after_ms(moments, each.stamp_ns)
+        times = {"at_ms": at_ms, "clock": clock.at(each.stamp_ns), "since": clock.since(each.stamp_ns)}
         found.append({**times, "words": words, "tone": tone, "picture": picture, **place})
+        if next_ns - each.stamp_ns > _SILENT_S * 1e9:
+            silent = {"words": "nothing recorded", "tone": "quiet", "x": None, "y": None, "belief": ""}
+            found.append(found[-1] | silent | {"at_ms": at_ms + 100})
     return found
+
+
+def _after_ms(moments: Sequence[Moment], stamp_ns: int) -> int:
+    """How long after the first moment."""
+    return (stamp_ns - moments[0].stamp_ns) // 10**6
 
 
 def _place(moment: Moment) -> tuple[float, float] | None:
@@ -208,7 +218,7 @@ def page(services: Services, context: PageContext, failure: str) -> dict[str, ob
         "clock": clock,
         "views": services.shown("failure", context, row, report),
         "seconds": {"instants": instants(moments, recorded, clock), "pictures": pictures},
-        "steps": first_looks(moments, began_ns),
+        "steps": {name: _after_ms(moments, moments[n].stamp_ns) for name, n in first_looks(moments, began_ns).items()},
         "scene": _scene(services, context, row, report, believed_path(moments, clock)),
         "nearby": near[:_LISTED],
         "held": (incidents := held(services, [row, *near[:_LISTED]])),

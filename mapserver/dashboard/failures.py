@@ -11,26 +11,15 @@ from typing import NamedTuple
 from fleetmap.errors import UsageError
 from fleetmap.messages import Cause, FailureKind
 from mapserver.api.incidents import incidents, of_failure
-from mapserver.api.moments import steps
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN, MANY_FAILURES
+from mapserver.dashboard.fleet_parts import bar_edges
 from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
 from mapserver.fleet.incidents import Incident, with_acts
 from mapserver.store import FailureFilter, FailureRow
 
 AXES = {"cause": "Cause", "area": "Area", "tile": "Tile", "version": "Map version", "robot": "Robot"}
 _SHADES = 6  # of causes; the last is that of all others
-_HOUR_NS = 3_600_000_000_000
-_STEPS_NS = {
-    _HOUR_NS // 12: "5 minutes",
-    _HOUR_NS: "an hour",
-    6 * _HOUR_NS: "6 hours",
-    24 * _HOUR_NS: "a day",
-    168 * _HOUR_NS: "a week",
-    28 * 24 * _HOUR_NS: "4 weeks",
-    364 * 24 * _HOUR_NS: "52 weeks",
-}
-_BARS = 42
 Chosen = Mapping[str, str]
 """Values by axis; none of those that everything may have."""
 
@@ -175,8 +164,7 @@ def _chart(
     since_ns, until_ns = context.time_range()
     times = [row.happened_ns for row in rows]
     first_ns, end_ns = since_ns or min(times), until_ns or max(time.time_ns(), max(times) + 1)
-    step_ns = next((step for step in _STEPS_NS if (end_ns - first_ns) / step < _BARS), max(_STEPS_NS))
-    edges = steps(first_ns, end_ns, step_ns, context.zone)
+    edges, step = bar_edges(first_ns, end_ns, context.zone)
     counts = [Counter[str]() for _ in edges[1:]]
     for row in rows:
         counts[bisect(edges, row.happened_ns) - 1][row.cause] += 1
@@ -190,10 +178,10 @@ def _chart(
             )
         told = ", ".join(f"{part} {cause.replace('_', ' ') or 'unknown'}" for cause, part in count.most_common())
         span = {"since": context.written(start_ns), "until": context.written(stop_ns)}
-        words = f"{context.moment(start_ns)}, {_STEPS_NS[step_ns]}: {told or 'none'}"
+        words = f"{context.moment(start_ns)}, {step}: {told or 'none'}"
         bars.append({"words": words, "parts": parts, "to": context.to("failures", **{**chosen, **span})})
     ends = [context.written(ns)[:16].replace("T", " ") for ns in (edges[0], end_ns)]
-    return {"bars": bars, "most": most, "step": _STEPS_NS[step_ns], "ends": ends, "span": (edges[0], edges[-1])}
+    return {"bars": bars, "most": most, "step": step, "ends": ends, "span": (edges[0], edges[-1])}
 
 
 def _scene(

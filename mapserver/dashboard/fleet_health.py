@@ -1,8 +1,9 @@
 """Fleet health for the pages: rates with their intervals, failures, versions on trial."""
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import scipy
 
@@ -77,6 +78,13 @@ class HealthData:
         first = 0 if since_ns is None else hour_of(since_ns)
         end = hour_of(self._clock_ns() if until_ns is None else until_ns - 1) + 1
         return kpis(_sum(self._store.fleet.hours(site, "site", since_hour=first, until_hour=end), first, end))
+
+    def rates(self, site: str, edges_ns: Sequence[int]) -> list[Rate]:
+        """Failures per robot-day between each two edges, in the whole hours that end after the one and not after the other."""
+        edges = [hour_of(edge_ns) for edge_ns in edges_ns]
+        hours = self._store.fleet.hours(site, "site", since_hour=edges[0], until_hour=edges[-1])
+        counts = [_sum(hours, *span) for span in pairwise(edges)]
+        return [rate(each.position_failures, each.robot_days) for each in counts]
 
     def places(self, site: str, since_ns: int | None = None, until_ns: int | None = None) -> list[tuple[float, float]]:
         """Where failures of a time began; without one, of the days that are shown."""

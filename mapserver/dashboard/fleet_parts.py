@@ -1,11 +1,13 @@
 """What the page of trends and that of the shift leader show of a fleet; templates/fleet_parts.html draws it."""
 
 from collections.abc import Callable, Iterable, Sequence
+from datetime import tzinfo
 from typing import NamedTuple
 
+from mapserver.api.moments import steps
 from mapserver.dashboard.rendering import begun, share
 from mapserver.fleet_statistics.canary_decision import CanaryFinding
-from mapserver.fleet_statistics.kpis import Kpis, Rate, driven_words, figure, format_rate
+from mapserver.fleet_statistics.kpis import HOUR_NS, Kpis, Rate, driven_words, figure, format_rate
 from mapserver.fleet_statistics.robot_calibration import CalibrationFigure
 from mapserver.store import CanaryRow
 
@@ -16,6 +18,20 @@ _TRIAL_WORDS = {
     "stopped": ("warn", "was tried by {share} of the robots until the trial was stopped at {when}"),
 }
 
+_STEPS_NS = {
+    HOUR_NS // 12: "5 minutes",
+    HOUR_NS: "an hour",
+    6 * HOUR_NS: "6 hours",
+    24 * HOUR_NS: "a day",
+    168 * HOUR_NS: "a week",
+    28 * 24 * HOUR_NS: "4 weeks",
+    364 * 24 * HOUR_NS: "52 weeks",
+}
+_BARS = 42
+
+Choice = tuple[str, bool, str]
+"""Something to choose or to take back: its words, whether it is chosen, and the address that does it."""
+
 
 class Figure(NamedTuple):
     """A large value with a remark below. tone: as of a badge, or empty."""
@@ -24,6 +40,15 @@ class Figure(NamedTuple):
     value: object
     remark: str
     tone: str = ""
+
+
+class Sentence(NamedTuple):
+    """What a page begins with: its tone, since which moment it is so, and what to do."""
+
+    tone: str
+    words: str
+    exact: str = ""
+    advice: str = ""
 
 
 class Bar(NamedTuple):
@@ -37,10 +62,11 @@ class Bar(NamedTuple):
 
 
 class Bars(NamedTuple):
-    """Rates side by side."""
+    """Rates side by side. span: from when until when, nanoseconds since 1970, where a time is chosen by dragging in them."""
 
     name: str
     bars: list[Bar]
+    span: tuple[int, int] | None = None
 
     @property
     def top(self) -> float:
@@ -58,6 +84,13 @@ class Trial(NamedTuple):
     finding: str
     tried: Rate
     others: Rate
+
+
+def bar_edges(first_ns: int, end_ns: int, zone: tzinfo | None, least_ns: int = 0) -> tuple[list[int], str]:
+    """The edges of the bars that show a time, each as long as the words say, and no shorter than `least_ns`."""
+    wide = (step_ns for step_ns in _STEPS_NS if step_ns >= least_ns and (end_ns - first_ns) / step_ns < _BARS)
+    step_ns = next(wide, max(_STEPS_NS))
+    return steps(first_ns, end_ns, step_ns, zone), _STEPS_NS[step_ns]
 
 
 def trial_of(canary: CanaryRow, found: CanaryFinding) -> Trial:

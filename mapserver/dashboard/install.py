@@ -85,11 +85,11 @@ def _link(title: str) -> tuple[str, str]:
 def _install_pages(console: Console) -> None:
     """What a page is asked with beside its site, and what it follows."""
     console.page("", "overview.html", overview.page, link=_link("Overview"))
-    console.stream("now", overview.now)
+    console.stream("now", overview.now, shows=("fleet",))
     console.page("trends", "trends.html", overview.trends, link=_link("Trends"), usual="Last 24 h")
     console.page("robots", "robots.html", robots.page, link=_link("Robots"), knows=("state", "without"))
     console.page("robots/{robot}", "robot.html", robot.page, usual="Last drive")
-    console.stream("robots/{robot}/now", robot.now)
+    console.stream("robots/{robot}/now", robot.now, shows=("robot", "facts"))
     compared = ("version", "before", "after")
     console.page("map", "map.html", map_page.page, link=_link("Map"), knows=compared, usual="Last 14 days")
     filters = (*failures.AXES, "older", "sort")

@@ -69,10 +69,10 @@ class LiveRobot:
         """Whether it runs another version than it should."""
         return self.status.version != self.status.wanted_version
 
-    def where(self, areas: Areas) -> str:
-        """Where it was last, as people know it; empty where it never said."""
+    def where(self, areas: Areas, levels: Mapping[str, str]) -> str:
+        """Where it was last, as people know it; empty where it never said. levels: names of the building's floors by their sites."""
         if self.floor:
-            return f"on the floor {self.floor}"
+            return f"on the floor {levels.get(self.floor, self.floor)}"
         if self.place_m is None:
             return ""
         return areas.at(*self.place_m) or "at {:.1f}, {:.1f} m".format(*self.place_m)

@@ -4,15 +4,16 @@ pages; the Overview is kept up to date by a stream of server-sent events.
 
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 from fleetmap.messages import Flag
 from mapserver.dashboard import fleet_parts
 from mapserver.dashboard.console import PageContext, Services, scene_of
 from mapserver.dashboard.data import EVER
-from mapserver.dashboard.fleet_health import SiteHealth
-from mapserver.dashboard.fleet_parts import Bars, Figure
+from mapserver.dashboard.fleet_health import DAYS_SHOWN, SiteHealth
+from mapserver.dashboard.fleet_parts import Bar, Bars, Choice, Figure, Sentence, bar_edges
 from mapserver.dashboard.live import LiveRobot, LiveSite
 from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
 from mapserver.dashboard.map_page import verdict_words
@@ -20,7 +21,7 @@ from mapserver.dashboard.rendering import age, begun, share
 from mapserver.fleet.alerts import dropped_words
 from mapserver.fleet.incidents import Incident, with_acts
 from mapserver.fleet_statistics.area_trend import trend_sentence
-from mapserver.fleet_statistics.kpis import figure
+from mapserver.fleet_statistics.kpis import HOUR_NS, Rate, figure
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.floor_plan.areas import OUTSIDE, Areas
 
@@ -28,12 +29,23 @@ from mapserver.floor_plan.areas import OUTSIDE, Areas
 _ALERTS = {"FleetmapNightFailed": "surveys", "FleetmapFailureRate": "failures"} | dict.fromkeys(
     ("FleetmapDiskFills", "FleetmapTrustFault"), "administration"
 )
+_NAMES = 7  # below bars
 _MANY = 20  # robots, whose places say better than the map's tiles what to show first
+
+
+class Notice(NamedTuple):
+    """What needs somebody: tone, words, address and name of the page that says more, and the incident to act on."""
+
+    tone: str
+    words: str
+    to: str
+    more: str
+    incident: Incident | None = None
 
 
 def page(services: Services, context: PageContext) -> dict[str, object]:
     """What the template needs."""
-    return {"data": {"scene": _scene(services, context), "now": now(services, context)}}
+    return {"scene": _scene(services, context), "now": now(services, context)}
 
 
 def _scene(services: Services, context: PageContext) -> dict[str, object] | None:
@@ -47,14 +59,16 @@ def _scene(services: Services, context: PageContext) -> dict[str, object] | None
         Layer("Robots", _marks(context, live)),
     ]
     places = [robot.place_m for robot in live.robots if robot.place_m is not None]
-    return scene_of(services, context, version, layers, places_m=places if len(places) > _MANY else ())
+    scene = scene_of(services, context, version, layers, places_m=places if len(places) > _MANY else ())
+    return scene | {"fills_page": True}
 
 
 def now(services: Services, context: PageContext) -> dict[str, object]:
     """What changes from second to second."""
     live, health = services.robots.look(context.site), services.health.site(context.site)
     areas = services.maps.store.areas(context.site)
-    floors, guests = _floors(services, context)
+    levels, (floors, guests) = services.maps.levels(context.site), _floors(services, context)
+    week_ns = health.week_since_ns
     alerts = [one for one in with_acts(services.maps.store, health.alerts) if one.state != "closed"]
     own = {one.about: one for one in sorted(alerts, key=lambda one: one.state == "open") if one.name not in _ALERTS}
     robots = sorted(live.robots, key=lambda robot: robot.tone in {"good", "quiet"} and not _is_troubled(robot))
@@ -62,56 +76,52 @@ def now(services: Services, context: PageContext) -> dict[str, object]:
         "line": site_line(live),
         "notices": _notices(services, context, health, alerts),
         "figures": _figures(live, health),
-        "robots": [_robot(context, robot, health, areas, own.get(robot.name)) for robot in robots] + guests,
+        "days": [] if health.day.failures.low is None else [day.per_robot_day for day in health.days],
+        "span": (week_ns - 7 * 24 * HOUR_NS, week_ns + 7 * 24 * HOUR_NS),
+        "trends": context.to("trends"),
+        "robots": [_robot(context, robot, health, areas, levels, own.get(robot.name)) for robot in robots] + guests,
         "marks": _marks(context, live),
         "floors": floors,
     }
 
 
-def _floors(services: Services, context: PageContext) -> tuple[list[dict[str, object]], list[dict[str, object]]]:
+def _floors(services: Services, context: PageContext) -> tuple[list[Choice], list[dict[str, object]]]:
     """The floors of the site's building with the robots on each, the highest first; and the robots of other floors that are on this one."""
-    site = context.site
-    building = services.maps.store.building(site) if services.maps.is_mapped(site) else None
-    if building is None:
-        return [], []
-    robots = [robot for floor in building.floors for robot in services.robots.look(floor.site).robots]
+    site, levels = context.site, services.maps.levels(context.site)
+    robots = [robot for floor in levels for robot in services.robots.look(floor).robots]
     counts = Counter(robot.floor or robot.status.site for robot in robots if robot.tone != "quiet")
-    floors: list[dict[str, object]] = [
-        {
-            "words": f"{floor.level} ({counts[floor.site]})",
-            "to": context.to("", site=floor.site),
-            "is_chosen": floor.site == site,
-        }
-        for floor in reversed(building.floors)
+    floors = [
+        (f"{level} ({counts[floor]})", floor == site, context.to("", site=floor))
+        for floor, level in reversed(levels.items())
     ]
     guests = []
     for robot in robots:
         if robot.floor == site:
             own = replace(context, site=robot.status.site)
-            row = _robot(own, robot, services.health.site(own.site), Areas())
+            row = _robot(own, robot, services.health.site(own.site), Areas(), levels)
             guests.append(
                 row | {"name": f"{robot.name} of {own.site}", "about": "on this floor: it tells no position here"}
             )
     return floors, guests
 
 
-def site_line(live: LiveSite) -> dict[str, str]:
+def site_line(live: LiveSite) -> Sentence:
     """One sentence for all robots."""
     online = [robot for robot in live.robots if robot.tone != "quiet"]
     lost, unsure = live.count("bad"), live.count("warn")
     if not live.robots:
-        return {"tone": "quiet", "words": "No robot has reported yet; `locclient run` on a robot does."}
+        return Sentence("quiet", "No robot has reported yet; locclient run on a robot does.")
     if not online:
         last_s = min(robot.status.seconds_since for robot in live.robots)
-        return {"tone": "quiet", "words": f"All robots are offline; the last one reported {age(last_s)} ago."}
+        return Sentence("quiet", f"All robots are offline; the last one reported {age(last_s)} ago.")
     troubled = sum(map(_is_troubled, online))
     counts = ((lost, "not localised"), (unsure, "uncertain"), (troubled, "localised with a problem"))
     parts = [f"{count} {words}" for count, words in counts if count]
     if not parts:
         all_of_them = f"All {len(online)} robots online are" if len(online) > 1 else f"{online[0].name} is"
-        return {"tone": "good", "words": f"{all_of_them} localised."}
+        return Sentence("good", f"{all_of_them} localised.")
     told = f"Of {len(online)} robot{'s' * (len(online) > 1)} online: {', '.join(parts)}."
-    return {"tone": "bad" if lost else "warn", "words": told}
+    return Sentence("bad" if lost else "warn", told)
 
 
 def _is_troubled(robot: LiveRobot) -> bool:
@@ -150,7 +160,12 @@ def since_words(context: PageContext, robot: LiveRobot) -> tuple[str, str]:
 
 
 def _robot(
-    context: PageContext, robot: LiveRobot, health: SiteHealth, areas: Areas, alert: Incident | None = None
+    context: PageContext,
+    robot: LiveRobot,
+    health: SiteHealth,
+    areas: Areas,
+    levels: Mapping[str, str],
+    alert: Incident | None = None,
 ) -> dict[str, object]:
     """One row of the list. alert: of the robot."""
     words, own = remarks(robot), health.robots.get(robot.name)
@@ -168,15 +183,10 @@ def _robot(
         "state": robot.words,
         "since": since,
         "exact": exact,
-        "about": " · ".join(filter(None, [robot.where(areas), ", ".join(words)])),
+        "about": " · ".join(filter(None, [robot.where(areas, levels), ", ".join(words)])),
         "place": robot.place_m,
-        "incident": _incident(alert),
+        "incident": alert,
     }
-
-
-def _incident(alert: Incident | None) -> dict[str, object] | None:
-    """What the page needs to act on it."""
-    return None if alert is None else {"id": alert.id, "is_open": alert.state == "open"}
 
 
 def _marks(context: PageContext, live: LiveSite) -> list[Mark]:
@@ -184,23 +194,19 @@ def _marks(context: PageContext, live: LiveSite) -> list[Mark]:
     return [mark for robot in reversed(live.robots) for mark in robot.marks(context.to(f"robots/{robot.name}"))]
 
 
-def _figures(live: LiveSite, health: SiteHealth) -> list[dict[str, object]]:
+def _figures(live: LiveSite, health: SiteHealth) -> list[Figure]:
     """Those that are known: what cannot be known yet is left out."""
     online, failures = len(live.robots) - live.count("quiet"), health.day.failures
-    found: list[dict[str, object]] = [{"name": "Online", "value": f"{online} of {len(live.robots)}"}]
+    found = [Figure("Online", f"{online} of {len(live.robots)}", "")]
     if shown := share(health.day.localised_share_of_all):
-        found.append({"name": "Localised while driving, 24 h", "value": shown})
+        found.append(Figure("Localised while driving, 24 h", shown, ""))
     if failures.low is not None:
-        low, high = (figure(value or 0.0) for value in (failures.low, failures.high))
-        days = [day.per_robot_day for day in health.days]
-        value, more = figure(failures.per_robot_day or 0.0), f"in truth {low} to {high}, with 95 % certainty"
-        found.append({"name": "Failures per robot-day, 24 h", "value": value, "more": more, "days": days})
+        value, low, high = (figure(rate or 0.0) for rate in (failures.per_robot_day, failures.low, failures.high))
+        found.append(Figure("Failures per robot-day, 24 h", value, f"in truth {low} to {high}, with 95 % certainty"))
     return found
 
 
-def _notices(
-    services: Services, context: PageContext, health: SiteHealth, alerts: Sequence[Incident]
-) -> list[dict[str, object]]:
+def _notices(services: Services, context: PageContext, health: SiteHealth, alerts: Sequence[Incident]) -> list[Notice]:
     """Alerts, a draft that waits, trials, running or just ended, and what got worse this week, each with a page that says more."""
     store, site = services.maps.store, context.site
     told = []
@@ -213,21 +219,21 @@ def _notices(
         tone, words, said = fleet_parts.trial_words(trial, context.moment)
         verdict, stop, _ = said.partition(". ")  # the page of trends has the rates
         told.append((tone, f"{words} {verdict}{stop}", "trends"))
-    found: list[dict[str, object]] = [
-        {
-            "tone": "bad" if one.state == "open" else "quiet",
-            "words": f"{begun(one.words)}.{f' {one.assignee} has it.' if one.assignee else ''}",
-            "to": context.to(_ALERTS[one.name]),
-            "more": begun(_ALERTS[one.name]),
-            "incident": _incident(one),
-        }
+    found = [
+        Notice(
+            "bad" if one.state == "open" else "quiet",
+            f"{begun(one.words)}.{f' {one.assignee} has it.' if one.assignee else ''}",
+            context.to(_ALERTS[one.name]),
+            begun(_ALERTS[one.name]),
+            one,
+        )
         for one in alerts
         if one.name in _ALERTS
     ]
-    found += [{"tone": tone, "words": words, "to": context.to(page), "more": begun(page)} for tone, words, page in told]
+    found += [Notice(tone, words, context.to(page), begun(page)) for tone, words, page in told]
     if health.areas:
         words = f"This week: {trend_sentence(list(health.areas))}."
-        found.append({"tone": "quiet", "words": words, "to": f"{context.to('trends')}#worse", "more": "Area by area"})
+        found.append(Notice("quiet", words, f"{context.to('trends')}#worse", "Area by area"))
     return found
 
 
@@ -246,8 +252,13 @@ def trends(services: Services, context: PageContext) -> dict[str, object]:
         Figure("Time with a usable position", share(day.availability) or "–", f"of the {when}"),
     ]
     cameras = fleet_parts.cameras((robot.name, robot.calibration) for robot in live.robots)
-    names = [*(f"-{n} d" for n in range(len(health.days) - 1, 0, -1)), "24 h"]
-    bars = [fleet_parts.rate_bar(*day) for day in zip(names, health.days, strict=True)]
+    begin_ns = span_ns[0] or (span_ns[1] or time.time_ns()) - DAYS_SHOWN * 24 * HOUR_NS
+    end_ns = span_ns[1] or max(time.time_ns(), begin_ns + 1)
+    for least_h in (1, 6, 24):  # until most bars tell something
+        edges, step = bar_edges(begin_ns, end_ns, context.zone, least_h * HOUR_NS)
+        rates = services.health.rates(context.site, edges)
+        if sum(rate.low is not None for rate in rates) > len(rates) / 2:
+            break
     return {
         "tried": fleet_parts.trials_shown(health.trials, context.moment),
         "kpis": figures,
@@ -257,13 +268,24 @@ def trends(services: Services, context: PageContext) -> dict[str, object]:
         "has_areas": health.has_areas,
         "outside": OUTSIDE,
         "since": context.written(span_ns[0] or health.week_since_ns),
-        "days": Bars("Failures per robot-day", bars),
+        "bars_over_time": Bars("Failures per robot-day", _bars(context, edges, rates), (edges[0], edges[-1])),
+        "step": step,
         "cameras": cameras,
         "drifting": sum(any(one.is_drifted for one in told.values()) for _, told in cameras),
         "parameters": {name: words for name, words in PARAMETERS.items() if any(name in told for _, told in cameras)},
         "concerns": health.resurvey,
         "outlines": _outlines(services, context.site),
     }
+
+
+def _bars(context: PageContext, edges: Sequence[int], rates: Sequence[Rate]) -> list[Bar]:
+    """Rates by the clock of whoever looks; few of them are named."""
+    is_day, every = edges[1] - edges[0] > 20 * HOUR_NS, -(-len(rates) // _NAMES)
+    starts = [context.written(edge)[slice(5, 10) if is_day else slice(11, 16)] for edge in edges[:-1]]
+    names = [name if n % every == 0 else "" for n, name in enumerate(starts)]
+    moments = (context.moment(edge) for edge in edges)
+    found = (fleet_parts.rate_bar(*bar) for bar in zip(names, rates, strict=True))
+    return [bar._replace(words=f"{moment}: {bar.words}") for moment, bar in zip(moments, found, strict=False)]
 
 
 def _outlines(services: Services, site: str) -> dict[str, list[tuple[float, float]]]:

@@ -13,6 +13,7 @@ from mapserver.dashboard.console import PageContext, Services, scene_of
 from mapserver.dashboard.data import EVER
 from mapserver.dashboard.failures import ADVICE, failure_marks, tone_of
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN
+from mapserver.dashboard.fleet_parts import Sentence
 from mapserver.dashboard.live import ORDER, SILENT, LiveRobot, words_of
 from mapserver.dashboard.map_layers import Layer, Line
 from mapserver.dashboard.overview import remarks, since_words
@@ -223,9 +224,8 @@ def now(services: Services, context: PageContext, robot: str) -> dict[str, objec
     """What changes from second to second."""
     live = services.robots.look(context.site).robot(robot)
     if live is None:
-        line = {"tone": "quiet", "words": "It is not known any more.", "exact": "", "advice": ""}
-        return {"line": line, "facts": [], "marks": []}
-    where = live.where(services.maps.store.areas(context.site))
+        return {"line": Sentence("quiet", "It is not known any more."), "facts": [], "marks": []}
+    where = live.where(services.maps.store.areas(context.site), services.maps.levels(context.site))
     state, (since, exact) = live.words.capitalize(), since_words(context, live)
     if live.tone == "quiet":
         state += f", last heard {since} ago"
@@ -236,7 +236,7 @@ def now(services: Services, context: PageContext, robot: str) -> dict[str, objec
     words = f"{': '.join(filter(None, [', '.join(filter(None, [state, where])), why]))}."
     told = [live.words] if is_offline else [*live.flags, live.words]
     advice = next((_ADVICE[name] for name in told if name in _ADVICE), "")
-    line = {"tone": live.tone, "words": words, "exact": exact and f"since {exact}", "advice": advice}
+    line = Sentence(live.tone, words, exact and f"since {exact}", advice)
     return {"line": line, "facts": _facts(live), "marks": live.marks()}
 
 

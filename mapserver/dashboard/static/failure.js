@@ -3,8 +3,8 @@ const { instants, pictures } = JSON.parse(document.getElementById("seconds").tex
 const [moment, seen, caption, now, when, belief, map] = ["moment", "seen", "seen-when", "now", "when", "belief", "map"].map((id) => document.getElementById(id));
 const address = ([place]) => seen.src.replace(/\d+$/, place);
 
-function show() {
-  const { x, y, tone, words, clock, since, heading_rad, picture, belief: believed } = instants[moment.value];
+function show(chosen_ms) {
+  const { x, y, tone, words, clock, since, heading_rad, picture, belief: believed } = instants.findLast(({ at_ms }) => at_ms <= chosen_ms);
   moment.setAttribute("aria-valuetext", `${clock}, ${since}: ${words}`);
   [now.textContent, now.className, when.textContent, belief.textContent] = [words, tone, `at ${clock}, ${since}`, believed];
   if (pictures.length) {
@@ -16,13 +16,13 @@ function show() {
   map?.map?.show("Chosen moment", x === null ? [] : [mark], false);
 }
 
-moment.addEventListener("input", show);
+moment.addEventListener("input", () => show(moment.value));
 for (const step of document.querySelectorAll("[data-at]"))
   step.addEventListener("click", () => {
     moment.value = step.dataset.at;
-    show();
+    show(step.dataset.at);
   });
 // Before somebody steps: a picture that comes late would be that of another moment.
 for (const begins of ["pointerenter", "focus"])
   moment.addEventListener(begins, () => pictures.forEach((each) => (new Image().src = address(each))), { once: true });
-show();
+show(moment.defaultValue); // its value is a tenth of a second

@@ -31,7 +31,7 @@ addEventListener("pointerup", ({ clientX }) => {
     const { since, until } = chart.dataset;
     const { start, end, left, width } = boxOf(clientX);
     const [first, last] = [start, end].map((px) => (Number(since) + ((px - left) / width) * (until - since)) / MINUTE_MS);
-    const to = new URL(location);
+    const to = new URL(chart.dataset.to ?? location, location);
     for (const [name, minute] of [["since", Math.floor(first)], ["until", Math.ceil(last)]])
       to.searchParams.set(name, `${new Date(minute * MINUTE_MS).toISOString().slice(0, 16)}Z`);
     location.assign(to);

@@ -1,29 +1,10 @@
-// The page of a robot: what it is now, from second to second, and a person's word of where it stands.
+// A person's word of where a robot stands.
 import "./maps.js";
-import "./renew.js";
-import { follow } from "./stream.js";
 
 const element = document.getElementById("map");
 const map = element?.map;
-const line = document.getElementById("line");
-const advice = document.getElementById("advice");
-const facts = document.getElementById("facts");
 const place = document.getElementById("place");
 const robot = document.querySelector("h1").textContent;
-const made = (tag, text) => Object.assign(document.createElement(tag), { textContent: text }); // robots choose their words: never markup
-
-function say({ tone, words, exact, advice: what = "" }) {
-  Object.assign(line, { className: `notice ${tone}`, title: exact });
-  if (line.textContent !== words) line.textContent = words;
-  advice.textContent = what;
-}
-
-function show({ line: told, facts: known, marks }) {
-  say(told);
-  facts.replaceChildren(...known.flatMap(([name, value]) => [made("dt", name), made("dd", value)]));
-  map?.show("Robots", marks);
-  for (const { x, y } of map && !map.touched ? marks : []) map.map.panInside([y, x], { padding: [40, 40] });
-}
 
 function choose() {
   const button = place.querySelector("[data-act]");
@@ -46,5 +27,3 @@ if (place) {
   });
   choose();
 }
-show(JSON.parse(document.getElementById("now").textContent));
-follow(`${robot}/now`, show, () => say({ words: "The server does not answer; trying again.", tone: "bad", exact: "" }));

@@ -104,6 +104,12 @@ def test_moments_and_pictures_of_another_time_are_left_out() -> None:
     assert list(story.first_looks(CARRIED[:60], BEGAN_NS)) == ["A second before", "As it began"]
 
 
+def test_the_seconds_have_a_gap_where_the_robot_was_silent() -> None:
+    found = story.instants((*CARRIED[:10], *CARRIED[60:]), [], story.FailureClock(BEGAN_NS, AT_NS, UTC))
+    told = [(each["at_ms"], each["words"]) for each in found[9:12]]
+    assert told == [(900, "localised"), (1000, "nothing recorded"), (6000, "lost, odometry lost")]
+
+
 def test_the_path_is_broken_where_the_estimate_was_corrected() -> None:
     lines = story.believed_path(CARRIED, story.FailureClock(BEGAN_NS, AT_NS, None))
     assert [(line.tone, len(line.points)) for line in lines] == [("good", 50), ("good", 31)]

@@ -149,7 +149,7 @@ PLACE_OF = """name => {
   const copy = document.createElement('canvas').getContext('2d', {willReadFrequently: true});
   copy.drawImage(canvas, corner.x - x, corner.y - y);
   const paint = copy.getImageData(0, 0, 1, 1).data;
-  const { layers } = JSON.parse(document.getElementById('data').textContent).scene;
+  const { layers } = JSON.parse(map.dataset.scene);
   const [left, low, right] = layers.flatMap(({ items }) => items).find(({ kind }) => kind === 'picture').box;
   const scale = (right - left) / picture.width;
   return paint[3] === 255 ? [left + (x - picture.x) * scale, low + (picture.bottom - y) * scale] : null;
@@ -280,6 +280,11 @@ def test_a_time_is_dragged_in_a_chart_and_kept_on_other_pages(page: Page, served
     page.locator(".range summary").click()
     page.get_by_role("link", name="Last 24 h", exact=True).click()
     expect(page.locator("main")).to_contain_text("What got worse this week")
+    bars = page.locator(".bars .ground")
+    bars.drag_to(bars, force=True, source_position={"x": 1, "y": 9})  # to its middle
+    page.wait_for_url(re.compile("since=.*until="))
+    since, until = (datetime.fromisoformat(parse_qs(urlsplit(page.url).query)[name][0]) for name in SPAN)
+    assert until - since == pytest.approx(timedelta(days=7.5), abs=timedelta(hours=12))
     assert seen.faults == []
 
 

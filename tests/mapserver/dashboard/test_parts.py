@@ -46,7 +46,7 @@ EVIL = "<script>alert(1)</script>\"'&"
 def test_words_from_elsewhere_never_become_markup() -> None:
     template = (
         '{% from "parts.html" import act, site_map with context %}{{ act(evil, evil, evil, {evil: evil}, evil) }}'
-        "{{ site_map(evil, {evil: evil}, evil) }}{% for words, to in context.range_presets(evil) %}{{ words }}{{ to }}{% endfor %}"
+        "{{ site_map(evil, {evil: evil}) }}{% for words, to in context.range_presets(evil) %}{{ words }}{{ to }}{% endfor %}"
     )
     context = PageContext(EVIL, EVIL, UTC)
     given = {"evil": EVIL, "root": EVIL, "api": EVIL, "site": EVIL, "may_change": True, "context": context}

@@ -136,11 +136,9 @@ def test_pages_lead_to_the_other_floors_and_list_robots_where_they_are(house: Pa
             site="hall-1", robot="r1", stamp_ns=1, version=1, status="TRACKING", metrics={"floor": "hall-2"}
         )
         bus.publish(robot_key("hall-1", "r1", "health"), encode_message(health))
-        assert eventually(
-            lambda: '"name":"r1 of hall-1","to":"/dashboard/robots/r1?site=hall-1"' in shown("?site=hall-2")
-        )
-        assert '"words":"L2 (1)"' in shown("?site=hall-2")
-        assert '"about":"on the floor hall-2"' in shown("?site=hall-1")
+        assert eventually(lambda: 'href="/dashboard/robots/r1?site=hall-1">r1 of hall-1</a>' in shown("?site=hall-2"))
+        assert ">L2 (1)</a>" in shown("?site=hall-2")
+        assert ">on the floor L2</span>" in shown("?site=hall-1")
 
 
 def test_lifts_drawn_in_the_building_come_back_in_the_map(house: Path) -> None:

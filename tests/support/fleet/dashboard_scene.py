@@ -18,6 +18,7 @@ from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.geometry import se3
 from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import (
+    Cause,
     FailureReport,
     FixNote,
     Placement,
@@ -182,8 +183,9 @@ def speak(bus: Bus, robot: str, stamp_ns: int, place_m: tuple[float, float], sta
     map_from_base = se3(np.eye(3), np.array([*place_m, 0.0]))
     estimate = PoseMessage.of(stamp_ns, map_from_base, np.eye(6) * 1e-4, status, 2)
     bus.publish(robot_key(SITE, robot, "pose"), encode_message(estimate))
+    flags = () if status == "TRACKING" else (Cause.ODOMETRY,)
     health = RobotHealth(
-        site=SITE, robot=robot, stamp_ns=stamp_ns, version=2, status=status, metrics={"speed_mps": 0.8}
+        site=SITE, robot=robot, stamp_ns=stamp_ns, version=2, status=status, flags=flags, metrics={"speed_mps": 0.8}
     )
     bus.publish(robot_key(SITE, robot, "health"), encode_message(health))
 

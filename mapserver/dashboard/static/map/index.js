@@ -1,8 +1,9 @@
 // The map of all pages: leaflet over metres (x to the right, y up), with layers and with marks that move between two reports.
 import * as L from "../vendor/leaflet/leaflet.js";
-import { Axes, Marks, MarkSet, Trails, words } from "./marks.js";
+import { Axes, Marks, MarkSet, Switch, words } from "./marks.js";
 
 const POINTS_PER_NAME_PX = 7;
+const FIT = { padding: [6, 6], animate: false };
 
 const corners = ([x0, y0, x1, y1]) => [[y0, x0], [y1, x1]];
 const places = (points) => points.map(([x, y]) => [y, x]);
@@ -16,20 +17,16 @@ const DRAWN = {
     if (item.hue !== null) drawn.on("add", () => drawn.getElement().style.setProperty("stroke", `hsl(${item.hue} 75% 55% / .55)`));
     return drawn;
   },
-  dots(item) {
-    const points = [];
-    for (let n = 0; n < item.points.length; n += 2) {
-      const place = [item.points[n + 1], item.points[n]];
-      points.push([place, place]);
-    }
-    return L.polyline(points, { className: "dots", weight: 2.5, smoothFactor: 0, noClip: true, interactive: false });
+  dots({ points }) {
+    const dots = Array.from({ length: points.length / 2 }, (_, n) => Array(2).fill([points[2 * n + 1], points[2 * n]]));
+    return L.polyline(dots, { className: "dots", weight: 2.5, smoothFactor: 0, noClip: true, interactive: false });
   },
 };
 
 export class SiteMap {
   // element: is filled by the map; scene: label, box and layers as of map_layers.py; onPick(x, y, mark): a click, but on a mark that leads to a page.
-  // fillsPage: the wheel zooms at once; else it scrolls the page until the map has the focus.
-  constructor(element, scene, { onPick = () => {}, fillsPage = false } = {}) {
+  // fills_page of a scene: the wheel zooms at once; else it scrolls the page until the map has the focus.
+  constructor(element, scene, { onPick = () => {} } = {}) {
     this.element = element;
     this.scene = scene;
     element.setAttribute("role", "group");
@@ -42,14 +39,15 @@ export class SiteMap {
       zoomAnimation: false,
       fadeAnimation: false,
       attributionControl: false,
-      scrollWheelZoom: fillsPage,
+      scrollWheelZoom: scene.fills_page ?? false,
       renderer: L.svg({ padding: 0.5 }),
     }));
-    if (!fillsPage) {
+    if (!scene.fills_page) {
       map.on("focus", () => map.scrollWheelZoom.enable());
       map.on("blur", () => map.scrollWheelZoom.disable());
     }
-    map.fitBounds(corners(scene.box), { padding: [6, 6] });
+    this.bounds = L.latLngBounds(corners(scene.box));
+    map.fitBounds(this.bounds, FIT);
     const marks = new Marks();
     if (scene.hasAxes !== false) map.addLayer(new Axes());
     map.addLayer(marks);
@@ -63,23 +61,20 @@ export class SiteMap {
     for (const { name, items, shown } of scene.layers) {
       const group = (this.layers[name] = L.layerGroup());
       group.marks = new MarkSet(marks);
-      group.addLayer(group.marks);
+      group.addLayer(new Switch(group.marks, "isShown"));
       if (shown) group.addTo(map);
       chosen[name] = group;
       this.fill(group, items, false);
-      if (name === "Robots") chosen["Trails of the last minute"] = new Trails(group.marks);
+      if (name === "Robots") chosen["Trails of the last minute"] = new Switch(group.marks, "hasTrails");
     }
     L.control.layers({}, chosen, { collapsed: true }).addTo(map);
     map.on("zoomend overlayadd", this.nameAreas, this);
     this.nameAreas();
-    this.follows = scene.follows;
-    map.on("dragstart", () => (this.follows = false));
-    element.addEventListener("wheel", () => (this.follows &&= !map.scrollWheelZoom.enabled()), { passive: true });
+    element.addEventListener("wheel", () => (this.touched ||= map.scrollWheelZoom.enabled()), { passive: true });
     this.observer = new ResizeObserver(() => {
       map.invalidateSize({ pan: false });
-      if (!this.touched) map.fitBounds(corners(this.box ?? scene.box), { padding: [6, 6], animate: false });
+      if (!this.touched) map.fitBounds(this.bounds, FIT);
     });
-    map.on("dragstart", () => (this.touched = true));
     element.addEventListener("pointerdown", () => (this.touched = true));
     this.observer.observe(element);
   }
@@ -88,7 +83,7 @@ export class SiteMap {
     this.map.remove();
   }
   fill(group, items, isMoving) {
-    for (const layer of group.getLayers()) if (layer !== group.marks) group.removeLayer(layer);
+    for (const layer of group.getLayers()) if (!(layer instanceof Switch)) group.removeLayer(layer);
     for (const item of items) {
       if (item.kind === "mark") continue;
       const drawn = DRAWN[item.kind](item);
@@ -106,15 +101,12 @@ export class SiteMap {
     if (!group) return; // of a version that was published while the page is open
     this.fill(group, items, isMoving);
     this.nameAreas();
-    if (this.follows && !this.touched) this.grow(items);
+    if (this.scene.follows && !this.touched) this.grow(items);
   }
   grow(items) {
-    const box = (this.box ??= [...this.scene.box]);
-    const add = ([x, y]) => {
-      [box[0], box[1], box[2], box[3]] = [Math.min(box[0], x - 2), Math.min(box[1], y - 2), Math.max(box[2], x + 2), Math.max(box[3], y + 2)];
-    };
-    for (const item of items) if (item.kind === "line") item.points.forEach(add);
-    this.map.fitBounds(corners(box), { padding: [6, 6], animate: false });
+    for (const item of items)
+      if (item.kind === "line") for (const [x, y] of item.points) this.bounds.extend(corners([x - 2, y - 2, x + 2, y + 2]));
+    this.map.fitBounds(this.bounds, FIT);
   }
   nameAreas() {
     // A name is there where its area has room for it.

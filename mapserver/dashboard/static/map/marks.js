@@ -69,10 +69,9 @@ const Painted = L.Layer.extend({
       L.DomUtil.setPosition(this.canvas, this.map.containerPointToLayerPoint([0, 0]));
       this.scale = this.map.options.crs.scale(this.map.getZoom());
       this.origin = this.map.layerPointToContainerPoint(L.point(0, 0).subtract(this.map.getPixelOrigin()));
-      const style = getComputedStyle(this.map.getContainer());
-      this.tones = {};
-      for (const tone of ["ground", "ink", "edge", "quiet", "good", "warn", "bad", "accent"])
-        this.tones[tone] = style.getPropertyValue(`--${tone}`);
+      const { style } = this.canvas;
+      const read = (tone) => ((style.color = `var(--${tone})`), [tone, getComputedStyle(this.canvas).color]);
+      this.tones = Object.fromEntries(["ground", "ink", "edge", "quiet", "good", "warn", "bad", "accent"].map(read));
     }
     const pen = this.canvas.getContext("2d");
     pen.setTransform(devicePixelRatio, 0, 0, devicePixelRatio, 0, 0);
@@ -272,21 +271,13 @@ export const Marks = Painted.extend({
   },
 });
 
-// The marks of one layer, which leaflet adds and removes with it.
-export const MarkSet = L.Layer.extend({
-  initialize(painter) {
+// The marks of one layer; they and their trails are shown by a `Switch` each.
+export class MarkSet {
+  constructor(painter) {
     this.painter = painter;
     this.marks = new Map();
     painter.sets.push(this);
-  },
-  onAdd() {
-    this.isShown = true;
-    this.painter.refresh();
-  },
-  onRemove() {
-    this.isShown = false;
-    this.painter.refresh();
-  },
+  }
   show(items, isMoving) {
     const still = !isMoving || matchMedia("(prefers-reduced-motion: reduce)").matches;
     const before = this.marks;
@@ -305,19 +296,20 @@ export const MarkSet = L.Layer.extend({
       this.marks.set(key, mark);
     });
     this.painter.refresh();
-  },
-});
+  }
+}
 
-export const Trails = L.Layer.extend({
-  initialize(set) {
-    this.set = set;
+export const Switch = L.Layer.extend({
+  initialize(set, name) {
+    this.turn = (isOn) => {
+      set[name] = isOn;
+      set.painter.refresh();
+    };
   },
   onAdd() {
-    this.set.hasTrails = true;
-    this.set.painter.refresh();
+    this.turn(true);
   },
   onRemove() {
-    this.set.hasTrails = false;
-    this.set.painter.refresh();
+    this.turn(false);
   },
 });

@@ -1,0 +1,23 @@
+// What changes from second to second, as the server's stream tells it: parts of the page, and the robots on its map.
+import "./maps.js";
+import { renewParts } from "./morph.js";
+import { follow } from "./stream.js";
+
+const NEAR_ZOOM = 5;
+const map = document.getElementById("map")?.map;
+
+function take({ html, marks }) {
+  const fresh = new DOMParser().parseFromString(html, "text/html");
+  renewParts(fresh, [...fresh.body.children].map(({ id }) => document.getElementById(id)));
+  map?.show("Robots", marks);
+  if (marks.length === 1 && map && !map.touched) map.map.panInside([marks[0].y, marks[0].x], { padding: [40, 40] });
+}
+
+document.getElementById("robots")?.addEventListener("click", ({ target }) => {
+  const place = target.closest("a, button") ? undefined : target.closest("li").dataset.place;
+  if (place) map?.map.setView(JSON.parse(place), NEAR_ZOOM);
+});
+follow(document.querySelector("[data-stream]").dataset.stream, take, () => {
+  const line = document.getElementById("line");
+  Object.assign(line, { textContent: "The server does not answer; trying again.", className: `${line.classList[0]} bad` });
+});
