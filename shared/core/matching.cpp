@@ -34,16 +34,23 @@ struct Nearest {
   bool passes(int max_distance, double ratio) const { return best <= max_distance && double(best) < ratio * double(second); }
 };
 
+// Fills the distances of a descriptor from columns first..last, over wide registers.
+[[gnu::always_inline]] inline void measure(const uint64_t* from, const Columns& columns, size_t first, size_t last,
+                                           std::vector<int32_t>& distances) {
+  const uint64_t a0 = from[0], a1 = from[1], a2 = from[2], a3 = from[3];
+  const uint64_t* w0 = columns.words.data() + first;
+  const uint64_t *w1 = w0 + columns.count, *w2 = w1 + columns.count, *w3 = w2 + columns.count;
+  int32_t* __restrict distance = distances.data();
+  for (size_t j = 0; j < last - first; ++j)
+    distance[j] = int32_t(std::popcount(a0 ^ w0[j]) + std::popcount(a1 ^ w1[j]) + std::popcount(a2 ^ w2[j]) + std::popcount(a3 ^ w3[j]));
+}
+
 // Compares one row with columns first..last. Each loop is one over wide registers.
 [[gnu::always_inline]] inline void compare_row(const uint64_t* row, int64_t row_index, const Columns& columns, size_t first, size_t last,
                                                std::vector<int32_t>& scratch, Claims& claims, Nearest& nearest) {
   const size_t count = last - first;
-  const uint64_t a0 = row[0], a1 = row[1], a2 = row[2], a3 = row[3];
-  const uint64_t* w0 = columns.words.data() + first;
-  const uint64_t *w1 = w0 + columns.count, *w2 = w1 + columns.count, *w3 = w2 + columns.count;
+  measure(row, columns, first, last, scratch);
   int32_t* __restrict distance = scratch.data();
-  for (size_t j = 0; j < count; ++j)
-    distance[j] = int32_t(std::popcount(a0 ^ w0[j]) + std::popcount(a1 ^ w1[j]) + std::popcount(a2 ^ w2[j]) + std::popcount(a3 ^ w3[j]));
   int32_t* __restrict claimed = claims.distance.data() + first;
   int64_t* __restrict claimant = claims.row.data() + first;
   for (size_t j = 0; j < count; ++j) {
@@ -70,21 +77,6 @@ Pairs returned(const std::vector<int64_t>& choice, const Claims& claims) {
   for (size_t i = 0; i < choice.size(); ++i)
     if (choice[i] >= 0 && claims.row[size_t(choice[i])] == int64_t(i)) pairs.emplace_back(int64_t(i), choice[i]);
   return pairs;
-}
-
-// For every descriptor of a, the nearest of b (-1 none), its distance and the second smallest one (kFar none).
-// Ties go to the lower index.
-auto nearest_two(const Packed& packed_a, const Packed& packed_b) {
-  const Descriptors a = packed_a, b = packed_b;
-  auto index = zeros<int64_t>(a.count);
-  auto first = zeros<int32_t>(a.count), second = zeros<int32_t>(a.count);
-  unlocked([&] {
-    for (size_t i = 0; i < a.count; ++i) {
-      const TwoNearest found(a[i], b);
-      index[i] = found.first, first[i] = found.distance, second[i] = found.second_distance;
-    }
-  });
-  return std::tuple(as_numpy<int64_t>(std::move(index)), as_numpy<int32_t>(std::move(first)), as_numpy<int32_t>(std::move(second)));
 }
 
 // Pairs that are each other's nearest, by rising index in a: at most max_distance apart, and below ratio times the distance of
@@ -151,12 +143,67 @@ auto mutual_within(const Packed& a, const Array<int32_t, -1, 2>& nodes_a, const 
   return as_numpy<int64_t>(unlocked([&] { return mutual_pairs_within(a, nodes_a.data(), b, nodes_b.data(), max_distance, ratio); }));
 }
 
+// For each descriptor, `cells` numbers of the centres nearest to it, the nearest first, -1 where there are fewer. Ties go to the lower
+// number.
+std::vector<int32_t> cells_of(Descriptors descriptors, Descriptors centres, size_t cells) {
+  const Columns columns(centres);
+  std::vector<int32_t> distances(centres.count), nearest(cells), numbers(descriptors.count * cells, -1);
+  run_popcount([&]() __attribute__((always_inline)) {
+    for (size_t i = 0; i < descriptors.count; ++i) {
+      measure(descriptors[i], columns, 0, centres.count, distances);
+      int32_t* const found = numbers.data() + i * cells;
+      size_t held = 0;
+      for (size_t c = 0; c < centres.count; ++c) {
+        if (held == cells && distances[c] >= nearest[cells - 1]) continue;
+        size_t at = held < cells ? held++ : cells - 1;
+        for (; at > 0 && nearest[at - 1] > distances[c]; --at) nearest[at] = nearest[at - 1], found[at] = found[at - 1];
+        nearest[at] = distances[c], found[at] = int32_t(c);
+      }
+    }
+  });
+  return numbers;
+}
+
+size_t checked_cells(int cells) {
+  if (cells < 1 || cells > 1024) throw nb::value_error("cells: 1 to 1024");
+  return size_t(cells);
+}
+
+auto nearest_cells(const Packed& descriptors, const Packed& centres, int cells) {
+  const size_t wanted = checked_cells(cells);
+  return as_numpy<int32_t, 2>(unlocked([&] { return cells_of(descriptors, centres, wanted); }), {descriptors.shape(0), wanted});
+}
+
+// Which of the held descriptors are within max_bits of any query, and lie in one of the `cells` cells nearest to the query. Those of cell
+// c are held[starts[c]] to held[starts[c + 1]].
+// Sources: Sivic and Zisserman 2003 on inverted files; Jegou, Douze and Schmid 2008 on querying several cells and comparing bits.
+auto near_descriptors(const Packed& queries, const Packed& centres, int cells, const Packed& held_ones, const Indices& starts,
+                      int max_bits) {
+  const size_t asked = checked_cells(cells);
+  const Descriptors descriptors = queries, held = held_ones;
+  check_rows(centres.shape(0) + 1, "starts: one more than centres", starts);
+  for (size_t c = 0; c < starts.shape(0); ++c)
+    if (starts(c) < (c ? starts(c - 1) : 0) || starts(c) > int64_t(held.count)) throw nb::value_error("starts: rising, of held");
+  auto is_near = zeros<uint8_t>(held.count);
+  unlocked([&] {
+    const std::vector<int32_t> numbers = cells_of(descriptors, centres, asked);
+    for (size_t i = 0; i < descriptors.count; ++i)
+      for (size_t p = 0; p < asked && numbers[i * asked + p] >= 0; ++p) {
+        const size_t cell = size_t(numbers[i * asked + p]);
+        for (int64_t j = starts(cell); j < starts(cell + 1); ++j)
+          if (!is_near[size_t(j)] && hamming(descriptors[i], held[size_t(j)]) <= max_bits) is_near[size_t(j)] = true;
+      }
+  });
+  return as_numpy<bool>(std::move(is_near));
+}
+
 }  // namespace
 
 void bind_matching(nb::module_& module) {
-  module.def("nearest_two", &nearest_two, "a"_a, "b"_a);
   module.def("mutual", &mutual, "a"_a, "b"_a, "max_distance"_a, "ratio"_a);
   module.def("mutual_within", &mutual_within, "a"_a, "nodes_a"_a, "b"_a, "nodes_b"_a, "max_distance"_a, "ratio"_a);
+  module.def("nearest_cells", &nearest_cells, "descriptors"_a, "centres"_a, "cells"_a);
+  module.def("near_descriptors", &near_descriptors, "descriptors"_a, "centres"_a, "cells"_a, "held"_a, "starts"_a, "max_bits"_a);
 }
 
 }  // namespace fleetmap

@@ -46,24 +46,6 @@ void run_popcount(const Loop& loop) {
 }
 #endif
 
-// Of many descriptors the nearest to another and the second nearest, -1 for none, with their distances. Ties go to the lower index.
-struct TwoNearest {
-  int64_t first = -1, second = -1;
-  int distance = kFar, second_distance = kFar;
-
-  TwoNearest(const uint64_t* descriptor, Descriptors among) {
-    for (size_t i = 0; i < among.count; ++i) {
-      const int apart = hamming(descriptor, among[i]);
-      if (apart < distance) {
-        second_distance = std::exchange(distance, apart);
-        second = std::exchange(first, int64_t(i));
-      } else if (apart < second_distance) {
-        second_distance = apart, second = int64_t(i);
-      }
-    }
-  }
-};
-
 using Pairs = std::vector<std::pair<int64_t, int64_t>>;
 
 // Predicted pixels and appearance of landmarks or features in an image; NaN excludes one from matching.

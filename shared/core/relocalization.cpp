@@ -18,7 +18,6 @@ constexpr double kNarrower = 0.6;    // of the guided radius, around the first a
 constexpr double kWidestOctave = 3.0, kCoarsestOctave = 5.0;  // up to which windows, and pixels' errors, grow
 constexpr double kOctavesApart = 2.0;                         // of a feature from the one that is expected
 constexpr double kMostAcrossPx = 10.0;                        // that a landmark's own sigma counts for
-constexpr double kNearlyPx = 50.0;                            // beside the image
 constexpr double kPassedM = 1.0, kPassedCosine = 0.8;         // limits of the survey's cameras that define covisible landmarks
 constexpr double kColumns = 8.0, kRows = 6.0;                 // the parts of an image
 constexpr double kPatchRadius = 15.0;                         // of a descriptor, at the finest octave
@@ -247,56 +246,6 @@ std::optional<MapFix> fix_by_projection(const MapLandmarks& map, std::span<const
   fix.features = std::move(matched->features), fix.rows = std::move(matched->rows);
   fix.points_map = std::move(matched->points), fix.pixels = std::move(matched->pixels), fix.sigmas_px = std::move(matched->sigmas);
   return fix;
-}
-
-double median_distance(const MapLandmarks& map, const StereoImage& camera, const FixLimits& limits, const SE3& map_from_cam) {
-  const VisibleLandmarks visible =
-      visible_landmarks(map.cones, map_from_cam, camera, float(limits.distance_scale), kNearlyPx, std::numbers::pi, limits.octave_scale);
-  std::vector<double> distances;
-  for (const int64_t row : visible.rows) distances.push_back(norm(vec3(map.cones.points_map + 3 * row) - map_from_cam.translation));
-  if (distances.empty()) return std::numeric_limits<double>::quiet_NaN();
-  const auto middle = distances.begin() + ptrdiff_t(distances.size() / 2);
-  std::nth_element(distances.begin(), middle, distances.end());
-  return distances.size() % 2 ? *middle : 0.5 * (*std::max_element(distances.begin(), middle) + *middle);
-}
-
-void nearest_cells(Descriptors descriptors, Descriptors centres, size_t wanted, int32_t* cells) {
-  const size_t count = centres.count;
-  std::vector<uint64_t> columns(4 * count);  // of the centres, by word: wide registers compare several at once
-  for (size_t c = 0; c < count; ++c)
-    for (size_t w = 0; w < 4; ++w) columns[w * count + c] = centres[c][w];
-  const uint64_t *w0 = columns.data(), *w1 = w0 + count, *w2 = w1 + count, *w3 = w2 + count;
-  std::vector<int32_t> all(count), nearest(wanted);  // distances of all centres, and of the cells
-  std::fill_n(cells, descriptors.count * wanted, -1);
-  run_popcount([&]() __attribute__((always_inline)) {
-    for (size_t i = 0; i < descriptors.count; ++i) {
-      const uint64_t a0 = descriptors[i][0], a1 = descriptors[i][1], a2 = descriptors[i][2], a3 = descriptors[i][3];
-      int32_t* __restrict distances = all.data();
-      for (size_t c = 0; c < count; ++c)
-        distances[c] =
-            int32_t(std::popcount(a0 ^ w0[c]) + std::popcount(a1 ^ w1[c]) + std::popcount(a2 ^ w2[c]) + std::popcount(a3 ^ w3[c]));
-      int32_t* const found = cells + i * wanted;
-      size_t held = 0;
-      for (size_t c = 0; c < count; ++c) {
-        if (held == wanted && distances[c] >= nearest[wanted - 1]) continue;
-        size_t at = held < wanted ? held++ : wanted - 1;
-        for (; at > 0 && nearest[at - 1] > distances[c]; --at) nearest[at] = nearest[at - 1], found[at] = found[at - 1];
-        nearest[at] = distances[c], found[at] = int32_t(c);
-      }
-    }
-  });
-}
-
-void mark_near(Descriptors descriptors, Descriptors centres, size_t asked, Descriptors held, const int64_t* starts, int max_bits,
-               uint8_t* is_near) {
-  std::vector<int32_t> cells(descriptors.count * asked);
-  nearest_cells(descriptors, centres, asked, cells.data());
-  for (size_t i = 0; i < descriptors.count; ++i)
-    for (size_t p = 0; p < asked && cells[i * asked + p] >= 0; ++p) {
-      const int64_t* cell = starts + cells[i * asked + p];
-      for (int64_t j = cell[0]; j < cell[1]; ++j)
-        if (!is_near[j] && hamming(descriptors[i], held[size_t(j)]) <= max_bits) is_near[j] = true;
-    }
 }
 
 }  // namespace fleetmap

@@ -98,17 +98,4 @@ struct MapFix {
 std::optional<MapFix> fix_by_projection(const MapLandmarks& map, std::span<const QueryFrame> frames, const StereoImage& camera,
                                         const FixLimits& limits, SE3 map_from_cam, double radius_px);
 
-// The median distance of the landmarks expected in view, or nearly so; NaN without any.
-double median_distance(const MapLandmarks& map, const StereoImage& camera, const FixLimits& limits, const SE3& map_from_cam);
-
-// Fills, for each descriptor, `wanted` numbers of the centres nearest to it, the nearest first, -1 where there are fewer. Ties go to the
-// lower number.
-void nearest_cells(Descriptors descriptors, Descriptors centres, size_t wanted, int32_t* cells);
-
-// Marks indexed descriptors within max_bits of any query, if they lie in one of the `asked` cells nearest to the query.
-// Those of cell c are held[starts[c]] to held[starts[c + 1]].
-// Sources: Sivic and Zisserman 2003 on inverted files; Jegou, Douze and Schmid 2008 on querying several cells and comparing bits.
-void mark_near(Descriptors descriptors, Descriptors centres, size_t asked, Descriptors held, const int64_t* starts, int max_bits,
-               uint8_t* is_near);
-
 }  // namespace fleetmap

@@ -1,4 +1,4 @@
-// The vocabulary's tree of binary words: descent to the words, and the nearest of the root's branches; places by their words.
+// The vocabulary's tree of binary words: descent to the words; places by their words.
 #include "bindings/in_turn.h"  // first: Python's header comes before the system's
 
 #include <algorithm>
@@ -39,20 +39,6 @@ auto descend(const Packed& packed, const Packed& packed_centres, const Numbers& 
     }
   });
   return as_numpy<int32_t>(std::move(words));
-}
-
-// For each descriptor, the numbers of the nearest centre and of the second nearest: the same twice for one centre, 0 for none.
-// Ties go to the lower number.
-auto two_nearest(const Packed& packed, const Packed& packed_centres) {
-  const Descriptors descriptors = packed, centres = packed_centres;
-  auto found = zeros<std::array<int32_t, 2>>(descriptors.count);
-  unlocked([&] {
-    for (size_t i = 0; i < descriptors.count; ++i) {
-      const TwoNearest nearest(descriptors[i], centres);
-      found[i] = {int32_t(std::max<int64_t>(nearest.first, 0)), int32_t(std::max<int64_t>(nearest.second, 0))};
-    }
-  });
-  return as_numpy<int32_t>(std::move(found));
 }
 
 using Weights = Array<float, -1>;
@@ -102,7 +88,6 @@ using SharedFile = Shared<InvertedFile>;
 
 void bind_vocabulary(nb::module_& module) {
   module.def("descend", &descend, "descriptors"_a, "centres"_a, "first_child"_a, "child_count"_a, "word_of_node"_a);
-  module.def("two_nearest", &two_nearest, "descriptors"_a, "centres"_a);
   nb::class_<SharedFile>(module, "InvertedFile")
       .def(nb::init<int>(), "words"_a)
       .def("add", in_turn<PythonLock::kReleased>(&InvertedFile::add), "word_ids"_a, "weights"_a)

@@ -25,9 +25,6 @@ _Pyramid = tuple[_Grey, _Grey, _Grey]
 _Counts = NDArray[np.uint16]
 _Rows = Callable[[_Reals, _Reals, _Reals, _Reals, bool], tuple[_Reals, _Reals, _Reals, _Reals]]
 
-def nearest_two(a: _Descriptors, b: _Descriptors) -> tuple[_Indices, _Numbers, _Numbers]:
-    """For each of a: (A,) index of the nearest of b, -1 for none, its distance, the second smallest one. Ties go to the lower index."""
-
 def mutual(a: _Descriptors, b: _Descriptors, max_distance: int, ratio: float) -> _Indices:
     """(P, 2) pairs that are each other's nearest."""
 
@@ -57,9 +54,6 @@ def descend(
     word_of_node: _Numbers,
 ) -> _Numbers:
     """(N,) words of a vocabulary's tree, whose arrays have a row for each node."""
-
-def two_nearest(descriptors: _Descriptors, centres: _Descriptors) -> _Numbers:
-    """(N, 2) numbers of the nearest and the second nearest centre."""
 
 class InvertedFile:
     """Index of places by their words."""
@@ -151,9 +145,6 @@ class FixFinder:
         refinement: tuple[float, float, tuple[int, int]],
         clearance_px: _Grey | None = None,
     ) -> None: ...
-    def median_distance_m(self, map_from_cam: _Reals) -> float:
-        """Median distance of the landmarks expected in a camera's view; NaN without any."""
-
     def by_projection(
         self,
         features: tuple[_Reals, _Reals, _Octaves, _Descriptors],

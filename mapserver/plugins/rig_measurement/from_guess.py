@@ -18,8 +18,9 @@ from scipy.optimize import least_squares
 from scipy.sparse import csr_matrix
 
 from fleetmap.errors import RecordingError
+from fleetmap.features.extraction import extract
 from fleetmap.features.matching import match_mutual
-from fleetmap.features.orb import Features, detect
+from fleetmap.features.orb import Features
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, se3, se3_inverse, skew, so3_exp, so3_log
 from fleetmap.recordings.calibration_files import format_calibration
@@ -116,12 +117,12 @@ def raw_matches(recording: Recording, on_progress: Callable[[str, int, int], Non
     for n, at in enumerate(np.linspace(0, len(frames) - 1 - max(_STEPS), _MOMENTS).astype(int).tolist()):
         on_progress("matching", n, _MOMENTS)
         frame = recording.read_frame(int(frames[max(at, 0)]))
-        left = detect(frame.left, settings)
+        left = extract(frame.left, settings)
         if frame.right is not None:
-            pairs.append(_chosen(_matched(left, detect(frame.right, settings)), rng))
+            pairs.append(_chosen(_matched(left, extract(frame.right, settings)), rng))
         for step in _STEPS:
             later = recording.read_frame(int(frames[min(max(at, 0) + step, len(frames) - 1)]))
-            match = _matched(left, detect(later.left, settings))
+            match = _matched(left, extract(later.left, settings))
             if len(match) > 60 and np.median(np.linalg.norm(match[:, :2] - match[:, 2:], axis=1)) > _LEAST_FLOW_PX:
                 motions.append(_chosen(match, rng))
     return RawMatches(np.concatenate(pairs) if pairs else np.zeros((0, 4)), motions)

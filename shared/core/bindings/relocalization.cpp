@@ -99,10 +99,6 @@ class FixFinder {
     });
   }
 
-  double median_distance_m(const SE3& map_from_cam) const {
-    return unlocked([&] { return median_distance(map(), camera_, limits_, map_from_cam); });
-  }
-
   auto by_projection(const Features& features, const std::optional<Unmeasured>& unmeasured, const SE3& map_from_cam, double radius_px,
                      const std::vector<EarlierFrame>& earlier) const {
     if (earlier.size() > kMostEarlier) throw nb::value_error("earlier: at most 16 frames");
@@ -146,29 +142,6 @@ class FixFinder {
   FixLimits limits_;
 };
 
-size_t checked_cells(int cells) {
-  if (cells < 1 || cells > 1024) throw nb::value_error("cells: 1 to 1024");
-  return size_t(cells);
-}
-
-auto nearest_cells_of(const Packed& descriptors, const Packed& centres, int cells) {
-  const size_t count = descriptors.shape(0), wanted = checked_cells(cells);
-  auto found = zeros<int32_t>(count * wanted);
-  unlocked([&] { nearest_cells(descriptors, centres, wanted, found.data()); });
-  return as_numpy<int32_t, 2>(std::move(found), {count, wanted});
-}
-
-auto near_descriptors_of(const Packed& descriptors, const Packed& centres, int cells, const Packed& held, const Indices& starts,
-                         int max_bits) {
-  const size_t asked = checked_cells(cells), count = held.shape(0);
-  check_rows(centres.shape(0) + 1, "starts: one more than centres", starts);
-  for (size_t c = 0; c < starts.shape(0); ++c)
-    if (starts(c) < (c ? starts(c - 1) : 0) || starts(c) > int64_t(count)) throw nb::value_error("starts: rising, of held");
-  auto is_near = zeros<uint8_t>(count);
-  unlocked([&] { mark_near(descriptors, centres, asked, held, starts.data(), max_bits, is_near.data()); });
-  return as_numpy<bool>(std::move(is_near));
-}
-
 }  // namespace
 
 void bind_relocalization(nb::module_& module) {
@@ -177,13 +150,10 @@ void bind_relocalization(nb::module_& module) {
                     double, double, const nb::object&, const nb::object&, double, const Limits&, const std::optional<Image>&>(),
            "cones"_a, "sigmas_m"_a, "descriptors"_a, "map_from_cam"_a, "shown"_a, "shown_from"_a, "pinhole"_a, "distance_scale"_a,
            "octave_scale"_a, "fix"_a, "stereo"_a, "min_inlier_share"_a, "refinement"_a, "clearance_px"_a = nb::none())
-      .def("median_distance_m", &FixFinder::median_distance_m, "map_from_cam"_a)
       .def("by_projection", &FixFinder::by_projection, "features"_a, "unmeasured"_a, "map_from_cam"_a, "radius_px"_a,
            "earlier"_a = nb::tuple());
   module.def("visible_landmarks", &visible_landmarks_of, "cones"_a, "map_from_cam"_a, "pinhole"_a, "distance_scale"_a, "margin_px"_a,
              "max_view_angle_rad"_a, "octave_scale"_a);
-  module.def("nearest_cells", &nearest_cells_of, "descriptors"_a, "centres"_a, "cells"_a);
-  module.def("near_descriptors", &near_descriptors_of, "descriptors"_a, "centres"_a, "cells"_a, "held"_a, "starts"_a, "max_bits"_a);
 }
 
 }  // namespace fleetmap

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.errors import MapFormatError, NewerFormatError
+from fleetmap.errors import MapFormatError, check_format
 from fleetmap.features.matching import Descriptors, Packed, packed
 
 WordIds = NDArray[np.int32]
@@ -71,7 +71,8 @@ class Vocabulary:
 
     def branches(self, descriptors: Descriptors) -> NDArray[np.int32]:
         """(N, 2) numbers of the two children of the root nearest to each descriptor (N, 32); 0 without children."""
-        return core.two_nearest(packed(descriptors), self.centres[1 : 1 + int(self.child_count[0])])
+        children = self.centres[1 : 1 + int(self.child_count[0])]
+        return np.maximum(core.nearest_cells(packed(descriptors), children, 2), 0)
 
     def bow_vector(self, words: WordIds) -> BowVector:
         """The tf-idf vector of a place's words (N,), L1-normalised. Source: Galvez-Lopez and Tardos 2012 (DBoW2)."""
@@ -114,15 +115,9 @@ def decode_vocabulary(data: bytes) -> Vocabulary:
 
 def _checked_header(data: bytes) -> tuple[int, int]:
     """Check the header and the checksum; return the numbers of nodes and words."""
-    if len(data) < _HEADER.size or data[:4] != _MAGIC:
-        raise MapFormatError(
-            f"vocabulary: {len(data)} bytes beginning {data[:4]!r}, not {_MAGIC!r}; another kind of file"
-        )
-    _, number, reserved, nodes, words, checksum = _HEADER.unpack_from(data)
-    if number > VOCABULARY_FORMAT:
-        raise NewerFormatError(
-            f"vocabulary has format {number}, this fleetmap reads up to {VOCABULARY_FORMAT}; update fleetmap to read it"
-        )
+    header = data[: _HEADER.size].ljust(_HEADER.size, b"\0")
+    magic, number, reserved, nodes, words, checksum = _HEADER.unpack(header)
+    check_format("vocabulary", magic, _MAGIC, number, VOCABULARY_FORMAT)
     if number < 1 or reserved != 0 or not 1 <= words <= nodes <= MAX_NODES:
         raise MapFormatError(
             f"vocabulary: format {number}, {nodes} nodes, {words} words (at most {MAX_NODES}): damaged, fetch it again"

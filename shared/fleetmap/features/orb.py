@@ -11,7 +11,7 @@ from fleetmap import core
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array
 from fleetmap.sensors.samples import Image
-from fleetmap.time_sliced import TimeSliced, finished
+from fleetmap.time_sliced import TimeSliced
 
 SCALE_FACTOR = 1.2
 _PATCH_RADIUS = 15
@@ -47,18 +47,11 @@ class Features:
         return cls(np.zeros((0, 2)), np.zeros(0, np.int8), np.zeros(0, np.float32), np.zeros((0, 32), np.uint8))
 
 
-def detect(image: Image, settings: OrbSettings, clearance_px: Image | None = None) -> Features:
+def detect_in_slices(image: Image, settings: OrbSettings, clearance_px: Image | None = None) -> TimeSliced[Features]:
     """Features of a rectified grey image, spread by suppression per level, whose patches show nothing of the robot itself.
 
-    Source: Rublee et al. 2011 (ORB), Mur-Artal 2015 (levels).
-    """
-    return finished(detect_in_slices(image, settings, clearance_px))
-
-
-def detect_in_slices(image: Image, settings: OrbSettings, clearance_px: Image | None = None) -> TimeSliced[Features]:
-    """As `detect`, in slices of about equal work: corners, descriptors, and the caller's use of them.
-
-    An image whose noise makes corners of its own is smoothed first (3x3 binomial).
+    In slices of about equal work: corners, descriptors, and the caller's use of them. An image whose noise makes corners of its own is
+    smoothed first (3x3 binomial). Sources: Rublee et al. 2011 (ORB), Mur-Artal 2015 (levels).
     """
     image = np.ascontiguousarray(image)
     if noise_grey(image) > _NOISE_SHARE * settings.fast_threshold:

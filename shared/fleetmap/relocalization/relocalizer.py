@@ -23,6 +23,7 @@ _RANKED = 8  # ratio of ranked to tried places
 _TRIALS_AT_A_PLACE = 2
 SAME_PLACE_M, _SAME_PLACE_COSINE = 1.2, 0.8  # less than half a bay: no look-alike place is so near
 _MIN_RANSAC_SHARE = 0.15
+_NEARLY_PX = 50.0  # beside the image: landmarks there count as in view for the search window
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,9 +293,10 @@ class Relocalizer:
 
     def _radius_px(self, map_from_cam: Array, cov_rot_trans: Array) -> float:
         """Three sigmas of a landmark's predicted pixel, at the median distance of the expected landmarks."""
-        depth = self._finder.median_distance_m(np.ascontiguousarray(map_from_cam))
-        if np.isnan(depth):
+        rows = self.view.visible(map_from_cam, self._camera, _NEARLY_PX, np.pi).rows
+        if not len(rows):
             return np.inf
+        depth = float(np.median(np.linalg.norm(self.view.points_map[rows] - map_from_cam[:3, 3], axis=1)))
         angle, position = _sigmas(cov_rot_trans)
         three_sigmas_px = 3.0 * self._camera.focal_px * (position / max(depth, 0.5) + angle)
         return max(self._settings.fix.guided_radius_px, three_sigmas_px)

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.bow.vocabulary import encode_vocabulary
-from fleetmap.features.orb import detect
+from fleetmap.features.extraction import extract
 from fleetmap.features.settings import OrbSettings
 from fleetmap.mapformat.names import sha256_hex
 from fleetmap.sensors.rectification import Rectifier
@@ -45,7 +45,7 @@ def features() -> list[NDArray[np.uint8]]:
         for number in np.unique(np.linspace(0, len(times) - 1, PICTURES).round().astype(int)):
             left, right = session.renderer.shoot(times[number])
             frame = rectifier.rectify(CameraFrame(0, left.image, right.image))
-            found.append(detect(frame.left, OrbSettings()).descriptors)
+            found.append(extract(frame.left, OrbSettings()).descriptors)
         session.renderer.close()
         print(f"{order.scenario} seed {order.seed}: {len(found)} pictures so far", flush=True)
     return found

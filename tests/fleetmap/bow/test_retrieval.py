@@ -17,7 +17,7 @@ from fleetmap.bow.vocabulary import (
     encode_vocabulary,
     shipped_vocabulary,
 )
-from fleetmap.features.orb import detect
+from fleetmap.features.extraction import extract
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, rotation_angle_rad, rotation_from_quat_wxyz
 from support.recordings.realdata import real_data
@@ -31,7 +31,7 @@ def _flight(root: Path) -> tuple[list[np.ndarray], Array, list[Array]]:
     truth = np.loadtxt(root / "state_groundtruth_estimate0" / "data.csv", delimiter=",")
     near = [int(np.argmin(np.abs(truth[:, 0] - int(stamp)))) for stamp, _ in rows]
     pictures = [cv2.imread(str(root / "cam0" / "data" / name.strip()), cv2.IMREAD_GRAYSCALE) for _, name in rows]
-    looks = [detect(picture, OrbSettings()).descriptors for picture in pictures]
+    looks = [extract(picture, OrbSettings()).descriptors for picture in pictures]
     return looks, truth[near, 1:4], [rotation_from_quat_wxyz(quat_wxyz) for quat_wxyz in truth[near, 4:8]]
 
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from fleetmap import core
 from fleetmap.features.matching import FAR, Projected, match_by_projection, match_mutual, packed
 from fleetmap.features.orb import Features
 from fleetmap.geometry import Array
@@ -28,31 +27,6 @@ def _family(rng: np.random.Generator, count: int) -> tuple[np.ndarray, np.ndarra
     noise = np.packbits(rng.random((count, 256)) < rng.uniform(0.0, 0.25, (count, 1)), axis=1)
     b = np.concatenate([a ^ noise, a[: count // 5], _descriptors(rng, count // 3)])
     return a, b[rng.permutation(len(b))]
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_knn2_is_brute_force(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    a, b = _family(rng, 60)
-    table = _distances(a, b)
-    index, first, second = core.nearest_two(packed(a), packed(b))
-    np.testing.assert_array_equal(index, table.argmin(1))
-    ordered = np.sort(table, axis=1)
-    np.testing.assert_array_equal(first, ordered[:, 0])
-    np.testing.assert_array_equal(second, ordered[:, 1])
-
-
-def test_knn2_of_too_few() -> None:
-    rng = np.random.default_rng(0)
-    a, nothing = _descriptors(rng, 3), np.zeros((0, 32), np.uint8)
-    index, first, second = core.nearest_two(packed(a), packed(nothing))
-    assert (index == -1).all()
-    assert (first == FAR).all()
-    index, first, second = core.nearest_two(packed(a), packed(a[:1]))
-    assert (index == 0).all()
-    assert first[0] == 0
-    assert (second == FAR).all()
-    assert len(core.nearest_two(packed(nothing), packed(a))[0]) == 0
 
 
 @pytest.mark.parametrize("nodes", [0, 1, 3, 4])  # 0: all with all

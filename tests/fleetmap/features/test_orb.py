@@ -7,6 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from fleetmap.features import orb
+from fleetmap.features.extraction import extract
 from fleetmap.features.matching import match_mutual
 from fleetmap.features.settings import OrbSettings
 from support.worlds.synthetic_texture import picture, pixel_grid, smooth_texture
@@ -30,14 +31,14 @@ def occupied(pixels: NDArray[np.floating]) -> int:
 
 
 def test_features_spread_better_than_plain_orb(image: NDArray[np.uint8]) -> None:
-    features = orb.detect(image, OrbSettings(count=300))
+    features = extract(image, OrbSettings(count=300))
     plain = cv2.ORB.create(nfeatures=300).detect(image, None)
     assert 200 < len(features) <= 310
     assert occupied(features.pixels) > 1.3 * occupied(np.array([k.pt for k in plain]))
 
 
 def test_some_features_are_taken(image: NDArray[np.uint8]) -> None:
-    features = orb.detect(image, OrbSettings(count=200))
+    features = extract(image, OrbSettings(count=200))
     taken = features.take(np.array([5, 3]))
     np.testing.assert_array_equal(taken.pixels, features.pixels[[5, 3]])
     np.testing.assert_array_equal(taken.descriptors, features.descriptors[[5, 3]])
@@ -52,8 +53,8 @@ def test_features_are_found_again_in_a_turned_or_larger_picture(scale: float, an
     second_from_first = scale * np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
     centre = np.array([WIDTH / 2, HEIGHT / 2])
     first_uv = (np.stack([u, v], -1) - centre) @ np.linalg.inv(second_from_first).T + centre
-    first = orb.detect(picture(texture, u, v), OrbSettings(count=400))
-    second = orb.detect(picture(texture, first_uv[..., 0], first_uv[..., 1]), OrbSettings(count=400))
+    first = extract(picture(texture, u, v), OrbSettings(count=400))
+    second = extract(picture(texture, first_uv[..., 0], first_uv[..., 1]), OrbSettings(count=400))
     pairs = match_mutual(first.descriptors, second.descriptors, 60, 0.85)
     expected = (first.pixels[pairs[:, 0]] - centre) @ second_from_first.T + centre
     good = np.linalg.norm(expected - second.pixels[pairs[:, 1]], axis=1) < 4.0
@@ -88,7 +89,7 @@ def test_by_night_more_of_the_scene_is_found_again(image: NDArray[np.uint8], mon
     def found(sigma: float) -> list[orb.Features]:
         rng = np.random.default_rng(2)
         noisy = [np.clip(np.rint(scene + rng.normal(0.0, sigma, scene.shape)), 0, 255).astype(np.uint8) for _ in "ab"]
-        return [orb.detect(picture, SOME) for picture in noisy]
+        return [extract(picture, SOME) for picture in noisy]
 
     aware = found(6.0), found(2.0)
     monkeypatch.setattr(orb, "_NOISE_SHARE", np.inf)

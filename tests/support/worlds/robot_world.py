@@ -10,13 +10,14 @@ import numpy as np
 
 from fleetmap.bow.vocabulary import decode_vocabulary, encode_vocabulary
 from fleetmap.features import orb
+from fleetmap.features.extraction import extract
 from fleetmap.geometry import Array
 from fleetmap.mapformat.manifest import CameraEntry
 from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples
-from fleetmap.sources.sensor_bundle import SensorBundle
+from fleetmap.sources.intake import SensorBundle
 from fleetmap.version_grid import TILE_CELLS, encode_grid, grid_report
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import LoadedMap
@@ -116,7 +117,7 @@ def tiles() -> tuple[Tile, ...]:
     parts = []
     for index in range(0, len(sample.stamps_ns), 6):
         frame = rectifier().rectify(CameraFrame(int(sample.stamps_ns[index]), sample.left[index], sample.right[index]))
-        features = orb.detect(frame.left, SETTINGS.orb)
+        features = extract(frame.left, SETTINGS.orb)
         map_from_cam = sample.world_from_body[index] @ rectifier().body_from_cam
         rays = (features.pixels - [camera.cx_px, camera.cy_px]) / camera.focal_px
         points = points_seen(map_from_cam, rays * FOCAL + [WIDTH / 2 - 0.5, HEIGHT / 2 - 0.5])

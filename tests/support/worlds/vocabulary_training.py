@@ -78,7 +78,8 @@ def seed_centres(bits: Packed, branching: int, uniforms: Array) -> Packed:
     centres = bits[[int(uniforms[0] * len(bits))]]
     squared = np.full(len(bits), FAR * FAR)
     while True:
-        squared = np.minimum(squared, core.nearest_two(bits, centres[-1:])[1].astype(np.int64) ** 2)
+        apart = np.unpackbits((bits ^ centres[-1]).view(np.uint8), axis=1).sum(axis=1, dtype=np.int64)
+        squared = np.minimum(squared, apart**2)
         passed = np.cumsum(squared)
         if len(centres) == branching or passed[-1] == 0:
             return centres
@@ -93,7 +94,7 @@ def cluster(bits: Packed, centres: Packed, iterations: int) -> Indices:
     """
     labels, each = np.full(len(bits), -1), np.unpackbits(bits.view(np.uint8), axis=1, bitorder="little")
     for _ in range(iterations):
-        before, labels = labels, core.nearest_two(bits, centres)[0]
+        before, labels = labels, core.nearest_cells(bits, centres, 1)[:, 0]
         if np.array_equal(labels, before):
             break
         counts = np.bincount(labels, minlength=len(centres))
