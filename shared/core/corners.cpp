@@ -13,11 +13,7 @@ namespace {
 
 constexpr ptrdiff_t kCircleRadius = 3;
 
-inline Eight<int16_t> eight(const uint8_t* pixels) {
-  Eight<uint8_t> bytes;
-  std::memcpy(&bytes, pixels, sizeof bytes);
-  return __builtin_convertvector(bytes, Eight<int16_t>);
-}
+inline Eight<int16_t> wide(const uint8_t* pixels) { return __builtin_convertvector(eight(pixels), Eight<int16_t>); }
 
 template <bool kHighest>
 inline uint8_t extreme(uint8_t a, uint8_t b) {
@@ -98,8 +94,8 @@ void min_eigenvalues(GreyImage image, const Pixel* pixels, size_t count, double*
     Eight<int32_t> column_xx = {}, column_xy = {}, column_yy = {};
     for (ptrdiff_t v = 0; v < 7; ++v) {
       const uint8_t* row = corner + v * image.width;
-      const auto along = __builtin_convertvector(eight(row + 1) - eight(row - 1), Eight<int32_t>);
-      const auto down = __builtin_convertvector(eight(row + image.width) - eight(row - image.width), Eight<int32_t>);
+      const auto along = __builtin_convertvector(wide(row + 1) - wide(row - 1), Eight<int32_t>);
+      const auto down = __builtin_convertvector(wide(row + image.width) - wide(row - image.width), Eight<int32_t>);
       column_xx += along * along;
       column_xy += along * down;
       column_yy += down * down;

@@ -2,7 +2,6 @@
 
 #include <algorithm>
 #include <cmath>
-#include <cstring>
 #include <limits>
 
 namespace fleetmap {
@@ -26,12 +25,6 @@ using WideWindow = float[kWideCells];
 struct Template {
   Window grey = {}, right = {}, down = {};  // brightness and its slopes
 };
-
-inline Eight<float> eight(const float* from) {
-  Eight<float> out;
-  std::memcpy(&out, from, sizeof out);
-  return out;
-}
 
 // A line or column of an image that is mirrored beyond its edges.
 inline ptrdiff_t mirrored(ptrdiff_t at, ptrdiff_t size) {

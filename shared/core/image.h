@@ -5,6 +5,7 @@
 #include <cmath>
 #include <cstddef>
 #include <cstdint>
+#include <cstring>
 
 namespace fleetmap {
 
@@ -35,6 +36,13 @@ inline ptrdiff_t whole(double number) { return std::abs(number) < 1e9 ? ptrdiff_
 // Eight numbers in one wide register, by the compilers' vector types: loops over bytes come out half as fast.
 template <typename Number>
 using Eight [[gnu::vector_size(8 * sizeof(Number))]] = Number;
+
+template <typename Number>
+inline Eight<Number> eight(const Number* from) {
+  Eight<Number> out;
+  std::memcpy(&out, from, sizeof out);
+  return out;
+}
 
 // The shares of four neighbouring pixels in the brightness between them, a to the right and b downwards.
 template <typename Real>

@@ -89,11 +89,7 @@ class Correlation {
       for (int v = 0; v < side; ++v) {
         const float* r = row(v) + n;
         Eight<float> of_row = {};
-        for (int u = 0; u < side; ++u) {
-          Eight<float> values;
-          std::memcpy(&values, r + u, sizeof values);
-          of_row += l[v][u] * values;
-        }
+        for (int u = 0; u < side; ++u) of_row += l[v][u] * eight(r + u);
         total += of_row;
       }
       std::memcpy(of_.products.data() + n, &total, sizeof total);

@@ -129,12 +129,24 @@ bool Tracker::search_motion(size_t agree, TrackedMotion& found) {
   return agree >= model_.min_inliers;
 }
 
+// Goes on with the points that have next pixels: those that next_of(n) returns.
+template <typename NextOf>
+void Tracker::keep_points(const NextOf& next_of) {
+  size_t stay = 0;
+  for (size_t n = 0; n < ids_.size(); ++n) {
+    const std::optional<Vec3> next = next_of(n);
+    if (!next) continue;
+    ids_[stay] = ids_[n];
+    store(*next, pixels_.data() + 3 * stay++);
+  }
+  ids_.resize(stay), pixels_.resize(3 * stay);
+}
+
 // Ends points farther than the limit from their predicted pixels; points without depth cannot disagree. The others go on with the
 // disparity that the motion leaves them, the prior of the new one.
 void Tracker::keep_agreeing(const TrackedMotion& motion) {
   const StereoLens& lens = model_.lens;
-  size_t stay = 0;
-  for (size_t n = 0; n < ids_.size(); ++n) {
+  keep_points([&](size_t n) -> std::optional<Vec3> {
     const Vec3 point = vec3(points_cam_.data() + 3 * n);
     const double u = places_[2 * n], v = places_[2 * n + 1];
     double u_right = kNaN;
@@ -142,14 +154,11 @@ void Tracker::keep_agreeing(const TrackedMotion& motion) {
       const Vec3 moved = motion.cam_from_previous * point;
       const Place expected = project(moved, pixels_.data() + 3 * n, lens);
       const double off_u = expected.u - u, off_v = expected.v - v;
-      if (!(std::sqrt(off_u * off_u + off_v * off_v) < model_.motion_px)) continue;
+      if (!(std::sqrt(off_u * off_u + off_v * off_v) < model_.motion_px)) return {};
       if (moved[2] > 0.0 && lens.focal_baseline > 0.0) u_right = u - lens.focal_baseline / moved[2];
     }
-    if (!kept_[n]) continue;
-    ids_[stay] = ids_[n];
-    store(Vec3{u, v, u_right}, pixels_.data() + 3 * stay++);
-  }
-  ids_.resize(stay), pixels_.resize(3 * stay);
+    return kept_[n] ? std::optional(Vec3{u, v, u_right}) : std::nullopt;
+  });
 }
 
 void Tracker::begin(GreyImage image) {
@@ -174,19 +183,11 @@ void Tracker::measure(const TrackerFrame& frame, const double* prior_px, size_t 
     if (!(disparities_px_[2 * n] > model_.min_disparity_px)) disparities_px_[2 * n] = kNaN;
 }
 
-void Tracker::end_hidden(const Clearance& clearance) {
-  size_t stay = 0;
-  for (size_t n = 0; n < ids_.size(); ++n) {
-    const double* pixel = pixels_.data() + 3 * n;
-    if (!clearance.holds(pixel[0], pixel[1], model_.half)) continue;
-    ids_[stay] = ids_[n];
-    store(vec3(pixel), pixels_.data() + 3 * stay++);
-  }
-  ids_.resize(stay), pixels_.resize(3 * stay);
-}
-
 void Tracker::renew(const TrackerFrame& frame) {
-  if (frame.clearance.px.at != nullptr) end_hidden(frame.clearance);
+  keep_points([&](size_t n) {
+    const Vec3 pixel = vec3(pixels_.data() + 3 * n);
+    return frame.clearance.holds(pixel[0], pixel[1], model_.half) ? std::optional(pixel) : std::nullopt;
+  });
   const size_t count = ids_.size(), missing = model_.max_points - std::min(model_.max_points, count);
   left_px_.resize(2 * count), prior_px_.resize(count), taken_.resize(count);
   for (size_t n = 0; n < count; ++n) {

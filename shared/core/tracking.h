@@ -74,8 +74,9 @@ class Tracker {
   size_t flow(const SE3& cam_from_previous, size_t levels);
   bool find_motion(TrackedMotion& found);
   bool search_motion(size_t agree, TrackedMotion& found);
+  template <typename NextOf>
+  void keep_points(const NextOf& next_of);
   void keep_agreeing(const TrackedMotion& motion);
-  void end_hidden(const Clearance& clearance);
   void measure(const TrackerFrame& frame, const double* prior_px, size_t count);
 
   TrackerModel model_;
