@@ -100,3 +100,16 @@ def disk_errors(fault: object, advice: str, kind: type[FleetmapError] = StoreErr
         yield
     except OSError as error:
         raise kind(f"{fault} ({error.strerror}); {advice}") from error
+
+
+def check_format(what: str, found: bytes, wanted: bytes, number: int, newest: int) -> None:
+    """Check a file's magic and format number.
+
+    MapFormatError for another kind of file, NewerFormatError for a format above the newest that this fleetmap reads.
+    """
+    if found != wanted:
+        raise MapFormatError(f"{what} begins {found!r}, not {wanted!r}; this is another kind of file")
+    if number > newest:
+        raise NewerFormatError(
+            f"{what} has format {number}, this fleetmap reads up to {newest}; update fleetmap to read it"
+        )

@@ -220,3 +220,18 @@ def inside_any(points: AnyArray, polygons: Iterable[Rings]) -> NDArray[np.bool_]
         for rows in np.array_split(near, 1 + len(near) * len(corners) // _MOST_AT_ONCE):
             inside[rows] |= inside_rings(flat[rows], rings)
     return inside
+
+
+def midpoints(rays_a: Array, rays_b: Array, apart: Array) -> tuple[Array, Array]:
+    """Points (N, 3) midway between unit rays (N, 3) from two centres that are `apart` (3,) or (N, 3), as seen from the first one.
+
+    NaN where the rays are parallel, or meet behind a centre. And the cosines (N,) of the angles between them.
+    """
+    cosines = (rays_a * rays_b).sum(axis=1)
+    a, b = (rays_a * apart).sum(axis=1), (rays_b * apart).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        determinant = 1.0 - cosines**2
+        along_a, along_b = (a - cosines * b) / determinant, (cosines * a - b) / determinant
+        points = 0.5 * (along_a[:, None] * rays_a + apart + along_b[:, None] * rays_b)
+    points[~((along_a > 0) & (along_b > 0) & (determinant > 1e-10))] = np.nan
+    return points, cosines

@@ -2,7 +2,7 @@
 
 import time
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from itertools import islice
@@ -170,26 +170,6 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
     )
 
 
-def write_session(session: Session, writer: McapRecordingWriter, on_frame: Callable[[int], None]) -> None:
-    """Write all samples and images in time order, frame by frame."""
-    truth = session.truth
-
-    def write_between(start_ns: int, end_ns: int) -> None:
-        first, last = np.searchsorted(truth.stamps_ns, [start_ns, end_ns])
-        writer.write_prior(tuple(prior for prior in session.priors if start_ns <= prior.stamp_ns < end_ns))
-        writer.write_imu(session.imu.between(start_ns, end_ns))
-        writer.write_wheel(tuple(sample for sample in session.wheel if start_ns <= sample.stamp_ns < end_ns))
-        writer.write_ground_truth(Trajectory(truth.stamps_ns[first:last], truth.frame_from_body[first:last]))
-
-    start_ns = 0
-    for done, frame in enumerate(session.frames(), start=1):
-        write_between(start_ns, frame.stamp_ns)
-        writer.write_frame(_png_frame(frame))
-        on_frame(done)
-        start_ns = frame.stamp_ns
-    write_between(start_ns, 1 << 62)
-
-
 def _png_frame(frame: CameraFrame) -> StoredFrame:
     """Images as PNG: half the size of raw ones, lossless."""
     right = None if frame.right is None else png_image(frame.right)
@@ -214,7 +194,11 @@ def record_order(order: Order, out: Path) -> str:
         name = f"{order.scenario}-{order.robot or 'first'}-seed{order.seed}-day{order.day}-{order.light}"
         try:
             with McapRecordingWriter(out, session.nominal, name=name) as writer:
-                write_session(session, writer, lambda done: progress.update(task, completed=done))
+                writer.write_all(
+                    map(_png_frame, session.frames()),
+                    *(session.imu, session.wheel, session.priors, session.truth),
+                    on_frame=lambda: progress.advance(task),
+                )
         finally:
             session.renderer.close()
     path_m = float(np.linalg.norm(np.diff(session.truth.positions_m, axis=0), axis=1).sum())

@@ -5,7 +5,7 @@ from math import pi
 
 import msgspec
 
-from fleetmap.errors import UsageError
+from fleetsim.choices import chosen
 from fleetsim.motion.routes import Route
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.movers import Mover
@@ -48,9 +48,7 @@ class Scenario:
         """The named run, the first one for None; UsageError naming the known ones."""
         if name is None:
             return next(iter(self.runs.items()))
-        if name not in self.runs:
-            raise UsageError(f"no robot {name!r} in this scenario; there are {', '.join(self.runs)}")
-        return name, self.runs[name]
+        return name, chosen("robot", name, self.runs)
 
 
 _END_M = 2.7  # distance of the robots' routes from the end walls

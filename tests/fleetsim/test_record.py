@@ -124,7 +124,7 @@ def test_camera_faults_are_in_the_pictures() -> None:
     [
         (Order("moon"), "unknown scenario 'moon'; known are clip"),
         (Order("clip", light="dusk"), "unknown light 'dusk'; known are day"),
-        (Order("clip", robot="r2"), "no robot 'r2'.*survey"),
+        (Order("clip", robot="r2"), "unknown robot 'r2'.*survey"),
         (Order("clip", lens="fish"), "unknown lens 'fish'; known are pinhole"),
         (Order("clip", day=-1), "day -1"),
         (Order("clip", camera_pipeline="polaroid"), "unknown camera pipeline 'polaroid'; known are clean, soft"),

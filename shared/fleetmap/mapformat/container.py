@@ -15,7 +15,7 @@ from collections.abc import Sequence
 
 import zstandard
 
-from fleetmap.errors import MapFormatError, NewerFormatError
+from fleetmap.errors import MapFormatError, check_format
 
 _HEADER = struct.Struct("<4sHHI")
 _LEVEL = 19  # tiles are written once at night and read by every robot
@@ -47,15 +47,8 @@ def unpack(magic: bytes, format_number: int, data: bytes, what: str, max_bytes: 
     Raises NewerFormatError for a format above `format_number`, MapFormatError for anything else but a complete
     envelope of kind `magic` with at most `max_bytes` inside. `what` names the thing in messages.
     """
-    if len(data) < _HEADER.size or data[:4] != magic:
-        raise MapFormatError(
-            f"{what}: {len(data)} bytes beginning {data[:4]!r}, not {magic!r}; this is another kind of file"
-        )
-    _, number, reserved, size = _HEADER.unpack_from(data)
-    if number > format_number:
-        raise NewerFormatError(
-            f"{what} has format {number}, this fleetmap reads up to {format_number}; update fleetmap to read it"
-        )
+    found, number, reserved, size = _HEADER.unpack(data[: _HEADER.size].ljust(_HEADER.size, b"\0"))
+    check_format(what, found, magic, number, format_number)
     if number != format_number or reserved != 0:
         raise MapFormatError(
             f"{what}: format {number} with reserved bytes {reserved} is invalid; the bytes are damaged"

@@ -25,7 +25,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from fleetmap.encoding import to_json
-from fleetmap.errors import MapFormatError, NewerFormatError, StoreError, disk_errors
+from fleetmap.errors import MapFormatError, StoreError, check_format, disk_errors
 from fleetmap.mapformat.manifest import MAX_MANIFEST_BYTES, Manifest, Name, Positive, Sha256, decode_manifest
 from fleetmap.mapformat.names import check_name, verified
 from fleetmap.mapformat.tile_codec import decode_tile
@@ -132,12 +132,7 @@ class ExportReader:
         if self._size < _START.size + DIGEST_BYTES:
             raise self._damaged(f"{self._size} bytes are too few")
         magic, number, reserved, head_bytes = _START.unpack(b"".join(self._span(0, _START.size)))
-        if magic != EXPORT_MAGIC:
-            raise self._damaged(f"it begins {magic!r}, not {EXPORT_MAGIC!r}")
-        if number > EXPORT_FORMAT:
-            raise NewerFormatError(
-                f"{self._path} has export format {number}, this fleetmap reads up to {EXPORT_FORMAT}; update fleetmap"
-            )
+        check_format(str(self._path), magic, EXPORT_MAGIC, number, EXPORT_FORMAT)
         if number < 1 or reserved != 0 or head_bytes > min(_MAX_HEAD_BYTES, self._size):
             raise self._damaged(f"format {number}, head of {head_bytes} bytes")
         body = _START.size + head_bytes

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.core import longest_gap_ns
-from fleetmap.geometry import Array, interpolate_se3, length, rotation_angle_rad, se3_inverse, skew
+from fleetmap.geometry import Array, interpolate_se3, length, rotation_angle_rad, se3_adjoint, se3_inverse
 from fleetmap.inertial import GRAVITY_MPS2
 from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
@@ -215,10 +215,7 @@ class WindowMode(Mode):
         """
         if tracked.information is None:
             return None
-        body_from_cam = np.zeros((6, 6))
-        rotation = self._rig.body_from_cam[:3, :3]
-        body_from_cam[:3, :3] = body_from_cam[3:, 3:] = rotation
-        body_from_cam[3:, :3] = skew(self._rig.body_from_cam[:3, 3]) @ rotation
+        body_from_cam = se3_adjoint(self._rig.body_from_cam)
         wide = sigmas**2 * np.linalg.inv(tracked.information + 1e-9 * np.eye(6))
         return np.asarray(body_from_cam @ wide @ body_from_cam.T)
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3_inverse
+from fleetmap.geometry import Array, midpoints, se3_inverse
 from fleetmap.sensors.calibration import CameraCalibration, Polygon, RigCalibration, hidden_pixels
 from fleetmap.sensors.cameras import LENSES
 from fleetmap.sensors.samples import CameraFrame, Image, Stamps
@@ -189,7 +189,9 @@ def _error_px2(rig: RigCalibration, points: FollowedPoints) -> float:
     rays, later = camera.ray_from_pixel(points.left), camera.ray_from_pixel(points.later)
     with np.errstate(divide="ignore", invalid="ignore"):
         if points.right is not None:
-            scene = _between_rays(rays, rig.cameras[1].ray_from_pixel(points.right), rig)
+            cam0_from_cam1 = se3_inverse(rig.cameras[0].body_from_cam) @ rig.cameras[1].body_from_cam
+            right = rig.cameras[1].ray_from_pixel(points.right) @ cam0_from_cam1[:3, :3].T
+            scene, _ = midpoints(rays, right, cam0_from_cam1[:3, 3])
         else:
             assert points.depth_m is not None
             scene = rays / rays[:, 2:] * points.depth_m[:, None]
@@ -205,16 +207,6 @@ def _error_px2(rig: RigCalibration, points: FollowedPoints) -> float:
             found = np.sqrt((there**2).sum(axis=1) + 2.0 * (here**2).sum(axis=1))
             errors[known] = np.minimum(np.nan_to_num(found, nan=_MOST_ERROR_PX), _MOST_ERROR_PX)
     return float((errors**2).mean())
-
-
-def _between_rays(left: Array, right: Array, rig: RigCalibration) -> Array:
-    """(N, 3) in cam0: the middle of the shortest line between the rays of both cameras."""
-    cam0_from_cam1 = se3_inverse(rig.cameras[0].body_from_cam) @ rig.cameras[1].body_from_cam
-    right, baseline = right @ cam0_from_cam1[:3, :3].T, cam0_from_cam1[:3, 3]
-    cosine, by_left, by_right = (left * right).sum(axis=1), left @ baseline, right @ baseline
-    sine2 = 1.0 - cosine**2
-    along_left, along_right = (by_left - cosine * by_right) / sine2, (cosine * by_left - by_right) / sine2
-    return np.asarray(0.5 * (left * along_left[:, None] + baseline + right * along_right[:, None]))
 
 
 def _moved(scene: Array, seen: Array, within: float) -> Array | None:

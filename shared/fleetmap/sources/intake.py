@@ -16,13 +16,12 @@ from fleetmap.messages import Flag
 from fleetmap.recordings import StoredFrame
 from fleetmap.recordings.ordering import UNITS, wrong_unit
 from fleetmap.sensors.samples import INTEGRATED_NS, PAUSE_NS, CameraFrame, ImuSamples, PositionPrior, WheelSample
-from fleetmap.sources.sensor_bundle import SensorBundle
+from fleetmap.sources.sensor_bundle import IMU_LEAD_NS, NEVER_NS, SensorBundle
 
-_IMU_LEAD_NS = 10_000_000  # a frame is handled once IMU samples slightly past it have arrived
 _ABSURD = 1e5
 _SET_BACK_NS = 1_000_000_000  # a stamp older by more than this is not due to a late arrival
 _STAYS_NS = 500_000_000  # duration of older stamps after which the clock counts as set back
-_NEVER_NS, _LATEST_NS = -(2**62), 2**62  # in 2116; later stamps are no times
+_LATEST_NS = 2**62  # in 2116; later stamps are no times
 _STEP_NS = 100_000_000  # between values, until their own steps are known
 _STEPS = 9  # whose median is the usual one
 _IMU = "the IMU is left out"
@@ -53,7 +52,7 @@ class _Stream(Generic[V]):
     """
 
     def __init__(self, what: str) -> None:
-        self.last_ns, self.refused, self.set_back = _NEVER_NS, 0, ""
+        self.last_ns, self.refused, self.set_back = NEVER_NS, 0, ""
         self._what = what
         self._held: tuple[int, V] | None = None
         self._steps_ns = deque([_STEP_NS], _STEPS)
@@ -83,7 +82,7 @@ class _Stream(Generic[V]):
         if self._held is None:
             return []
         (stamp_ns, value), self._held = self._held, None
-        if self.last_ns != _NEVER_NS:
+        if self.last_ns != NEVER_NS:
             self._steps_ns.append(stamp_ns - self.last_ns)
         self.last_ns, self._older_since_ns, self.set_back = stamp_ns, None, ""
         return [value]
@@ -211,7 +210,7 @@ class Intake:
             self._changed.wait_for(lambda: self._frames or self._finished or images.set_back, timeout_s)
             if images.set_back:
                 raise RecordingError(f"{images.set_back}; start again, which begins a new run with the new clock")
-            if images.last_ns == _NEVER_NS:  # a first frame that no second one has confirmed in time
+            if images.last_ns == NEVER_NS:  # a first frame that no second one has confirmed in time
                 self._queue(images.release())
             if not self._frames:
                 return SensorBundle()
@@ -219,7 +218,7 @@ class Intake:
                 self.counts.imu_late += 1
             frame = self._frames.popleft()
             body_ns = frame.stamp_ns + self._offset_ns
-            imu = _take_until(self._imu, body_ns + _IMU_LEAD_NS)
+            imu = _take_until(self._imu, body_ns + IMU_LEAD_NS)
             wheel, self._wheel = _split(self._wheel, body_ns)
             priors, self._priors = _split(self._priors, frame.stamp_ns)
             forget, self._forget = self._forget, False

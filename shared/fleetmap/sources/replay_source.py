@@ -10,10 +10,7 @@ from fleetmap.geometry import Array
 from fleetmap.recordings import FrameSelection, Recording
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, wheel_between
-from fleetmap.sources.sensor_bundle import SensorBundle
-
-_IMU_LEAD_NS = 10_000_000  # a frame is handled once IMU samples slightly past it have arrived
-_NEVER_NS = -(2**62)
+from fleetmap.sources.sensor_bundle import IMU_LEAD_NS, NEVER_NS, SensorBundle
 
 
 @dataclass(frozen=True)
@@ -61,14 +58,14 @@ class ReplaySource:
 
     def samples_before_each(self) -> Iterator[SensorBundle]:
         """For each frame of the playback, the other samples that are handled before it; none backwards."""
-        recording, since_ns = self.recording, _NEVER_NS
+        recording, since_ns = self.recording, NEVER_NS
         # To the clock of the IMU and the wheels
         offset_ns = int(recording.calibration.cameras[0].imu_minus_cam_s * 1e9)
         for until_ns in recording.frame_stamps_ns[self.indices].tolist():
             if self.reverse:
                 yield SensorBundle()
                 continue
-            imu = recording.imu.between(*(ns + offset_ns + _IMU_LEAD_NS for ns in (since_ns, until_ns)))
+            imu = recording.imu.between(*(ns + offset_ns + IMU_LEAD_NS for ns in (since_ns, until_ns)))
             wheel = wheel_between(recording.wheel, *(ns + offset_ns + 1 for ns in (since_ns, until_ns)))
             priors = [prior for prior in recording.priors if since_ns < prior.stamp_ns <= until_ns]
             yield SensorBundle(None, imu, list(wheel), priors)

@@ -7,6 +7,9 @@ from fleetmap.messages import Flag
 from fleetmap.recordings.images import StoredFrame
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, WheelSample
 
+IMU_LEAD_NS = 10_000_000  # a frame is handled once IMU samples slightly past it have arrived
+NEVER_NS = -(2**62)
+
 
 @dataclass(frozen=True, slots=True)
 class SensorBundle:

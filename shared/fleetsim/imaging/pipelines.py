@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.sensors.samples import CameraFrame, Image
+from fleetsim.scene.light import sensor_noise_of
 
 Grey = NDArray[np.float32]
 _WHITE = 255.0
 # Electrons behind a grey value at gain 1, and read noise before and after the amplifier, as of the renderer's own sensor.
-_ELECTRONS_PER_GREY, _READ_ELECTRONS, _AFTER_GAIN_GREY = 39.0, 5.0, 0.5
 # Exponents of the tone curves that tint the grey scene: warm lights, cold shadows, so that edges are coloured as well.
 _TINT_EXPONENTS = {"red": 0.9, "green": 1.0, "blue": 1.15}
 # Share of white light that a sensor's dyes transmit; the white balance divides by it, which amplifies noise.
@@ -43,12 +43,8 @@ def flicker(picture: Grey, amplitude: float, stamp_ns: int) -> Grey:
 
 
 def sensor_noise(picture: Grey, gain: float, rng: np.random.Generator) -> Grey:
-    """Shot and read noise, Gaussian and independent from pixel to pixel.
-
-    Source: European Machine Vision Association, EMVA Standard 1288, the linear camera model.
-    """
-    shot = gain / _ELECTRONS_PER_GREY
-    read = np.hypot(_AFTER_GAIN_GREY, gain * _READ_ELECTRONS / _ELECTRONS_PER_GREY)
+    """Shot and read noise, Gaussian and independent from pixel to pixel."""
+    shot, read = sensor_noise_of(gain)
     sigma = np.sqrt(np.maximum(picture, 0.0) * np.float32(shot) + np.float32(read * read))
     return np.asarray(picture + sigma * rng.standard_normal(picture.shape, np.float32), np.float32)
 

@@ -10,7 +10,7 @@ from fleetmap import core
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.sensors.samples import Image
 from fleetsim.render.optics import Optics
-from fleetsim.scene.light import GREY_PER_MS, Exposure
+from fleetsim.scene.light import GREY_PER_MS, Exposure, sensor_noise_of
 from fleetsim.scene.movers import AnyMover, add_movers, mover_light
 from fleetsim.scene.world import Scene, World
 
@@ -18,7 +18,6 @@ Path = Callable[[float], Array]  # t_s -> map_from_cam
 # One of an exposure: samples per pixel side, their shift in pixels, weight in the picture.
 _Instant = tuple[int, tuple[float, float], float]
 _Canvas = tuple[Array, NDArray[np.float32]]  # a picture in the making (H, W): radiance, depth
-_ELECTRONS_PER_GREY, _READ_ELECTRONS, _AFTER_GAIN_GREY = 39.0, 5.0, 0.5
 _BLUR_STEP_PX, _MOST_SUBFRAMES, _NEAR_THINGS_M = 1.2, 8, 1.5
 _R2_SEQUENCE = np.array([0.7548776662, 0.5698402910])
 _NOISE_TABLE = 1 << 18
@@ -70,10 +69,7 @@ class Painter:
             shift = (0.5 + _R2_SEQUENCE * (number + 0.5)) % 1.0 - 0.5 if count > 1 else np.zeros(2)
             instant = samples, (float(shift[0]), float(shift[1])), 1.0 / count
             self._add((radiance, depth_m), instant, path(moment), moment, wants_truth=number == count // 2)
-        shot, read = 0.0, 0.0
-        if self._has_noise:
-            shot = exposure.gain / _ELECTRONS_PER_GREY
-            read = float(np.hypot(_AFTER_GAIN_GREY, exposure.gain * _READ_ELECTRONS / _ELECTRONS_PER_GREY))
+        shot, read = sensor_noise_of(exposure.gain) if self._has_noise else (0.0, 0.0)
         noise = (shot, read, self._normals, noise_key * 2 + self._number)
         grey_per_radiance = GREY_PER_MS * 1e3 * exposure.time_s * exposure.gain
         image = core.develop(radiance, grey_per_radiance, *noise, self._optics.vignetting)

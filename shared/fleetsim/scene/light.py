@@ -14,6 +14,7 @@ GREY_PER_MS = 70.0  # grey levels per unit radiance and millisecond of exposure 
 _AMBIENT_SHARE = 0.9  # of the unshadowed mean light on the ground
 _MEAN_REFLECTANCE = 0.32
 _TARGET_GREY, _EXPOSURES_S, _MOST_GAIN = 95.0, (0.0004, 0.010), 12.0  # of the automatic exposure
+_ELECTRONS_PER_GREY, _READ_ELECTRONS, _AFTER_GAIN_GREY = 39.0, 5.0, 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,6 +23,11 @@ class Exposure:
 
     time_s: float
     gain: float
+
+
+def sensor_noise_of(gain: float) -> tuple[float, float]:
+    """Shot noise, as variance per grey level, and read noise in grey levels. Source: EMVA Standard 1288, the linear camera model."""
+    return gain / _ELECTRONS_PER_GREY, float(np.hypot(_AFTER_GAIN_GREY, gain * _READ_ELECTRONS / _ELECTRONS_PER_GREY))
 
 
 class LampField:

@@ -17,7 +17,7 @@ from fleetmap.mapformat.tile import Tile
 from fleetmap.messages import WantedVersion
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples
-from fleetmap.sources.intake import SensorBundle
+from fleetmap.sources.sensor_bundle import SensorBundle
 from fleetmap.version_grid import TILE_CELLS, encode_grid, grid_report
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import LoadedMap

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.geometry import Array, se3, se3_inverse, transform_points
-from fleetmap.odometry.mono.two_view import midpoints, rays_from_pixels, two_view_motion
+from fleetmap.geometry import Array, midpoints, se3, se3_inverse, transform_points
+from fleetmap.odometry.mono.two_view import rays_from_pixels, two_view_motion
 from fleetmap.odometry.settings import MonocularSettings
 from fleetmap.pnp.pnp import Correspondences, ransac_pnp, refine_pnp
 from fleetmap.sensors.rectification import StereoCamera

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.geometry import Array, se3
+from fleetmap.geometry import Array, midpoints, se3
 from fleetmap.sensors.rectification import StereoCamera
 
 _SCORED_PX = 3.0
@@ -84,21 +84,6 @@ def triangulate_pair(camera: StereoCamera, b_from_a: Array, pixels_a: Array, pix
     rays_b = rays_from_pixels(camera, pixels_b) @ b_from_a[:3, :3]  # in the axes of a
     points, cosines = midpoints(rays_a, rays_b, -b_from_a[:3, :3].T @ b_from_a[:3, 3])
     return points, np.arccos(np.clip(cosines, -1.0, 1.0))
-
-
-def midpoints(rays_a: Array, rays_b: Array, apart: Array) -> tuple[Array, Array]:
-    """Points (N, 3) midway between unit rays (N, 3) from two centres that are `apart` (3,) or (N, 3), as seen from the first one.
-
-    NaN where the rays are parallel, or meet behind a centre. And the cosines (N,) of the angles between them.
-    """
-    cosines = (rays_a * rays_b).sum(axis=1)
-    a, b = (rays_a * apart).sum(axis=1), (rays_b * apart).sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        determinant = 1.0 - cosines**2
-        along_a, along_b = (a - cosines * b) / determinant, (cosines * a - b) / determinant
-        points = 0.5 * (along_a[:, None] * rays_a + apart + along_b[:, None] * rays_b)
-    points[~((along_a > 0) & (along_b > 0) & (determinant > 1e-10))] = np.nan
-    return points, cosines
 
 
 def rays_from_pixels(camera: StereoCamera, pixels: Array) -> Array:

@@ -115,6 +115,34 @@ class McapRecordingWriter:
             data = messages.encode_pose(stamp_ns, MAP_FRAME, frame_from_body)
             self._write(self._topics.ground_truth, "geometry_msgs/PoseStamped", stamp_ns, data)
 
+    def write_all(
+        self,
+        frames: Iterable[CameraFrame | StoredFrame],
+        imu: ImuSamples,
+        wheel: Iterable[WheelSample],
+        priors: Iterable[PositionPrior],
+        truth: Trajectory | None,
+        *,
+        on_frame: Callable[[], None],
+    ) -> None:
+        """Write everything; samples precede the frame that follows them, so that the file is ordered in time to within one frame."""
+
+        def write_between(start_ns: int, end_ns: int) -> None:
+            self.write_prior(prior for prior in priors if start_ns <= prior.stamp_ns < end_ns)
+            self.write_imu(imu.between(start_ns, end_ns))
+            self.write_wheel(sample for sample in wheel if start_ns <= sample.stamp_ns < end_ns)
+            if truth is not None:
+                first, last = truth.stamps_ns.searchsorted([start_ns, end_ns])
+                self.write_ground_truth(Trajectory(truth.stamps_ns[first:last], truth.frame_from_body[first:last]))
+
+        start_ns = -(1 << 62)
+        for frame in frames:
+            write_between(start_ns, frame.stamp_ns)
+            self.write_frame(frame)
+            on_frame()
+            start_ns = frame.stamp_ns
+        write_between(start_ns, 1 << 62)
+
     def close(self) -> None:
         """Finish the file and give it its name. Closing twice does nothing."""
         if self._file.closed:
@@ -187,26 +215,11 @@ class McapRecordingWriter:
 def copy_to_mcap(recording: Recording, path: Path, on_frame: Callable[[], None] = lambda: None) -> None:
     """Write all of `recording` to a new file at `path`; images keep their encoding, `on_frame` is called after every frame.
 
-    Samples precede the frame that follows them, so that the file is ordered in time to within one frame. The
-    file appears at `path` only when it is complete.
+    The file appears at `path` only when it is complete.
     """
     is_uncertain, rig = UNCERTAIN_STAMPS in recording.issues, recording.calibration
+    frames = (recording.stored_frame(index) for index in range(len(recording)))
     with McapRecordingWriter(path, rig, name=recording.name, has_uncertain_stamps=is_uncertain) as writer:
-        since_ns = -(1 << 62)
-        for index, stamp_ns in enumerate(recording.frame_stamps_ns.tolist()):
-            _write_between(recording, writer, since_ns, stamp_ns)
-            writer.write_frame(recording.stored_frame(index))
-            since_ns = stamp_ns
-            on_frame()
-        _write_between(recording, writer, since_ns, 1 << 62)
-
-
-def _write_between(recording: Recording, writer: McapRecordingWriter, start_ns: int, end_ns: int) -> None:
-    """Write all samples except frames with start_ns <= stamp < end_ns."""
-    writer.write_imu(recording.imu.between(start_ns, end_ns))
-    writer.write_wheel(sample for sample in recording.wheel if start_ns <= sample.stamp_ns < end_ns)
-    writer.write_prior(prior for prior in recording.priors if start_ns <= prior.stamp_ns < end_ns)
-    truth = recording.ground_truth
-    if truth is not None:
-        first, last = truth.stamps_ns.searchsorted([start_ns, end_ns])
-        writer.write_ground_truth(Trajectory(truth.stamps_ns[first:last], truth.frame_from_body[first:last]))
+        writer.write_all(
+            frames, recording.imu, recording.wheel, recording.priors, recording.ground_truth, on_frame=on_frame
+        )
