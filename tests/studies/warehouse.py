@@ -79,7 +79,7 @@ def configuration_row(rows: list[Row], name: str) -> Row:
     """A configuration's rates and their top causes."""
     found = strata(rows, name, "failures")
     failures, silent = day_rate(list(found.values())), day_rate(list(strata(rows, name, "silent").values()))
-    shares = {situation: s.weight * sum(s.failures) for situation, s in found.items() if sum(s.failures)}
+    shares = {situation: s.per_day / s.exposure * sum(s.failures) for situation, s in found.items() if sum(s.failures)}
     causes = sorted(shares, key=lambda situation: -shares[situation])[:3]
     return {
         "name": name, "situations": len(found), "failures": written(failures), "silent": written(silent), "robot_days": failures.robot_days,

@@ -1,7 +1,7 @@
 """Examination of a site: a version and drives through it become the figures of a report."""
 
 import os
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -91,16 +91,14 @@ def area_name(named: Areas, size_m: float, place_m: Array) -> str:
 
 def similar(view: MapView, where: Where, probes: Sequence[Probe]) -> list[Similar]:
     """Return the areas of which frames fit other places, too, the most alike first."""
-    recalls: defaultdict[tuple[str, str], list[float]] = defaultdict(list)
+    pairs: Counter[tuple[str, str]] = Counter()
     for probe in probes:
-        pair: dict[tuple[str, str], float] = {}
-        for fix in aliases(view, probe):
-            names = where(probe.map_from_cam[:2, 3]), where(fix.map_from_cam[:2, 3])
-            pair[names] = max(pair.get(names, 0.0), fix.landmark_recall)
-        for names, recall in pair.items():
-            recalls[names].append(recall)
-    found = [Similar(area, other, len(of), round(max(of), 4)) for (area, other), of in recalls.items()]
-    return sorted(found, key=lambda alike: (-alike.frames, alike.area, alike.other))
+        others = {where(fix.map_from_cam[:2, 3]) for fix in aliases(view, probe)}
+        pairs.update((where(probe.map_from_cam[:2, 3]), other) for other in others)
+    return sorted(
+        (Similar(*pair, frames) for pair, frames in pairs.items()),
+        key=lambda alike: (-alike.frames, alike.area, alike.other),
+    )
 
 
 def areas_of(view: MapView, where: Where, drives: Sequence[Drive]) -> list[AreaFigures]:

@@ -73,12 +73,11 @@ class AreaFigures(msgspec.Struct):
 
 
 class Similar(msgspec.Struct, frozen=True):
-    """Frames of an area that robots accept at another place, too; recall: the largest landmark recall there."""
+    """Number of frames of an area that robots accept at another place, too."""
 
     area: str
     other: str
     frames: int
-    recall: float
 
 
 class DriveFigures(msgspec.Struct, frozen=True):

@@ -1,6 +1,6 @@
 """Verdict on a site: its figures beside their limits, what to survey again, and the comparison with an earlier report. Pure."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
 import msgspec
@@ -281,8 +281,11 @@ def _tests(now: AreaFigures, old: AreaFigures) -> Iterator[tuple[str, float, boo
     """Yield each figure of an area as text with the probability that chance changed it as much, and if it is better now."""
     counts = {"frames localized": (now.frames, old.frames)}
     counts["starts found"] = now.starts.found_of_all, old.starts.found_of_all
-    counts |= {f"frames localized with {n} stops less light": pair for n, pair in _both(now.darkness, old.darkness)}
-    counts |= {f"frames localized with a blur of {n} px": pair for n, pair in _both(now.blur, old.blur)}
+    for words, ladder, before in (
+        ("{} stops less light", now.darkness, old.darkness),
+        ("a blur of {} px", now.blur, old.blur),
+    ):
+        counts |= {f"frames localized with {words.format(n)}": (ladder[n], before[n]) for n in ladder if n in before}
     for name, (mine, other) in counts.items():
         if mine.tries and other.tries:
             table = np.array([[count.hits, count.tries - count.hits] for count in (mine, other)])
@@ -293,7 +296,3 @@ def _tests(now: AreaFigures, old: AreaFigures) -> Iterator[tuple[str, float, boo
     if medians[0] is not None and medians[1] is not None:
         p = float(scipy.stats.mannwhitneyu(now.errors_mm, old.errors_mm).pvalue)
         yield f"{now.name}: median error {medians[0]:.1f} mm, {medians[1]:.1f} mm before", p, medians[0] < medians[1]
-
-
-def _both(now: Mapping[str, Count], old: Mapping[str, Count]) -> list[tuple[str, tuple[Count, Count]]]:
-    return [(level, (count, old[level])) for level, count in now.items() if level in old]
