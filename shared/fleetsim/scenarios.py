@@ -176,11 +176,7 @@ def _two_floors() -> Scenario:
     lift = (first[1][0], loop.layout.width_m / 2)
     ride = Route((*first[:2], lift)), Route((lift, *first[2:]))
     survey = loop.runs["survey"]
-    runs = {
-        "ground": survey,
-        "upper": replace(survey, floors=(1,)),
-        "tote-1": Run("tote", ride, floors=(0, 1)),
-    }
+    runs = {"ground": survey, "upper": replace(survey, floors=(1,)), "tote-1": Run("tote", ride, floors=(0, 1))}
     return replace(loop, description="two small loops above each other, and a lift that the robot rides", runs=runs)
 
 

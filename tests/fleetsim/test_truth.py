@@ -45,13 +45,7 @@ def _track(
 
 @pytest.mark.parametrize(
     ("lens", "has_blur"),
-    [
-        ("pinhole", False),
-        ("radial-tangential", False),
-        ("equidistant", False),
-        ("double-sphere", False),
-        ("pinhole", True),
-    ],
+    [*((lens, False) for lens in ("pinhole", "radial-tangential", "equidistant", "double-sphere")), ("pinhole", True)],
 )
 def test_tracks_lie_where_truth_says(lens: str, has_blur: bool) -> None:
     rig, renderer = _renderer(lens, has_blur=has_blur)
@@ -82,11 +76,6 @@ def test_tracks_lie_where_truth_says(lens: str, has_blur: bool) -> None:
     assert np.median(epipolar_px) < 0.12
     assert np.median(temporal_px) < 0.25
     assert np.median(stereo_px) < 0.4
-
-
-# Every pixel of the painter against a ray caster that shares nothing with it but the list of boxes.
-
-WIDTH, HEIGHT = 200, 150
 
 
 @pytest.mark.parametrize(("yaw", "pitch"), [(0.0, 0.0), (1.2, 0.0), (0.0, -1.2), (-0.8, 0.6)])

@@ -9,12 +9,7 @@ from fleetsim.scene.world import World
 
 
 def _slots(layout: Layout) -> list[Slot]:
-    return [
-        Slot(row, bay, level)
-        for row in range(layout.rows)
-        for bay in range(layout.bays)
-        for level in range(layout.levels)
-    ]
+    return [Slot(*place) for place in np.ndindex(layout.rows, layout.bays, layout.levels)]
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.125, 0.5])
@@ -84,12 +79,7 @@ def test_a_cross_aisle_is_free_and_its_sides_are_guarded() -> None:
     inside = (x + half > start) & (x - half < end)
     assert not (inside & (boxes[:, 2] < 3.0)).any()
     guards = np.abs(boxes[:, 2] - 0.25) < 1e-6
-    for place in (
-        layout.bay_x_m(0) - 0.12,
-        layout.bay_x_m(2) + 0.12,
-        layout.bay_x_m(3) - 0.12,
-        layout.bay_x_m(5) + 0.12,
-    ):
+    for place in (layout.bay_x_m(bay) + side_m for bay, side_m in ((0, -0.12), (2, 0.12), (3, -0.12), (5, 0.12))):
         assert (guards & (np.abs(x - place) < 1e-6)).sum() == 2, place
     assert len(layout.packing_stations_m()) == 2
     assert (x < layout.dock_m).any()

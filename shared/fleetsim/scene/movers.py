@@ -52,19 +52,12 @@ def _robot(_: float) -> list[Part]:
     ]
 
 
-@dataclass(frozen=True, slots=True)
-class MoverKind:
-    """parts(t) in the mover's axes (x forward), radius of its soft shadow."""
-
-    parts: Callable[[float], list[Part]]
-    shadow_m: float
-
-
-MOVER_KINDS = {
-    "person": MoverKind(_person, 0.5),
-    "forklift": MoverKind(_forklift, 1.3),
-    "robot": MoverKind(_robot, 0.6),
+MOVER_KINDS: dict[str, tuple[Callable[[float], list[Part]], float]] = {
+    "person": (_person, 0.5),
+    "forklift": (_forklift, 1.3),
+    "robot": (_robot, 0.6),
 }
+"""By name its parts at a time, in its axes (x forward), and the radius of its soft shadow in metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,15 +104,16 @@ def add_movers(builder: FaceBuilder, movers: tuple[AnyMover, ...], textures: Tex
     for number, mover in enumerate(movers):
         x, y, yaw = mover.place(t_s)
         cosine, sine = float(np.cos(yaw)), float(np.sin(yaw))
-        for (px, py, pz), half, material in MOVER_KINDS[mover.kind].parts(t_s):
+        parts, shadow_m = MOVER_KINDS[mover.kind]
+        for (px, py, pz), half, material in parts(t_s):
             centre = (x + cosine * px - sine * py, y + sine * px + cosine * py, pz)
             builder.add_box(centre, half, Surface(materials[material]), yaw_rad=yaw)
-        shadows[number] = x, y, 1.0 / MOVER_KINDS[mover.kind].shadow_m ** 2
+        shadows[number] = x, y, 1.0 / shadow_m**2
     return shadows
 
 
 def mover_light(faces: Faces, movers: tuple[AnyMover, ...], floor_light: list[float], t_s: float) -> Array:
     """Light samples of the movers' faces: the ground's light at each one's place, by side."""
-    of_box = np.repeat(np.array(floor_light), [len(MOVER_KINDS[mover.kind].parts(t_s)) for mover in movers])
+    of_box = np.repeat(np.array(floor_light), [len(MOVER_KINDS[mover.kind][0](t_s)) for mover in movers])
     per_face = 0.8 * of_box[faces.owners[:, 0]] * SIDE_LIGHT[faces.owners[:, 1]]
     return np.repeat(per_face, faces.numbers[:, 4] * faces.numbers[:, 5])

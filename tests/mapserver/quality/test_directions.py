@@ -41,17 +41,24 @@ def test_an_aisle_driven_one_way_names_the_other(sector: int) -> None:
     assert tile_directions(tiles_of(places)) == [TileDirections((0, 0), {HEADINGS[sector]: 17}, {other: 17})]
 
 
-def test_an_aisle_driven_both_ways_misses_nothing() -> None:
-    """The lanes are a metre apart, and the second robot looks a little aside."""
-    found = tile_directions(tiles_of(aisle(0, 4.0) + aisle(200, 5.0)))
-    assert found == [TileDirections((0, 0), {"E": 28, "W": 28}, {})]
-    assert one_way_words(found) == ""
-
-
-def test_the_next_aisle_does_not_count() -> None:
-    """East in one aisle and west in the next, in one tile: both ways are seen, and missing."""
-    (found,) = tile_directions(tiles_of(aisle(0, 4.0) + aisle(180, 8.0)))
-    assert found.seen == found.missing == {"E": 28, "W": 28}
+@pytest.mark.parametrize(
+    ("places", "found"),
+    [
+        # Lanes a metre apart, and the second robot looks a little aside
+        (aisle(0, 4.0) + aisle(200, 5.0), [TileDirections((0, 0), {"E": 28, "W": 28}, {})]),
+        # The next aisle does not count: both ways are seen, and missing
+        (aisle(0, 4.0) + aisle(180, 8.0), [TileDirections((0, 0), {"E": 28, "W": 28}, {"E": 28, "W": 28})]),
+        # Lanes on both sides of a tile's border are one aisle; the order is that of the tiles
+        (
+            aisle(0, 15.5) + aisle(180, 16.5),
+            [TileDirections((0, 0), {"E": 28}, {}), TileDirections((0, 1), {"W": 28}, {})],
+        ),
+        ([looking(0, 1.0 + k, 4.0, up_deg=85.0) for k in range(10)], []),  # without a heading
+    ],
+)
+def test_two_drives(places: list[Array], found: list[TileDirections]) -> None:
+    assert tile_directions(tiles_of(places)) == found
+    assert (one_way_words(found) == "") == (not any(tile.missing for tile in found))
 
 
 def test_the_half_that_was_driven_both_ways_is_not_missing() -> None:
@@ -61,12 +68,6 @@ def test_the_half_that_was_driven_both_ways_is_not_missing() -> None:
     assert 8 <= found.missing["W"] <= 12
 
 
-def test_a_place_beyond_the_border_of_the_tile_counts() -> None:
-    """Lanes on both sides of a tile's border are one aisle; the order is that of the tiles."""
-    found = tile_directions(tiles_of(aisle(0, 15.5) + aisle(180, 16.5)))
-    assert found == [TileDirections((0, 0), {"E": 28}, {}), TileDirections((0, 1), {"W": 28}, {})]
-
-
 def test_a_turn_on_the_spot_is_no_aisle() -> None:
     turn = [looking(heading, 8.0, 4.0) for heading in range(0, 180, 12)]
     (found,) = tile_directions(tiles_of(turn))
@@ -74,9 +75,7 @@ def test_a_turn_on_the_spot_is_no_aisle() -> None:
     assert sum(found.seen.values()) == len(turn)
 
 
-def test_cameras_without_a_heading_and_tiles_without_places_are_left_out() -> None:
-    places = [looking(0, 1.0 + k, 4.0, up_deg=85.0) for k in range(10)]
-    assert tile_directions(tiles_of(places)) == []
+def test_tiles_without_places_are_left_out() -> None:
     assert tile_directions({(0, 0): np.zeros((0, 4, 4))}) == []
     assert tile_directions({}) == []
 

@@ -32,7 +32,7 @@ class MoverLandmarks:
                 continue
             cosine, sine = np.cos(yaw_rad), np.sin(yaw_rad)
             rotation = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-            for part, (centre, half, _) in enumerate(MOVER_KINDS[mover.kind].parts(time_s)):
+            for part, (centre, half, _) in enumerate(MOVER_KINDS[mover.kind][0](time_s)):
                 place = rotation @ np.array(centre, np.float64) + (x_m, y_m, 0.0)
                 found.append((number, part, place, np.array(half, np.float64), rotation))
         return found
