@@ -914,11 +914,8 @@ class Filter:
     def motion_between(self, earlier_id: int, later_id: int) -> _Reals:
         """earlier_from_later (4, 4) between two clones."""
 
-    def body_since(self, clone_id: int) -> _Reals:
-        """earlier_from_now (4, 4) between a clone and the newest one."""
-
     def motion_since(self, clone_id: int) -> tuple[_Reals, _Reals]:
-        """As body_since, and its covariance (6, 6), of a left perturbation in axes of the earlier body."""
+        """earlier_from_now (4, 4) between a clone and the newest one, and its covariance (6, 6), a left one in the former's axes."""
 
     def cam_from_earlier(self, clone_id: int, cam_from_body: _Reals, camera: int = 0) -> _Reals:
         """(4, 4) from a clone's first camera to that of the state."""

@@ -227,9 +227,6 @@ void bind_filter(nb::module_& module) {
              return filter.motion_between(index_of(filter, earlier), index_of(filter, later));
            }),
            "earlier_id"_a, "later_id"_a)
-      .def("body_since",
-           in_turn(+[](SharedFilter& filter, int64_t id) { return filter.motion_between(index_of(filter, id), newest(filter)); }),
-           "clone_id"_a)
       .def("motion_since", in_turn(&motion_since), "clone_id"_a)
       .def("cam_from_earlier", in_turn(&cam_from_earlier), "clone_id"_a, "cam_from_body"_a, "camera"_a = 0)
       .def("odom_from_clone", in_turn(+[](SharedFilter& filter, int64_t id) { return filter.clone(index_of(filter, id)); }), "clone_id"_a)

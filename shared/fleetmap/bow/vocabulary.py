@@ -84,18 +84,6 @@ class Vocabulary:
         return BowVector(word_ids[used].astype(np.int32), weights.astype(np.float32))
 
 
-def encode_vocabulary(vocabulary: Vocabulary) -> bytes:
-    """Encode a vocabulary; equal vocabularies give equal bytes on every machine."""
-    nodes = len(vocabulary.child_count)
-    assert nodes <= MAX_NODES
-    body = (
-        vocabulary.child_count.astype(np.uint8).tobytes()
-        + np.ascontiguousarray(vocabulary.centres, "<u8").tobytes()
-        + np.ascontiguousarray(vocabulary.idf, "<f4").tobytes()
-    )
-    return _HEADER.pack(_MAGIC, VOCABULARY_FORMAT, 0, nodes, vocabulary.word_count, zlib.crc32(body)) + body
-
-
 def decode_vocabulary(data: bytes) -> Vocabulary:
     """Decode the vocabulary in `data`.
 

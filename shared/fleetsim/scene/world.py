@@ -68,7 +68,8 @@ class World:
         self.lamps = LampField(every_lamp, layout.length_m * layout.width_m)
         self.decals = self._lay_decals()
         self.floor_numbers = np.array([self.textures.concrete_coarse, self.textures.dirt], np.int32)
-        self._built = lru_cache(_MOST_BUILT_CHUNKS)(lambda key: self._build(key, is_plain=False))
+        # The detailed version of a chunk, by column and row, without light.
+        self.detailed_faces = lru_cache(_MOST_BUILT_CHUNKS)(lambda *key: self._build(key, is_plain=False))
         self._lit = lru_cache(_MOST_BAKED_CHUNKS)(lambda key: self._light(key, is_plain=False))
         self._plain = lru_cache(None)(lambda key: self._light(key, is_plain=True))
         self._scenes = lru_cache(_MOST_SCENES)(self._assemble)
@@ -80,10 +81,6 @@ class World:
     def builder(self) -> FaceBuilder:
         """An empty builder that knows the site's textures."""
         return FaceBuilder(self.textures.atlas.table[:, :2], self.textures.stretched)
-
-    def detailed_faces(self, column: int, row: int) -> Faces:
-        """The detailed version of a chunk, without light."""
-        return self._built((column, row))
 
     def _lay_decals(self) -> NDArray[np.int32]:
         """(rows, columns) decal texture * 4 + quarter turns, -1 for none; the pattern repeats after 82 m."""
@@ -124,9 +121,13 @@ class World:
 
     def _light(self, key: tuple[int, int], *, is_plain: bool) -> LitFaces:
         """Light, of a detailed chunk with shadows from the boxes in it and the eight around it; further lamps are not counted."""
-        boxes, shift, faces = np.zeros((0, 8)), 0, self._build(key, is_plain=True) if is_plain else self._built(key)
+        boxes, shift, faces = (
+            np.zeros((0, 8)),
+            0,
+            self._build(key, is_plain=True) if is_plain else self.detailed_faces(*key),
+        )
         if not is_plain:
-            parts = {other: self._built(other) for other in sorted(self._neighbours(key, 1, 1))}
+            parts = {other: self.detailed_faces(*other) for other in sorted(self._neighbours(key, 1, 1))}
             shift = sum(len(part.boxes) for other, part in parts.items() if other < key)
             boxes = np.concatenate([part.boxes for part in parts.values()])
         rectangles = np.array([self._hall.rectangle(*other) for other in self._neighbours(key, 1, 1)])

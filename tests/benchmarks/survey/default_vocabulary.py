@@ -12,14 +12,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.bow.vocabulary import encode_vocabulary
 from fleetmap.features.extraction import extract
 from fleetmap.features.settings import OrbSettings
 from fleetmap.mapformat.names import sha256_hex
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
 from fleetsim.recorder import Order, prepare
-from support.worlds.vocabulary_training import train_vocabulary
+from support.worlds.vocabulary_training import encode_vocabulary, train_vocabulary
 
 PICTURES = 60  # of each run, evenly spread
 RUNS = (

@@ -14,14 +14,13 @@ from fleetmap.bow.vocabulary import (
     PlaceIndex,
     default_vocabulary,
     default_vocabulary_bytes,
-    encode_vocabulary,
     shipped_vocabulary,
 )
 from fleetmap.features.extraction import extract
 from fleetmap.features.settings import OrbSettings
 from fleetmap.geometry import Array, rotation_angle_rad, rotation_from_quat_wxyz
 from support.recordings.realdata import real_data
-from support.worlds.vocabulary_training import train_vocabulary
+from support.worlds.vocabulary_training import encode_vocabulary, train_vocabulary
 
 
 @lru_cache(maxsize=1)

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fleetmap.bow.vocabulary import Vocabulary, decode_vocabulary, encode_vocabulary
+from fleetmap.bow.vocabulary import Vocabulary, decode_vocabulary
 from fleetmap.errors import MapFormatError, NewerFormatError
-from support.worlds.vocabulary_training import train_vocabulary
+from support.worlds.vocabulary_training import encode_vocabulary, train_vocabulary
 
 
 def _clustered(rng: np.random.Generator, clusters: int, each: int, noise: float = 0.05) -> np.ndarray:

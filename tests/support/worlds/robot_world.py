@@ -8,7 +8,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from fleetmap.bow.vocabulary import decode_vocabulary, encode_vocabulary
+from fleetmap.bow.vocabulary import decode_vocabulary
 from fleetmap.features import orb
 from fleetmap.features.extraction import extract
 from fleetmap.geometry import Array
@@ -28,7 +28,7 @@ from mapserver.store import DraftContent, MapStore
 from support.recordings.recording_samples import FOCAL, HEIGHT, WIDTH, Sample, calibration, write_mcap
 from support.storage.map_samples import draft_details
 from support.worlds.box_room import out_and_back, points_seen, ride_sample
-from support.worlds.vocabulary_training import train_vocabulary
+from support.worlds.vocabulary_training import encode_vocabulary, train_vocabulary
 
 RIDE_S, STAND_S, FRAME_S = 6.0, 1.0, 0.1
 CYCLE_NS = round((STAND_S + RIDE_S) * 1e9)

@@ -1,10 +1,13 @@
 """Training of vocabularies: how the one that ships was made, and small ones for tests."""
 
+import struct
+import zlib
+
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap import core
-from fleetmap.bow.vocabulary import Vocabulary
+from fleetmap.bow.vocabulary import VOCABULARY_FORMAT, Vocabulary
 from fleetmap.features.matching import FAR, Descriptors, packed
 from fleetmap.geometry import Array
 
@@ -104,3 +107,14 @@ def cluster(bits: Packed, centres: Packed, iterations: int) -> Indices:
         majority = np.packbits(2 * ones > counts[held, None], axis=1, bitorder="little")
         centres[held] = majority.view(np.uint64)
     return labels
+
+
+def encode_vocabulary(vocabulary: Vocabulary) -> bytes:
+    """Encode a vocabulary; equal vocabularies give equal bytes on every machine."""
+    nodes = len(vocabulary.child_count)
+    body = (
+        vocabulary.child_count.astype(np.uint8).tobytes()
+        + np.ascontiguousarray(vocabulary.centres, "<u8").tobytes()
+        + np.ascontiguousarray(vocabulary.idf, "<f4").tobytes()
+    )
+    return struct.pack("<4sHHIII", b"FMVB", VOCABULARY_FORMAT, 0, nodes, vocabulary.word_count, zlib.crc32(body)) + body

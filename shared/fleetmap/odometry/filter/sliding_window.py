@@ -74,11 +74,8 @@ class SlidingWindow:
 
     def body_since(self, frame_index: int) -> Array | None:
         """The transform of `motion_since` alone."""
-        kept, frame_from_kept = self._kept(frame_index)
-        if kept not in self.filter.clone_ids:
-            return None
-        kept_from_now = self.filter.body_since(kept)
-        return kept_from_now if kept == frame_index else frame_from_kept @ kept_from_now
+        found = self.motion_since(frame_index)
+        return None if found is None else found[0]
 
     def _kept(self, frame_index: int) -> tuple[int, Array]:
         """The kept frame that represents a dropped one, and frame_from_kept (4, 4); for a kept frame itself."""
