@@ -265,7 +265,8 @@ def _keep(run: _Run, built: BuildResult, parent: Before | None, maps: MapStore) 
     tiles, views = chooser.choose(asked_views(sessions))
     run.times.begin("extras")
     before = None if parent is None else parent.manifest
-    extras = _extras(ChosenDraft(sessions, run.settings, built.corrections, before, maps))
+    chosen, stages = ChosenDraft(sessions, run.settings, built.corrections, before, maps), plugins("mapserver.stages")
+    extras: dict[str, Extra] = {key: made for stage in stages.values() for key, made in stage(chosen).items()}
     run.times.begin("examining")
     evidence = msgspec.structs.replace(_evidence(run, built, sessions, tiles, parent), views=views)
     run.times.begin("storing")
@@ -301,11 +302,6 @@ def _keep(run: _Run, built: BuildResult, parent: Before | None, maps: MapStore) 
     draft = Draft(version, maps.areas(site).name_tiles(words, TILE_SIZE_M), said, left_out)
     _write_files(run, built, draft)
     return draft
-
-
-def _extras(chosen: ChosenDraft) -> dict[str, Extra]:
-    """Return what the stages of plug-ins add to the draft, by key; what they kept on the way ends with this call."""
-    return {key: made for stage in plugins("mapserver.stages").values() for key, made in stage(chosen).items()}
 
 
 def _details(

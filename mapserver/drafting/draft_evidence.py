@@ -27,7 +27,6 @@ from mapserver.quality.evidence import Probes, displaced, examine, trajectory_br
 from mapserver.quality.figures import Evidence, RigEvidence, TrajectoryBreaks
 from mapserver.quality.probes import (
     Probe,
-    held_out_frames,
     probe_features,
     probes_of_map,
     repetition,
@@ -102,10 +101,12 @@ def probed_frames(
     recording: Recording, selected: Sequence[int], rectifier: Rectifier, survey: Survey, orb: OrbSettings
 ) -> list[ProbedFrame]:
     """Return frames of a surveyed recording that did not become keyframes, and both ends, read again. Damaged ones are left out."""
-    keyframes = [k.frame_index for k in survey.odometry.keyframes]
-    numbers = held_out_frames(keyframes, survey.map.trajectory_estimated, _HELD_OUT)
-    ends = spread(np.flatnonzero(survey.map.trajectory_estimated), 2)
-    found = _read(recording, selected, sorted({*numbers, *ends}), rectifier, orb)
+    keyframes, measured = survey.odometry.keyframe_frames, np.flatnonzero(survey.map.trajectory_estimated)
+    # The survey used no image of these. Odometry tracked them, so their position between two keyframes is known to millimetres;
+    # excluding whole stretches would leave gaps in the map.
+    free = np.setdiff1d(measured, keyframes)
+    numbers = sorted({*spread(free, _HELD_OUT), *spread(measured, 2)})
+    found = _read(recording, selected, numbers, rectifier, orb)
     return [replace(frame, is_held_out=frame.number not in keyframes) for frame in found]
 
 

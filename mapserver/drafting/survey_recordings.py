@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from fleetmap.config import Section, load_toml
-from fleetmap.errors import FleetmapError, RecordingError, SurveyError
+from fleetmap.errors import FleetmapError, RecordingError, SurveyError, UsageError
 from fleetmap.geometry import Array
 from fleetmap.log_lines import printable
 from fleetmap.mapformat.manifest import RecordingEntry
@@ -49,7 +49,7 @@ from mapserver.survey.odometry_pass import LEAD_NS, parts_between_lifts
 from mapserver.survey.pose_graph.position_priors import aligned_by_priors
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.stages import Survey, begin_survey, finish_survey, survey
-from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools, Zones, zones_of
+from mapserver.survey.survey_inputs import AdjustedChain, SurveyConfig, SurveyInputs, SurveyTools, Zones
 
 _log = logging.getLogger(__name__)
 
@@ -503,9 +503,28 @@ def map_trajectories(joined: MergedMap) -> list[Trajectory]:
 
 
 def read_zones(path: Path | None) -> Zones:
-    """Read zones from a TOML file: a table [zones] with name = [[x, y], ...] in metres; UsageError if invalid. None gives no zones."""
+    """Read zones from a TOML file: a table [zones] with name = [[x, y], ...] in metres. None gives no zones.
+
+    Raises UsageError, naming the file and the zone, unless a zone has three or more corners of two finite numbers each.
+    """
 
     class ZonesFile(Section, frozen=True):
         zones: dict[str, object]
 
-    return Zones() if path is None else zones_of(load_toml(path, ZonesFile).zones, str(path))
+    if path is None:
+        return Zones()
+    polygons = {}
+    for name, value in load_toml(path, ZonesFile).zones.items():
+        where = f"{path}: zone {name!r}"
+        try:
+            corners = msgspec.convert(value, list[tuple[float, float]])
+        except msgspec.ValidationError as error:
+            raise UsageError(f"{where}: {error}; write it as a list of corners [x, y] in metres") from error
+        if len(corners) < 3:
+            raise UsageError(f"{where} has {len(corners)} corner(s); an area needs at least 3")
+        polygons[name] = np.array(corners, np.float64)
+        if not np.isfinite(polygons[name]).all():
+            raise UsageError(f"{where} has a corner that is not finite: {corners}; write metres")
+    if not polygons:
+        raise UsageError(f"{path}: the table [zones] is empty; write name = [[x, y], ...] or leave --zones out")
+    return Zones(polygons)

@@ -62,17 +62,6 @@ def most_similar_beyond(view: MapView, probe: Probe, radius_m: float) -> Array |
     return np.asarray(view.map_from_cam[places[0]]) if len(places) else None
 
 
-def held_out_frames(keyframes: Sequence[int], measured: NDArray[np.bool_], count: int) -> list[int]:
-    """Return up to `count` numbers, evenly spread, of measured frames (F,) that are not keyframes: the survey used none of their images.
-
-    Odometry tracked them, so their position between two keyframes is known to millimetres; excluding whole stretches would
-    leave gaps in the map. Empty if every frame is a keyframe.
-    """
-    free = measured.copy()
-    free[list(keyframes)] = False
-    return spread(np.flatnonzero(free), count)
-
-
 def spread(numbers: NDArray[np.int64], count: int) -> list[int]:
     """Return at most `count` of the numbers, evenly spread."""
     if len(numbers) <= count:

@@ -29,7 +29,6 @@ from mapserver.survey.bundle.stereo_yaw_check import StereoYaw, estimate_stereo_
 from mapserver.survey.finish.frame_adjustment import place_frames
 from mapserver.survey.finish.map_assembly import Culled, assemble
 from mapserver.survey.finish.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
-from mapserver.survey.given_poses import poses_as_odometry
 from mapserver.survey.loops.connected_components import (
     Component,
     between_kept,
@@ -40,7 +39,7 @@ from mapserver.survey.loops.connected_components import (
     without_doubted,
 )
 from mapserver.survey.loops.loops import LoopCloser, Loops
-from mapserver.survey.odometry_pass import initial_state, run_odometry
+from mapserver.survey.odometry_pass import initial_state, poses_as_odometry, run_odometry
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.odometry_factors import blackout_factors, chain_edges, odometry_factors
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph

@@ -87,14 +87,12 @@ def _sound(recording: "Recording") -> "Recording":
 @contextmanager
 def _shown() -> "Iterator[SurveyTools]":
     """Tools of a survey with displayed progress."""
-    from rich.progress import Progress
-
     from fleetmap.console import plain_console
+    from mapserver.drafting.progress import ProgressView
     from mapserver.survey.survey_inputs import SurveyTools
 
-    with Progress(console=plain_console(stderr=True), transient=True) as progress:
-        task = progress.add_task("", total=None)
-        yield SurveyTools(lambda stage, done, of: progress.update(task, description=stage, completed=done, total=of))
+    with ProgressView(plain_console(stderr=True)) as view:
+        yield SurveyTools(view)
 
 
 def _write(out: Path, text: str, advice: str) -> None:

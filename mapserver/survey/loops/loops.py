@@ -176,8 +176,11 @@ class LoopCloser:
         """
         bodies, top, here_m = self._keyframe[ids], self._settings.top, self._map_from_body[i, :3, 3]
         reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[i], self._depths_m[bodies])
-        reachable, known = self._marginals.gate(i, bodies, reach_m, _WELL_KNOWN)
-        places_m = self._map_from_body[bodies, :3, 3]
+        covariances, places_m = self._marginals.relative_covs(i, bodies), self._map_from_body[bodies, :3, 3]
+        reachable = self._marginals.reachable(i, bodies, reach_m, covariances)
+        known = (
+            np.linalg.eigvalsh(covariances / np.outer(_WELL_KNOWN, _WELL_KNOWN))[:, -1] < 1.0
+        )  # in all directions at once
         known &= np.linalg.norm(places_m - here_m, axis=1) < _ALIAS_REACH * reach_m
         unlinked = np.array([self._are_unlinked(i, j) for j in bodies.tolist()])
         beyond = np.flatnonzero(~reachable & unlinked)[:top].tolist()

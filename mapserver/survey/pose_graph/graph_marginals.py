@@ -78,15 +78,6 @@ class GraphMarginals:
         i_from_map = se3_adjoint(se3_inverse(self._map_from_body[i]))
         return np.asarray(i_from_map @ cov_map @ i_from_map.T)
 
-    def gate(self, i: int, js: Indices, reach_m: float | Array, sigmas: Array) -> tuple[Mask, Mask]:
-        """Return (M,) which keyframes js are `reachable`, and for which i_from_j is known to sigmas (6,) in all directions at once.
-
-        Both by one query of the covariances.
-        """
-        covariances = self.relative_covs(i, js)
-        known = np.linalg.eigvalsh(covariances / (sigmas[:, None] * sigmas))[:, -1] < 1.0
-        return self.reachable(i, js, reach_m, covariances), known
-
     def reachable(self, i: int, js: Indices, reach_m: float | Array, covariances: Array | None = None) -> Mask:
         """Return (M,) True if keyframe j may be within `reach_m` of keyframe i, given the uncertainty of their distance.
 

@@ -8,8 +8,7 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from fleetmap.geometry import Array, transform_points
-from mapserver.survey.pose_graph.gnc import improved, squared_residuals
-from mapserver.survey.pose_graph.pose_graph import PoseEdge, check_edges
+from mapserver.survey.pose_graph.pose_graph import PoseEdge, check_edges, improved, squared_residuals
 
 _FIXED_SIGMA = 1e-6
 _INLIER_PROBABILITY = 0.999

@@ -26,7 +26,7 @@ from mapserver.drafting.view_check import TileChooser, asked_views
 from mapserver.quality.evidence import trajectory_breaks
 from mapserver.quality.figures import TRUSTED_KEY, Evidence, RigEvidence, merged
 from mapserver.quality.gate import GateSettings, GateVerdict, judge
-from mapserver.quality.probes import held_out_frames, lookalike_words, probe_features
+from mapserver.quality.probes import lookalike_words, probe_features
 from mapserver.survey.settings import BudgetSettings, SurveySettings
 from mapserver.survey.stages import Survey, survey
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs
@@ -58,8 +58,7 @@ def surveyed(rig: RigCalibration) -> tuple[Survey, list[ProbedFrame]]:
     imu = ImuSamples(sample.imu_stamps_ns, sample.gyro_radps, sample.accel_mps2)
     inputs = SurveyInputs(iter(frames), FRAMES, imu, rig, rectifier)
     done = survey(inputs, SurveyConfig(SETTINGS, WORDS))
-    keyframes = [k.frame_index for k in done.odometry.keyframes]
-    numbers = held_out_frames(keyframes, done.map.trajectory_estimated, 40)
+    numbers = np.setdiff1d(np.flatnonzero(done.map.trajectory_estimated), done.odometry.keyframe_frames)[:40].tolist()
     seen = [probe_features(rectifier.rectify(frames[n]), rectifier.camera, SETTINGS.orb) for n in numbers]
     camera, body_from_cam = rectifier.camera, rectifier.body_from_cam
     return done, [ProbedFrame(n, camera, body_from_cam, found) for n, found in zip(numbers, seen, strict=True)]

@@ -22,7 +22,7 @@ from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.plugins.given_trajectories import given as given_module
 from mapserver.plugins.given_trajectories.formats import WrittenPoses
 from mapserver.plugins.given_trajectories.given import GivenTrajectory, OwnMotion, fitted_scale, stamps_on_clock
-from mapserver.survey.given_poses import poses_as_odometry
+from mapserver.survey.odometry_pass import poses_as_odometry
 from mapserver.survey.state import OdometryPass
 from support.recordings.recording_samples import BODY_FROM_CAM0, START_NS, Sample, write_mcap
 from support.worlds.box_room import out_and_back, ride_sample
