@@ -213,7 +213,9 @@ def image_rows(
     if seen.axes.baseline_m > 0:
         by_right = _projection_slopes(view.in_left - view.right_m, pair[1])
         by_cam[:, 2:] = by_left - by_right
-        by_calibration[:, 2:, _PLACE] -= np.einsum("mij,jk->mik", by_right, _right_place_slopes(seen.axes, theta))
+        steps = 1e-6 * np.eye(UNKNOWNS)[_PLACE]
+        moved = [right_camera(seen.axes, theta + step)[1] - right_camera(seen.axes, theta - step)[1] for step in steps]
+        by_calibration[:, 2:, _PLACE] -= np.einsum("mij,jk->mik", by_right, np.stack(moved, axis=1) / 2e-6)
     by_point = -np.einsum("mij,mjk->mik", by_cam, view.rect_from_map)
     # X <- Exp(-phi) X changes by X x phi
     by_calibration[:, :, _TURN] = -np.cross(by_cam, view.in_left[:, None, :])
@@ -226,13 +228,6 @@ def image_rows(
     by_calibration += np.einsum("mijc,mkj->mkic", fixed.slopes.as_given, off).reshape(-1, 4, UNKNOWNS)
     by_calibration *= factor[:, :, None]
     return ImageRows(residuals, by_point, by_calibration, positions)
-
-
-def _right_place_slopes(axes: RigAxes, theta: Array) -> Array:
-    """Return (3, 3) derivatives of the right camera's position by baseline and its direction."""
-    steps = 1e-6 * np.eye(UNKNOWNS)[_PLACE]
-    moved = [right_camera(axes, theta + step)[1] - right_camera(axes, theta - step)[1] for step in steps]
-    return np.stack(moved, axis=1) / 2e-6
 
 
 def _predicted(view: _View, pair: tuple[StereoCamera, StereoCamera]) -> Array:

@@ -22,7 +22,15 @@ from fleetmap.recordings import Topics
 from fleetmap.recordings.tum import write_tum
 from fleetmap.sensors.rectification import StereoCamera
 from mapserver.drafting.area_corrections import AreaCorrections, driven_since
-from mapserver.drafting.draft_evidence import Before, DraftMap, MappedSession, examine_draft, replayed_probes
+from mapserver.drafting.draft_evidence import (
+    Before,
+    DraftMap,
+    MappedSession,
+    TileChooser,
+    asked_views,
+    examine_draft,
+    replayed_probes,
+)
 from mapserver.drafting.extras import ChosenDraft, Extra
 from mapserver.drafting.job_lock import Job, JobProgress, recorded_job
 from mapserver.drafting.mapped_images import MappedImageStore
@@ -48,8 +56,8 @@ from mapserver.drafting.survey_recordings import (
     say_left_out,
     survey_all,
     survey_recording,
+    taken,
 )
-from mapserver.drafting.view_check import TileChooser, asked_views
 from mapserver.drafting.worker import open_executor, single_threaded_libraries
 from mapserver.evaluation.trajectory_error import Accuracy, accuracy, truth_from_estimate
 from mapserver.quality.figures import EVIDENCE_KEY, TRUSTED_KEY, Evidence, merged
@@ -142,7 +150,7 @@ class BuildResult:
     @property
     def taken(self) -> list[RecordingSurvey]:
         """The recordings that were joined to the map."""
-        return [s for s, outcome in zip(self.surveyed, self.joined.outcomes, strict=True) if outcome.joined]
+        return taken(self.surveyed, self.joined)
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,8 +305,8 @@ def _keep(run: _Run, built: BuildResult, parent: Before | None, maps: MapStore) 
     said |= {"map_bytes": report.map_bytes}
     run.times.begin("writing")
     words = sentence(site, version, None if before is None else before.version, report, maps.folder)
-    taken, outcomes = {s.entry.sha256 for s in built.taken}, zip(built.surveyed, built.joined.outcomes, strict=True)
-    left_out = {s.entry.sha256: o.reason for s, o in outcomes if s.entry.sha256 not in taken}
+    mapped, outcomes = {s.entry.sha256 for s in built.taken}, zip(built.surveyed, built.joined.outcomes, strict=True)
+    left_out = {s.entry.sha256: o.reason for s, o in outcomes if s.entry.sha256 not in mapped}
     draft = Draft(version, maps.areas(site).name_tiles(words, TILE_SIZE_M), said, left_out)
     _write_files(run, built, draft)
     return draft

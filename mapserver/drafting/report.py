@@ -13,7 +13,7 @@ import numpy as np
 
 from fleetmap.encoding import to_plain
 from fleetmap.errors import disk_errors
-from mapserver.drafting.survey_recordings import RecordingSurvey, map_trajectories
+from mapserver.drafting.survey_recordings import RecordingSurvey, map_trajectories, taken
 from mapserver.evaluation.trajectory_error import Accuracy
 from mapserver.quality.directions import one_way_words
 from mapserver.quality.figures import Evidence, Starts, SurveyedViews, TileDirections
@@ -69,13 +69,13 @@ def make_report(
 ) -> BuildReport:
     """Return the report of surveyed recordings, map_bytes still unknown. more: keys that the caller knows."""
     survey_map = joined.map
-    taken = [s for s, outcome in zip(recordings, joined.outcomes, strict=True) if outcome.joined]
+    mapped = taken(recordings, joined)
     duration_s = sum(float(t.stamps_ns[-1] - t.stamps_ns[0]) * 1e-9 for t in joined.trajectories)
     path_m = sum(float(np.linalg.norm(np.diff(t.positions_m, axis=0), axis=1).sum()) for t in joined.trajectories)
-    loops = [s.survey.loops.counts() for s in taken]
-    culled = [asdict(s.survey.culled) for s in taken]
+    loops = [s.survey.loops.counts() for s in mapped]
+    culled = [asdict(s.survey.culled) for s in mapped]
     return BuildReport(
-        recordings=[s.entry.name for s in taken],
+        recordings=[s.entry.name for s in mapped],
         duration_s=round(duration_s, 6),
         seconds=round(seconds, 3),
         realtime_factor=round(duration_s / max(seconds, 1e-9), 4),
@@ -93,7 +93,7 @@ def make_report(
         culled={key: sum(count[key] for count in culled) for key in culled[0]},
         findings={s.entry.name: s.remarks() for s in recordings},
         checks={s.entry.name: s.checks for s in recordings},
-        corrections={s.entry.name: s.corrections for s in taken if s.corrections},
+        corrections={s.entry.name: s.corrections for s in mapped if s.corrections},
         sessions=[
             {"recording": recordings[o.number].entry.name, "joined": o.joined, "verdict": o.verdict.value}
             | {"reason": o.reason}
@@ -161,13 +161,13 @@ def sentence(site: str, version: int, parent: int | None, report: BuildReport, s
     return f"site {site}: draft {version}{built_on} {whole}; make it current with {publish}"
 
 
-def loop_places(taken: Sequence[RecordingSurvey], joined: MergedMap) -> list[dict[str, Any]]:
+def loop_places(mapped: Sequence[RecordingSurvey], joined: MergedMap) -> list[dict[str, Any]]:
     """Return loops of the recordings in the map: accepted ones and the most similar refused ones.
 
     Each has its recording, both ends (x, y) in `map`, verdict, reason and score.
     """
     accepted, refused = list[dict[str, Any]](), list[dict[str, Any]]()
-    for recording, trajectory in zip(taken, map_trajectories(joined), strict=True):
+    for recording, trajectory in zip(mapped, map_trajectories(joined), strict=True):
         survey = recording.survey
         frames = [keyframe.frame_index for keyframe in survey.odometry.keyframes]
         # Records have keyframe numbers from before components were left out: then their places are unknown.

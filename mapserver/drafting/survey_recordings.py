@@ -488,11 +488,15 @@ def say_left_out(console: Console, site: str, surveyed: list[RecordingSurvey], j
         )
 
 
-def joined_truth(surveyed: list[RecordingSurvey], joined: MergedMap) -> Trajectory | None:
+def taken(surveyed: Sequence[RecordingSurvey], joined: MergedMap) -> list[RecordingSurvey]:
+    """Return the recordings that were joined to the map."""
+    return [s for s, outcome in zip(surveyed, joined.outcomes, strict=True) if outcome.joined]
+
+
+def joined_truth(surveyed: Sequence[RecordingSurvey], joined: MergedMap) -> Trajectory | None:
     """Return the ground truth of the joined recordings on one clock, None if one of them has none."""
-    truths = [s.truth for s, outcome in zip(surveyed, joined.outcomes, strict=True) if outcome.joined]
-    known = [truth for truth in truths if truth is not None]
-    return chained(known, joined.trajectories) if len(known) == len(truths) else None
+    truths = [s.truth for s in taken(surveyed, joined) if s.truth is not None]
+    return chained(truths, joined.trajectories) if len(truths) == len(joined.trajectories) else None
 
 
 def map_trajectories(joined: MergedMap) -> list[Trajectory]:

@@ -33,8 +33,6 @@ from mapserver.survey.stages import Survey
 from mapserver.survey.state import Mask, RigImages
 from mapserver.survey.survey_map import SurveyMap
 
-_NO_LIMITS = SurveyLimits()
-
 
 @dataclass(frozen=True, slots=True)
 class Counts:
@@ -110,7 +108,7 @@ class MapMerger:
     once, are tried after all others. The map depends on the order of the sessions, not on the time of adding them.
     """
 
-    def __init__(self, base: SurveyMap | None, settings: SurveySettings, limits: SurveyLimits = _NO_LIMITS) -> None:
+    def __init__(self, base: SurveyMap | None, settings: SurveySettings, limits: SurveyLimits) -> None:
         self._settings, self._current, self._limits = settings, base, limits
         self._measured: Measured | None = None  # constraints of an unpublished map
         self._sessions: list[Session] = []

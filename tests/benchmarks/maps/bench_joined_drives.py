@@ -40,6 +40,7 @@ from mapserver.drafting.survey_recordings import (
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.survey.merge import multi_session
 from mapserver.survey.merge.base_map import BaseMap
+from mapserver.survey.merge.changes import SurveyLimits
 from mapserver.survey.merge.joint_adjustment import JointSolution
 from mapserver.survey.merge.multi_session import MapMerger, MergedMap, Session
 from mapserver.survey.survey_inputs import SurveyConfig, SurveyTools
@@ -111,7 +112,7 @@ def added(base: SurveyMap | None, surveys: Sequence[RecordingSurvey]) -> MergedM
     settings = survey_settings(None, surveys[0].sensor_set)
     if path_m(surveys[0]) < _SHORT_M:  # whether such halves belong together is no question here
         settings = msgspec.structs.replace(settings, sessions=msgspec.structs.replace(settings.sessions, min_places=1))
-    joining = MapMerger(base, settings)
+    joining = MapMerger(base, settings, SurveyLimits())
     for each in surveys:
         joining.add(Session(each.survey, each.map_from_survey))
     found = joining.finish()

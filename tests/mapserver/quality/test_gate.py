@@ -21,8 +21,15 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples, Trajectory
 from fleetmap.time_sliced import TimeSliced
-from mapserver.drafting.draft_evidence import Before, DraftMap, MappedSession, ProbedFrame, examine_draft
-from mapserver.drafting.view_check import TileChooser, asked_views
+from mapserver.drafting.draft_evidence import (
+    Before,
+    DraftMap,
+    MappedSession,
+    ProbedFrame,
+    TileChooser,
+    asked_views,
+    examine_draft,
+)
 from mapserver.quality.evidence import trajectory_breaks
 from mapserver.quality.figures import TRUSTED_KEY, Evidence, RigEvidence, merged
 from mapserver.quality.gate import GateSettings, GateVerdict, judge

@@ -12,7 +12,7 @@ from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples, Trajectory
 from mapserver.survey.merge import multi_session
 from mapserver.survey.merge.base_map import BaseMap, with_baseline
-from mapserver.survey.merge.changes import fewer_keyframes, known_well
+from mapserver.survey.merge.changes import SurveyLimits, fewer_keyframes, known_well
 from mapserver.survey.merge.membership import Membership, MembershipVerdict
 from mapserver.survey.merge.multi_session import MapMerger, Session, chained
 from mapserver.survey.rig import Rig
@@ -132,7 +132,7 @@ def test_sessions_join_when_what_they_need_is_there(
     sites = Sites(needs)
     monkeypatch.setattr(multi_session, "extend", sites.extend)
     monkeypatch.setattr(multi_session, "_begun", lambda session, _: (session.survey.map, None))
-    joining = MapMerger(None, SurveySettings())
+    joining = MapMerger(None, SurveySettings(), SurveyLimits())
     for letter in sessions:
         survey: Any = SimpleNamespace(name=letter, map=made_up_map(letter))
         joining.add(Session(survey, np.eye(4) if letter.islower() else None))
