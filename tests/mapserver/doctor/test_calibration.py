@@ -20,20 +20,10 @@ from mapserver.survey.executor import SERIAL
 from mapserver.survey.settings import SurveySettings
 from support.recordings.realdata import real_data
 from support.recordings.recording_samples import calibration
+from support.worlds.calibration_scene import estimate
 
 P = CalibrationParameter
 FOCAL_PX = 420.0
-
-
-def estimate(*, unknown: dict[P, str] | None = None, **off: float) -> CalibrationEstimate:
-    """All parameters right to a tenth of their limit, but for those that are off, by name of the member, and those that nothing shows."""
-    sigmas = np.array([0.1 * p.warn_above for p in COLUMNS])
-    values = {P[name.upper()]: value for name, value in off.items()}
-    parameters = [
-        ParameterEstimate(p, values.get(p, 0.0), float(s), p not in (unknown or {}), (unknown or {}).get(p, ""))
-        for p, s in zip(COLUMNS, sigmas, strict=True)
-    ]
-    return CalibrationEstimate(tuple(parameters), np.diag(sigmas**2), 40, 4000)
 
 
 def measured(found: CalibrationEstimate) -> MeasuredCalibration:

@@ -10,8 +10,7 @@ import pytest
 
 from fleetmap.errors import RecordingError
 from fleetmap.recordings import Recording, open_recording
-from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate
-from mapserver.calibration.parameters import COLUMNS
+from mapserver.calibration import CalibrationParameter
 from mapserver.doctor import Finding, Verdict, sensors
 from mapserver.doctor.calibration import MeasuredCalibration, findings_of
 from mapserver.doctor.findings import not_judged
@@ -19,6 +18,7 @@ from mapserver.doctor.gyro_images import GyroFit
 from mapserver.doctor.run_checks import CheckResults
 from mapserver.drafting import admission
 from support.recordings.recording_samples import make_sample, write_mcap
+from support.worlds.calibration_scene import estimate
 
 P = CalibrationParameter
 
@@ -29,9 +29,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 def measured(parameter: P, value: float) -> MeasuredCalibration:
-    """Everything known to a hundredth of its useful sigma, one parameter off."""
-    rows = [ParameterEstimate(p, value * (p is parameter), 0.01 * p.useful_sigma, True) for p in COLUMNS]
-    found = CalibrationEstimate(tuple(rows), np.diag([row.sigma**2 for row in rows]), 40, 4000)
+    """Everything right, one parameter off."""
+    found = estimate(**{parameter.name.lower(): value})
     return MeasuredCalibration(findings_of(found, 200.0), found)
 
 

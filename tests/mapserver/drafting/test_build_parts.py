@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from fleetmap.errors import RecordingError, UsageError
+from fleetmap.errors import UsageError
 from fleetmap.geometry import se3_exp, se3_inverse, transform_points
 from fleetmap.sensors.samples import Trajectory
 from mapserver.drafting.draft import read_zones
 from mapserver.drafting.progress import ProgressView, StageTimes
-from mapserver.evaluation.trajectory_error import accuracy, check_truth
+from mapserver.evaluation.trajectory_error import accuracy
 from mapserver.survey.survey_map import SurveyMap
 from support.storage.map_samples import random_survey
 
@@ -55,13 +55,6 @@ def test_accuracy_is_over_all_estimated_frames_that_have_a_truth() -> None:
     assert accuracy(survey.estimated_trajectory, frames, None).evaluated_share is None
     few = accuracy(survey.estimated_trajectory, frames, Trajectory(stamps[:2], true[:2]))
     assert (few.rigid, few.evaluated_share) == (None, pytest.approx(0.2))
-
-
-def test_truth_is_asked_for_before_the_survey() -> None:
-    truth = Trajectory(np.array([0, 10, 20], np.int64), np.tile(np.eye(4), (3, 1, 1)))
-    check_truth("walk", np.array([0, 5, 10, 20]), truth)
-    with pytest.raises(RecordingError, match="walk: 2 of 3 selected frames"):
-        check_truth("walk", np.array([0, 10, 30]), truth)
 
 
 def test_the_time_before_a_call_goes_to_the_stage_that_used_it() -> None:

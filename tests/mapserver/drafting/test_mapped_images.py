@@ -17,7 +17,6 @@ from fleetmap.sensors.rectification import RectifiedFrame
 from mapserver.drafting import mapped_images
 from mapserver.drafting.mapped_images import MappedImageStore
 from mapserver.drafting.worker import Threads, open_executor, read_ahead
-from mapserver.survey.executor import in_batches
 from mapserver.survey.state import Pictures
 
 
@@ -160,8 +159,3 @@ def test_reading_ahead_keeps_order_and_errors() -> None:
     early = read_ahead(iter(range(100)))
     assert next(early) == 0
     early.close()  # type: ignore[attr-defined]
-
-
-def test_batches_keep_everything() -> None:
-    assert in_batches([1, 2, 3, 4, 5], 2) == [[1, 2], [3, 4], [5]]
-    assert in_batches([], 2) == []

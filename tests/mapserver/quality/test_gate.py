@@ -40,6 +40,7 @@ from mapserver.survey.survey_inputs import SurveyConfig, SurveyInputs
 from mapserver.survey.survey_map import SurveyMap
 from mapserver.tiles.tiling import tiles_from_survey
 from support.recordings.recording_samples import calibration
+from support.storage.map_samples import OBSERVED, observed
 from support.worlds.box_room import ride_sample
 
 FRAMES, FRAME_S = 44, 0.1
@@ -69,9 +70,6 @@ def surveyed(rig: RigCalibration) -> tuple[Survey, list[ProbedFrame]]:
     seen = [probe_features(rectifier.rectify(frames[n]), rectifier.camera, SETTINGS.orb) for n in numbers]
     camera, body_from_cam = rectifier.camera, rectifier.body_from_cam
     return done, [ProbedFrame(n, camera, body_from_cam, found) for n, found in zip(numbers, seen, strict=True)]
-
-
-OBSERVED = ("obs_keyframe", "obs_landmark", "obs_pixels", "obs_octave", "obs_sigma_px")
 
 
 @lru_cache(maxsize=1)
@@ -178,7 +176,7 @@ def nights_after(first: SurveyMap, nights: int) -> SurveyMap:
     """The map after nights whose keyframes stand where the first ones do, and observe three landmarks each: what was new."""
     count = len(first.map_from_body)
     rows = np.concatenate([np.flatnonzero(first.obs_keyframe == k)[:3] for k in range(count)])
-    later = replace(first, **{name: getattr(first, name)[rows] for name in OBSERVED})
+    later = observed(first, rows)
     parts = [first, *(replace(later, obs_keyframe=later.obs_keyframe + count * (n + 1)) for n in range(nights))]
     names = (*OBSERVED, "map_from_body", "keyframe_stamps_ns")
     return replace(first, **{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
@@ -213,7 +211,7 @@ def test_a_view_without_a_fix_gets_the_landmarks_that_it_matches_and_is_named_if
     assert found.given_more > 0
     assert found.without_fix == []
     kept = looks_at_first_wall(survey_map.map_from_body)[survey_map.obs_keyframe]
-    unmapped = replace(survey_map, **{name: getattr(survey_map, name)[kept] for name in OBSERVED})
+    unmapped = observed(survey_map, kept)
     _, found = chooser._replace(survey_map=unmapped).choose(views)
     assert found.given_more == 0
     at_second = [view for view in views if view.probe.map_from_cam[:3, 2] @ facing() < 0.0]
@@ -260,7 +258,7 @@ def test_nights_that_changed_little_do_not_hold_the_next_one() -> None:
 def test_what_the_current_version_does_not_find_either_is_no_loss() -> None:
     survey_map = sound()[0].map
     kept = ~looks_at_first_wall(survey_map.map_from_body)[survey_map.obs_keyframe]
-    half = replace(survey_map, **{name: getattr(survey_map, name)[kept] for name in OBSERVED})
+    half = observed(survey_map, kept)
     evidence = beside_itself(survey_map, tiles_from_survey(half))
     assert evidence.last_version.draft.frames < len(survey_map.map_from_body)
     assert evidence.last_version.draft.localised_share == 1.0
@@ -270,7 +268,7 @@ def test_a_draft_that_lost_a_third_of_its_landmarks_is_refused() -> None:
     survey_map = sound()[0].map
     lost = np.random.default_rng(1).random(len(survey_map.landmark_ids)) < 1 / 3
     kept = ~lost[survey_map.obs_landmark]
-    fewer = replace(survey_map, **{name: getattr(survey_map, name)[kept] for name in OBSERVED})
+    fewer = observed(survey_map, kept)
     said, evidence = verdict(fewer)
     assert evidence.last_version.inliers_share < 0.8
     assert any("number of landmarks" in reason for reason in said.reasons)

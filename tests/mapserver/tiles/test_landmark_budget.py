@@ -13,7 +13,7 @@ from mapserver.survey.settings import BudgetSettings
 from mapserver.survey.survey_map import SurveyMap, history_of
 from mapserver.tiles import tiling as module
 from mapserver.tiles.tiling import choose_landmarks, covered_path_m, distinctive_landmarks, tiles_from_survey
-from support.storage.map_samples import random_survey
+from support.storage.map_samples import observed, random_survey
 
 
 def exactly(count: int, tile_landmarks: int = 1 << 30) -> BudgetSettings:
@@ -115,10 +115,7 @@ def test_every_view_gets_what_tells_it_from_its_twins_first() -> None:
     is_alone = distinctive_landmarks(survey.points_map, survey.descriptors)
     np.testing.assert_array_equal(np.flatnonzero(is_alone), np.arange(720, 800))
     once = np.isin(survey.obs_landmark, np.arange(720)) | (np.diff(survey.obs_landmark, prepend=-1) != 0)
-    survey = replace(
-        survey, obs_keyframe=survey.obs_keyframe[once], obs_landmark=survey.obs_landmark[once],
-        obs_pixels=survey.obs_pixels[once], obs_octave=survey.obs_octave[once], obs_sigma_px=survey.obs_sigma_px[once],
-    )  # fmt: skip
+    survey = observed(survey, once)
     wanted = seen_per_view(survey, is_alone)
     told = choose_landmarks(survey, msgspec.structs.replace(exactly(200), view_distinctive_landmarks=60))
     untold = choose_landmarks(survey, exactly(200))
@@ -206,15 +203,7 @@ def test_a_full_tile_of_the_default_budget_fits_in_256_kb() -> None:
 
 
 def test_nothing_comes_of_nothing() -> None:
-    survey = random_survey(np.random.default_rng(7))
-    nobody = replace(
-        survey,
-        obs_keyframe=survey.obs_keyframe[:0],
-        obs_landmark=survey.obs_landmark[:0],
-        obs_pixels=survey.obs_pixels[:0],
-        obs_octave=survey.obs_octave[:0],
-        obs_sigma_px=survey.obs_sigma_px[:0],
-    )
+    nobody = observed(random_survey(np.random.default_rng(7)), np.arange(0))
     assert not choose_landmarks(nobody, BudgetSettings()).any()
 
 

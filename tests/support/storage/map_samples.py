@@ -1,12 +1,15 @@
 """Made-up tiles, surveys and drafts for tests of the map's way from the survey to the robot."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from fleetmap.encoding import to_json
-from fleetmap.geometry import se3_exp
+from fleetmap.geometry import Array, se3_exp
 from fleetmap.mapformat.manifest import CameraEntry, RecordingEntry
 from fleetmap.mapformat.names import sha256_hex
 from fleetmap.mapformat.tile import Tile
@@ -16,7 +19,9 @@ from fleetmap.version_grid import TILE_CELLS, encode_grid, grid_report
 from mapserver import releases
 from mapserver.store import DraftContent, DraftDetails, MapStore
 from mapserver.store.survey_pictures import PICTURES_KEY, PictureIndex, PicturesReport, SurveyPicture
-from mapserver.survey.survey_map import SurveyMap
+from mapserver.survey.survey_map import History, SurveyMap
+
+OBSERVED = ("obs_keyframe", "obs_landmark", "obs_pixels", "obs_octave", "obs_sigma_px")
 
 
 def random_tile(
@@ -50,6 +55,27 @@ def random_tile(
             np.sort(rng.choice(ids, min(landmarks, 1 + int(rng.integers(20))), replace=False)) for _ in range(places)
         ),
     )
+
+
+def observed(survey_map: SurveyMap, kept: NDArray[Any]) -> SurveyMap:
+    """The map with some of its observations (M,)."""
+    return replace(survey_map, **{name: getattr(survey_map, name)[kept] for name in OBSERVED})
+
+
+def plain_survey(
+    camera: StereoCamera, body_from_cam: Array, map_from_body: Array, seen: Any, history: History | None = None
+) -> SurveyMap:
+    """A survey of keyframes (K, 4, 4) with the landmarks of a problem or a state, all alike to a descriptor."""
+    count, stamps_ns = len(seen.points_map), np.arange(len(map_from_body), dtype=np.int64)
+    return SurveyMap(
+        camera=camera, body_from_cam=body_from_cam, keyframe_stamps_ns=stamps_ns, map_from_body=map_from_body,
+        landmark_ids=np.arange(count, dtype=np.uint32), points_map=seen.points_map,
+        descriptors=np.zeros((count, 32), np.uint8), point_sigma_m=np.full(count, 0.01),
+        obs_keyframe=seen.obs_keyframe.astype(np.int32), obs_landmark=seen.obs_landmark.astype(np.int32),
+        obs_pixels=seen.obs_pixels, obs_octave=np.zeros(len(seen.obs_pixels), np.int8), obs_sigma_px=seen.obs_sigma_px,
+        trajectory=Trajectory(stamps_ns, map_from_body), trajectory_estimated=np.ones(len(stamps_ns), bool),
+        patches=np.zeros((count, 21, 21), np.uint8), history=history,
+    )  # fmt: skip
 
 
 def random_survey(rng: np.random.Generator, *, keyframes: int = 6, landmarks: int = 80) -> SurveyMap:

@@ -12,8 +12,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3, so3_exp, so3_log
+from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
-from support.recordings.recording_samples import BASELINE_M, BODY_FROM_CAM0, FOCAL, HEIGHT, START_NS, WIDTH, Sample
+from mapserver.survey.keyframes.keyframes import make_keyframe
+from mapserver.survey.settings import SurveySettings
+from mapserver.survey.state import Keyframe
+from support.recordings.recording_samples import (
+    BASELINE_M,
+    BODY_FROM_CAM0,
+    FOCAL,
+    HEIGHT,
+    START_NS,
+    WIDTH,
+    Sample,
+    calibration,
+)
 
 ROOM_M = np.array([[-4.0, -3.0, -1.5], [4.0, 3.0, 1.5]])
 GRAVITY_MPS2 = 9.81
@@ -152,3 +165,10 @@ def stereo_pair(map_from_body: Array, stamp_ns: int) -> CameraFrame:
     map_from_cam = map_from_body @ BODY_FROM_CAM0
     shift = se3(np.eye(3), np.array([BASELINE_M, 0, 0]))
     return CameraFrame(stamp_ns, _render(map_from_cam), _render(map_from_cam @ shift))
+
+
+def rendered_keyframes(places: Array, settings: SurveySettings, period_ns: int = 1) -> tuple[list[Keyframe], Rectifier]:
+    """Keyframes of bodies in the room at places (K, 4, 4), and the rig that sees them."""
+    rectifier = Rectifier(calibration())
+    frames = [rectifier.rectify(stereo_pair(there, k * period_ns)) for k, there in enumerate(places)]
+    return [make_keyframe(frame, k, rectifier.camera, settings) for k, frame in enumerate(frames)], rectifier

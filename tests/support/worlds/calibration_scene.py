@@ -9,6 +9,7 @@ from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import ImuSamples
 from fleetsim.recorder import Order, Session, prepare
+from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate
 from mapserver.calibration.motion_rows import CalibrationData, MotionState
 from mapserver.calibration.parameters import COLUMNS, RigAxes, corrected_rig
 from support.estimator.simulated_run import EstimatorSession
@@ -108,3 +109,14 @@ def _rectified(rectifier: Rectifier, rig: RigCalibration, raw_px: Array, number:
 def zero_theta() -> Array:
     """(C,) no correction."""
     return np.zeros(len(COLUMNS))
+
+
+def estimate(*, unknown: dict[CalibrationParameter, str] | None = None, **off: float) -> CalibrationEstimate:
+    """All parameters right to a tenth of their limit, but for those that are off, by name of the member, and those that nothing shows."""
+    sigmas = np.array([0.1 * p.warn_above for p in COLUMNS])
+    values = {CalibrationParameter[name.upper()]: value for name, value in off.items()}
+    parameters = [
+        ParameterEstimate(p, values.get(p, 0.0), float(s), p not in (unknown or {}), (unknown or {}).get(p, ""))
+        for p, s in zip(COLUMNS, sigmas, strict=True)
+    ]
+    return CalibrationEstimate(tuple(parameters), np.diag(sigmas**2), 40, 4000)

@@ -4,11 +4,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fleetmap.features.orb import Features
 from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples
 from mapserver.survey.rig import Rig
-from mapserver.survey.state import KeyframeMotion, Landmarks, SurveyState
+from mapserver.survey.state import ImageStore, Keyframe, KeyframeMotion, Landmarks, SurveyState
 
 CAMERA = StereoCamera(300.0, 320.0, 240.0, 0.12, 640, 480)
 BODY_FROM_CAM = se3(np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]]), np.array([0.1, 0.05, 0.2]))
@@ -81,3 +82,15 @@ def neighbour_errors_m(given: Scene) -> Array:
     found, true = given.state.map_from_body, given.map_from_body
     steps = [se3_inverse(m[:-1]) @ m[1:] for m in (found, true)]
     return np.linalg.norm(steps[0][:, :3, 3] - steps[1][:, :3, 3], axis=1)
+
+
+def plain_keyframes(octaves: list[int], features: int, rng: np.random.Generator | None = None) -> list[Keyframe]:
+    """One for each octave, which all its features have, with random descriptors or with all alike; no pictures."""
+    pixels, angles, places = np.zeros((features, 2)), np.zeros(features, np.float32), np.zeros((features, 3))
+    words = np.zeros((len(octaves), features, 32), np.uint8)
+    words = words if rng is None else rng.integers(0, 256, words.shape, dtype=np.uint8)
+    kinds = [
+        Features(pixels, np.full(features, octave, np.int8), angles, own)
+        for octave, own in zip(octaves, words, strict=True)
+    ]
+    return [Keyframe(k, k, kind, np.zeros((features, 2)), places, ImageStore(), 0) for k, kind in enumerate(kinds)]

@@ -1,15 +1,15 @@
 """A made-up map with known truth, and what keyframes of a later survey see of it. No pictures."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, se3_inverse, transform_points
-from fleetmap.sensors.samples import Trajectory
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import Sighting, Sightings
-from mapserver.survey.survey_map import History, SurveyMap
+from mapserver.survey.survey_map import History
+from support.storage.map_samples import plain_survey
 from support.worlds.bundle_scene import BODY_FROM_CAM, CAMERA, make_scene
 
 SIGMA_PX = 0.4
@@ -38,21 +38,11 @@ class SessionScene:
 def session_scene(seed: int, *, landmarks: int = 300, history: History | None = None) -> SessionScene:
     """Keyframes 0 and 2, 4... of a ride made the map, those between them are the later survey."""
     problem = make_scene(keyframes=12, landmarks=landmarks, step_s=0.3, seed=seed, noise_px=0.5, mono_share=0.0).problem
-    old = np.isin(problem.obs_keyframe, np.arange(0, 12, 2))
-    order = np.lexsort((problem.obs_keyframe[old], problem.obs_landmark[old]))
-    keyframe, landmark = problem.obs_keyframe[old][order] // 2, problem.obs_landmark[old][order]
-    count = len(problem.points_map)
-    stamps_ns, map_from_body = np.arange(6, dtype=np.int64), problem.map_from_body[::2]
-    survey_map = SurveyMap(
-        camera=CAMERA, body_from_cam=BODY_FROM_CAM, keyframe_stamps_ns=stamps_ns, map_from_body=map_from_body,
-        landmark_ids=np.arange(count, dtype=np.uint32), points_map=problem.points_map,
-        descriptors=np.zeros((count, 32), np.uint8), point_sigma_m=np.full(count, 0.01),
-        obs_keyframe=keyframe.astype(np.int32), obs_landmark=landmark.astype(np.int32),
-        obs_pixels=problem.obs_pixels[old][order], obs_octave=np.zeros(len(order), np.int8),
-        obs_sigma_px=problem.obs_sigma_px[old][order], trajectory=Trajectory(stamps_ns, map_from_body),
-        trajectory_estimated=np.ones(6, bool), patches=np.zeros((count, 21, 21), np.uint8), history=history,
-    )  # fmt: skip
-    in_map = np.unique(landmark)
+    rows = np.flatnonzero(problem.obs_keyframe % 2 == 0)
+    old = problem.observed(rows[np.lexsort((problem.obs_keyframe[rows], problem.obs_landmark[rows]))])
+    old = replace(old, obs_keyframe=old.obs_keyframe // 2)
+    survey_map = plain_survey(CAMERA, BODY_FROM_CAM, problem.map_from_body[::2], old, history)
+    in_map = np.unique(old.obs_landmark)
     visible = [
         np.intersect1d(problem.obs_landmark[problem.obs_keyframe == k], in_map).astype(np.int64)
         for k in range(1, 12, 2)

@@ -13,7 +13,7 @@ from fleetmap.recordings import open_recording, read_calibration
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame
 from fleetsim.recorder import Order
-from mapserver.calibration import CalibrationEstimate, CalibrationParameter, ParameterEstimate
+from mapserver.calibration import CalibrationParameter
 from mapserver.calibration.estimator import adjust
 from mapserver.calibration.parameters import COLUMNS, DISTORTION
 from mapserver.cli import app
@@ -22,7 +22,7 @@ from support.command_line import status
 from support.recordings.recording_samples import calibration, make_sample, write_euroc
 from support.recordings.rig_samples import write_kitti_raw
 from support.worlds.box_room import out_and_back, ride_sample
-from support.worlds.calibration_scene import Stretch, make_stretch, measured
+from support.worlds.calibration_scene import Stretch, estimate, make_stretch, measured
 
 DISTORTED = np.array([-0.28, 0.07, 0.0, 0.0])
 
@@ -127,9 +127,8 @@ def test_the_other_cameras_of_a_rig_are_kept(tmp_path: Path, monkeypatch: pytest
     shown = [CameraFrame(int(s), a, b) for s, a, b in zip(sample.stamps_ns, sample.left, sample.right, strict=True)]
     frames = [replace(frame, others=(frame,)) for frame in shown]
     drive = write_kitti_raw(tmp_path / "drive", replace(front, cameras=(*front.cameras, *rear)), frames)
-    is_wrong = [p is CalibrationParameter.BASELINE for p in COLUMNS]
-    parameters = [ParameterEstimate(p, 0.01 * wrong, 1e-4, wrong) for p, wrong in zip(COLUMNS, is_wrong, strict=True)]
-    found = CalibrationEstimate(tuple(parameters), 1e-8 * np.eye(len(COLUMNS)), 9, 99)
+    unknown = {p: "" for p in COLUMNS if p is not CalibrationParameter.BASELINE}
+    found = estimate(unknown=unknown, baseline=0.01)
     monkeypatch.setattr("mapserver.calibration.estimate_calibration", lambda *_: found)
     done = CliRunner().invoke(app, ["calibrate", str(drive), "--out", str(tmp_path / "cams.yaml")])
     assert done.exit_code == 0, done.output

@@ -93,15 +93,6 @@ def test_reduced_system(inertial: bool, body_from_others: Array) -> None:
     np.testing.assert_allclose(ours_rhs[free], rhs, atol=2e-5 * np.abs(rhs).max())
 
 
-@pytest.mark.parametrize("inertial", [False, True])
-def test_solvers_agree(inertial: bool) -> None:
-    problem = _problem(inertial=inertial)
-    dense = solver_of(problem, NO_ROBUSTNESS).step(1e-3)
-    sparse = solver_of(problem, BundleSettings(huber_sigmas=1e9, dense_unknowns=0)).step(1e-3)
-    np.testing.assert_allclose(sparse, dense, atol=1e-8 * np.abs(dense).max())
-    assert (dense[~_free(problem)] == 0).all()
-
-
 def _free(problem: BundleProblem) -> NDArray[np.bool_]:
     """(U,) which unknowns of the reduced system move: keyframes without any are not in it."""
     moves = np.ones((len(problem.fixed), 6 if problem.inertial is None else 15), np.bool_)

@@ -6,28 +6,11 @@ import numpy as np
 
 from fleetmap import core
 from fleetmap.features.matching import packed
-from fleetmap.features.orb import Features
 from fleetmap.geometry import Array
 from mapserver.survey.finish.map_assembly import cull, parallax_rad, redundant
 from mapserver.survey.settings import CullSettings
-from mapserver.survey.state import ImageStore, Keyframe, Landmarks
-from support.worlds.corridor_scene import CAMERA, scene
-
-
-def keyframes(count: int, features: int, seed: int = 0) -> list[Keyframe]:
-    """Keyframes with random descriptors and octave 0, no pictures."""
-    rng = np.random.default_rng(seed)
-    return [
-        Keyframe(
-            k, k,
-            Features(
-                np.zeros((features, 2)), np.zeros(features, np.int8), np.zeros(features, np.float32),
-                rng.integers(0, 256, (features, 32), dtype=np.uint8),
-            ),
-            np.zeros((features, 2)), np.zeros((features, 3)), ImageStore(), 0,
-        )
-        for k in range(count)
-    ]  # fmt: skip
+from mapserver.survey.state import Landmarks
+from support.worlds.corridor_scene import CAMERA, plain_keyframes, scene
 
 
 def seen_by(table: Array, landmarks: int) -> Landmarks:
@@ -67,7 +50,7 @@ def test_a_double_goes_and_its_neighbours_stay() -> None:
         np.vstack([marks.points_map, marks.points_map[split]]), marks.obs_keyframe[order], marks.obs_camera, landmark[order],
         marks.obs_feature[order], marks.obs_pixels[order], marks.obs_sigma_px[order],
     )  # fmt: skip
-    frames = keyframes(12, int(marks.obs_feature.max()) + 1)
+    frames = plain_keyframes([0] * 12, int(marks.obs_feature.max()) + 1, np.random.default_rng(0))
     sigmas = np.full(len(counts) + 1, 0.01)
     settings = CullSettings(min_parallax_deg=0.0, redundant_share=1.1)
     _, kept, none = cull(replace(state, landmarks=broken), frames, sigmas, settings)

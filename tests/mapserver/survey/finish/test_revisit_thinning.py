@@ -5,41 +5,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fleetmap.features.orb import Features
 from fleetmap.geometry import se3_exp
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.bundle_rounds import bundle_rounds
 from mapserver.survey.finish.revisit_thinning import adjust_visits, redundant_keyframes, without_redundant
 from mapserver.survey.rig import Rig
 from mapserver.survey.settings import BundleSettings, CullSettings, SurveySettings
-from mapserver.survey.state import ImageStore, Keyframe, Landmarks, RigImages
+from mapserver.survey.state import Landmarks, RigImages
 from mapserver.survey.tracks.tracks import Tracks
 from support.worlds.bundle_scene import make_scene
-from support.worlds.corridor_scene import BODY_FROM_CAM, CAMERA, Scene, scene
+from support.worlds.corridor_scene import BODY_FROM_CAM, CAMERA, Scene, plain_keyframes, scene
 
 FEATURES = 60
-
-
-def keyframes(octaves: list[int]) -> list[Keyframe]:
-    """One for each octave, which all its features have; no pictures."""
-    return [
-        Keyframe(
-            k, k,
-            Features(
-                np.zeros((FEATURES, 2)), np.full(FEATURES, octave, np.int8), np.zeros(FEATURES, np.float32),
-                np.zeros((FEATURES, 32), np.uint8),
-            ),
-            np.zeros((FEATURES, 2)), np.zeros((FEATURES, 3)), ImageStore(), 0,
-        )
-        for k, octave in enumerate(octaves)
-    ]  # fmt: skip
 
 
 def redundant(tracks: Tracks, octaves: list[int], settings: SurveySettings) -> np.ndarray:
     """As told of keyframes of one camera with these octaves."""
     places = np.tile(np.eye(4), (len(octaves), 1, 1))
     rig = Rig.of_one(CAMERA, BODY_FROM_CAM)
-    return redundant_keyframes(tracks, RigImages.of(keyframes(octaves), places, rig), settings)
+    return redundant_keyframes(tracks, RigImages.of(plain_keyframes(octaves, FEATURES), places, rig), settings)
 
 
 def tracks_seen_by(who: list[list[int]]) -> Tracks:

@@ -15,7 +15,6 @@ from fleetmap.bow.vocabulary import Vocabulary
 from fleetmap.geometry import Array, se3_exp, se3_inverse, se3_log, transform_points
 from fleetmap.pnp.pnp import Correspondences, refine_pnp
 from fleetmap.sensors.rectification import Rectifier, StereoCamera
-from mapserver.survey.keyframes.keyframes import make_keyframe
 from mapserver.survey.loops.keyframe_groups import KeyframeGroups
 from mapserver.survey.loops.loops import LoopCloser, LoopRecord, Loops, LoopVerdict, by_disparity
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
@@ -24,8 +23,7 @@ from mapserver.survey.rig import rig_of
 from mapserver.survey.settings import LoopSettings, SurveySettings
 from mapserver.survey.state import Keyframe, RigImages
 from mapserver.survey.survey_inputs import SurveyConfig, Zones
-from support.recordings.recording_samples import calibration
-from support.worlds.box_room import out_and_back, stereo_pair
+from support.worlds.box_room import out_and_back, rendered_keyframes
 from support.worlds.vocabulary_training import train_vocabulary
 
 SETTINGS = SurveySettings(loops=LoopSettings(min_gap_keyframes=6))
@@ -35,14 +33,10 @@ WALL, AGAIN = range(4), range(10, 14)
 @lru_cache(maxsize=1)
 def seen() -> tuple[list[Keyframe], Array, Rectifier, Vocabulary]:
     """Ten rendered keyframes, where each was, the rig and a vocabulary."""
-    rectifier = Rectifier(calibration())
     wall = [out_and_back(6.0)(t) for t in (2.0, 2.2, 2.4, 2.6)]
     other = [out_and_back(6.0, yaw_rad=-1.2)(t) for t in (2.0, 2.2, 2.4, 2.6, 2.8, 3.0)]
     places = np.array([*wall, *other])
-    keyframes = [
-        make_keyframe(rectifier.rectify(stereo_pair(there, k * 10**9)), k, rectifier.camera, SETTINGS)
-        for k, there in enumerate(places)
-    ]
+    keyframes, rectifier = rendered_keyframes(places, SETTINGS, 10**9)
     descriptors = np.concatenate([k.features.descriptors for k in keyframes])
     images = np.repeat(np.arange(len(keyframes)), [len(k.features) for k in keyframes])
     return keyframes, places, rectifier, train_vocabulary(descriptors, 8, 3, np.random.default_rng(2), images)

@@ -7,16 +7,17 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from fleetmap.geometry import Array, se3, se3_inverse, so3_exp, transform_points
+from fleetmap.geometry import Array, align_points, se3, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.rectification import StereoCamera
 from fleetmap.sensors.samples import ImuSamples, Trajectory
+from mapserver.evaluation.trajectory_error import absolute_trajectory_error
 from mapserver.survey.bundle.bundle_rounds import bundle_problem, bundle_rounds
 from mapserver.survey.merge.base_map import BaseMap
 from mapserver.survey.merge.guided_matching import Sightings
 from mapserver.survey.merge.joint_adjustment import Measured, adjust_jointly
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import KeyframeMotion, Landmarks, PriorTerm, RelativeTerm, SurveyState
-from mapserver.survey.survey_map import SurveyMap
+from support.storage.map_samples import plain_survey
 from support.worlds.bundle_scene import rig
 
 CAMERA = StereoCamera(420.0, 320.0, 240.0, 0.12, 640, 480)
@@ -101,17 +102,12 @@ def drive(
 
 
 def rigid(true: Array, found: Array) -> Array:
-    """true_from_found (4, 4) that brings positions (K, 3) nearest to each other (Horn 1987)."""
-    a, b = found - found.mean(axis=0), true - true.mean(axis=0)
-    u, _, vt = np.linalg.svd(b.T @ a)
-    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
-    return se3(turn, true.mean(axis=0) - turn @ found.mean(axis=0))
+    """true_from_found (4, 4) that brings positions (K, 3) nearest to each other."""
+    return align_points(true, found)[0]
 
 
 def ate_m(true: Array, found: Array) -> float:
-    a, b = true[:, :3, 3], found[:, :3, 3]
-    fit = rigid(a, b)
-    return float(np.sqrt(np.square(a - b @ fit[:3, :3].T - fit[:3, 3]).sum(axis=1).mean()))
+    return absolute_trajectory_error(*(Trajectory(np.arange(len(each)), each) for each in (found, true))).rmse_m
 
 
 def beside(first: Drive, later: Drive, points: int) -> tuple[Measured, Sightings]:
@@ -282,30 +278,8 @@ def test_docks_that_know_the_heading_to_a_degree_do_not_turn_the_map() -> None:
 
 def published(made: Drive) -> BaseMap:
     """The drive's survey as a site's map."""
-    state, marks = made.state, made.state.landmarks
-    count = len(marks.points_map)
-    return BaseMap(
-        SurveyMap(
-            camera=CAMERA,
-            body_from_cam=BODY_FROM_CAM,
-            keyframe_stamps_ns=state.stamps_ns,
-            map_from_body=state.map_from_body,
-            landmark_ids=np.arange(count, dtype=np.uint32),
-            points_map=marks.points_map,
-            descriptors=np.zeros((count, 32), np.uint8),
-            point_sigma_m=np.full(count, 0.01),
-            obs_keyframe=marks.obs_keyframe,
-            obs_landmark=marks.obs_landmark,
-            obs_pixels=marks.obs_pixels,
-            obs_octave=np.zeros(len(marks.obs_keyframe), np.int8),
-            obs_sigma_px=marks.obs_sigma_px,
-            trajectory=Trajectory(state.stamps_ns, state.map_from_body),
-            trajectory_estimated=np.ones(len(state.stamps_ns), bool),
-            patches=np.zeros((count, 21, 21), np.uint8),
-        ),
-        CAMERA,
-        BODY_FROM_CAM,
-    )
+    state = made.state
+    return BaseMap(plain_survey(CAMERA, BODY_FROM_CAM, state.map_from_body, state.landmarks), CAMERA, BODY_FROM_CAM)
 
 
 @pytest.mark.parametrize("sees", ["little", "the end"])

@@ -9,14 +9,12 @@ import numpy as np
 from fleetmap.geometry import Array, se3, se3_exp, so3_exp
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.survey.executor import SERIAL, SerialExecutor
-from mapserver.survey.keyframes.keyframes import make_keyframe
 from mapserver.survey.rig import rig_of
 from mapserver.survey.settings import PairSettings, SurveySettings
 from mapserver.survey.state import Keyframe, RigImages
 from mapserver.survey.tracks.matching import NearPlaces, PairFinder, fixed_allowance_m
 from mapserver.survey.tracks.pairs import PairTask, view_overlap
-from support.recordings.recording_samples import calibration
-from support.worlds.box_room import out_and_back, stereo_pair
+from support.worlds.box_room import out_and_back, rendered_keyframes
 
 SETTINGS = SurveySettings(pairs=PairSettings(previous=2, covisible=3))
 
@@ -24,12 +22,8 @@ SETTINGS = SurveySettings(pairs=PairSettings(previous=2, covisible=3))
 @lru_cache(maxsize=1)
 def seen() -> tuple[list[Keyframe], Array, Rectifier]:
     """Ten keyframes along the wall and back, and where each truly was."""
-    rectifier = Rectifier(calibration())
     places = np.array([out_and_back(6.0)(t) for t in np.linspace(1.0, 5.0, 10)])
-    keyframes = [
-        make_keyframe(rectifier.rectify(stereo_pair(there, k)), k, rectifier.camera, SETTINGS)
-        for k, there in enumerate(places)
-    ]
+    keyframes, rectifier = rendered_keyframes(places, SETTINGS)
     return keyframes, places, rectifier
 
 

@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-from fleetmap.sensors.rectification import RGBD_BASELINE_M, StereoCamera
-from mapserver.survey.rig import survey_camera
 from mapserver.survey.tracks.mono_depths import fuse_inverse_depths
 
 
@@ -27,9 +25,3 @@ def test_a_feature_that_views_contradict_stays_without_depth() -> None:
 def test_a_depth_that_is_hardly_known_is_none() -> None:
     assert np.isnan(fuse_inverse_depths(np.array([[0, 0.1, 0.02]]), 1, 0.12)).all()
     assert np.isnan(fuse_inverse_depths(np.zeros((0, 3)), 2, 0.12)).all()
-
-
-def test_only_a_single_camera_gets_a_baseline() -> None:
-    single, pair = (StereoCamera(400.0, 320.0, 240.0, base, 640, 480) for base in (0.0, 0.2))
-    assert survey_camera(single).baseline_m == RGBD_BASELINE_M
-    assert survey_camera(pair) is pair

@@ -9,14 +9,12 @@ import numpy as np
 from fleetmap.geometry import Array, se3_inverse, so3_exp, transform_points
 from fleetmap.sensors.rectification import Rectifier
 from mapserver.survey.executor import SERIAL
-from mapserver.survey.keyframes.keyframes import make_keyframe
 from mapserver.survey.rig import rig_of
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import Keyframe, Landmarks, RigImages, image_numbers
 from mapserver.survey.tracks.pairs import MatchInputs, PairMatch, PredictedMotion, match_pair
 from mapserver.survey.tracks.tracks import Tracks, build_landmarks, refine_observations, tracks_of
-from support.recordings.recording_samples import calibration
-from support.worlds.box_room import out_and_back, points_seen, stereo_pair
+from support.worlds.box_room import out_and_back, points_seen, rendered_keyframes
 
 
 def pair(i: int, j: int, features: list[tuple[int, int]]) -> PairMatch:
@@ -83,12 +81,8 @@ def test_observations_go_and_landmarks_that_are_seen_too_rarely_with_them() -> N
 def views() -> tuple[list[Keyframe], Array, Rectifier, Landmarks]:
     """Keyframes of the room from four true places, and the landmarks that they share."""
     settings = SurveySettings()
-    rectifier = Rectifier(calibration())
     map_from_body = np.array([out_and_back(6.0)(t) for t in (2.0, 2.3, 2.6, 2.9)])
-    keyframes = [
-        make_keyframe(rectifier.rectify(stereo_pair(there, k)), k, rectifier.camera, settings)
-        for k, there in enumerate(map_from_body)
-    ]
+    keyframes, rectifier = rendered_keyframes(map_from_body, settings)
     pairs = []
     for i in range(4):
         for j in range(i + 1, 4):
