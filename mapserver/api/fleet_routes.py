@@ -5,7 +5,7 @@ from dataclasses import replace
 from itertools import accumulate
 from typing import Annotated, Any, NamedTuple
 
-from fastapi import APIRouter, Depends, Query, Request, Response
+from fastapi import APIRouter, Depends, Request, Response
 
 from fleetmap.encoding import to_json, to_plain
 from fleetmap.mapformat.names import sha256_hex
@@ -94,10 +94,10 @@ def fleet_hours(
 
 
 @router.get("/v1/failures")
-def failures(store: p.Store, query: Annotated[p.FailureQuery, Query()]) -> views.Page[FailureRow]:
+def failures(store: p.Store, wanted: p.FailuresWanted, page: p.NumberPage) -> views.Page[FailureRow]:
     """Failures, latest arrival first; kind `suspected` marks estimated silent failures."""
-    found = store.fleet.failures(query.filter(), before=query.cursor, limit=query.limit + 1)
-    return query.page.of(found, lambda failure: failure.number)
+    found = store.fleet.failures(wanted, before=page.cursor, limit=page.limit + 1)
+    return page.of(found, lambda failure: failure.number)
 
 
 @router.get("/v1/failures/{number}")

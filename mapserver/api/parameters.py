@@ -12,7 +12,6 @@ from fastapi import Depends, Path, Query, Request
 from fastapi.dependencies.utils import get_flat_params
 from fastapi.params import Header
 from fastapi.routing import APIRoute
-from pydantic import BaseModel
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 
@@ -135,29 +134,21 @@ async def known_parameters(request: HTTPConnection) -> None:
         raise HTTPException(422, f"unknown query parameter {unknown[0][:40]!r}; {words}")
 
 
-class FailureQuery(BaseModel):
-    """Filters and the page of a list of failures."""
+def failure_filter(
+    within: TimeRange,
+    site: SiteFilter = None,
+    robot: KeyFilter = None,
+    version: VersionFilter = None,
+    tile: KeyFilter = None,
+    area: KeyFilter = None,
+    cause: KeyFilter = None,
+    kind: KeyFilter = None,
+) -> FailureFilter:
+    """Return the filter of a list of failures."""
+    return FailureFilter(site, robot, version, tile, cause, kind, *within, area)
 
-    site: SiteFilter = None
-    robot: KeyFilter = None
-    version: VersionFilter = None
-    tile: KeyFilter = None
-    area: KeyFilter = None
-    cause: KeyFilter = None
-    kind: KeyFilter = None
-    since: Since = None
-    until: Until = None
-    limit: Limit = 100
-    cursor: NumberCursor = None
 
-    @property
-    def page(self) -> "_ByNumber":
-        return _ByNumber(self.limit, self.cursor)
-
-    def filter(self) -> FailureFilter:
-        since_ns, until_ns = time_range(self.since, self.until)
-        named = self.model_dump(exclude={"limit", "cursor", "since", "until"})
-        return FailureFilter(**named, since_ns=since_ns, until_ns=until_ns)
+FailuresWanted = Annotated[FailureFilter, Depends(failure_filter)]
 
 
 @dataclass(frozen=True, slots=True)

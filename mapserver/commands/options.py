@@ -156,6 +156,13 @@ def print_table(columns: Sequence[str], rows: Iterable[Iterable[object]], title:
     plain_console().print(table)
 
 
+def print_records(
+    columns: Sequence[str], found: Sequence[object], rows: Iterable[Iterable[object]], *, json: bool
+) -> None:
+    """Print records to stdout: as JSON, or else their rows."""
+    print_json(found) if json else print_table(columns, rows)
+
+
 @contextmanager
 def shown_progress(what: str) -> Iterator[Callable[[int, int], None]]:
     """Yield a function that shows how many are done of how many."""

@@ -85,6 +85,8 @@ def ask_operation(
         path |= {"name": f"{number}.mcap"} if number % 2 and "name" in path else {}
         path |= {"box": "held", "name": f"held-{number}.mcap"} if number % 2 and "box" in path else {}
         path |= {name: value for name, value in chosen(operation.label).items() if number % 2}
+        if number % 2 and isinstance(case.body, dict) and "incident" in case.body:
+            case.body["incident"] = "failure/hall/1"
         if number % 2 and operation.label.endswith("/estimate"):
             case.query = {"pin": PINS}
         if number % 4 == 3 and isinstance(case.query, dict):  # made-up moments are hardly ever ones

@@ -18,38 +18,17 @@ from mapserver.api.metrics import Metrics
 from mapserver.api.parameters import ApiSettings
 from mapserver.fleet.alerts import AlertSettings
 from mapserver.fleet.fleet import Fleet
-from mapserver.fleet.incidents import Incident
 from mapserver.plugins import alert_messages
 from mapserver.plugins.alert_messages import Webhook, check_address
 from mapserver.store import MapStore
 from support.fleet.webhook_receiver import receiver
 from support.waiting import eventually
 
-NOW_NS = 1_900_000_000_000_000_000
-
 
 @pytest.fixture
 def store(tmp_path: Path) -> Iterator[MapStore]:
     with MapStore.open(tmp_path / "store", create=True) as opened:
         yield opened
-
-
-def test_it_is_told_once_and_once_more_when_it_is_over(tmp_path: Path) -> None:
-    held = [Incident("FleetmapRobotLost", "lab", "r1", NOW_NS, "r1 of lab has had no known position for 5 min")]
-    (tmp_path / "token").write_text("secret\n")
-    with receiver() as (address, got):
-        sender = Webhook(AlertSettings(webhook=address, token_file=str(tmp_path / "token")))
-        for active in (held, held, held, [], [], []):
-            sender.tell(active, [], NOW_NS)
-        assert eventually(lambda: len(got) == 2)
-        sender.close()
-    assert {headers["Authorization"] for headers, _ in got} == {"Bearer secret"}
-    begun, ended = (json.loads(body) for _, body in got)
-    assert [begun["version"], begun["status"], ended["status"]] == ["4", "firing", "resolved"]
-    (alert,) = begun["alerts"]
-    assert alert["labels"] == {"alertname": "FleetmapRobotLost", "site": "lab", "about": "r1"}
-    assert (alert["startsAt"], ended["alerts"][0]["endsAt"]) == ("2030-03-17T17:46:40Z",) * 2
-    assert alert["annotations"]["summary"].startswith("r1 of lab")
 
 
 @pytest.mark.parametrize("status", [301, 307, 308, 404, 500])
