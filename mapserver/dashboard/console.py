@@ -6,10 +6,11 @@ now and then is fetched anew by `static/renew.js`. Acts are requests to the HTTP
 
 import asyncio
 import time
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, date, tzinfo
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
 from fastapi import FastAPI, Request, Response
@@ -27,7 +28,7 @@ from mapserver.api.parameters import ApiSettings
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots
-from mapserver.dashboard.map_layers import Layer, box_around, box_of, ground
+from mapserver.dashboard.map_layers import Layer, box_around, box_of, ground, heat
 from mapserver.dashboard.rendering import TEMPLATES, address, age
 from mapserver.fleet_statistics.kpis import HOUR_NS
 from mapserver.operators.roles import Scope
@@ -305,14 +306,22 @@ def number(text: str | None, name: str) -> int | None:
 def scene_of(
     services: Services,
     context: PageContext,
-    version: int,
+    version: int | None,
     over: Sequence[Layer],
     *,
+    dense_m: Mapping[str, Iterable[tuple[float, float]]] = MappingProxyType({}),
     places_m: Sequence[tuple[float, float]] = (),
     shows_coverage: bool = False,
-) -> dict[str, object]:
-    """A version's map with layers over it, for `site_map` of templates. places_m: what is in sight first, everything without them."""
+) -> dict[str, object] | None:
+    """A version's map with layers over it, for `site_map` of templates; None for a version that is not there.
+
+    dense_m: places by the name of a layer that shows how dense they are, once somebody wants it. places_m: what is in sight first,
+    everything without them.
+    """
+    if version is None or not services.maps.has_version(context.site, version):
+        return None
     plan = services.maps.plan(context.site, version)
+    over = [*(Layer(name, heat(found, box_of(plan)), shown=False) for name, found in dense_m.items()), *over]
     below = services.maps.underlays(context.site, version, context.root)
     picture, areas = context.plan_picture(version), services.maps.store.areas(context.site)
     layers = [*ground(plan, picture, areas, below, shows_coverage=shows_coverage), *over]

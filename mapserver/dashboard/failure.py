@@ -236,9 +236,6 @@ def _scene(
     services: Services, context: PageContext, row: FailureRow, report: FailureReport, way: Sequence[Line]
 ) -> dict[str, object] | None:
     """The map around it: what the robot believed in these seconds, and its fixes. None where the version is gone."""
-    version = row.version or services.maps.current_version(context.site)
-    if version is None or not services.maps.has_version(context.site, version):
-        return None
     found = [
         Mark(fix.position_map_m[0], fix.position_map_m[1], "accent", "circle", f"fix, {fix.refused or 'used'}")
         for fix in report.fixes
@@ -247,6 +244,7 @@ def _scene(
     found += failure_marks(context, [row])
     layers = [Layer("Path", way), Layer("Failure", found), Layer("Chosen moment")]
     places_m = [(mark.x, mark.y) for mark in found] + [place for line in way for place in line.points]
+    version = row.version or services.maps.current_version(context.site)
     return scene_of(services, context, version, layers, places_m=places_m)
 
 

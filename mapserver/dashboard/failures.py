@@ -14,7 +14,7 @@ from mapserver.api.incidents import incidents, of_failure
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.fleet_health import FAILURES_SHOWN, MANY_FAILURES
 from mapserver.dashboard.fleet_parts import bar_edges
-from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
+from mapserver.dashboard.map_layers import Layer, Mark
 from mapserver.fleet.incidents import Incident, with_acts
 from mapserver.store import FailureFilter, FailureRow
 
@@ -24,21 +24,16 @@ Chosen = Mapping[str, str]
 """Values by axis; none of those that everything may have."""
 
 
-class Choice(NamedTuple):
-    """A value, how many failures choosing it shows, and the address that does so; of a chosen one, that which takes the choice back."""
-
-    value: str
-    failures: int
-    to: str
-
-
 class Facet(NamedTuple):
-    """An axis by which failures are chosen."""
+    """An axis by which failures are chosen.
+
+    choices: values, how many failures choosing each shows, and the address that does so; of a chosen one, that which takes the choice back.
+    """
 
     axis: str
     title: str
     chosen: str | None
-    choices: list[Choice]
+    choices: list[tuple[str, int, str]]
 
 
 ADVICE: dict[str, str] = {
@@ -78,11 +73,15 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     else:
         found = kept_failures.failures(wanted, before=before, limit=FAILURES_SHOWN + 1)
     shown = found[:FAILURES_SHOWN]
+    places = [(row.x_map_m, row.y_map_m) for row in matching if row.x_map_m is not None and row.y_map_m is not None]
+    dense = {"Density": places}
+    is_kept = version is not None and services.maps.has_version(context.site, version)
+    drawn = version if is_kept else services.maps.current_version(context.site)
     facets = _facets(context, rows, chosen, kept, services.maps.store.areas(context.site).names)
     settings = services.settings.config.alerts
     found_open = incidents(maps.store, services.robots.fleet, settings, maps.inbox, context.site)
     causes = next((facet.choices for facet in facets if facet.axis == "cause"), [])
-    shades = {cause.value: min(n, _SHADES - 1) for n, cause in enumerate(causes)}
+    shades = {cause: min(n, _SHADES - 1) for n, (cause, *_) in enumerate(causes)}
     return {
         "answer": _answer(matching),
         "is_chosen": any(value for name, value in kept.items() if name != "sort"),
@@ -95,7 +94,8 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
         "shades": shades,
         "advice": ADVICE,
         "chart": _chart(context, matching, shades, chosen) if matching else None,
-        "scene": _scene(services, context, shown, matching, version),
+        # where the listed ones are, and where all that match are dense
+        "scene": scene_of(services, context, drawn, [Layer("Failures", failure_marks(context, shown))], dense_m=dense),
         "rows": shown,
         "held": held(services, shown),
         "incidents": sorted(found_open, key=lambda one: one.state != "open"),
@@ -150,7 +150,7 @@ def _facets(
         if not counts or (axis == "tile" and areas and not own):
             continue
         choices = [
-            Choice(value, count, context.to("failures", **{**kept, axis: None if value == own else value}))
+            (value, count, context.to("failures", **{**kept, axis: None if value == own else value}))
             for value, count in counts.most_common()
         ]
         found.append(Facet(axis, title, own, choices))
@@ -182,24 +182,6 @@ def _chart(
         bars.append({"words": words, "parts": parts, "to": context.to("failures", **{**chosen, **span})})
     ends = [context.written(ns)[:16].replace("T", " ") for ns in (edges[0], end_ns)]
     return {"bars": bars, "most": most, "step": step, "ends": ends, "span": (edges[0], edges[-1])}
-
-
-def _scene(
-    services: Services,
-    context: PageContext,
-    shown: Sequence[FailureRow],
-    matching: Sequence[FailureRow],
-    wanted: int | None,
-) -> dict[str, object] | None:
-    """The map with the failures that are listed, and where all that match are dense; None before the first version."""
-    version = wanted if wanted and services.maps.has_version(context.site, wanted) else None
-    version = version or services.maps.current_version(context.site)
-    if version is None:
-        return None
-    places = [(row.x_map_m, row.y_map_m) for row in matching if row.x_map_m is not None and row.y_map_m is not None]
-    dense = heat(places, box_of(services.maps.plan(context.site, version)))
-    layers = [Layer("Density", dense, shown=False), Layer("Failures", failure_marks(context, shown))]
-    return scene_of(services, context, version, layers)
 
 
 def failure_marks(context: PageContext, shown: Sequence[FailureRow]) -> list[Mark]:

@@ -37,7 +37,7 @@ class SiteHealth:
     """A site's figures. day: the last 24 h; days: rates of 24 h each, oldest first, the last ends now.
 
     robots: each one's figures of the last 24 h. trend: how day compares with the 7 days before, in words. areas: the last 7 days beside
-    the 7 before them by named area, or by tile where has_areas says that none is named, from week_since_ns on. alerts: of the site and the
+    the 7 before them by named area, or by tile where none is named, from week_since_ns on. alerts: of the site and the
     server.
     """
 
@@ -48,7 +48,6 @@ class SiteHealth:
     trials: tuple[Trial, ...]
     resurvey: tuple[TileConcern, ...]
     areas: tuple[AreaTrend, ...]
-    has_areas: bool
     week_since_ns: int
     alerts: tuple[Incident, ...]
 
@@ -121,7 +120,6 @@ class HealthData:
         robots = self._store.fleet.counters_of(site, "robot", next_hour - DAY_H)
         ended_ns = now_ns - _ENDED_SHOWN_NS
         trials = [row for row in self._store.canaries(site) if row.ended_ns is None or row.ended_ns > ended_ns][:3]
-        has_areas = bool(self._store.areas(site))
         is_mapped = any(info.site == site for info in self._store.sites())
         return SiteHealth(
             kpis(days[-1]),
@@ -131,7 +129,6 @@ class HealthData:
             tuple(trial_of(row, find(self._store, row, self._canary, now_ns)) for row in trials),
             tuple(resurvey_list(self._store, site, self._resurvey, now_ns).tiles) if is_mapped else (),
             tuple(self.area_trends(site, None, None)),
-            has_areas,
             (next_hour - WEEK_H) * HOUR_NS,
             tuple(alert for alert in self._alerts(now_ns) if alert.site in {"", site}),
         )

@@ -9,7 +9,7 @@ from fleetmap.errors import FleetmapError
 from mapserver.api.incidents import of_drafts
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.data import EVER, MapData
-from mapserver.dashboard.map_layers import Layer, Outline, Picture, box_of, heat, squares
+from mapserver.dashboard.map_layers import Layer, Outline, Picture, box_of, squares
 from mapserver.dashboard.plan import Plan
 from mapserver.dashboard.rendering import begun, share, size
 from mapserver.drafting.area_corrections import AreaCorrections
@@ -90,8 +90,8 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     drawn = [ring.round(2).tolist() for area in forgets for ring in area.outlines]
     others = [one for one in requests if one.corners_map_m not in drawn]
     asked_for = [Outline([[(x, y) for x, y in one.corners_map_m]], f"survey {one.id}") for one in others]
+    failed = {"Failures": services.health.places(site, *span_ns)}
     over = [
-        Layer("Failures", heat(services.health.places(site, *span_ns), box_of(plan)), shown=False),
         Layer("Changed tiles", squares(plan, changes["tiles"]), shown=compares),
         Layer("Requested surveys", asked_for),
         Layer("Outline that you draw"),
@@ -105,7 +105,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
             for info in reversed(rows.versions.values())
         ],
         "shown": shown,
-        "scene": scene_of(services, context, shown, over, shows_coverage=not compares),
+        "scene": scene_of(services, context, shown, over, dense_m=failed, shows_coverage=not compares),
         "gate": _gate(maps, info, verdicts.get(shown)),
         "version_facts": _facts(maps, info, plan),
         "one_way": one_way(plan, maps.store.areas(site)),

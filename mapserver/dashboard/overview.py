@@ -15,7 +15,7 @@ from mapserver.dashboard.data import EVER
 from mapserver.dashboard.fleet_health import DAYS_SHOWN, SiteHealth
 from mapserver.dashboard.fleet_parts import Bar, Bars, Choice, Figure, Sentence, bar_edges
 from mapserver.dashboard.live import LiveRobot, LiveSite
-from mapserver.dashboard.map_layers import Layer, Mark, box_of, heat
+from mapserver.dashboard.map_layers import Layer, Mark
 from mapserver.dashboard.map_page import verdict_words
 from mapserver.dashboard.rendering import age, begun, share
 from mapserver.fleet.alerts import dropped_words
@@ -45,22 +45,12 @@ class Notice(NamedTuple):
 
 def page(services: Services, context: PageContext) -> dict[str, object]:
     """What the template needs."""
-    return {"scene": _scene(services, context), "now": now(services, context)}
-
-
-def _scene(services: Services, context: PageContext) -> dict[str, object] | None:
-    """The map, None before the first version."""
-    site, version = context.site, services.maps.current_version(context.site)
-    if version is None:
-        return None
-    live, box = services.robots.look(site), box_of(services.maps.plan(site, version))
-    layers = [
-        Layer("Failures", heat(services.health.places(site), box), shown=False),
-        Layer("Robots", _marks(context, live)),
-    ]
+    live, version = services.robots.look(context.site), services.maps.current_version(context.site)
     places = [robot.place_m for robot in live.robots if robot.place_m is not None]
-    scene = scene_of(services, context, version, layers, places_m=places if len(places) > _MANY else ())
-    return scene | {"fills_page": True}
+    shown, dense = [Layer("Robots", _marks(context, live))], {"Failures": services.health.places(context.site)}
+    in_sight = places if len(places) > _MANY else ()
+    scene = scene_of(services, context, version, shown, dense_m=dense, places_m=in_sight)
+    return {"scene": scene and scene | {"fills_page": True}, "now": now(services, context)}
 
 
 def now(services: Services, context: PageContext) -> dict[str, object]:
@@ -242,6 +232,7 @@ def trends(services: Services, context: PageContext) -> dict[str, object]:
     live, health = services.robots.look(context.site), services.health.site(context.site)
     span_ns = context.time_range()
     day, when, trend, areas = health.day, "last 24 h", f"; {health.trend}", list(health.areas)
+    has_areas = bool(services.maps.store.areas(context.site))
     if span_ns != EVER:
         day, when, trend = services.health.span(context.site, *span_ns), "chosen hours", ""
         areas = services.health.area_trends(context.site, *span_ns)
@@ -265,7 +256,7 @@ def trends(services: Services, context: PageContext) -> dict[str, object]:
         "areas": areas,
         "worse": trend_sentence(areas) if areas else "",
         "is_chosen": span_ns != EVER,
-        "has_areas": health.has_areas,
+        "has_areas": has_areas,
         "outside": OUTSIDE,
         "since": context.written(span_ns[0] or health.week_since_ns),
         "bars_over_time": Bars("Failures per robot-day", _bars(context, edges, rates), (edges[0], edges[-1])),

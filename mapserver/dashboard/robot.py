@@ -188,22 +188,19 @@ def page(services: Services, context: PageContext, robot: str) -> dict[str, obje
     within = [row for row in failures if since_ns <= row.happened_ns < until_ns]
     curves = [(words, form, curve(rows, name, (since_ns, until_ns))) for words, name, form in _CURVES]
     version = live.status.version or services.maps.current_version(context.site)
-    drawn = None
-    if version is not None and services.maps.has_version(context.site, version):
-        trail = way(rows, shown, ingest.trace_every_s)
-        layers = [
-            Layer("Way", trail),
-            Layer("Failures", failure_marks(context, within)),
-            Layer("Robots", live.marks()),
-            Layer("Chosen place"),
-        ]
-        places = [place for line in trail for place in line.points] + ([] if live.place_m is None else [live.place_m])
-        drawn = scene_of(services, context, version, layers, places_m=places)
+    trail = way(rows, shown, ingest.trace_every_s)
+    layers = [
+        Layer("Way", trail),
+        Layer("Failures", failure_marks(context, within)),
+        Layer("Robots", live.marks()),
+        Layer("Chosen place"),
+    ]
+    places = [place for line in trail for place in line.points] + ([] if live.place_m is None else [live.place_m])
     return {
         "usual": "Last drive" if drive else "Last 24 h",
         "robot": robot,
         "now": now(services, context, robot),
-        "scene": drawn,
+        "scene": scene_of(services, context, version, layers, places_m=places),
         "version": version,
         "at": lambda ns: round(100 * (ns - since_ns) / span_ns, 3),
         "ticks": [since_ns + n * span_ns // (_TICKS - 1) for n in range(_TICKS)],

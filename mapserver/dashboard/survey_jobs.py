@@ -191,9 +191,8 @@ def _loops(services: Services, context: PageContext, build: dict[str, Any]) -> d
     reasons = (
         re.sub(r"\d+(\.\d+)?", "…", loop.reason or words) for loop, _, words in refused
     )  # the same but for figures
-    drawn = None if not found or version is None else scene_of(services, context, version, layers)
     return {
-        "scene": drawn,
+        "scene": scene_of(services, context, version, layers) if found else None,
         "version": version,
         "counts": build.get("loops"),
         "loops": found,

@@ -1,5 +1,5 @@
 // What changes from second to second, as the server's stream tells it: parts of the page, and the robots on its map.
-import "./maps.js";
+import "./map/index.js";
 import { renewParts } from "./morph.js";
 import { follow } from "./stream.js";
 

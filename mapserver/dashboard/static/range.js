@@ -1,43 +1,35 @@
-// A time is chosen by dragging in a chart, which says from when until when it shows, in milliseconds since 1970.
+// A time is chosen by dragging in a chart, which says from when until when it shows, in milliseconds since 1970, and by `data-to` on which page.
 const [MINUTE_MS, LEAST_PX] = [60_000, 6];
-const shade = Object.assign(document.createElement("div"), { className: "dragged" });
-let chart, from;
-let isDragged = false;
+const shade = Object.assign(document.createElement("div"), { className: "dragged" }); // on the page while somebody drags
+let drag;
 
-const boxOf = (x) => {
-  const { left, right, top, height } = chart.getBoundingClientRect();
-  const [start, end] = [from, x].map((px) => Math.min(right, Math.max(left, px))).sort((a, b) => a - b);
-  return { start, end, left, top, height, width: right - left };
-};
+const ends = (x) => [drag.from, x].map((px) => Math.min(drag.box.right, Math.max(drag.box.left, px))).sort((a, b) => a - b);
 
 function end() {
-  shade.remove();
-  chart = undefined;
-  setTimeout(() => (isDragged = false)); // after the click that ends it
+  drag = undefined;
+  setTimeout(() => shade.remove()); // after the click that ends it
 }
 
 addEventListener("pointerdown", ({ target, button, clientX }) => {
-  [chart, from, isDragged] = [button === 0 ? target.closest("[data-since]") : undefined, clientX, false];
+  const chart = button === 0 ? target.closest("[data-since]") : null;
+  drag = chart ? { chart, box: chart.getBoundingClientRect(), from: clientX } : undefined;
 });
 addEventListener("pointermove", ({ clientX }) => {
-  if (!chart || (!isDragged && Math.abs(clientX - from) < LEAST_PX)) return;
-  isDragged = true;
-  const { start, end, top, height } = boxOf(clientX);
-  Object.assign(shade.style, { left: `${start}px`, width: `${end - start}px`, top: `${top}px`, height: `${height}px` });
+  if (!drag || (!shade.isConnected && Math.abs(clientX - drag.from) < LEAST_PX)) return;
+  const { top, height } = drag.box, [left, right] = ends(clientX);
+  Object.assign(shade.style, { left: `${left}px`, width: `${right - left}px`, top: `${top}px`, height: `${height}px` });
   document.body.append(shade);
 });
 addEventListener("pointerup", ({ clientX }) => {
-  if (chart && isDragged) {
-    const { since, until } = chart.dataset;
-    const { start, end, left, width } = boxOf(clientX);
-    const [first, last] = [start, end].map((px) => (Number(since) + ((px - left) / width) * (until - since)) / MINUTE_MS);
-    const to = new URL(chart.dataset.to ?? location, location);
+  if (drag && shade.isConnected) {
+    const { left, width } = drag.box, { since, until, to = location } = drag.chart.dataset, address = new URL(to, location);
+    const [first, last] = ends(clientX).map((px) => (Number(since) + ((px - left) / width) * (until - since)) / MINUTE_MS);
     for (const [name, minute] of [["since", Math.floor(first)], ["until", Math.ceil(last)]])
-      to.searchParams.set(name, `${new Date(minute * MINUTE_MS).toISOString().slice(0, 16)}Z`);
-    location.assign(to);
+      address.searchParams.set(name, `${new Date(minute * MINUTE_MS).toISOString().slice(0, 16)}Z`);
+    location.assign(address);
   }
   end();
 });
 addEventListener("pointercancel", end);
 addEventListener("dragstart", (event) => event.target.closest?.("[data-since]") && event.preventDefault()); // its links are no things to drag
-addEventListener("click", (event) => isDragged && event.preventDefault(), true);
+addEventListener("click", (event) => shade.isConnected && event.preventDefault(), true);

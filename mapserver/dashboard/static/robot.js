@@ -1,5 +1,5 @@
 // A person's word of where a robot stands.
-import "./maps.js";
+import "./map/index.js";
 
 const element = document.getElementById("map");
 const map = element?.map;

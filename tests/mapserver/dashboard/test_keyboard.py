@@ -52,6 +52,7 @@ def test_everything_is_reached_with_the_keyboard_alone(page: Page, small_fleet: 
     assert page.evaluate("document.body.className") == "console "
 
     enter(page, "Robots", "Robots of hall")
+    assert page.evaluate("document.body.className") == "console ", "the look that was chosen stays"
     tab_to(page, "Find a robot")
     page.keyboard.type("tug-3")
     expect(page.locator("#rows tbody tr").filter(visible=True)).to_have_count(1)

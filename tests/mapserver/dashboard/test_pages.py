@@ -429,15 +429,6 @@ def test_times_are_those_of_the_browser_and_ranges_are_kept_to(served: Served) -
     assert later in within, "the form says what was asked"
 
 
-def test_the_look_that_was_chosen_stays(page: Page, served: Served) -> None:
-    opened(page, served, "")
-    page.get_by_label("Theme").select_option("Dark")
-    chosen = "document.body.classList.contains('body--dark')"
-    assert page.evaluate(chosen)
-    opened(page, served, "surveys")
-    assert page.evaluate(chosen)
-
-
 def test_under_another_name_there_is_no_page(page: Page, served: Served) -> None:
     answer = page.goto(f"http://elsewhere.example:{urlsplit(served.http).port}/dashboard/map")
     assert answer.status == 403

@@ -1,4 +1,5 @@
-// The map of all pages: leaflet over metres (x to the right, y up), with layers and with marks that move between two reports.
+// The map of all pages: leaflet over metres (x to the right, y up), with layers and with marks that move between two reports. Each is drawn
+// from what its element says; a click is its event `pick`, with x and y in metres and the mark that is there, unless that leads to a page.
 import * as L from "../vendor/leaflet/leaflet.js";
 import { Axes, Marks, MarkSet, Switch, words } from "./marks.js";
 
@@ -117,4 +118,9 @@ export class SiteMap {
       name.getElement().style.display = hasRoom ? "" : "none";
     });
   }
+}
+
+for (const element of document.querySelectorAll("[data-scene]")) {
+  const onPick = (x, y, mark) => element.dispatchEvent(new CustomEvent("pick", { detail: { x, y, mark } }));
+  element.map = new SiteMap(element, JSON.parse(element.dataset.scene), { onPick });
 }

@@ -1,6 +1,6 @@
 // A version in three dimensions, and a walk along the places of its surveys. Words of robots are painted as text, never markup.
 import * as THREE from "./vendor/three/three.js";
-import "../../static/maps.js";
+import "../../static/map/index.js";
 import { follow } from "../../static/stream.js";
 
 // A scale that is told apart without red and green, from low to high.
@@ -82,10 +82,14 @@ function frustums(rows, color, tangents) {
   return lines(ends, color, 0.6);
 }
 
+async function fetched(address, what) {
+  const answer = await fetch(address);
+  if (!answer.ok) throw new Error(`The ${what} could not be fetched: ${await answer.text()}`);
+  return answer.arrayBuffer();
+}
+
 async function fetchMap() {
-  const answer = await fetch(scene.address);
-  if (!answer.ok) throw new Error(`The map could not be fetched: ${await answer.text()}`);
-  const bytes = await answer.arrayBuffer(), head = new DataView(bytes);
+  const bytes = await fetched(scene.address, "map"), head = new DataView(bytes);
   const count = head.getUint32(0, true);
   places = head.getUint32(4, true);
   points = new Float32Array(bytes, 8, 3 * count);
@@ -97,29 +101,32 @@ async function fetchMap() {
 // What three.js makes of a grey level of a picture.
 const LINEAR = Uint16Array.from({ length: 256 }, (_, grey) => 65535 * new THREE.Color().setRGB(grey / 255, 0, 0, THREE.SRGBColorSpace).r);
 
-// A Points for each level, as wide as its voxels.
+function cloud(places, colours, look) {
+  const shape = new THREE.BufferGeometry();
+  shape.setAttribute("position", new THREE.BufferAttribute(places, 3));
+  shape.setAttribute("color", colours);
+  return new THREE.Points(shape, new THREE.PointsMaterial({ vertexColors: true, ...look }));
+}
+
+// A cloud for each level, as wide as its voxels.
 async function drawSurfels() {
-  const answer = await fetch(scene.surfels);
-  if (!answer.ok) throw new Error(`The surfels could not be fetched: ${await answer.text()}`);
-  const bytes = await answer.arrayBuffer(), levels = new DataView(bytes).getUint32(0, true);
+  const bytes = await fetched(scene.surfels, "surfels"), levels = new DataView(bytes).getUint32(0, true);
   const counts = new Uint32Array(bytes, 4, levels), edges = new Float32Array(bytes, 4 + 4 * levels, levels);
   const first = 4 + 8 * levels, total = counts.reduce((sum, count) => sum + count, 0);
   let begun = 0;
   counts.forEach((count, level) => {
-    const shape = new THREE.BufferGeometry(), greys = new Uint8Array(bytes, first + 12 * total + begun, count);
-    shape.setAttribute("position", new THREE.BufferAttribute(new Float32Array(bytes, first + 12 * begun, 3 * count), 3));
-    shape.setAttribute("color", new THREE.BufferAttribute(Uint16Array.from({ length: 3 * count }, (_, n) => LINEAR[greys[Math.floor(n / 3)]]), 3, true));
-    groups.surfels.add(new THREE.Points(shape, new THREE.PointsMaterial({ size: 1.5 * edges[level], vertexColors: true })));
+    const greys = new Uint8Array(bytes, first + 12 * total + begun, count);
+    const colours = Uint16Array.from({ length: 3 * count }, (_, n) => LINEAR[greys[Math.floor(n / 3)]]);
+    const places = new Float32Array(bytes, first + 12 * begun, 3 * count);
+    groups.surfels.add(cloud(places, new THREE.BufferAttribute(colours, 3, true), { size: 1.5 * edges[level] }));
     begun += count;
   });
   draw();
 }
 
 function drawMap() {
-  const shape = new THREE.BufferGeometry();
-  shape.setAttribute("position", new THREE.BufferAttribute(points, 3));
-  shape.setAttribute("color", new THREE.BufferAttribute(new Float32Array(points.length), 3));
-  groups.landmarks.add(new THREE.Points(shape, new THREE.PointsMaterial({ size: 2, sizeAttenuation: false, vertexColors: true })));
+  const colours = new THREE.BufferAttribute(new Float32Array(points.length), 3);
+  groups.landmarks.add(cloud(points, colours, { size: 2, sizeAttenuation: false }));
   groups.places.add(frustums(rows, TONES.accent));
   // Reports tell ends from above: each is drawn at the height of the place nearest to it.
   const ends = { loops: [], "refused loops": [] };

@@ -1,5 +1,5 @@
 // The live page is shown anew as soon as more of the survey was heard; at first it has no map.
-import "../../static/maps.js";
+import "../../static/map/index.js";
 import { renew } from "../../static/renew.js";
 import { follow } from "../../static/stream.js";
 
