@@ -5,8 +5,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
-import scipy
-
 from fleetmap.errors import RecordingError
 from fleetmap.failure_summary import Moment, decode_summary
 from fleetmap.messages import CameraNote
@@ -19,7 +17,7 @@ from mapserver.fleet_statistics.area_trend import AreaTrend, area_trends
 from mapserver.fleet_statistics.canary_decision import CanarySettings
 from mapserver.fleet_statistics.kpis import HOUR_NS, Counters, Kpis, Rate, hour_of, kpis, rate
 from mapserver.fleet_statistics.resurvey_decision import ResurveySettings, TileConcern
-from mapserver.store import FailureFilter, MapStore, TraceRow
+from mapserver.store import FailureFilter, MapStore
 
 _log = logging.getLogger(__name__)
 DAY_H, WEEK_H = 24, 7 * 24
@@ -29,7 +27,12 @@ MANY_FAILURES = 5000
 NEAR_NS = 60_000_000_000  # of a failure's beginning
 _CACHED_NS = 5_000_000_000
 _ENDED_SHOWN_NS = 7 * DAY_H * HOUR_NS
-_SIGNIFICANCE = 0.05
+_TRENDS = {
+    "worse": "more than in the week before",
+    "better": "fewer than in the week before",
+    "no clear change": "no clear change from the week before",
+    "too little driving to say": "too little driving to compare with the week before",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +68,6 @@ class HealthData:
     def site(self, site: str) -> SiteHealth:
         """A site's figures, a few seconds old at most, computed once for all open pages."""
         return self._sites.get(site, lambda: self._site(site))
-
-    def trace(self, site: str, robot: str, since_ns: int, until_ns: int) -> list[TraceRow]:
-        """Where a robot was and what it said of itself, thinned, oldest first."""
-        hours = {"since_hour": hour_of(since_ns), "until_hour": hour_of(until_ns - 1) + 1}
-        found = self._store.fleet.trace(site, robot, **hours)
-        return [row for row in found if since_ns <= row.heard_ns < until_ns]
 
     def span(self, site: str, since_ns: int | None, until_ns: int | None) -> Kpis:
         """A site's figures of whole hours: those that both ends lie in, too."""
@@ -123,7 +120,7 @@ class HealthData:
         is_mapped = any(info.site == site for info in self._store.sites())
         return SiteHealth(
             kpis(days[-1]),
-            trend_words(days[-1], week),
+            _TRENDS[area_trends({"": days[-1]}, {"": week})[0].verdict],
             tuple(rate(counts.position_failures, counts.robot_days) for counts in days),
             {robot: kpis(counts) for robot, counts in robots.items()},
             tuple(trial_of(row, find(self._store, row, self._canary, now_ns)) for row in trials),
@@ -149,23 +146,3 @@ def _sum(hours: Mapping[int, Counters], since: int, until: int) -> Counters:
             total.add(counts)
     total.continued = first.continued
     return total
-
-
-def trend_words(day: Counters, week: Counters) -> str:
-    """How a day's failures compare with the week's before, as far as the counts can tell.
-
-    Given all failures of both, those of the day are binomial with the day's share of the driving if nothing changed (the
-    conditional test of two Poisson rates, Przyborowski and Wilenski 1940; twice the smaller tail).
-    """
-    if day.robot_days <= 0 or week.robot_days <= 0:
-        return "nothing to compare with yet"
-    total = day.position_failures + week.position_failures
-    if total == 0:
-        return "none in the week before either"
-    share = day.robot_days / (day.robot_days + week.robot_days)
-    fewer = float(scipy.special.bdtr(day.position_failures - 1, total, share)) if day.position_failures else 0.0
-    if 2 * (1 - fewer) < _SIGNIFICANCE:
-        return "more than in the week before"
-    if 2 * float(scipy.special.bdtr(day.position_failures, total, share)) < _SIGNIFICANCE:
-        return "fewer than in the week before"
-    return "no clear change from the week before"

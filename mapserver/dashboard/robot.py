@@ -17,6 +17,7 @@ from mapserver.dashboard.fleet_parts import Sentence
 from mapserver.dashboard.live import ORDER, SILENT, LiveRobot, words_of
 from mapserver.dashboard.map_layers import Layer, Line
 from mapserver.dashboard.overview import remarks, since_words
+from mapserver.fleet_statistics.kpis import hour_of
 from mapserver.fleet_statistics.robot_calibration import PARAMETERS
 from mapserver.store import FailureFilter, TraceRow
 
@@ -173,8 +174,9 @@ def page(services: Services, context: PageContext, robot: str) -> dict[str, obje
     (since_ns, end_ns), now_ns, ingest = context.time_range(), time.time_ns(), services.settings.config.ingest
     until_ns = min(now_ns, end_ns or now_ns)
     kept_ns = until_ns - max(_USUAL_NS, round(ingest.trace_days * _USUAL_NS))
-    traced = services.health.trace(context.site, robot, min(since_ns or kept_ns, until_ns - 1), until_ns)
-    rows = sorted(traced, key=lambda row: row.heard_ns)
+    hours = {"since_hour": hour_of(min(since_ns or kept_ns, until_ns - 1)), "until_hour": hour_of(until_ns - 1) + 1}
+    traced = services.maps.store.fleet.trace(context.site, robot, **hours)
+    rows = sorted((row for row in traced if row.heard_ns < until_ns), key=lambda row: row.heard_ns)
     drive = last_drive(rows) if (since_ns, end_ns) == EVER else None
     if drive is not None:
         since_ns, until_ns = drive[0], min(drive[1], now_ns)
