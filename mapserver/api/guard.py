@@ -35,7 +35,7 @@ SIGN_IN, SIGN_OUT, STYLE = "/sign-in", "/sign-out", "/dashboard/static/style.css
 _OPEN = {"/healthz", "/readyz", SIGN_IN, SIGN_OUT, STYLE}
 _RIGHTS = (  # needed for reading, too; operations say their own
     (re.compile(r"/metrics$"), Right.METRICS),
-    (re.compile(r"/v1/(operators|tokens)(/|$)|/dashboard/administration/people(/|$)"), Right.OPERATORS),
+    (re.compile(r"/v1/(operators|tokens|log)(/|$)|/dashboard/administration/(people|log)(/|$)"), Right.OPERATORS),
     (re.compile(r"/v1/sites/[^/]+/enrolled(/|$)"), Right.ROBOTS),
 )
 _FORWARDED = {"forwarded", "x-forwarded-for", "x-real-ip"}

@@ -1,14 +1,18 @@
-"""Endpoints of operators and enrolled robots. The guard requires the rights `operators` and `robots`, also for reading."""
+"""Endpoints of operators, enrolled robots and the log. The guard requires the rights `operators` and `robots`, also for reading."""
 
-from fastapi import APIRouter
+from typing import Annotated
+
+from fastapi import APIRouter, Query
 
 from mapserver.api import parameters as p
 from mapserver.api import views
 from mapserver.operators.operators import Operators
-from mapserver.store import MapStore
+from mapserver.store import AuditLine, MapStore
 from mapserver.trust.enrolment import EnrolledRobot, RobotRegister
 
 router = APIRouter()
+Person = Annotated[str | None, Query(max_length=200, description="what this person did alone", examples=["ada"])]
+Kind = Annotated[str | None, Query(max_length=64, description="kinds that begin so", examples=["robot enrolled"])]
 
 
 def operators_of(store: MapStore) -> list[views.OperatorView]:
@@ -38,6 +42,21 @@ def enrolled_of(store: MapStore, site: str) -> list[EnrolledRobot]:
 def list_operators(store: p.Store, page: p.NamePage) -> views.Page[views.OperatorView]:
     """Operators and programs by name, with their sessions and tokens."""
     return page.of(operators_of(store), lambda operator: operator.name)
+
+
+@router.get("/v1/log")
+def log(
+    store: p.Store,
+    page: p.NumberPage,
+    within: p.TimeRange,
+    person: Person = None,
+    site: p.SiteFilter = None,
+    kind: Kind = None,
+) -> views.Page[AuditLine]:
+    """What people did, the last first: who, what, where, when and why."""
+    asked = {"site": site, "person": person, "kind": kind}
+    lines = store.log(**asked, of_people=True, span_ns=within, before=page.cursor, limit=page.limit + 1)
+    return page.of(lines, lambda line: line.id)
 
 
 @router.get("/v1/sites/{site}/enrolled")

@@ -171,13 +171,16 @@ def audit(
     store: StoreFolder,
     verify: Annotated[bool, typer.Option("--verify", help="Check the hash chain; status 3 for a fault.")] = False,
     last: Annotated[int, typer.Option(min=1, help="Number of lines to print.")] = 50,
+    person: Annotated[str | None, typer.Option(metavar="NAME", help="Only what this person did.")] = None,
+    site: Annotated[str | None, typer.Option(help="Only what was done to this site.")] = None,
+    kind: Annotated[str | None, typer.Option(metavar="KIND", help="Only kinds that begin so.")] = None,
     json: Json = False,
 ) -> None:
     """Print the log of a store: releases, sign-ins, operators, refusals; the last lines, oldest first."""
     from mapserver.store import chain_faults
 
     with open_store(store, read_only=True) as maps:
-        lines = maps.audit_lines(None if verify else last)
+        lines = maps.audit_lines() if verify else maps.log(site=site, person=person, kind=kind, limit=last)[::-1]
     if not verify:
         print_result(lines, map(_words, lines), json=json)
         return

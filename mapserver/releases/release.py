@@ -22,7 +22,7 @@ from mapserver.quality.figures import TRUSTED_KEY, TrustedCalibration, trusted_c
 from mapserver.quality.gate import GateSettings, GateVerdict, judge
 from mapserver.releases.version_diff import Difference, manifest_difference
 from mapserver.store import NOBODY, Actor, CanaryRow, MapStore, SiteReleases, VerdictRow, VersionInfo
-from mapserver.store.release import Release
+from mapserver.store.queries import Release
 from mapserver.trust.signing import try_update_lists
 
 _USUAL_GATE = GateSettings()

@@ -176,9 +176,6 @@ class Database(ABC):
         """Return the first column."""
         return [next(iter(row.values())) for row in self.query(sql, values)]
 
-    def audit_lines(self, last: int | None = None) -> list[AuditLine]:
-        return self.select(AuditLine, "events", {}, "id DESC", last)[::-1]
-
     def copy_from(self, source: "Database") -> None:
         """Fill the database, which is empty, with the rows of another one. StoreError if it holds something."""
         with self.write() as change:

@@ -43,8 +43,7 @@ from mapserver.store.files import (
 )
 from mapserver.store.fleet_queries import name_failures
 from mapserver.store.places import DATABASE, Places, open_database, open_objects, read_places, write_places
-from mapserver.store.queries import EXTRA_TABLES, StoreQueries
-from mapserver.store.release import Release
+from mapserver.store.queries import EXTRA_TABLES, Release, StoreQueries
 from mapserver.store.rows import NOBODY, Actor, DraftContent, Retention, VerdictRow, VersionInfo
 from mapserver.store.schema import FORMAT
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence, Set
 from contextlib import closing
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -20,7 +20,7 @@ from mapserver.floor_plan.areas import Areas, read_areas
 from mapserver.floor_plan.survey_requests import KIND, SurveyRequest, read_request
 from mapserver.quality.figures import Evidence, TrustedCalibration, carried_evidence, trusted_calibrations
 from mapserver.store.blobs import Blobs
-from mapserver.store.database import Database, SqliteDatabase, matching
+from mapserver.store.database import Database, SqliteDatabase, Transaction, matching
 from mapserver.store.fleet_queries import FleetQueries, keep_last_reports
 from mapserver.store.operators import OperatorQueries
 from mapserver.store.places import open_database, open_objects, read_places
@@ -28,6 +28,7 @@ from mapserver.store.rows import (
     INCIDENT,
     NOBODY,
     Actor,
+    AuditLine,
     CanaryRow,
     Event,
     JobInfo,
@@ -60,7 +61,6 @@ class StoreQueries:
         self.fleet, self.operators = FleetQueries(self._database), OperatorQueries(self._database)
         self.files = self._database.files(root)
         self.locked, self.leads, self.is_shared = self._database.locked, self._database.leads, self._database.is_shared
-        self.audit_lines = self._database.audit_lines
         self.blob_size, self.blob_chunks, self.is_whole = self._blobs.size, self._blobs.chunks, self._blobs.is_whole
         self.disk_space: Callable[[], DiskSpace] = DiskMeter(root, clock_ns).look
         self.usage: Callable[[], StoreUsage | None] = UsageMeter(root, self._database, self._blobs).look
@@ -270,6 +270,33 @@ class StoreQueries:
             self._acts_read = last
             return dict(self._acts)
 
+    def log(
+        self,
+        *,
+        site: str | None = None,
+        person: str | None = None,
+        kind: str | None = None,
+        of_people: bool = False,
+        span_ns: Span = (None, None),
+        before: int | None = None,
+        limit: int | None = None,
+    ) -> list[AuditLine]:
+        """Return lines of the log, the last first. kind: its beginning; of_people: not what the server did; before: a line."""
+        by, start_ns, end_ns = "" if of_people else None, *span_ns
+        wanted = {"site": site, "actor": person, "actor <>": by, "stamp_ns >=": start_ns, "stamp_ns <": end_ns}
+        wanted |= {"kind LIKE": None if kind is None else f"{kind}%", "id <": before}
+        return self._database.select(AuditLine, "events", wanted, "id DESC", limit)
+
+    def log_values(self, column: Literal["actor", "site", "kind"]) -> list[str]:
+        """Return what lines of people have in a column of the log."""
+        return self._database.column(
+            f"SELECT DISTINCT {column} FROM events WHERE actor <> '' AND {column} <> '' ORDER BY {column}"
+        )
+
+    def audit_lines(self) -> list[AuditLine]:
+        """Return the whole log, oldest first."""
+        return self.log()[::-1]
+
     def note_restored(self, detail: str, ahead: int, actor: Actor) -> None:
         """Log the restoration of this store, and let its sites' versions go on `ahead` numbers later: the lost store gave the next ones."""
         with self._database.write() as change:
@@ -385,6 +412,56 @@ def site_releases(database: Database, site: str) -> SiteReleases:
         canary=running[0] if running else None,
         files={row["kind"]: row["sha256"] for row in files if row["kind"] in FOR_ROBOTS},
     )
+
+
+class Release:
+    """Changes of one site's releases, in the transaction that reads their state; `mapserver.releases` decides them. rows: before them."""
+
+    def __init__(self, database: Database, change: Transaction, site: str) -> None:
+        self._change, self._site, self._now_ns = change, site, database.now_ns()
+        self.rows = site_releases(database, site)
+        self.has_new_current = False
+
+    def set_state(self, version: int, state: str) -> None:
+        """Set a version published, current or retired, with the time of the first and of the last."""
+        self.has_new_current |= state == "current"
+        self._change.execute(
+            """UPDATE versions SET state = ?, published_ns = coalesce(published_ns, ?), retired_ns = ?
+               WHERE site = ? AND version = ?""",
+            (state, self._now_ns, self._now_ns if state == "retired" else None, self._site, version),
+        )
+
+    def make_current(self, version: int) -> None:
+        """Make a version current instead of the present one, which stays published."""
+        if self.rows.current is not None:
+            self.set_state(self.rows.current.version, "published")
+        self.set_state(version, "current")
+        self._change.insert("currents", [{"site": self._site, "version": version, "since_ns": self._now_ns}])
+
+    def roll_back(self, version: int) -> None:
+        """Make the rollback target current again; the present version retires, and leaves the history of current ones."""
+        if self.rows.current is not None:
+            self.set_state(self.rows.current.version, "retired")
+        self.set_state(version, "current")
+        self._change.execute(
+            """DELETE FROM currents WHERE site = ? AND id > (SELECT max(id) FROM currents WHERE site = ? AND version = ?)""",
+            (self._site, self._site, version),
+        )
+
+    def begin_canary(self, version: int, base_version: int, share: float, threshold: float, actor: Actor) -> None:
+        """Begin a canary; its version, perhaps a draft, is published."""
+        self.set_state(version, "published")
+        row = {"site": self._site, "version": version, "base_version": base_version, "share": share}
+        row |= {"threshold": threshold, "state": "running", "started_ns": self._now_ns, "outcome": ""}
+        self._change.insert("canaries", [row | {"actor": actor.name, "reason": actor.reason}])
+
+    def end_canary(self, state: str, outcome: str) -> None:
+        """End the running canary: promoted, rolled_back or stopped, and the reason."""
+        query = "UPDATE canaries SET state = ?, ended_ns = ?, outcome = ? WHERE site = ? AND state = 'running'"
+        self._change.execute(query, (state, self._now_ns, outcome, self._site))
+
+    def log(self, kind: str, detail: str, version: int, actor: Actor) -> None:
+        self._change.log(self._site, kind, detail, version, actor)
 
 
 def mentioned(database: Database, leaving: Set[tuple[str, int]] = frozenset()) -> set[str]:

@@ -11,8 +11,7 @@ from fleetmap.mapformat.names import current_path
 from mapserver.store.blobs import Blobs
 from mapserver.store.database import Database
 from mapserver.store.files import is_plain_file
-from mapserver.store.queries import EXTRA_TABLES, mentioned, site_releases
-from mapserver.store.release import Release
+from mapserver.store.queries import EXTRA_TABLES, Release, mentioned, site_releases
 from mapserver.store.rows import Actor, Retention, SiteReleases, VersionInfo
 
 _DAY_NS = 86_400_000_000_000

@@ -115,7 +115,7 @@ def test_a_store_that_does_not_answer_lets_nobody_in(
 def test_programs_and_the_pages_themselves_do(server: Server, headers: dict[str, str]) -> None:
     with client_of(server) as client:
         assert client.post(PUBLISH, json=ACT, headers=headers).status_code == 200
-        assert server.store.last_events("lab", 1)[0].actor == "ada"
+        assert server.store.log(site="lab", limit=1)[0].actor == "ada"
         check_problem(client.post("/v1/sites/lab/rollback", json={}, headers=headers), 422, "name the person who acts")
 
 

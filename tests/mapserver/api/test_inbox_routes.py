@@ -45,7 +45,7 @@ def test_a_recording_comes_in_pieces_and_waits(server: Server, lab: Path) -> Non
     answer = server.client.put(f"{INBOX}/monday.mcap", params=ADA, content=iter(pieces))
     assert (answer.status_code, answer.json()) == (201, {"name": "monday.mcap", "size_bytes": 3_500_000})
     assert (lab / "monday.mcap").read_bytes() == b"".join(pieces)
-    event = server.store.last_events("lab", 1)[0]
+    event = server.store.log(site="lab", limit=1)[0]
     assert (event.kind, event.actor, event.reason) == ("recording_uploaded", "ada", "aisle 3")
     here = server.client.get(INBOX).json()
     assert [(one["name"], one["size_bytes"]) for one in here["waiting"]] == [("monday.mcap", 3_500_000)]
@@ -187,7 +187,7 @@ def test_what_was_left_out_is_tried_again(server: Server, lab: Path) -> None:
     (lab / name).unlink()
     assert name in [one["name"] for one in server.client.post(again, json=ADA).json()["waiting"]]
     assert files(held) == []
-    assert server.store.last_events("lab", 1)[0].kind == "recording_tried_again"
+    assert server.store.log(site="lab", limit=1)[0].kind == "recording_tried_again"
     check_problem(server.client.post(again, json=ADA), 404, "no recording")
     assert server.client.post(f"{INBOX}/done/{quote(name)}/retry", json=ADA).status_code == 422
     assert server.client.post(f"{INBOX}/held/{quote('../x', safe='')}/retry", json=ADA).status_code == 404
@@ -217,7 +217,7 @@ def test_a_build_without_space_is_an_answer_and_in_no_log(
 
     monkeypatch.setattr(night_runs, "TemporaryFile", full)
     check_problem(server.client.post("/v1/sites/lab/build", json=ADA), 503, "No space left")
-    assert server.store.last_events("lab", 1)[0].kind == "saved"
+    assert server.store.log(site="lab", limit=1)[0].kind == "saved"
 
 
 def test_a_build_is_in_the_log_before_it_begins(server: Server, lab: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -225,7 +225,7 @@ def test_a_build_is_in_the_log_before_it_begins(server: Server, lab: Path, monke
     known: list[str] = []
 
     def started(*_: object) -> None:
-        known.extend(event.kind for event in server.store.last_events("lab", 1))
+        known.extend(event.kind for event in server.store.log(site="lab", limit=1))
         raise StateError("no process")
 
     monkeypatch.setattr(night_runs.NightRuns, "_started", started)

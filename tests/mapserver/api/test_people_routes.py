@@ -27,7 +27,7 @@ ACTS = (
     ("/v1/sites/lab/enrolled/r1/revoke", {}, "robots"),
     ("/v1/sites/lab/robots/r1/remove", {}, "robots"),
 )
-LISTS = (("/v1/operators", "operators"), ("/v1/sites/lab/enrolled", "robots"))
+LISTS = (("/v1/operators", "operators"), ("/v1/log", "operators"), ("/v1/sites/lab/enrolled", "robots"))
 
 
 @pytest.fixture
@@ -72,6 +72,13 @@ def test_each_address_asks_for_its_right(server: Server, named: dict[str, dict[s
     assert {row["name"]: row["is_disabled"] for row in client.get("/v1/operators", headers=named["ada"]).json()["items"]} == {
         "ada": False, "bob": False, "ci": False, "olga": True, "program": False, "vic": False,
     }  # fmt: skip
+    asked, ada = "/v1/log?person=ada&site=lab&kind=robot&limit=2", named["ada"]
+    whole, log = client.get("/v1/log?limit=1000", headers=ada).json()["items"], client.get(asked, headers=ada).json()
+    assert [line["detail"] for line in log["items"]] == ["r1", "r1"]
+    assert [line["kind"] for line in log["items"]] == ["robot removed", "robot revoked"]
+    (last,) = client.get(f"{asked}&cursor={log['next']}", headers=ada).json()["items"]
+    assert (last["kind"], last["reason"], last in whole) == ("robot enrolled", "monday", True)
+    assert {line["actor"] for line in whole} >= {"root", "ada"}
     enrolled = client.get("/v1/sites/lab/enrolled", headers=named["ada"]).json()["items"]
     assert enrolled == server.store.robots("lab") == []
 

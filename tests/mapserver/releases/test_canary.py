@@ -233,11 +233,11 @@ def test_what_becomes_current_ends_the_canary(store: MapStore) -> None:
     releases.start_canary(store, "lab", 3, 0.1, actor=ADA)
     releases.promote(store, "lab", 3, actor=ADA)
     assert [(canary.state, canary.outcome) for canary in store.canaries("lab")] == [("promoted", "a test")]
-    assert [event.kind for event in store.last_events("lab", 2)] == ["promoted", "canary_promoted"]
+    assert [event.kind for event in store.log(site="lab", limit=2)] == ["promoted", "canary_promoted"]
     releases.start_canary(store, "lab", 2, 0.1, actor=ADA)
     releases.promote(store, "lab", 1, actor=ADA)
     assert store.canaries("lab")[0].outcome == "version 1 became current"
-    assert [event.kind for event in store.last_events("lab", 2)] == ["promoted", "canary_stopped"]
+    assert [event.kind for event in store.log(site="lab", limit=2)] == ["promoted", "canary_stopped"]
 
 
 def test_a_canary_begins_only_beside_the_version_that_it_was_judged_against(store: MapStore, meanwhile) -> None:
@@ -249,4 +249,4 @@ def test_a_canary_begins_only_beside_the_version_that_it_was_judged_against(stor
         releases.start_canary(store, "lab", 3, 0.1)
     releases.roll_back(store, "lab")
     releases.start_canary(store, "lab", 3, 0.1)
-    assert [event.kind for event in store.last_events("lab", 2)] == ["canary_started", "admitted"]
+    assert [event.kind for event in store.log(site="lab", limit=2)] == ["canary_started", "admitted"]

@@ -71,7 +71,7 @@ def test_what_is_restored_is_the_store(store: MapStore, where: str, tmp_path: Pa
         assert restored.verify().faults == []
         assert content(restored) == content(store)
         assert restored.restored_ns() > 0
-        assert restored.audit_lines(1)[0].reason == ADA.reason
+        assert restored.log(limit=1)[0].reason == ADA.reason
         assert save_sample_draft(restored, seed=8) > 1000, "the lost store may have given the next numbers"
     restore(target, tmp_path / "older", ADA, name=first.snapshot)
     with MapStore.open(tmp_path / "older", clock_ns=clock) as older:
