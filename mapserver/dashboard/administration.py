@@ -1,14 +1,15 @@
-"""The pages of the server (is it well? alerts, disk, what expires, for how long reports are kept), and of people and robots.
+"""The pages of the server (is it well? alerts, disk, what expires, for how long reports are kept), of people and robots, and of the log.
 
-Those say who may do what here: operators with role, sessions and tokens; robots and their enrolment.
+Those say who may do what here: operators with role, sessions and tokens; robots and their enrolment. The log says what people did.
 """
 
+import re
 import time
 from typing import NamedTuple
 
 from fleetmap.errors import StateError
 from mapserver.api.people_routes import enrolled_of, operators_of
-from mapserver.dashboard.console import PageContext, Services
+from mapserver.dashboard.console import PageContext, Services, number
 from mapserver.dashboard.live import ORDER, LiveRobot
 from mapserver.dashboard.rendering import size
 from mapserver.fleet.alerts import active_alerts
@@ -31,7 +32,9 @@ _NAMES = {
 _RENEWED = "renewed by the server itself"
 _BY_SERVER = ("snapshot", "timestamp", "site-")
 _SOON_DAYS = 30
-_MOST_ROBOTS = 500
+_MOST_ROBOTS = _MOST_LINES = 500
+LOG_FILTERS = ("person", "where", "kind")
+_OF_REQUEST = re.compile(r" [0-9a-f]{8}$")  # in the kind of its lines
 _ROLES = {
     Role.VIEWER: "viewer: reads",
     Role.OPERATOR: "operator: publishes and rolls back, too",
@@ -130,6 +133,7 @@ def people(services: Services, context: PageContext) -> dict[str, object]:
     heard = {robot.name: robot for robot in services.robots.look(context.site).robots}
     robots = [_Robot(name, heard.get(name), enrolled.get(name)) for name in {*enrolled, *heard}]
     return {
+        "allowed": {line.detail: line for line in reversed(store.log(site=context.site, kind="robot enrolled"))},
         "operators": operators_of(store),
         "roles": _ROLES,
         "rights": _RIGHTS,
@@ -140,6 +144,26 @@ def people(services: Services, context: PageContext) -> dict[str, object]:
         "robots": sorted(robots, key=lambda robot: (ORDER[robot.tone], robot.name)),
         "most": _MOST_ROBOTS,
         "cannot_enrol": cannot_enrol(RobotRegister(store)),
+    }
+
+
+def log(services: Services, context: PageContext) -> dict[str, object]:
+    """What the template needs: who did what, where, when and why, the last first."""
+    store, chosen = services.maps.store, {name: context.query.get(name) or None for name in LOG_FILTERS}
+    before, span_ns = number(context.query.get("older"), "line"), context.time_range()
+    asked = {"person": chosen["person"], "site": chosen["where"], "kind": chosen["kind"]}
+    lines = store.log(**asked, of_people=True, span_ns=span_ns, before=before, limit=_MOST_LINES + 1)
+    kept, has_more = chosen | {"find": context.query.get("find")}, len(lines) > _MOST_LINES
+    kinds = sorted({_OF_REQUEST.sub("", kind) for kind in store.log_values("kind")})
+    return {
+        "filters": [
+            ("person", "Person", "everybody", store.log_values("actor")),
+            ("where", "Site", "anywhere", store.log_values("site")),
+            ("kind", "Kind", "everything", kinds),
+        ],
+        "chosen": chosen,
+        "lines": lines[:_MOST_LINES],
+        "older": context.to("administration/log", **kept, older=lines[-2].id) if has_more else None,
     }
 
 

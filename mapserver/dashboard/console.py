@@ -124,6 +124,11 @@ class PageContext:
         """Both ends of the range as the address has them."""
         return {name: self.query.get(name) for name in RANGE}
 
+    def doc(self, place: str) -> str:
+        """The address of a document, or of a section of it: "floors.md#lifts"."""
+        document, mark, section = place.removeprefix("docs/").partition("#")
+        return f"{self.to(f'docs/{document}')}{mark}{section}"
+
     @property
     def api(self) -> str:
         """Prefix of the API's addresses."""
@@ -134,6 +139,11 @@ class PageContext:
         return f"{self.root}/plans/{self.site}/{version}.png"
 
 
+def no_sites(_: str | None) -> list[str]:
+    """For pages of sites that have a version, jobs or an inbox."""
+    return []
+
+
 class _Page(NamedTuple):
     """A page. under: the page that leads to it; the others as `Console.page` says."""
 
@@ -142,17 +152,20 @@ class _Page(NamedTuple):
     fill: Callable[..., dict[str, object]]
     knows: Sequence[str]
     usual: str = ""
-    under_way: Callable[[], list[str]] = list
+    under_way: Callable[[str | None], list[str]] = no_sites
     of_site: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class Console:
-    """Where pages are added. links: title and icon of each page that all pages link to, by its path, in their order."""
+    """Where pages are added. links: title and icon of each page that all pages link to, by its path, in their order; help: what documents
+    say of it, as of `PageContext.doc`.
+    """
 
     app: FastAPI
     services: Services
     links: dict[str, tuple[str, str]] = field(default_factory=dict)
+    help: dict[str, str] = field(default_factory=dict)
 
     def files(self, path: str, folder: Path) -> None:
         """Adds what pages load: the files of a folder."""
@@ -179,7 +192,7 @@ class Console:
         under: str | None = None,
         knows: Sequence[str] = (),
         usual: str = "",
-        under_way: Callable[[], list[str]] = list,
+        under_way: Callable[[str | None], list[str]] = no_sites,
         of_site: bool = True,
     ) -> None:
         """Adds a page. fill: what its template needs beside `context`, of the services, it and the parts of `path` in braces; may block.
@@ -187,7 +200,7 @@ class Console:
         A FleetmapError becomes a notice within the frame. link: title and icon by which all pages link to it; under: the page that
         leads to it. knows: query parameters beside those of the frame. usual: what is shown of a page over time where
         its address has no range, in words. under_way: sites that the page knows though the store has no
-        version of them. of_site: False for a page that shows the same whatever site its address names.
+        version of them, of the one that its address names. of_site: False for a page that shows the same whatever site its address names.
         """
         if link is not None:
             self.links[path] = link
@@ -204,7 +217,7 @@ class Console:
         one: Callable[..., dict[str, Any]],
         *,
         shows: Sequence[str] = (),
-        under_way: Callable[[], list[str]] = list,
+        under_way: Callable[[str | None], list[str]] = no_sites,
     ) -> None:
         """Adds what a page follows: looked at every second and told when it has changed, for as long as the session lasts.
 
@@ -214,7 +227,7 @@ class Console:
         @self.app.get(f"/{path}", include_in_schema=False)
         async def followed(request: Request, site: str) -> StreamingResponse:
             """A stream of server-sent events."""
-            chosen = site if site in await load(under_way) else await load(self.services.maps.chosen_site, site)
+            chosen = site if site in await load(under_way, site) else await load(self.services.maps.chosen_site, site)
             zone = zone_of(request.cookies.get(_ZONE_COOKIE))
             context = PageContext(_root(request), chosen, zone, request.query_params)
             guard, ended = self.services.settings.guard, b"event: ended\ndata: %s\n\n" % SIGN_IN.encode()
@@ -244,7 +257,7 @@ class Console:
         template, site, found, status = page.template, request.query_params.get("site"), {}, 200
         root, sites = _root(request), list[str]()
         try:
-            growing, stored = await load(page.under_way), await load(self.services.maps.sites)
+            growing, stored = await load(page.under_way, site), await load(self.services.maps.sites)
             sites = sorted({*stored, *growing})
             if site is None and growing:
                 site = growing[0]
@@ -263,7 +276,8 @@ class Console:
             template, found = "problem.html", {"words": str(error)}
             status = 503 if isinstance(error, StoreError) else 404
             site = site if site in sites else None  # links lead somewhere
-        kept = PageContext(root, "", query=request.query_params).range_kept if status == 200 else {}
+        here = PageContext(root, site or "", query=request.query_params if status == 200 else {})
+        kept = here.range_kept
         listed = f"{root}/{page.under if page.under in self.links else ''}"  # what is of one site is not looked for in another
         look = request.cookies.get(_LOOK_COOKIE, "")
         frame = {
@@ -272,6 +286,7 @@ class Console:
             "pages": {path: (*link, address(f"{root}/{path}", site=site, **kept)) for path, link in self.links.items()},
             "kept": {name: value for name, value in kept.items() if value},
             "usual": page.usual,
+            "help": here.doc(self.help.get(page.under, "service.md#dashboard")),
             "page": page.under,
             "sites": sites,
             "elsewhere": listed if request.path_params or page.under not in self.links else None,

@@ -18,7 +18,7 @@ from fleetmap.hooks import plugins
 from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.guard import SIGN_IN, SIGN_OUT, STYLE, GuardSettings, address_of, set_session
 from mapserver.api.parameters import ApiSettings
-from mapserver.dashboard import administration, failure, failures, map_page, overview, robot, robots, survey_jobs
+from mapserver.dashboard import administration, docs, failure, failures, map_page, overview, robot, robots, survey_jobs
 from mapserver.dashboard.console import PATH, Console, Services
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
@@ -28,6 +28,14 @@ from mapserver.fleet.alerts import active_alerts
 from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore
 
+_HELP = {
+    "trends": "service.md#the-fleets-health",
+    "robots": "troubleshooting.md#status-of-a-robot",
+    "map": "how_to.md#correct-the-map",
+    "failures": "service.md#causes",
+    "surveys": "how_to.md#build-a-map-every-night",
+    "administration": "operations.md",
+}
 LASTING = "private, max-age=31536000, immutable"  # versions do not change
 Hear = Callable[[str, str, Callable[[str, bytes], None]], None]
 """`BusService.hear`."""
@@ -59,7 +67,7 @@ def install_dashboard(
     )
     pages = FastAPI(openapi_url=None)
     pages.add_middleware(GZipMiddleware, compresslevel=5)
-    console = Console(pages, services)
+    console = Console(pages, services, help=_HELP.copy())
     console.files("static", Path(__file__).parent / "static")
     _install_pages(console)
     for install in plugins("mapserver.parts").values():
@@ -67,6 +75,10 @@ def install_dashboard(
     link = _link("Administration")  # behind those of the parts
     console.page("administration", "administration.html", administration.page, link=link, of_site=False)
     console.page("administration/people", "people.html", administration.people, of_site=False)
+    knows = (*administration.LOG_FILTERS, "older")
+    console.page("administration/log", "log.html", administration.log, knows=knows, usual="All", of_site=False)
+    console.page("docs/{document:path}", "docs.html", docs.page, of_site=False)
+    console.files("pictures", docs.FOLDER)
     console.nothing_else()
     _install_files(pages, services)
     app.mount(PATH, pages)

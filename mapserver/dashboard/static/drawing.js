@@ -41,6 +41,10 @@ function drawn() {
     show(wrong < 0 ? undefined : `"${written[wrong]}" is not a corner: ${EXAMPLE}.`);
   });
   isOn.addEventListener("change", () => show());
+  drawing.firstElementChild.addEventListener("click", () => {
+    isOn.checked = !drawing.open && corners.length < 3;
+    show();
+  });
   back.addEventListener("click", () => change(corners.slice(0, -1)));
   close.addEventListener("click", () => end(corners));
   cancel.addEventListener("click", () => end([]));
@@ -51,15 +55,14 @@ function drawn() {
 }
 
 // The areas are sent as a whole: as they were when the dialog opened, with one change. The server refuses it if others changed them since.
-const described = ({ name, mask, percent, correction, reason }) => ({
-  name, ...(mask && { mask }), ...(mask === "speed" && { percent: Number(percent) }), ...(correction && { correction: { kind: correction, reason } }),
+const described = ({ name, kind, lift, mask, percent, correction, reason }) => ({
+  name, ...(kind && { lift: lift.trim() }), ...(mask && { mask }), ...(mask === "speed" && { percent: Number(percent) }), ...(correction && { correction: { kind: correction, reason } }),
 });
-const lift = ({ properties }) => properties.lift && { lift: properties.lift };
 const isCalled = (name) => ({ properties }) => properties.name === name;
 const outlined = () => ({ type: "Polygon", coordinates: [[...corners, corners[0]]] });
 const CHANGES = {
   add: (areas, _, fields) => [...areas, { type: "Feature", geometry: outlined(), properties: described(fields) }],
-  change: (areas, name, fields) => areas.map((area) => (isCalled(name)(area) ? { ...area, properties: { ...lift(area), ...described(fields) } } : area)),
+  change: (areas, name, fields) => areas.map((area) => (isCalled(name)(area) ? { ...area, properties: described(fields) } : area)),
   remove: (areas, name) => areas.filter((area) => !isCalled(name)(area)),
 };
 
@@ -68,12 +71,12 @@ async function read(address) {
   return { answer, areas: answer.ok && (await answer.json()) };
 }
 
-async function send(before, { dataset }, { name, mask, percent, correction, ...by }) {
+async function send(before, { dataset }, { name, kind, lift, mask, percent, correction, ...by }) {
   const { answer, areas } = await before;
   if (!answer.ok) return answer;
   if (dataset.name && !areas.features.some(isCalled(dataset.name)))
     return new Response(JSON.stringify({ detail: `There is no area ${dataset.name} any more: somebody else changed it.` }), { status: 412 });
-  const features = CHANGES[dataset.area](areas.features, dataset.name, { name: name?.trim(), mask, percent, correction, reason: by.reason });
+  const features = CHANGES[dataset.area](areas.features, dataset.name, { name: name?.trim(), kind, lift, mask, percent, correction, reason: by.reason });
   const headers = { "If-Match": answer.headers.get("ETag"), "Content-Type": "application/geo+json" };
   const request = features.length ? { method: "PUT", headers, body: JSON.stringify({ ...areas, features }) } : { method: "DELETE", headers };
   return fetch(`${dataset.act}?${new URLSearchParams(by)}`, request);
@@ -84,13 +87,14 @@ document.addEventListener("asked", ({ target }) => {
   const before = read(target.dataset.act);
   before.catch(() => {}); // it is told when it is sent
   target.send = (act, told) => send(before, act, told);
-  const { mask, percent, correction, reason } = document.querySelector("dialog form").elements;
+  const { kind, lift, mask, percent, correction, reason } = document.querySelector("dialog form").elements;
   if (!mask) return;
   const follow = () => {
+    lift.required = !(lift.parentElement.hidden = !kind.value);
     percent.required = !(percent.parentElement.hidden = mask.value !== "speed");
     reason.required = Boolean(correction.value) && correction.value !== target.dataset.correction;
   };
-  for (const field of [mask, correction]) field.addEventListener("change", follow);
+  for (const field of [kind, mask, correction]) field.addEventListener("change", follow);
   follow();
 });
 if (drawing) drawn();

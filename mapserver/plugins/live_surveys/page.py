@@ -5,7 +5,6 @@ import time
 from base64 import b64encode
 from collections.abc import Callable
 from functools import partial
-from itertools import count
 from pathlib import Path
 from typing import NamedTuple
 
@@ -13,7 +12,7 @@ import numpy as np
 
 from fleetmap.errors import LinkError
 from fleetmap.geometry import Array
-from fleetmap.mapformat.names import check_name
+from fleetmap.mapformat.names import check_name, is_name, sha256_hex
 from fleetmap.messages import decode_message, split_key
 from mapserver.dashboard.console import PageContext, Services
 from mapserver.dashboard.install import Host
@@ -38,11 +37,11 @@ SILENT_S = 5.0  # surveys report twice a second during the drive
 
 
 class LiveSurvey(NamedTuple):
-    """A state, the time since it was received, and its number: of all states that differ from the one before."""
+    """A state, the time since it was received, and its hash."""
 
     state: LiveSurveyState
     seconds_since: float
-    number: int
+    sha256: str
 
     @property
     def is_silent(self) -> bool:
@@ -54,8 +53,7 @@ class LiveSurveys:
 
     def __init__(self, clock_s: Callable[[], float] = time.monotonic) -> None:
         self._clock_s = clock_s
-        self._states: dict[str, tuple[LiveSurveyState, float, int]] = {}
-        self._numbers = count(1)
+        self._states: dict[str, tuple[LiveSurveyState, float, str]] = {}
         self._lock = threading.Lock()
 
     def hear(self, key: str, payload: bytes) -> None:
@@ -66,15 +64,15 @@ class LiveSurveys:
             raise LinkError(f"a survey of {state.site[:64]!r} under the key of another site; check its sender")
         state.path(), state.part_numbers(), *map(state.rows, COLUMNS)
         with self._lock:
-            before = self._states.pop(state.site, None)
-            number = before[2] if before is not None and before[0] == state else next(self._numbers)
-            self._states[state.site] = state, self._clock_s(), number
+            self._states.pop(state.site, None)
+            self._states[state.site] = state, self._clock_s(), sha256_hex(payload)
             if len(self._states) > _MOST_SITES:
                 del self._states[next(iter(self._states))]
 
-    def sites(self) -> list[str]:
+    def sites(self, asked: str | None = None) -> list[str]:
+        """Return those with a survey, and the one that is asked for, whose survey may be the first thing heard of it."""
         with self._lock:
-            return sorted(self._states)
+            return sorted({*self._states, *filter(is_name, [asked or ""])})
 
     def of(self, site: str) -> LiveSurvey | None:
         """Return the site's survey, None if none was received since the server's start."""
@@ -88,6 +86,7 @@ def install(host: Host) -> None:
     surveys, console = LiveSurveys(), host.console
     if host.hear is not None:
         host.hear(live_key("*"), "survey", surveys.hear)
+    console.help["live"] = "how_to.md#watch-a-survey-while-it-drives"
     console.files("parts/live", _FOLDER / "static")
     template = TEMPLATES.from_string((_FOLDER / "live.html").read_text("utf-8"))
     link = "Live", "parts/live/icon.svg#live"
@@ -100,7 +99,7 @@ def heard(surveys: LiveSurveys, _: Services, context: PageContext) -> dict[str, 
     survey = surveys.of(context.site)
     if survey is None:
         return {"heard": None}
-    return {"heard": survey.number, "silent": survey.is_silent}
+    return {"heard": survey.sha256, "silent": survey.is_silent}
 
 
 def page(surveys: LiveSurveys, _: Services, context: PageContext) -> dict[str, object]:

@@ -59,7 +59,6 @@ def test_a_survey_is_asked_for_by_drawing_it_and_ended(page: Page, served: Serve
     expect(dialog).to_contain_text("Draw at least three corners first")
     dialog.get_by_role("button", name="No, change nothing").click()
     drawing = page.locator(".site-map")
-    page.get_by_label("Draw: each click").check()
     for place in ((250, 200), (300, 200), (300, 260), (100, 100)):
         drawing.click(position=dict(zip("xy", place, strict=True)))
     assert len(marks(page, 4)) == 4
@@ -132,7 +131,7 @@ def test_a_map_is_aligned_with_its_plan_by_clicks_in_both(page: Page, tmp_path: 
         expect(page.locator("#aligning")).to_contain_text("aligned with hall plan.png by 3 points, at most 0.")
         found = store.alignment(SITE)
         assert (found.plan, found.metres_per_unit) == ("hall plan.png", pytest.approx(scale, rel=0.1))
-        assert store.last_events(SITE, 1)[0].actor == "ada"
+        assert store.log(site=SITE, limit=1)[0].actor == "ada"
         page.get_by_text("Align the map with a floor plan").click()
         change(page, "Forget the alignment")
         expect(page.locator("#aligning")).to_contain_text("The map is not aligned yet.")
@@ -151,7 +150,7 @@ def test_an_area_is_drawn_named_changed_and_removed(page: Page, tmp_path: Path) 
         seen = opened(page, served, "map")
         drawing, corners = page.locator(".site-map"), page.get_by_label("Corners, x and y in metres")
         page.get_by_text("Draw an area or a survey on the map").click()
-        page.get_by_label("Draw: each click").check()
+        expect(page.get_by_label("Draw: each click")).to_be_checked()  # as its panel opened
         for place in ((250, 200), (300, 200), (300, 260), (250, 200)):
             drawing.click(position=dict(zip("xy", place, strict=True)))
         expect(page.get_by_label("Draw: each click")).not_to_be_checked()  # the first corner closed it
@@ -191,19 +190,28 @@ def test_an_area_is_drawn_named_changed_and_removed(page: Page, tmp_path: Path) 
         dialog.get_by_label("Your name").fill("ada")
         found = store.areas(SITE).geojson(SITE)
         shape = {"type": "Polygon", "coordinates": [[[0, 0], [4, 0], [4, 3], [0, 0]]]}
-        found["features"][0]["properties"]["lift"] = "A"  # which the page does not change
+        found["features"][0]["properties"]["lift"] = "A"
         found["features"].append({"type": "Feature", "geometry": shape, "properties": {"name": "gate"}})
         replace_areas(store, SITE, to_json(found), Actor("bob"), tag=None)
         dialog.get_by_role("button", name=re.compile("^Yes")).click()
         expect(dialog.get_by_role("alert")).to_contain_text("were changed meanwhile; load them anew")
         dialog.get_by_role("button", name="No, change nothing").click()
         assert [area.name for area in store.areas(SITE).areas] == ["gate", "aisle <5>"]
+        expect(areas).to_contain_text("lift A")
         page.get_by_role("button", name="Change aisle <5>").click()
         dialog.get_by_label("Name of the area").fill("aisle 5")
         dialog.get_by_label("For planners").select_option("no effect")
         dialog.get_by_role("button", name=re.compile("^Yes")).click()
         expect(areas).to_contain_text("aisle 5: 128 m²")
         assert listed() == "aisle 5: 128.0 m2, lift A\ngate: 6.0 m2\n2 areas\n"
+        page.get_by_role("button", name="Change gate").click()
+        expect(dialog.get_by_label("Name of the lift")).to_be_hidden()
+        dialog.get_by_label("Kind").select_option("the cabin of a lift")
+        dialog.get_by_label("Name of the lift").fill("B")
+        dialog.get_by_label("Your name").fill("ada")
+        dialog.get_by_role("button", name=re.compile("^Yes")).click()
+        expect(areas).to_contain_text("gate: 6 m², lift B")
+        assert listed() == "aisle 5: 128.0 m2, lift A\ngate: 6.0 m2, lift B\n2 areas\n"
 
         page.get_by_role("button", name="Change aisle 5").click()
         dialog.get_by_label("Correct the map").select_option("forget what is here, learn it anew")
@@ -261,7 +269,7 @@ def test_a_recording_is_uploaded_built_and_tried_again(page: Page, tmp_path: Pat
         change(page, "Try again")
         expect(waiting.locator(".bad")).to_have_count(0)
         with MapStore.open(store) as maps:
-            kinds = [(event.kind, event.actor) for event in maps.last_events(SITE, 3)]
+            kinds = [(event.kind, event.actor) for event in maps.log(site=SITE, limit=3)]
         assert kinds == [(kind, "ada") for kind in ("recording_tried_again", "build_started", "recording_uploaded")]
         refusals = ("422 (Unprocessable Entity)", "409 (Conflict)")
         told = [f"Failed to load resource: the server responded with a status of {status}" for status in refusals]

@@ -44,6 +44,8 @@ PAGES = {
     "surveys": "Surveys of hall",
     "administration": "Administration",
     "administration/people": "Administration",
+    "administration/log": "Administration",
+    "docs/floors.md": "Floors and lifts",
 }
 SPAN = ("since", "until")
 
@@ -57,6 +59,19 @@ def test_every_page_is_whole_in_both_looks_and_loads_nothing_from_elsewhere(page
         assert seen.faults == []
         assert len(seen.requests) > 3
         assert seen.elsewhere([served.http, served.http.replace("http:", "ws:")]) == []
+
+
+def test_every_link_to_a_document_leads_to_its_section(served: Served) -> None:
+    waiting, texts = {f"/dashboard/{path}" for path in PAGES}, dict[str, str]()
+    while waiting:
+        texts |= {path: httpx.get(f"{served.http}{path}").raise_for_status().text for path in waiting}
+        linked = {to for text in texts.values() for to in re.findall(r'href="(/dashboard/docs/[^"]*)"', text)}
+        waiting = {to.partition("#")[0] for to in linked} - texts.keys()
+    assert len(texts) > len(PAGES) + 25
+    for path, _, section in (to.partition("#") for to in linked):
+        assert not section or f'id="{section}"' in texts[path], f"{path} has no section {section}"
+    for picture in {to for text in texts.values() for to in re.findall(r'src="(/dashboard/pictures/[^"]*)"', text)}:
+        assert httpx.get(f"{served.http}{picture}").headers["content-type"] == "image/png"
 
 
 def test_robots_are_seen_where_they_are_and_move(page: Page, served: Served) -> None:

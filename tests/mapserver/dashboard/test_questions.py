@@ -25,7 +25,9 @@ def served(browser: Chromium, tmp_path_factory: pytest.TempPathFactory) -> Itera
     folder = tmp_path_factory.mktemp("store")
     fill_shift(folder)
     with serving(folder) as server, MapStore.open(folder) as store:
-        RobotRegister(store).authorities.init(["localhost"], None, None)
+        register = RobotRegister(store)
+        register.authorities.init(["localhost"], None, None)
+        register.enrol(SITE, ["tug-7"], "tls/localhost:7447", actor=Actor("ada", "a new robot"))
         yield server
 
 
@@ -197,6 +199,8 @@ def test_questions_that_a_page_answers(operator: Operator) -> None:
             "#endings tr",
             r"Certificate of the server for robots.*\d+ days",
         ),
+        ("who enrolled this robot", ["Administration", "People and robots"], "#of-tug-7", r"by ada, \d+ \S+ ago"),
+        ("who did that", ["Administration", "Log"], "#lines tr", r"ada.*robot enrolled: tug-7.*a new robot"),
     ):
         operator.begin()
         for link in links:

@@ -44,6 +44,7 @@ def test_a_survey_is_followed_to_its_end(page: Page, served: Served) -> None:
     with Bus(served.zenoh).open() as bus:
         page.goto(f"{served.http}/dashboard/live?site=yard")
         expect(page.get_by_role("link", name="Live", exact=True)).to_have_count(1)
+        expect(page.get_by_role("status")).to_contain_text("waits for the first data")
         deadline_s = time.monotonic() + 20
         while time.monotonic() < deadline_s:  # the subscription is known everywhere after a moment
             bus.publish(live_key("yard"), encode_message(STATE))
