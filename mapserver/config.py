@@ -5,7 +5,6 @@ line.
 """
 
 from pathlib import Path
-from typing import Any
 
 import msgspec
 
@@ -79,11 +78,6 @@ def read_config(path: Path | None, commands: Commands) -> tuple[MapserverConfig,
 
 def survey_settings(path: Path | None, sensor_set: SensorSet) -> SurveySettings:
     """Return the survey settings for these sensors: the preset, overridden by [survey] of the file at `path`."""
-    given: dict[str, Any] = {} if path is None else msgspec.toml.decode(path.read_bytes()).get("survey", {})
-    return msgspec.convert(over(preset(sensor_set), given), SurveySettings)
-
-
-def preset(sensor_set: SensorSet) -> dict[str, Any]:
-    """Return the settings of [survey] in which this sensor set differs from the defaults."""
-    content: dict[str, Any] = msgspec.toml.decode((_PRESETS / f"{sensor_set.value}.toml").read_bytes())
-    return content
+    preset = msgspec.toml.decode((_PRESETS / f"{sensor_set.value}.toml").read_bytes())
+    given = {} if path is None else msgspec.toml.decode(path.read_bytes()).get("survey", {})
+    return msgspec.convert(over(preset, given), SurveySettings)

@@ -46,37 +46,15 @@ _NONE: dict[str, NDArray[Any]] = {
 
 
 @dataclass(frozen=True)
-class BuiltMap:
-    """A built and stored draft.
+class BuiltMap(Draft):
+    """A built and stored draft: its version in the store, the result as a sentence, its report (the keys of docs/reports.md).
 
-    map: keyframes, landmarks and observations as arrays. report: the keys of docs/reports.md. left_out: by content hash, the reason
-    why a recording is not in the map.
+    map: keyframes, landmarks and observations as arrays. left_out: by content hash, the reason why a recording is not in the map.
     """
 
     store: Path
     site: str
-    draft: Draft
     built: BuildResult
-
-    @property
-    def version(self) -> int:
-        """Its number in the store."""
-        return self.draft.version
-
-    @property
-    def report(self) -> dict[str, Any]:
-        """Measurements of the build."""
-        return self.draft.report
-
-    @property
-    def sentence(self) -> str:
-        """The result as text."""
-        return self.draft.sentence
-
-    @property
-    def left_out(self) -> dict[str, str]:
-        """Recordings that could not be joined."""
-        return self.draft.left_out
 
     @property
     def map(self) -> SurveyMap:
@@ -90,7 +68,7 @@ class BuiltMap:
 
     def save_picture(self, path: str | Path) -> None:
         """Draw the map from above as a PNG."""
-        write_file(Path(path), picture_png(self.site, self.draft, self.built))
+        write_file(Path(path), picture_png(self.site, self, self.built))
 
     def publish(
         self,
@@ -120,7 +98,7 @@ def build_map(
     paths = (recordings,) if isinstance(recordings, str | Path) else recordings
     request = BuildRequest(tuple(Path(path) for path in paths), check_name(site, "site"), Path(store), options)
     draft, built = build_draft(request, settings_for(request), recorded=True)
-    return BuiltMap(request.store, site, draft, built)
+    return BuiltMap(draft.version, draft.sentence, draft.report, draft.left_out, request.store, site, built)
 
 
 def settings_for(request: BuildRequest) -> SurveySettings:

@@ -59,7 +59,6 @@ class BusGuard:
         self._told: frozenset[str] = frozenset()
         self._twice_s: dict[tuple[str, str], float] = {}  # start of the second connection of a robot (site, name)
         self.copied: frozenset[tuple[str, str]] = frozenset()
-        self._audited = self.copied
         self._refusals = LogLimit(_log)
         self._due_s = 0.0
 
@@ -84,7 +83,7 @@ class BusGuard:
         `copied` names the latter's robots; the connections of all servers of the store count. A robot that lost its connection counts
         twice until the old lease ends; only a longer double connection is reported. Raises StoreError.
         """
-        here, now_s = self._bus.certificates(), self._clock_s()
+        here, now_s, before = self._bus.certificates(), self._clock_s(), self.copied
         unknown = (name[:64] for name in here if self.access.holder(name) is None)
         found = [f"certificate {name!r} is connected but not enrolled; it may send nothing" for name in unknown]
         sessions: Counter[tuple[str, str]] = Counter()
@@ -100,7 +99,7 @@ class BusGuard:
             )
         for words in sorted(frozenset(found) - self._told):
             self._refusals.warning(words, "%s", words)
-        for site, robot in self.copied - self._audited:
+        for site, robot in self.copied - before:
             self.register.store.audit("robot connected twice", f"{robot}: was its certificate copied?", site=site)
-        self._told, self._audited = frozenset(found), self.copied
+        self._told = frozenset(found)
         return found

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from ipaddress import ip_address
 from operator import itemgetter
-from typing import Any, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from fleetmap.bus.endpoints import is_loopback_name
 from fleetmap.log_lines import LogLimit
@@ -101,11 +101,12 @@ class BoundedListener(socket.socket):
         return marks
 
 
-class _Mark:
+class _Mark(NamedTuple):
     """Start of a connection's present state. acked: bytes acknowledged by the client then."""
 
-    def __init__(self, state: object, since_s: float, acked: int) -> None:
-        self.state, self.since_s, self.acked = state, since_s, acked
+    state: object
+    since_s: float
+    acked: int
 
     @classmethod
     def after(cls, before: "_Mark | None", protocol: Any, now_s: float) -> "_Mark":

@@ -48,14 +48,6 @@ class ListRepository:
         self.lists, self.keys = SignedLists(draft or store), KeyFolder(store / "keys")
         self.now, self.ahead = now.astimezone(UTC).replace(microsecond=0), 0
 
-    def root(self) -> Root:
-        """Content of the newest root; errors as of `SignedLists.metadata`."""
-        return cast(Root, self.lists.read("root"))
-
-    def targets(self) -> Targets:
-        """Content of the newest targets; errors as of `SignedLists.metadata`."""
-        return cast(Targets, self.lists.read("targets"))
-
     # --- with the root key --------------------------------------------------------------------------------------------
 
     def check_empty(self) -> None:
@@ -77,7 +69,7 @@ class ListRepository:
 
     def check_root_key(self, root_key: Signer) -> None:
         """Raise StateError for a key that is not the root key, before any change."""
-        roles, keyid = self.root().roles, root_key.public_key.keyid
+        roles, keyid = self.lists.read("root").roles, root_key.public_key.keyid
         if not all(keyid in roles[name].keyids for name in ("root", "targets")):
             raise StateError(f"key {keyid[:8]} is not the root key of {self.lists.folder}; name its file by --key")
 
@@ -94,13 +86,13 @@ class ListRepository:
 
     def renew_targets(self, root_key: Signer) -> None:
         """Write the next targets with the same content."""
-        targets = self.targets()
+        targets = self.lists.read("targets")
         targets.version += 1 + self.ahead
-        self._sign("targets", targets, root_key, judges=(self.root(),))
+        self._sign("targets", targets, root_key, judges=(self.lists.read("root"),))
 
     def _change_root(self, roles: Sequence[str], key: Key, signers: Sequence[Signer]) -> None:
         """Write the next root, in which only `key` signs these roles; StateError unless the last root's key and its own signed it."""
-        before, root = self.root(), self.root()
+        before, root = self.lists.read("root"), self.lists.read("root")
         for role in roles:
             for keyid in list(root.roles[role].keyids):
                 root.revoke_key(keyid, role)
@@ -110,7 +102,7 @@ class ListRepository:
 
     def delegate(self, site: str, key: Key, root_key: Signer) -> None:
         """Make this key the only one that signs the list of a site. StateError unless the root key signed."""
-        targets, name = self.targets(), site_role(site)
+        targets, name = self.lists.read("targets"), site_role(site)
         held = targets.delegations or Delegations(keys={}, roles={})
         role = DelegatedRole(name, [], 1, terminating=True, paths=[manifest_target(site, "*")])
         roles = {**(held.roles or {}), name: role}
@@ -119,7 +111,7 @@ class ListRepository:
         used = {keyid for known in roles.values() for keyid in known.keyids}
         targets.delegations.keys = {keyid: key for keyid, key in targets.delegations.keys.items() if keyid in used}
         targets.version += 1
-        self._sign("targets", targets, root_key, judges=(self.root(),))
+        self._sign("targets", targets, root_key, judges=(self.lists.read("root"),))
 
     # --- with the keys of the server ----------------------------------------------------------------------------------
 
@@ -127,7 +119,7 @@ class ListRepository:
         """Write the next list of a site, and return its number; StateError unless the site's key signed."""
         name = site_role(site)
         signed = site_targets(site, admitted, self.lists.newest(name) + 1 + self.ahead)
-        self._sign(name, signed, key, judges=(self.targets(),))
+        self._sign(name, signed, key, judges=(self.lists.read("targets"),))
         return signed.version
 
     def sign_online(self, online: Signer) -> None:
@@ -135,7 +127,7 @@ class ListRepository:
 
         Raises StateError if root and targets do not allow this key.
         """
-        root, targets = self.root(), self.lists.metadata("targets")
+        root, targets = self.lists.read("root"), self.lists.metadata("targets")
         _check(root, "targets", targets)
         meta = {"targets.json": MetaFile(targets.signed.version)}
         number, stamped = self.lists.newest("snapshot"), 0

@@ -1,6 +1,7 @@
 """`mapserver live`: map a survey during the drive, show it to viewers, and store it as a draft at its end."""
 
 import signal
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -70,7 +71,7 @@ def live(
 
     at = None if options.foxglove is None else viewer_address(options.foxglove, insecure=options.insecure)
     use = None if options.use is None else named_sensor_set(options.use)
-    build, is_stopped = options.build_options(context, use=use), _stopping()
+    build, stopped = options.build_options(context, use=use), _stopping()
     tells, see = list[Callable[["LiveSurveyState"], None]](), None
     with ExitStack() as opened:
         if at is not None:
@@ -95,9 +96,9 @@ def live(
             for each in tells:
                 each(state)
 
-        result = run_live(request, drive, tell, is_stopped, plain_console(stderr=True), see)
-    typer.echo(result.figures.words())
-    typer.echo(result.built.sentence)
+        figures, built = run_live(request, drive, tell, stopped.is_set, plain_console(stderr=True), see)
+    typer.echo(figures.words())
+    typer.echo(built.sentence)
 
 
 @contextmanager
@@ -129,19 +130,18 @@ def _driven(
     yield drive, survey_settings(build.config, sensors)
 
 
-def _stopping() -> Callable[[], bool]:
-    """Return a function that is True once Ctrl-C or SIGTERM has ended the drive; a second signal ends the build too."""
-    stopped = False
+def _stopping() -> threading.Event:
+    """Return what Ctrl-C or SIGTERM sets to end the drive; a second signal ends the build too."""
+    stopped = threading.Event()
 
     def stop(*_: object) -> None:
-        nonlocal stopped
-        stopped = True
+        stopped.set()
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, signal.default_int_handler)
 
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, stop)
-    return lambda: stopped
+    return stopped
 
 
 def _bus(server: str, store: Path) -> "Bus":

@@ -1,8 +1,11 @@
-"""A live survey: frames are tracked as they arrive, the map grows in parallel, viewers may watch, and a build ends it."""
+"""A live survey: frames are tracked as they arrive, the map grows in parallel, viewers may watch, and a build ends it.
+
+Tracking is the survey's own odometry, frame by frame; its keyframes are the growing map's.
+"""
 
 import gc
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,23 +18,106 @@ from rich.console import Console
 
 from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.errors import FleetmapError
+from fleetmap.geometry import Array, se3_inverse
+from fleetmap.odometry.estimate import OdometryEstimate, OdometryStatus
 from fleetmap.recordings.images import jpeg_image
-from fleetmap.sensors.samples import Image
+from fleetmap.sensors.calibration import RigCalibration
+from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
+from fleetmap.sensors.samples import Image, ImuSamples, WheelSample
 from mapserver.drafting.draft import BuildOptions
 from mapserver.drafting.survey_recordings import read_zones
 from mapserver.library import BuiltMap, build_map
 from mapserver.plugins.live_surveys.drives import Drive, DueFrame
 from mapserver.plugins.live_surveys.mapping_process import MappingProcess
-from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, MOST_PLACES, LiveSurveyState, thinning
-from mapserver.plugins.live_surveys.tracking import LiveTracking, Tracked
+from mapserver.plugins.live_surveys.message import (
+    MAX_ARRAY_BYTES,
+    MOST_PLACES,
+    LiveSurveyState,
+    NewKeyframe,
+    joined_imu,
+    thinning,
+)
+from mapserver.survey.odometry_pass import OdometryRun, TrackedFrame
+from mapserver.survey.pose_graph.odometry_factors import FLOOR, INERTIAL_FLOOR, step_covariance
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.survey_inputs import SurveyConfig
 
-Tell = Callable[[LiveSurveyState], None]
-See = Callable[[Tracked], None]
-
+_TORN_M2 = 100.0
 _TELL_EVERY_S = 0.5
 _PICTURE_PX, _PICTURE_QUALITY = 320, 50  # of the longer side; 10 kB
+
+
+class Tracked(NamedTuple):
+    """Tracking result of one frame.
+
+    quality: share of its consistent points, 0 while the odometry is lost; keyframe: its data for the map, None if it is not one;
+    pixels (N, 3), u_left v u_right, of the tracked points, None without any.
+    """
+
+    frame: RectifiedFrame
+    quality: float
+    keyframe: NewKeyframe | None
+    pixels: Array | None = None
+
+
+class LiveTracking:
+    """Processes every frame in order."""
+
+    def __init__(self, calibration: RigCalibration, rectifier: Rectifier, settings: SurveySettings) -> None:
+        self._run = OdometryRun(calibration, rectifier, settings)
+        self._is_single, self._has_imu = rectifier.camera.baseline_m == 0, calibration.imu is not None
+        self._torn_m2 = 0.0  # variance of the gaps between runs of one camera
+        self._before: tuple[Array, Array, float] | None = (
+            None  # covariance and pose of the last keyframe, the gaps until then
+        )
+        self._imu: list[ImuSamples] = []
+
+    def handle(self, frame: RectifiedFrame, imu: ImuSamples, wheel: Sequence[WheelSample]) -> Tracked:
+        """Track the next frame, with the new samples of the IMU and the wheels up to it."""
+        tracked = self._run.handle(frame, imu, wheel)
+        self._imu.append(imu)
+        estimate = tracked.estimate
+        keyframe = self._keyframe(tracked) if tracked.is_keyframe and self._has_place(estimate) else None
+        quality = 0.0 if estimate.status is OdometryStatus.DEGRADED else float(estimate.inlier_share)
+        return Tracked(tracked.frame, quality, keyframe, estimate.track_pixels)
+
+    def _has_place(self, estimate: OdometryEstimate) -> bool:
+        """True if the frame's pose relative to earlier ones is known: with one camera only after its start, with an IMU after scale."""
+        if not self._is_single or (
+            estimate.status is not OdometryStatus.INITIALISING and estimate.scale_known == self._has_imu
+        ):
+            return True
+        if self._before is not None and not self._has_imu:
+            self._torn_m2 += _TORN_M2  # a new start has its own scale
+        return False
+
+    def _keyframe(self, tracked: TrackedFrame) -> NewKeyframe:
+        estimate, covariance, frame_from_body = tracked.estimate, self._run.chain.covariance, tracked.frame_from_body
+        step_cov, imu = None, joined_imu(self._imu)
+        if self._before is not None:
+            cov_before, frame_before, torn_before_m2 = self._before
+            least = INERTIAL_FLOOR if estimate.inertial else FLOOR
+            step = se3_inverse(frame_before) @ frame_from_body
+            step_cov = step_covariance((cov_before, covariance), frame_before[:3, :3], step, least)
+            if self._torn_m2 > torn_before_m2:
+                step_cov = step_cov + _TORN_M2 * np.eye(6)
+        velocity_body_mps = estimate.odom_from_body[:3, :3].T @ estimate.velocity_odom_mps
+        self._before = covariance, frame_from_body, self._torn_m2
+        self._imu = []
+        return NewKeyframe(
+            number=tracked.number,
+            frame_from_body=frame_from_body,
+            level_from_frame=self._run.chain.level_from_frame,
+            step_cov=step_cov,
+            motion_body=np.r_[velocity_body_mps, estimate.gyro_bias_radps, estimate.accel_bias_mps2],
+            inertial=estimate.inertial,
+            imu=imu,
+            variance_m2=float(np.trace(covariance[3:, 3:])) + self._torn_m2,
+        )
+
+
+Tell = Callable[[LiveSurveyState], None]
+See = Callable[[Tracked], None]
 
 
 @dataclass(frozen=True)
@@ -74,13 +160,6 @@ class LiveFigures(NamedTuple):
         )
 
 
-class LiveResult(NamedTuple):
-    """Figures of the drive, and the draft built from it."""
-
-    figures: LiveFigures
-    built: BuiltMap
-
-
 def run_live(
     request: LiveRequest,
     drive: Drive,
@@ -88,8 +167,8 @@ def run_live(
     is_stopped: Callable[[], bool],
     console: Console,
     see: See | None = None,
-) -> LiveResult:
-    """Run a survey to its end, or until it is stopped, and build the draft.
+) -> tuple[LiveFigures, BuiltMap]:
+    """Run a survey to its end, or until it is stopped; return the figures of the drive, and the draft built from it.
 
     tell: receives the state, twice a second; see: receives every frame, and returns at once. Raises the FleetmapErrors of a build,
     before the drive if possible.
@@ -107,7 +186,7 @@ def run_live(
         survey.say("failed", words=str(error))
         raise
     survey.say("stored", version=built.version, words=built.sentence)
-    return LiveResult(survey.figures(), built)
+    return survey.figures(), built
 
 
 class _Survey:

@@ -31,8 +31,8 @@ from fleetmap.plugins.viewer_channels.channels import (
     encoding_of,
 )
 from mapserver.plugins.live_surveys.drives import Drive
+from mapserver.plugins.live_surveys.live_survey import Tracked
 from mapserver.plugins.live_surveys.message import LiveSurveyState
-from mapserver.plugins.live_surveys.tracking import Tracked
 
 _WAITING = 32  # messages of a topic that are not encoded yet
 _BACKLOG = 256  # encoded messages waiting for one viewer; the library drops the oldest

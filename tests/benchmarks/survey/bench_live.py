@@ -27,7 +27,7 @@ def bench(path: Path) -> dict[str, Any]:
         settings = survey_settings(None, opened.sensor_set)
         drive = RecordedDrive(path, opened, indices, "::", 1.0)
         request = LiveRequest("live", Path(folder) / "store", settings, BuildOptions())
-        return run_live(request, drive, lambda _: None, lambda: False, Console(quiet=True)).figures._asdict()
+        return run_live(request, drive, lambda _: None, lambda: False, Console(quiet=True))[0]._asdict()
 
 
 def main() -> None:

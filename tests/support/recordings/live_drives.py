@@ -4,15 +4,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
+import pytest
 
+import mapserver
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.rectification import RectifiedFrame, Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet
+from mapserver.drafting.draft import BuildOptions
 from mapserver.drafting.survey_recordings import RecordingOptions
+from mapserver.plugins.live_surveys import live_survey
 from mapserver.plugins.live_surveys.drives import RecordedDrive
 from mapserver.plugins.live_surveys.live_map import LiveMap
 from mapserver.plugins.live_surveys.mapping_process import NO_SKETCH
@@ -51,6 +55,23 @@ class MappingHere:
     def map_from_body(self) -> Array:
         """(K, 4, 4) of the keyframes."""
         return self.map.map_from_body
+
+
+Call = tuple[Path, Path, str, BuildOptions]
+
+
+def order_builds(monkeypatch: pytest.MonkeyPatch) -> list[Call]:
+    """The builds that are ordered from now on and not done; mapping is done in this process."""
+    ordered: list[Call] = []
+
+    def build_map(*call: Any) -> object:
+        ordered.append(call)
+        return type("Built", (), {"version": 1, "sentence": "built"})()
+
+    monkeypatch.setattr(live_survey, "MappingProcess", MappingHere)
+    for module in (live_survey, mapserver):
+        monkeypatch.setattr(module, "build_map", build_map)
+    return ordered
 
 
 class Laid(NamedTuple):

@@ -12,7 +12,6 @@ from click.testing import Result
 from rich.console import Console
 from typer.testing import CliRunner
 
-import mapserver
 from fleetmap.errors import FleetmapError, LinkError, RecordingError, UsageError
 from fleetmap.geometry import transform_points
 from fleetmap.recordings import OpenOptions, Topics, open_recording
@@ -20,14 +19,13 @@ from fleetmap.sensors.samples import CameraFrame, SensorSet
 from fleetmap.sources.intake import Intake
 from mapserver.cli import app
 from mapserver.config import survey_settings
-from mapserver.drafting.draft import BuildOptions
 from mapserver.plugins.live_surveys import command as live_command
-from mapserver.plugins.live_surveys import drives, live_survey
+from mapserver.plugins.live_surveys import drives
 from mapserver.plugins.live_surveys.drives import RecordedDrive, SensorDrive
 from mapserver.plugins.live_surveys.live_survey import LiveRequest, run_live
 from mapserver.plugins.live_surveys.message import LiveSurveyState
 from mapserver.store import MapStore
-from support.recordings.live_drives import MappingHere, laid_on_truth, write_rgbd
+from support.recordings.live_drives import Call, MappingHere, laid_on_truth, order_builds, write_rgbd
 from support.recordings.recording_samples import calibration, kalibr_text, write_mcap
 from support.worlds import robot_world
 from support.worlds.box_room import ROOM_M
@@ -56,23 +54,10 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Site:
     return Site(tmp_path_factory.mktemp("site"))
 
 
-Call = tuple[object, Path, str, BuildOptions]
-
-
 @pytest.fixture(autouse=True)
 def builds(monkeypatch: pytest.MonkeyPatch) -> list[Call]:
-    """Mapping in this process; builds are ordered, not done: test_live_survey.py does one."""
-    ordered: list[Call] = []
-
-    def build_map(recordings: object, store: Path, name: str, options: BuildOptions) -> object:
-        ordered.append((recordings, store, name, options))
-        return type("Built", (), {"version": 1, "sentence": "built"})()
-
-    monkeypatch.setattr(live_survey, "MappingProcess", MappingHere)
-    monkeypatch.setattr(live_survey, "build_map", build_map)
-    monkeypatch.setattr(mapserver, "build_map", build_map)
-    monkeypatch.setattr(live_command, "_stopping", lambda: lambda: False)
-    return ordered
+    monkeypatch.setattr(live_command, "_stopping", threading.Event)
+    return order_builds(monkeypatch)
 
 
 def configured(tmp_path: Path, site: Site, kind: SensorSet, more: str = "") -> Path:

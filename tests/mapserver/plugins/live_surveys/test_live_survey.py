@@ -13,6 +13,7 @@ from typer.testing import CliRunner
 
 from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.errors import FleetmapError, UsageError
+from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import MAX_MESSAGE_BYTES, encode_message
 from fleetmap.recordings import Topics, open_recording
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
@@ -22,22 +23,27 @@ from fleetmap.sources.source import RecordingSource
 from mapserver.cli import app
 from mapserver.config import survey_settings
 from mapserver.drafting.draft import BuildOptions
-from mapserver.library import build_map
-from mapserver.plugins.live_surveys import live_survey
+from mapserver.library import BuiltMap, build_map
 from mapserver.plugins.live_surveys.drives import SensorDrive
-from mapserver.plugins.live_surveys.live_survey import LiveRequest, LiveResult, run_live
-from mapserver.plugins.live_surveys.mapping_process import MappingProcess
-from mapserver.plugins.live_surveys.message import MAX_ARRAY_BYTES, LiveSurveyState, NewKeyframe, packed
+from mapserver.plugins.live_surveys.live_survey import LiveFigures, LiveRequest, run_live
+from mapserver.plugins.live_surveys.mapping_process import MappingProcess, covered_cells, missing_directions
+from mapserver.plugins.live_surveys.message import (
+    COVERAGE_CELL_M,
+    MAX_ARRAY_BYTES,
+    LiveSurveyState,
+    NewKeyframe,
+    packed,
+)
 from mapserver.store import MapStore
 from mapserver.survey.survey_inputs import SurveyConfig
-from support.recordings.live_drives import MappingHere, played
+from support.recordings.live_drives import Call, MappingHere, order_builds, played
 from support.recordings.recording_samples import make_sample, write_mcap
 from support.worlds.textured_room import rig, stereo_frame
 
 FRAMES = 24
 SETTINGS = survey_settings(None, SensorSet.STEREO_INERTIAL)
 QUIET = Console(quiet=True)
-Finished = tuple[LiveResult, list[LiveSurveyState], Path]
+Finished = tuple[tuple[LiveFigures, BuiltMap], list[LiveSurveyState], Path]
 
 
 @pytest.fixture(scope="module")
@@ -55,8 +61,7 @@ def finished(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Finis
 
 
 def test_every_frame_is_tracked_and_every_keyframe_mapped(finished: Finished) -> None:
-    result, told, _ = finished
-    figures = result.figures
+    (figures, _), told, _ = finished
     assert (figures.frames, figures.mapping_failed) == (FRAMES, "")
     assert figures.seconds == pytest.approx((FRAMES - 1) * 0.05)
     assert 0 < figures.latency_ms[0] <= figures.latency_ms[1]
@@ -71,46 +76,38 @@ def test_every_frame_is_tracked_and_every_keyframe_mapped(finished: Finished) ->
 
 
 def test_its_phases_are_told_in_order_and_end_with_the_draft(finished: Finished) -> None:
-    result, told, _ = finished
+    (figures, built), told, _ = finished
     phases = list(dict.fromkeys(state.phase for state in told))
     assert phases[-2:] == ["adjusting", "stored"]
-    assert (told[-1].version, told[-1].words) == (1, result.built.sentence)
-    assert "live: 24 frames" in result.figures.words()
+    assert (told[-1].version, told[-1].words) == (1, built.sentence)
+    assert "live: 24 frames" in figures.words()
 
 
 def test_the_draft_is_what_a_build_makes_of_the_recording(finished: Finished, recording: Path, tmp_path: Path) -> None:
-    result, _, store = finished
+    (_, mapped), _, store = finished
     built = build_map(recording, tmp_path / "maps", "lab", BuildOptions(settings=SETTINGS))
-    assert result.built.trajectory.frame_from_body.tobytes() == built.trajectory.frame_from_body.tobytes()
+    assert mapped.trajectory.frame_from_body.tobytes() == built.trajectory.frame_from_body.tobytes()
     with MapStore.open(store) as one, MapStore.open(tmp_path / "maps") as other:
         assert [t.sha256 for t in one.manifest("lab", 1).tiles] == [t.sha256 for t in other.manifest("lab", 1).tiles]
 
 
 @pytest.fixture
-def ordered(monkeypatch: pytest.MonkeyPatch) -> list[tuple[Path, BuildOptions]]:
-    """Builds that were ordered and not done; mapping is done in this process."""
-    orders: list[tuple[Path, BuildOptions]] = []
-
-    def build_map(recording: Path, _store: Path, _site: str, options: BuildOptions) -> object:
-        orders.append((recording, options))
-        return type("Built", (), {"version": 1, "sentence": "built"})()
-
-    monkeypatch.setattr(live_survey, "MappingProcess", MappingHere)
-    monkeypatch.setattr(live_survey, "build_map", build_map)
-    return orders
+def ordered(monkeypatch: pytest.MonkeyPatch) -> list[Call]:
+    return order_builds(monkeypatch)
 
 
 def test_a_drive_that_is_ended_early_is_built_as_far_as_it_went(
-    recording: Path, tmp_path: Path, ordered: list[tuple[Path, BuildOptions]]
+    recording: Path, tmp_path: Path, ordered: list[Call]
 ) -> None:
     seen: list[LiveSurveyState] = []
     calls = iter(range(FRAMES))
     with played(recording, speed=0) as drive:
         request = LiveRequest("lab", tmp_path / "maps", SETTINGS)
-        result = run_live(request, drive, seen.append, lambda: next(calls) >= 18, QUIET)
-    assert result.figures.frames == 18
-    assert result.figures.latency_ms is None
-    assert ordered == [(recording, BuildOptions(frames="0:18:1", settings=SETTINGS))]
+        figures, _ = run_live(request, drive, seen.append, lambda: next(calls) >= 18, QUIET)
+    assert figures.frames == 18
+    assert figures.latency_ms is None
+    ((path, *_, options),) = ordered
+    assert (path, options) == (recording, BuildOptions(frames="0:18:1", settings=SETTINGS))
     assert seen[-1].latency_ms is None
 
 
@@ -133,21 +130,20 @@ def test_one_camera_says_that_its_scale_is_not_known_yet(recording: Path, tmp_pa
     assert {(state.scale_known, state.keyframes) for state in told[1:]} == {(False, 0)}
 
 
-def test_sensors_are_recorded_while_they_are_mapped(
-    recording: Path, tmp_path: Path, ordered: list[tuple[Path, BuildOptions]]
-) -> None:
+def test_sensors_are_recorded_while_they_are_mapped(recording: Path, tmp_path: Path, ordered: list[Call]) -> None:
     """A recording takes the place of the sensors: what comes out must hold all that went in."""
     source = RecordingSource(open_recording(recording), speed=0)
     drive = SensorDrive(source, tmp_path / "drive.mcap", Topics())
-    result = run_live(LiveRequest("lab", tmp_path / "maps", SETTINGS), drive, lambda _state: None, lambda: False, QUIET)
-    assert (result.figures.frames, result.figures.dropped) == (FRAMES, 0)
+    figures, _ = run_live(LiveRequest("lab", tmp_path / "maps", SETTINGS), drive, lambda _: None, lambda: False, QUIET)
+    assert (figures.frames, figures.dropped) == (FRAMES, 0)
     with open_recording(recording) as given, open_recording(tmp_path / "drive.mcap") as kept:
         assert kept.frame_stamps_ns.tolist() == given.frame_stamps_ns.tolist()
         np.testing.assert_array_equal(kept.read_frame(5).left, given.read_frame(5).left)
         inside = given.imu.between(0, int(kept.imu.stamps_ns[-1]) + 1)
         np.testing.assert_array_equal(kept.imu.gyro_radps, inside.gyro_radps)
         assert kept.imu.stamps_ns[-1] >= given.frame_stamps_ns[-1]
-    assert ordered == [(tmp_path / "drive.mcap", BuildOptions(settings=SETTINGS))]
+    ((path, *_, options),) = ordered
+    assert (path, options) == (tmp_path / "drive.mcap", BuildOptions(settings=SETTINGS))
     with pytest.raises(UsageError, match="--record"):
         SensorDrive(source, tmp_path / "drive.mcap", Topics())
 
@@ -226,3 +222,31 @@ def test_thinned_rows_fit_a_message_and_keep_the_last() -> None:
         path_m=full, quality=full[: MAX_ARRAY_BYTES // 8], landmarks_m=full, loops_m=full, picture=full,
     )  # fmt: skip
     assert len(encode_message(state)) < MAX_MESSAGE_BYTES
+
+
+def looking(positions_m: Array, yaw_rad: float) -> Array:
+    """(K, 4, 4) cameras at positions (K, 2), whose optical axis is level and points along yaw."""
+    forward = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+    turn = so3_exp(np.array([0.0, 0.0, yaw_rad])) @ forward
+    return np.array([se3(turn, np.array([x, y, 1.0])) for x, y in positions_m.tolist()])
+
+
+AISLE = np.column_stack([np.arange(0.5, 20.0, 0.5), np.full(39, 2.0)])
+
+
+def test_an_aisle_driven_one_way_misses_the_other() -> None:
+    east, west = looking(AISLE, 0.0), looking(AISLE, np.pi)
+    missing = missing_directions(east)
+    assert {each.heading for each in missing} == {"W"}
+    assert sum(each.places for each in missing) == len(AISLE)
+    for each in missing:
+        assert each.y_m == pytest.approx(2.0)
+        assert abs(each.x_m % COVERAGE_CELL_M - COVERAGE_CELL_M / 2) < 1.0
+    assert missing_directions(np.concatenate([east, west])) == []
+
+
+def test_a_square_is_covered_by_ten_landmarks() -> None:
+    points = np.concatenate([np.full((10, 3), 1.0), np.full((9, 3), -1.0), np.full((30, 3), 6.0)])
+    assert covered_cells(points, 10).tolist() == [[0, 0, 10], [1, 1, 30]]
+    assert covered_cells(points, 1).tolist() == [[1, 1, 30]]
+    assert covered_cells(points[:0], 10).shape == (0, 3)
