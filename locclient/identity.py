@@ -17,7 +17,7 @@ import msgspec
 
 from fleetmap.bus.endpoints import TlsFiles, check_endpoint, handshake_fault, has_tls, is_loopback
 from fleetmap.bus.zenoh_bus import Bus
-from fleetmap.encoding import to_json
+from fleetmap.encoding import decode_json, to_json
 from fleetmap.errors import LinkError, StateError, UsageError, disk_errors
 from fleetmap.files import write_atomically
 from fleetmap.mapformat.names import check_name
@@ -59,12 +59,8 @@ class RobotIdentity:
                 why = "its enrolment did not end" if "robot.pem" in lacking else "remove the folder"
                 raise UsageError(f"{folder} holds half an identity, without {', '.join(lacking)}: {why}; {_ENROL}")
             data = (folder / "identity.json").read_bytes()
-        try:
-            return cls(folder, msgspec.json.decode(data, type=Identity))
-        except (msgspec.MsgspecError, UnicodeDecodeError) as error:
-            raise UsageError(
-                f"the identity in {folder} is damaged ({error}); remove the folder and {_ENROL}"
-            ) from error
+        words = f"the identity in {folder} is damaged ({{}}); remove the folder and {_ENROL}"
+        return cls(folder, decode_json(data, Identity, words, UsageError))
 
     @property
     def tls(self) -> TlsFiles:

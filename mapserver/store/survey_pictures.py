@@ -5,8 +5,9 @@ from typing import Annotated
 
 import msgspec
 
-from fleetmap.errors import MapFormatError, NewerFormatError, StateError
-from fleetmap.mapformat.manifest import Manifest, Positive, Sha256
+from fleetmap.encoding import decode_json
+from fleetmap.errors import NewerFormatError, StateError
+from fleetmap.mapformat.manifest import Manifest, Positive, Sha256, manifest_entry
 
 PICTURES_KEY = "pictures"
 """Key in `report` of a manifest with the index; older readers ignore it."""
@@ -48,15 +49,15 @@ class PicturesReport(msgspec.Struct, frozen=True, kw_only=True):
 
 def pictures_of(manifest: Manifest, blob: Callable[[str], bytes]) -> tuple[SurveyPicture, ...]:
     """Return the pictures of a version. StateError with the reason if it has none, MapFormatError or NewerFormatError for invalid bytes."""
-    where, found = f"version {manifest.version} of site {manifest.site}", manifest.report.get(PICTURES_KEY)
+    where = f"version {manifest.version} of site {manifest.site}"
+    found = manifest_entry(manifest, "report", PICTURES_KEY, PicturesReport)
     if found is None:
         raise StateError(
             f"{where} keeps no pictures of its surveys: it was built without `survey_pictures` in [survey]"
         )
-    try:
-        index = msgspec.json.decode(blob(msgspec.convert(found, PicturesReport).sha256), type=PictureIndex)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise MapFormatError(f"{where}: index of pictures: {error}; it is damaged or of another program") from error
+    index = decode_json(
+        blob(found.sha256), PictureIndex, f"{where}: index of pictures: {{}}; it is damaged or of another program"
+    )
     if index.format_version != _FORMAT:
         raise NewerFormatError(f"{where}: pictures of format {index.format_version}; update this fleetmap")
     return index.pictures

@@ -7,7 +7,7 @@ import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Self, TypeVar
 
 import msgspec
 import numpy as np
@@ -59,6 +59,7 @@ FLOOR_M, SLICE_M, SLICES = 0.10, 0.25, 8  # the ground's unevenness, and the noi
 TOP_M = FLOOR_M + SLICES * SLICE_M
 HEIGHT_STEP_M, LOWEST_M = 0.01, -0.16  # codes of heights: 0 unknown, then steps from LOWEST_M
 Counts = NDArray[np.uint8]
+Blobs = list[bytes]
 T = TypeVar("T", bound=msgspec.Struct)
 Tiles = dict[tuple[int, int], Counts]
 """By (x, y) of the tile: (N, N, 4) bits of occupied voxels, bits of free ones, codes of the lowest and the highest surface."""
@@ -83,16 +84,27 @@ class GridIndex(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     tiles: Annotated[tuple[TileEntry, ...], msgspec.Meta(max_length=_MAX_TILES)] = ()
 
 
-class GridReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Grid entry in a build's report. sha256: of the index, None without a grid; bytes: of it and its tiles; tiles: number of tiles.
+class LayerReport(msgspec.Struct, frozen=True, kw_only=True):
+    """Entry in a build's report of what it made beside the map's tiles. sha256: of its index, None without it; bytes: of index and tiles.
 
     without: by recording, the reason why it adds nothing.
     """
 
     sha256: Sha256 | None = None
     bytes: int = 0
-    tiles: int = 0
     without: dict[str, str] = {}
+
+    @classmethod
+    def of(cls, blobs: Blobs, without: dict[str, str], **counts: int) -> Self:
+        """Report of an index and its tiles, of no blobs for none; counts: of the layer's own fields."""
+        sha256 = sha256_hex(blobs[0]) if blobs else None
+        return cls(sha256=sha256, bytes=sum(map(len, blobs)), without=without, **counts)
+
+
+class GridReport(LayerReport, frozen=True, kw_only=True):
+    """Entry of the grid, with its number of tiles."""
+
+    tiles: int = 0
 
 
 def encode_grid(tiles: Mapping[tuple[int, int], Counts]) -> list[bytes]:
@@ -108,8 +120,7 @@ def encode_grid(tiles: Mapping[tuple[int, int], Counts]) -> list[bytes]:
 
 def grid_report(blobs: list[bytes], without: dict[str, str]) -> GridReport:
     """Report of the blobs that `encode_grid` returned."""
-    sha256 = sha256_hex(blobs[0]) if blobs else None
-    return GridReport(sha256=sha256, bytes=sum(map(len, blobs)), tiles=max(0, len(blobs) - 1), without=without)
+    return GridReport.of(blobs, without, tiles=max(0, len(blobs) - 1))
 
 
 def grid_of(manifest: Manifest, blob: Callable[[str], bytes]) -> Tiles:
@@ -117,19 +128,13 @@ def grid_of(manifest: Manifest, blob: Callable[[str], bytes]) -> Tiles:
 
     Raises StateError, with the reason, for a version without a grid, and MapFormatError or NewerFormatError for invalid bytes.
     """
-    where = f"version {manifest.version} of site {manifest.site}"
-    report = report_of(manifest)
-    if report is None:
-        raise StateError(f"{where} has no grid: set `occupancy_grid = true` in [survey] and build the next version")
-    if report.sha256 is None:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in report.without.items())
-        raise StateError(f"{where} has no grid: {reasons or 'no recording showed anything near'}")
-    tiles = {}
-    for entry in read_index(blob(report.sha256)).tiles:
+    nothing = "no recording showed anything near"
+    tiles, address = {}, layer_address(manifest, report_of(manifest), "grid", "occupancy_grid", nothing)
+    for entry in read_index(blob(address)).tiles:
         place, cells = decode_grid_tile(blob(entry.sha256))
         if place != (entry.x, entry.y):
             fault = f"grid tile {place} stands in the place of {entry.x}, {entry.y}"
-            raise MapFormatError(f"{where}: {fault}; it is damaged")
+            raise MapFormatError(f"version {manifest.version} of site {manifest.site}: {fault}; it is damaged")
         tiles[place] = cells
     return tiles
 
@@ -169,8 +174,19 @@ def read_index(data: bytes) -> GridIndex:
     return decode_index(data, GridIndex, "a grid", tiles=())
 
 
+def layer_address(manifest: Manifest, report: LayerReport | None, what: str, setting: str, otherwise: str) -> str:
+    """Return the SHA-256 of a layer's index; StateError for a version without it, with the setting or the reasons."""
+    where = f"version {manifest.version} of site {manifest.site} has no {what}"
+    if report is None:
+        raise StateError(f"{where}: set `{setting} = true` in [survey] and build the next version")
+    if report.sha256 is None:
+        reasons = "; ".join(f"{name}: {reason}" for name, reason in report.without.items())
+        raise StateError(f"{where}: {reasons or otherwise}")
+    return report.sha256
+
+
 def decode_index(data: bytes, kind: type[T], what: str, **own: object) -> T:
-    """Decode an index of tiles; MapFormatError for anything else, NewerFormatError unless all but its `own` values are the defaults."""
+    """Decode a layer's index; MapFormatError for anything else, NewerFormatError unless all but its `own` values are the defaults."""
     index = decode_json(data, kind, f"index of {what}: {{}}; it is damaged or of another program")
     if msgspec.structs.replace(index, **own) != kind():
         number = getattr(index, "format_version", None)

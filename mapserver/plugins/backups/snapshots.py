@@ -11,12 +11,13 @@ credentials and the endpoint of the environment (AWS_ACCESS_KEY_ID, AWS_ENDPOINT
 import re
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import Annotated
 
 import msgspec
 
-from fleetmap.encoding import to_json
+from fleetmap.encoding import decode_json, to_json
 from fleetmap.errors import FleetmapError, MapFormatError, NewerFormatError, StoreError, UsageError
-from fleetmap.mapformat.names import check_sha256
+from fleetmap.mapformat.manifest import Sha256
 from mapserver.store.blobs import Blobs
 from mapserver.store.places import open_objects
 
@@ -45,9 +46,9 @@ class Snapshot(msgspec.Struct, frozen=True, kw_only=True):
     format: int = FORMAT
     store_format: int
     versions: int
-    files: dict[str, list[str]]
-    blobs: dict[str, int]
-    keys: str = ""
+    files: dict[str, list[Sha256]]
+    blobs: dict[Sha256, int]
+    keys: Annotated[str, msgspec.Meta(pattern=r"^([0-9a-f]{64})?\Z")] = ""
     missing: list[str] = []
 
     def objects(self) -> dict[str, int]:
@@ -137,12 +138,7 @@ class BackupTarget:
 
 
 def _decoded(name: str, data: bytes) -> Snapshot:
-    try:
-        found = msgspec.json.decode(data, type=Snapshot)
-        for address in found.objects():
-            check_sha256(address)
-    except (msgspec.MsgspecError, UnicodeDecodeError, MapFormatError) as error:
-        raise MapFormatError(f"snapshot {name} is damaged ({error}); take an earlier one with --snapshot") from error
+    found = decode_json(data, Snapshot, f"snapshot {name} is damaged ({{}}); take an earlier one with --snapshot")
     if found.format > FORMAT:
         raise NewerFormatError(f"snapshot {name} has format {found.format}, this fleetmap reads {FORMAT}; update it")
     if unknown := [path for path in found.files if not NAMED.fullmatch(path)]:

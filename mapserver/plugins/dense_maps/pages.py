@@ -32,12 +32,7 @@ def install(host: Host) -> None:
     console.files("parts/dense", _FOLDER / "static")
     template = TEMPLATES.from_string((_FOLDER / "space.html").read_text("utf-8"))
     console.page("space", template, _space_page, under="map", knows=("version", "x", "y"))
-    panels: dict[str, Callable[..., str]] = {
-        "failure": _expected,
-        "changes": _changes,
-        "version": _link,
-        "place": _link_from,
-    }
+    panels: dict[str, Any] = {"failure": _expected, "changes": _changes, "version": _link, "place": _link}
     for place, panel in panels.items():
         console.services.panels.setdefault(place, []).append(panel)
 
@@ -65,14 +60,9 @@ def _changes(services: Services, context: PageContext, before: int, after: int) 
     return str(_PANELS.changes(context.api, context.site, before, after, next(lacks, None)))
 
 
-def _link(_: Services, context: PageContext, version: int) -> str:
-    return str(_PANELS.link(context.to("space", version=version), "3D view"))
-
-
-def _link_from(_: Services, context: PageContext, version: int, x_m: float, y_m: float) -> str:
-    return str(
-        _PANELS.link(context.to("space", version=version, x=round(x_m, 2), y=round(y_m, 2)), "3D view from there")
-    )
+def _link(_: Services, context: PageContext, version: int, *place_m: float) -> str:
+    place = {axis: round(value, 2) for axis, value in zip("xy", place_m, strict=False)}
+    return str(_PANELS.link(context.to("space", version=version, **place), f"3D view{' from there' if place else ''}"))
 
 
 _FARTHEST_M = 20.0  # from the middle of a robot to its camera

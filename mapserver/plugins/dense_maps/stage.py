@@ -12,12 +12,12 @@ from fleetmap.version_grid import CELL_M, TILE_CELLS, TILE_SIZE_M, Tiles, encode
 from mapserver.drafting.area_corrections import AreaCorrections
 from mapserver.drafting.extras import ChosenDraft, Extra
 from mapserver.plugins.dense_maps.surfel_map import (
+    SurfelReport,
     Surfels,
     SurfelTile,
     SurfelTiles,
     encode_tile,
     known_surfels,
-    surfel_report,
 )
 from mapserver.plugins.dense_maps.survey_grid import GridGrower, Grower, grow
 from mapserver.plugins.dense_maps.survey_pictures import kept_pictures
@@ -45,7 +45,7 @@ def make_dense_maps(draft: ChosenDraft) -> dict[str, Extra]:
     if settings.surfel_map:
         grown = corrected_surfels(draft.corrections, surfel_grower.surfels, known)
         surfels = grown.blobs()
-        found["surfels"] = Extra(surfel_report(surfels, len(grown), without["surfels"]), "surfel", surfels)
+        found["surfels"] = Extra(SurfelReport.of(surfels, without["surfels"], surfels=len(grown)), "surfel", surfels)
     return found | {PICTURES_KEY: _pictures(draft)}
 
 

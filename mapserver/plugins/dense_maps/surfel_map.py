@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from fleetmap import core
 from fleetmap.encoding import to_json
-from fleetmap.errors import MapFormatError, StateError
+from fleetmap.errors import MapFormatError
 from fleetmap.geometry import AnyArray, Array
 from fleetmap.mapformat.container import pack, unpack
-from fleetmap.mapformat.manifest import Manifest, Positive, Sha256, TileEntry, manifest_entry
+from fleetmap.mapformat.manifest import Manifest, Positive, TileEntry, manifest_entry
 from fleetmap.mapformat.names import sha256_hex
 from fleetmap.mapformat.tile import off_tile_m
-from fleetmap.version_grid import decode_index
+from fleetmap.version_grid import LayerReport, decode_index, layer_address
 from mapserver.plugins.dense_maps.exposure import FALLOFF
 
 _log = logging.getLogger(__name__)
@@ -91,16 +91,10 @@ class SurfelIndex(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     tiles: Annotated[tuple[TileEntry, ...], msgspec.Meta(max_length=_MOST_TILES)] = ()
 
 
-class SurfelReport(msgspec.Struct, frozen=True, kw_only=True):
-    """Entry in the report of a build. sha256: of the index, None without surfels; bytes: of it and its tiles; surfels: number.
+class SurfelReport(LayerReport, frozen=True, kw_only=True):
+    """Entry of the surfels, with their number."""
 
-    without: by recording, the reason why it adds none.
-    """
-
-    sha256: Sha256 | None = None
-    bytes: int = 0
     surfels: int = 0
-    without: dict[str, str] = {}
 
 
 class SurfelTile(NamedTuple):
@@ -146,21 +140,9 @@ class SurfelTiles:
         return [to_json(index, order="deterministic"), *blobs] if blobs else []
 
 
-def surfel_report(blobs: list[bytes], surfels: int, without: dict[str, str]) -> SurfelReport:
-    """Return the report of blobs from `SurfelTiles.blobs`."""
-    sha256 = sha256_hex(blobs[0]) if blobs else None
-    return SurfelReport(sha256=sha256, bytes=sum(map(len, blobs)), surfels=surfels, without=without)
-
-
 def index_address(manifest: Manifest) -> str:
     """Return the SHA-256 of the index of a version's surfels; StateError with the reason if it has none."""
-    where, report = f"version {manifest.version} of site {manifest.site}", report_of(manifest)
-    if report is None:
-        raise StateError(f"{where} has no surfels: set `surfel_map = true` in [survey] and build the next version")
-    if report.sha256 is None:
-        reasons = "; ".join(f"{name}: {reason}" for name, reason in report.without.items())
-        raise StateError(f"{where} has no surfels: {reasons or 'no recording has near surfaces'}")
-    return report.sha256
+    return layer_address(manifest, report_of(manifest), "surfels", "surfel_map", "no recording has near surfaces")
 
 
 def surfels_of(

@@ -10,10 +10,10 @@ from mapserver.drafting.draft_evidence import MappedSession
 from mapserver.plugins.dense_maps.surfel_map import (
     EDGE_M,
     TILE_SIZE_M,
+    SurfelReport,
     Surfels,
     SurfelTiles,
     encode_tile,
-    surfel_report,
 )
 from mapserver.plugins.dense_maps.survey_pictures import kept_pictures
 from mapserver.store import MapStore
@@ -33,7 +33,7 @@ def encode_surfels(surfels: Surfels) -> list[bytes]:
 def surfel_extras(surfels: Surfels) -> tuple[list[tuple[str, bytes]], object]:
     """The bytes of a draft's surfels, and what is reported of them."""
     blobs = encode_surfels(surfels)
-    return [("surfel", data) for data in blobs], msgspec.to_builtins(surfel_report(blobs, len(surfels), {}))
+    return [("surfel", data) for data in blobs], msgspec.to_builtins(SurfelReport.of(blobs, {}, surfels=len(surfels)))
 
 
 def wall(distance_m: float = 2.0, *, grey: int = 120, edge_level: int = 1) -> Surfels:
