@@ -9,6 +9,7 @@ import pytest
 from playwright.sync_api import Page, expect
 
 import mapserver
+from mapserver.store import MapStore
 from mapserver.store.places import Places, write_places
 from support.command_line import status as status_of
 from support.fleet.dashboard_scene import ROBOTS, Served, fill_store, serving, talking
@@ -38,6 +39,13 @@ def roomy_disk(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def clock() -> Clock:
     return Clock()
+
+
+@pytest.fixture
+def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
+    """A new store, whose time is the clock's."""
+    with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as opened:
+        yield opened
 
 
 @pytest.fixture(scope="session")

@@ -1,8 +1,6 @@
 """Alerts: what holds is named, and nothing else."""
 
 import re
-from collections.abc import Iterator
-from pathlib import Path
 
 import msgspec
 import pytest
@@ -29,10 +27,9 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
-    with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as opened:
-        publish_samples(opened, 2)
-        yield opened
+def store(store: MapStore) -> MapStore:
+    publish_samples(store, 2)
+    return store
 
 
 def health(status: str, number: int = 1) -> RobotHealth:

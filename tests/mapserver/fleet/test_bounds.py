@@ -1,6 +1,5 @@
 """Nothing that robots send grows without bound: failures in rate, size and number, pictures in bytes, traces, robots. Rows 8, 9, 23."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -24,10 +23,9 @@ SECOND_NS = 10**9
 
 
 @pytest.fixture
-def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
-    with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as made:
-        publish_samples(made, 1)
-        yield made
+def store(store: MapStore) -> MapStore:
+    publish_samples(store, 1)
+    return store
 
 
 @pytest.fixture

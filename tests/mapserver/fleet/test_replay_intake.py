@@ -3,7 +3,6 @@
 import struct
 import subprocess
 import threading
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,11 +49,9 @@ class Server:
 
 
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[Server]:
-    clock = Clock()
-    with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as store:
-        publish_samples(store, 1)
-        yield Server(store, Fleet(store, clock_ns=clock), clock)
+def server(store: MapStore, clock: Clock) -> Server:
+    publish_samples(store, 1)
+    return Server(store, Fleet(store, clock_ns=clock), clock)
 
 
 def test_parts_make_the_recording(server: Server, tmp_path: Path) -> None:
@@ -165,18 +162,16 @@ def test_uploads_and_rates_are_bounded(server: Server, monkeypatch: pytest.Monke
         server.send(b"x" * 100, "more", robot="r9")
 
 
-def test_the_oldest_recordings_go(tmp_path: Path) -> None:
+def test_the_oldest_recordings_go(store: MapStore, clock: Clock, tmp_path: Path) -> None:
     data = small_file(tmp_path / "f.mcap")
-    clock = Clock()
-    with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as store:
-        publish_samples(store, 1)
-        settings = IngestSettings(replay_bytes=2 * len(data) + 100)
-        server = Server(store, Fleet(store, settings=settings, clock_ns=clock), clock)
-        for number in range(3):
-            server.report(f"f{number}")
-            assert server.send(small_file(tmp_path / "n.mcap", id=f"f{number}"), f"f{number}").refused == ""
-        with pytest.raises(UsageError, match="for space"):
-            store.fleet.replay(1)
-        assert store.fleet.failure(1).report.id == "f0", "the failure stays"
-        assert store.fleet.replay(2)
-        assert store.fleet.replay(3)
+    publish_samples(store, 1)
+    settings = IngestSettings(replay_bytes=2 * len(data) + 100)
+    server = Server(store, Fleet(store, settings=settings, clock_ns=clock), clock)
+    for number in range(3):
+        server.report(f"f{number}")
+        assert server.send(small_file(tmp_path / "n.mcap", id=f"f{number}"), f"f{number}").refused == ""
+    with pytest.raises(UsageError, match="for space"):
+        store.fleet.replay(1)
+    assert store.fleet.failure(1).report.id == "f0", "the failure stays"
+    assert store.fleet.replay(2)
+    assert store.fleet.replay(3)

@@ -186,12 +186,11 @@ ADA = Actor("ada", "a test")
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> Iterator[MapStore]:
+def store(store: MapStore) -> MapStore:
     """Versions 1 and 2, published, and 3, a draft."""
-    with MapStore.open(tmp_path / "store", create=True, clock_ns=lambda: 1_000) as opened:
-        publish_samples(opened, 2)
-        save_sample_draft(opened, seed=3)
-        yield opened
+    publish_samples(store, 2)
+    save_sample_draft(store, seed=3)
+    return store
 
 
 @pytest.fixture

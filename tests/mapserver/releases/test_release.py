@@ -19,12 +19,6 @@ ADA = Actor("ada", "a test")
 DAY_NS = 86_400_000_000_000
 
 
-@pytest.fixture
-def store(tmp_path: Path):
-    with MapStore.open(tmp_path / "store", create=True) as opened:
-        yield opened
-
-
 def states(store: MapStore) -> dict[int, str]:
     return {info.version: info.state for info in store.versions("lab")}
 

@@ -3,7 +3,6 @@
 import fcntl
 import os
 import stat
-from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -34,11 +33,10 @@ def clock() -> Clock:
 
 
 @pytest.fixture
-def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
-    with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as made:
-        publish(made, seed=1)
-        init_here(made)
-        yield made
+def store(store: MapStore) -> MapStore:
+    publish(store, seed=1)
+    init_here(store)
+    return store
 
 
 def publish(store: MapStore, seed: int) -> int:

@@ -4,7 +4,6 @@ import json
 import socket
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -23,12 +22,6 @@ from mapserver.plugins.alert_messages import Webhook, check_address
 from mapserver.store import MapStore
 from support.fleet.webhook_receiver import receiver
 from support.waiting import eventually
-
-
-@pytest.fixture
-def store(tmp_path: Path) -> Iterator[MapStore]:
-    with MapStore.open(tmp_path / "store", create=True) as opened:
-        yield opened
 
 
 @pytest.mark.parametrize("status", [301, 307, 308, 404, 500])

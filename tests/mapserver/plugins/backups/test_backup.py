@@ -5,7 +5,6 @@ import os
 import sqlite3
 import tarfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import msgspec
@@ -31,15 +30,9 @@ DAY_NS = 86_400_000_000_000
 
 
 @pytest.fixture
-def clock() -> Clock:
-    return Clock()
-
-
-@pytest.fixture
-def store(tmp_path: Path, clock: Clock) -> Iterator[MapStore]:
-    with MapStore.open(tmp_path / "store", create=True, clock_ns=clock) as opened:
-        publish_samples(opened, 2)
-        yield opened
+def store(store: MapStore) -> MapStore:
+    publish_samples(store, 2)
+    return store
 
 
 @pytest.fixture

@@ -17,14 +17,20 @@ from mapserver import releases
 from mapserver.store import MapStore, Retention
 from support.drawn_areas import geojson
 from support.recordings.painted_room import Ride, write_ride
-from support.storage.dense_samples import save_surfel_draft, seen_wall, wall
+from support.storage.dense_samples import save_surfel_draft, seen_wall, surfel_extras, wall
 from support.storage.map_samples import save_grid_draft, save_sample_draft
+
+
+def save_dense(store: MapStore, seed: int = 0) -> None:
+    """A draft with a grid and surfels that no other seed's has."""
+    extras, said = surfel_extras(wall(grey=100 + seed))
+    save_grid_draft(store, seed, extras=extras, surfels=said)
 
 
 @pytest.fixture
 def site(tmp_path: Path) -> tuple[str, ...]:
     with MapStore.open(tmp_path / "store", create=True) as store:
-        save_grid_draft(store)
+        save_dense(store)
         releases.publish(store, "lab")
     return ("--site", "lab", "--store", str(tmp_path / "store"))
 
@@ -73,24 +79,27 @@ def test_wrong_orders_for_grids_are_told(run, site, tmp_path: Path) -> None:
     assert not list(tmp_path.glob("a.*"))
 
 
-def test_a_grid_travels_with_the_archive_and_goes_with_its_version(run, site, tmp_path: Path) -> None:
+def test_grid_and_surfels_travel_with_the_archive_and_go_with_their_version(run, site, tmp_path: Path) -> None:
     other = ("--site", "lab", "--store", str(tmp_path / "other"))
     run("export", *site, tmp_path / "v.fmex")
     run("import", "--store", tmp_path / "other", tmp_path / "v.fmex")
     run("grid", "export", *other, tmp_path / "a.yaml", "--version", 1)
     assert (read(tmp_path / "a.yaml")[0] == 0).any()
-    # Robots fetch a file without it, of the format that they know.
+    assert f"{len(wall())} surfels of version 1" in run("map", "splats", *other, 1, tmp_path / "a.ply")
+    # Robots fetch a file without them, of the format that they know.
     run("export", *site, tmp_path / "robots.fmex", "--without-archive")
-    assert (tmp_path / "robots.fmex").read_bytes()[4:6] == b"\x01\x00"
+    formats = [(tmp_path / f"{name}.fmex").read_bytes()[4:6] for name in ("v", "robots")]
+    assert formats == [b"\x03\x00", b"\x01\x00"]
     with MapStore.open(tmp_path / "store") as store:
         assert store.verify().faults == []
+        assert store.served_kind(store.manifest("lab", 1).report["surfels"]["sha256"]) is None  # robots never get them
         for seed in (1, 2, 3):
-            save_grid_draft(store, seed)
+            save_dense(store, seed)
         before = store.verify()
         gone = store.collect_garbage(Retention(keep_drafts=1, keep_days=0.0))
         after = store.verify()
         assert (gone.removed, after.faults) == ([("lab", 2), ("lab", 3)], [])
-        assert before.blobs - after.blobs >= 2 * 3  # manifest, index and tile of each
+        assert before.blobs - after.blobs >= 2 * 5  # manifest, indices and tiles of each
     run("grid", "export", *site, tmp_path / "b.yaml", "--version", 4)
     # What is damaged is told.
     with MapStore.open(tmp_path / "store") as store:

@@ -1,7 +1,6 @@
 """Surfels as bytes and back, through the store and its exports, and what is no surfel told by name."""
 
 import struct
-from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -9,9 +8,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from fleetmap.errors import MapFormatError, NewerFormatError, StateError
-from mapserver import releases
-from mapserver.plugins.dense_maps.surfel_map import LEVELS, TILE_SIZE_M, Surfels, known_surfels, surfels_of
-from mapserver.store import MapStore, Retention
+from mapserver.plugins.dense_maps.surfel_map import LEVELS, TILE_SIZE_M, Surfels, surfels_of
+from mapserver.store import MapStore
 from support.storage.dense_samples import encode_surfels, save_surfel_draft, wall
 from support.storage.map_samples import save_sample_draft
 
@@ -35,12 +33,11 @@ def test_bytes_are_the_same_in_any_order_and_give_the_surfels_back() -> None:
     assert encode_surfels(Surfels.joined([])) == []
 
 
-def test_a_version_keeps_them_and_gives_those_that_are_near(tmp_path: Path) -> None:
+def test_a_version_keeps_them_and_gives_those_that_are_near(store: MapStore) -> None:
     surfels = scattered()
-    with MapStore.open(tmp_path, create=True) as store:
-        manifest = store.manifest("lab", save_surfel_draft(store, surfels))
-        found = surfels_of(manifest, store.blob)
-        near = surfels_of(manifest, store.blob, (1.0, 1.0, 2.0))
+    manifest = store.manifest("lab", save_surfel_draft(store, surfels))
+    found = surfels_of(manifest, store.blob)
+    near = surfels_of(manifest, store.blob, (1.0, 1.0, 2.0))
     assert (len(found), found.falloff) == (len(surfels), surfels.falloff)
     meant = surfels[:50]
     picked = found[cKDTree(found.points_map).query(meant.points_map)[1]]
@@ -52,45 +49,23 @@ def test_a_version_keeps_them_and_gives_those_that_are_near(tmp_path: Path) -> N
     assert (np.abs(near.points_map[:, :2] - 1.0) <= TILE_SIZE_M + 2.0).all()
 
 
-def test_surfels_far_above_or_below_their_tile_are_left_out(tmp_path: Path) -> None:
+def test_surfels_far_above_or_below_their_tile_are_left_out(store: MapStore) -> None:
     surfels = scattered()
     stray = surfels[np.array([0, 1])]
     stray.points_map[:, 2] += [70.0, -70.0]
-    with MapStore.open(tmp_path, create=True) as store:
-        manifest = store.manifest("lab", save_surfel_draft(store, Surfels.joined([surfels, stray])))
-        found = surfels_of(manifest, store.blob)
+    manifest = store.manifest("lab", save_surfel_draft(store, Surfels.joined([surfels, stray])))
+    found = surfels_of(manifest, store.blob)
     assert len(found) == len(surfels)
     assert found.points_map[:, 2].min() == pytest.approx(surfels.points_map[:, 2].min(), abs=1e-3)
     assert found.points_map[:, 2].max() == pytest.approx(surfels.points_map[:, 2].max(), abs=1e-3)
 
 
-def test_they_travel_with_the_archive_and_go_with_their_version(tmp_path: Path) -> None:
-    with MapStore.open(tmp_path / "a", create=True) as store, MapStore.open(tmp_path / "b", create=True) as other:
-        for level in range(4):
-            save_surfel_draft(store, wall(edge_level=1 + level % 2, grey=100 + level))
-        releases.publish(store, "lab", 1)
-        store.export_version("lab", 1, tmp_path / "v.fmex")
-        store.export_version("lab", 1, tmp_path / "robots.fmex", archive=False)
-        assert (tmp_path / "v.fmex").read_bytes()[4:6] == b"\x03\x00"
-        assert (tmp_path / "robots.fmex").read_bytes()[4:6] == b"\x01\x00"
-        other.import_version(tmp_path / "v.fmex")
-        assert len(known_surfels(other.manifest("lab", 1), other.blob)) == len(wall())
-        index = store.manifest("lab", 1).report["surfels"]["sha256"]
-        assert store.served_kind(index) is None  # robots never get them
-        before = store.verify()
-        removed = store.collect_garbage(Retention(keep_drafts=1, keep_days=0.0)).removed
-        after = store.verify()
-        assert (removed, after.faults) == ([("lab", 2), ("lab", 3)], [])
-        assert before.blobs - after.blobs >= 2 * 3
-
-
-def test_what_is_not_there_or_damaged_is_told(tmp_path: Path) -> None:
-    with MapStore.open(tmp_path, create=True) as store:
-        bare = store.manifest("lab", save_sample_draft(store))
-        with pytest.raises(StateError, match="surfel_map = true"):
-            surfels_of(bare, store.blob)
-        manifest = store.manifest("lab", save_surfel_draft(store, wall()))
-        blobs = encode_surfels(wall())
+def test_what_is_not_there_or_damaged_is_told(store: MapStore) -> None:
+    bare = store.manifest("lab", save_sample_draft(store))
+    with pytest.raises(StateError, match="surfel_map = true"):
+        surfels_of(bare, store.blob)
+    manifest = store.manifest("lab", save_surfel_draft(store, wall()))
+    blobs = encode_surfels(wall())
     for said, kind, words in (
         ({"without": {"ride": "one camera measures no depth"}}, StateError, "ride: one camera"),
         ({"sha256": "x"}, MapFormatError, "surfels"),

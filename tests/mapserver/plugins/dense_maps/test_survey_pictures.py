@@ -59,13 +59,12 @@ def test_those_that_look_elsewhere_come_last() -> None:
     assert found[0][1] < 1.5
 
 
-def test_a_version_without_pictures_and_damaged_ones_are_told(tmp_path) -> None:
-    with MapStore.open(tmp_path, create=True) as store:
-        old = store.manifest("lab", save_sample_draft(store))
-        manifest = store.manifest("lab", save_session_pictures(store, [along(9.0)]))
-        assert len(pictures_of(manifest, store.blob)) == 4
-        assert store.verify().faults == []
-        assert store.served_kind(manifest.report[PICTURES_KEY]["sha256"]) is None, "robots never get them"
+def test_a_version_without_pictures_and_damaged_ones_are_told(store: MapStore) -> None:
+    old = store.manifest("lab", save_sample_draft(store))
+    manifest = store.manifest("lab", save_session_pictures(store, [along(9.0)]))
+    assert len(pictures_of(manifest, store.blob)) == 4
+    assert store.verify().faults == []
+    assert store.served_kind(manifest.report[PICTURES_KEY]["sha256"]) is None, "robots never get them"
     with pytest.raises(StateError, match="built without `survey_pictures`"):
         pictures_of(old, {}.__getitem__)
     with pytest.raises(MapFormatError, match="index of pictures"):
