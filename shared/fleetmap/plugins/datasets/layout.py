@@ -2,10 +2,8 @@
 
 import contextlib
 import hashlib
-import io
 import os
 import re
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -16,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.errors import CalibrationError, RecordingError
-from fleetmap.geometry import AnyArray, Array
+from fleetmap.geometry import Array
 from fleetmap.recordings.files import hash_file, lines_of, read_text, what_instead
 from fleetmap.recordings.image_series import ImageReader, ImageSeries, SeriesFrames, rig_views
 from fleetmap.recordings.images import (
@@ -243,14 +241,19 @@ def read_stamped_rows(path: Path, columns: int, log: ReadLog) -> tuple[Stamps, A
     first, _, rest = text.lstrip().partition("\n")
     if first[:1].isalpha() and re.match(r"\s*\d", rest):  # names of columns
         text = rest
-    dtype = np.dtype([("stamp_ns", np.int64), ("values", np.float64, (columns,))])
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # of empty tables, which are an error below
-            table: AnyArray = np.loadtxt(io.StringIO(text), dtype, comments="#", usecols=range(columns + 1), ndmin=1)
-    except ValueError:
-        table = _whole_rows(path, text, dtype, log)
-    if len(table) == 0:
+    stamps_ns, rows, bad = list[int](), list[list[float]](), 0
+    for _, line in lines_of(text, path):
+        first, *words = line.partition("#")[0].split()
+        try:
+            stamp_ns, values = int(first), [float(word) for word in words[:columns]]
+        except ValueError:
+            stamp_ns, values = 0, []
+        if len(values) == columns and abs(stamp_ns) <= LAST_NS:
+            stamps_ns.append(stamp_ns)
+            rows.append(values)
+        else:
+            bad += 1
+    if not rows:
         first = next((line for line in text.splitlines() if line.partition("#")[0].strip()), "")
         with contextlib.suppress(ValueError):  # no likely unit
             _whole_ns(first.split()[0] if first else "", str(path))
@@ -258,24 +261,11 @@ def read_stamped_rows(path: Path, columns: int, log: ReadLog) -> tuple[Stamps, A
         raise RecordingError(
             f"{path} holds no row of a stamp in ns and {columns} numbers, {there}; the recording is incomplete, copy it again"
         )
+    if bad:
+        fault = f"{bad} of {bad + len(rows)} lines lack a stamp and {columns} numbers"
+        log.note(f"{path.name}: unreadable lines", fault)
     log.files.append(path)
-    return table["stamp_ns"], table["values"]
-
-
-def _whole_rows(path: Path, text: str, dtype: "np.dtype[np.void]", log: ReadLog) -> AnyArray:
-    columns = dtype["values"].shape[0]
-    rows, bad = [], 0
-    for _, line in lines_of(text, path):
-        first, *words = line.partition("#")[0].split()
-        try:
-            stamp, values = int(first), [float(word) for word in words[:columns]]
-        except ValueError:
-            stamp, values = 0, []
-        is_whole = len(values) == columns and abs(stamp) <= LAST_NS
-        rows += [(stamp, values)] if is_whole else []
-        bad += not is_whole
-    log.note(f"{path.name}: unreadable lines", f"{bad} of {bad + len(rows)} lines lack a stamp and {columns} numbers")
-    return np.array(rows, dtype)
+    return np.array(stamps_ns, np.int64), np.array(rows)
 
 
 def read_imu(path: Path, log: ReadLog) -> ImuSamples:
