@@ -15,8 +15,6 @@ Indices = NDArray[np.int64]
 Distances = NDArray[np.int32]
 FAR = 257  # more than any two descriptors can differ by
 
-__all__ = ["FAR", "Projected", "match_by_projection", "match_mutual", "packed"]
-
 
 def packed(descriptors: Descriptors) -> Packed:
     """(N, 4) uint64 of descriptors (N, 32) uint8: the same bits as machine words, copied only if the core needs it."""
