@@ -33,10 +33,9 @@ from mapserver.store import Actor
 _log = logging.getLogger(__name__)
 SIGN_IN, SIGN_OUT, STYLE = "/sign-in", "/sign-out", "/dashboard/static/style.css"
 _OPEN = {"/healthz", "/readyz", SIGN_IN, SIGN_OUT, STYLE}
-_RIGHTS = (  # needed for reading, too; operations say their own
+_RIGHTS = (  # needed for reading, too, as what operations say of their paths
     (re.compile(r"/metrics$"), Right.METRICS),
-    (re.compile(r"/v1/(operators|tokens|log)(/|$)|/dashboard/administration/(people|log)(/|$)"), Right.OPERATORS),
-    (re.compile(r"/v1/sites/[^/]+/enrolled(/|$)"), Right.ROBOTS),
+    (re.compile(r"(/v1/log|/dashboard/administration/(people|log))(/|$)"), Right.OPERATORS),
 )
 _FORWARDED = {"forwarded", "x-forwarded-for", "x-real-ip"}
 _FORBIDDEN = Path(__file__).with_name("forbidden.html").read_text("utf-8")

@@ -3,11 +3,10 @@
 import sys
 import time
 from collections.abc import Iterator
-from enum import StrEnum
 from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -18,13 +17,6 @@ from mapserver.commands.options import ActorOptions, Json, SiteName, StoreFolder
 
 if TYPE_CHECKING:
     from mapserver.fleet.resurvey_list import ResurveyList
-
-
-class ExportFormat(StrEnum):
-    """File format of `fleet export`."""
-
-    JSONL = "jsonl"
-    MCAP = "mcap"
 
 
 def report(
@@ -50,7 +42,7 @@ def export(
     site: Annotated[str | None, typer.Option(help="Name of the site; default: all sites.")] = None,
     hours: Annotated[int | None, typer.Option(min=1, help="Only the last N hours; default: everything.")] = None,
     format_: Annotated[
-        ExportFormat | None, typer.Option("--format", help="jsonl or mcap; default: by the file's name.")
+        Literal["jsonl", "mcap"] | None, typer.Option("--format", help="jsonl or mcap; default: by the file's name.")
     ] = None,
 ) -> None:
     """Write failures as JSON lines, or as MCAP with log, positions and pictures for Foxglove."""
@@ -58,14 +50,14 @@ def export(
     from mapserver.fleet.exports import write_json_lines
     from mapserver.store import FailureFilter
 
-    chosen = format_ or next((known for known in ExportFormat if out.suffix == f".{known}"), None)
+    chosen = format_ or {".jsonl": "jsonl", ".mcap": "mcap"}.get(out.suffix)
     if chosen is None:
         raise UsageError(f"{out}: name it .jsonl or .mcap, or name --format")
     since_ns = None if hours is None else time.time_ns() - hours * 3_600_000_000_000
     with open_store(store, read_only=True) as maps:
         if site is not None:
             maps.current(site)  # raises for an unknown site
-        is_plain = chosen is ExportFormat.JSONL
+        is_plain = chosen == "jsonl"
         write = write_json_lines if is_plain else plugin("mapserver.failure_exports", chosen, f"--format {chosen}")
         count = write(maps, FailureFilter(site=site, since_ns=since_ns), out)
     typer.echo(f"{count} failures")

@@ -3,9 +3,8 @@
 import getpass
 import socket
 from collections.abc import Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -27,16 +26,8 @@ Hosts = Annotated[
     list[str] | None,
     typer.Option(metavar="NAME", help="Name or address of this machine for robots; repeat it."),
 ]
+Rotated = Literal["online", "root", "server", "robots-ca"]
 SiteArgument = Annotated[str, typer.Argument(metavar="SITE", help="Name of the site.")]
-
-
-class Rotated(StrEnum):
-    """Key or certificate that `trust rotate` replaces."""
-
-    ONLINE = "online"
-    ROOT = "root"
-    SERVER = "server"
-    ROBOTS_CA = "robots-ca"
 
 
 def init(
@@ -106,18 +97,18 @@ def rotate(
     ] = False,
 ) -> None:
     """Replace keys, or sign root and targets again before they expire."""
-    if (stick and what is not Rotated.ROOT) or (host and what is not Rotated.SERVER):
+    if (stick and what != "root") or (host and what != "server"):
         raise UsageError("--stick is for `trust rotate root`, --host for `trust rotate server`")
-    if stolen and what is not Rotated.ROBOTS_CA:
+    if stolen and what != "robots-ca":
         raise UsageError("--stolen is for `trust rotate robots-ca`")
     from mapserver.trust import signing
 
     with open_store(store) as maps:
-        if what in {Rotated.SERVER, Rotated.ROBOTS_CA}:
+        if what in {"server", "robots-ca"}:
             _rotate_certificates(maps, what, key, host or (), is_stolen=stolen)
             return
         root_key = _root_key(maps, key)
-        if what is Rotated.ONLINE:
+        if what == "online":
             signing.rotate_online(maps, root_key)
         elif made := signing.rotate_root(maps, root_key, stick):
             _show(*made)
@@ -131,7 +122,7 @@ def _rotate_certificates(
 
     register = RobotRegister(maps)
     _ = register.tls  # raises if there is nothing to rotate
-    if what is Rotated.SERVER:
+    if what == "server":
         register.authorities.rotate_server(key, None if key is None else _passphrase(key), hosts)
         typer.echo("done; a running server loads it within two seconds")
         return

@@ -198,29 +198,23 @@ def _figures(live: LiveSite, health: SiteHealth) -> list[Figure]:
 
 def _notices(services: Services, context: PageContext, health: SiteHealth, alerts: Sequence[Incident]) -> list[Notice]:
     """Alerts, a draft that waits, trials, running or just ended, and what got worse this week, each with a page that says more."""
-    store, site = services.maps.store, context.site
-    told = []
+    store, site, found = services.maps.store, context.site, list[Notice]()
+
+    def told(tone: str, words: str, page: str, incident: Incident | None = None) -> None:
+        found.append(Notice(tone, words, context.to(page), begun(page), incident))
+
+    for one in (one for one in alerts if one.name in _ALERTS):
+        words = f"{begun(one.words)}.{f' {one.assignee} has it.' if one.assignee else ''}"
+        told("bad" if one.state == "open" else "quiet", words, _ALERTS[one.name], one)
     versions = store.releases(site).versions if services.maps.is_mapped(site) else {}
     newest = next(reversed(versions.values()), None)
     if newest is not None and newest.state == "draft":
         tone, said = verdict_words(store.last_verdicts(site).get(newest.version), is_draft=True)
-        told.append((tone, f"Draft {newest.version} is not published. {said}", "map"))
+        told(tone, f"Draft {newest.version} is not published. {said}", "map")
     for trial in health.trials:
         tone, words, said = fleet_parts.trial_words(trial, context.moment)
         verdict, stop, _ = said.partition(". ")  # the page of trends has the rates
-        told.append((tone, f"{words} {verdict}{stop}", "trends"))
-    found = [
-        Notice(
-            "bad" if one.state == "open" else "quiet",
-            f"{begun(one.words)}.{f' {one.assignee} has it.' if one.assignee else ''}",
-            context.to(_ALERTS[one.name]),
-            begun(_ALERTS[one.name]),
-            one,
-        )
-        for one in alerts
-        if one.name in _ALERTS
-    ]
-    found += [Notice(tone, words, context.to(page), begun(page)) for tone, words, page in told]
+        told(tone, f"{words} {verdict}{stop}", "trends")
     if health.areas:
         words = f"This week: {trend_sentence(list(health.areas))}."
         found.append(Notice("quiet", words, f"{context.to('trends')}#worse", "Area by area"))

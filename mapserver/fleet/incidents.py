@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
-from mapserver.store import INCIDENT, Actor, Event, MapStore
+from mapserver.store import Event, MapStore
 
 _STATES = {
     "acknowledged": "acknowledged",
@@ -35,10 +35,6 @@ class Incident:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "id", "/".join(filter(None, (self.name, self.site, self.about))))
-
-    def noted(self, store: MapStore, act: str, actor: Actor) -> None:
-        """Log what somebody does about it: one of `_STATES`, with `handed` to whom, or `commented`."""
-        store.audit(INCIDENT, f"{act}: {self.id}", actor=actor, site=self.site)
 
 
 def acts_after(store: MapStore, number: int) -> list[Event]:

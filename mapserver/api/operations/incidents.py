@@ -60,9 +60,10 @@ def reopen(caller: Caller, incident: Id, *, inbox: InboxFolder = None) -> Done:
 def _noted(caller: Caller, incident: str, act: str, inbox: Path | None) -> Done:
     from mapserver.api.incidents import find, present
     from mapserver.fleet.fleet import Fleet
+    from mapserver.store import INCIDENT
 
     store, served = caller.store, caller.served
     fleet, inbox = (Fleet(store), inbox) if served is None else (served.fleet, served.settings.inbox)
     found = find(store, present(store, fleet, caller.config.alerts, inbox), incident)
-    found.noted(store, act, caller.actor)
+    store.audit(INCIDENT, f"{act}: {found.id}", actor=caller.actor, site=found.site)
     return Done(f"{found.id} is {act}")

@@ -75,7 +75,7 @@ def test_the_page_stands_alone_and_shows_the_count(folder: tuple[Path, Known]) -
     assert "&lt;b&gt;dark &amp; dusty" in page and "<b>dark" not in page
     assert f"{known.failures['site', '']} in {driven}" in page
     assert "Version 2 is tried by 30.0 % of the robots" in page
-    assert "prefers-color-scheme: dark" in page
+    assert "body.print { color-scheme: light dark; }" in page
 
 
 def test_an_idle_site_has_a_page_too(tmp_path: Path) -> None:
