@@ -36,9 +36,8 @@ from mapserver.store.archive import decode_archive
 
 _NEVER_LOCALISED = 6  # exit status of `locclient replay` that comes with a report
 _TRACKING, _AMBIGUOUS = "TRACKING", "AMBIGUOUS"  # fleetmap.messages.Status, as the report writes them
-_DOCK_SIGMA_M = (
-    0.1  # of a place that can judge an estimate of centimetres: a dock or tag, not a zone or an operator's click
-)
+# Of a place that can judge an estimate of centimetres: a dock or tag, not a zone or an operator's click
+_DOCK_SIGMA_M = 0.1
 
 
 class StartFrame(msgspec.Struct, frozen=True):
@@ -125,15 +124,11 @@ class Drive:
 
 
 class Reference(NamedTuple):
-    """Poses of a drive with the name of their source, and the mask (F,) of selected frames that did not make the map.
-
-    is_surveyed: True if the drive itself made it.
-    """
+    """Poses of a drive with the name of their source, and the mask (F,) of selected frames that did not make the map."""
 
     source: str
     trajectory: Trajectory
     free: NDArray[np.bool_]
-    is_surveyed: bool
 
 
 def replayed(request: DriveRequest, version: MapUnderTest) -> tuple[ReplayReport, Trajectory]:
@@ -198,7 +193,7 @@ def examined(
             frames=report.frames,
             hours=round(float(stamps_ns[-1] - stamps_ns[0]) / 3.6e12, 6),
             reference=reference.source,
-            is_surveyed=reference.is_surveyed,
+            is_surveyed=any(recording.content_hash() == each.sha256 for each in version.manifest.recordings),
             localised_share=round(report.localised_share_of_all or 0.0, 4),
             failures=report.position_failures,
             silent=_silent_runs((stamp, is_wrong(*error)) for stamp, error in off.items()),
@@ -223,8 +218,7 @@ def _reference(
     elif known is not None:
         source = f"the survey of version {version.manifest.version}"
         trajectory = Trajectory(recording.frame_stamps_ns[selected], known[0])
-    is_surveyed = any(entry.sha256 == each.sha256 for each in version.manifest.recordings)
-    return Reference(source, trajectory, np.ones(len(selected), bool) if known is None else known[1], is_surveyed)
+    return Reference(source, trajectory, np.ones(len(selected), bool) if known is None else known[1])
 
 
 def _off(map_from_body: Array, truth: Array) -> tuple[float, float]:

@@ -106,7 +106,7 @@ class DriveFigures(msgspec.Struct, frozen=True):
 
 
 class Figure(msgspec.Struct, frozen=True):
-    """A line of the table: of the site, of its weakest area or drive, and its limit; is_met: None without a limit."""
+    """A line of the table: of the site, its weakest area or drive, and its limit; is_met: None without one, or if too little was tried."""
 
     name: str
     site: str

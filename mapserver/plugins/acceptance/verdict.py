@@ -38,13 +38,16 @@ class Reason(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A figure of the site, of its weakest area or drive, its limit, empty for none, and the reasons if it is beyond."""
+    """A figure of the site, of its weakest area or drive, its limit, empty for none, and the reasons if it is beyond.
+
+    reasons: None without a limit, and if too little was tried to say.
+    """
 
     name: str
     site: str
     weakest: str = ""
     limit: str = ""
-    reasons: Sequence[Reason] = ()
+    reasons: Sequence[Reason] | None = None
 
 
 Part = tuple[float, str, str]
@@ -60,7 +63,7 @@ def judged(report: Report, settings: GateSettings, evidence: Evidence | None, fl
     failures put on the list, as text.
     """
     rows = [*_of_frames(report, settings), *_of_robots(report, settings), *_of_site(report, settings)]
-    found = [reason for row in rows for reason in row.reasons]
+    found = [reason for row in rows for reason in row.reasons or ()]
     reasons, again = [reason.words for reason in found], [reason.again for reason in found if reason.again]
     if evidence is not None and evidence.views is not None and evidence.views.warning:
         again.append(evidence.views.warning)
@@ -72,7 +75,7 @@ def judged(report: Report, settings: GateSettings, evidence: Evidence | None, fl
         verdict=f"NOT ACCEPTED: {site}: {first_of(reasons, 1)}." if reasons else accepted,
         is_accepted=not reasons,
         reasons=reasons,
-        figures=[Figure(*row[:4], not row.reasons if row.limit else None) for row in rows],
+        figures=[Figure(*row[:4], None if row.reasons is None else not row.reasons) for row in rows],
         survey_again=list(dict.fromkeys([*again, *fleet])),
         not_judged=list(_not_judged(report)),
     )
@@ -106,15 +109,16 @@ def _of_frames(report: Report, settings: GateSettings) -> Iterator[Row]:
         yield Row(f"the same {words}", ", ".join(ladder.get(str(level), Count()).text for level in levels))
     wrong = [(area.wrong / area.frames.tries, area.name, str(area.wrong)) for area in report.areas if area.frames.tries]
     words = f"{whole.wrong} of {tries} frames are localized at a wrong place"
-    reasons = [Reason(words)] if whole.wrong > settings.max_wrong_share * tries else []
+    over = [Reason(words)] if whole.wrong > settings.max_wrong_share * tries else [] if tries else None
     limit = f"at most {100 * settings.max_wrong_share:g} %"
-    yield Row("Frames localized at a wrong place", f"{whole.wrong} of {tries}", _worst(wrong), limit, reasons)
+    yield Row("Frames localized at a wrong place", f"{whole.wrong} of {tries}", _worst(wrong), limit, over)
     limit_mm, median_mm = 1e3 * settings.max_median_error_m, float(np.median(whole.errors_mm or [0.0]))
     words = f"the median error is {median_mm:.0f} mm, the limit is {limit_mm:.0f} mm"
-    reasons = [Reason(words)] if median_mm > limit_mm else []
+    is_known = quantile(whole.errors_mm, 0.5) is not None
+    over = [Reason(words)] if median_mm > limit_mm else [] if is_known else None
     medians = _worst(_errors((area.name, quantile(area.errors_mm, 0.5)) for area in report.areas))
     yield Row(
-        "Error of these frames, median", _mm(whole.errors_mm, "median"), medians, f"at most {limit_mm:g} mm", reasons
+        "Error of these frames, median", _mm(whole.errors_mm, "median"), medians, f"at most {limit_mm:g} mm", over
     )
     yield Row("Error of these frames, 95 %", _mm(whole.errors_mm, "p95"))
 
@@ -137,7 +141,7 @@ def _of_robots(report: Report, settings: GateSettings) -> Iterator[Row]:
     )
     if not whole.found_of_all.tries:
         row = row._replace(reasons=[Reason("no start without a guess was tried: record a longer drive")])
-    yield row._replace(limit="", reasons=()) if KNOWN_STARTS in report.promises else row
+    yield row._replace(limit="", reasons=None) if KNOWN_STARTS in report.promises else row
     yield Row("Starts that stay AMBIGUOUS, or lost", f"{whole.ambiguous}, {whole.lost}")
     silent = [(area.name, area.starts.silent) for area in report.areas if area.starts.silent]
     wrong = [(area, f"{n}", Reason(f"{area}: {n} starts without a guess are silently wrong")) for area, n in silent]
@@ -176,7 +180,7 @@ def _of_site(report: Report, settings: GateSettings) -> Iterator[Row]:
             one_way.append((area.name, ways, Reason(words, f"{area.name}: drive it facing {ways} ({counts})")))
     yield _none("Areas driven through, and not in the map", strays)
     row = _none("Areas surveyed in one direction only", one_way)
-    yield row._replace(limit="", reasons=()) if ONE_WAY in report.promises else row
+    yield row._replace(limit="", reasons=None) if ONE_WAY in report.promises else row
     alike = [f"{one.area}: {one.frames} like {one.other}" for one in report.similar]
     yield Row(f"Areas that look alike, by {report.similar_of} frames", str(len(alike)), first_of(alike, 1))
     doubts = [(rig.rig, subject, words) for rig in report.calibrations for subject, words in rig.doubted.items()]
@@ -203,7 +207,8 @@ def _share(
     low, high = count.share.low, count.share.high
     between = "" if low is None or high is None else f" ({100 * low:.0f} to {100 * high:.0f} % with 95 %)"
     parts = [(-of(area).hits / of(area).tries, area.name, of(area).text) for area in areas]
-    return Row(name, count.text + between, _worst(parts), f"at least {100 * settings.min_localised_share:g} %", reasons)
+    limit = f"at least {100 * settings.min_localised_share:g} %"
+    return Row(name, count.text + between, _worst(parts), limit, reasons if count.tries else None)
 
 
 def _none(name: str, found: Sequence[Found], number: int | None = None) -> Row:
