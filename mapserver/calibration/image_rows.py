@@ -160,27 +160,6 @@ def _rays(camera: StereoCamera, pixels: Array) -> Array:
     return np.column_stack([(pixels - [camera.cx_px, camera.cy_px]) / camera.focal_px, np.ones(len(pixels))])
 
 
-@dataclass(frozen=True)
-class _View:
-    """Landmarks from the keyframes: in the left camera (M, 3), and relative to the body (M, 3), map axes."""
-
-    in_left: Array
-    from_body: Array
-    rect_from_map: Array
-    right_m: Array
-
-
-def _view(seen: Observations, data: CalibrationData, state: MotionState, theta: Array) -> _View:
-    turned = seen.axes.body_from_rect @ so3_exp(theta[_TURN])
-    place = seen.calibration.cameras[0].body_from_cam[:3, 3] + theta[_SHIFT]
-    body_from_map = state.map_from_body[:, :3, :3].transpose(0, 2, 1)
-    rect_from_map = (turned.T @ body_from_map)[data.obs_keyframe]
-    from_body = state.points_map[data.obs_landmark] - state.map_from_body[data.obs_keyframe, :3, 3]
-    in_left = np.einsum("mij,mj->mi", rect_from_map, from_body) - turned.T @ place
-    apart = right_camera(seen.axes, theta)[1] if seen.axes.baseline_m > 0 else np.zeros(3)
-    return _View(in_left, from_body, rect_from_map, apart)
-
-
 def image_rows(
     seen: Observations,
     data: CalibrationData,
@@ -196,31 +175,38 @@ def image_rows(
 
     scales (4,): factors on the rows' sigmas.
     """
-    view, pair, positions = _view(seen, data, state, theta), seen.pair(theta), state.map_from_body[:, :3, 3]
-    is_ahead, is_seen = view.in_left[:, 2] > _MIN_DEPTH_M, np.isfinite(seen.row_sigmas)
+    pair, positions = seen.pair(theta), state.map_from_body[:, :3, 3]
+    turned = seen.axes.body_from_rect @ so3_exp(theta[_TURN])
+    place = seen.calibration.cameras[0].body_from_cam[:3, 3] + theta[_SHIFT]
+    rect_from_map = (turned.T @ state.map_from_body[:, :3, :3].transpose(0, 2, 1))[data.obs_keyframe]
+    # Landmarks from the bodies, in map axes, and in the left camera; place of the right one in that
+    from_body = state.points_map[data.obs_landmark] - positions[data.obs_keyframe]
+    in_left = np.einsum("mij,mj->mi", rect_from_map, from_body) - turned.T @ place
+    right_m = right_camera(seen.axes, theta)[1] if seen.axes.baseline_m > 0 else np.zeros(3)
+    is_ahead, is_seen = in_left[:, 2] > _MIN_DEPTH_M, np.isfinite(seen.row_sigmas)
     usable = is_ahead[:, None] & is_seen
     # of the pixel, of the pair's difference
-    off = np.where(usable, measured.rows - _predicted(view, pair), 0.0).reshape(-1, 2, 2)
+    off = np.where(usable, measured.rows - _predicted(in_left, right_m, pair), 0.0).reshape(-1, 2, 2)
     back = measured.as_given
     errors = np.einsum("mij,mkj->mki", back, off).reshape(-1, 4)
     factor = np.where(usable, 1.0 / (seen.row_sigmas * scales), 0.0)
     residuals = np.where(is_ahead[:, None] | ~is_seen, errors * factor, _BEHIND_SIGMAS)
     if fixed is None:
         return ImageRows(residuals, np.zeros((0, 4, 3)), np.zeros((0, 4, UNKNOWNS)), positions)
-    by_left = _projection_slopes(view.in_left, pair[0])
+    by_left = _projection_slopes(in_left, pair[0])
     by_cam = np.concatenate([by_left, np.zeros_like(by_left)], axis=1)
     by_calibration = fixed.slopes.rows.copy()
     if seen.axes.baseline_m > 0:
-        by_right = _projection_slopes(view.in_left - view.right_m, pair[1])
+        by_right = _projection_slopes(in_left - right_m, pair[1])
         by_cam[:, 2:] = by_left - by_right
         steps = 1e-6 * np.eye(UNKNOWNS)[_PLACE]
         moved = [right_camera(seen.axes, theta + step)[1] - right_camera(seen.axes, theta - step)[1] for step in steps]
         by_calibration[:, 2:, _PLACE] -= np.einsum("mij,jk->mik", by_right, np.stack(moved, axis=1) / 2e-6)
-    by_point = -np.einsum("mij,mjk->mik", by_cam, view.rect_from_map)
+    by_point = -np.einsum("mij,mjk->mik", by_cam, rect_from_map)
     # X <- Exp(-phi) X changes by X x phi
-    by_calibration[:, :, _TURN] = -np.cross(by_cam, view.in_left[:, None, :])
+    by_calibration[:, :, _TURN] = -np.cross(by_cam, in_left[:, None, :])
     by_calibration[:, :, _SHIFT] = -np.einsum("mij,mjk->mik", by_point, state.map_from_body[data.obs_keyframe, :3, :3])
-    flow = np.cross(view.from_body, fixed.rates_map[data.obs_keyframe]) - state.motions[data.obs_keyframe, :3]
+    flow = np.cross(from_body, fixed.rates_map[data.obs_keyframe]) - state.motions[data.obs_keyframe, :3]
     by_calibration[:, :, INDEX[P.TIME_OFFSET]] = np.einsum("mij,mj->mi", by_point, flow)
     by_calibration[:, 2:, INDEX[P.FOCAL_RATIO]] += (off[:, 1] - off[:, 0]) / (1.0 + theta[INDEX[P.FOCAL_RATIO]])
     by_point = (back[:, None] @ by_point.reshape(-1, 2, 2, 3)).reshape(-1, 4, 3) * factor[:, :, None]
@@ -230,11 +216,11 @@ def image_rows(
     return ImageRows(residuals, by_point, by_calibration, positions)
 
 
-def _predicted(view: _View, pair: tuple[StereoCamera, StereoCamera]) -> Array:
-    left = pair[0].pixel_from_point(view.in_left)[:, :2]
-    if not view.right_m.any():
+def _predicted(in_left: Array, right_m: Array, pair: tuple[StereoCamera, StereoCamera]) -> Array:
+    left = pair[0].pixel_from_point(in_left)[:, :2]
+    if not right_m.any():
         return np.column_stack([left, np.zeros_like(left)])
-    return np.column_stack([left, left - pair[1].pixel_from_point(view.in_left - view.right_m)[:, :2]])
+    return np.column_stack([left, left - pair[1].pixel_from_point(in_left - right_m)[:, :2]])
 
 
 def _projection_slopes(points: Array, camera: StereoCamera) -> Array:

@@ -43,10 +43,8 @@ def estimate_calibration(
 
     is_enough: True if an estimate is accurate enough, however far the named parameters are from the given calibration.
     follow: returns the tracked data of a recording under a calibration; None for its stretch with the most motion.
-    RecordingError if there is no recording or their calibrations differ; SurveyError if one of them is too short to be tracked.
+    RecordingError if their calibrations differ; SurveyError if one of them is too short to be tracked.
     """
-    if not recordings:
-        raise RecordingError("no recording to calibrate from; name at least one")
     rig = recordings[0].calibration
     for other in recordings[1:]:
         if not _is_same(rig, other.calibration):

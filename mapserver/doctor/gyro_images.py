@@ -74,7 +74,7 @@ def turn_upside_down(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float
         return None
     gyro, seen = _gyro_rates(turns, imu, imu_minus_cam_s), turns.rates_body_radps
     rotated = body_from_cam[:3, :3] @ np.diag([-1.0, -1.0, 1.0]) @ body_from_cam[:3, :3].T
-    as_given, as_rotated = _correlation(gyro, seen), _correlation(gyro @ rotated.T, seen)
+    as_given, as_rotated = correlation(gyro, seen), correlation(gyro @ rotated.T, seen)
     return as_rotated > as_given if max(as_given, as_rotated) > _SURE_CORRELATION else None
 
 
@@ -91,7 +91,7 @@ def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> Gyr
     for _ in range(2):
         seen, gyro = all_seen[kept] - all_seen[kept].mean(axis=0), all_gyro[:, kept]
         speeds = np.linalg.norm(all_seen[kept], axis=1)
-        offset = int(np.argmax([_correlation(np.linalg.norm(rates, axis=1), speeds) for rates in gyro]))
+        offset = int(np.argmax([correlation(np.linalg.norm(rates, axis=1), speeds) for rates in gyro]))
         for _ in range(3):
             body_from_gyro, _ = _axes(seen, gyro[offset])
             scores = _scores(gyro, seen, body_from_gyro)
@@ -119,7 +119,7 @@ def fit_gyro(turns: CameraTurns, imu: ImuSamples, imu_minus_cam_s: float) -> Gyr
 
 def _scores(gyro: Array, seen: Array, body_from_gyro: Array) -> Array:
     """Return the correlation of the gyro's rates at every offset (D, K, 3) with the images' rates (K, 3)."""
-    return np.array([_correlation(rates @ body_from_gyro.T, seen) for rates in gyro])
+    return np.array([correlation(rates @ body_from_gyro.T, seen) for rates in gyro])
 
 
 def _inliers(seen: Array, turned: Array) -> Array:
@@ -159,7 +159,8 @@ def _gyro_rates(turns: CameraTurns, imu: ImuSamples, shift_s: float) -> Array:
     return np.stack(angles, axis=1) / (end_s - start_s)[:, None]
 
 
-def _correlation(first: Array, second: Array) -> float:
+def correlation(first: Array, second: Array) -> float:
+    """Return the correlation of columns (N,) or (N, k), each about its mean."""
     a, b = first - first.mean(axis=0), second - second.mean(axis=0)
     return float((a * b).sum() / max(np.sqrt((a * a).sum() * (b * b).sum()), 1e-12))
 

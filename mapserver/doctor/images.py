@@ -11,6 +11,7 @@ from fleetmap.recordings import Recording
 from fleetmap.sensors.lens_fit import DOUBTFUL_RATIO, FITS_PX2, lens_of_frames
 from fleetmap.sensors.samples import CameraFrame, Image
 from mapserver.doctor.findings import Finding, Limits, Verdict, judge, not_judged
+from mapserver.doctor.gyro_images import correlation
 from mapserver.doctor.sensors import SPARSE_S
 
 FIXED_PATTERN, LENS = "fixed pattern", "lens"
@@ -96,7 +97,7 @@ def fixed_pattern(structures: Sequence[tuple[Array, Array]]) -> Finding:
     """
     kept: list[tuple[Array, Array]] = []
     for fine, coarse in structures:
-        if all(_correlation(coarse, other) < _SAME_SCENE for _, other in kept):
+        if all(correlation(coarse.ravel(), other.ravel()) < _SAME_SCENE for _, other in kept):
             kept.append((fine, coarse))
     count = len(kept)
     if count < _MIN_SCENES:
@@ -122,11 +123,6 @@ def _cells(fine: Array) -> Array:
     tiled = fine.reshape(height // _CELL_PX, _CELL_PX, width // _CELL_PX, _CELL_PX)
     cells = tiled.transpose(0, 2, 1, 3).reshape(-1, _CELL_PX * _CELL_PX)
     return np.asarray(cells - cells.mean(axis=1, keepdims=True), np.float64)
-
-
-def _correlation(first: Array, second: Array) -> float:
-    a, b = first - first.mean(), second - second.mean()
-    return float((a * b).sum() / max(float(np.sqrt((a * a).sum() * (b * b).sum())), 1e-9))
 
 
 _RANGE_M = (0.05, 100.0)

@@ -24,7 +24,6 @@ from fleetmap.sensors.rectification import StereoCamera
 from mapserver.drafting.area_corrections import AreaCorrections, driven_since
 from mapserver.drafting.draft_evidence import (
     Before,
-    DraftMap,
     MappedSession,
     TileChooser,
     asked_views,
@@ -348,9 +347,8 @@ def _evidence(
     if before is not None:
         opened = replace(options, trajectory=None).opened
         replayed = replayed_probes(options.replay, before, opened, (camera, run.settings.orb))
-    drafted = DraftMap(tiles, default_vocabulary(), camera)
     with open_executor(options.threads, None) as executor:
-        evidence = examine_draft(drafted, before, sessions, replayed, executor)
+        evidence = examine_draft(tiles, default_vocabulary(), camera, before, sessions, replayed, executor)
     known = [] if before is None else before.calibrations
     return msgspec.structs.replace(evidence, calibrations=merged([*known, *(s.evidence() for s in built.taken)]))
 

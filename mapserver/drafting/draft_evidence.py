@@ -199,8 +199,7 @@ class TileChooser(NamedTuple):
         return tiles_from_survey(self.survey_map, chosen=chosen)
 
     def _view(self, tiles: Sequence[Tile]) -> MapView:
-        stored = [decode_tile(encode_tile(tile)) for tile in tiles]
-        return MapView(stored, self.vocabulary, self.survey_map.camera.focal_px)
+        return MapView(_as_stored(tiles), self.vocabulary, self.survey_map.camera.focal_px)
 
     def _fixes(self, tiles: Sequence[Tile], views: Sequence[AskedView]) -> list[Fix | None]:
         view = self._view(tiles)
@@ -224,6 +223,10 @@ class TileChooser(NamedTuple):
         order = np.argsort(survey.landmark_ids, kind="stable")
         landmarks = order[np.searchsorted(survey.landmark_ids, view.landmark_ids[rows], sorter=order)]
         return Sighting(fix.map_from_cam, landmarks, probe.features.pixels[features])
+
+
+def _as_stored(tiles: Sequence[Tile]) -> list[Tile]:
+    return [decode_tile(encode_tile(tile)) for tile in tiles]
 
 
 def _lacking(fixes: Sequence[Fix | None]) -> tuple[int, int]:
@@ -316,32 +319,21 @@ def replayed_probes(
     return probes
 
 
-class DraftMap(NamedTuple):
-    """The draft in its form for robots; camera: that of the map."""
-
-    tiles: Sequence[Tile]
-    vocabulary: Vocabulary
-    camera: StereoCamera
-
-    def view(self) -> MapView:
-        """Return the robots' view of it."""
-        return MapView(self.tiles, self.vocabulary, self.camera.focal_px)
-
-
 def examine_draft(
-    drafted: DraftMap,
+    tiles: Sequence[Tile],
+    vocabulary: Vocabulary,
+    camera: StereoCamera,
     before: Before | None,
     sessions: Sequence[MappedSession],
     replayed: Sequence[Probe],
     executor: Executor = SERIAL,
 ) -> Evidence:
-    """Return the findings of probes in the tiles as stored; `sessions` are the map's recordings."""
+    """Return the findings of probes in the tiles as stored; camera: that of the map; sessions: its recordings."""
     held_out = [probe for session in sessions for probe in session.probes(session.judging(len(sessions)))]
-    stored = [decode_tile(encode_tile(tile)) for tile in drafted.tiles]
-    drafted = drafted._replace(tiles=stored)
+    stored = _as_stored(tiles)
     probes = Probes(held_out, replayed, [] if before is None else probes_of_map(before.survey, PROBES))
-    current = None if before is None else DraftMap(before.tiles, drafted.vocabulary, before.survey.camera).view()
-    draft = drafted.view()
+    current = None if before is None else MapView(before.tiles, vocabulary, before.survey.camera.focal_px)
+    draft = MapView(stored, vocabulary, camera.focal_px)
     tasks: list[Callable[[], Any]] = [
         lambda: starts_without_prior(draft, probes.frames),
         lambda: repetition(draft, probes.frames),

@@ -153,13 +153,9 @@ def _residual_px(view: MapView, probe: Probe, fix: Fix) -> float:
 
 def aliasing(view: MapView, probes: Sequence[Probe]) -> Aliasing | None:
     """Offer each probe with the prior of the most similar far place; None if there is no such place."""
-    offered = accepted = 0
-    for probe in probes:
-        elsewhere = most_similar_beyond(view, probe, ELSEWHERE_M)
-        if elsewhere is not None:
-            offered += 1
-            accepted += relocalized(view, probe, elsewhere) is not None
-    return Aliasing(offered, round(accepted / offered, 4)) if offered else None
+    places = [(probe, most_similar_beyond(view, probe, ELSEWHERE_M)) for probe in probes]
+    accepted = [relocalized(view, probe, place) is not None for probe, place in places if place is not None]
+    return Aliasing(len(accepted), round(float(np.mean(accepted)), 4)) if accepted else None
 
 
 def trajectory_breaks(

@@ -70,12 +70,10 @@ def rig_of(rectifier: Rectifier) -> Rig:
         CameraKind.DEPTH if each.has_depth else CameraKind.STEREO if each.camera.baseline_m > 0 else CameraKind.SINGLE
         for each in cameras
     ]
-    return Rig(survey_camera(rectifier.camera), np.array([each.body_from_cam for each in cameras]), tuple(kinds))
-
-
-def survey_camera(camera: StereoCamera) -> StereoCamera:
-    """Return the camera model of a survey: a single camera gets a baseline, so that depths have disparities, as with a depth sensor."""
-    return camera if camera.baseline_m > 0 else replace(camera, baseline_m=RGBD_BASELINE_M)
+    camera = (
+        rectifier.camera if rectifier.camera.baseline_m > 0 else replace(rectifier.camera, baseline_m=RGBD_BASELINE_M)
+    )
+    return Rig(camera, np.array([each.body_from_cam for each in cameras]), tuple(kinds))
 
 
 def scaled_bodies(map_from_body: Array, body_from_cam: Array, scale: float) -> Array:

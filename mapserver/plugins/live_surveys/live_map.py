@@ -37,7 +37,7 @@ from mapserver.survey.loops.loops import LoopCloser, LoopRecord, Loops, LoopVerd
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
 from mapserver.survey.pose_graph.sim3_pose_graph import gate_covariances, solve_scaled
-from mapserver.survey.rig import CameraKind, Rig, survey_camera
+from mapserver.survey.rig import rig_of
 from mapserver.survey.state import Keyframe, KeyframeMotion, RelativeTerm, RigImages, SurveyState, turned
 from mapserver.survey.survey_inputs import SurveyConfig
 from mapserver.survey.tracks.matching import PairFinder, drift_allowance_m
@@ -62,8 +62,7 @@ class LiveMap:
     def __init__(self, options: SurveyConfig, rectifier: Rectifier) -> None:
         """rectifier: of a single camera, features get their depths from the keyframes of the window."""
         self._options, self._settings, self._rectifier = options, options.settings, rectifier
-        kind = CameraKind.DEPTH if rectifier.has_depth else CameraKind.STEREO
-        self._mounted = Rig.of_one(survey_camera(rectifier.camera), rectifier.body_from_cam, kind)
+        self._mounted = rig_of(rectifier).first
         self._scale_known = rectifier.camera.baseline_m > 0 or rectifier.calibration.imu is not None
         self._depths = None
         if rectifier.camera.baseline_m == 0:

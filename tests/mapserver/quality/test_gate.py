@@ -23,7 +23,6 @@ from fleetmap.sensors.samples import CameraFrame, Image, ImuSamples, Trajectory
 from fleetmap.time_sliced import TimeSliced
 from mapserver.drafting.draft_evidence import (
     Before,
-    DraftMap,
     MappedSession,
     ProbedFrame,
     TileChooser,
@@ -99,7 +98,7 @@ def verdict(
     tiles, current = tiles_from_survey(survey_map), tiles_from_survey(done.map)
     before = Before(manifest(current, 1), done.map, current, []) if has_current else None
     session = MappedSession(trajectory or done.map.trajectory, own if held_out is None else held_out, done)
-    evidence = examine_draft(DraftMap(tiles, done.vocabulary, survey_map.camera), before, [session], [])
+    evidence = examine_draft(tiles, done.vocabulary, survey_map.camera, before, [session], [])
     said = judge(manifest(tiles, 2), manifest(current, 1) if has_current else None, GateSettings(), evidence)
     return said, evidence
 
@@ -187,7 +186,7 @@ def beside_itself(archive: SurveyMap, tiles: list[Tile]) -> Evidence:
     done, own = sound()
     before = Before(manifest(tiles, 1), archive, tiles, [])
     session = MappedSession(done.map.trajectory, own, done)
-    return examine_draft(DraftMap(tiles, done.vocabulary, done.map.camera), before, [session], [])
+    return examine_draft(tiles, done.vocabulary, done.map.camera, before, [session], [])
 
 
 def test_frames_that_choose_landmarks_do_not_judge_the_draft() -> None:
