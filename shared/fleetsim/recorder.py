@@ -38,7 +38,7 @@ from fleetsim.sensors.measurements import (
 from fleetsim.sensors.robots import HiddenErrors, RobotKind, nominal_calibration, true_calibration
 
 _TRUTH_STEP_S = 0.02
-_SEEDS_PER_FLOOR = 1 << 20
+_SEEDS_PER_STOREY = 1 << 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,7 +117,7 @@ def _generator(order: Order, robot: str, purpose: str) -> np.random.Generator:
 def drive(run: Run, kind: RobotKind, layout: Layout, rng: np.random.Generator) -> Motion:
     """The run's motion; UsageError if it comes too near to an obstacle."""
     pieces = [RouteMotion(route, kind.limits, kind.body_height_m, kind.shake, rng) for route in run.routes]
-    motion: Motion = pieces[0] if len(pieces) == 1 else CarriedMotion(pieces, rides=len(run.floors) > 1)
+    motion: Motion = pieces[0] if len(pieces) == 1 else CarriedMotion(pieces, rides=len(run.storeys) > 1)
     check_clear(motion.map_from_body(sample_times(motion.duration_s, 20.0))[:, :2, 3], layout, kind.clearance_m)
     return motion
 
@@ -142,7 +142,7 @@ def prepare(order: Order, workers: ThreadPoolExecutor | None = None) -> Session:
     every_time = [float(t) for t in sample_times(motion.duration_s, run.rate_hz)]
     times = [t for t in every_time if not plan.has("frames-dropped", t)][: order.frames]
     end_s = times[-1] + 0.1 if times else motion.duration_s
-    seeds = [order.seed + _SEEDS_PER_FLOOR * floor for floor in run.floors]
+    seeds = [order.seed + _SEEDS_PER_STOREY * storey for storey in run.storeys]
     worlds = [World(scenario.layout, seed=seed, day=order.day, workers=workers) for seed in seeds]
     renderer, *above = [
         RigRenderer(world, true, motion, light=light, movers=movers, faults=plan.faults, key=key, has_blur=has_blur)

@@ -17,7 +17,7 @@ from fleetsim.sensors.robots import ROBOTS, RobotKind
 class Run:
     """One robot's drive. Several routes: the robot is carried from the end of one to the start of the next.
 
-    floors: on which the routes are; from one to the next the robot rides a lift, which is dark. is_sharp: without motion blur, as
+    storeys: on which the routes are; from one to the next the robot rides a lift, which is dark. is_sharp: without motion blur, as
     a survey at leisure with a short exposure.
     """
 
@@ -27,7 +27,7 @@ class Run:
     is_sharp: bool = False
     faults: tuple[Fault, ...] = ()
     zone_period_s: float = 0.0
-    floors: tuple[int, ...] = (0,)
+    storeys: tuple[int, ...] = (0,)
 
     @property
     def kind(self) -> RobotKind:
@@ -176,7 +176,7 @@ def _two_floors() -> Scenario:
     lift = (first[1][0], loop.layout.width_m / 2)
     ride = Route((*first[:2], lift)), Route((lift, *first[2:]))
     survey = loop.runs["survey"]
-    runs = {"ground": survey, "upper": replace(survey, floors=(1,)), "tote-1": Run("tote", ride, floors=(0, 1))}
+    runs = {"ground": survey, "upper": replace(survey, storeys=(1,)), "tote-1": Run("tote", ride, storeys=(0, 1))}
     return replace(loop, description="two small loops above each other, and a lift that the robot rides", runs=runs)
 
 

@@ -124,7 +124,7 @@ STOREY_M, STOREY_S = 4.0, 8.0
 
 class CarriedMotion:
     """Several motions in sequence. Between two of them the robot is lifted by hand by LIFT_M within LIFT_S, and set down as fast at the
-    start of the next: its sensors measure both, but nothing of the transport between. Or it rides a lift to the next floor, where heights
+    start of the next: its sensors measure both, but nothing of the transport between. Or it rides a lift to the next storey, where heights
     begin at 0 again. Its wheels stand still."""
 
     def __init__(self, motions: Sequence[RouteMotion], *, rides: bool = False) -> None:

@@ -48,9 +48,8 @@ class RigRenderer:
         ]
         self._workers = ThreadPoolExecutor(len(self._painters))
         self._last_right: Image | None = None
-        self.above: list[
-            tuple[float, RigRenderer]
-        ] = []  # of the floors above, with the time from which the robot is there
+        # Of the storeys above, with the time from which the robot is there
+        self.above: list[tuple[float, RigRenderer]] = []
 
     def close(self) -> None:
         """End the threads."""
