@@ -4,9 +4,11 @@ The message holds the offending value and the next step. Caught only in the comm
 "I do not know where I am" is a value with a status, never one of these.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from typing import Literal
+from typing import Literal, TypeVar
+
+T = TypeVar("T")
 
 
 class FleetmapError(Exception):
@@ -113,3 +115,10 @@ def check_format(what: str, found: bytes, wanted: bytes, number: int, newest: in
         raise NewerFormatError(
             f"{what} has format {number}, this fleetmap reads up to {newest}; update fleetmap to read it"
         )
+
+
+def chosen(what: str, name: str, known: Mapping[str, T]) -> T:
+    """Return the entry of a name; UsageError naming the known ones."""
+    if name not in known:
+        raise UsageError(f"unknown {what} {name!r}; known are {', '.join(known)}")
+    return known[name]

@@ -165,30 +165,15 @@ class RobotAck(msgspec.Struct, frozen=True, kw_only=True):
     refused: Text = ""
 
 
-HEALTH_FIGURES = (
-    "speed_mps",
-    "radius_95_m",
-    "frames",
-    "frames_dropped",
-    "frame_ms_mean",
-    "first_fix_s",
-    "fix_innovation",
-    "fix_innovation_m",
-    "dock_error_m",
-    "landmarks_expected",
-    "landmarks_seen",
-)
-"""Metrics of RobotHealth that the server evaluates; a robot omits unknown ones. Since the previous report:
-fix_innovation, the largest squared Mahalanobis distance (6 degrees of freedom) between a fix and its prediction,
-fix_innovation_m, the largest such distance in metres, and dock_error_m, the distance between estimate and dock at an arrival;
-both in metres only where the robot was TRACKING. Since the start of the run: frames, frames_dropped, landmarks_expected and
-landmarks_seen (searched for in images, and found), first_fix_s, the time to the first fix. The others are current."""
-
-
 class RobotHealth(msgspec.Struct, frozen=True, kw_only=True):
     """A robot's report: status of the localization, raised flags, metrics by name.
 
     stamp_ns: sensor clock; wall_ns: the robot's wall clock when it sent this, from which the server measures the clock's error.
+    metrics that the server evaluates, without unknown ones: speed_mps, radius_95_m and frame_ms_mean are current. Since the previous
+    report: fix_innovation, the largest squared Mahalanobis distance (6 degrees of freedom) between a fix and its prediction,
+    fix_innovation_m, the largest such distance in metres, and dock_error_m, the distance between estimate and dock at an arrival; both
+    in metres only where the robot was TRACKING. Since the start of the run: frames, frames_dropped, landmarks_expected and
+    landmarks_seen (searched for in images, and found), first_fix_s, the time to the first fix.
     """
 
     site: Name

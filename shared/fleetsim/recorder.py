@@ -12,12 +12,11 @@ import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from fleetmap.console import plain_console
-from fleetmap.errors import UsageError
+from fleetmap.errors import UsageError, chosen
 from fleetmap.recordings.images import StoredFrame, png_image
 from fleetmap.recordings.mcap.writer import McapRecordingWriter
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.samples import CameraFrame, ImuSamples, PositionPrior, Trajectory, WheelSample
-from fleetsim.choices import chosen
 from fleetsim.imaging.pipelines import IMAGE_PIPELINES, process_frame
 from fleetsim.motion.body_motion import CarriedMotion, Motion, RouteMotion
 from fleetsim.motion.routes import check_clear

@@ -5,7 +5,7 @@ from math import pi
 
 import msgspec
 
-from fleetsim.choices import chosen
+from fleetmap.errors import chosen
 from fleetsim.motion.routes import Route
 from fleetsim.scene.layout import Layout
 from fleetsim.scene.movers import Mover

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from fleetmap.errors import UsageError
+from fleetmap.errors import chosen
 from fleetmap.features import orb
 from fleetmap.features.settings import OrbSettings
 from fleetmap.sensors.samples import Image
@@ -24,6 +24,4 @@ def extract_in_slices(
     image: Image, settings: OrbSettings, clearance_px: Image | None = None
 ) -> TimeSliced[orb.Features]:
     """As `extract`, in slices."""
-    if settings.extractor not in EXTRACTORS:
-        raise UsageError(f"unknown feature extractor {settings.extractor!r}; choose one of {', '.join(EXTRACTORS)}")
-    return EXTRACTORS[settings.extractor](image, settings, clearance_px)
+    return chosen("feature extractor", settings.extractor, EXTRACTORS)(image, settings, clearance_px)

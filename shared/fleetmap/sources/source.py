@@ -5,7 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Protocol
 
-from fleetmap.errors import RecordingError, UsageError
+from fleetmap.errors import RecordingError, UsageError, chosen
 from fleetmap.hooks import plugins
 from fleetmap.recordings import FrameSelection, OpenOptions, Recording, Topics, open_recording
 from fleetmap.sensors.calibration import RigCalibration
@@ -83,6 +83,5 @@ def open_source(section: SourceSection, topics: Topics, map_frame: str = "map") 
     UsageError for an unknown kind or a missing option, RecordingError and CalibrationError for unusable files.
     """
     openers = SOURCES if section.kind in SOURCES else SOURCES | plugins("locclient.sources")
-    if section.kind not in openers:
-        raise UsageError(f"[source] kind = {section.kind!r}; known are {', '.join(openers)}")
-    return openers[section.kind](section, topics, map_frame)
+    source: Source = chosen("[source] kind", section.kind, openers)(section, topics, map_frame)
+    return source

@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fleetmap.errors import UsageError
+from fleetmap.errors import UsageError, chosen
 from fleetmap.sensors.samples import ImuSamples, WheelSample
-from fleetsim.choices import chosen
 from fleetsim.sensors.measurements import START_NS
 
 FAULTS = {

@@ -5,9 +5,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from fleetmap.errors import chosen
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.sensors.calibration import CameraCalibration, ImuNoise, RigCalibration, check_camera
-from fleetsim.choices import chosen
 from fleetsim.motion.body_motion import Shake
 from fleetsim.motion.routes import Limits
 
