@@ -47,6 +47,8 @@ def with_acts(store: MapStore, found: Iterable[Incident]) -> list[Incident]:
     known, shown = store.incident_acts(), []
     for one in found:
         state, assignee, acts = "open", "", known.get(one.id, [])
+        if one.name == "failure":  # the number of one that was removed may be given again
+            acts = [act for act in acts if act.stamp_ns >= one.since_ns]
         for act in acts:
             done, _, name = act.detail.partition(": ")[0].partition(" to ")
             state = _STATES.get(done, state)

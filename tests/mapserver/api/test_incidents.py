@@ -80,7 +80,12 @@ def test_each_kind_by_route_and_command(tmp_path: Path) -> None:
             assert incident not in states(server)
             act(server, "reopen", incident)
             assert states(server).get(incident, ("open", "")) == ("open", "")
-        done = [line.detail.removesuffix(f": {FAILURE}") for line in server.store.audit_lines(5)]
+        act(server, "close", RECORDING)
+        retry = "/v1/sites/lab/inbox/held/0a-monday.mcap/retry"
+        assert server.client.post(retry, json={"actor": "dan"}).status_code == 200
+        (tmp_path / "inbox" / "lab" / "0a-monday.mcap").rename(held / "0a-monday.mcap")
+        assert states(server)[RECORDING] == ("open", ""), "it is held again"
+        done = [line.detail.removesuffix(f": {FAILURE}") for line in server.store.audit_lines()][-8:-3]
         assert done == ["acknowledged", "handed to Bob B", "commented", "closed", "reopened"]
         for name, told, status in (
             ("comment", {"incident": DRAFT}, 422),
