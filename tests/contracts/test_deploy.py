@@ -21,6 +21,7 @@ from mapserver.fleet.fleet import Fleet
 from mapserver.store import MapStore
 from mapserver.trust import init_here
 from support.fleet.contracts_documents import REPOSITORY, click_command, text
+from support.fleet.dashboard_scene import serving
 from support.storage.map_samples import publish_samples
 
 DEPLOY = REPOSITORY / "deploy"
@@ -141,7 +142,14 @@ def test_image_unit_and_configuration_agree(image: str, unit: str) -> None:
     assert f"./{unit}.toml:{words[words.index('--config') + 1]}:ro" in SERVICES[image]["volumes"]
     listens = tomllib.loads(text("deploy/mapserver.toml"))["serve"]["http"]
     assert environment("server")["READYZ"] == f"http://{listens}/readyz"
-    compile(exec_form(last("server", "HEALTHCHECK"))[-1], "HEALTHCHECK", "exec")
+
+
+def test_the_image_is_healthy_while_its_server_answers(tmp_path: Path) -> None:
+    program = [sys.executable, *exec_form(last("server", "HEALTHCHECK"))[1:]]
+    with serving(tmp_path, "--create") as served:
+        given = {"READYZ": f"{served.http}/readyz"}
+        assert subprocess.run(program, env=given, check=False).returncode == 0
+    assert subprocess.run(program, env=given, check=False, capture_output=True).returncode == 1
 
 
 def test_examples_agree_on_ports() -> None:
