@@ -52,6 +52,7 @@ def test_wheel_holds_the_four_packages_and_nothing_else(wheel: Path) -> None:
     assert {top for top in tops if not top.endswith(".dist-info")} == PACKAGES
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert sum(name.endswith(".so") for name in names) == 1, "the core alone is compiled"
+    assert "mapserver/docs/service.md" in names
     assert {"fleetmap/_core.pyi", "fleetmap/py.typed", "locclient/py.typed", "fleetmap/data/vocabulary.fmvb"} <= set(
         names
     )

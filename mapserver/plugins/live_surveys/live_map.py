@@ -19,7 +19,6 @@ from mapserver.plugins.live_surveys.message import (
     NO_PART,
     LiveMissing,
     LivePart,
-    LiveParts,
     LiveRevisit,
     MapSketch,
     NewKeyframe,
@@ -117,13 +116,13 @@ class LiveMap:
             for _, r in sorted(best.items())[-_NEWEST:]
         ]
         accepted = [(r.i, r.j) for r in found.records if r.verdict is LoopVerdict.ACCEPTED]
-        places_m, parts = self.map_from_body[:, :2, 3], self.parts()
-        numbers = np.where((parts.labels < 0) | (parts.labels >= NO_PART), NO_PART, parts.labels).astype(np.uint8)
+        places_m, (labels, spans) = self.map_from_body[:, :2, 3], self.parts()
+        numbers = np.where((labels < 0) | (labels >= NO_PART), NO_PART, labels).astype(np.uint8)
         return MapSketch(
             keyframes=len(self),
             path_m=packed(places_m),
             part=numbers[thinning(len(numbers), MOST_PLACES)].tobytes(),
-            parts=parts.spans[:NO_PART],
+            parts=spans[:NO_PART],
             landmarks_m=packed(self.points_map()[:, :2]),
             loops_m=packed(places_m[np.array(accepted, np.int64).reshape(-1, 2)].reshape(-1, 4)),
             loops=len(accepted),
@@ -131,15 +130,17 @@ class LiveMap:
             revisits=newest,
             cells=packed(cells),
             missing=missing,
-            estimate=self._estimate(parts),
+            estimate=self._estimate(labels, spans),
         )
 
     def _loops(self) -> Loops:
         """All candidates so far, and the loops accepted by the pose graph."""
         return Loops() if self._closer is None else self._closer.loops.without_outliers(self._loop_weights)
 
-    def parts(self) -> LiveParts:
-        """Connected parts: by neighbours, by odometry, and by accepted loops."""
+    def parts(self) -> tuple[NDArray[np.int64], list[LivePart]]:
+        """Return the parts that tracking, odometry and accepted loops connect: labels (K,) number them by time, -1 for keyframes that saw
+        too little. Only the one with the most keyframes can be the map: parts still separate at the end are left out.
+        """
         whole = KeyframeGroups(enumerate(self._parts.labels().tolist()), len(self))
         for edge in self._loops().edges:
             whole.join(edge.i, edge.j)
@@ -156,29 +157,29 @@ class LiveMap:
             )
             for number, m in enumerate(members)
         ]
-        return LiveParts(labels, spans)
+        return labels, spans
 
-    def _estimate(self, parts: LiveParts) -> EstimateMessage | None:
+    def _estimate(self, labels: NDArray[np.int64], spans: list[LivePart]) -> EstimateMessage | None:
         """Return the pose of the base at the newest keyframe in the growing map, relative to its first one, in the robots' form with
         odometry's continuous frame as `odom`; LOST while in another part. None for a single keyframe."""
         newest, placed, cov = len(self) - 1, None, None
         if len(self) < _BELONGING:
             return None
-        label = int(parts.labels[newest])
-        span = parts.spans[label] if label >= 0 else None
+        label = int(labels[newest])
+        span = spans[label] if label >= 0 else None
         body_from_base, odom_from_body = (
             se3_inverse(self._rectifier.calibration.base_from_body),
             self._news[newest].frame_from_body,
         )
         if span is not None and not span.is_map:
             status = Status.LOST, Cause.NO_MATCH
-        elif not parts.spans:
+        elif not spans:
             status = Status.INITIALISING, Cause.NONE
         else:
             is_sure = span is not None and bool(self._seeing[newest])
             status = (Status.TRACKING, Cause.NONE) if is_sure else (Status.DEGRADED, Cause.ODOMETRY)
-            kept = next(n for n, each in enumerate(parts.spans) if each.is_map)
-            first, placed = int(np.flatnonzero(parts.labels == kept)[0]), self.map_from_body[newest]
+            kept = next(n for n, each in enumerate(spans) if each.is_map)
+            first, placed = int(np.flatnonzero(labels == kept)[0]), self.map_from_body[newest]
             cov, lever = np.zeros((6, 6)), np.eye(6)
             if self._marginals is not None and first != newest:
                 turn = np.kron(np.eye(2), placed[:3, :3])

@@ -167,7 +167,7 @@ def _map(pipe: Connection) -> None:
 
 
 def _quality(growing: LiveMap, rectifier: Rectifier) -> tuple[Array, list[LiveMissing]]:
-    labels = growing.parts().labels
+    labels, _ = growing.parts()
     largest = np.bincount(labels[labels >= 0]).argmax() if (labels >= 0).any() else 0
     cells = covered_cells(growing.points_map(), MAX_ARRAY_BYTES // 12)
     return cells, missing_directions(growing.map_from_body[labels == largest] @ rectifier.body_from_cam)

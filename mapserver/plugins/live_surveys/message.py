@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -170,16 +170,6 @@ class NewKeyframe:
     inertial: bool = False
     imu: ImuSamples = field(default_factory=ImuSamples.empty)
     variance_m2: float = 0.0
-
-
-class LiveParts(NamedTuple):
-    """Parts of a survey that lost tracking: labels (K,) number them by time, -1 for keyframes that saw too little.
-
-    Only one can be the map, the one with the most keyframes: parts still separate at the end are left out.
-    """
-
-    labels: NDArray[np.int64]
-    spans: list[LivePart]
 
 
 def joined_imu(parts: Sequence[ImuSamples]) -> ImuSamples:

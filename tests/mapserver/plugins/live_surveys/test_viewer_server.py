@@ -1,26 +1,32 @@
-"""The server against viewers of another library: what they see, several at once, and those that do not read."""
+"""The server against viewers of another library: several at once, some that do not read; and `mapserver live` as a process."""
 
 import os
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 from fleetmap.errors import RecordingError, UsageError
 from fleetmap.geometry import se3, so3_exp
 from fleetmap.messages import EstimateMessage, Placement
 from fleetmap.plugins.viewer_channels import channels
 from fleetmap.plugins.viewer_channels.channels import ChannelMessage, Shown
+from mapserver.cli import app
 from mapserver.plugins.live_surveys.command import viewer_address
 from mapserver.plugins.live_surveys.message import LiveSurveyState
 from mapserver.plugins.live_surveys.viewer_server import FoxgloveServer, LiveViewer
 from support.fleet.foxglove_client import FoxgloveClient
 from support.fleet.foxglove_schemas import decoded, matrix
+from support.recordings.recording_samples import make_sample, write_mcap
 
 FREE = ("127.0.0.1", 0)
 TURNED = se3(so3_exp(np.array([0.1, -0.2, 0.7])), np.array([1.0, -2.0, 3.0]))
@@ -196,3 +202,56 @@ def test_addresses() -> None:
     for text in ("0.0.0.0:1", "maps.example:1", "[::]:1"):
         with pytest.raises(UsageError, match="--insecure"):
             viewer_address(text, insecure=False)
+
+
+@contextmanager
+def live(recording: Path, store: Path, *given: str) -> Iterator[FoxgloveClient]:
+    """What a viewer sees of a survey, which must end well."""
+    words = ["live", str(recording), "--site", "lab", "--store", str(store), "--foxglove", "0", *given]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "mapserver.cli", *words],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        url = process.stdout.readline().removeprefix("foxglove: ").strip()
+        with FoxgloveClient(url, within_s=240.0) as viewer:
+            yield viewer
+        process.stdout.read()
+        assert process.wait(240) == 0
+    finally:
+        process.kill()
+        process.wait(30)
+        process.stdout.close()
+
+
+@pytest.mark.timeout(900)
+def test_the_map_grows_before_the_viewers_eyes(tmp_path: Path) -> None:
+    recording = write_mcap(tmp_path / "walk", make_sample(24))
+    with live(recording, tmp_path / "maps") as viewer:
+        viewer.subscribe(["/survey/path", "/survey/landmarks", "/camera", "/camera/matches", "/camera/calibration"])
+        image = viewer.wait_for("/camera")[0][1]
+        picture = cv2.imdecode(np.frombuffer(image.data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        lens = viewer.wait_for("/camera/calibration")[0][1]
+        assert picture.shape == (lens.height, lens.width)
+        count, dots = 0, []
+        while not dots:
+            count += 1
+            dots = viewer.wait_for("/camera/matches", count)[-1][1].points[0].points
+        assert all(0 <= dot.x < lens.width and 0 <= dot.y < lens.height for dot in dots)
+        path = viewer.wait_for("/survey/path")[-1][1]
+        while len(path.poses) < 2:
+            path = viewer.wait_for("/survey/path", len(viewer.messages["/survey/path"]) + 1)[-1][1]
+        assert path.frame_id == "survey"
+        assert len(viewer.wait_for("/survey/landmarks")[-1][1].data) % 12 == 0
+
+
+@pytest.mark.parametrize(("given", "words"), [("x", "8765"), ("0.0.0.0:0", "--insecure"), ("TAKEN", "cannot listen")])
+def test_wrong_orders_are_told_before_the_drive(tmp_path: Path, given: str, words: str) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        address = str(taken.getsockname()[1]) if given == "TAKEN" else given
+        asked = ["live", str(tmp_path / "none"), "--site", "lab", "--store", str(tmp_path / "maps"), "--foxglove"]
+        done = CliRunner().invoke(app, [*asked, address])
+    assert isinstance(done.exception, UsageError)
+    assert words in str(done.exception)
