@@ -21,12 +21,8 @@ def size(number: int | None) -> str | None:
     """Bytes with a unit."""
     if number is None:
         return None
-    value = float(number)
-    for unit in ("B", "kB", "MB"):
-        if value < 1000:
-            return f"{value:.0f} {unit}" if unit == "B" else f"{value:.1f} {unit}"
-        value /= 1000
-    return f"{value:.2f} GB" if value < 1000 else f"{value / 1000:.2f} TB"
+    power = min(4, (len(str(number)) - 1) // 3)
+    return f"{number / 1000**power:.{(0, 1, 1, 2, 2)[power]}f} {('B', 'kB', 'MB', 'GB', 'TB')[power]}"
 
 
 def begun(words: str) -> str:

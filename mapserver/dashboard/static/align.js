@@ -9,24 +9,28 @@ function begin() {
   const parts = ["[type=file]", "[type=text]", ".paper", "output", "[data-do=back]", "[data-act]"];
   const [chosen, text, paper, told, back, save] = parts.map((part) => aligning.querySelector(part));
   const to = save.dataset.act;
-  let plan, asked, half = {}, pins = [];
+  let plan, asked, pins = []; // the last one may lack its half
 
-  const query = (more = {}) => new URLSearchParams([...pins.map(({ plan, map }, n) => ["pin", `${n + 1}=${plan}:${map}`]), ...Object.entries(more)]);
+  const isWhole = ({ plan, map }) => plan && map;
+  const query = (more = {}) => new URLSearchParams([...pins.filter(isWhole).map(({ plan, map }, n) => ["pin", `${n + 1}=${plan}:${map}`]), ...Object.entries(more)]);
   const isOpen = () => aligning.open && !map.classList.contains("drawing");
   const marks = (side, turn) =>
-    [...pins.map((pin, n) => [pin[side], `${n + 1}`]), ...(half[side] ? [[half[side], `${pins.length + 1}`]] : [])].map(([[x, y], name]) => (
-      { kind: "mark", x, y: turn * y, tone: "accent", shape: "square", words: `point ${name}`, name, heading_rad: null, address: null }
-    ));
+    pins.flatMap(({ [side]: place }, n) => {
+      const name = `${n + 1}`;
+      if (!place) return [];
+      return [{ kind: "mark", x: place[0], y: turn * place[1], tone: "accent", shape: "square", words: `point ${name}`, name, heading_rad: null, address: null }];
+    });
   function show() {
     map.map.show(LAYER, marks("map", 1), false);
     plan?.show("Points", marks("plan", -1), false);
-    save.dataset.lacks = pins.length < 2 ? "Give at least two points first: click a point in the plan and the same in the map, or write them." : "";
+    save.dataset.lacks = pins.filter(isWhole).length < 2 ? "Give at least two points first: click a point in the plan and the same in the map, or write them." : "";
     estimate();
   }
   // Which points fit how well, while they are given.
   async function estimate() {
-    told.textContent = half.plan || half.map ? `Now the same point in the ${half.plan ? "map" : "plan"}.` : "";
-    if (pins.length < 2) return;
+    const half = pins.find((pin) => !isWhole(pin));
+    told.textContent = half ? `Now the same point in the ${half.plan ? "map" : "plan"}.` : "";
+    if (pins.filter(isWhole).length < 2) return;
     const now = (asked = query().toString());
     const answer = await fetch(`${to}/estimate?${now}`).catch(() => undefined);
     const found = await answer?.json().catch(() => undefined);
@@ -37,27 +41,24 @@ function begin() {
     told.textContent = `${found.metres_per_unit.toPrecision(3)} m for each pixel. Left at the points: ${left}.${checked} ${told.textContent}`;
   }
   function pick(side, place) {
-    half[side] = place;
-    if (half.plan && half.map) {
-      pins.push(half);
-      half = {};
-    }
+    const half = pins.find((pin) => !isWhole(pin));
+    if (half) half[side] = place;
+    else pins.push({ [side]: place });
     write();
   }
   function write() {
-    text.value = pins.map(({ plan, map }) => `${plan.join(", ")}: ${map.join(", ")}`).join("; ");
+    text.value = pins.filter(isWhole).map(({ plan, map }) => `${plan.join(", ")}: ${map.join(", ")}`).join("; ");
     show();
   }
   map.addEventListener("pick", ({ detail: { x, y } }) => isOpen() && pick("map", [x, y].map((metres) => Number(metres.toFixed(2)))));
   back.addEventListener("click", () => {
-    if (half.plan || half.map) half = {};
-    else pins.pop();
+    pins.pop();
     write();
   });
   text.addEventListener("input", () => {
     const written = text.value.split(";").filter((pin) => pin.trim()).map((pin) => pin.split(":").map((side) => side.split(",").map(Number)));
     const isRight = written.every((pin) => pin.length === 2 && pin.every((side) => side.length === 2 && side.every(Number.isFinite)));
-    [pins, half] = [isRight ? written.map(([plan, map]) => ({ plan, map })) : [], {}];
+    pins = isRight ? written.map(([plan, map]) => ({ plan, map })) : [];
     show();
     if (!isRight) told.textContent = "Write pixels and metres as in 120, 2310: 0.4, -1.2; 900, 2310: 39, -1.2";
   });
