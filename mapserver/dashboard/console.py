@@ -28,7 +28,7 @@ from mapserver.api.parameters import ApiSettings
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots
-from mapserver.dashboard.map_layers import Layer, box_around, box_of, ground, heat
+from mapserver.dashboard.map_layers import Layer, box_around, ground, heat
 from mapserver.dashboard.rendering import TEMPLATES, address, age
 from mapserver.fleet_statistics.kpis import HOUR_NS
 from mapserver.operators.roles import Scope
@@ -40,7 +40,6 @@ _LOOK_COOKIE, _ZONE_COOKIE = "fleetmap_look", "fleetmap_zone"
 RANGE = ("since", "until")
 """The parameters by which every address keeps a range of time."""
 
-_ONE_OF_RANGE = ("older", "job")  # chosen in a range, and perhaps not in another one
 _WEEK_NS = 7 * 24 * HOUR_NS
 _EVERY_S = 1.0
 _THEMES = {"dark": "body--dark", "light": ""}  # else as the system has it
@@ -108,8 +107,8 @@ class PageContext:
 
     def kept_in_range(self) -> dict[str, str]:
         """The parameters of the address that stay when another range is chosen."""
-        kept = {name: value for name, value in self.query.items() if name not in (*RANGE, *_ONE_OF_RANGE)}
-        return {"site": self.site} | kept
+        of_one = (*RANGE, "older", "job")  # what is chosen in a range is perhaps not in another one
+        return {"site": self.site} | {name: value for name, value in self.query.items() if name not in of_one}
 
     def written(self, stamp_ns: int) -> str:
         """A stamp as `since` and `until` of an address take it."""
@@ -336,11 +335,11 @@ def scene_of(
     if version is None or not services.maps.has_version(context.site, version):
         return None
     plan = services.maps.plan(context.site, version)
-    over = [*(Layer(name, heat(found, box_of(plan)), shown=False) for name, found in dense_m.items()), *over]
+    over = [*(Layer(name, heat(found, plan.box), shown=False) for name, found in dense_m.items()), *over]
     below = services.maps.underlays(context.site, version, context.root)
     picture, areas = context.plan_picture(version), services.maps.store.areas(context.site)
     layers = [*ground(plan, picture, areas, below, shows_coverage=shows_coverage), *over]
-    box = box_around(places_m, box_of(plan))
+    box = box_around(places_m, plan.box)
     return {"label": f"Map of {context.site}, version {version}", "box": box, "layers": layers, "follows": False}
 
 

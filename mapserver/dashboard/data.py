@@ -17,8 +17,8 @@ from fleetmap.mapformat.building import ALIGNMENT
 from fleetmap.mapformat.tile_codec import decode_tile
 from fleetmap.version_grid import OccupancyGrid, known_grid, occupancy
 from mapserver import releases
-from mapserver.dashboard.map_layers import Box, Layer, Picture, box_of
-from mapserver.dashboard.plan import Plan, inked, make_plan, png
+from mapserver.dashboard.map_layers import Layer, Picture
+from mapserver.dashboard.plan import Box, Plan, inked, make_plan, png
 from mapserver.floor_plan.alignment import PLAN, Alignment
 from mapserver.floor_plan.plan_file import decode_plan
 from mapserver.nightly.inbox import Inbox, contents, sites_of
@@ -179,7 +179,7 @@ class MapData:
             data, alignment = self.store.site_file(site, PLAN), self.store.alignment(site)
             if data is None or alignment is None:
                 return None
-            box = box_of(self.plan(site, version))
+            box = self.plan(site, version).box
             return floor_picture(data, alignment, box), box
         except FleetmapError as error:
             _log.warning("the map of %s is shown without its %s: %s", site, kind, error)

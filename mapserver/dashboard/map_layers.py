@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from fleetmap.geometry import Array
-from mapserver.dashboard.plan import Plan, inked, png
+from mapserver.dashboard.plan import Box, Plan, inked, png
 from mapserver.floor_plan.areas import Areas
 
 _WEAK = 0.5  # of the tracked points agree: below, a person should look
@@ -20,8 +20,6 @@ _HEAT_CELL_M, _HEAT_SIGMA_M, _HEAT_CELLS = 0.5, 2.0, 1000
 _MARGIN_M, _SMALLEST_M = 3.0, 10.0  # of what is in sight around places
 _HEAT_BGR = (32, 60, 220)
 _DIRECTIONS_RAD = {"E": 0.0, "N": np.pi / 2, "W": np.pi, "S": -np.pi / 2}
-Box = tuple[float, float, float, float]
-"""Low x, low y, high x, high y."""
 
 
 class _Drawn(msgspec.Struct, frozen=True, tag_field="kind", tag=str.lower):
@@ -97,11 +95,6 @@ class Layer:
     shown: bool = True
 
 
-def box_of(plan: Plan) -> Box:
-    """Corners of a plan."""
-    return (*plan.low_m, *plan.high_m)
-
-
 def box_around(places_m: Sequence[tuple[float, float]], box: Box) -> Box:
     """The part of a map's box around places, with room beside them; all of it where none of them lies in it."""
     inside = [(x, y) for x, y in places_m if box[0] <= x <= box[2] and box[1] <= y <= box[3]]
@@ -123,7 +116,7 @@ def ground(
     return [
         *below,
         Layer("Coverage", coverage(plan), shown=shows_coverage),
-        Layer("Landmarks and places", [Picture(picture_address, box_of(plan))]),
+        Layer("Landmarks and places", [Picture(picture_address, plan.box)]),
         Layer("Areas", outlines(areas)),
         Layer("Directions surveyed", directions(plan), shown=False),
     ]

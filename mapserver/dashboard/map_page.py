@@ -9,7 +9,7 @@ from fleetmap.errors import FleetmapError
 from mapserver.api.incidents import of_drafts
 from mapserver.dashboard.console import PageContext, Services, number, scene_of
 from mapserver.dashboard.data import EVER, MapData
-from mapserver.dashboard.map_layers import Layer, Outline, Picture, box_of, squares
+from mapserver.dashboard.map_layers import Layer, Outline, Picture, squares
 from mapserver.dashboard.plan import Plan
 from mapserver.dashboard.rendering import begun, share, size
 from mapserver.drafting.area_corrections import AreaCorrections
@@ -345,7 +345,7 @@ def _swipe(maps: MapData, context: PageContext, before: int, after: int) -> dict
     def pictures(version: int) -> list[Picture]:
         layers = maps.underlays(context.site, version, context.root)
         below = [item for layer in layers for item in layer.items if isinstance(item, Picture)]
-        return [*below, Picture(context.plan_picture(version), box_of(maps.plan(context.site, version)))]
+        return [*below, Picture(context.plan_picture(version), maps.plan(context.site, version).box)]
 
     left, right = pictures(before), pictures(after)
     x0, y0, x1, y1 = zip(*(picture.box for picture in (*left, *right)), strict=True)

@@ -21,16 +21,18 @@ _BEYOND_M, _MARGIN_M = 12.0, 1.0
 _FEW = 1.0  # per cent
 _LANDMARK_BGR, _PLACE_BGR = (140, 128, 118), (235, 120, 50)  # middle tones, to be seen on white and on black
 
+Box = tuple[float, float, float, float]
+"""Low x, low y, high x, high y."""
+
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """low, high: corners in `map`, metres. png: transparent where nothing is. places: number of places.
+    """box: in `map`, metres. png: transparent where nothing is. places: number of places.
 
     directions: viewing directions of each tile's places.
     """
 
-    low_m: tuple[float, float]
-    high_m: tuple[float, float]
+    box: Box
     tile_size_m: float
     tiles: tuple[TileEntry, ...]
     places: int
@@ -45,8 +47,7 @@ def make_plan(manifest: Manifest, read_tile: Callable[[TileEntry], Tile]) -> Pla
     places = np.concatenate([np.zeros((0, 2)), *(tile.map_from_cam[:, :2, 3] for tile in tiles)])
     low, high = _corners(manifest, places, landmarks)
     return Plan(
-        (float(low[0]), float(low[1])),
-        (float(high[0]), float(high[1])),
+        (*low.tolist(), *high.tolist()),
         manifest.tile_size_m,
         manifest.tiles,
         len(places),

@@ -8,7 +8,7 @@ from markupsafe import Markup
 
 from fleetmap.encoding import to_json
 from mapserver.api.operations import OPERATIONS
-from mapserver.fleet_statistics.kpis import Rate, driven_words, format_rate
+from mapserver.fleet_statistics.kpis import driven_words, format_rate
 
 
 def address(path: str, **query: object) -> str:
@@ -49,10 +49,6 @@ def script_json(value: object) -> Markup:
     return Markup(text.translate({ord(mark): f"\\u{ord(mark):04x}" for mark in "<>&'"}))
 
 
-def _counted(found: Rate) -> str:
-    return f"{found.events} in {driven_words(found.robot_days)}"
-
-
 _LOADER = FileSystemLoader(Path(__file__).parent / "templates")
 TEMPLATES = Environment(loader=_LOADER, autoescape=True, undefined=StrictUndefined)
 TEMPLATES.globals["operations"] = OPERATIONS
@@ -62,5 +58,5 @@ TEMPLATES.filters |= {
     "size": size,
     "share": share,
     "rate": format_rate,
-    "counted": _counted,
+    "counted": lambda found: f"{found.events} in {driven_words(found.robot_days)}",
 }

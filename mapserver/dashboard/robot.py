@@ -48,8 +48,6 @@ GAP_NS = 45_000_000_000
 _COLUMNS = 300  # of a curve
 _STEP_M = 0.5
 _PAUSE_NS, _AROUND_NS = 600_000_000_000, 60_000_000_000
-Range = tuple[int, int]
-"""From when until before when, nanoseconds since 1970."""
 
 
 class Stretch(NamedTuple):
@@ -129,7 +127,7 @@ def way(rows: Sequence[TraceRow], parts: Sequence[Stretch], every_s: float = 10.
     return sorted((line for line in found if len(line.points) > 1), key=lambda line: -ORDER[line.tone])
 
 
-def last_drive(rows: Sequence[TraceRow]) -> Range | None:
+def last_drive(rows: Sequence[TraceRow]) -> tuple[int, int] | None:
     """The last time in which it moved without a pause of ten minutes, and a minute around it; None where it never moved."""
     begin_ns = end_ns = None
     before: tuple[float, float] | None = None
@@ -145,7 +143,7 @@ def last_drive(rows: Sequence[TraceRow]) -> Range | None:
     return None if begin_ns is None or end_ns is None else (begin_ns - _AROUND_NS, end_ns + _AROUND_NS)
 
 
-def curve(rows: Sequence[TraceRow], name: str, shown: Range) -> tuple[float, float, str] | None:
+def curve(rows: Sequence[TraceRow], name: str, shown: tuple[int, int]) -> tuple[float, float, str] | None:
     """How a figure of the traces went, in means of equal parts of a range: lowest, highest, and the path of an SVG 1000 wide and 100 high.
 
     It begins at 0 and is broken where nothing was heard; None where the figure was never reported.

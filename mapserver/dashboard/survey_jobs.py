@@ -5,7 +5,6 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import PurePath
 from typing import Any, NamedTuple
 
@@ -21,7 +20,6 @@ from mapserver.fleet.incidents import with_acts
 from mapserver.store import JobInfo
 
 _TELLING_S = 4.0  # of a stage, before what is left of it can be said
-_LONG_H = 12.0  # a job that is killed cannot say so
 _LEFT_OUT = {"foreign": "another place", "undecided": "held", "bad": "refused"}
 _WAITS = "waits"
 MOST_LOOPS = 3000
@@ -101,7 +99,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     shown: dict[str, object] = {
         "context": context,
         "site": context.site,
-        "jobs": [(job, _state(job), _progress(job)) for job in jobs],
+        "jobs": [(job, _progress(job)) for job in jobs],
         "chosen": chosen,
         "inbox": inbox,
         "held": {one.about: one for one in held},
@@ -116,11 +114,6 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
 def _did_something(job: JobInfo) -> bool:
     """Whether a recording was built or refused in it: a night in which all of them wait was none."""
     return any(row.result != _WAITS for row in _recordings(job))
-
-
-def _state(job: JobInfo) -> str:
-    hours = (datetime.now(UTC) - datetime.fromisoformat(job.started)).total_seconds() / 3600
-    return "running or killed" if job.state == "running" and hours >= _LONG_H else job.state
 
 
 def _progress(job: JobInfo) -> dict[str, object] | None:

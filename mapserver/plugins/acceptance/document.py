@@ -37,7 +37,7 @@ def html_page(report: Report, plan: SitePlan) -> str:
 
 def _drawn(plan: SitePlan, *, has_drives: bool) -> dict[str, Any]:
     """Return the plan's parts in units of the drawing, y down."""
-    low, high = np.array(plan.seen.low_m), np.array(plan.seen.high_m)
+    low, high = np.array(plan.seen.box[:2]), np.array(plan.seen.box[2:])
     per_m = float(min((_WIDTH, _HEIGHT) / (high - low)))
 
     def placed(points_m: Any) -> list[tuple[float, float]]:

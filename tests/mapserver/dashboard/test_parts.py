@@ -79,11 +79,12 @@ def test_a_plan_shows_landmarks_where_they_are(store: MapStore) -> None:
     data = MapData(store, GateSettings(), 0.05)
     plan = data.plan(SITE, 2)
     picture = cv2.imdecode(np.frombuffer(plan.png, np.uint8), cv2.IMREAD_UNCHANGED)
-    scale_m = (plan.high_m[0] - plan.low_m[0]) / picture.shape[1]
-    assert (plan.high_m[1] - plan.low_m[1]) / picture.shape[0] == pytest.approx(scale_m, rel=0.01)
+    x0, y0, x1, y1 = plan.box
+    scale_m = (x1 - x0) / picture.shape[1]
+    assert (y1 - y0) / picture.shape[0] == pytest.approx(scale_m, rel=0.01)
 
     def alpha(x_m: float, y_m: float) -> int:
-        row, column = int((plan.high_m[1] - y_m) / scale_m), int((x_m - plan.low_m[0]) / scale_m)
+        row, column = int((y1 - y_m) / scale_m), int((x_m - x0) / scale_m)
         return int(picture[max(row - 2, 0) : row + 3, max(column - 2, 0) : column + 3, 3].max())
 
     points = np.concatenate([tile.points_map for tile in hall_tiles(shifted_m=0.2)])
@@ -105,12 +106,12 @@ def test_the_map_page_names_the_way_that_nobody_drove(store: MapStore) -> None:
 def test_a_plan_without_tiles_and_one_without_places(store: MapStore) -> None:
     manifest = store.manifest(SITE, 2)
     empty = make_plan(_with_tiles(manifest, ()), lambda _: pytest.fail("there is none"))
-    assert (empty.low_m, empty.high_m) == ((-5.0, -5.0), (5.0, 5.0))
+    assert empty.box == (-5.0, -5.0, 5.0, 5.0)
     (tile,) = (tile for tile in hall_tiles() if (tile.tile_x, tile.tile_y) == (0, 0))
     bare = replace(tile, place_ids=tile.place_ids[:0], map_from_cam=tile.map_from_cam[:0], place_landmark_ids=())
     entry = next(entry for entry in manifest.tiles if (entry.x, entry.y) == (0, 0))
     alone = make_plan(_with_tiles(manifest, (entry,)), lambda _: bare)
-    assert (alone.low_m, alone.high_m, alone.places) == ((0.0, 0.0), (16.0, 16.0), 0)
+    assert (alone.box, alone.places) == ((0.0, 0.0, 16.0, 16.0), 0)
 
 
 def _with_tiles(manifest: Manifest, tiles: tuple[object, ...]) -> Manifest:
