@@ -93,10 +93,13 @@ def find_components(state: SurveyState, odometry_sigmas_m: SigmaBetween, join_si
 
 def find_groups(state: SurveyState, sigmas_m: SigmaBetween, join_sigma_m: float) -> KeyframeGroups:
     """Return the same before loops are closed: there may be many groups, and none is chosen."""
-    rows, columns = _shared_landmarks(state, MIN_SHARED)
-    seeing = _seeing(state)
-    joins = [*zip(rows.tolist(), columns.tolist(), strict=True), *bridges(seeing, sigmas_m, join_sigma_m)]
-    return KeyframeGroups(joins, len(seeing))
+    marks, seeing = state.landmarks, _seeing(state)
+    ones, shape = np.ones(len(marks.obs_keyframe), np.int32), (len(seeing), len(marks.points_map))
+    seen = csr_matrix((ones, (marks.obs_keyframe, marks.obs_landmark)), shape)
+    shared = coo_matrix(seen @ seen.T)
+    enough = (shared.data >= MIN_SHARED) & (shared.row < shared.col)
+    pairs = zip(shared.row[enough].tolist(), shared.col[enough].tolist(), strict=True)
+    return KeyframeGroups([*pairs, *bridges(seeing, sigmas_m, join_sigma_m)], len(seeing))
 
 
 def _seeing(state: SurveyState) -> NDArray[np.bool_]:
@@ -149,16 +152,6 @@ def only_kept(
     edges = [replace(e, i=int(number[e.i]), j=int(number[e.j])) for e in loops.edges if kept[e.i] and kept[e.j]]
     keyframes = [k for k, keep in zip(odometry.keyframes, kept, strict=True) if keep]
     return state.of(kept), replace(odometry, keyframes=keyframes), replace(loops, edges=edges)
-
-
-def _shared_landmarks(state: SurveyState, at_least: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return pairs of keyframes, the older one first, that share at least `at_least` landmarks."""
-    marks = state.landmarks
-    ones, shape = np.ones(len(marks.obs_keyframe), np.int32), (len(state.stamps_ns), len(marks.points_map))
-    seen = csr_matrix((ones, (state.landmarks.obs_keyframe, marks.obs_landmark)), shape)
-    shared = coo_matrix(seen @ seen.T)
-    enough = (shared.data >= at_least) & (shared.row < shared.col)
-    return shared.row[enough].astype(np.int64), shared.col[enough].astype(np.int64)
 
 
 def between_kept(frames: int, keyframe_frames: NDArray[np.int64], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:

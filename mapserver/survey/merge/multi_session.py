@@ -133,8 +133,7 @@ class MapMerger:
             self._has_grown = False
             for number in list(self._waiting):
                 self._try(number)
-        if self._current is None:
-            raise ValueError("no session to begin a map with")
+        assert self._current is not None, "no session to begin a map with"
         order = sorted(self._found)
         trajectories, estimated = tuple(map(self._trajectory, order)), tuple(self._found[n][1] for n in order)
         joined_map = self._current

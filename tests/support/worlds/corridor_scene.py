@@ -1,5 +1,6 @@
 """A made-up survey along a corridor of points, as it comes from odometry, with its truth."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -82,6 +83,13 @@ def neighbour_errors_m(given: Scene) -> Array:
     found, true = given.state.map_from_body, given.map_from_body
     steps = [se3_inverse(m[:-1]) @ m[1:] for m in (found, true)]
     return np.linalg.norm(steps[0][:, :3, 3] - steps[1][:, :3, 3], axis=1)
+
+
+def plain_marks(pairs: Sequence[tuple[int, int]], points_map: Array) -> Landmarks:
+    """Landmarks (N, 3) as pairs of a keyframe and a landmark see them, each by a feature of its own, without pixels."""
+    keyframe, landmark = np.ascontiguousarray(np.array(pairs, np.int32).reshape(-1, 2).T)
+    rows, none = np.arange(len(pairs), dtype=np.int32), np.zeros((len(pairs), 5))
+    return Landmarks(points_map, keyframe, np.zeros_like(keyframe), landmark, rows, none[:, :3], none[:, 3:] + 1.0)
 
 
 def plain_keyframes(octaves: list[int], features: int, rng: np.random.Generator | None = None) -> list[Keyframe]:

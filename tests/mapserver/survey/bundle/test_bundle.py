@@ -1,6 +1,7 @@
 """Bundle adjustment of images, relative poses and priors: truth recovered, gtsam agreed with, bad input survived."""
 
 from dataclasses import replace
+from typing import Literal
 
 import gtsam
 import numpy as np
@@ -143,10 +144,13 @@ def test_priors_alone_can_hold_the_map() -> None:
     np.testing.assert_allclose(result.map_from_body, moved_from_map @ truth.map_from_body, atol=1e-4)
 
 
-def test_refuses_a_map_that_nothing_holds() -> None:
-    problem = replace(make_scene(keyframes=4, landmarks=50, step_s=0.4, seed=1).problem, fixed=np.zeros(4, np.bool_))
-    with pytest.raises(SurveyError, match="4 keyframes has none fixed"):
-        optimize(problem, BundleSettings())
+@pytest.mark.parametrize(
+    ("gauge", "says"), [("pose", "4 keyframes has none fixed"), ("yaw_position", "needs inertial")]
+)
+def test_refuses_a_map_that_nothing_holds(gauge: Literal["pose", "yaw_position"], says: str) -> None:
+    problem = make_scene(keyframes=4, landmarks=50, step_s=0.4, seed=1).problem
+    with pytest.raises(SurveyError, match=says):
+        optimize(replace(problem, gauge=gauge, fixed=np.zeros(4, np.bool_)), BundleSettings())
 
 
 @pytest.mark.parametrize("cutoff", [np.inf, 5.0])
@@ -169,9 +173,3 @@ def test_nothing_seen_at_all() -> None:
     truth = make_scene(keyframes=3, landmarks=80, step_s=0.4, seed=1).problem
     blind = replace(truth.observed(np.zeros(len(truth.obs_camera), bool)), points_map=np.zeros((0, 3)))
     np.testing.assert_allclose(optimize(blind, BundleSettings()).map_from_body, truth.map_from_body)
-
-
-def test_yaw_position_needs_gravity() -> None:
-    problem = replace(make_scene(keyframes=4, landmarks=50, step_s=0.4, seed=1).problem, gauge="yaw_position")
-    with pytest.raises(SurveyError, match="needs inertial edges"):
-        optimize(problem, BundleSettings())

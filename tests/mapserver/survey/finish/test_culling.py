@@ -10,15 +10,12 @@ from fleetmap.geometry import Array
 from mapserver.survey.finish.map_assembly import cull, parallax_rad, redundant
 from mapserver.survey.settings import CullSettings
 from mapserver.survey.state import Landmarks
-from support.worlds.corridor_scene import CAMERA, plain_keyframes, scene
+from support.worlds.corridor_scene import CAMERA, plain_keyframes, plain_marks, scene
 
 
 def seen_by(table: Array, landmarks: int) -> Landmarks:
     """Observations (landmark, keyframe), sorted."""
-    return Landmarks(
-        np.zeros((landmarks, 3)), table[:, 1].astype(np.int32), np.zeros(len(table), np.int32), table[:, 0].astype(np.int32),
-        np.zeros(len(table), np.int32), np.zeros((len(table), 3)), np.ones((len(table), 2)),
-    )  # fmt: skip
+    return plain_marks(table[:, ::-1], np.zeros((landmarks, 3)))
 
 
 def test_keyframes_that_repeat_each_other_do_not_all_go() -> None:

@@ -18,7 +18,8 @@ from mapserver.survey.loops.connected_components import (
 from mapserver.survey.loops.loops import Loops
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.rig import Rig
-from mapserver.survey.state import KeyframeMotion, Landmarks, OdometryPass, RelativeTerm, SurveyState
+from mapserver.survey.state import KeyframeMotion, OdometryPass, RelativeTerm, SurveyState
+from support.worlds.corridor_scene import plain_marks
 
 PER_KEYFRAME = 40
 
@@ -31,20 +32,10 @@ def survey(seen: list[range], loops: list[tuple[int, int]] | None = None) -> Sur
         pairs += [(k, count + n) for k in (a, b) for n in range(20)]
         count += 20
     pairs.sort(key=lambda pair: (pair[1], pair[0]))
-    keyframe, landmark = np.array(pairs, np.int32).reshape(-1, 2).T
     places = np.tile(np.eye(4), (len(seen), 1, 1))
     places[:, 0, 3] = np.arange(len(seen))
     points = np.column_stack([np.arange(count), np.zeros(count), np.zeros(count)]).astype(float)
     each = np.column_stack([np.arange(len(seen))] * 3).astype(float)
-    marks = Landmarks(
-        points,
-        keyframe,
-        np.zeros_like(keyframe),
-        landmark,
-        np.arange(len(pairs), dtype=np.int32),
-        np.zeros((len(pairs), 3)),
-        np.ones((len(pairs), 2)),
-    )
     return SurveyState(
         np.arange(len(seen), dtype=np.int64) * 1_000_000_000, places,
         Rig.of_one(StereoCamera(200.0, 160.0, 120.0, 0.1, 320, 240), np.eye(4)),
@@ -52,7 +43,7 @@ def survey(seen: list[range], loops: list[tuple[int, int]] | None = None) -> Sur
             False, ImuSamples.empty(), None, 0.0, np.tile(each, 3),
             [RelativeTerm(k, k + 1, np.eye(4), np.eye(6)) for k in range(len(seen) - 1)],
         ),
-        marks,
+        plain_marks(pairs, points),
     )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from mapserver.survey.loops.keyframe_groups import KeyframeGroups, Revisit, WaitingRevisits
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
+from support.worlds.pose_graph_scene import chain_of
 
 SURE, LOST = np.diag([0.002**2] * 3 + [0.01**2] * 3), np.diag([1.5**2] * 3 + [15.0**2] * 3)
 FIRST, SECOND = range(6), range(6, 12)
@@ -29,9 +30,7 @@ def believed() -> Array:
 
 def marginals() -> GraphMarginals:
     placed = believed()
-    steps = [se3_inverse(a) @ b for a, b in pairwise(placed)]
-    edges = [PoseEdge(k, k + 1, step, LOST if k == 5 else SURE, is_loop=False) for k, step in enumerate(steps)]
-    return GraphMarginals(placed, edges)
+    return GraphMarginals(placed, chain_of(placed, [*[SURE] * 5, LOST, *[SURE] * 5]))
 
 
 def groups() -> KeyframeGroups:

@@ -24,6 +24,7 @@ from mapserver.survey.settings import LoopSettings, SurveySettings
 from mapserver.survey.state import Keyframe, RigImages
 from mapserver.survey.survey_inputs import SurveyConfig, Zones
 from support.worlds.box_room import out_and_back, rendered_keyframes
+from support.worlds.pose_graph_scene import chain_of
 from support.worlds.vocabulary_training import train_vocabulary
 
 SETTINGS = SurveySettings(loops=LoopSettings(min_gap_keyframes=6))
@@ -77,10 +78,7 @@ def looked(
         features = whole[n].features
         elsewhere = np.random.default_rng(n).permutation(features.descriptors)
         whole[n] = replace(whole[n], features=replace(features, descriptors=elsewhere))
-    chain = [
-        PoseEdge(k, k + 1, se3_inverse(path[k]) @ path[k + 1], np.diag([1e-8] * 3 + [s**2] * 3), is_loop=False)
-        for k, s in enumerate(sigmas)
-    ]
+    chain = chain_of(path, [np.diag([1e-8] * 3 + [s**2] * 3) for s in sigmas])
     closer = LoopCloser(
         RigImages.of(whole, path, rig_of(rectifier)),
         SurveyConfig(settings, vocabulary, zones or Zones()),

@@ -18,6 +18,7 @@ from mapserver.survey.merge.multi_session import MapMerger, Session, chained
 from mapserver.survey.rig import Rig
 from mapserver.survey.settings import SurveySettings
 from mapserver.survey.state import KeyframeMotion, Landmarks, SurveyState
+from support.worlds.corridor_scene import plain_marks
 from support.worlds.session_scene import session_scene
 
 SECOND_NS = 1_000_000_000
@@ -47,12 +48,8 @@ def test_recordings_that_overlap_follow_each_other_and_their_truth_with_them() -
 
 def test_each_landmark_keeps_enough_keyframes_and_no_more_are_taken() -> None:
     """Ten keyframes see all of thirty landmarks: three of them are enough; a landmark that only one sees keeps that one."""
-    seen = [(n, k) for n in range(30) for k in range(10)] + [(30, 10)]
-    table = np.array(seen)
-    marks = Landmarks(
-        np.zeros((31, 3)), table[:, 1].astype(np.int32), np.zeros(len(seen), np.int32), table[:, 0].astype(np.int32),
-        np.arange(len(seen), dtype=np.int32), np.zeros((len(seen), 3)), np.ones((len(seen), 2)),
-    )  # fmt: skip
+    seen = [(k, n) for n in range(30) for k in range(10)] + [(10, 30)]
+    marks = plain_marks(seen, np.zeros((31, 3)))
     fewer = fewer_keyframes(marks, 3)
     assert np.bincount(fewer.obs_landmark).tolist() == [3] * 30 + [1]
     assert len(np.unique(fewer.obs_keyframe)) == 4

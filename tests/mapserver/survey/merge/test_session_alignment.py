@@ -1,6 +1,6 @@
 """Alignments of a survey to the map: fixes whose motion is the survey's own, and the pose graph that follows them."""
 
-from itertools import pairwise
+from itertools import repeat
 
 import numpy as np
 
@@ -8,6 +8,7 @@ from fleetmap.geometry import Array, se3, se3_exp, se3_inverse, so3_exp
 from mapserver.survey.merge.session_alignment import Alignment, SessionFix, alignments, follow_fixes
 from mapserver.survey.pose_graph.graph_marginals import GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
+from support.worlds.pose_graph_scene import chain_of, driven
 
 MAP_FROM_SURVEY = se3(so3_exp(np.array([0, 0, 0.7])), np.array([12.0, -3.0, 0.4]))
 COVARIANCE = np.diag([0.003**2] * 3 + [0.02**2] * 3)
@@ -15,16 +16,11 @@ COVARIANCE = np.diag([0.003**2] * 3 + [0.02**2] * 3)
 
 def drive(count: int = 20) -> Array:
     """survey_from_body (K, 4, 4): a bend of half a metre a step."""
-    step, places = se3(so3_exp(np.array([0, 0, 0.05])), np.array([0.5, 0, 0])), [np.eye(4)]
-    for _ in range(count - 1):
-        places.append(places[-1] @ step)
-    return np.array(places)
+    return driven([se3(so3_exp(np.array([0, 0, 0.05])), np.array([0.5, 0, 0]))] * (count - 1))
 
 
 def chain(places: Array) -> list[PoseEdge]:
-    steps = [se3_inverse(a) @ b for a, b in pairwise(places)]
-    cov = np.diag([0.004**2] * 3 + [0.02**2] * 3)
-    return [PoseEdge(k, k + 1, step, cov, is_loop=False) for k, step in enumerate(steps)]
+    return chain_of(places, repeat(np.diag([0.004**2] * 3 + [0.02**2] * 3)))
 
 
 def found(fixes: list[SessionFix]) -> list[Alignment]:

@@ -1,6 +1,7 @@
 """Covariances of the pose graph against gtsam's marginals, and the loop gate's two tests against known truth."""
 
 import tracemalloc
+from itertools import repeat
 
 import gtsam
 import numpy as np
@@ -10,7 +11,7 @@ from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, rotation_angle_rad, se3, se3_adjoint, se3_exp, se3_inverse
 from mapserver.survey.pose_graph.graph_marginals import CHI2_6_0999, ChainCovariance, GraphMarginals
 from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
-from support.worlds.pose_graph_scene import LOOP_COV, ODOMETRY_COV, Drive, make_drive, measured
+from support.worlds.pose_graph_scene import LOOP_COV, ODOMETRY_COV, Drive, chain_of, driven, make_drive, measured
 
 
 def _exact(drive: Drive, pairs: list[tuple[int, int]], is_loop: bool = True) -> list[PoseEdge]:
@@ -107,10 +108,7 @@ def test_right_loops_are_as_far_off_as_chi_square_says_and_wrong_ones_are_not() 
     squared, aliased = [], []
     for _ in range(300):
         odometry = [measured(rng, truth, k, k + 1, ODOMETRY_COV, is_loop=False) for k in range(30)]
-        start = [truth[0]]
-        for edge in odometry:
-            start.append(start[-1] @ edge.i_from_j)
-        marginals = GraphMarginals(np.array(start), odometry)
+        marginals = GraphMarginals(driven([edge.i_from_j for edge in odometry], truth[0]), odometry)
         loop = measured(rng, truth, 28, 2, LOOP_COV, is_loop=True)
         squared.append(marginals.innovation_squared(loop))
         next_aisle = se3_exp(np.array([0.0, 0.0, 0.0, 0.0, 3.0, 0.0])) @ loop.i_from_j
@@ -163,16 +161,11 @@ SURE_LOOP_COV = np.diag([1e-3**2] * 3 + [0.01**2] * 3)
 def drifting_circle(seed: int) -> tuple[Array, Array, list[PoseEdge]]:
     """Truth (K, 4, 4) of one round, the same by odometry with noise, and the odometry's edges."""
     rng = np.random.default_rng(seed)
-    step = se3_exp(np.array([0, 0, 2 * np.pi / COUNT, 0.5, 0, 0]))
-    true = [se3_exp(np.array([0.1, 0.2, 0.5, 40.0, -30.0, 2.0]))]
-    measured = [true[0]]
-    edges = []
-    for k in range(COUNT):
-        noisy = se3_exp(rng.normal(0, np.sqrt(np.diag(CHAIN_COV)))) @ step
-        edges.append(PoseEdge(k, k + 1, noisy, CHAIN_COV, is_loop=False))
-        true.append(true[-1] @ step)
-        measured.append(measured[-1] @ noisy)
-    return np.array(true), np.array(measured), edges
+    step, start = (
+        se3_exp(np.array(at)) for at in ([0, 0, 2 * np.pi / COUNT, 0.5, 0, 0], [0.1, 0.2, 0.5, 40.0, -30.0, 2.0])
+    )
+    found = driven([se3_exp(rng.normal(0, np.sqrt(np.diag(CHAIN_COV)))) @ step for _ in range(COUNT)], start)
+    return driven([step] * COUNT, start), found, chain_of(found, repeat(CHAIN_COV))
 
 
 def loop(true: Array, i: int, j: int) -> PoseEdge:

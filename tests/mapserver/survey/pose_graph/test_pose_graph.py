@@ -12,7 +12,7 @@ from mapserver.survey.pose_graph.pose_graph import PoseEdge, optimize_pose_graph
 from studies import doppelganger
 from support.problems.g2o import parse_g2o
 from support.recordings.realdata import real_data
-from support.worlds.pose_graph_scene import Drive, make_drive
+from support.worlds.pose_graph_scene import Drive, driven, make_drive
 
 
 def _revisit_error_m(drive: Drive, map_from_body: Array) -> float:
@@ -95,13 +95,6 @@ def _square(turn_deg: float) -> list[Array]:
     return ([se3(np.eye(3), np.array([1.0, 0.0, 0.0]))] * 10 + [turn]) * 4
 
 
-def _driven(steps: list[Array]) -> Array:
-    places = [np.eye(4)]
-    for step in steps:
-        places.append(places[-1] @ step)
-    return np.array(places)
-
-
 def _closed(turn_sigma_deg: float, loop_sigma_deg: float) -> tuple[bool, float]:
     """Whether the loop is believed that closes a square whose turns are two degrees short, and the places' largest error in metres."""
     sigmas_deg = ([0.02] * 10 + [turn_sigma_deg]) * 4 + [loop_sigma_deg]
@@ -109,8 +102,8 @@ def _closed(turn_sigma_deg: float, loop_sigma_deg: float) -> tuple[bool, float]:
     steps = _square(88.0)
     edges = [PoseEdge(k, k + 1, step, covariances[k], is_loop=False) for k, step in enumerate(steps)]
     edges.append(PoseEdge(0, len(steps), np.eye(4), covariances[-1], is_loop=True))
-    found = optimize_pose_graph(_driven(steps), edges)
-    errors_m = np.linalg.norm(found.map_from_body[:, :3, 3] - _driven(_square(90.0))[:, :3, 3], axis=1)
+    found = optimize_pose_graph(driven(steps), edges)
+    errors_m = np.linalg.norm(found.map_from_body[:, :3, 3] - driven(_square(90.0))[:, :3, 3], axis=1)
     return bool(found.loop_weights[0] > 0.5), float(errors_m.max())
 
 

@@ -1,5 +1,7 @@
 """The graph of similarities: derivatives, scale drift taken up by a loop, wrong loops, and how loops measure the scale."""
 
+from itertools import repeat
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from fleetmap.errors import SurveyError
 from fleetmap.geometry import Array, align_points, se3, se3_exp, se3_inverse, so3_exp, transform_points
 from mapserver.survey.pose_graph.pose_graph import PoseEdge
 from mapserver.survey.pose_graph.sim3_pose_graph import gate_covariances, measured_log_scale, solve_scaled
+from support.worlds.pose_graph_scene import chain_of
 
 COUNT = 120
 CHAIN_COV = np.diag([0.002**2] * 3 + [0.008**2] * 3)
@@ -39,13 +42,6 @@ def drifted(truth: Array, drift: float, rng: np.random.Generator) -> tuple[Array
     return np.array(places), scale
 
 
-def chain_of(places: Array) -> list[PoseEdge]:
-    return [
-        PoseEdge(k, k + 1, se3_inverse(places[k]) @ places[k + 1], CHAIN_COV, is_loop=False)
-        for k in range(len(places) - 1)
-    ]
-
-
 def scale_errors(found: Array, truth: Array) -> tuple[float, float]:
     """After one similarity: largest error in metres, and how far the scale of tenths of the way still wanders."""
     placed, scale = align_points(truth[:, :3, 3], found[:, :3, 3], with_scale=True)
@@ -66,7 +62,7 @@ def test_five_percent_of_scale_drift_go_with_one_loop() -> None:
         COUNT - 1, 0, se3_exp(rng.multivariate_normal(np.zeros(6), LOOP_COV)) @ last_from_first, LOOP_COV, is_loop=True
     )
     measured = {(COUNT - 1, 0): (float(np.log(scale[-1] / scale[0])) + 0.002 * rng.normal(), 0.003)}
-    map_from_body, weights = solve_scaled(start, chain_of(start), [loop], measured, WALK)
+    map_from_body, weights = solve_scaled(start, chain_of(start, repeat(CHAIN_COV)), [loop], measured, WALK)
     after_m, after = scale_errors(map_from_body, truth)
     assert before > 0.02
     assert weights.tolist() == [1.0]
@@ -74,7 +70,7 @@ def test_five_percent_of_scale_drift_go_with_one_loop() -> None:
     assert after_m < 0.25 * before_m
     # a rigid graph bends the lap instead: what similarities are for
     rigid_scales = {(COUNT - 1, 0): (0.0, 1e-4)}
-    bent, _ = solve_scaled(start, chain_of(start), [loop], rigid_scales, 1e-5)
+    bent, _ = solve_scaled(start, chain_of(start, repeat(CHAIN_COV)), [loop], rigid_scales, 1e-5)
     assert scale_errors(bent, truth)[1] > 2 * after
 
 
@@ -89,14 +85,14 @@ def test_a_wrong_loop_is_disbelieved() -> None:
     # what the loop measures has lengths of the old keyframe
     for n, (_, j) in enumerate(pairs[:3]):
         loops[n].i_from_j[:3, 3] *= scale[j]
-    map_from_body, weights = solve_scaled(start, chain_of(start), loops, measured, WALK)
+    map_from_body, weights = solve_scaled(start, chain_of(start, repeat(CHAIN_COV)), loops, measured, WALK)
     assert weights.tolist() == [1.0, 1.0, 1.0, 0.0]
     assert scale_errors(map_from_body, truth)[1] < 0.005
 
 
 def test_edges_that_cannot_be_solved_are_named() -> None:
     start = circle()[:4]
-    chain, loop = chain_of(start), PoseEdge(3, 0, np.eye(4), np.nan * LOOP_COV, is_loop=True)
+    chain, loop = chain_of(start, repeat(CHAIN_COV)), PoseEdge(3, 0, np.eye(4), np.nan * LOOP_COV, is_loop=True)
     for edges, loops, reason in ((chain[:1], [], r"\[2, 3\]"), (chain, [loop], "edge 3-0: .* not finite")):
         with pytest.raises(SurveyError, match=reason):
             solve_scaled(start, edges, loops, {}, WALK)
@@ -118,7 +114,7 @@ def test_points_of_both_keyframes_measure_the_scale() -> None:
 def test_the_gate_widens_with_the_way() -> None:
     """The end's spread after a random walk of the scale, against the sum of the widened edges: never less."""
     truth = circle()
-    chain = chain_of(truth)
+    chain = chain_of(truth, repeat(CHAIN_COV))
     widened = gate_covariances(chain, WALK)
     total = sum(e.cov_rot_trans[3, 3] - c.cov_rot_trans[3, 3] for e, c in zip(widened, chain, strict=True))
     rng = np.random.default_rng(4)
