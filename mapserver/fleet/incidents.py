@@ -5,13 +5,7 @@ from dataclasses import dataclass, field, replace
 
 from mapserver.store import Event, MapStore
 
-_STATES = {
-    "acknowledged": "acknowledged",
-    "handed": "acknowledged",
-    "closed": "closed",
-    "reopened": "open",
-    "ended": "open",
-}
+_STATES = {"acknowledged": "acknowledged", "handed": "acknowledged", "closed": "closed"}  # reopened and ended: open
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +45,7 @@ def with_acts(store: MapStore, found: Iterable[Incident]) -> list[Incident]:
             acts = [act for act in acts if act.stamp_ns >= one.since_ns]
         for act in acts:
             done, _, name = act.detail.partition(": ")[0].partition(" to ")
-            state = _STATES.get(done, state)
+            state = state if done == "commented" else _STATES.get(done, "open")
             taker = name or act.actor
             assignee = "" if state == "open" else taker if done in ("acknowledged", "handed") else assignee
         shown.append(replace(one, state=state, assignee=assignee, acts=acts))
