@@ -143,13 +143,20 @@ def no_sites(_: str | None) -> list[str]:
     return []
 
 
-class _Page(NamedTuple):
-    """A page. under: the page that leads to it; the others as `Console.page` says."""
+class Page(NamedTuple):
+    """A page. fill: what its template needs beside `context`, of the services, it and the parts of its path in braces; may block.
 
-    under: str
+    A FleetmapError of that becomes a notice within the frame. link: title and icon by which all pages link to it; under: the page that
+    leads to it, without one that of the first part of its path. knows: query parameters beside those of the frame. usual: what is shown
+    of a page over time where its address has no range, in words. under_way: sites that the page knows though the store has no
+    version of them, of the one that its address names. of_site: False for a page that shows the same whatever site its address names.
+    """
+
     template: str | Template
     fill: Callable[..., dict[str, object]]
-    knows: Sequence[str]
+    link: tuple[str, str] | None = None
+    under: str = ""
+    knows: Sequence[str] = ()
     usual: str = ""
     under_way: Callable[[str | None], list[str]] = no_sites
     of_site: bool = True
@@ -179,31 +186,13 @@ class Console:
         @self.app.exception_handler(404)
         async def missing(request: Request, _: Exception) -> Response:
             """Within the frame, with a way back."""
-            return await self._shown(request, _Page("none", "", no_page, tuple(request.query_params)))
+            return await self._shown(request, Page("", no_page, under="none", knows=tuple(request.query_params)))
 
-    def page(
-        self,
-        path: str,
-        template: str | Template,
-        fill: Callable[..., dict[str, object]],
-        *,
-        link: tuple[str, str] | None = None,
-        under: str | None = None,
-        knows: Sequence[str] = (),
-        usual: str = "",
-        under_way: Callable[[str | None], list[str]] = no_sites,
-        of_site: bool = True,
-    ) -> None:
-        """Adds a page. fill: what its template needs beside `context`, of the services, it and the parts of `path` in braces; may block.
-
-        A FleetmapError becomes a notice within the frame. link: title and icon by which all pages link to it; under: the page that
-        leads to it. knows: query parameters beside those of the frame. usual: what is shown of a page over time where
-        its address has no range, in words. under_way: sites that the page knows though the store has no
-        version of them, of the one that its address names. of_site: False for a page that shows the same whatever site its address names.
-        """
-        if link is not None:
-            self.links[path] = link
-        page = _Page(under or path.partition("/")[0], template, fill, knows, usual, under_way, of_site)
+    def page(self, path: str, page: Page) -> None:
+        """Adds a page."""
+        if page.link is not None:
+            self.links[path] = page.link
+        page = page._replace(under=page.under or path.partition("/")[0])
 
         @self.app.get(f"/{path}", include_in_schema=False)
         async def shown(request: Request) -> Response:
@@ -252,7 +241,7 @@ class Console:
 
             return StreamingResponse(events(), media_type="text/event-stream", headers={"Cache-Control": "no-store"})
 
-    async def _shown(self, request: Request, page: _Page) -> Response:
+    async def _shown(self, request: Request, page: Page) -> Response:
         template, site, found, status = page.template, request.query_params.get("site"), {}, 200
         root, sites = _root(request), list[str]()
         try:

@@ -19,7 +19,7 @@ from mapserver.api.bytes_response import PICTURE_HEADERS
 from mapserver.api.guard import SIGN_IN, SIGN_OUT, STYLE, GuardSettings, address_of, set_session
 from mapserver.api.parameters import ApiSettings
 from mapserver.dashboard import administration, docs, failure, failures, map_page, overview, robot, robots, survey_jobs
-from mapserver.dashboard.console import PATH, Console, Services
+from mapserver.dashboard.console import PATH, Console, Page, Services
 from mapserver.dashboard.data import MapData
 from mapserver.dashboard.fleet_health import HealthData
 from mapserver.dashboard.live import LiveRobots
@@ -73,11 +73,11 @@ def install_dashboard(
     for install in plugins("mapserver.parts").values():
         install(Host(store, fleet, settings, app, console, hear))
     link = _link("Administration")  # behind those of the parts
-    console.page("administration", "administration.html", administration.page, link=link, of_site=False)
-    console.page("administration/people", "people.html", administration.people, of_site=False)
+    console.page("administration", Page("administration.html", administration.page, link=link, of_site=False))
+    console.page("administration/people", Page("people.html", administration.people, of_site=False))
     knows = (*administration.LOG_FILTERS, "older")
-    console.page("administration/log", "log.html", administration.log, knows=knows, usual="All", of_site=False)
-    console.page("docs/{document:path}", "docs.html", docs.page, of_site=False)
+    console.page("administration/log", Page("log.html", administration.log, knows=knows, usual="All", of_site=False))
+    console.page("docs/{document:path}", Page("docs.html", docs.page, of_site=False))
     console.files("pictures", docs.FOLDER)
     console.nothing_else()
     _install_files(pages, services)
@@ -96,18 +96,20 @@ def _link(title: str) -> tuple[str, str]:
 
 def _install_pages(console: Console) -> None:
     """What a page is asked with beside its site, and what it follows."""
-    console.page("", "overview.html", overview.page, link=_link("Overview"))
+    console.page("", Page("overview.html", overview.page, link=_link("Overview")))
     console.stream("now", overview.now, shows=("fleet",))
-    console.page("trends", "trends.html", overview.trends, link=_link("Trends"), usual="Last 24 h")
-    console.page("robots", "robots.html", robots.page, link=_link("Robots"), knows=("state", "without"))
-    console.page("robots/{robot}", "robot.html", robot.page, usual="Last drive")
+    console.page("trends", Page("trends.html", overview.trends, link=_link("Trends"), usual="Last 24 h"))
+    console.page("robots", Page("robots.html", robots.page, link=_link("Robots"), knows=("state", "without")))
+    console.page("robots/{robot}", Page("robot.html", robot.page, usual="Last drive"))
     console.stream("robots/{robot}/now", robot.now, shows=("robot", "facts"))
     compared = ("version", "before", "after")
-    console.page("map", "map.html", map_page.page, link=_link("Map"), knows=compared, usual="Last 14 days")
+    console.page("map", Page("map.html", map_page.page, link=_link("Map"), knows=compared, usual="Last 14 days"))
     filters = (*failures.AXES, "older", "sort")
-    console.page("failures", "failures.html", failures.page, link=_link("Failures"), knows=filters, usual="All")
-    console.page("failures/{failure}", "failure.html", failure.page, of_site=False)
-    console.page("surveys", "surveys.html", survey_jobs.page, link=_link("Surveys"), knows=("job",), usual="All jobs")
+    console.page("failures", Page("failures.html", failures.page, link=_link("Failures"), knows=filters, usual="All"))
+    console.page("failures/{failure}", Page("failure.html", failure.page, of_site=False))
+    console.page(
+        "surveys", Page("surveys.html", survey_jobs.page, link=_link("Surveys"), knows=("job",), usual="All jobs")
+    )
 
 
 def _install_files(pages: FastAPI, services: Services) -> None:

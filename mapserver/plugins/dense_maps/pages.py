@@ -11,7 +11,7 @@ from fastapi import Response
 from fleetmap.errors import FleetmapError, StateError, UsageError
 from fleetmap.mapformat.tile_codec import decode_tile
 from fleetmap.messages import CameraNote, FailureReport
-from mapserver.dashboard.console import PageContext, Services, number, scene_of
+from mapserver.dashboard.console import Page, PageContext, Services, number, scene_of
 from mapserver.dashboard.data import JOBS_SHOWN
 from mapserver.dashboard.install import Host, file_response
 from mapserver.dashboard.map_layers import Layer
@@ -31,7 +31,7 @@ def install(host: Host) -> None:
     console, store = host.console, host.store
     console.files("parts/dense", _FOLDER / "static")
     template = TEMPLATES.from_string((_FOLDER / "space.html").read_text("utf-8"))
-    console.page("space", template, _space_page, under="map", knows=("version", "x", "y"))
+    console.page("space", Page(template, _space_page, under="map", knows=("version", "x", "y")))
     panels: dict[str, Any] = {"failure": _expected, "changes": _changes, "version": _link, "place": _link}
     for place, panel in panels.items():
         console.services.panels.setdefault(place, []).append(panel)

@@ -14,7 +14,7 @@ from fleetmap.errors import LinkError
 from fleetmap.geometry import Array
 from fleetmap.mapformat.names import check_name, is_name, sha256_hex
 from fleetmap.messages import decode_message, split_key
-from mapserver.dashboard.console import PageContext, Services
+from mapserver.dashboard.console import Page, PageContext, Services
 from mapserver.dashboard.install import Host
 from mapserver.dashboard.live import words_of
 from mapserver.dashboard.map_layers import Dots, Layer, Line, Mark, Square, trail
@@ -90,7 +90,7 @@ def install(host: Host) -> None:
     console.files("parts/live", _FOLDER / "static")
     template = TEMPLATES.from_string((_FOLDER / "live.html").read_text("utf-8"))
     link = "Live", "parts/live/icon.svg#live"
-    console.page("live", template, partial(page, surveys), link=link, under_way=surveys.sites)
+    console.page("live", Page(template, partial(page, surveys), link=link, under_way=surveys.sites))
     console.stream("live/now", partial(heard, surveys), under_way=surveys.sites)
 
 
