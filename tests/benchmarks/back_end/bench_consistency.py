@@ -12,7 +12,7 @@ import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 import numpy as np
 
 from benchmarks.common import consistency
-from benchmarks.common.recorded_runs import parsed, write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark
 
 REPORTED_FROM, _FRAMES = 7000, 255
 
@@ -31,16 +31,12 @@ def summary(runs: list[consistency.Figures]) -> dict[str, float]:
     }
 
 
-def main() -> None:
-    """Print the figures of both sensor sets; write them as JSON where asked."""
-    options, site = parsed(__doc__, runs=100, seed=REPORTED_FROM), consistency.Site()
+@benchmark(runs=100, seed=REPORTED_FROM)
+def main(options: Options) -> Results:
+    site = consistency.Site()
     runs: dict[str, list[consistency.Figures]] = {"stereo-inertial": [], "stereo": []}
     for seed in range(options.seed, options.seed + options.runs):
         session = site.session(seed)
         for name, done in runs.items():
             done.append(consistency.run(session, name == "stereo-inertial", _FRAMES)[0])
-    write_results(options.out, {"results": {name: summary(done) for name, done in runs.items()}})
-
-
-if __name__ == "__main__":
-    main()
+    return {"results": {name: summary(done) for name, done in runs.items()}}

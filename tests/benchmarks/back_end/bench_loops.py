@@ -18,7 +18,7 @@ from unittest.mock import patch
 import numpy as np
 from scipy.stats import chi2
 
-from benchmarks.common.recorded_runs import parsed, write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark
 from benchmarks.common.simulated_survey import SimulatedSurvey, drawn_alignment, session_of, simulated_survey
 from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.geometry import Array, se3_inverse, se3_log
@@ -99,15 +99,11 @@ def summary(loops: list[Loop]) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    given, every = parsed(__doc__, seed=40100, loops=1500), list[Loop]()
+@benchmark(seed=40100, loops=1500)
+def main(given: Options) -> Results:
+    every = list[Loop]()
     for loops in surveys(given.seed):
         every += loops
         if len(every) >= given.loops:
             break
-    write_results(given.out, summary(every))
-
-
-if __name__ == "__main__":
-    main()
+    return summary(every)

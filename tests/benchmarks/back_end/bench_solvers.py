@@ -16,7 +16,7 @@ import gtsam
 import numpy as np
 from scipy.stats import chi2
 
-from benchmarks.common.recorded_runs import parsed, write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark
 from fleetmap.geometry import Array, align_points, se3, se3_inverse, se3_log, so3_exp, transform_points
 from mapserver.survey.bundle.bundle_adjustment import optimize
 from mapserver.survey.bundle.problem import BundleProblem
@@ -186,11 +186,6 @@ SECTIONS: dict[str, Callable[[], object]] = {
 }
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    options = parsed(__doc__, SECTIONS)
-    write_results(options.out, {name: SECTIONS[name]() for name in options.only or SECTIONS})
-
-
-if __name__ == "__main__":
-    main()
+@benchmark(SECTIONS)
+def main(options: Options) -> Results:
+    return {name: SECTIONS[name]() for name in options.only}

@@ -7,7 +7,7 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -19,21 +19,39 @@ from locclient.maps.map_client import connected
 from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.run_result import ReplayResult
 
+Options, Results = argparse.Namespace, dict[str, Any]
+Measure = Callable[[Options], Results]
+
 SITE = "hall"
 _CODE = {".py", ".cpp", ".h", ".fmvb"}
 
 
-def parsed(description: str | None, names: Iterable[str] = (), **numbers: int) -> argparse.Namespace:
-    """The options of benchmarks: `only` some of the names, numbers with these defaults, the `work` folder, made if missing, and `out`."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", action="append", default=[], choices=list(names))
-    for name, default in numbers.items():
-        parser.add_argument(f"--{name.replace('_', '-')}", type=int, default=default)
-    parser.add_argument("--work", type=Path, default=kept_folder())
-    parser.add_argument("--out", type=Path)
-    arguments = parser.parse_args()
-    arguments.work.mkdir(parents=True, exist_ok=True)
-    return arguments
+def benchmark(names: Iterable[str] = (), several: str = "", **numbers: int) -> Callable[[Measure], Measure]:
+    """Runs a function with these options where its file is the program, prints its results as JSON, and writes them to `--out`.
+
+    `--only`: some of the names, all by default; numbers with these defaults; the `--work` folder, made if missing; `several`: one and
+    more of what is called so.
+    """
+
+    def run(measure: Measure) -> Measure:
+        if measure.__module__ != "__main__":
+            return measure
+        description = sys.modules["__main__"].__doc__
+        parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+        if several:
+            parser.add_argument(several, nargs="+")
+        parser.add_argument("--only", action="append", choices=list(names))
+        for name, default in numbers.items():
+            parser.add_argument(f"--{name.replace('_', '-')}", type=int, default=default)
+        parser.add_argument("--work", type=Path, default=kept_folder())
+        parser.add_argument("--out", type=Path)
+        options = parser.parse_args()
+        options.only = options.only or list(names)
+        options.work.mkdir(parents=True, exist_ok=True)
+        write_results(options.out, measure(options))
+        return measure
+
+    return run
 
 
 def kept_folder() -> Path:
@@ -51,7 +69,7 @@ def resident_mb() -> dict[str, float]:
     return {wanted[row[0][:-1]]: float(row[1]) * 1.024e-3 for row in rows if row and row[0][:-1] in wanted}
 
 
-def write_results(path: Path | None, results: dict[str, Any]) -> None:
+def write_results(path: Path | None, results: Results) -> None:
     """Print the results as JSON, and write them where a file is asked for."""
     text = json.dumps(results, indent=2) + "\n"
     print(text)

@@ -16,7 +16,7 @@ from typing import Any
 
 from playwright.sync_api import Page, sync_playwright
 
-from benchmarks.common.recorded_runs import parsed, write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark
 from benchmarks.common.yardstick import slowness
 from benchmarks.fleet.server_process import cpu_s, resident_mb
 from support.fleet.dashboard_scene import SITE, fill_store, serving, talking
@@ -94,9 +94,8 @@ def measure(http: str, zenoh: str, server: int, robots: int) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    asked = parsed(__doc__, robots=300)
+@benchmark(robots=300)
+def main(asked: Options) -> Results:
     with tempfile.TemporaryDirectory() as folder:
         fill_store(Path(folder))
         slow = slowness()
@@ -106,8 +105,4 @@ def main() -> None:
     figures["ready_cpu_s"] = ready_s
     if slow is not None:
         figures["ready_cpu_s_at_reference"] = ready_s / slow
-    write_results(asked.out, {f"{asked.robots} robots": figures})
-
-
-if __name__ == "__main__":
-    main()
+    return {f"{asked.robots} robots": figures}

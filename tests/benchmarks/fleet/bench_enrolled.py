@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.common.recorded_runs import parsed, write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark
 from benchmarks.fleet.server_process import resident_mb
 from fleetmap.access import Holder
 from fleetmap.bus.endpoints import TlsFiles
@@ -91,12 +91,8 @@ def opening_and_revoking(folder: Path, count: int, connected: int) -> dict[str, 
     return found
 
 
-def main() -> None:
-    options = parsed(__doc__)
+@benchmark()
+def main(options: Options) -> Results:
     with tempfile.TemporaryDirectory() as name:
         found: dict[str, Any] = {"thousand": opening_and_revoking(Path(name) / "many", 1000, 12)}
-    write_results(options.out, found)
-
-
-if __name__ == "__main__":
-    main()
+    return found

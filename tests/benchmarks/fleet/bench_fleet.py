@@ -19,7 +19,7 @@ import httpx
 import numpy as np
 from prometheus_client.parser import text_string_to_metric_families
 
-from benchmarks.common.recorded_runs import parsed, write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark
 from benchmarks.fleet.server_process import SITE, measured
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import FleetmapError
@@ -196,9 +196,8 @@ def measure_month(folder: Path, robots: int) -> dict[str, float]:
     return {"size_mb": sum(path.stat().st_size for path in folder.glob("store.sqlite3*")) / 1e6}
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    options = parsed(__doc__, robots=300, seconds=120)
+@benchmark(robots=300, seconds=120)
+def main(options: Options) -> Results:
     with tempfile.TemporaryDirectory() as name:
         store = Path(name) / "store"
         rng = np.random.default_rng(0)
@@ -209,8 +208,4 @@ def main() -> None:
             releases.publish(maps, SITE)
         found = {"load": measure_load(store, options.robots, options.seconds)}
         found["month"] = measure_month(Path(name) / "month", options.robots)
-    write_results(options.out, found)
-
-
-if __name__ == "__main__":
-    main()
+    return found

@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import parsed, write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark
 from benchmarks.fleet.server_process import SITE, measured
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.mapformat.manifest import Manifest, decode_manifest
@@ -173,12 +173,7 @@ def bench(folder: Path, clients: int, site_mb: float) -> dict[str, dict[str, flo
     return rows
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    options = parsed(__doc__, clients=300, site_mb=50)
+@benchmark(clients=300, site_mb=50)
+def main(options: Options) -> Results:
     with tempfile.TemporaryDirectory() as name:
-        write_results(options.out, bench(Path(name) / "store", options.clients, options.site_mb))
-
-
-if __name__ == "__main__":
-    main()
+        return bench(Path(name) / "store", options.clients, options.site_mb)

@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 from rich.console import Console
 
-from benchmarks.common.recorded_runs import parsed, write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark
 from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.geometry import Array
 from fleetmap.sensors.rectification import StereoCamera
@@ -164,18 +164,13 @@ def joined(surveys: Sequence[RecordingSurvey]) -> dict[str, Any]:
     return row
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    given = parsed(__doc__, ("drives", *REAL), seed=60817)
+@benchmark(("drives", *REAL), seed=60817)
+def main(given: Options) -> Results:
     figures = {}
-    for name in given.only or ("drives", *REAL):
+    for name in given.only:
         surveys = list[RecordingSurvey]()
         parts = [(recorded(given.seed, n, given.work), "::") for n in range(DRIVES)] if name == "drives" else []
         for path, frames in parts or [(DATA / name, f"{half}::2") for half in range(2)]:
             surveys.append(surveyed(path, frames, surveys[0].survey.state.rig.camera if surveys else None))
         figures[name] = joined(surveys)
-    write_results(given.out, figures)
-
-
-if __name__ == "__main__":
-    main()
+    return figures

@@ -10,14 +10,13 @@ to 80 m. Rates come with the 95 % bound of Clopper and Pearson. There is no join
 pose graph of fixes.
 """
 
-import argparse
 from collections.abc import Iterator, Sequence
 from typing import Any
 
 from scipy.stats import beta
 
 from benchmarks.common.joining_sites import Drive, Site, SiteMap, cut, drive, error_m, length_m, session, site_map
-from benchmarks.common.recorded_runs import parsed, write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark
 from fleetmap.geometry import Array
 from mapserver.survey.merge.membership import Membership, MembershipVerdict
 
@@ -112,22 +111,17 @@ def summary(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return result
 
 
-def measured(options: argparse.Namespace) -> Iterator[dict[str, Any]]:
+def measured(options: Options) -> Iterator[dict[str, Any]]:
     """A row for each session."""
     plain = [Site(_PLAIN[n % 3], options.seed + 100 + n) for n in range(options.true_sites)]
     parts = {"foreign": foreign(sites(options.sites, options.seed + 50)), "true": true(plain)}
-    for part in options.only or PARTS:
+    for part in options.only:
         for row in parts[part]:
             yield row | {name: f"{row[name].scenario} {row[name].seed}" for name in ("map", "session")} | {"part": part}
 
 
-def main() -> None:
-    """Print the rates; write them as JSON where asked."""
-    options = parsed(__doc__, PARTS, sites=15, true_sites=34, seed=500)
+@benchmark(PARTS, sites=15, true_sites=34, seed=500)
+def main(options: Options) -> Results:
     rows = list(measured(options))
-    figures = {part: summary([row for row in rows if row["part"] == part]) for part in options.only or PARTS}
-    write_results(options.out, {"rates": figures | {"all": summary(rows)}, "sessions": rows})
-
-
-if __name__ == "__main__":
-    main()
+    figures = {part: summary([row for row in rows if row["part"] == part]) for part in options.only}
+    return {"rates": figures | {"all": summary(rows)}, "sessions": rows}

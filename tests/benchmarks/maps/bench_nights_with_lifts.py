@@ -23,7 +23,7 @@ from unittest.mock import patch
 import numpy as np
 from rich.console import Console
 
-from benchmarks.common.recorded_runs import parsed, played, write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark, played
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import se3_inverse
 from fleetmap.mapformat.tile_codec import decode_tile
@@ -152,9 +152,9 @@ def spent(folder: Path, number: int, robot: Path) -> dict[str, Any]:
     return row
 
 
-def main() -> None:
-    """The command."""
-    arguments, rows = parsed(__doc__, nights=30, seeds=10), []
+@benchmark(nights=30, seeds=10)
+def main(arguments: Options) -> Results:
+    rows = []
     work, carried = arguments.work / "nights-with-lifts", CLIP.run("carried")[1]
     for n in range(-arguments.seeds, arguments.nights):
         folder = work if n >= 0 else work / f"seed{n}"
@@ -174,8 +174,4 @@ def main() -> None:
         "published": len(versions),
         "versions_that_lose_a_robot": sum(row.get("localised", 1.0) < LOST_SHARE for row in versions),
     }
-    write_results(arguments.out, {"figures": figures, "nights": rows})
-
-
-if __name__ == "__main__":
-    main()
+    return {"figures": figures, "nights": rows}

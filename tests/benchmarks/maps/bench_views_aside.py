@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import SITE, parsed, surveyed, write_results
+from benchmarks.common.recorded_runs import SITE, Options, Results, benchmark, surveyed
 from benchmarks.robot.bench_real_robots import mapped
 from benchmarks.robot.standing_robot import Standing
 from fleetmap.bow.vocabulary import default_vocabulary
@@ -136,12 +136,6 @@ def bench(name: str, work: Path) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    names = (*SIMULATED, *RECORDED)
-    arguments = parsed(__doc__, names)
-    write_results(arguments.out, {"cases": {name: bench(name, arguments.work) for name in arguments.only or names}})
-
-
-if __name__ == "__main__":
-    main()
+@benchmark([*SIMULATED, *RECORDED])
+def main(arguments: Options) -> Results:
+    return {"cases": {name: bench(name, arguments.work) for name in arguments.only}}

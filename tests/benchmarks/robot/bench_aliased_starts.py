@@ -16,7 +16,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import parsed, write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark
 from benchmarks.robot.aliased_starts import (
     WHOLE_SITE,
     Site,
@@ -103,19 +103,14 @@ def judged(name: str, found: list[Start]) -> dict[str, float]:
     return figures
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    arguments = parsed(__doc__, KINDS, starts=200, seed=11)
+@benchmark(KINDS, starts=200, seed=11)
+def main(arguments: Options) -> Results:
     seeds = arguments.seed, arguments.seed + 1
-    found: dict[str, list[Start]] = {name: [] for name in arguments.only or KINDS}
+    found: dict[str, list[Start]] = {name: [] for name in arguments.only}
     for seed in seeds:
         sites = {of: surveyed_site(of[0], seed, *of[1:]) for of in {_site_of(name) for name in found}}
         for name, starts in found.items():
             starts.extend(starts_of(name, sites[_site_of(name)], max(1, arguments.starts // len(seeds)), seed))
     figures = {name: judged(name, starts) for name, starts in found.items()}
     outcomes = {name: [asdict(start) for start in starts] for name, starts in found.items()}
-    write_results(arguments.out, {"figures": figures, "starts": outcomes})
-
-
-if __name__ == "__main__":
-    main()
+    return {"figures": figures, "starts": outcomes}

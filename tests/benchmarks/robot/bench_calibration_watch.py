@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.common.recorded_runs import SITE, parsed, recorded, surveyed, write_results
+from benchmarks.common.recorded_runs import SITE, Options, Results, benchmark, recorded, surveyed
 from fleetmap.geometry import se3_inverse
 from fleetmap.messages import Status
 from fleetmap.recordings import FrameSelection, Recording, open_recording
@@ -149,9 +149,8 @@ def good_starts(
     return starts
 
 
-def main() -> None:
-    """Print the outcomes; write them as JSON where asked."""
-    options = parsed(__doc__, good=0)
+@benchmark(good=0)
+def main(options: Options) -> Results:
     store = surveyed(options.work, int(_SEED))
     path = recorded(options.work, ("--seed", _SEED, "--robot", _ROBOT, "--frames", "450"))
     told: list[dict[str, Any]] = []
@@ -168,8 +167,4 @@ def main() -> None:
             good = good or found
             told.append(asdict(found) | {"is_right": found.is_right(good), "begin": int(chosen[0])})
             print(json.dumps(told[-1]), flush=True)
-    write_results(options.out, {"good" if options.good else "faults": told})
-
-
-if __name__ == "__main__":
-    main()
+    return {"good" if options.good else "faults": told}

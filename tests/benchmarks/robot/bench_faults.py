@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import parsed, played, recorded, surveyed, write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark, played, recorded, surveyed
 from fleetsim.scenarios import SCENARIOS
 from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
@@ -101,15 +101,10 @@ def outcome(fault: str, result: ReplayResult) -> Outcome:
     )
 
 
-def main() -> None:
-    """Print the outcomes; write JSON where asked."""
-    arguments = parsed(__doc__, EXPECTED)
+@benchmark(EXPECTED)
+def main(arguments: Options) -> Results:
     store, found = surveyed(arguments.work), []
-    for name in arguments.only or EXPECTED:
+    for name in arguments.only:
         recording = recorded(arguments.work, ("--robot", name, "--day", "1"), "faults")
         found.append(outcome(name, played(recording, store, LocalizerSettings())))
-    write_results(arguments.out, {"faults": {o.fault: asdict(o) | {"is_right": o.is_right} for o in found}})
-
-
-if __name__ == "__main__":
-    main()
+    return {"faults": {o.fault: asdict(o) | {"is_right": o.is_right} for o in found}}

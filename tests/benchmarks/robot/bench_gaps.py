@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import SITE, parsed, recorded, surveyed, write_results
+from benchmarks.common.recorded_runs import SITE, Options, Results, benchmark, recorded, surveyed
 from fleetmap.messages import Status
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.sensors.samples import ImuSamples
@@ -73,10 +73,9 @@ def _is_beyond(frame: FrameRecord) -> bool:
     return bool(np.linalg.norm(frame.error_map_m) > 3.0 * sigma_m)
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    arguments = parsed(__doc__, CASES, seed=1, sites=5)
-    frames: dict[str, list[FrameRecord]] = {name: [] for name in arguments.only or CASES}
+@benchmark(CASES, seed=1, sites=5)
+def main(arguments: Options) -> Results:
+    frames: dict[str, list[FrameRecord]] = {name: [] for name in arguments.only}
     for seed in range(arguments.seed, arguments.seed + arguments.sites):
         store = surveyed(arguments.work, seed)
         path = recorded(arguments.work, ("--robot", "tote-1", "--day", "1", "--seed", str(seed)))
@@ -93,8 +92,4 @@ def main() -> None:
             "tracking_beyond": sum(map(_is_beyond, tracking)),
             "largest_m": max(frame.error_m or 0.0 for frame in tracking),
         }
-    write_results(arguments.out, {"figures": figures})
-
-
-if __name__ == "__main__":
-    main()
+    return {"figures": figures}

@@ -12,7 +12,7 @@ import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 from dataclasses import replace
 
 from benchmarks.common.laps import repeated
-from benchmarks.common.recorded_runs import SITE, parsed, recorded, resident_mb, surveyed, write_results
+from benchmarks.common.recorded_runs import SITE, Options, Results, benchmark, recorded, resident_mb, surveyed
 from fleetmap.free_memory import give_back_free_memory
 from fleetmap.messages import Status
 from fleetmap.recordings import FrameSelection, open_recording
@@ -28,9 +28,8 @@ from locclient.robot.version_trial import TrialSettings
 _SETTLED_MINUTES = 5
 
 
-def main() -> None:
-    """Drives, and writes the figures."""
-    arguments = parsed(__doc__, minutes=60)
+@benchmark(minutes=60)
+def main(arguments: Options) -> Results:
     store, path = surveyed(arguments.work), recorded(arguments.work, ())
     address, resident, tracking = MapAddress(site=SITE, robot="bench", store=str(store)), [], 0
     with open_recording(path) as once, connected(address) as link:
@@ -61,8 +60,4 @@ def main() -> None:
         "last_mb": settled[-1],
         "growth_share": max(settled) / settled[0] - 1.0,
     }
-    write_results(arguments.out, found)
-
-
-if __name__ == "__main__":
-    main()
+    return found

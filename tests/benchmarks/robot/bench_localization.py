@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import parsed, played, recorded, resident_mb, surveyed, write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark, played, recorded, resident_mb, surveyed
 from benchmarks.common.yardstick import at_reference, mean_of, slowness
 from fleetmap.free_memory import give_back_free_memory
 from fleetmap.odometry.odometry import Odometry
@@ -79,11 +79,10 @@ def figures(result: ReplayResult) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    arguments = parsed(__doc__, CASES)
+@benchmark(CASES)
+def main(arguments: Options) -> Results:
     store, settings, found = surveyed(arguments.work), LocalizerSettings(), {}
-    for name in arguments.only or CASES:
+    for name in arguments.only:
         recording = recorded(arguments.work, CASES[name])
         played(recording, store, settings, ":60")
         give_back_free_memory()
@@ -99,8 +98,4 @@ def main() -> None:
             "cpu_p99_ms_at_reference": at_reference(found[name]["cpu_p99_ms"], slow),
         }
     survey = json.loads((arguments.work / "survey.json").read_text("utf-8"))
-    write_results(arguments.out, {"cases": found, "map_bytes_per_m": survey["map_bytes"] / survey["path_m"]})
-
-
-if __name__ == "__main__":
-    main()
+    return {"cases": found, "map_bytes_per_m": survey["map_bytes"] / survey["path_m"]}

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common import estimator_loop
-from benchmarks.common.recorded_runs import SITE, parsed, recorded, surveyed, write_results
+from benchmarks.common.recorded_runs import SITE, Options, Results, benchmark, recorded, surveyed
 from benchmarks.robot.aliased_starts import within_budget
 from fleetmap.messages import Status
 from fleetmap.recordings import open_recording
@@ -191,20 +191,17 @@ def _figures(found: list[Outcome]) -> dict[str, float]:
     }  # fmt: skip
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    cases = {"carried": _carried, "dark for 2 to 300 s": _dark, "pushed": _pushed}
-    names = [*cases, *(f"{share:.0%} {_DROPPED}" for share in _SHARES)]
-    arguments = parsed(__doc__, names, runs=50, seed=900)
-    cases |= {f"{share:.0%} {_DROPPED}": _dropped(arguments.work, share) for share in _SHARES}
+CASES = {"carried": _carried, "dark for 2 to 300 s": _dark, "pushed": _pushed}
+LOSSES = {f"{share:.0%} {_DROPPED}": share for share in _SHARES}
+
+
+@benchmark([*CASES, *LOSSES], runs=50, seed=900)
+def main(arguments: Options) -> Results:
+    cases = CASES | {name: _dropped(arguments.work, share) for name, share in LOSSES.items()}
     figures = {}
-    for name in arguments.only or names:
+    for name in arguments.only:
         found = [cases[name](arguments.seed, number) for number in range(arguments.runs)]
         for half, aids in enumerate(_AIDS.get(name, ("IMU", "no IMU"))):
             figures[f"{name}, {aids}"] = _figures(found[half::2])
     dropped = {name: row for name, row in figures.items() if _DROPPED in name}
-    write_results(arguments.out, {"figures": figures, "dropped": dropped})
-
-
-if __name__ == "__main__":
-    main()
+    return {"figures": figures, "dropped": dropped}

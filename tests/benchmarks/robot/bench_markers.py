@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from benchmarks.common import estimator_loop
-from benchmarks.common.recorded_runs import parsed, write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark
 from benchmarks.robot.aliased_starts import LateSession, Site, is_wrong, surveyed_site
 from fleetmap.geometry import Array, se3
 from fleetmap.messages import Placement, Status
@@ -103,11 +103,10 @@ def in_aisles(site: Site, count: int) -> list[int]:
     return [int(inside[k]) for k in np.linspace(0, len(inside) - 1, count).astype(int)]
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    arguments = parsed(__doc__, tuple(KINDS), starts=100, seed=31)
+@benchmark(KINDS, starts=100, seed=31)
+def main(arguments: Options) -> Results:
     figures, sites = {}, dict[str, Site]()
-    for name in arguments.only or KINDS:
+    for name in arguments.only:
         scenario, moved_m, duration_s = KINDS[name]
         if scenario not in sites:
             sites[scenario] = surveyed_site(scenario, arguments.seed)
@@ -122,8 +121,4 @@ def main() -> None:
             "named": sum(bool(start.named) for start in found),
             "last_s": max((time_s for time_s in times_s if time_s is not None), default=None),
         }
-    write_results(arguments.out, {"figures": figures})
-
-
-if __name__ == "__main__":
-    main()
+    return {"figures": figures}

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import SITE, parsed, recorded, surveyed, write_results
+from benchmarks.common.recorded_runs import SITE, Options, Results, benchmark, recorded, surveyed
 from benchmarks.robot.bench_real_robots import mapped
 from fleetmap.messages import Status
 from fleetmap.recordings import open_recording
@@ -79,10 +79,10 @@ def figures(path: Path, store: Path, use: SensorSet, *, has_wheels: bool) -> dic
     }
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    arguments, found = parsed(__doc__, CASES), {}
-    for name in arguments.only or CASES:
+@benchmark(CASES)
+def main(arguments: Options) -> Results:
+    found = {}
+    for name in arguments.only:
         use, has_wheels = CASES[name]
         if name.startswith("euroc"):
             path = DATA / name
@@ -90,8 +90,4 @@ def main() -> None:
         else:
             path, store = recorded(arguments.work, ("--robot", "tote-1", "--day", "1")), surveyed(arguments.work)
         found[name] = figures(path, store, use, has_wheels=has_wheels)
-    write_results(arguments.out, {"cases": found})
-
-
-if __name__ == "__main__":
-    main()
+    return {"cases": found}

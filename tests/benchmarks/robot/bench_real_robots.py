@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import SITE, parsed, played, tool, write_results
+from benchmarks.common.recorded_runs import SITE, Options, Results, benchmark, played, tool
 from benchmarks.common.yardstick import at_reference, mean_of, slowness
 from fleetmap.recordings import open_recording
 from locclient.localization.settings import LocalizerSettings
@@ -101,14 +101,10 @@ def mapped(work: Path, path: Path, frames: str = MAPPED) -> Path:
     return store
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    arguments, found = parsed(__doc__, CASES), {}
-    for name in arguments.only or CASES:
+@benchmark(CASES)
+def main(arguments: Options) -> Results:
+    found = {}
+    for name in arguments.only:
         folder = DATA / CASES[name].recording
         found[name] = CASES[name].how(folder, mapped(arguments.work, folder))
-    write_results(arguments.out, {"cases": found})
-
-
-if __name__ == "__main__":
-    main()
+    return {"cases": found}

@@ -1,10 +1,9 @@
 """What ROS 2 costs a robot: a stereo driver of rclpy at 30 Hz and 752x480 sends to the robot's side, raw for long, then compressed, then
 with an IMU of 210 Hz while the robot publishes its estimates. CPU per frame is that of ROS 2 in the robot's process.
 
-`python tests/benchmarks/robot/bench_ros2.py --out FILE.json [--seconds 1200]`; needs `make ros2-env`.
+`PYTHONPATH=tests python tests/benchmarks/robot/bench_ros2.py --out FILE.json [--seconds 1200]`; needs `make ros2-env`.
 """
 
-import argparse
 import json
 import select
 import tempfile
@@ -12,8 +11,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from common.yardstick import at_reference, slowness
-
+from benchmarks.common.recorded_runs import Options, Results, benchmark
+from benchmarks.common.yardstick import at_reference, slowness
 from fleetmap.recordings.calibration_files import format_calibration
 from support.recordings.recording_samples import calibration
 from support.ros2.environment import ros_program
@@ -49,25 +48,16 @@ def measured(rig: Path, driver: dict[str, Any], robot: list[str]) -> dict[str, f
     }
 
 
-def main() -> None:
-    """Write a table of the three drives."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--seconds", type=int, default=1200)
-    options = parser.parse_args()
+@benchmark(seconds=1200)
+def main(options: Options) -> Results:
     with tempfile.TemporaryDirectory() as folder:
         rig = Path(folder) / "rig.yaml"
         rig.write_text(format_calibration(replace(calibration(), imu=None)))
         with_imu = Path(folder) / "inertial.yaml"
         with_imu.write_text(format_calibration(calibration()))
         frames, short = options.seconds * _RATE_HZ, min(options.seconds, _SHORT_S) * _RATE_HZ
-        figures = {
+        return {
             "raw": measured(rig, {"frames": frames}, []),
             "compressed": measured(rig, {"frames": short, "is_compressed": True}, []),
             "raw, IMU, estimates": measured(with_imu, {"frames": short, "has_imu": True}, ["--publish"]),
         }
-    options.out.write_text(json.dumps(figures, indent=1) + "\n", encoding="utf-8")
-
-
-if __name__ == "__main__":
-    main()

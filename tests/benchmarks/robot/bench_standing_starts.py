@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from benchmarks.common.recorded_runs import SITE, parsed, surveyed, write_results
+from benchmarks.common.recorded_runs import SITE, Options, Results, benchmark, surveyed
 from benchmarks.robot.aliased_starts import WRONG_M, part_of
 from benchmarks.robot.standing_robot import standing
 from fleetmap.geometry import Array
@@ -109,15 +109,14 @@ def figures(found: Sequence[Start], unmapped: Sequence[Start]) -> dict[str, floa
     }
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    arguments = parsed(__doc__, PIPELINES, seed=500, starts=30)
+@benchmark(PIPELINES, seed=500, starts=30)
+def main(arguments: Options) -> Results:
     cv2.setNumThreads(1)
     store = str(surveyed(arguments.work, arguments.seed))
     with connected(MapAddress(site=SITE, robot="bench", store=store)) as link:
         loaded = load_map(link)[0]
     drive = prepare(Order("small-loop", seed=arguments.seed, day=_DAY, light=_LIGHT, robot=_ROBOT))
-    found: dict[str, tuple[list[Start], list[Start]]] = {name: ([], []) for name in arguments.only or PIPELINES}
+    found: dict[str, tuple[list[Start], list[Start]]] = {name: ([], []) for name in arguments.only}
     for number, time_s in enumerate(np.linspace(0.5, drive.motion.duration_s - 0.5, arguments.starts).tolist()):
         session = standing(drive, time_s, number, _FOLLOWED_S)
         frames = list(session.frames())
@@ -129,8 +128,4 @@ def main() -> None:
             unmapped.append(start(session, shown, rest))
             print(f"{time_s:5.1f} s, {name:10} {mapped[-1]} {unmapped[-1].is_wrong}", flush=True)
     drive.renderer.close()
-    write_results(arguments.out, {"figures": {name: figures(*starts) for name, starts in found.items()}})
-
-
-if __name__ == "__main__":
-    main()
+    return {"figures": {name: figures(*starts) for name, starts in found.items()}}

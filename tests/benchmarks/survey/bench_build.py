@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common.laps import repeated
-from benchmarks.common.recorded_runs import parsed, recorded, tool, write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark, recorded, tool
 from benchmarks.common.yardstick import at_reference, slowness
 from fleetmap.recordings import open_recording
 from fleetmap.recordings.mcap.writer import copy_to_mcap
@@ -65,11 +65,6 @@ def measure(source: Path, minutes: int) -> dict[str, Any]:
     return rows
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    given = parsed(__doc__, minutes=10)
-    write_results(given.out, measure(recorded(given.work, ("--seed", "1"), "five-aisles"), given.minutes))
-
-
-if __name__ == "__main__":
-    main()
+@benchmark(minutes=10)
+def main(given: Options) -> Results:
+    return measure(recorded(given.work, ("--seed", "1"), "five-aisles"), given.minutes)

@@ -6,15 +6,13 @@ Every so many frames of the scenario's first run are rendered and looked at from
 without a survey's error. Then those of another day. A path is planned by A* between two places of the drive, for a robot of 0.3 m radius.
 """
 
-import argparse
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import numpy as np
 from scipy.ndimage import binary_dilation
 
 from benchmarks.common.grid_truth import GridFigures, Mask, compare, in_hall, passable, plan, truth_mask
-from benchmarks.common.recorded_runs import write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark
 from fleetmap.features.settings import StereoSettings
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame
@@ -89,12 +87,8 @@ def judge_night(views: SessionViews, after: Tiles, truths: tuple[Mask, Mask]) ->
     return int(moved.sum()), int((moved & (second == OCCUPIED)).sum())
 
 
-def main() -> None:
-    """Prints the figures."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("halls", nargs="+", metavar="SCENARIO:SEED")
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
+@benchmark(several="halls")
+def main(options: Options) -> Results:
     halls = {}
     for hall in options.halls:
         scenario, _, seed = hall.partition(":")
@@ -107,8 +101,4 @@ def main() -> None:
         moved, left = judge_night(views, second, (judged[0].truth, judged[1].truth))
         found = [asdict(one.figures) | {"path": one.path, "crossed": one.crossed} for one in judged]
         halls[hall] = {"days": found, "moved": moved, "left": left}
-    write_results(options.out, halls)
-
-
-if __name__ == "__main__":
-    main()
+    return halls

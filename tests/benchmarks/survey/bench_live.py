@@ -5,14 +5,13 @@
 The draft at the end is that of `build`, to the byte, so that its accuracy is not measured again. On a machine that does nothing else.
 """
 
-import argparse
 import tempfile
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from benchmarks.common.recorded_runs import write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark
 from mapserver.config import survey_settings
 from mapserver.drafting.draft import BuildOptions
 from mapserver.drafting.survey_recordings import RecordingOptions
@@ -30,14 +29,6 @@ def bench(path: Path) -> dict[str, Any]:
         return run_live(request, drive, lambda _: None, lambda: False, Console(quiet=True))[0]._asdict()
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("recordings", nargs="+", type=Path)
-    parser.add_argument("--out", type=Path)
-    options = parser.parse_args()
-    write_results(options.out, {path.name: bench(path) for path in options.recordings})
-
-
-if __name__ == "__main__":
-    main()
+@benchmark(several="recordings")
+def main(options: Options) -> Results:
+    return {Path(path).name: bench(Path(path)) for path in options.recordings}

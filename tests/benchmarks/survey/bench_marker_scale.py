@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import parsed, recorded, tool, write_results
+from benchmarks.common.recorded_runs import Options, Results, benchmark, recorded, tool
 from fleetmap.encoding import to_json
 from fleetmap.messages import Placement
 from fleetmap.plugins.markers import Marker, MarkerList
@@ -45,9 +45,8 @@ def built(drive: Path, store: Path, calibration: Path, version: int) -> float:
     return float(true_m / map_m - 1.0)
 
 
-def main() -> None:
-    """Print the figures; write them as JSON where asked."""
-    arguments = parsed(__doc__, seed=0)
+@benchmark(seed=0)
+def main(arguments: Options) -> Results:
     layout = SCENARIOS[SCENARIO]().layout
     places = {n: facing(np.array([x, y, z]), yaw_rad) for n, x, y, z, yaw_rad in layout.markers}
     known = MarkerList(
@@ -68,8 +67,4 @@ def main() -> None:
         files = ["--calibration", str(wrong), "--known", str(listed), "--scaled", str(right)]
         subprocess.run([*tool("mapserver"), "markers", str(drive), *which, *files], check=True)
         after = built(drive, store, right, 2)
-    write_results(arguments.out, {"off_before": before, "off_after": after, "off": abs(after)})
-
-
-if __name__ == "__main__":
-    main()
+    return {"off_before": before, "off_after": after, "off": abs(after)}
