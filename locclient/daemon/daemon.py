@@ -13,8 +13,7 @@ import cv2
 
 from fleetmap.bus.zenoh_bus import Bus
 from fleetmap.errors import UsageError
-from fleetmap.free_memory import gc_frozen, give_back_free_memory
-from fleetmap.messages import WantedVersion
+from fleetmap.free_memory import gc_frozen
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.intake import Intake
@@ -91,21 +90,19 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
         )
         spool = configured_outbox(run, address)
         outbox = _opened_outbox(spool, run.outbox_bytes)
-        give_back_free_memory()
         stack.enter_context(gc_frozen())
         caches: tuple[TileCache, ...] = ()
         server: ServerSync | None = None
-        first: WantedVersion | None
         maps: MapSource
-        if bus is None:
-            maps = LocalMapSource(Path(run.store or ""), address.site)
-            first = maps.wanted()
-            address_of(first)  # LinkError without one
-        else:
+        if bus is not None:
             # Two caches of the same folder, because one is not thread-safe; the second only reads.
             caches = tuple(TileCache(cache_folder(run.cache), max_bytes=run.cache_bytes) for _ in range(2))
             server = _server(config, address, bus, outbox, caches[0], intake)
             maps, first = CachedMap(caches[1], address.site), server.client.active()
+        else:
+            maps = LocalMapSource(Path(run.store or ""), address.site)
+            first = maps.wanted()
+            address_of(first)  # LinkError without one
         keeps_replay = address.server is not None and run.replays != "off"
         priors = image_priors_of(config, rectifier.mounted[0], calibration.base_from_body)
         settings = config.localizer, run.trial

@@ -16,8 +16,9 @@ def give_back_free_memory() -> None:
 @contextmanager
 def gc_frozen() -> Iterator[None]:
     """Exempt existing objects from garbage collection: libraries hold several hundred thousand permanent objects, whose traversal
-    would delay a frame from time to time."""
+    would delay a frame from time to time. What they left is given back first."""
     gc.collect()
+    give_back_free_memory()
     gc.freeze()
     try:
         yield

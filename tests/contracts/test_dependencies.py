@@ -19,6 +19,7 @@ DISTRIBUTIONS = {
     "cv2": "opencv-python-headless",
     "foxglove": "foxglove-sdk",
     "google": "protobuf",
+    "markdown_it": "markdown-it-py",
     "paho": "paho-mqtt",
     "yaml": "pyyaml",
     "zenoh": "eclipse-zenoh",

@@ -138,10 +138,17 @@ def test_image_unit_and_configuration_agree(image: str, unit: str) -> None:
     lines = text(f"deploy/{unit}.service").splitlines()
     (started,) = (line.removeprefix("ExecStart=") for line in lines if line.startswith("ExecStart="))
     program, *words = shlex.split(started)
-    assert [PurePosixPath(program).name, *words] == exec_form(last(image, "CMD"))
+    new_volume = ["--create"] if image == "server" else []
+    assert [PurePosixPath(program).name, *words, *new_volume] == exec_form(last(image, "CMD"))
     assert f"./{unit}.toml:{words[words.index('--config') + 1]}:ro" in SERVICES[image]["volumes"]
     listens = tomllib.loads(text("deploy/mapserver.toml"))["serve"]["http"]
     assert environment("server")["READYZ"] == f"http://{listens}/readyz"
+
+
+def test_the_image_builds_its_wheel_of_all_that_wheels_have() -> None:
+    packages = tomllib.loads(text("pyproject.toml"))["tool"]["scikit-build"]["wheel"]["packages"]
+    copied = {rest.split()[0] for word, rest in STAGES["build"] if word == "COPY"}
+    assert {folder.split("/")[0] for folder in packages.values()} <= copied
 
 
 def test_the_image_is_healthy_while_its_server_answers(tmp_path: Path) -> None:
