@@ -423,7 +423,7 @@ def test_operators_tokens_and_robots_begin_and_end(page: Page, tmp_path: Path) -
         expect(tug).to_contain_text("certificate for 365 days")
         page.get_by_label("Choose tug-7").check()
         ask("Revoke the chosen")
-        expect(dialog).to_contain_text("tug-7: Within two seconds")
+        expect(dialog).to_contain_text("tug-7: Remove robots, such as stolen ones")
         dialog.get_by_role("button", name="Yes: Revoke the chosen").click()
         expect(tug).to_contain_text("not enrolled")
         page.get_by_label("Choose all").check()
