@@ -16,7 +16,7 @@ from mapserver.drafting.job_lock import log_path
 from mapserver.nightly.inbox import Inbox, contents, put_back, sites_of
 from mapserver.nightly.upload import Upload
 from mapserver.serving.night_runs import SETTLE_S, NightRuns
-from mapserver.store import INCIDENT, Actor, JobInfo, MapStore
+from mapserver.store import Actor, JobInfo, MapStore
 
 NO_INBOX = "This server has no inbox; `mapserver serve --inbox DIR` gives it one, a folder with a folder for each site."
 _MOST_UPLOADS = 4  # at once
@@ -95,8 +95,6 @@ def retry_recording(
     who = sender.of(act)
     put_back(runs.inbox / site, box, name)
     _logged(store, "recording_tried_again", f"{name}, which was {box}", site, who)
-    if (incident := f"recording/{site}/{box}/{name}") in store.incident_acts():
-        store.audit(INCIDENT, f"ended: {incident}", actor=who, site=site)
     return inbox(runs, store, site)
 
 

@@ -1,7 +1,7 @@
 """What is an incident: alerts, drafts that were refused, recordings that are held or bad, and failures."""
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -36,11 +36,12 @@ def of_drafts(store: MapStore, site: str) -> Iterator[Incident]:
             yield Incident("draft", site, str(version), verdict.stamp_ns, words)
 
 
-def of_inbox(inbox: Inbox, now_ns: int) -> Iterator[Incident]:
+def of_inbox(inbox: Inbox) -> Iterator[Incident]:
     """Yield the recordings that are held or bad."""
     for box, entries in (("held", inbox.held), ("bad", inbox.bad)):
         for one in entries:
-            yield Incident("recording", inbox.site, f"{box}/{one.name}", now_ns, f"{one.name} is {box}: {one.reason}")
+            words = f"{one.name} is {box}: {one.reason}"
+            yield Incident("recording", inbox.site, f"{box}/{one.name}", one.since_ns, words)
 
 
 def present(
@@ -58,7 +59,7 @@ def present(
         found += of_drafts(store, name)
     if inbox is not None:
         for name in (name for name in sites_of(inbox) if site in (None, name)):
-            found += of_inbox(contents(inbox / name, SETTLE_S, now_ns), now_ns)
+            found += of_inbox(contents(inbox / name, SETTLE_S, now_ns))
     names = (incident.split("/") for incident in store.incident_acts() if incident.startswith("failure/"))
     failures = (Incident("failure", name[1], name[2], 0, "") for name in names if site in (None, name[1]))
     for failure in with_acts(store, failures):
@@ -72,11 +73,12 @@ def incidents(*of: Any) -> list[Incident]:
     return [one for one in present(*of) if one.state != "closed"]
 
 
-def find(store: MapStore, found: Iterable[Incident], incident: str) -> Incident:
+def find(incident: str, store: MapStore, *more: Any) -> Incident:
     """Return one of those that are present or any failure, by its id; UsageError for another one."""
-    if is_failure := _FAILURE.fullmatch(incident):
-        return of_failure(store.fleet.failure(int(is_failure[1])).failure)
+    number = _FAILURE.fullmatch(incident)
+    found = [of_failure(store.fleet.failure(int(number[1])).failure)] if number else present(store, *more)
     for one in found:
         if one.id == incident:
             return one
-    raise UsageError(f"there is no incident {incident[:200]!r} now; `mapserver incidents list` shows all")
+    how = "`mapserver incidents list` shows all, with --inbox DIR recordings too"
+    raise UsageError(f"there is no incident {incident[:200]!r} now; {how}")

@@ -97,7 +97,7 @@ VersionFilter = Annotated[int | None, Query(ge=1, le=1 << 31, description="on th
 Limit = Annotated[int, Query(ge=1, le=1000, description="items of a page", examples=[100])]
 _NEXT = "`next` of the previous page"
 NumberCursor = Annotated[int | None, Query(ge=0, le=(1 << 62), description=_NEXT, examples=[None])]
-NameCursor = Annotated[str | None, Query(max_length=160, description=_NEXT, examples=[None])]
+NameCursor = Annotated[str | None, Query(max_length=500, description=_NEXT, examples=[None])]
 _TIME = "ISO 8601; without an offset the server's local time; a date alone is the whole day"
 Since = Annotated[
     str | None, Query(max_length=40, description=f"not before: {_TIME}", examples=["2026-01-02T03:04:05Z"])

@@ -12,6 +12,7 @@ import typer
 
 from fleetmap.cli_options import TopicNames, config_path, settings_of
 from fleetmap.errors import UsageError, disk_errors
+from fleetmap.log_lines import printable
 
 if TYPE_CHECKING:
     from fleetmap.recordings import Topics
@@ -141,7 +142,7 @@ def print_result(value: object, lines: Iterable[str], *, json: bool) -> None:
         print_json(value)
         return
     for line in lines:
-        typer.echo(line)
+        typer.echo("\n".join(map(printable, line.split("\n"))))  # strangers chose some of the words
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Iterable[object]], title: str | None = None) -> None:
@@ -152,7 +153,7 @@ def print_table(columns: Sequence[str], rows: Iterable[Iterable[object]], title:
 
     table = Table(*columns, title=title)
     for row in rows:
-        table.add_row(*("" if cell is None else str(cell) for cell in row))
+        table.add_row(*("" if cell is None else printable(str(cell)) for cell in row))
     plain_console().print(table)
 
 

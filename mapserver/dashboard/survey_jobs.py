@@ -95,7 +95,7 @@ def page(services: Services, context: PageContext) -> dict[str, object]:
     jobs = services.maps.store.jobs(context.site, context.time_range(), limit=JOBS_SHOWN)
     chosen = chosen or next((job for job in jobs if job.state != "running" and _did_something(job)), None)
     inbox = services.maps.inbox_of(context.site)
-    held = () if inbox is None else with_acts(services.maps.store, of_inbox(inbox, services.maps.store.now_ns()))
+    held = () if inbox is None else with_acts(services.maps.store, of_inbox(inbox))
     shown: dict[str, object] = {
         "context": context,
         "site": context.site,

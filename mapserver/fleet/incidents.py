@@ -33,7 +33,8 @@ class Incident:
 
 def acts_after(store: MapStore, number: int) -> list[Event]:
     """Return what people did about incidents behind a line of the log."""
-    return [act for acts in store.incident_acts().values() for act in acts if act.id > number and act.actor]
+    acts = [act for acts in store.incident_acts().values() for act in acts if act.id > number and act.actor]
+    return sorted(acts, key=lambda act: act.id)
 
 
 def with_acts(store: MapStore, found: Iterable[Incident]) -> list[Incident]:
@@ -41,7 +42,7 @@ def with_acts(store: MapStore, found: Iterable[Incident]) -> list[Incident]:
     known, shown = store.incident_acts(), []
     for one in found:
         state, assignee, acts = "open", "", known.get(one.id, [])
-        if one.name == "failure":  # the number of one that was removed may be given again
+        if one.name in ("failure", "recording"):  # the number of a removed one, or the name, may be given again
             acts = [act for act in acts if act.stamp_ns >= one.since_ns]
         for act in acts:
             done, _, name = act.detail.partition(": ")[0].partition(" to ")

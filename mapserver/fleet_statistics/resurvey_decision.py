@@ -4,6 +4,8 @@ A tile is listed if robots fail clearly more often there than before (or, withou
 find clearly fewer of the expected landmarks.
 """
 
+import csv
+import io
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -103,11 +105,16 @@ def route(concerned: Sequence[TileConcern], places: Mapping[str, tuple[float, fl
 
 def route_csv(way: Sequence[Waypoint]) -> str:
     """Return the route as CSV: one waypoint a line, metres in `map`."""
-    lines = ["number,x_map_m,y_map_m,tile,reason"]
+    text = io.StringIO()
+    write = csv.writer(text, lineterminator="\n").writerow
+    write(("number", "x_map_m", "y_map_m", "tile", "reason"))
     for number, point in enumerate(way, start=1):
-        reason = point.reason.replace('"', "'")
-        lines.append(f'{number},{point.x_map_m:.3f},{point.y_map_m:.3f},"{point.tile}","{reason}"')
-    return "\n".join(lines) + "\n"
+        reason = " ".join(point.reason.split())
+        guard = "'" * reason.startswith(
+            ("=", "+", "-", "@")
+        )  # people choose words: none begins a formula of a spreadsheet
+        write((number, f"{point.x_map_m:.3f}", f"{point.y_map_m:.3f}", point.tile, guard + reason))
+    return text.getvalue()
 
 
 def route_geojson(site: str, version: int, way: Sequence[Waypoint]) -> dict[str, Any]:

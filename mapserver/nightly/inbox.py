@@ -197,11 +197,15 @@ def put_away(path: Path, where: str, sha256: str | None, reason: str | None) -> 
 
 @dataclass(frozen=True, slots=True)
 class InboxEntry:
-    """An entry of an inbox. size_bytes: of a file; reason: why it waits, is held or is bad; empty if the next night takes it."""
+    """An entry of an inbox. size_bytes: of a file; reason: why it waits, is held or is bad; empty if the next night takes it.
+
+    since_ns: when the reason was written, without one the entry's last change, nanoseconds since 1970; 0 if it is gone.
+    """
 
     name: str
     size_bytes: int | None
     reason: str
+    since_ns: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -237,10 +241,11 @@ def contents(inbox: Path, settle_s: float, now_ns: int) -> Inbox:
     kept: dict[str, list[InboxEntry]] = {HELD: [], BAD: []}
     for where, entries in kept.items():
         for name in names(inbox / where)[:_MOST_LISTED]:
-            path, reason = inbox / where / name, ""
+            path, reason, since_ns = inbox / where / name, "", 0
             with suppress(OSError), os.fdopen(os.open(f"{path}{_REASON}", _FOR_READING), "rb") as file:
                 reason = (file.read(_REASON_BYTES) or b"").decode("utf-8", "replace").strip()
-            entries.append(_entry(path, reason.replace(f"{inbox}/", "")))
+                since_ns = os.fstat(file.fileno()).st_mtime_ns
+            entries.append(_entry(path, reason.replace(f"{inbox}/", ""), since_ns))
     return Inbox(inbox.name, waiting[:_MOST_LISTED], kept[HELD], kept[BAD], len(names(inbox / DONE)))
 
 
@@ -252,12 +257,13 @@ def names(folder: Path) -> list[str]:
     return []
 
 
-def _entry(path: Path, reason: str) -> InboxEntry:
+def _entry(path: Path, reason: str, since_ns: int = 0) -> InboxEntry:
     size_bytes = None
     with suppress(OSError):
         status = path.lstat()
         size_bytes = status.st_size if stat.S_ISREG(status.st_mode) else None
-    return InboxEntry(path.name, size_bytes, printable(reason))
+        since_ns = since_ns or status.st_ctime_ns
+    return InboxEntry(path.name, size_bytes, printable(reason), since_ns)
 
 
 def put_back(inbox: Path, where: str, name: str) -> None:

@@ -173,11 +173,12 @@ def test_what_was_left_out_is_tried_again(server: Server, lab: Path) -> None:
     (lab / "done/3fa9c1d2e4b5-friday.mcap").touch()
     (held / name).write_bytes(b"x")
     (held / f"{name}.reason.txt").write_text(f"{lab}/{name} fits nowhere\n")
+    since_ns = (held / f"{name}.reason.txt").stat().st_mtime_ns
     (lab / "link.mcap").symlink_to("/etc/passwd")
     (lab / "ride").mkdir()
     here = server.client.get(INBOX).json()
     assert (here["held"], here["bad"], here["done"]) == (
-        [{"name": name, "size_bytes": 1, "reason": f"{name} fits nowhere"}], [], 1,
+        [{"name": name, "size_bytes": 1, "reason": f"{name} fits nowhere", "since_ns": str(since_ns)}], [], 1,
     )  # fmt: skip
     assert [one["name"] for one in here["waiting"]] == ["link.mcap", "ride"]
     assert "symbolic link" in here["waiting"][0]["reason"]

@@ -1,6 +1,7 @@
 """Incidents: what somebody must look after is acknowledged, handed over, commented, closed and reopened by route, command and webhook."""
 
 import json
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -24,7 +25,7 @@ from support.waiting import eventually
 ALERT, DRAFT, RECORDING, FAILURE = (
     "FleetmapNightFailed/lab/job 1",
     "draft/lab/3",
-    "recording/lab/held/0a-monday.mcap",
+    f"recording/lab/held/0a-{'monday' * 30}.mcap",
     "failure/lab/1",
 )
 
@@ -48,15 +49,24 @@ def act(server: Server, name: str, incident: str, **more: str) -> None:
 
 
 def states(server: Server) -> dict[str, tuple[str, str]]:
-    items = server.client.get("/v1/incidents?site=lab").json()["items"]
-    return {one["id"]: (one["state"], one["assignee"]) for one in items if one["site"]}
+    asked, found, page = {"site": "lab", "limit": "1"}, [], {"next": ""}
+    while page["next"] is not None:
+        page = server.client.get(
+            "/v1/incidents", params=asked | ({"cursor": page["next"]} if page["next"] else {})
+        ).json()
+        found += page["items"]
+    return {one["id"]: (one["state"], one["assignee"]) for one in found if one["site"]}
+
+
+def hold(inbox: Path) -> None:
+    (inbox / "held").mkdir(parents=True, exist_ok=True)
+    held = inbox / "held" / Path(RECORDING).name
+    held.touch()
+    Path(f"{held}.reason.txt").write_text("it saw another hall")
 
 
 def test_each_kind_by_route_and_command(tmp_path: Path) -> None:
-    held = tmp_path / "inbox" / "lab" / "held"
-    held.mkdir(parents=True)
-    (held / "0a-monday.mcap").touch()
-    (held / "0a-monday.mcap.reason.txt").write_text("it saw another hall")
+    hold(tmp_path / "inbox" / "lab")
     folder = tmp_path / "store"
     with served_api(folder, tmp_path / "inbox") as server:
         server.store.update_job(server.store.begin_job("lab", "nightly"), "failed", "the disk is full", {})
@@ -81,21 +91,28 @@ def test_each_kind_by_route_and_command(tmp_path: Path) -> None:
             act(server, "reopen", incident)
             assert states(server).get(incident, ("open", "")) == ("open", "")
         act(server, "close", RECORDING)
-        retry = "/v1/sites/lab/inbox/held/0a-monday.mcap/retry"
-        assert server.client.post(retry, json={"actor": "dan"}).status_code == 200
-        (tmp_path / "inbox" / "lab" / "0a-monday.mcap").rename(held / "0a-monday.mcap")
-        assert states(server)[RECORDING] == ("open", ""), "it is held again"
-        done = [line.detail.removesuffix(f": {FAILURE}") for line in server.store.audit_lines()][-8:-3]
+        assert RECORDING not in states(server)
+        hold(tmp_path / "inbox" / "lab")
+        assert states(server)[RECORDING] == ("open", ""), "another of its name is held"
+        asked = {"incident": RECORDING, "actor": "d\x1b[31mn"}
+        with ThreadPoolExecutor(4) as pool:
+            answers = [pool.submit(server.client.post, "/v1/incidents/acknowledge", json=asked) for _ in range(4)]
+        assert sorted(each.result().status_code for each in answers) == [200, 409, 409, 409], "one of them has it"
+        assert "\x1b" not in run(app, "incidents", "list", "--store", folder, "--inbox", tmp_path / "inbox")
+        done = [line.detail.removesuffix(f": {FAILURE}") for line in server.store.audit_lines()][-7:-2]
         assert done == ["acknowledged", "handed to Bob B", "commented", "closed", "reopened"]
         for name, told, status in (
             ("comment", {"incident": DRAFT}, 422),
             ("close", {"incident": "failure/lab/9"}, 404),
+            ("close", {"incident": "failure/hall/1"}, 404),
+            ("reopen", {"incident": DRAFT}, 409),
             ("close", {"incident": "draft/lab/1"}, 404),
             ("assign", {"incident": DRAFT, "to": "a: b"}, 422),
         ):
             check_problem(server.client.post(f"/v1/incidents/{name}", json=told | {"actor": "dan"}), status, "")
-        refused = invoke(app, "incidents", "assign", DRAFT, "--to", "a: b", *command)
-        assert isinstance(refused.exception, InvalidValueError)
+        for name in ("a: b", "bob\n", "b" * 65):
+            refused = invoke(app, "incidents", "assign", DRAFT, "--to", name, *command)
+            assert isinstance(refused.exception, InvalidValueError)
 
 
 def test_an_acknowledged_alert_is_silent_until_it_begins_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

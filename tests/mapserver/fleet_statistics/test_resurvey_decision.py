@@ -1,5 +1,6 @@
 """Tiles to survey again: found where robots fail more or see less than before, and nowhere else."""
 
+import csv
 import json
 import math
 from pathlib import Path
@@ -65,12 +66,14 @@ def test_positions_outside_of_all_tiles_are_no_tile() -> None:
 
 def test_the_route_goes_to_the_nearest_that_is_left() -> None:
     (one,) = concerns({"0,0": counts(50), "9,9": counts(0, 400.0)}, {}, SETTINGS)
-    found = [one] + [TileConcern(tile, ["x"], one.failures, one.failures, None, None) for tile in ("9,0", "1,0", "5,0")]
+    found = [one] + [
+        TileConcern(tile, ['=x"\ny'], one.failures, one.failures, None, None) for tile in ("9,0", "1,0", "5,0")
+    ]
     places = {concern.tile: (10.0 * int(concern.tile[0]), 0.0) for concern in found}
     way = route(found, places)
     assert [point.tile for point in way] == ["0,0", "1,0", "5,0", "9,0"]
-    lines = route_csv(way).splitlines()
-    assert len(lines) == 5 and lines[2].startswith('2,10.000,0.000,"1,0"')
+    rows = [*csv.reader(route_csv(way).splitlines())]
+    assert len(rows) == 5 and rows[2] == ["2", "10.000", "0.000", "1,0", "'=x\" y"], "no formula of a spreadsheet"
     document = json.loads(json.dumps(route_geojson("lab", 3, way)))
     assert document["type"] == "FeatureCollection"
     assert document["features"][-1]["geometry"]["coordinates"] == [[0.0, 0.0], [10.0, 0.0], [50.0, 0.0], [90.0, 0.0]]
