@@ -118,23 +118,19 @@ def _report(
 
 def _before(named: str, site: str, report_of: "Callable[[int], tuple[Report, SitePlan]]") -> "Report":
     """Return the earlier report: that of a file, or of the same drives in an earlier version."""
-    import msgspec
-
+    from fleetmap.encoding import decode_json
     from fleetmap.errors import disk_errors
-    from mapserver.plugins.acceptance.figures import FORMAT, Report
+    from mapserver.plugins.acceptance.figures import FORMAT, Numbered, Report
 
     if named.isdecimal():
         return report_of(int(named))[0]
     with disk_errors(f"{named} cannot be read", "name a version or a report", UsageError):
         data = Path(named).read_bytes()
-    try:
-        found = msgspec.json.decode(data, type=Report)
-    except msgspec.MsgspecError as error:
-        raise RecordingError(f"{named} is no acceptance report ({error}); name its acceptance.json") from error
-    if found.format != FORMAT:
-        raise UsageError(
-            f"{named} has format {found.format}, this program writes {FORMAT}; compare by the version's number"
-        )
+    words = f"{named} is no acceptance report ({{}}); name its acceptance.json"
+    number = decode_json(data, Numbered, words, RecordingError).format
+    if number != FORMAT:
+        raise UsageError(f"{named} has format {number}, this program writes {FORMAT}; compare by the version's number")
+    found = decode_json(data, Report, words, RecordingError)
     if found.site != site:
         raise UsageError(f"{named} is a report of site {found.site}; name one of site {site}")
     return found

@@ -115,7 +115,13 @@ class Figure(msgspec.Struct, frozen=True):
     is_met: bool | None
 
 
-class Report(msgspec.Struct, kw_only=True):
+class Numbered(msgspec.Struct, kw_only=True):
+    """What a report of any format tells."""
+
+    format: int = FORMAT
+
+
+class Report(Numbered, kw_only=True):
     """The report.
 
     program: version of fleetmap. promises: the operator's statements. reasons: against the site. figures: the table. similar: places that
@@ -123,7 +129,6 @@ class Report(msgspec.Struct, kw_only=True):
     robot-day that the robots reported in this version, None if they drove too little. better and worse: against an earlier report.
     """
 
-    format: int = FORMAT
     verdict: str = ""
     is_accepted: bool = False
     site: str

@@ -69,7 +69,8 @@ def judged(report: Report, settings: GateSettings, evidence: Evidence | None, fl
         again.append(evidence.views.warning)
     site = f"{report.site}, version {report.version}"
     promised = f", if {' and '.join(report.promises)}" if report.promises else ""
-    accepted = f"ACCEPTED{promised}: {site}: every figure is within its limit."
+    judged_ones = " that could be judged" if any(row.limit and row.reasons is None for row in rows) else ""
+    accepted = f"ACCEPTED{promised}: {site}: every figure{judged_ones} is within its limit."
     return msgspec.structs.replace(
         report,
         verdict=f"NOT ACCEPTED: {site}: {first_of(reasons, 1)}." if reasons else accepted,
@@ -101,7 +102,7 @@ def _of_frames(report: Report, settings: GateSettings) -> Iterator[Row]:
     reasons = [Reason(few)] if tries < settings.min_frames else []
     yield Row("Frames at a known place", str(tries), "", f"at least {settings.min_frames}", reasons)
     yield _share("Frames localized, each by itself", report, settings, lambda area: area.frames, unlocalized)
-    yield _share("the same with half the light", report, settings, half, dim)
+    yield _share("Frames localized with half the light", report, settings, half, dim)
     for words, levels, ladder in (
         (f"with 1/{', 1/'.join(str(2**stop) for stop in STOPS[1:])} of the light", STOPS[1:], whole.darkness),
         (f"with a blur of {', '.join(map(str, BLUR_PX))} px", BLUR_PX, whole.blur),
@@ -145,7 +146,7 @@ def _of_robots(report: Report, settings: GateSettings) -> Iterator[Row]:
     yield Row("Starts that stay AMBIGUOUS, or lost", f"{whole.ambiguous}, {whole.lost}")
     silent = [(area.name, area.starts.silent) for area in report.areas if area.starts.silent]
     wrong = [(area, f"{n}", Reason(f"{area}: {n} starts without a guess are silently wrong")) for area, n in silent]
-    yield _none("Starts that are silently wrong", wrong, whole.silent)
+    yield _none("Starts that are silently wrong", wrong, whole.silent, is_tried=whole.found_of_all.tries > 0)
     frames = sum(drive.frames for drive in drives)
     hits = sum(drive.localised_share * drive.frames for drive in drives)
     shares = [(-drive.localised_share, drive.name, f"{100 * drive.localised_share:.1f} %") for drive in drives]
@@ -159,7 +160,9 @@ def _of_robots(report: Report, settings: GateSettings) -> Iterator[Row]:
         )
     silent = [(drive.name, drive.silent) for drive in drives if drive.silent]
     wrong = [(drive, f"{n}", Reason(f"{drive}: {n} silent failures while driving")) for drive, n in silent]
-    yield _none("Silent failures while driving", wrong, sum(drive.silent for drive in drives))
+    # Against a drive's own replay nothing is silently wrong.
+    is_tried = any(drive.errors_mm for drive in drives)
+    yield _none("Silent failures while driving", wrong, sum(drive.silent for drive in drives), is_tried=is_tried)
     failures = [(drive.failures, drive.name, str(drive.failures)) for drive in drives]
     yield Row("Position failures while driving", str(sum(drive.failures for drive in drives)), _worst(failures))
     docks_mm = [off_mm for drive in drives for off_mm in drive.docks_mm]
@@ -188,7 +191,7 @@ def _of_site(report: Report, settings: GateSettings) -> Iterator[Row]:
         (rig, subject, Reason(f"the calibration {rig} is in doubt: {subject}: {words}"))
         for rig, subject, words in doubts
     ]
-    yield _none("Calibrations in doubt", doubted)
+    yield _none("Calibrations in doubt", doubted, is_tried=any(rig.judged for rig in report.calibrations))
     yield Row("Failures a robot-day that the fleet reported", report.fleet or "too little driving")
 
 
@@ -199,22 +202,27 @@ def _share(
     of: Callable[[AreaFigures], Count],
     reason: Callable[[AreaFigures], Reason],
 ) -> Row:
-    """Return a share's row; of areas with few tries each, which judge none of them, all together may be below the limit."""
-    count, areas = of(report.whole), [area for area in report.areas if area.name != UNKNOWN_PLACE and of(area).tries]
+    """Return a share's row; of areas with few tries each, which judge none of them, all together may be below the limit.
+
+    A share that is below, as chance may have it, is neither within its limit nor a reason.
+    """
+    count = sum(map(of, report.areas), Count())
+    areas = [area for area in report.areas if area.name != UNKNOWN_PLACE and of(area).tries]
     reasons = [reason(area) for area in areas if _is_below(of(area), settings)]
     if not reasons and _is_below(count, settings):
         reasons = [Reason(f"{name}: only {count.text}", "all areas: survey them")]
-    low, high = count.share.low, count.share.high
+    low, high, least = count.share.low, count.share.high, settings.min_localised_share
     between = "" if low is None or high is None else f" ({100 * low:.0f} to {100 * high:.0f} % with 95 %)"
     parts = [(-of(area).hits / of(area).tries, area.name, of(area).text) for area in areas]
-    limit = f"at least {100 * settings.min_localised_share:g} %"
-    return Row(name, count.text + between, _worst(parts), limit, reasons if count.tries else None)
+    is_met = count.tries > 0 and count.hits >= least * count.tries
+    judged_by = reasons if reasons or is_met else None
+    return Row(name, count.text + between, _worst(parts), f"at least {100 * least:g} %", judged_by)
 
 
-def _none(name: str, found: Sequence[Found], number: int | None = None) -> Row:
+def _none(name: str, found: Sequence[Found], number: int | None = None, *, is_tried: bool = True) -> Row:
     """Return the row of what must not be. number: default that of the places where it was found."""
     named = first_of([f"{where}: {words}" for where, words, _ in found], 1)
-    reasons = [reason for _, _, reason in found]
+    reasons = [reason for _, _, reason in found] if found or is_tried else None
     return Row(name, str(len(found) if number is None else number), named, "none", reasons)
 
 

@@ -71,7 +71,7 @@ def report(seen: Aisle, surveyed: Array, driven: Array, *, dark: str = "") -> Re
         pictures.append(Picture(probe, grey, error_m, False, rungs))
         outcome = "lost" if fix is None else "ambiguous" if aliases(view, probe) else "found"
         starts.append(Start(place[:2, 3], outcome))
-    known = "ground truth", False, 1.0, 0, 0, None, [20.0], CALIBRATION, []
+    known = "ground truth", False, 1.0, 0, 0, {"median": 9.0, "max": 30.0}, [20.0], CALIBRATION, []
     figures = DriveFigures("drive", "00", "2026-11-29", len(driven), 0.01, *known)
     ride = Drive(figures, starts, pictures, driven[:, :2, 3])
     return Report(
@@ -81,7 +81,7 @@ def report(seen: Aisle, surveyed: Array, driven: Array, *, dark: str = "") -> Re
     )  # fmt: skip
 
 
-def change_drive(report: Report, **values: float) -> None:
+def change_drive(report: Report, **values: object) -> None:
     report.drives[0] = msgspec.structs.replace(report.drives[0], **values)
 
 
@@ -142,6 +142,8 @@ def test_a_dark_aisle_is_told_so(good: Report) -> None:
     found = verdict(report(DIFFERENT, BOTH_WAYS, DRIVEN, dark="aisle 2"))
     assert "aisle 2 is too dark (grey level 5 of 255): 0 of 8 frames get a fix" in found.verdict
     assert "aisle 2: survey it with more light" in found.survey_again
+    (half,) = [line.site for line in found.figures if line.name == "Frames localized with half the light"]
+    assert half.startswith("8 of 8 "), "of aisle 1: the other one is not judged twice"
     change = compared(found, verdict(good))
     assert "aisle 2: 0 of 8 frames localized, 8 of 8 before" in change.worse
     assert not any(words.startswith("aisle 1") for words in (*change.better, *change.worse))
@@ -186,8 +188,18 @@ def test_what_was_not_tried_is_not_accepted(good: Report) -> None:
     for area in bad.areas:
         area.starts = StartCounts()
     assert "no start without a guess was tried" in verdict(bad).verdict
-    lines = {line.name: line.is_met for line in verdict(bad, KNOWN_STARTS).figures}
-    assert lines["Starts without a guess that find their place"] is None
+    change_drive(bad, errors_mm=None)
+    bad.calibrations[0] = RigEvidence("rig")
+    found = verdict(bad, KNOWN_STARTS)
+    assert "every figure that could be judged is within its limit" in found.verdict
+    silent = "Silent failures while driving", "Starts that are silently wrong"
+    assert {line.name for line in found.figures if line.limit and line.is_met is None} == {
+        *silent,
+        "Calibrations in doubt",
+    }
+    bad.areas[0].starts = StartCounts(found=1, lost=3)
+    lines = {line.name: line.is_met for line in verdict(bad).figures}
+    assert lines["Starts without a guess that find their place"] is None, "the share may well be a half"
     bad.areas.append(AreaFigures(UNKNOWN_PLACE, starts=StartCounts(found=12, silent=1)))
     assert "unknown place: 1 starts without a guess are silently wrong" in verdict(bad).verdict
 
@@ -205,7 +217,7 @@ def test_a_larger_error_is_worse_and_chance_is_not(good: Report) -> None:
 
 
 PLAN = SitePlan(
-    Plan((-10.0, -5.0), (40.0, 20.0), 20.0, (), 3, b"", ()), HALVES, {"found": ONE[:, :2, 3], "lost": np.full((1, 2), np.nan)},
+    Plan((-10.0, -5.0, 40.0, 20.0), 20.0, (), 3, b"", ()), HALVES, {"found": ONE[:, :2, 3], "lost": np.full((1, 2), np.nan)},
     [(np.array([5.0, 1.0]), "W")],
 )  # fmt: skip
 
@@ -250,6 +262,9 @@ def test_a_report_is_compared_with_one_of_its_site(good: Report, tmp_path: Path)
     assert _before(str(tmp_path / "acceptance.json"), "hall", nothing) == good
     with pytest.raises(UsageError, match="of site hall"):
         _before(str(tmp_path / "acceptance.json"), "yard", nothing)
+    (tmp_path / "acceptance.json").write_text('{"format": 1}')
+    with pytest.raises(UsageError, match="has format 1"):
+        _before(str(tmp_path / "acceptance.json"), "hall", nothing)
 
 
 # Pictures made darker and more blurred.
