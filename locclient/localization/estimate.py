@@ -74,10 +74,10 @@ class Estimate:
         cause = f" ({self.cause.value})" if self.cause.value else ""
         version = "no map" if self.map_version is None else f"version {self.map_version}"
         of_floor = f" of {self.floor}" if self.floor else ""
-        known = (
-            "" if self.map_from_body is None else f", position known to {radius_95_m(self.cov_rot_trans):.2f} m (95 %)"
-        )
-        return f"{self.status.value}{cause}, {version}{of_floor}{known}"
+        words = f"{self.status.value}{cause}, {version}{of_floor}"
+        if self.map_from_body is None:
+            return words
+        return f"{words}, position known to {radius_95_m(self.cov_rot_trans):.2f} m (95 %)"
 
     @property
     def views_in_words(self) -> str:

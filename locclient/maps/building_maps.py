@@ -92,9 +92,8 @@ class BuildingMaps:
                 if asks and isinstance(error, UnreachableError):
                     raise
                 self._note(entry.site, str(error))
-        made_of = (
-            repr([(key, floor.entry) for key, floor in floors.items()] + files).encode() if floors else alone or b""
-        )
+        known = [(key, floor.entry) for key, floor in floors.items()]
+        made_of = repr([*known, *files]).encode() if floors else alone or b""
         if made_of != self._made_of or maps:
             if made_of == self._made_of or not (floors or self._floors):
                 floors = self._floors  # the same object: a ride goes on

@@ -70,9 +70,9 @@ def rig_of(rectifier: Rectifier) -> Rig:
         CameraKind.DEPTH if each.has_depth else CameraKind.STEREO if each.camera.baseline_m > 0 else CameraKind.SINGLE
         for each in cameras
     ]
-    camera = (
-        rectifier.camera if rectifier.camera.baseline_m > 0 else replace(rectifier.camera, baseline_m=RGBD_BASELINE_M)
-    )
+    camera = rectifier.camera
+    if camera.baseline_m <= 0:
+        camera = replace(camera, baseline_m=RGBD_BASELINE_M)
     return Rig(camera, np.array([each.body_from_cam for each in cameras]), tuple(kinds))
 
 

@@ -178,9 +178,8 @@ class LoopCloser:
         reach_m = self._settings.view_range_depths * np.maximum(self._depths_m[i], self._depths_m[bodies])
         covariances, places_m = self._marginals.relative_covs(i, bodies), self._map_from_body[bodies, :3, 3]
         reachable = self._marginals.reachable(i, bodies, reach_m, covariances)
-        known = (
-            np.linalg.eigvalsh(covariances / np.outer(_WELL_KNOWN, _WELL_KNOWN))[:, -1] < 1.0
-        )  # in all directions at once
+        # In all directions at once
+        known = np.linalg.eigvalsh(covariances / np.outer(_WELL_KNOWN, _WELL_KNOWN))[:, -1] < 1.0
         known &= np.linalg.norm(places_m - here_m, axis=1) < _ALIAS_REACH * reach_m
         unlinked = np.array([self._are_unlinked(i, j) for j in bodies.tolist()])
         beyond = np.flatnonzero(~reachable & unlinked)[:top].tolist()

@@ -104,8 +104,8 @@ def decode_vocabulary(data: bytes) -> Vocabulary:
 def _checked_header(data: bytes) -> tuple[int, int]:
     """Check the header and the checksum; return the numbers of nodes and words."""
     header = data[: _HEADER.size].ljust(_HEADER.size, b"\0")
-    magic, number, reserved, nodes, words, checksum = _HEADER.unpack(header)
-    check_format("vocabulary", magic, _MAGIC, number, VOCABULARY_FORMAT)
+    _, number, reserved, nodes, words, checksum = _HEADER.unpack(header)
+    check_format("vocabulary", data[:4], _MAGIC, number, VOCABULARY_FORMAT)
     if number < 1 or reserved != 0 or not 1 <= words <= nodes <= MAX_NODES:
         raise MapFormatError(
             f"vocabulary: format {number}, {nodes} nodes, {words} words (at most {MAX_NODES}): damaged, fetch it again"

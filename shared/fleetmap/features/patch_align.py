@@ -32,10 +32,8 @@ class Patches(NamedTuple):
     @classmethod
     def of(cls, pyramid: Pyramid, features: Features, chosen: NDArray[np.int64]) -> "Patches":
         """Return the chosen features (N,) of an image."""
-        pixels, octaves = (
-            np.ascontiguousarray(features.pixels, np.float64),
-            np.ascontiguousarray(features.octaves, np.int8),
-        )
+        pixels = np.ascontiguousarray(features.pixels, np.float64)
+        octaves = np.ascontiguousarray(features.octaves, np.int8)
         return cls(pyramid, pixels, octaves, np.ascontiguousarray(features.angles_deg, np.float32), chosen)
 
 

@@ -47,8 +47,8 @@ def unpack(magic: bytes, format_number: int, data: bytes, what: str, max_bytes: 
     Raises NewerFormatError for a format above `format_number`, MapFormatError for anything else but a complete
     envelope of kind `magic` with at most `max_bytes` inside. `what` names the thing in messages.
     """
-    found, number, reserved, size = _HEADER.unpack(data[: _HEADER.size].ljust(_HEADER.size, b"\0"))
-    check_format(what, found, magic, number, format_number)
+    _, number, reserved, size = _HEADER.unpack(data[: _HEADER.size].ljust(_HEADER.size, b"\0"))
+    check_format(what, data[:4], magic, number, format_number)
     if number != format_number or reserved != 0:
         raise MapFormatError(
             f"{what}: format {number} with reserved bytes {reserved} is invalid; the bytes are damaged"

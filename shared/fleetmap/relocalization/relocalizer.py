@@ -86,10 +86,14 @@ class Relocalizer:
         earlier: other frames that count as well. Chance matches of several frames add up: so the fix must be reliable, and pose and
         motion known to within the smallest window. None otherwise.
         """
-        radius, settings = self._radius_px(map_from_cam, cov_rot_trans), self._settings.fix
+        rows, settings = self.view.visible(map_from_cam, self._camera, _NEARLY_PX, np.pi).rows, self._settings.fix
+        if not len(rows):
+            return None
+        depth_m = float(np.median(np.linalg.norm(self.view.points_map[rows] - map_from_cam[:3, 3], axis=1)))
+        radius = self._radius_px(depth_m, cov_rot_trans)
         if not earlier:
             return self.by_projection(query, map_from_cam, radius) if radius <= settings.max_radius_px else None
-        known = [e for e in earlier if self._radius_px(map_from_cam, e.cov_rot_trans) <= settings.guided_radius_px]
+        known = [e for e in earlier if self._radius_px(depth_m, e.cov_rot_trans) <= settings.guided_radius_px]
         if not known or radius > settings.guided_radius_px:
             return None
         fix = self.by_projection(query, map_from_cam, radius, known)
@@ -291,14 +295,10 @@ class Relocalizer:
         both = np.column_stack([sigmas, np.maximum(sigmas, 1.0)])
         return Correspondences(self._camera, self.view.points_map[rows], measured, both)
 
-    def _radius_px(self, map_from_cam: Array, cov_rot_trans: Array) -> float:
-        """Three sigmas of a landmark's predicted pixel, at the median distance of the expected landmarks."""
-        rows = self.view.visible(map_from_cam, self._camera, _NEARLY_PX, np.pi).rows
-        if not len(rows):
-            return np.inf
-        depth = float(np.median(np.linalg.norm(self.view.points_map[rows] - map_from_cam[:3, 3], axis=1)))
+    def _radius_px(self, depth_m: float, cov_rot_trans: Array) -> float:
+        """Three sigmas of the predicted pixel of a landmark at a distance."""
         angle, position = _sigmas(cov_rot_trans)
-        three_sigmas_px = 3.0 * self._camera.focal_px * (position / max(depth, 0.5) + angle)
+        three_sigmas_px = 3.0 * self._camera.focal_px * (position / max(depth_m, 0.5) + angle)
         return max(self._settings.fix.guided_radius_px, three_sigmas_px)
 
 

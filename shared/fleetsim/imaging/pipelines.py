@@ -11,7 +11,6 @@ from fleetsim.scene.light import sensor_noise_of
 
 Grey = NDArray[np.float32]
 _WHITE = 255.0
-# Electrons behind a grey value at gain 1, and read noise before and after the amplifier, as of the renderer's own sensor.
 # Exponents of the tone curves that tint the grey scene: warm lights, cold shadows, so that edges are coloured as well.
 _TINT_EXPONENTS = {"red": 0.9, "green": 1.0, "blue": 1.15}
 # Share of white light that a sensor's dyes transmit; the white balance divides by it, which amplifies noise.

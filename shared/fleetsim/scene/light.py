@@ -14,6 +14,7 @@ GREY_PER_MS = 70.0  # grey levels per unit radiance and millisecond of exposure 
 _AMBIENT_SHARE = 0.9  # of the unshadowed mean light on the ground
 _MEAN_REFLECTANCE = 0.32
 _TARGET_GREY, _EXPOSURES_S, _MOST_GAIN = 95.0, (0.0004, 0.010), 12.0  # of the automatic exposure
+# Electrons behind a grey value at gain 1, and read noise before and after the amplifier
 _ELECTRONS_PER_GREY, _READ_ELECTRONS, _AFTER_GAIN_GREY = 39.0, 5.0, 0.5
 
 

@@ -121,11 +121,8 @@ class World:
 
     def _light(self, key: tuple[int, int], *, is_plain: bool) -> LitFaces:
         """Light, of a detailed chunk with shadows from the boxes in it and the eight around it; further lamps are not counted."""
-        boxes, shift, faces = (
-            np.zeros((0, 8)),
-            0,
-            self._build(key, is_plain=True) if is_plain else self.detailed_faces(*key),
-        )
+        boxes, shift = np.zeros((0, 8)), 0
+        faces = self._build(key, is_plain=True) if is_plain else self.detailed_faces(*key)
         if not is_plain:
             parts = {other: self.detailed_faces(*other) for other in sorted(self._neighbours(key, 1, 1))}
             shift = sum(len(part.boxes) for other, part in parts.items() if other < key)

@@ -83,11 +83,10 @@ def test_several_frames_prove_a_place_only_where_pose_and_motion_are_known(
         return Fix(place, np.eye(6), 20, 9, landmark_recall=recall)
 
     monkeypatch.setattr(Relocalizer, "by_projection", by_projection)
-    monkeypatch.setattr(
-        Relocalizer, "_radius_px", lambda _, place, covariance: max(12.0, 600 * covariance[5, 5] ** 0.5)
-    )
-    relocalizer = Relocalizer(line_of_places(), CAMERA, RelocalizerSettings())
-    nothing = FrameFeatures(Features.empty(), np.zeros((0, 3)))
-    earlier = [EarlierFrame(nothing, np.eye(4), m**2 * np.eye(6)) for m in (0.01, motion_m)]
-    fix = relocalizer.near(nothing, np.eye(4), sigma_m**2 * np.eye(6), earlier)
+    view, moved = line_of_places(), np.diag([0.0, 0.0, 0.0, 1.0, 1.0, 1.0])
+    relocalizer = Relocalizer(view, CAMERA, RelocalizerSettings())
+    nothing, amid = FrameFeatures(Features.empty(), np.zeros((0, 3))), se3(np.eye(3), view.points_map.mean(axis=0))
+    earlier = [EarlierFrame(nothing, np.eye(4), m**2 * moved) for m in (0.01, motion_m)]
+    fix = relocalizer.near(nothing, amid, sigma_m**2 * moved, earlier)
     assert (0 if fix is None else counted[0]) == frames
+    assert relocalizer.near(nothing, se3(np.eye(3), np.full(3, 1e4)), 1e-4 * moved) is None, "nothing is in view"

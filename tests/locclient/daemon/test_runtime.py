@@ -158,8 +158,8 @@ def world(tmp_path: Path) -> Iterator[World]:
 def test_a_network_that_goes_away_changes_no_estimate_and_loses_no_report(
     world: World, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level("INFO")
     """Without a network from frame 30 to 120, dark from 60 to 100: the estimates are to the bit those of a robot alone."""
+    caplog.set_level("INFO")
     bundles = list(robot_world.bundles(130, dark=range(60, 100)))
     folder = LocalMapSource(world.folder / "store", "room")
     whole = TileLoader(folder, TileSelectionSettings()).load(folder.wanted(), PositionBound())

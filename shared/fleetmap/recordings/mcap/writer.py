@@ -7,7 +7,7 @@ calls make equal bytes.
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import AbstractContextManager, suppress
 from pathlib import Path
 
@@ -119,8 +119,8 @@ class McapRecordingWriter:
         self,
         frames: Iterable[CameraFrame | StoredFrame],
         imu: ImuSamples,
-        wheel: Iterable[WheelSample],
-        priors: Iterable[PositionPrior],
+        wheel: Sequence[WheelSample],
+        priors: Sequence[PositionPrior],
         truth: Trajectory | None,
         *,
         on_frame: Callable[[], None],
