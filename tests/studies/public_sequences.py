@@ -12,11 +12,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.common.recorded_runs import SITE, played, tool
-from benchmarks.robot.bench_real_robots import UNSEEN, mapped
+from benchmarks.robot.bench_real_robots import UNSEEN, robots_map
 from fleetmap.recordings import open_recording
 from fleetmap.recordings.tum import read_tum
 from fleetmap.sensors.samples import Trajectory
-from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
 from locclient.replay.run_result import ReplayResult
 from mapserver.evaluation.trajectory_error import absolute_trajectory_error, paired
@@ -41,18 +40,10 @@ def survey(path: Path) -> Row:
     """Every frame's pose after the adjustment of all, against the truth: after the best rigid alignment."""
     with TemporaryDirectory() as scratch:
         report, out = Path(scratch) / "report.json", Path(scratch) / "out.tum"
-        to_store = [
-            "--site",
-            SITE,
-            "--store",
-            scratch + "/store",
-            "--report",
-            str(report),
-            "--trajectory-out",
-            str(out),
-        ]
+        to_store = ["--site", SITE, "--store", f"{scratch}/store"]
+        files = ["--report", str(report), "--trajectory-out", str(out)]
         done = subprocess.run(
-            [*tool("mapserver"), "build", str(path), *to_store], capture_output=True, text=True, check=False
+            [*tool("mapserver"), "build", str(path), *to_store, *files], capture_output=True, text=True, check=False
         )
         if done.returncode:
             return {"survey": done.stderr.strip().splitlines()[-1]}
@@ -108,14 +99,13 @@ def case(name: str) -> Row:
         return row
     with TemporaryDirectory() as scratch:
         try:
-            store = mapped(Path(scratch), path)
+            store = robots_map(Path(scratch), path)
         except subprocess.CalledProcessError as error:
             return row | {"map": f"no map of the even frames: status {error.returncode}"}
-        settings = LocalizerSettings()
         with open_recording(path) as recording:
             truth = recording.ground_truth
         assert truth is not None
-        return row | odometry(played(path, store, settings), truth) | robots(played(path, store, settings, UNSEEN))
+        return row | odometry(played(path, store), truth) | robots(played(path, store, UNSEEN))
 
 
 CASES: dict[str, Callable[[], Row]] = {name: partial(case, name) for name in PEERS}

@@ -2,7 +2,6 @@
 
 import os
 import shutil
-import subprocess
 import time
 from collections.abc import Callable
 from functools import partial
@@ -12,7 +11,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from benchmarks.common.recorded_runs import SITE, played, tool
+from benchmarks.common.recorded_runs import SITE, mapped, played
 from fleetmap.errors import FleetmapError
 from fleetmap.geometry import Array, align_points, transform_points
 from fleetsim.motion.routes import Route
@@ -20,7 +19,6 @@ from fleetsim.recorder import Order, record_order
 from fleetsim.scenarios import SCENARIOS, Run, Scenario
 from fleetsim.scene.layout import Layout
 from fleetsim.sensors.faults import Fault
-from locclient.localization.settings import LocalizerSettings
 from locclient.maps.map_client import MapClient
 from locclient.maps.tile_cache import TileCache
 from locclient.replay import run_metrics
@@ -100,11 +98,7 @@ def night(number: int) -> Row:
     if number == 0:
         shutil.rmtree(WORK, ignore_errors=True)
         (WORK / "inbox").mkdir(parents=True)
-        to_store = ["--site", SITE, "--store", str(store)]
-        subprocess.run(
-            [*tool("mapserver"), "build", record(0, "survey"), *to_store, "--frame-from-ground-truth"], check=True
-        )
-        subprocess.run([*tool("mapserver"), "publish", *to_store], check=True)
+        mapped(store, Path(record(0, "survey")), WORK / "survey.json")
         said = {"state": "done", "version": 1, "recordings": [], "message": ""}
     else:
         if not store.exists():
@@ -180,7 +174,7 @@ def sits_on(points_map: Array) -> dict[str, Array]:
 def robot(number: int) -> Row:
     """A robot that wakes in the site on the next day and drives through all thirds of it."""
     path = Path(record(number, "robot"))
-    frames = played(path, WORK / "store", LocalizerSettings()).frames
+    frames = played(path, WORK / "store").frames
     path.unlink()
     errors = run_metrics.error_m(frames)
     return {

@@ -41,17 +41,13 @@ _WRONG_M = 0.5 * Layout.bay_m  # half of the smallest step by which the site rep
 
 def measure(drive: Path, keyframes: int) -> dict[str, Any]:
     """One survey's figures."""
-    with MappedImageStore(drive.parent) as store:
+    with MappedImageStore(drive.parent) as store, open_executor(1, None) as executor:
         survey = SimulatedSurvey.read(drive, keyframes, store)
-        return _measure(survey, store)
-
-
-def _measure(survey: SimulatedSurvey, store: ImageStore) -> dict[str, Any]:
-    Path("/proc/self/clear_refs").write_text("5")  # the peak from now on
-    begun_s = time.process_time()
-    with drawn_alignment(survey), open_executor(1, None) as executor:
-        made = survey.surveyed(SETTINGS, SurveyTools(images=store, executor=executor))
-    cpu_s, peak_mb = time.process_time() - begun_s, _peak_mb()
+        Path("/proc/self/clear_refs").write_text("5")  # the peak from now on
+        begun_s = time.process_time()
+        with drawn_alignment(survey):
+            made = survey.surveyed(SETTINGS, SurveyTools(images=store, executor=executor))
+        cpu_s, peak_mb = time.process_time() - begun_s, _peak_mb()
     truth = survey.map_from_body[[k.frame_index for k in made.odometry.keyframes]]
     return {
         "keyframes": len(survey.odometry.keyframes),

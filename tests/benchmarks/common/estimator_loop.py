@@ -184,12 +184,6 @@ class Observed:
     reaches_m: list[float] = field(default_factory=list)
     descriptors: list[NDArray[np.uint8]] = field(default_factory=list)
 
-    def add(self, direction: Array, reach_m: float, descriptor: NDArray[np.uint8]) -> None:
-        """One more sighting."""
-        self.directions.append(direction)
-        self.reaches_m.append(reach_m)
-        self.descriptors.append(descriptor)
-
 
 def is_new_place(last_map_from_cam: Array, map_from_cam: Array, every_m: float = _EVERY_M) -> bool:
     """Whether a map holds one more place here."""
@@ -229,8 +223,9 @@ def _add_places(
             landmark = int(sighting.ids[row])
             entry = observed.setdefault(landmark, Observed(points[feature]))
             away = map_from_cam[:3, 3] - sighting.points_map[row]
-            reach = float(sighting.distances_m[row]) * orb.SCALE_FACTOR ** float(found.octaves[feature])
-            entry.add(away / np.linalg.norm(away), reach, found.descriptors[feature])
+            entry.directions.append(away / np.linalg.norm(away))
+            entry.reaches_m.append(float(sighting.distances_m[row]) * orb.SCALE_FACTOR ** float(found.octaves[feature]))
+            entry.descriptors.append(found.descriptors[feature])
             members.append(landmark)
         places.append((map_from_cam, members))
 

@@ -5,18 +5,19 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common.estimator_loop import is_new_place, run_odometry, seen, survey_map
-from fleetmap.geometry import Array, se3, se3_inverse
+from fleetmap.geometry import Array, se3, se3_inverse, so3_exp
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.relocalization.relocalizer import Relocalizer
 from fleetmap.sensors.samples import SensorSet
 from fleetsim import recorder
 from fleetsim.motion.routes import Route
-from fleetsim.scenarios import SCENARIOS, Run, Scenario
+from fleetsim.scenarios import SCENARIOS, Run
 from fleetsim.scene.world import World
 from mapserver.config import survey_settings
 from mapserver.survey.merge.confirmation import firm_landmarks
@@ -55,8 +56,8 @@ class Drive:
     def docks(self, shift_m: float = 0.0, turn_rad: float = 0.0) -> Array:
         """map_from_survey as docks of its own building say, put wrong by a shift and a turn."""
         true = self.map_from_body[0] @ se3_inverse(self.visit.survey_from_body[0])
-        c, s = np.cos(turn_rad), np.sin(turn_rad)
-        return se3(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]), np.array([shift_m, -0.6 * shift_m, 0.0])) @ true
+        turn = so3_exp(np.array([0.0, 0.0, turn_rad]))
+        return se3(turn, np.array([shift_m, -0.6 * shift_m, 0.0])) @ true
 
 
 @dataclass(frozen=True)
@@ -119,20 +120,11 @@ def _world(scenario: str, seed: int, day: int) -> World:
 
 def session(site: Site, day: int, route: Route, name: str, robot: str = "surveyor") -> EstimatorSession:
     """A run of a robot of this name along a route on a day; names make noise of their own."""
-    base = SCENARIOS[site.scenario]()
-
-    def make() -> Scenario:
-        return replace(base, runs={name: Run(robot, (route,), rate_hz=RATE_HZ)})
-
-    own = f"{site.scenario}-joining"
-    SCENARIOS[own] = make
-    built = recorder.World
-    try:
-        recorder.World = lambda *_, **__: _world(site.scenario, site.seed, day)  # type: ignore[assignment,misc]
+    base, own = SCENARIOS[site.scenario](), f"{site.scenario}-joining"
+    here = replace(base, runs={name: Run(robot, (route,), rate_hz=RATE_HZ)})
+    world = _world(site.scenario, site.seed, day)
+    with patch.dict(SCENARIOS, {own: lambda: here}), patch.object(recorder, "World", lambda *_, **__: world):
         prepared = recorder.prepare(recorder.Order(own, seed=site.seed, day=day))
-    finally:
-        recorder.World = built  # type: ignore[misc]
-        del SCENARIOS[own]
     return EstimatorSession(prepared, field=_field(site.scenario, site.seed, day))
 
 
@@ -146,12 +138,8 @@ def drive(run: EstimatorSession) -> Drive:
     for frame in range(len(run)):
         if not frames or is_new_place(placed[frames[-1]], placed[frame]):
             frames.append(frame)
-    guess: Any = SimpleNamespace(
-        keyframes=[SimpleNamespace(frame_index=frame) for frame in frames],
-        odom_from_body=placed,
-        covariances=trajectory.covariances(),
-        inertial=trajectory.estimates[-1].inertial,
-    )
+    known: dict[str, Any] = {"covariances": trajectory.covariances(), "inertial": trajectory.estimates[-1].inertial}
+    guess: Any = SimpleNamespace(keyframe_frames=frames, odom_from_body=placed, **known)
     state: Any = SimpleNamespace(map_from_body=placed[frames])
     keyframes = [seen(run, frame) for frame in frames]
     visit = SessionKeyframes(keyframes, placed[frames], chain_edges(guess, state), run.camera, run.body_from_cam[None])

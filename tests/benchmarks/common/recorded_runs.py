@@ -7,15 +7,19 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sources.replay_source import ReplaySource
 from locclient.identity import MapAddress
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.map_client import connected
+from locclient.maps.map_source import MapSource
 from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.run_result import ReplayResult
 
@@ -63,10 +67,9 @@ def kept_folder() -> Path:
 
 
 def resident_mb() -> dict[str, float]:
-    """10^6 bytes of this process in memory, and of those what is not mapped from disk. Linux."""
-    wanted = {"VmRSS": "resident", "RssAnon": "anonymous"}
-    rows = (line.split() for line in Path("/proc/self/status").read_text().splitlines())
-    return {wanted[row[0][:-1]]: float(row[1]) * 1.024e-3 for row in rows if row and row[0][:-1] in wanted}
+    """10^6 bytes of this process in memory, and of those what is not mapped from disk."""
+    now = psutil.Process().memory_info()
+    return {"resident": now.rss / 1e6, "anonymous": (now.rss - now.shared) / 1e6}
 
 
 def write_results(path: Path | None, results: Results) -> None:
@@ -91,28 +94,40 @@ def recorded(work: Path, options: tuple[str, ...], scenario: str = "small-loop")
 
 
 def surveyed(work: Path, seed: int | None = None, scenario: str = "small-loop") -> Path:
-    """The store with the map of the survey of a site, in the frame of the truth; the simulator's first site without a seed."""
+    """The store with the map of the survey of a site; the simulator's first site without a seed."""
     options, name = ((), "") if seed is None else (("--seed", str(seed)), f"-{seed}")
     if scenario != "small-loop":
         name = f"-{scenario}{name}"
-    store = work / f"store{name}"
+    return mapped(work / f"store{name}", recorded(work, options, scenario), work / f"survey{name}.json")
+
+
+def mapped(store: Path, recording: Path, report: Path, *, frames: str = ":", accepted: Sequence[str] = ()) -> Path:
+    """A store with the map of a recording's frames in the frame of the truth, made where it is not there yet; the build's report.
+
+    accepted: options of `mapserver publish`.
+    """
     if not (store / "built").exists():
+        store.parent.mkdir(parents=True, exist_ok=True)
         to_store = ["--site", SITE, "--store", str(store)]
-        survey = recorded(work, options, scenario)
-        report = ["--report", str(work / f"survey{name}.json")]
-        subprocess.run(
-            [*tool("mapserver"), "build", str(survey), *to_store, "--frame-from-ground-truth", *report], check=True
-        )
-        subprocess.run([*tool("mapserver"), "publish", *to_store], check=True)
+        options = ["--frames", frames, "--frame-from-ground-truth", "--report", str(report)]
+        subprocess.run([*tool("mapserver"), "build", str(recording), *to_store, *options], check=True)
+        subprocess.run([*tool("mapserver"), "publish", *to_store, *accepted], check=True)
         (store / "built").touch()
     return store
 
 
-def played(
-    path: Path, store: Path, settings: LocalizerSettings, frames: str = ":", *, reverse: bool = False
-) -> ReplayResult:
-    """The recording replayed in the store's map, as `locclient replay` does."""
-    address = MapAddress(site=SITE, robot="bench", store=str(store))
-    with open_recording(path) as recording, connected(address) as link:
-        source = ReplaySource.of(recording, FrameSelection.parse(frames), reverse=reverse)
-        return replay(source, link, ReplayOptions(settings))
+def robot_in(store: Path) -> AbstractContextManager[MapSource]:
+    """A robot's way to the store's map."""
+    return connected(MapAddress(site=SITE, robot="bench", store=str(store)))
+
+
+def replayed(source: ReplaySource, store: Path, settings: LocalizerSettings | None = None) -> ReplayResult:
+    """A source's frames in the store's map, as `locclient replay` does."""
+    with robot_in(store) as link:
+        return replay(source, link, ReplayOptions(settings or LocalizerSettings()))
+
+
+def played(path: Path, store: Path, frames: str = ":", *, reverse: bool = False) -> ReplayResult:
+    """A recording's frames in the store's map."""
+    with open_recording(path) as recording:
+        return replayed(ReplaySource.of(recording, FrameSelection.parse(frames), reverse=reverse), store)

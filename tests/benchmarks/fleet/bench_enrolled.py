@@ -6,7 +6,6 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from benchmarks.common.recorded_runs import Options, Results, benchmark
 from benchmarks.fleet.server_process import resident_mb
@@ -92,7 +91,6 @@ def opening_and_revoking(folder: Path, count: int, connected: int) -> dict[str, 
 
 
 @benchmark()
-def main(options: Options) -> Results:
+def main(_: Options) -> Results:
     with tempfile.TemporaryDirectory() as name:
-        found: dict[str, Any] = {"thousand": opening_and_revoking(Path(name) / "many", 1000, 12)}
-    return found
+        return {"thousand": opening_and_revoking(Path(name) / "many", 1000, 12)}

@@ -1,30 +1,25 @@
 """What a running server costs."""
 
-import os
 import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import httpx
+import psutil
 
 SITE = "bench"
 
 
 def resident_mb(pid: int) -> float:
     """Memory of a process."""
-    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
-        if line.startswith("VmRSS:"):
-            return int(line.split()[1]) * 1024 / 1e6
-    return float("nan")
+    return float(psutil.Process(pid).memory_info().rss / 1e6)
 
 
 def cpu_s(pid: int) -> float:
     """CPU time that a process has used."""
-    words = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(words[11]) + int(words[12])) / os.sysconf("SC_CLK_TCK")
+    return float(sum(psutil.Process(pid).cpu_times()[:2]))
 
 
 @dataclass

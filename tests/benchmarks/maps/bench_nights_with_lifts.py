@@ -35,7 +35,6 @@ from fleetsim.recorder import Order, Session, record_order
 from fleetsim.scenarios import SCENARIOS, Run
 from fleetsim.sensors.faults import Fault
 from fleetsim.sensors.robots import HiddenErrors
-from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
 from mapserver.drafting.draft import BuildOptions
 from mapserver.library import build_map
@@ -147,7 +146,7 @@ def spent(folder: Path, number: int, robot: Path) -> dict[str, Any]:
     recording = recorded(folder / f"night-{number}.mcap", run, 1, 1, kind, hidden)
     row = {"night": number, "kind": kind, "miscalibrated": hidden is WRONG} | night(folder, recording)
     if "version" in row:
-        frames = played(robot, folder / "store", LocalizerSettings()).frames
+        frames = played(robot, folder / "store").frames
         row |= {"localised": run_metrics.localised_share_of_all(frames), "error_m": run_metrics.error_m(frames)}
     return row
 

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common.recorded_runs import SITE, Options, Results, benchmark, surveyed
-from benchmarks.robot.bench_real_robots import mapped
+from benchmarks.robot.bench_real_robots import robots_map
 from benchmarks.robot.standing_robot import Standing
 from fleetmap.bow.vocabulary import default_vocabulary
 from fleetmap.errors import UsageError
@@ -112,7 +112,7 @@ def bench(name: str, work: Path) -> dict[str, Any]:
         view, survey = published(surveyed(work, seed, scenario))
         probes = rendered(scenario, seed, survey)
     else:
-        view, survey = published(mapped(work, DATA / name))
+        view, survey = published(robots_map(work, DATA / name))
         probes = left_out(DATA / name, survey)
     keyframes, fixed, wrong, errors_m = [], [], 0, []
     for keyframe, probe in probes:

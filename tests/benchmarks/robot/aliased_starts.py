@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,18 +37,7 @@ class RememberingSession(EstimatorSession):
     def __init__(self, session: Session, field: LandmarkField | None, smudge: Smudge | None = None) -> None:
         super().__init__(session, field=field, smudge=smudge)
         self.field = field
-        self._sightings: dict[int, Sighting] = {}
-        self._found: dict[int, Found] = {}
-
-    def sighting(self, frame: int) -> Sighting:
-        if frame not in self._sightings:
-            self._sightings[frame] = super().sighting(frame)
-        return self._sightings[frame]
-
-    def features(self, frame: int) -> Found:
-        if frame not in self._found:
-            self._found[frame] = super().features(frame)
-        return self._found[frame]
+        self.sighting, self.features = cache(self.sighting), cache(self.features)
 
 
 class LateSession(EstimatorSession):

@@ -16,16 +16,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.common.recorded_runs import SITE, Options, Results, benchmark, recorded, surveyed
+from benchmarks.common.recorded_runs import Options, Results, benchmark, recorded, replayed, surveyed
 from fleetmap.geometry import se3_inverse
 from fleetmap.messages import Status
 from fleetmap.recordings import FrameSelection, Recording, open_recording
 from fleetmap.sensors.samples import PositionPrior, wheel_between
 from fleetmap.sources.replay_source import ReplaySource
-from locclient.identity import MapAddress
-from locclient.localization.settings import LocalizerSettings
-from locclient.maps.map_client import connected
-from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.run_result import ReplayResult
 from support.recordings.calibration_faults import (
     AXES,
@@ -118,12 +114,11 @@ def outcome(fault: str, result: ReplayResult) -> Outcome:
     )
 
 
-def played(recording: Recording, store: Path, indices: NDArray[np.int64], watched_s: float) -> ReplayResult:
-    """So many seconds of a recording's frames from the first of `indices` on, as `locclient replay` does."""
+def watched(recording: Recording, store: Path, indices: NDArray[np.int64], watched_s: float) -> ReplayResult:
+    """So many seconds of a recording's frames from the first of `indices` on."""
     stamps = recording.frame_stamps_ns[indices]
     indices = indices[stamps <= stamps[0] + watched_s * 1e9]
-    with connected(MapAddress(site=SITE, robot="bench", store=str(store))) as link:
-        return replay(ReplaySource(recording, indices, reverse=False), link, ReplayOptions(LocalizerSettings()))
+    return replayed(ReplaySource(recording, indices, reverse=False), store)
 
 
 def good_starts(
@@ -163,7 +158,7 @@ def main(options: Options) -> Results:
             every = faults(recording).items()
             runs = [(name, spoiled, indices, _WATCHED_S) for name, spoiled in every]
         for name, drive, chosen, watched_s in runs:
-            found = outcome(name, played(drive, store, chosen, watched_s))
+            found = outcome(name, watched(drive, store, chosen, watched_s))
             good = good or found
             told.append(asdict(found) | {"is_right": found.is_right(good), "begin": int(chosen[0])})
             print(json.dumps(told[-1]), flush=True)

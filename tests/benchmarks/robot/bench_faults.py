@@ -16,7 +16,6 @@ import numpy as np
 
 from benchmarks.common.recorded_runs import Options, Results, benchmark, played, recorded, surveyed
 from fleetsim.scenarios import SCENARIOS
-from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
 from locclient.replay.run_result import ReplayResult
 
@@ -106,5 +105,5 @@ def main(arguments: Options) -> Results:
     store, found = surveyed(arguments.work), []
     for name in arguments.only:
         recording = recorded(arguments.work, ("--robot", name, "--day", "1"), "faults")
-        found.append(outcome(name, played(recording, store, LocalizerSettings())))
+        found.append(outcome(name, played(recording, store)))
     return {"faults": {o.fault: asdict(o) | {"is_right": o.is_right} for o in found}}

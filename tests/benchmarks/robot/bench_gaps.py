@@ -14,14 +14,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import SITE, Options, Results, benchmark, recorded, surveyed
+from benchmarks.common.recorded_runs import Options, Results, benchmark, recorded, replayed, surveyed
 from fleetmap.messages import Status
 from fleetmap.recordings import Recording, open_recording
 from fleetmap.sensors.samples import ImuSamples
 from fleetmap.sources.replay_source import ReplaySource
-from locclient.identity import MapAddress
-from locclient.maps.map_client import connected
-from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.run_metrics import FrameRecord
 
 _GAPS_S, _SHARES = (0.25, 0.5, 1.0), (0.0, 0.25, 0.5, 0.75)
@@ -79,11 +76,10 @@ def main(arguments: Options) -> Results:
     for seed in range(arguments.seed, arguments.seed + arguments.sites):
         store = surveyed(arguments.work, seed)
         path = recorded(arguments.work, ("--robot", "tote-1", "--day", "1", "--seed", str(seed)))
-        address = MapAddress(site=SITE, robot="bench", store=str(store))
-        with open_recording(path) as recording, connected(address) as link:
+        with open_recording(path) as recording:
             for case in frames:
                 for source in _drives(recording, case, seed):
-                    frames[case] += replay(source, link, ReplayOptions()).frames
+                    frames[case] += replayed(source, store).frames
     figures = {}
     for case, found in frames.items():
         tracking = [frame for frame in found if frame.status is Status.TRACKING]

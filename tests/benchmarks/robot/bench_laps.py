@@ -12,15 +12,13 @@ import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 from dataclasses import replace
 
 from benchmarks.common.laps import repeated
-from benchmarks.common.recorded_runs import SITE, Options, Results, benchmark, recorded, resident_mb, surveyed
+from benchmarks.common.recorded_runs import Options, Results, benchmark, recorded, resident_mb, robot_in, surveyed
 from fleetmap.free_memory import give_back_free_memory
 from fleetmap.messages import Status
 from fleetmap.recordings import FrameSelection, open_recording
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.replay_source import ReplaySource
-from locclient.identity import MapAddress
 from locclient.localization.settings import LocalizerSettings
-from locclient.maps.map_client import connected
 from locclient.replay.replay import load_map
 from locclient.robot.robot import Robot
 from locclient.robot.version_trial import TrialSettings
@@ -31,8 +29,8 @@ _SETTLED_MINUTES = 5
 @benchmark(minutes=60)
 def main(arguments: Options) -> Results:
     store, path = surveyed(arguments.work), recorded(arguments.work, ())
-    address, resident, tracking = MapAddress(site=SITE, robot="bench", store=str(store)), [], 0
-    with open_recording(path) as once, connected(address) as link:
+    resident, tracking = [], 0
+    with open_recording(path) as once, robot_in(store) as link:
         laps = 2
         while (laps_ns := repeated(once, laps).frame_stamps_ns)[-1] - laps_ns[0] < arguments.minutes * 60e9:
             laps *= 2

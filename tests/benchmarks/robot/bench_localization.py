@@ -10,6 +10,7 @@ import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 # isort: split
 import json
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sources.replay_source import ReplaySource
 from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
-from locclient.replay.run_result import ReplayResult
+from locclient.replay.run_metrics import FrameRecord
 
 # Options of `fleetsim record small-loop` for the robot's recording.
 CASES: dict[str, tuple[str, ...]] = {
@@ -35,9 +36,9 @@ CASES: dict[str, tuple[str, ...]] = {
 }
 
 
-def odometry_ms(path: Path, settings: LocalizerSettings) -> list[float]:
+def odometry_ms(path: Path) -> list[float]:
     """CPU milliseconds of each frame by odometry alone, rectification included."""
-    out = []
+    out, settings = [], LocalizerSettings()
     with open_recording(path) as recording:
         source = ReplaySource.of(recording, FrameSelection.parse(":"), reverse=False)
         rectifier = Rectifier(source.calibration)
@@ -52,15 +53,13 @@ def odometry_ms(path: Path, settings: LocalizerSettings) -> list[float]:
     return out[run_metrics.WARM_UP_FRAMES :]
 
 
-def figures(result: ReplayResult) -> dict[str, Any]:
+def run_figures(frames: Sequence[FrameRecord]) -> dict[str, Any]:
     """What a run was worth, flat."""
-    frames = result.frames
     errors, angles, cpu = run_metrics.error_m(frames), run_metrics.error_deg(frames), run_metrics.frame_ms(frames)
     outside = [run_metrics.is_outside_its_bound(frame) for frame in frames if frame.error_map_m is not None]
-    first = run_metrics.first_fix(frames)
     return {
         "frames": len(frames),
-        "first_fix_frame": first,
+        "first_fix_frame": run_metrics.first_fix(frames),
         "localised_share_of_all": run_metrics.localised_share_of_all(frames),
         "localised_share": run_metrics.localised_share(frames),
         "median_mm": None if errors is None else 1e3 * errors["median"],
@@ -81,15 +80,15 @@ def figures(result: ReplayResult) -> dict[str, Any]:
 
 @benchmark(CASES)
 def main(arguments: Options) -> Results:
-    store, settings, found = surveyed(arguments.work), LocalizerSettings(), {}
+    store, found = surveyed(arguments.work), {}
     for name in arguments.only:
         recording = recorded(arguments.work, CASES[name])
-        played(recording, store, settings, ":60")
+        played(recording, store, ":60")
         give_back_free_memory()
         slow = [slowness()]
-        found[name] = figures(played(recording, store, settings))
+        found[name] = run_figures(played(recording, store).frames)
         slow.append(slowness())
-        alone = odometry_ms(recording, settings)
+        alone = odometry_ms(recording)
         found[name] |= {
             "odometry_alone_mean_ms": float(np.mean(alone)),
             "odometry_alone_p99_ms": float(np.percentile(alone, 99)),

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.common import estimator_loop
-from benchmarks.common.recorded_runs import SITE, Options, Results, benchmark, recorded, surveyed
+from benchmarks.common.recorded_runs import Options, Results, benchmark, recorded, replayed, surveyed
 from benchmarks.robot.aliased_starts import within_budget
 from fleetmap.messages import Status
 from fleetmap.recordings import open_recording
@@ -33,11 +33,8 @@ from fleetsim.recorder import Order, Session, prepare
 from fleetsim.scenarios import SCENARIOS, Run, Scenario
 from fleetsim.scene.layout import Layout
 from fleetsim.sensors.faults import Fault
-from locclient.identity import MapAddress
 from locclient.localization.estimate import Estimate
-from locclient.maps.map_client import connected
 from locclient.replay import run_metrics
-from locclient.replay.replay import ReplayOptions, replay
 from studies.robot_days.drives import judged
 from support.estimator.landmarks import LandmarkField
 from support.estimator.simulated_run import EstimatorSession
@@ -172,8 +169,7 @@ def _dropped(work: Path, share: float) -> Callable[[int, int], Outcome]:
         with open_recording(recorded(work, ("--robot", "runner-1", "--day", "1"))) as recording:
             frames = _kept(len(recording.frame_stamps_ns), share, number % 4 >= 2, rng)
             source = (_WithoutImu if number % 2 else ReplaySource)(recording, frames, reverse=False)
-            with connected(MapAddress(site=SITE, robot="bench", store=str(store))) as link:
-                result = replay(source, link, ReplayOptions())
+            result = replayed(source, store)
         tracking = float(np.mean([frame.status is Status.TRACKING for frame in result.frames]))
         says_carried = any(e.cause == "carried" for e in result.estimates)
         silent = run_metrics.silent_failures(result.frames) or 0

@@ -13,17 +13,15 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import SITE, Options, Results, benchmark, recorded, surveyed
-from benchmarks.robot.bench_real_robots import mapped
+from benchmarks.common.recorded_runs import Options, Results, benchmark, recorded, replayed, surveyed
+from benchmarks.robot.bench_localization import run_figures
+from benchmarks.robot.bench_real_robots import robots_map
 from fleetmap.messages import Status
 from fleetmap.recordings import open_recording
 from fleetmap.recordings.sensor_subset import reduced
 from fleetmap.sensors.samples import SensorSet
 from fleetmap.sources.replay_source import ReplaySource
-from locclient.identity import MapAddress
-from locclient.maps.map_client import connected
 from locclient.replay import run_metrics
-from locclient.replay.replay import ReplayOptions, replay
 from locclient.replay.run_metrics import FrameRecord
 from support.recordings.realdata import DATA
 
@@ -51,24 +49,18 @@ def _is_beyond(frame: FrameRecord) -> bool:
 
 def figures(path: Path, store: Path, use: SensorSet, *, has_wheels: bool) -> dict[str, Any]:
     """The whole drive, and the starts."""
-    with open_recording(path) as opened, connected(MapAddress(site=SITE, robot="bench", store=str(store))) as link:
+    with open_recording(path) as opened:
         kept = reduced(replace(opened, wheel=opened.wheel if has_wheels else (), priors=()), use)
         stamps_ns = kept.frame_stamps_ns
         last = int(np.searchsorted(stamps_ns, stamps_ns[-1] - int(_START_S * 1e9)))
         begins = np.unique(np.linspace(0, max(last - 1, 0), _STARTS).round().astype(int)).tolist()
         ends = [max(int(np.searchsorted(stamps_ns, stamps_ns[n] + int(_START_S * 1e9))), n + 3) for n in begins]
         whole, *starts = (
-            replay(
-                ReplaySource(kept, np.arange(a, min(b, len(stamps_ns))), reverse=False), link, ReplayOptions()
-            ).frames
+            replayed(ReplaySource(kept, np.arange(a, min(b, len(stamps_ns))), reverse=False), store).frames
             for a, b in [(0, len(stamps_ns)), *zip(begins, ends, strict=True)]
         )
-    errors = run_metrics.error_m(whole)
-    return {
+    return run_figures(whole) | {
         "near_share": float(np.mean([_is_near(frame) for frame in whole])),
-        "localised_share_of_all": run_metrics.localised_share_of_all(whole),
-        "median_mm": None if errors is None else 1e3 * errors["median"],
-        "silent_failures": run_metrics.silent_failures(whole),
         "tracking_beyond_3_sigma": sum(map(_is_beyond, whole)),
         "starts": {
             "count": len(starts),
@@ -86,7 +78,7 @@ def main(arguments: Options) -> Results:
         use, has_wheels = CASES[name]
         if name.startswith("euroc"):
             path = DATA / name
-            store = mapped(arguments.work, path, "0::1")
+            store = robots_map(arguments.work, path, "0::1")
         else:
             path, store = recorded(arguments.work, ("--robot", "tote-1", "--day", "1")), surveyed(arguments.work)
         found[name] = figures(path, store, use, has_wheels=has_wheels)

@@ -9,7 +9,6 @@ the process's.
 import benchmarks.common.one_core  # noqa: F401 -- first of all, before numpy
 
 # isort: split
-import subprocess
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,10 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.common.recorded_runs import SITE, Options, Results, benchmark, played, tool
+from benchmarks.common.recorded_runs import Options, Results, benchmark, mapped, played
 from benchmarks.common.yardstick import at_reference, mean_of, slowness
+from benchmarks.robot.bench_localization import run_figures
 from fleetmap.recordings import open_recording
-from locclient.localization.settings import LocalizerSettings
 from locclient.replay import run_metrics
 from support.recordings.realdata import DATA
 from support.room_site import KNOWN_RIG
@@ -39,18 +38,8 @@ class Case:
 
 def drive(path: Path, store: Path, *, reverse: bool) -> dict[str, Any]:
     """All odd frames in a row."""
-    frames = played(path, store, LocalizerSettings(), UNSEEN, reverse=reverse).frames
-    errors, cpu = run_metrics.error_m(frames), run_metrics.frame_ms(frames)
-    return {
-        "frames": len(frames),
-        "localised": sum(run_metrics.localised(frames)),
-        "localised_share_of_all": run_metrics.localised_share_of_all(frames),
-        "localised_share": run_metrics.localised_share(frames),
-        "median_mm": None if errors is None else 1e3 * errors["median"],
-        "max_mm": None if errors is None else 1e3 * errors["max"],
-        "silent_failures": run_metrics.silent_failures(frames),
-        "cpu_mean_ms": None if cpu is None else cpu["mean"],
-    }
+    frames = played(path, store, UNSEEN, reverse=reverse).frames
+    return run_figures(frames) | {"localised": sum(run_metrics.localised(frames))}
 
 
 def start_anywhere(path: Path, store: Path) -> dict[str, Any]:
@@ -58,9 +47,9 @@ def start_anywhere(path: Path, store: Path) -> dict[str, Any]:
     with open_recording(path) as recording:
         odd = np.arange(1, len(recording.frame_stamps_ns), 2)
     fixed, cpu_ms, errors_mm, slow = 0, [], [], []
-    played(path, store, LocalizerSettings(), ":40")  # loads what computes
+    played(path, store, ":40")  # loads what computes
     for number in odd[np.linspace(0, len(odd) - 1, _STARTS).astype(int)].tolist():
-        (frame,) = played(path, store, LocalizerSettings(), f"{number}:{number + 1}").frames
+        (frame,) = played(path, store, f"{number}:{number + 1}").frames
         fixed += frame.has_fix
         slow.append(slowness())
         cpu_ms.append(at_reference(1e3 * frame.cpu_s, slow[-1:]) or np.inf)
@@ -88,17 +77,10 @@ CASES: dict[str, Case] = {
 }
 
 
-def mapped(work: Path, path: Path, frames: str = MAPPED) -> Path:
-    """A store with the map of some frames, the even ones unless others are named, in the frame of the truth."""
+def robots_map(work: Path, path: Path, frames: str = MAPPED) -> Path:
+    """A store with the map of some frames, the even ones unless others are named."""
     store = work / path.stem / ("store" if frames == MAPPED else f"store-{frames.replace(':', '-')}")
-    if not (store / "built").exists():
-        to_store = ["--site", SITE, "--store", str(store)]
-        options = ["--frames", frames, "--frame-from-ground-truth", "--report", str(work / f"{path.stem}.json")]
-        store.parent.mkdir(parents=True, exist_ok=True)
-        subprocess.run([*tool("mapserver"), "build", str(path), *to_store, *options], check=True)
-        subprocess.run([*tool("mapserver"), "publish", *to_store, *KNOWN_RIG], check=True)
-        (store / "built").touch()
-    return store
+    return mapped(store, path, work / f"{path.stem}.json", frames=frames, accepted=KNOWN_RIG)
 
 
 @benchmark(CASES)
@@ -106,5 +88,5 @@ def main(arguments: Options) -> Results:
     found = {}
     for name in arguments.only:
         folder = DATA / CASES[name].recording
-        found[name] = CASES[name].how(folder, mapped(arguments.work, folder))
+        found[name] = CASES[name].how(folder, robots_map(arguments.work, folder))
     return {"cases": found}

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from benchmarks.common.recorded_runs import SITE, Options, Results, benchmark, surveyed
+from benchmarks.common.recorded_runs import Options, Results, benchmark, robot_in, surveyed
 from benchmarks.robot.aliased_starts import WRONG_M, part_of
 from benchmarks.robot.standing_robot import standing
 from fleetmap.geometry import Array
@@ -26,10 +26,8 @@ from fleetmap.sensors.samples import CameraFrame, wheel_between
 from fleetmap.sources.sensor_bundle import SensorBundle
 from fleetsim.imaging.pipelines import IMAGE_PIPELINES, process_frame
 from fleetsim.recorder import Order, Session, prepare
-from locclient.identity import MapAddress
 from locclient.localization.settings import LocalizerSettings
 from locclient.maps.loaded_map import LoadedMap
-from locclient.maps.map_client import connected
 from locclient.replay.replay import load_map
 from locclient.robot.robot import Robot
 from locclient.robot.version_trial import TrialSettings
@@ -112,8 +110,7 @@ def figures(found: Sequence[Start], unmapped: Sequence[Start]) -> dict[str, floa
 @benchmark(PIPELINES, seed=500, starts=30)
 def main(arguments: Options) -> Results:
     cv2.setNumThreads(1)
-    store = str(surveyed(arguments.work, arguments.seed))
-    with connected(MapAddress(site=SITE, robot="bench", store=store)) as link:
+    with robot_in(surveyed(arguments.work, arguments.seed)) as link:
         loaded = load_map(link)[0]
     drive = prepare(Order("small-loop", seed=arguments.seed, day=_DAY, light=_LIGHT, robot=_ROBOT))
     found: dict[str, tuple[list[Start], list[Start]]] = {name: ([], []) for name in arguments.only}
