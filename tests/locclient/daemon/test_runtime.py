@@ -134,6 +134,16 @@ class World:
             caches=caches,
         )
 
+    def drive(
+        self, bundles: list[SensorBundle], before: dict[int, Callable[[], None]] | None = None, *,
+        robot: Robot | None = None, source: type[ScriptedSource] = ScriptedSource,
+    ) -> list[Estimate]:  # fmt: skip
+        """What a robot tells that gets these once it has its map; does something before some of them."""
+        robot, listener = robot or robot_world.new_robot(), Listener()
+        scripted = source(bundles, before or {}, ready=lambda: robot.running is not None)
+        Runtime(self.parts(scripted, robot, listener), ServiceManager("")).run()
+        return listener.estimates
+
 
 @pytest.fixture
 def world(tmp_path: Path) -> Iterator[World]:
@@ -221,18 +231,16 @@ def test_a_robot_that_is_too_slow_for_its_frames_stays_exact_and_people_see_it(
 ) -> None:
     """On its page, in the metrics, as an alert, in its log, and as the cause once nothing in the pictures is known any more."""
     caplog.set_level("INFO")
-    robot, listener, rng = robot_world.new_robot(), Listener(), np.random.default_rng(3)
-    bundles = list(robot_world.bundles(240))
+    bundles, rng = list(robot_world.bundles(240)), np.random.default_rng(3)
     for number, bundle in enumerate(bundles[160:], 160):
         noise = rng.integers(0, 255, bundle.frame.left.shape, np.uint8)
         bundles[number] = replace(bundle, frame=CameraFrame(bundle.frame.stamp_ns, noise, noise))
-    source = CrowdedSource(bundles, ready=lambda: robot.running is not None)
-    Runtime(world.parts(source, robot, listener), ServiceManager("")).run()
-    for number, one in zip(range(3, 160, 4), listener.estimates, strict=False):
+    said = world.drive(bundles, source=CrowdedSource)
+    for number, one in zip(range(3, 160, 4), said, strict=False):
         off_m = one.map_from_body[:3, 3] - robot_world.truth(number)[:3, 3]
         assert one.status is Status.TRACKING
         assert off_m @ np.linalg.solve(one.cov_rot_trans[3:, 3:], off_m) < 16.27, "0.999 of chi-square"
-    assert Cause.OVERLOADED in {one.cause for one in listener.estimates[40:]}
+    assert Cause.OVERLOADED in {one.cause for one in said[40:]}
     (status,) = world.fleet.robots("room")
     lines = [record.getMessage() for record in caplog.records]
     assert sum(int(n) for line in lines for n in re.findall(r"^lost: (\d+) frames dropped", line)) == 180
@@ -303,9 +311,7 @@ def test_a_new_version_is_taken_while_driving(world: World) -> None:
 
 
 def test_a_robot_that_is_told_its_place_believes_it_until_fixes_outweigh_it(world: World) -> None:
-    robot, listener = robot_world.new_robot(), Listener()
-    source = ScriptedSource(list(robot_world.bundles(150)), ready=lambda: robot.running is not None)
-    parts = world.parts(source, robot, listener)
+    robot = robot_world.new_robot()
     place = robot_world.truth(60) @ se3_inverse(robot.base_from_body)
     told = InitialPoseMessage(
         site="room", robot="r1", x_map_m=float(place[0, 3]) + 6.0, y_map_m=float(place[1, 3]), heading_rad=0.0
@@ -315,40 +321,36 @@ def test_a_robot_that_is_told_its_place_believes_it_until_fixes_outweigh_it(worl
         with MemoryBus(world.hub) as server:
             place_robot(world.store, world.fleet, server, told, Actor("ada", "it was pushed"))
 
-    source.before[60] = tell
-    Runtime(parts, ServiceManager("")).run()
-    assert {one.status for one in listener.estimates[30:60]} == {Status.TRACKING}
-    moved = [n for n, one in enumerate(listener.estimates[60:70], 60) if one.status is Status.DEGRADED]
+    said = world.drive(list(robot_world.bundles(150)), {60: tell}, robot=robot)
+    assert {one.status for one in said[30:60]} == {Status.TRACKING}
+    moved = [n for n, one in enumerate(said[60:70], 60) if one.status is Status.DEGRADED]
     assert moved
     assert moved[0] <= 63, "within a few frames"
-    off_m = listener.estimates[moved[0]].map_from_body[:2, 3] - robot_world.truth(moved[0])[:2, 3]
+    off_m = said[moved[0]].map_from_body[:2, 3] - robot_world.truth(moved[0])[:2, 3]
     assert np.linalg.norm(off_m) == pytest.approx(6.0, abs=0.3)
-    assert listener.estimates[-1].status is Status.TRACKING
+    assert said[-1].status is Status.TRACKING
     (event,) = [event for event in world.store.events("room") if event.kind == "robot placed"]
     assert (event.actor, event.reason) == ("ada", "it was pushed")
 
 
 @pytest.mark.parametrize(("at", "ahead_ns"), [(0, 5 * 10**9), (60, 4 * 10**8), (60, 5 * 10**9), (60, 2**62)])
 def test_one_wrong_stamp_of_a_camera_and_an_imu_costs_a_frame(world: World, at: int, ahead_ns: int) -> None:
-    robot, listener, bundles = robot_world.new_robot(), Listener(), list(robot_world.bundles(100))
+    bundles = list(robot_world.bundles(100))
     wrong, stamps_ns = bundles[at], bundles[at].imu.stamps_ns.copy()
     stamps_ns[-1] = wrong.frame.stamp_ns + ahead_ns
     wrong_frame = replace(wrong.frame, stamp_ns=wrong.frame.stamp_ns + ahead_ns)
     bundles[at] = replace(wrong, frame=wrong_frame, imu=replace(wrong.imu, stamps_ns=stamps_ns))
-    source = ScriptedSource(bundles, ready=lambda: robot.running is not None)
-    Runtime(world.parts(source, robot, listener), ServiceManager("")).run()
-    assert [one.stamp_ns for one in listener.estimates[-99:]] == [
-        b.frame.stamp_ns for b in bundles if b is not bundles[at]
-    ]
-    assert {one.status for one in listener.estimates[35:67]} == {listener.estimates[-1].status} == {Status.TRACKING}
-    off_m = listener.estimates[-1].map_from_body[:3, 3] - robot_world.truth(99)[:3, 3]
+    said = world.drive(bundles)
+    assert [one.stamp_ns for one in said[-99:]] == [b.frame.stamp_ns for b in bundles if b is not bundles[at]]
+    assert {one.status for one in said[35:67]} == {said[-1].status} == {Status.TRACKING}
+    off_m = said[-1].map_from_body[:3, 3] - robot_world.truth(99)[:3, 3]
     assert np.linalg.norm(off_m) < 0.1
 
 
 @pytest.mark.parametrize("is_imu", [True, False])
 def test_a_clock_that_is_set_back_costs_its_sensor_and_people_see_it(world: World, is_imu: bool) -> None:
     """Of wheels or an IMU. That of the cameras, and thus of all, ends the run."""
-    robot, listener, bundles = robot_world.new_robot(), Listener(), list(robot_world.bundles(110))
+    robot, bundles = robot_world.new_robot(), list(robot_world.bundles(110))
     for number, bundle in enumerate(bundles):
         back_ns = 10**10 if number >= 60 else 0
         earlier_from_now = se3_inverse(robot_world.truth(number - 1)) @ robot_world.truth(number)
@@ -356,10 +358,9 @@ def test_a_clock_that_is_set_back_costs_its_sensor_and_people_see_it(world: Worl
         wheel = WheelSample(bundle.frame.stamp_ns - (0 if is_imu else back_ns), speed_mps, 0.0, 0.02, 0.02)
         imu = replace(bundle.imu, stamps_ns=bundle.imu.stamps_ns - back_ns) if is_imu else bundle.imu
         bundles[number] = replace(bundle, imu=imu, wheel=[wheel])
-    source = ScriptedSource(bundles, ready=lambda: robot.running is not None)
-    Runtime(world.parts(source, robot, listener), ServiceManager("")).run()
-    assert [one.stamp_ns for one in listener.estimates] == [bundle.frame.stamp_ns for bundle in bundles]
-    for number, one in list(enumerate(listener.estimates))[35:]:
+    said = world.drive(bundles, robot=robot)
+    assert [one.stamp_ns for one in said] == [bundle.frame.stamp_ns for bundle in bundles]
+    for number, one in list(enumerate(said))[35:]:
         off_m = one.map_from_body[:3, 3] - robot_world.truth(number)[:3, 3]
         assert one.status is Status.TRACKING
         assert off_m @ np.linalg.solve(one.cov_rot_trans[3:, 3:], off_m) < 16.27, "0.999 of chi-square"
@@ -369,8 +370,6 @@ def test_a_clock_that_is_set_back_costs_its_sensor_and_people_see_it(world: Worl
 
 def test_a_lying_account_on_the_bus_ends_nothing(world: World) -> None:
     """From frame 30 on it answers and speaks in the server's place; at the next start the server hears the failure of then."""
-    robot, listener = robot_world.new_robot(), Listener()
-    source = ScriptedSource(list(robot_world.bundles(125, dark=range(55, 95))), ready=lambda: robot.running is not None)
     honest, spoken = list(world.hub.queryables), list[str]()
     wanted = {"site": "room", "version": 1, "manifest_sha256": "0" * 64, "restored_ns": 2**63 + 5}
     placed = {"site": "room", "robot": "r1", "x_map_m": 0.0, "y_map_m": 0.0, "heading_rad": 0.0, "sigma_m": 0.5}
@@ -387,27 +386,21 @@ def test_a_lying_account_on_the_bus_ends_nothing(world: World) -> None:
                 bus.publish(robot_key("room", "r1", "initial_pose"), encode_message(placed | changed))  # type: ignore[arg-type]
             bus.publish(robot_key("room", "r1", "wanted"), encode_message(wanted | {"restored_ns": 0}))  # type: ignore[arg-type]
 
-    source.before[30] = begin
-    Runtime(world.parts(source, robot, listener), ServiceManager("")).run()
-    assert {one.status for one in listener.estimates[35:54]} == {listener.estimates[-1].status} == {Status.TRACKING}
+    said = world.drive(list(robot_world.bundles(125, dark=range(55, 95))), {30: begin})
+    assert {one.status for one in said[35:54]} == {said[-1].status} == {Status.TRACKING}
     assert {"wanted", "failures"} <= set(spoken)
     assert world.table == []
     world.hub.queryables = honest
-    robot, listener = robot_world.new_robot(), Listener()
-    source = ScriptedSource(list(robot_world.bundles(40)), ready=lambda: robot.running is not None)
-    Runtime(world.parts(source, robot, listener), ServiceManager("")).run()
-    assert (len(world.table), listener.estimates[-1].status) == (1, Status.TRACKING)
+    said = world.drive(list(robot_world.bundles(40)))
+    assert (len(world.table), said[-1].status) == (1, Status.TRACKING)
 
 
 def test_what_kills_a_thread_ends_the_daemon(world: World) -> None:
-    robot = robot_world.new_robot()
-
     def die() -> None:
         raise RuntimeError("the driver broke")
 
-    source = ScriptedSource(list(robot_world.bundles(3)), {1: die})
     with pytest.raises(FleetmapError, match=r"the thread sensors died \(RuntimeError: the driver broke\)"):
-        Runtime(world.parts(source, robot, Listener()), ServiceManager("")).run()
+        world.drive(list(robot_world.bundles(3)), {1: die})
     assert not [thread for thread in threading.enumerate() if thread.name in {"sensors", "disk", "network"}]
 
 
