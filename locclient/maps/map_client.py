@@ -136,6 +136,7 @@ class MapClient(MapSource):
         self.chunks = ChunkReader(bus, timeout_s=timeout_s, patience_s=patience_s)
         self.trust: TrustedMap | None = None
         self.takes_grids = False  # for planners, if versions have them; localization does not need them
+        self._brought: WantedVersion | None = None  # since the start, with all that this robot takes
         self.surveys: tuple[SurveyArea, ...] = ()  # that robots may make, by its last answer
         self.restored_ns = 0  # when the server's store was restored from a backup, by its last answer
         self._away: UnreachableError | None = None  # while tiles are read
@@ -202,7 +203,8 @@ class MapClient(MapSource):
             if self.trust is None:
                 raise UntrustedError("signature", "this robot has no signed lists")
             wanted = self.trust.current()
-            if wanted != active:
+            # An active version may have come before planners needed grids, or without its own.
+            if wanted != (self._brought if self.takes_grids else active):
                 self.bring(wanted)
         except (LinkError, MapFormatError, StoreError) as error:
             if active is None:
@@ -214,6 +216,7 @@ class MapClient(MapSource):
     def bring(self, wanted: WantedVersion) -> None:
         """Fetch all of a version into the cache and activate it; errors as of `fetch` and `activate`."""
         self.activate(self.fetch(wanted), wanted)
+        self._brought = wanted
 
     def fetch(self, wanted: WantedVersion) -> Manifest:
         """Fetch all of a version into the cache, where it is kept until `activate` or the next fetch; return its manifest.

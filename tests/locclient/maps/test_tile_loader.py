@@ -28,7 +28,7 @@ from locclient.maps import map_client
 from locclient.maps.building_maps import BuildingMaps
 from locclient.maps.loaded_map import PositionBound, PositionBoundTracker, TileSelectionSettings
 from locclient.maps.map_client import ChunkReader, MapClient
-from locclient.maps.map_source import LocalMapSource
+from locclient.maps.map_source import CachedMap, LocalMapSource
 from locclient.maps.tile_cache import TileCache
 from locclient.maps.tile_loader import TileLoader
 from mapserver import releases
@@ -169,17 +169,20 @@ class Network:
 
     def __init__(self, folder: Path, stack: ExitStack) -> None:
         self.cache, self.hub, self._stack = folder / "cache", MemoryHub(), stack
-        self.store = stack.enter_context(house(folder / "store", robot_world.tiles(), robot_world.tiles()))
+        self.store = stack.enter_context(
+            house(folder / "store", robot_world.tiles(), robot_world.tiles(), has_grid=True)
+        )
         init_here(self.store)
         self.bus = stack.enter_context(MemoryBus(self.hub))
         self.service = BusService(self.store, Fleet(self.store), self.bus, lambda *_: None)
 
-    def floors(self) -> BuildingMaps:
+    def floors(self, *, takes_grid_of: str = "") -> BuildingMaps:
         bus, cache = self._stack.enter_context(MemoryBus(self.hub)), TileCache(self.cache)
         root = (self.store.folder / "trust" / "1.root.json").read_bytes()
 
         def client(site: str) -> MapClient:
             made = MapClient(bus, cache, site, ROBOT, timeout_s=0.2)
+            made.takes_grids = site == takes_grid_of
             made.trust = TrustedMap(self.cache / "trust" / site, site, root, ask_over(bus, site, ROBOT, 0.2))
             return made
 
@@ -261,6 +264,14 @@ def test_without_a_server_the_disk_has_them(network: Network) -> None:
     floors = network.floors()
     floors.refresh(asks=False)
     assert [loaded.version for loaded in floors.changes[-1].maps] == [1]
+
+
+def test_planners_get_the_grid_of_a_floor_that_came_without(network: Network) -> None:
+    network.floors().refresh()
+    floors = network.floors(takes_grid_of="high")
+    floors.refresh()
+    loader = TileLoader(CachedMap(TileCache(network.cache), "low"), TileSelectionSettings())
+    assert (loader.grid(floors.held["high"], 1.0).cells == 100).any()
 
 
 # Parts: put together in order, bounded, and never believed.

@@ -162,6 +162,22 @@ def test_a_wrong_pose_is_believed_until_fixes_outweigh_it(store: MapStore) -> No
     assert all(one.status is not Status.TRACKING or off_m(one, n) < 0.3 for n, one in enumerate(estimates))
 
 
+@pytest.mark.parametrize(
+    ("beside_m", "sigma_m", "is_covered"), [(16.5, 0.5, True), (18.5, 0.5, False), (18.5, 5.0, True)]
+)
+def test_who_may_be_within_a_tile_of_the_map_may_see_it(
+    store: MapStore, beside_m: float, sigma_m: float, is_covered: bool
+) -> None:
+    robot, loaded = robot_world.new_robot(), robot_world.loaded(store)
+    robot.use(loaded)
+    last = max(loaded.manifest.tiles, key=lambda tile: tile.x)
+    x_m, y_m = (last.x + 1) * robot_world.TILE_M + beside_m, (last.y + 0.5) * robot_world.TILE_M
+    covariance = np.diag([0.05**2, 0.05**2, 0.26**2, sigma_m**2, sigma_m**2, 0.25**2])
+    told = PositionPrior(0, se3(np.eye(3), np.array([x_m, y_m, 0.0])), covariance, is_revisable=True)
+    outcome = robot.handle(replace(next(iter(robot_world.bundles(1))), priors=[told]))
+    assert outcome.may_be_mapped == is_covered
+
+
 @pytest.mark.parametrize("forget", [False, True])
 def test_a_robot_that_forgets_claims_nothing_until_it_finds_itself(store: MapStore, forget: bool) -> None:
     """In the dark, where nothing can be found: what it claims there is what it remembers."""
