@@ -59,7 +59,8 @@ def _covariance(matrix: AnyArray, _: StereoCamera) -> bool:
 def _prior_covariance(matrix: AnyArray, camera: StereoCamera) -> bool:
     """Check the covariance of a position prior; infinite variances are unconstrained axes."""
     known = np.isfinite(np.diagonal(matrix))
-    return not np.isnan(matrix).any() and _covariance(matrix[np.ix_(known, known)], camera) if known.any() else True
+    is_good = not known.any() or _covariance(matrix[np.ix_(known, known)], camera)
+    return is_good and not np.isnan(matrix).any()
 
 
 def _within(pixels: AnyArray, camera: StereoCamera) -> bool:

@@ -18,8 +18,8 @@ _LEAST_M = 3.0  # one-way places within a smaller extent are a turn, not an aisl
 
 
 def headings_of(map_from_cam: Array) -> tuple[NDArray[np.int64], NDArray[np.bool_], NDArray[np.bool_]]:
-    """Return of places (K, 4, 4) the numbers of their HEADINGS, which look neither up nor down, and which of these none near them looks
-    the other way."""
+    """Return the numbers of the HEADINGS of places (K, 4, 4), which of them look neither up nor down, and which of those are one-way: no
+    place near them looks the other way."""
     axes_map = map_from_cam[:, :2, 2]
     lengths = np.linalg.norm(axes_map, axis=1)
     level = lengths > _UPRIGHT

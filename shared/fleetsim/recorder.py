@@ -191,13 +191,10 @@ def record_order(order: Order, out: Path) -> str:
         count = len(session.frame_times_s)
         task = progress.add_task(f"recording {order.scenario}", total=count)
         name = f"{order.scenario}-{order.robot or 'first'}-seed{order.seed}-day{order.day}-{order.light}"
+        samples = session.imu, session.wheel, session.priors, session.truth
         try:
             with McapRecordingWriter(out, session.nominal, name=name) as writer:
-                writer.write_all(
-                    map(_png_frame, session.frames()),
-                    *(session.imu, session.wheel, session.priors, session.truth),
-                    on_frame=lambda: progress.advance(task),
-                )
+                writer.write_all(map(_png_frame, session.frames()), *samples, on_frame=lambda: progress.advance(task))
         finally:
             session.renderer.close()
     path_m = float(np.linalg.norm(np.diff(session.truth.positions_m, axis=0), axis=1).sum())

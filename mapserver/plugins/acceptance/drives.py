@@ -186,10 +186,11 @@ def examined(
             and (there := localised.at(prior.stamp_ns)) is not None
         ]  # fmt: skip
         stamps_ns = recording.frame_stamps_ns[selected]
+        day = str(stamps_ns[0].astype("M8[ns]").astype("M8[D]"))
         figures = DriveFigures(
             name=recording.name,
             sha256=recording.content_hash(),
-            day=day if (day := str(stamps_ns[0].astype("M8[ns]").astype("M8[D]"))) > "2000" else None,
+            day=day if day > "2000" else None,
             frames=report.frames,
             hours=round(float(stamps_ns[-1] - stamps_ns[0]) / 3.6e12, 6),
             reference=reference.source,
