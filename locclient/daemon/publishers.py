@@ -1,7 +1,7 @@
 """Publishers of estimates to the robot's own programs. To add one: a class, and a plug-in's `OutputHook` or a line in OUTPUTS."""
 
 from fleetmap.bus.zenoh_bus import Bus
-from fleetmap.errors import UsageError
+from fleetmap.errors import chosen
 from fleetmap.geometry import Array, se3_inverse
 from fleetmap.hooks import plugins
 from fleetmap.messages import EstimateMessage, Placement, covariance_entries, encode_message, robot_key
@@ -45,7 +45,5 @@ OUTPUTS = {"messagepack": OutputHook(MessagePackPublisher, lambda _section, _top
 
 def output_of(section: OutputSection) -> OutputHook:
     """Return the format of the section. UsageError for an unknown one."""
-    known = OUTPUTS if section.format in OUTPUTS else OUTPUTS | plugins("locclient.outputs")
-    if section.format not in known:
-        raise UsageError(f"[output] format = {section.format!r}; known are {' and '.join(known)}")
-    return known[section.format]
+    known: dict[str, OutputHook] = OUTPUTS if section.format in OUTPUTS else OUTPUTS | plugins("locclient.outputs")
+    return chosen("[output] format", section.format, known)

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetmap.errors import RecordingError, UsageError
+from fleetmap.errors import RecordingError, chosen
 from fleetmap.recordings import OpenOptions, Recording, open_recording
 from fleetmap.recordings.recording import WrappedFrames
 from fleetmap.sensors.calibration import RigCalibration
@@ -32,10 +32,7 @@ def sensor_set_of(path: Path, options: OpenOptions | None = None) -> SensorSet:
 
 def named_sensor_set(name: str) -> SensorSet:
     """Return the sensor set of that name; UsageError for an invalid name."""
-    try:
-        return SensorSet(name)
-    except ValueError as error:
-        raise UsageError(f"--use {name}: unknown sensor set; choose one of {', '.join(SensorSet)}") from error
+    return chosen("sensor set of --use", name, {each.value: each for each in SensorSet})
 
 
 def reduced(recording: Recording, use: SensorSet | None) -> Recording:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.encoding import decode_json
-from fleetmap.errors import UsageError, disk_errors
+from fleetmap.errors import UsageError, chosen, disk_errors
 from fleetmap.geometry import Array, se3, so3_exp
 from fleetmap.messages import Placement
 from fleetmap.sensors.rectification import StereoCamera
@@ -58,10 +58,8 @@ def read_markers(path: Path) -> MarkerList:
 
 def detector_of(dictionary: str) -> cv2.aruco.ArucoDetector:
     """Return OpenCV's detector with corners refined below a pixel; UsageError for an unknown dictionary."""
-    number = getattr(cv2.aruco, f"DICT_{dictionary}", None)
-    if not isinstance(number, int):
-        known = sorted(name.removeprefix("DICT_") for name in dir(cv2.aruco) if name.startswith("DICT_"))
-        raise UsageError(f"unknown dictionary of markers {dictionary!r}; OpenCV knows {', '.join(known)}")
+    known = {name.removeprefix("DICT_"): number for name, number in vars(cv2.aruco).items() if name.startswith("DICT_")}
+    number: int = chosen("dictionary of markers", dictionary, known)
     parameters = cv2.aruco.DetectorParameters()
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(number), parameters)
