@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 
 from fleetmap.bus.zenoh_bus import Bus
-from fleetmap.errors import UsageError
+from fleetmap.errors import StoreError, UsageError
 from fleetmap.free_memory import gc_frozen
 from fleetmap.sensors.calibration import RigCalibration
 from fleetmap.sensors.rectification import Rectifier
@@ -131,9 +131,11 @@ def daemon_parts(config: LocclientConfig) -> Iterator[RuntimeParts]:
 
 
 def _opened_outbox(file: Path, max_bytes: int) -> Outbox:
-    outbox = Outbox(file, max_bytes=max_bytes, is_needed=False)
-    if outbox.fault:
-        _log.error("failures are not kept: %s", outbox.fault)
+    outbox = Outbox(file, max_bytes=max_bytes)
+    try:
+        outbox.counts()
+    except StoreError as error:
+        _log.error("failures are not kept: %s", error)
     if outbox.set_aside is not None:
         _log.warning("the spool was damaged; it was moved to %s, and a new one was started", outbox.set_aside)
     return outbox
@@ -149,7 +151,7 @@ def _keep_recordings(
     if server.is_alone or run.replays == "off":
         return None
     replays = spool.with_name(f"{spool.stem}.replays{spool.suffix}")
-    server.replays = Outbox(replays, max_bytes=run.replays_bytes, is_needed=False)
+    server.replays = _opened_outbox(replays, run.replays_bytes)
     return ReplayQueue(server.replays, profile)
 
 

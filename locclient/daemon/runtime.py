@@ -185,9 +185,10 @@ class Runtime:
         else:
             silent_s = now_s - self._last_frame_s
             self._note_failure(robot.handle_silence(silent_s), silent_s)
-        self._held = [loaded.wanted for loaded in robot.held]
+        self._held = [loaded.wanted for loaded in robot.versions.held]
         if server is not None:
-            server.changes.extend(robot.take_changes())
+            server.changes.extend(robot.versions.changes)
+            robot.versions.changes.clear()
         self._report(now_s)
 
     def _after_frame(self, outcome: Outcome) -> None:
@@ -196,7 +197,7 @@ class Runtime:
         if self._publisher is not None:
             _send(partial(self._publisher.publish, estimate, outcome.published, self._robot.base_from_body))
         for link in self._links:
-            held = frozenset(loaded.version for loaded in self._robot.held)
+            held = frozenset(loaded.version for loaded in self._robot.versions.held)
             link.after_frame(outcome, held, self._robot.building, self._robot.visited_versions)
         was_lost, last = self._figures.search.is_long, self._figures.last
         if last is None or (estimate.status, estimate.floor) != (last.estimate.status, last.estimate.floor):
@@ -258,7 +259,7 @@ class Runtime:
             _log.warning("tile cache: %s", fault)
             self._cache_faults += 1
         tiles = {
-            "tiles_held": sum(len(loaded.tiles) for loaded in self._robot.held),
+            "tiles_held": sum(len(loaded.tiles) for loaded in self._robot.versions.held),
             "tiles_refused": sum(map(len, self._refused_tiles.values())),
             "cache_faults": self._cache_faults,
         }

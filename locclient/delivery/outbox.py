@@ -41,23 +41,11 @@ class Outbox:
     robot that cannot report must still drive. Thread-safe; each call opens the file itself.
     """
 
-    def __init__(
-        self, path: Path, *, max_bytes: int, is_needed: bool = True, wall_ns: Callable[[], int] = time.time_ns
-    ) -> None:
-        """Create the file and its folder; raise StoreError if that fails.
-
-        is_needed: if False, store the reason in `fault` instead and retry at each call.
-        """
-        self._path = path
-        self._max_bytes, self._wall_ns = max_bytes, wall_ns
+    def __init__(self, path: Path, *, max_bytes: int, wall_ns: Callable[[], int] = time.time_ns) -> None:
+        """The first call creates the file and its folder; it raises StoreError if that fails, and the next one tries again."""
+        self._path, self._max_bytes, self._wall_ns = path, max_bytes, wall_ns
+        self._is_made = False
         self.set_aside: Path | None = None
-        self._is_made, self.fault = False, ""
-        try:
-            self._make()
-        except StoreError as error:
-            if is_needed:
-                raise
-            self.fault = str(error)
 
     def _make(self) -> None:
         path = self._path
@@ -75,7 +63,7 @@ class Outbox:
         except (OSError, sqlite3.Error) as error:
             reason = f"the spool {path} cannot be used ({error}); check the disk and the file's owner, or change [run] outbox"
             raise StoreError(reason) from error
-        self._is_made, self.fault = True, ""
+        self._is_made = True
 
     def put(self, report: QueuedReport) -> None:
         """Store a report; ignore one whose id waits already. Raises StoreError on a disk error."""

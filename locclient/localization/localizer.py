@@ -38,7 +38,7 @@ class Localizer:
         self._calibration = CalibrationMonitor(self._mounting, settings.relocalizer, rig.imu_minus_cam_s)
         self.maps = HeldMaps()
         self._tracker = PoseTracker(settings, rig.mounted, rig.base_from_body, self.maps)
-        self._query = MapQuery(self._tracker, self.maps, settings, len(rig.mounted))
+        self._query = MapQuery(self._tracker, settings, len(rig.mounted))
         self._tracker.on_restart.append(self._calibration.give_up)
         self._given = GivenPrior(self._tracker)
         self._lift = LiftRide(self._tracker, self.perception.gauge)
@@ -80,7 +80,7 @@ class Localizer:
         """
         settings, mounted = self._settings.relocalizer, self._rig.mounted
         relocalizers = tuple(Relocalizer(view, camera, settings, site) for camera, _ in mounted)
-        self.maps.use(site, HeldMap(version, relocalizers, lookalikes, alias_step_m))
+        self.maps.by_floor[site] = HeldMap(version, relocalizers, lookalikes, alias_step_m)
         self._query.begin_anew()
         self._calibration.give_up()
 

@@ -16,7 +16,6 @@ from fleetmap.relocalization.relocalizer import EarlierFrame, Fix, Relocalizer
 from fleetmap.sensors.rectification import RectifiedFrame
 from fleetmap.time_sliced import TimeSliced
 from locclient.localization.alias_disambiguation import ViewpointGate
-from locclient.localization.held_maps import HeldMaps
 from locclient.localization.image_quality import UNUSABLE
 from locclient.localization.perception import Percept, QueryInput
 from locclient.localization.pose_hypothesis import PoseHypothesis
@@ -60,9 +59,9 @@ class MapQuery:
     failed: number of failed queries in a row.
     """
 
-    def __init__(self, tracker: PoseTracker, maps: HeldMaps, settings: LocalizerSettings, cameras: int = 1) -> None:
+    def __init__(self, tracker: PoseTracker, settings: LocalizerSettings, cameras: int) -> None:
         """cameras: number of those of the rig."""
-        self._tracker, self._maps, self._settings, self._track = tracker, maps, settings, settings.track
+        self._tracker, self._maps, self._settings, self._track = tracker, tracker.maps, settings, settings.track
         self.view = 0  # whose frame is queried
         self.failed = 0
         self.finished: FinishedQuery | None = None  # finished with the last frame

@@ -130,11 +130,28 @@ def replay(
 
 
 def _add(result: ReplayResult, outcome: Outcome, truth: Array | None, wall_s: float, decode_s: float) -> None:
-    """Add a frame to the result; truth: map_from_body or that in the frame of the truth, as of the result."""
-    result.frames.append(frame_record(outcome, truth if result.truth_in_map else None, wall_s, decode_s))
-    result.estimates.append(outcome.estimate)
+    """Add a frame, whose images were decoded beforehand; truth: map_from_body or that in the frame of the truth, as of the result."""
+    estimate, error_map_m, error_rad = outcome.estimate, None, None
+    if truth is not None and result.truth_in_map and estimate.map_from_body is not None:
+        error_map_m = estimate.map_from_body[:3, 3] - truth[:3, 3]
+        error_rad = rotation_angle_rad(estimate.map_from_body[:3, :3].T @ truth[:3, :3])
+    record = FrameRecord(
+        stamp_ns=estimate.stamp_ns,
+        status=estimate.status,
+        has_fix=estimate.fix is not None,
+        cov_rot_trans=estimate.cov_rot_trans,
+        error_map_m=error_map_m,
+        error_rad=error_rad,
+        cpu_s=outcome.cpu_s,
+        wall_s=wall_s,
+        stage_s={**outcome.stage_s, "decode": decode_s},
+        speed_mps=outcome.speed_mps,
+        may_be_mapped=outcome.may_be_mapped,
+    )
+    result.frames.append(record)
+    result.estimates.append(estimate)
     result.truths.append(truth)
-    result.search.handle(outcome.estimate, outcome.speed_mps, may_be_mapped=outcome.may_be_mapped)
+    result.search.handle(estimate, outcome.speed_mps, may_be_mapped=outcome.may_be_mapped)
     result.failures += outcome.failure is not None
     result.notes.extend(words for words in outcome.left_out.values() if words not in result.notes)
 
@@ -153,27 +170,6 @@ def _note_the_whole(result: ReplayResult, source: ReplaySource, unread: list[str
             result.notes.append(fit.words(recording.calibration.cameras[0]))
     if not result.truth_in_map and any(truth is not None for truth in result.truths):
         result.notes.append(result.alignment_note())
-
-
-def frame_record(outcome: Outcome, truth_map_from_body: Array | None, wall_s: float, decode_s: float) -> FrameRecord:
-    """Return the record of a frame whose images were decoded beforehand."""
-    estimate, error_map_m, error_rad = outcome.estimate, None, None
-    if truth_map_from_body is not None and estimate.map_from_body is not None:
-        error_map_m = estimate.map_from_body[:3, 3] - truth_map_from_body[:3, 3]
-        error_rad = rotation_angle_rad(estimate.map_from_body[:3, :3].T @ truth_map_from_body[:3, :3])
-    return FrameRecord(
-        stamp_ns=estimate.stamp_ns,
-        status=estimate.status,
-        has_fix=estimate.fix is not None,
-        cov_rot_trans=estimate.cov_rot_trans,
-        error_map_m=error_map_m,
-        error_rad=error_rad,
-        cpu_s=outcome.cpu_s,
-        wall_s=wall_s,
-        stage_s={**outcome.stage_s, "decode": decode_s},
-        speed_mps=outcome.speed_mps,
-        may_be_mapped=outcome.may_be_mapped,
-    )
 
 
 # --- starts without a guess: a robot that is switched on somewhere, looks around for some seconds, and knows nothing -------------------

@@ -98,7 +98,6 @@ class OnsetRecorder:
         self._belief: Belief | None = None
         self._fix: tuple[int, float] = (-(1 << 62), 0.0)
         self._break: Onset | None = None
-        self._was_odometry_lost = True
         self._least_step_ns = 1 << 62  # between two frames
         self._last: tuple[Estimate, Array] | None = None
 
@@ -107,14 +106,13 @@ class OnsetRecorder:
     ) -> None:
         """Add a frame. begun_ns: start of conditions that may become a failure, by kind; odom_from_body as of `Belief`."""
         stamp_ns, last, self._last = estimate.stamp_ns, self._last, (estimate, odom_from_body)
-        step_ns = 0 if last is None else stamp_ns - last[0].stamp_ns
         if estimate.fix is not None:
             self._fix = (stamp_ns, estimate.fix.landmark_recall)
         # A claimed pose is one without competitors that is not an unconfirmed candidate.
         if estimate.map_from_body is not None and estimate.cov_rot_trans is not None and not estimate.hypotheses:
             claimed = (estimate.map_from_body, estimate.cov_rot_trans, odom_from_body)
             self._belief = Belief(stamp_ns, *claimed, *self._fix, estimate.floor)
-        if self._breaks(estimate, step_ns):
+        if last is not None and self._breaks(last[0], estimate):
             self._break = self._onset(stamp_ns, frame, odom_from_body, estimate.view)
         for kind, began_ns in begun_ns.items():
             if kind not in self._open or self._open[kind].stamp_ns != began_ns:
@@ -157,12 +155,12 @@ class OnsetRecorder:
     def _is_break_of(self, began_ns: int) -> bool:
         return self._break is not None and self._break.stamp_ns >= began_ns - _BREAK_NS
 
-    def _breaks(self, estimate: Estimate, step_ns: int) -> bool:
+    def _breaks(self, last: Estimate, estimate: Estimate) -> bool:
         """Return True if the odometry lost its tracks in this frame although the image is good and no frame before it is missing."""
-        if step_ns:
-            self._least_step_ns = min(self._least_step_ns, step_ns)
-        is_lost = estimate.odometry.status is OdometryStatus.DEGRADED
-        begins, self._was_odometry_lost = is_lost and not self._was_odometry_lost, is_lost
+        step_ns = estimate.stamp_ns - last.stamp_ns
+        self._least_step_ns = min(self._least_step_ns, step_ns)
+        was_lost, is_lost = (each.odometry.status is OdometryStatus.DEGRADED for each in (last, estimate))
+        begins = is_lost and not was_lost
         is_next = step_ns <= _DROPPED_STEPS * self._least_step_ns
         return begins and is_next and estimate.image.cause is Cause.NONE
 

@@ -33,13 +33,14 @@ class SearchWay:
     """Path since a robot was last localized, tracking or with a fix and a usable position, or since its start.
 
     metres: by wheels or odometry; unknown_s: seconds of driving at unknown speed. seconds: total duration. was_found: localized before.
+    frames: number of all, also before.
     """
 
     metres: float = 0.0
     unknown_s: float = 0.0
     seconds: float = 0.0
     was_found: bool = False
-    _frames: int = 0
+    frames: int = 0
     _lost_frames: int = 0
     _causes: Counter[str] = field(default_factory=Counter)
     _last_ns: int | None = None
@@ -49,7 +50,7 @@ class SearchWay:
         dt_ns = 0 if self._last_ns is None else max(0, estimate.stamp_ns - self._last_ns)
         dt_s = dt_ns * 1e-9 if dt_ns <= PAUSE_NS else 0.0  # a speed does not hold for a whole pause
         self._last_ns = estimate.stamp_ns
-        self._frames += 1
+        self.frames += 1
         is_fixed = estimate.fix is not None and is_usable(estimate.status, radius_95_m(estimate.cov_rot_trans))
         if estimate.status is Status.TRACKING or is_fixed:
             self.metres = self.unknown_s = self.seconds = 0.0
@@ -82,7 +83,7 @@ class SearchWay:
     @property
     def is_lost_run(self) -> bool:
         """True if a run that ends here was not localized: never, or not any more for more than half of its frames."""
-        is_most = self._lost_frames > self._frames / 2 and not self.is_off_map
+        is_most = self._lost_frames > self.frames / 2 and not self.is_off_map
         return self.is_long and (is_most or not self.was_found)
 
     @property
@@ -92,7 +93,7 @@ class SearchWay:
         way = f"{self.metres:.1f} m{unknown}"
         if self.is_long:
             return f"not localized over {way}: {self._causes.most_common(1)[0][0]}"
-        if self.was_found or not self._frames:
+        if self.was_found or not self.frames:
             return ""
         return (
             f"no frame was localized, but {way} in {self.seconds:.1f} s are too short to say why: drive {_ENOUGH_M:g} m"
@@ -111,7 +112,7 @@ class HealthFigures:
     """
 
     def __init__(self) -> None:
-        self._all_frames = self._frames = self._localised = self.failures = 0
+        self._frames = self._localised = self.failures = 0
         self._expected = self._seen = 0  # landmarks
         self._frame_ms: deque[float] = deque(maxlen=_RECENT)
         self._first_ns: int | None = None
@@ -132,7 +133,6 @@ class HealthFigures:
                 self._first_fix_s = (estimate.stamp_ns - self._first_ns) * 1e-9
             self._expected += estimate.fix.expected
             self._seen += estimate.fix.seen
-        self._all_frames += 1
         self._frames += self._first_fix_s is not None
         self._localised += estimate.status is Status.TRACKING
         was_tracking = last is not None and last.estimate.status is Status.TRACKING
@@ -153,7 +153,7 @@ class HealthFigures:
         self._largest = {}
         flags: list[Flag | Cause] = [Cause.NO_FRAMES] if silent else []
         figures: dict[str, Figure] = {
-            "localised_share_of_all": self._localised / self._all_frames if self._all_frames else None,
+            "localised_share_of_all": self._localised / self.search.frames if self.search.frames else None,
             "localised_share": self._localised / self._frames if self._frames else None,
             "first_fix_s": self._first_fix_s,
             "first_frame_ms": self._first_frame_ms,

@@ -31,7 +31,7 @@ from locclient.robot.motion_checks import (
     accelerometer_refused,
     imu_refused,
 )
-from locclient.robot.version_trial import TrialSettings, VersionChange, VersionTrials
+from locclient.robot.version_trial import TrialSettings, VersionTrials
 
 Clock = Callable[[], float]  # seconds
 _MAY_BE_OVERLOAD = {Cause.NONE, Cause.ODOMETRY, Cause.UNMATCHED}  # what frames too far apart look like
@@ -111,7 +111,7 @@ class Robot:
         self.base_from_body = calibration.base_from_body
         self.localizer = Localizer(rectifier.rig, settings, clock_s)
         self.ring = FailureRing() if keeps_replay else None
-        self._versions = VersionTrials(trial, self._show)
+        self.versions = VersionTrials(trial, self._show)
         self._odom = ContinuousOdom(calibration.base_from_body)
         self.monitor = FailureMonitor()
         self._docks = DockCheck(calibration.base_from_body)
@@ -130,28 +130,18 @@ class Robot:
         self._site = ""  # whose map the last estimate is in
 
     @property
-    def held(self) -> list[LoadedMap]:
-        """Return the versions in memory, the confirmed one first."""
-        return self._versions.held
-
-    @property
     def running(self) -> LoadedMap | None:
         """Return the map of the site where the robot is."""
-        return self._visited.get(self._site) if self._site else self._versions.running
+        return self._visited.get(self._site) if self._site else self.versions.running
 
     @property
     def visited_versions(self) -> dict[str, int]:
         """Return the versions of the maps of the building's other sites."""
         return {site: loaded.version for site, loaded in self._visited.items()}
 
-    def take_changes(self) -> list[VersionChange]:
-        """Return changes of versions since the last call."""
-        taken, self._versions.changes = self._versions.changes, []
-        return taken
-
     def use(self, loaded: LoadedMap) -> None:
         """Use other tiles of a held version, or a new version: the first one is adopted at once, any other is put on trial."""
-        self._versions.use(loaded)
+        self.versions.use(loaded)
 
     def use_building(
         self, building: Mapping[str, Floor], maps: Sequence[LoadedMap], frame: BuildingFrame | None = None
@@ -204,14 +194,16 @@ class Robot:
         published = replace(self._odom.handle(estimate), building_from_map=self._building_from_map(), level=level)
         odom_from_body = published.odom_from_base @ self.base_from_body
         if estimate.is_at_home:
-            self._versions.handle(estimate, odom_from_body)
+            self.versions.handle(estimate, odom_from_body)
         else:
-            self._versions.pause()
+            self.versions.pause()
         speed_mps = self._speed.handle(wheel, estimate.odometry, published.odom_from_base)
         rolled = wheel if self._wheels_fault else bundle.wheel
         odometry, percept = self.localizer.perception.odometry, self.localizer.perception.percept
         if isinstance(odometry, WheelOdometry):
-            self._wheels.handle_way(rolled, odometry.seen_way, self.base_from_body @ self._rectifier.body_from_cam)
+            self._wheels.handle_way(
+                rolled, odometry.wheels.seen_way, self.base_from_body @ self._rectifier.body_from_cam
+            )
         else:
             self._wheels.handle(rolled, estimate.odometry)
         self._images_refused = self._views.refused(self._wheels, odometry.accelerometer)
@@ -249,7 +241,7 @@ class Robot:
         if self._images_refused:
             return {**self._images_refused, **self._wheels_unused, **self._load.overload}
         wheels = self._wheels.refused or self._wheels_unused
-        imu = imu_refused(odometry.imu_late_s) if odometry.refuses_imu else {}
+        imu = imu_refused(odometry.clock.off_s) if odometry.refuses_imu else {}
         return {**imu, **accelerometer_refused(odometry.accelerometer.fault), **wheels, **self._load.overload}
 
     def handle_silence(self, for_s: float) -> FailureContext | None:

@@ -93,7 +93,7 @@ class VersionTrials:
     """Two versions while one of them is on trial.
 
     good: the confirmed version; candidate: the one on trial. If the candidate fails, the good version is tried again at the same
-    place: the candidate is refused if that gives fixes, else postponed.
+    place: the candidate is refused if that gives fixes, else postponed. changes: since the caller last cleared them.
     """
 
     def __init__(self, settings: TrialSettings, show: Callable[[LoadedMap], None]) -> None:
@@ -108,6 +108,7 @@ class VersionTrials:
 
     @property
     def held(self) -> list[LoadedMap]:
+        """Return the versions in memory, the confirmed one first."""
         return [loaded for loaded in (self._good, self._candidate) if loaded is not None]
 
     @property

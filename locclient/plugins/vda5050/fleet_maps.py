@@ -27,15 +27,13 @@ _TOGETHER = 2  # space for a file, and for its extracted blobs
 _CHUNK_BYTES = 1 << 18
 _STALL_S = 30.0  # without a byte
 _MIN_BYTES_PER_S = 20_000  # mean of a file, after _STALL_S: no server may occupy the network thread for a day
+_REMEDY = "; delete a map, or raise [run] cache_bytes"
+_HALF = f": half of the room in the cache{_REMEDY}"
 _log = logging.getLogger(__name__)
 
 
-class TooLargeError(LinkError):
-    """A file that is larger than the free space."""
-
-
 class NoRoomError(StoreError):
-    """A version that does not fit into the cache."""
+    """A file that is larger than half of the room in the cache, or a version that does not fit."""
 
 
 class DuplicateMapError(StateError):
@@ -80,8 +78,8 @@ class Origins:
 def download(link: str, origins: Origins, target: IO[bytes], *, max_bytes: int) -> str:
     """Download a link into `target` and return the SHA-256. Redirections are not followed.
 
-    Raises LinkError for a refused link or a response that is an error or longer than max_bytes, UnreachableError if the server does not
-    answer or stalls, StoreError on a disk error.
+    Raises LinkError for a refused link or a response that is an error, NoRoomError for one longer than max_bytes, UnreachableError if the
+    server does not answer or stalls, StoreError on a disk error.
     """
     parts = origins.admit(link)
     connection = _connection(parts, origins)
@@ -111,11 +109,11 @@ def download(link: str, origins: Origins, target: IO[bytes], *, max_bytes: int) 
 def _receive(answer: http.client.HTTPResponse, link: str, target: IO[bytes], max_bytes: int) -> str:
     whole, received, begun_s = hashlib.sha256(), 0, time.monotonic()
     if answer.length is not None and answer.length > max_bytes:
-        raise TooLargeError(f"{link[:200]} has {answer.length} bytes, the limit is {max_bytes}")
+        raise NoRoomError(f"{link[:200]} has {answer.length} bytes, the limit is {max_bytes}{_HALF}")
     while chunk := answer.read1(_CHUNK_BYTES):
         received += len(chunk)
         if received > max_bytes:
-            raise TooLargeError(f"{link[:200]} has more than {max_bytes} bytes")
+            raise NoRoomError(f"{link[:200]} has more than {max_bytes} bytes{_HALF}")
         late_s = time.monotonic() - begun_s - _STALL_S
         if late_s > 0 and received < late_s * _MIN_BYTES_PER_S:
             raise UnreachableError(f"{link[:200]} comes too slowly: {received} bytes in {late_s + _STALL_S:.0f} s")
@@ -184,12 +182,7 @@ class FleetMaps:
         room_bytes = self._cache.room_bytes() // _TOGETHER
         fault = disk_errors(f"{self._folder} cannot be written", "make space for the cache")
         with fault, tempfile.NamedTemporaryFile(dir=self._folder, suffix=".fmex") as file:
-            try:
-                got = download(link, self._origins, file, max_bytes=max(room_bytes, 1))
-            except TooLargeError as error:
-                raise NoRoomError(
-                    f"{error}: half of the room in the cache; delete a map, or raise [run] cache_bytes"
-                ) from error
+            got = download(link, self._origins, file, max_bytes=max(room_bytes, 1))
             file.flush()
             if sha256 and got != sha256.lower():
                 raise LinkError(
@@ -209,9 +202,7 @@ class FleetMaps:
         reader.check_tiles(manifest)
         new = [blob for blob in head.blobs if blob.kind != "archive" and blob.sha256 not in self._cache]
         if sum(blob.bytes for blob in new) > self._cache.room_bytes():
-            raise NoRoomError(
-                f"version {version} does not fit into the cache; delete a map, or raise [run] cache_bytes"
-            )
+            raise NoRoomError(f"version {version} does not fit into the cache{_REMEDY}")
         for number, blob in enumerate(head.blobs):
             if blob in new:
                 self._cache.put(blob.sha256, reader.data(number))

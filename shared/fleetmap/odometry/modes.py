@@ -382,7 +382,7 @@ class StartingMode(GyroMode):
     def begin(self, stamp_ns: int) -> Mode:
         """See Mode: stereo-inertial at once if the IMU rested before the first frame."""
         start = self._static_start(stamp_ns)
-        return self if start is None else InertialMode.started(self.window, self._imu, start)
+        return self if start is None else InertialMode(self.window.restarted(start), self._imu)
 
     def process(self, frame_index: int, tracked: Tracked) -> Step:
         """See Mode; switches to stereo-inertial once gravity is known, which redefines `odom`."""
@@ -396,7 +396,7 @@ class StartingMode(GyroMode):
         start = self._static_start(stamp_ns) or self._dynamic_start()
         if start is None:
             return step
-        mode = InertialMode.started(self.window, self._imu, start)
+        mode = InertialMode(self.window.restarted(start), self._imu)
         mode.predict(stamp_ns)
         mode.window.seed(frame_index, tracked)
         change = np.asarray(mode.window.filter.odom_from_body() @ se3_inverse(old_odom_from_body))
@@ -464,11 +464,6 @@ class InertialMode(WindowMode):
         self._elsewhere_frames = 0  # consecutive frames whose descriptor matches contradicted the prediction
         self._is_pause = False
         self._guess: Array | None = None  # cam_from_previous of a bridged step until the state is moved
-
-    @classmethod
-    def started(cls, old: SlidingWindow, imu: ImuInputs, start: InitialState) -> "InertialMode":
-        """Replace another mode, with an empty window."""
-        return cls(old.restarted(start.state, start.covariance, start.stamp_ns), imu)
 
     def follow(self, rig: OdometryRig) -> None:
         super().follow(rig)
@@ -646,7 +641,7 @@ class InertialMode(WindowMode):
         motion = np.eye(4) if seen is None else seen
         odom_from_body = self._last_odom_from_body @ rig.body_from_cam @ se3_inverse(motion) @ rig.cam_from_body
         state = NavState(rotation=odom_from_body[:3, :3], position_m=odom_from_body[:3, 3])
-        window = self.window.restarted(state, np.diag([1e-10] * 15), self._frame_ns)
+        window = self.window.restarted(InitialState(state, np.diag([1e-10] * 15), self._frame_ns))
         window.seed(frame_index, tracked)
         self._imu.monitor.begin_again()
         if self._imu.has_fault:

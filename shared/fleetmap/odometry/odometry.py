@@ -11,7 +11,7 @@ from fleetmap.features.settings import StereoSettings
 from fleetmap.geometry import Array
 from fleetmap.odometry.accelerometer_check import AccelerometerCheck
 from fleetmap.odometry.estimate import OdometryEstimate
-from fleetmap.odometry.filter.msckf import NavState
+from fleetmap.odometry.filter.msckf import InitialState, NavState
 from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.gyro_clock import GyroClock
 from fleetmap.odometry.modes import ImuInputs, Mode, StartingMode, VisualMode
@@ -38,7 +38,7 @@ class Odometry:
         self._rig, self._stereo_settings = OdometryRig(rig, settings), stereo_settings
         self._samples = SensorBuffer()
         self.accelerometer = AccelerometerCheck(rig.base_from_body)
-        self._clock = GyroClock(MAX_OFFSET_SIGMAS * settings.filter.time_offset_sigma_s)
+        self.clock = GyroClock(MAX_OFFSET_SIGMAS * settings.filter.time_offset_sigma_s)
         self._tracker = self._new_tracker(0, 0)
         self._before: RectifiedFrame | None = None  # of a camera that is followed from the next frame on
         self._mode = self._first_mode()
@@ -99,11 +99,6 @@ class Odometry:
         """True if the images contradicted the IMU's rotation, so that it is no longer used."""
         return self._rig.imu is not None and type(self._mode) is VisualMode
 
-    @property
-    def imu_late_s(self) -> float | None:
-        """Delay of the IMU's stamps relative to the calibration if the IMU is excluded for it; None otherwise."""
-        return self._clock.off_s
-
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """earlier_from_now (4, 4) since a frame (counted from 0) as known now, and its covariance.
 
@@ -118,7 +113,7 @@ class Odometry:
         return self._mode.will_forget(frame_index)
 
     def _first_mode(self) -> Mode:
-        window = SlidingWindow(self._rig, NavState(), np.diag([1e-10] * 15), 0)
+        window = SlidingWindow(self._rig, InitialState(NavState(), np.diag([1e-10] * 15), 0))
         if self._rig.imu is None:
             return VisualMode(window)
-        return StartingMode(window, ImuInputs(self._rig, self._samples, self._clock, self.accelerometer))
+        return StartingMode(window, ImuInputs(self._rig, self._samples, self.clock, self.accelerometer))

@@ -296,7 +296,9 @@ def run_localizer(
 
     localizer.perception.odometry._new_tracker = new_tracker  # type: ignore[method-assign]
     localizer.perception.odometry._tracker = new_tracker(0, 0)
-    localizer.maps.use("", HeldMap(1, tuple(SessionRelocalizer(view, each, settings) for each in views), lookalikes))
+    localizer.maps.by_floor[""] = HeldMap(
+        1, tuple(SessionRelocalizer(view, each, settings) for each in views), lookalikes
+    )
     if prior is not None:
         localizer.handle_prior(prior)
     estimates, last_ns = [], 0

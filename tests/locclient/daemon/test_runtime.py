@@ -293,7 +293,9 @@ def test_a_new_version_is_taken_while_driving(world: World) -> None:
         with MemoryBus(world.hub) as server:
             server.publish(robot_key("room", "r1", "wanted"), encode_message(current))
         deadline = time.monotonic() + 20
-        while len(robot.held) < 2 and time.monotonic() < deadline:  # the thread that localizes takes it between frames
+        while (
+            len(robot.versions.held) < 2 and time.monotonic() < deadline
+        ):  # the thread that localizes takes it between frames
             time.sleep(0.01)
 
     source.before[70] = publish

@@ -22,9 +22,9 @@ def report(name: str, size: int = 10) -> QueuedReport:
 
 def test_what_waits_survives_a_restart_in_order(tmp_path: Path) -> None:
     spool = Outbox(tmp_path / "new" / "spool.sqlite3", max_bytes=10_000)
-    assert stat.S_IMODE((tmp_path / "new" / "spool.sqlite3").stat().st_mode) == OWN_FILE
     for name in ("a", "b", "c"):
         spool.put(report(name))
+    assert stat.S_IMODE((tmp_path / "new" / "spool.sqlite3").stat().st_mode) == OWN_FILE
     spool.put(report("a", size=20))
     again = Outbox(tmp_path / "new" / "spool.sqlite3", max_bytes=10_000)
     assert again.waiting(10) == [report("a"), report("b"), report("c")]
@@ -49,10 +49,10 @@ def test_the_oldest_are_dropped_and_counted(tmp_path: Path) -> None:
 def test_a_damaged_file_is_set_aside(tmp_path: Path, content: bytes) -> None:
     (tmp_path / "spool").write_bytes(content)
     spool = Outbox(tmp_path / "spool", max_bytes=1000)
-    assert spool.set_aside == tmp_path / "spool.damaged"
-    assert spool.set_aside.read_bytes() == content
     spool.put(report("a"))
     assert spool.waiting() == [report("a")]
+    assert spool.set_aside == tmp_path / "spool.damaged"
+    assert spool.set_aside.read_bytes() == content
 
 
 DATA = bytes(range(256)) * (5 * PART_BYTES // 512)  # two parts and a half

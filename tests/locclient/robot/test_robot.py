@@ -40,9 +40,8 @@ def test_the_first_version_is_taken_and_the_robot_finds_itself(store: MapStore) 
     assert robot.handle(bundles[0]).estimate.map_version is None
     robot.use(robot_world.loaded(store))
     errors = drive(robot, range(1, 70), bundles)
-    assert [change.change for change in robot.take_changes()] == [Change.ADOPTED]
+    assert [change.change for change in robot.versions.changes] == [Change.ADOPTED]
     assert max(errors[45:]) < 0.05
-    assert robot.take_changes() == []
 
 
 def test_a_robot_knows_where_its_map_lies_in_the_building(store: MapStore) -> None:
@@ -70,12 +69,11 @@ def test_a_version_that_slipped_is_refused_and_the_place_kept(store: MapStore) -
     robot, bundles = robot_world.new_robot(), list(robot_world.bundles(130))
     robot.use(robot_world.loaded(store))
     drive(robot, range(70), bundles)
-    robot.take_changes()
     slipped = robot_world.moved(np.array([2.0, 0.0, 0.0]))
     robot_world.save(store)
     robot.use(robot_world.loaded(store, of=slipped))
     errors = drive(robot, range(70, 130), bundles)
-    changes = robot.take_changes()
+    _, *changes = robot.versions.changes
     assert [(change.change, change.wanted.version) for change in changes] == [(Change.REFUSED, 2)]
     assert "of version 2 0 fixes and 2 that contradict it" in changes[0].reason
     assert "version 1 gives fixes" in changes[0].reason
@@ -88,12 +86,11 @@ def test_darkness_is_no_verdict_about_a_version(store: MapStore) -> None:
     bundles = list(robot_world.bundles(120, dark=range(71, 120)))
     robot.use(robot_world.loaded(store))
     drive(robot, range(70), bundles)
-    robot.take_changes()
     robot_world.save(store)
     robot.use(robot_world.loaded(store))
     drive(robot, range(70, 120), bundles)
-    assert [change.change for change in robot.take_changes()] == [Change.POSTPONED]
-    assert [held.version for held in robot.held] == [1]
+    assert [change.change for change in robot.versions.changes] == [Change.ADOPTED, Change.POSTPONED]
+    assert [held.version for held in robot.versions.held] == [1]
 
 
 def test_laps_cost_no_memory(store: MapStore) -> None:
@@ -108,7 +105,7 @@ def test_laps_cost_no_memory(store: MapStore) -> None:
     robot.use(robot_world.loaded(store))
     for number, bundle in enumerate(robot_world.bundles(LAPS * LAP_FRAMES)):
         robot.handle(bundle)
-        robot.take_changes()
+        robot.versions.changes.clear()
         if number % LAP_FRAMES == LAP_FRAMES - 1:
             resident.append(resident_bytes())
     assert resident[-1] - resident[LAPS // 2 - 1] < LAPS // 2 * LAP_FRAMES * resource.getpagesize()

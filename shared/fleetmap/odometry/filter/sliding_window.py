@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fleetmap.geometry import Array, length, rotation_angle_rad, se3_adjoint, se3_inverse
-from fleetmap.odometry.filter.msckf import InvariantFilter, NavState
+from fleetmap.odometry.filter.msckf import InitialState, InvariantFilter
 from fleetmap.odometry.odometry_checks import middle
 from fleetmap.odometry.settings import OdometrySettings
 from fleetmap.odometry.tracking.tracker import Tracked
@@ -35,27 +35,26 @@ class OdometryRig:
 class SlidingWindow:
     """The state at stamp_ns (IMU clock), one clone for each frame that is kept, and the observations not used yet."""
 
-    def __init__(self, rig: OdometryRig, state: NavState, covariance: Array, stamp_ns: int) -> None:
-        """covariance (15, 15) in the filter's error."""
-        self.rig, self.stamp_ns = rig, stamp_ns
+    def __init__(self, rig: OdometryRig, start: InitialState) -> None:
+        self.rig, self.stamp_ns = rig, start.stamp_ns
         self.rate_body_radps = np.zeros(3)  # at the state, without bias
         self.scene_depth_m = _UNKNOWN_DEPTH_M
         self.contradicts_images = False
         self._judged = deque[NDArray[np.int8]](maxlen=_JUDGED_UPDATES)  # accepted and refused tracks
         self._refused_frames = 0  # in a row in which the filter refused tracks and accepted none
         settings = rig.settings.filter
-        true_error_cov = settings.real_start_share**2 * covariance
+        true_error_cov = settings.real_start_share**2 * start.covariance
         if rig.imu is not None:  # the mean of a steady gyro is far more accurate than its weight
             true_error_cov[9:12, :], true_error_cov[:, 9:12] = 0.0, 0.0
             true_error_cov[range(9, 12), range(9, 12)] = settings.real_gyro_bias_sigma_radps**2
-        self.filter = InvariantFilter(state, covariance, settings, rig.mounted, true_error_cov)
+        self.filter = InvariantFilter(start.state, start.covariance, settings, rig.mounted, true_error_cov)
         self._stamps_ns: dict[int, int] = {}
         # Frames dropped with the newest: a frame that is kept, and kept_from_dropped.
         self._merged: dict[int, tuple[int, Array]] = {}
 
-    def restarted(self, state: NavState, covariance: Array, stamp_ns: int) -> "SlidingWindow":
+    def restarted(self, start: InitialState) -> "SlidingWindow":
         """An empty window of the same scene."""
-        window = type(self)(self.rig, state, covariance, stamp_ns)
+        window = type(self)(self.rig, start)
         window.scene_depth_m = self.scene_depth_m
         return window
 

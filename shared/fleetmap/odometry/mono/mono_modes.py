@@ -17,7 +17,7 @@ from fleetmap.odometry.filter.sliding_window import OdometryRig, SlidingWindow
 from fleetmap.odometry.init.imu_alignment import mono_inertial_initialization, static_initialization
 from fleetmap.odometry.modes import ImuInputs, InertialMode, Mode, StartingMode, Step, VisualMode, WindowMode
 from fleetmap.odometry.mono.mono_vo import VisualEstimate, VisualOdometry
-from fleetmap.odometry.mono.wheel_mode import SeenWay, WheelMode
+from fleetmap.odometry.mono.wheel_mode import WheelMode
 from fleetmap.odometry.odometry import Odometry
 from fleetmap.odometry.odometry_checks import is_image_still
 from fleetmap.odometry.sensor_buffer import IMU_GAP_NS
@@ -39,8 +39,8 @@ Ids = NDArray[np.int64]
 class MonocularWindow(SlidingWindow):
     """The window of one camera: depth comes from points triangulated from several frames."""
 
-    def __init__(self, rig: OdometryRig, state: NavState, covariance: Array, stamp_ns: int) -> None:
-        super().__init__(rig, state, covariance, stamp_ns)
+    def __init__(self, rig: OdometryRig, start: InitialState) -> None:
+        super().__init__(rig, start)
         self.is_blind = False  # its speed is not known well enough to place points by its way
         self._sightings: dict[int, list[tuple[int, Array]]] = {}
 
@@ -146,7 +146,7 @@ class MonocularMode(Mode):
 
     def cam_from_earlier(self, frame_index: int) -> Array | None:
         """See Mode: repeats the last motion, for the frame before."""
-        return self.visual_odometry.motion_guess()
+        return se3_inverse(self.visual_odometry.step)
 
     def motion_since(self, frame_index: int) -> tuple[Array, Array] | None:
         """See Mode: none while the image stands still, of any scale. Else the gyro's turn, and a way of unknown direction and speed."""
@@ -259,7 +259,7 @@ class MonocularMode(Mode):
 
         After motion: all frames since vision began; after rest: those since the image stands still.
         """
-        window = MonocularWindow(self._rig, start.state, start.covariance, start.stamp_ns)
+        window = MonocularWindow(self._rig, start)
         window.scene_depth_m = self._visual.depth * (1.0 if metres_per_unit is None else metres_per_unit)
         mode = InertialMode(window, imu)
         mode.predict(self.stamp_ns)
@@ -414,7 +414,7 @@ class MonocularOdometry(Odometry):
         start = self._by_map.handle(at.stamp_ns + offset_ns, map_from_body, cov_rot_trans, needed=needed)
         if start is None or (last.scale_known and last.status is not OdometryStatus.DEGRADED and self._blind is None):
             return
-        window = MonocularWindow(self._rig, start.state, start.covariance, start.stamp_ns)
+        window = MonocularWindow(self._rig, start)
         window.filter = InvariantFilter(start.state, start.covariance, self._rig.settings.filter, self._rig.mounted)
         # Before it is certainly in motion, its images cannot place points, whose distance its step measures.
         velocity_mps = start.state.velocity_mps
@@ -434,7 +434,7 @@ class MonocularOdometry(Odometry):
 
     def _first_mode(self) -> Mode:
         rig = self._rig
-        imu = None if rig.imu is None else ImuInputs(rig, self._samples, self._clock)
+        imu = None if rig.imu is None else ImuInputs(rig, self._samples, self.clock)
         self.vision = MonocularMode(rig, imu)
         self._by_map = None if imu is None else MapStart(rig, imu)
         return self.vision
@@ -454,13 +454,8 @@ class WheelOdometry(Odometry):
     """The class `Odometry` for one camera and wheels, see `WheelMode`."""
 
     def _first_mode(self) -> Mode:
-        self._wheels = WheelMode(self._rig, self._samples)
-        return self._wheels
+        self.wheels = WheelMode(self._rig, self._samples)
+        return self.wheels
 
     def _points_in_camera(self, ids: Ids) -> Array:
         return np.full((len(ids), 3), np.nan)
-
-    @property
-    def seen_way(self) -> SeenWay | None:
-        """The way of the camera by the images alone, if one ends with the last frame."""
-        return self._wheels.seen_way

@@ -63,7 +63,7 @@ class VisualOdometry:
         self._map = _LocalMap()
         self._waiting: list[Frame] = []
         self._last = np.eye(4)  # vision_from_cam of the frame before
-        self._step = np.eye(4)  # previous camera from this one
+        self.step = np.eye(4)  # previous camera from this one
         self._covariance = np.zeros((6, 6))
         self.depth = settings.first_depth
 
@@ -77,18 +77,14 @@ class VisualOdometry:
         known = np.array([self._map.points.get(i, _NOWHERE) for i in ids.tolist()]).reshape(-1, 3)
         return transform_points(se3_inverse(self._last), known)
 
-    def motion_guess(self) -> Array:
-        """cam_from_previous (4, 4), equal to the last step."""
-        return se3_inverse(self._step)
-
     def add(self, frame_index: int, ids: Ids, pixels: Array) -> VisualEstimate:
         """Return the estimate at one frame from the ids (N,) and pixels (N, 2) of its tracks."""
-        frame = Frame(frame_index, ids, pixels, self._last @ self._step)
+        frame = Frame(frame_index, ids, pixels, self._last @ self.step)
         if not self.started:
             return self._first_frames(frame)
         located = self._locate(frame)
         if located is None:
-            self._map, self._waiting, self._step = _LocalMap(), [frame], np.eye(4)
+            self._map, self._waiting, self.step = _LocalMap(), [frame], np.eye(4)
             return VisualEstimate(None, self._covariance, lost=True, depth=self.depth)
         frame, cov = located
         self._place_new(frame)
@@ -103,8 +99,8 @@ class VisualOdometry:
 
     def _advance(self, frame: Frame, cov: Array, revised: Iterable[Frame] = ()) -> VisualEstimate:
         vision_from_cam = frame.vision_from_cam
-        self._step = se3_inverse(self._last) @ vision_from_cam
-        length = float(np.linalg.norm(self._step[:3, 3]))
+        self.step = se3_inverse(self._last) @ vision_from_cam
+        length = float(np.linalg.norm(self.step[:3, 3]))
         rotation = np.kron(np.eye(2), vision_from_cam[:3, :3])
         grown = np.diag([1e-7] * 3 + [(self._settings.drift_share * length) ** 2 + 1e-9] * 3)
         self._covariance = self._covariance + grown + 0.1 * rotation @ (_CORRELATION**2 * cov) @ rotation.T
@@ -136,7 +132,7 @@ class VisualOdometry:
 
     def _begin(self, ids: Ids, before: Array, now: Array) -> VisualEstimate | None:
         s = self._settings
-        found = two_view_motion(self._camera, before, now, threshold_px=1.0, seed=len(ids))
+        found = two_view_motion(self._camera, before, now, seed=len(ids))
         if (
             found is None
             or found.inliers.sum() < max(s.first_min_points, 0.6 * len(ids))

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from fleetmap.geometry import Array, midpoints, se3
 from fleetmap.sensors.rectification import StereoCamera
 
-_SCORED_PX = 3.0
+_INLIER_PX, _SCORED_PX = 1.0, 3.0  # of RANSAC, and of the score
 _RIVAL_SHARE = 0.75  # a second solution that explains at least this share of the best one makes the motion ambiguous
 
 
@@ -26,9 +26,7 @@ class TwoView:
     parallax_rad: float
 
 
-def two_view_motion(
-    camera: StereoCamera, pixels_a: Array, pixels_b: Array, *, threshold_px: float, seed: int
-) -> TwoView | None:
+def two_view_motion(camera: StereoCamera, pixels_a: Array, pixels_b: Array, *, seed: int) -> TwoView | None:
     """The motion with which most matched pixels (N, 2) agree; None without one, or if two motions fit equally well.
 
     Candidates come from the essential matrix and from a homography (a flat scene has both); each is scored by the points that it
@@ -36,8 +34,9 @@ def two_view_motion(
     """
     if len(pixels_a) < 8:
         return None
-    candidates = _candidates(camera, pixels_a, pixels_b, threshold_px, seed)
-    scored = [_scored(camera, b_from_a, pixels_a, pixels_b) for b_from_a in candidates]
+    scored = [
+        _scored(camera, b_from_a, pixels_a, pixels_b) for b_from_a in _candidates(camera, pixels_a, pixels_b, seed)
+    ]
     best = max(scored, key=lambda found: int(found.inliers.sum()), default=None)
     if best is None or not best.inliers.any():
         return None
@@ -45,11 +44,11 @@ def two_view_motion(
     return None if any(rival.inliers.sum() > _RIVAL_SHARE * best.inliers.sum() for rival in rivals) else best
 
 
-def _candidates(camera: StereoCamera, pixels_a: Array, pixels_b: Array, threshold_px: float, seed: int) -> list[Array]:
+def _candidates(camera: StereoCamera, pixels_a: Array, pixels_b: Array, seed: int) -> list[Array]:
     a, b = np.ascontiguousarray(pixels_a, np.float64), np.ascontiguousarray(pixels_b, np.float64)
     cv2.setRNGSeed(seed)
     found: list[Array] = []
-    essential, _ = cv2.findEssentialMat(a, b, camera.matrix, cv2.RANSAC, 0.999, threshold_px)
+    essential, _ = cv2.findEssentialMat(a, b, camera.matrix, cv2.RANSAC, 0.999, _INLIER_PX)
     if essential is not None and essential.shape == (3, 3):
         first, second, direction = cv2.decomposeEssentialMat(essential)
         found += [
@@ -57,7 +56,7 @@ def _candidates(camera: StereoCamera, pixels_a: Array, pixels_b: Array, threshol
             for rotation in (first, second)
             for sign in (1.0, -1.0)
         ]
-    homography, _ = cv2.findHomography(a, b, cv2.RANSAC, 1.5 * threshold_px)
+    homography, _ = cv2.findHomography(a, b, cv2.RANSAC, 1.5 * _INLIER_PX)
     if homography is not None:
         _, rotations, directions, _ = cv2.decomposeHomographyMat(homography, camera.matrix)
         for rotation, direction in zip(rotations, directions, strict=True):

@@ -54,7 +54,7 @@ class WheelMode(Mode):
         self._newest: WheelSample | None = None
         self._velocity_mps = np.zeros(3)
         self._is_silent = True
-        self.seen_way: SeenWay | None = None  # until this frame
+        self.seen_way: SeenWay | None = None  # by the images alone, if one ends with the last frame
         self._way_begins: tuple[int, Tracked, float] | None = None  # and the motion in the image that it needs, pixels
 
     def follow(self, rig: OdometryRig) -> None:
@@ -106,7 +106,7 @@ class WheelMode(Mode):
         moved_px = float(np.median(np.linalg.norm(pixels_a - pixels_b, axis=1)))
         if moved_px < wanted_px:
             return None
-        found = two_view_motion(self._rig.camera, pixels_a, pixels_b, threshold_px=1.0, seed=len(a))
+        found = two_view_motion(self._rig.camera, pixels_a, pixels_b, seed=len(a))
         if found is None or found.inliers.mean() < 0.6 or found.parallax_rad < np.radians(s.min_angle_deg):
             self._way_begins = since_ns, before, 1.5 * moved_px  # a turn, or too flat a scene
             return None

@@ -26,7 +26,7 @@ def seen(points: Array, cam_from_map: Array, rng: np.random.Generator, sigma_px:
 
 def two_views(rng: np.random.Generator, points: Array, b_from_a: Array, sigma_px: float) -> TwoView | None:
     a, b = seen(points, np.eye(4), rng, sigma_px), seen(points, b_from_a, rng, sigma_px)
-    return two_view_motion(CAMERA, a, b, threshold_px=1.0, seed=1)
+    return two_view_motion(CAMERA, a, b, seed=1)
 
 
 def test_two_views_give_direction_and_rotation() -> None:
@@ -35,7 +35,7 @@ def test_two_views_give_direction_and_rotation() -> None:
     points = cloud(rng, 200)
     a, b = seen(points, np.eye(4), rng, 0.3), seen(points, B_FROM_A, rng, 0.3)
     b[::4] = rng.uniform([0, 0], [640, 480], (50, 2))
-    found = two_view_motion(CAMERA, a, b, threshold_px=1.0, seed=1)
+    found = two_view_motion(CAMERA, a, b, seed=1)
     assert is_right(found.b_from_a)
     right = np.ones(200, bool)
     right[::4] = False

@@ -164,7 +164,7 @@ def test_an_imu_that_is_left_out_is_named_while_vision_goes_on_alone() -> None:
     said = [odometry.handle_stereo(replace(frame, stamp_ns=k * FRAME_NS)) for k in range(1, 20)]
     assert said[-1].inertial
     assert not odometry.refuses_imu
-    odometry._clock.off_s = 0.1
+    odometry.clock.off_s = 0.1
     said = [odometry.handle_stereo(replace(frame, stamp_ns=k * FRAME_NS)) for k in range(20, 23)]
     assert not said[-1].inertial
     assert odometry.refuses_imu

@@ -112,7 +112,7 @@ def test_files_that_are_not_the_map_leave_nothing(tmp_path: Path, file: bytes) -
     for data, words in (
         (bytes(spoiled), "is not a complete export|damaged|SHA-256"),
         (file[:-9], "does not fit"),
-        (b"<html>not found</html>" * 9, "not a complete export"),
+        (b"<html>not found</html>" * 9, "is another kind of file"),
         (b"", "too few"),
     ):
         with web_server(serve(data)) as http:
