@@ -112,11 +112,11 @@ class FleetQueries:
         self, change: Transaction, number: int, place: int, pictures: Sequence[tuple[str, int, bytes]]
     ) -> None:
         """Add pictures (kind, stamp, JPEG) to a failure, from a place on."""
-        columns = ("kind", "stamp_ns", "jpeg")
-        own = [{"number": number, "place": place + n} for n in range(len(pictures))]
-        change.insert(
-            "failure_pictures", [a | dict(zip(columns, p, strict=True)) for a, p in zip(own, pictures, strict=True)]
-        )
+        rows = [
+            {"number": number, "place": place + n, "kind": kind, "stamp_ns": stamp_ns, "jpeg": jpeg}
+            for n, (kind, stamp_ns, jpeg) in enumerate(pictures)
+        ]
+        change.insert("failure_pictures", rows)
         self._picture_bytes += sum(len(jpeg) for _, _, jpeg in pictures)
 
     def counters(
@@ -287,9 +287,10 @@ def name_failures(change: Transaction, site: str, areas: Areas) -> None:
 
 def keep_last_reports(change: Transaction, reports: LastReports) -> None:
     """Store the robots' last reports."""
-    columns = ("site", "robot", "version", "last_seen_ns", "last_report")
-    values = [(*key, version, ns, to_json(report).decode()) for key, (version, ns, report) in reports.items()]
-    rows = [dict(zip(columns, row, strict=True)) for row in values]
+    rows = [
+        {"site": site, "robot": robot, "version": version, "last_seen_ns": ns, "last_report": to_json(report).decode()}
+        for (site, robot), (version, ns, report) in reports.items()
+    ]
     otherwise = """ON CONFLICT (site, robot) DO UPDATE SET version = coalesce(excluded.version, robots.version),
                    last_seen_ns = excluded.last_seen_ns, last_report = excluded.last_report"""
     change.insert("robots", rows, otherwise)
@@ -309,19 +310,14 @@ def _ids(change: Transaction, keys: Iterable[Key]) -> dict[Key, int]:
     its replica, may have lost keys that a cache would still know, and counts would go to another one."""
     wanted, found = list(dict.fromkeys(keys)), dict[Key, int]()
     for first in range(0, len(wanted), _KEYS_AT_ONCE):
-        some = wanted[first : first + _KEYS_AT_ONCE]
-        found |= _known_ids(change, some)
-        if new := [key for key in some if key not in found]:
-            change.insert("tally_keys", [dict(zip(("site", "axis", "key"), key, strict=True)) for key in new])
-            found |= _known_ids(change, new)
+        values = [part for key in wanted[first : first + _KEYS_AT_ONCE] for part in key]
+        groups = ", ".join(["(?, ?, ?)"] * (len(values) // 3))
+        change.execute(f"INSERT INTO tally_keys (site, axis, key) VALUES {groups} ON CONFLICT DO NOTHING", values)
+        query = f"SELECT site, axis, key, id FROM tally_keys WHERE (site, axis, key) IN (VALUES {groups})"
+        found |= {
+            (site, axis, key): int(number) for site, axis, key, number in change.execute(query, values).fetchall()
+        }
     return found
-
-
-def _known_ids(change: Transaction, keys: Sequence[Key]) -> dict[Key, int]:
-    groups = ", ".join(["(?, ?, ?)"] * len(keys))
-    query = f"SELECT site, axis, key, id FROM tally_keys WHERE (site, axis, key) IN (VALUES {groups})"
-    rows = change.execute(query, [part for key in keys for part in key]).fetchall()
-    return {(site, axis, key): int(number) for site, axis, key, number in rows}
 
 
 def _add_counters(change: Transaction, ids: Mapping[Key, int], counters: Mapping[CounterKey, Counters]) -> None:

@@ -52,10 +52,9 @@ class OperatorQueries:
 
     def set_role(self, name: str, role: str, actor: Actor, *, keeps_an_admin: bool = False) -> None:
         """Set a role, from the next request on. keeps_an_admin: StateError for the last admin."""
-        with (
-            self._changing("operator's role", f"{name}, {role}", actor) as change,
-            self._keeping_an_admin(name, keeps_an_admin),
-        ):
+        with self._changing("operator's role", f"{name}, {role}", actor) as change:
+            if keeps_an_admin and role != "admin":
+                self._check_another_admin(name)
             _set(change, name, "role = ?", role)
 
     def set_password(self, name: str, password: str, actor: Actor) -> None:
@@ -67,8 +66,9 @@ class OperatorQueries:
     def disable(self, name: str, actor: Actor, *, keeps_an_admin: bool = False) -> None:
         """End sessions and tokens of a name at once, and refuse its sign-in. keeps_an_admin: as of `set_role`."""
         with self._changing("operator disabled", name, actor) as change:
-            with self._keeping_an_admin(name, keeps_an_admin):
-                _set(change, name, "is_disabled = ?", 1)
+            if keeps_an_admin:
+                self._check_another_admin(name)
+            _set(change, name, "is_disabled = ?", 1)
             for table in ("sessions", "tokens"):
                 change.execute(f"DELETE FROM {table} WHERE name = ?", (name,))
 
@@ -130,13 +130,13 @@ class OperatorQueries:
             yield change
             change.log("", kind, detail, actor=actor)
 
-    @contextmanager
-    def _keeping_an_admin(self, name: str, is_wanted: bool) -> Iterator[None]:
-        """Raise StateError, which takes the change of the block back, if it leaves no admin who can sign in."""
-        before = self.find(name)
-        yield
-        admins = "SELECT 1 FROM operators WHERE role = 'admin' AND password IS NOT NULL AND is_disabled = 0 LIMIT 1"
-        if is_wanted and before is not None and before.role == "admin" and self._database.value(admins) is None:
+    def _check_another_admin(self, name: str) -> None:
+        """Raise StateError for an admin without whom no admin could sign in."""
+        others = (
+            "SELECT 1 FROM operators WHERE role = 'admin' AND password IS NOT NULL AND is_disabled = 0 AND name <> ?"
+        )
+        known = self.find(name)
+        if known is not None and known.role == "admin" and self._database.value(others, (name,)) is None:
             raise StateError(
                 f"{name} is the last admin; add another one first, or use the command line of the server, which always can"
             )

@@ -5,6 +5,7 @@ import threading
 from collections.abc import Callable, Sequence, Set
 from contextlib import closing
 from datetime import UTC, datetime
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -45,6 +46,7 @@ EXTRA_TABLES = {"grid": "grid_blobs", "surfel": "surfel_blobs"}
 """By kind: table of the bytes of a version not needed by its robots; pictures of surveys are among the surfels."""
 _OF_VERSIONS = ("manifest", "tile", "vocabulary")
 _RESTORED = "restored"
+_REQUESTS_KEPT = 4096
 Span = tuple[int | None, int | None]
 
 
@@ -66,7 +68,8 @@ class StoreQueries:
         self.usage: Callable[[], StoreUsage | None] = UsageMeter(root, self._database, self._blobs).look
         self._areas: dict[str, tuple[list[str], Areas]] = {}  # by the addresses of their source files
         self._acts, self._acts_read, self._acts_lock = dict[str, list[Event]](), 0, threading.Lock()
-        self._requests: dict[str, dict[tuple[str, str], SurveyRequest]] = {}  # by the addresses of their files
+        # Every robot asks for requests every few seconds, and an object store answers slowly.
+        self._request = lru_cache(_REQUESTS_KEPT)(lambda kind, sha256: read_request(kind, self._blobs.get(sha256)))
 
     # ---------------------------------------------------------------------------------------------- sites and versions
 
@@ -233,14 +236,8 @@ class StoreQueries:
         """Return the open survey requests, oldest first; empty for an unknown site."""
         query = "SELECT kind, sha256 FROM site_files WHERE site = ? AND substr(kind, 1, ?) = ?"
         rows = self._database.query(query, (site, len(KIND), KIND))
-        known = self._requests.get(site, {})  # every robot asks every few seconds, and an object store answers slowly
-        found = {
-            key: known.get(key) or read_request(key[0], self._blobs.get(key[1]))
-            for key in [(row["kind"], row["sha256"]) for row in rows]
-        }
-        if found or known:  # no name that has none is remembered: it may be made up
-            self._requests[site] = found
-        return sorted(found.values(), key=lambda request: (request.asked_ns, request.id))
+        found = [self._request(row["kind"], row["sha256"]) for row in rows]
+        return sorted(found, key=lambda request: (request.asked_ns, request.id))
 
     # ---------------------------------------------------------------------------------------------------------- the log
 
@@ -473,5 +470,4 @@ def mentioned(database: Database, leaving: Set[tuple[str, int]] = frozenset()) -
 
 
 def _iso(stamp_ns: int) -> str:
-    moment = datetime.fromtimestamp(stamp_ns // 10**9, UTC)
-    return moment.isoformat(timespec="seconds").replace("+00:00", "Z")
+    return f"{datetime.fromtimestamp(stamp_ns // 10**9, UTC):%Y-%m-%dT%H:%M:%SZ}"

@@ -56,14 +56,13 @@ def _drawn(plan: SitePlan, *, has_drives: bool) -> dict[str, Any]:
         "height": round(height, 1),
         "png": b64encode(plan.seen.png).decode(),
         "tiles": path(tiles),
-        "areas": [(area.name, path(area.outlines), *placed(_corner(area.outlines[0]))) for area in plan.areas.areas],
+        "areas": [
+            (area.name, path(area.outlines), *placed([ring[:, 0].min(), ring[:, 1].max()]))
+            for area in plan.areas.areas
+            for ring in area.outlines[:1]
+        ],
         "starts": {outcome: placed(places) for outcome, places in plan.starts.items()},
         "drives": [(*placed(place)[0], -45 * HEADINGS.index(facing)) for place, facing in plan.to_drive if has_drives],
         "bar_m": bar_m,
         "bar": round(bar_m * per_m, 1),
     }
-
-
-def _corner(ring: Array) -> tuple[float, float]:
-    """Return the upper left corner of what holds a ring (N, 2)."""
-    return ring[:, 0].min(), ring[:, 1].max()

@@ -3,6 +3,7 @@
 import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
@@ -25,7 +26,7 @@ from fleetmap.recordings.tum import read_tum
 from fleetmap.relocalization.map_view import MapView
 from fleetmap.sensors.rectification import Rectifier
 from fleetmap.sensors.samples import CameraFrame, SensorSet, Trajectory
-from mapserver.doctor import Finding, Verdict, run_checks
+from mapserver.doctor import Verdict, run_checks
 from mapserver.drafting.admission import fingerprint, rig_evidence
 from mapserver.drafting.draft_evidence import Before
 from mapserver.plugins.acceptance.figures import QUANTILES, DriveFigures, quantile
@@ -151,18 +152,11 @@ def replayed(request: DriveRequest, version: MapUnderTest) -> tuple[ReplayReport
         return msgspec.json.decode(report.read_bytes(), type=ReplayReport), read_tum(trajectory)
 
 
-def checked(request: DriveRequest) -> list[Finding]:
-    """Return the doctor's findings; errors as of the recording."""
-    with open_recording(request.path, request.opening) as recording:
-        return run_checks(recording).findings
-
-
-def examined(
-    request: DriveRequest, version: MapUnderTest, replay: tuple[ReplayReport, Trajectory], findings: list[Finding]
-) -> Drive:
-    """Return the figures of a drive from its replay and its findings; errors as of the recording."""
-    report, localised = replay
+def examined(request: DriveRequest, version: MapUnderTest, replay: Future[tuple[ReplayReport, Trajectory]]) -> Drive:
+    """Return the figures of a drive, which the doctor checks while it is replayed; errors as of the recording and the replay."""
     with open_recording(request.path, request.opening) as opened:
+        findings = run_checks(opened).findings
+        report, localised = replay.result()
         recording, selected = opened.readable(FrameSelection.parse(request.frames).apply(opened))
         reference = _reference(recording, selected, version, localised)
         truths = [reference.trajectory.at(int(stamp)) for stamp in recording.frame_stamps_ns[selected]]

@@ -18,7 +18,7 @@ from mapserver.drafting.worker import single_threaded_libraries
 from mapserver.fleet_statistics.kpis import Counters, format_rate, rate
 from mapserver.floor_plan.areas import Areas
 from mapserver.plugins.acceptance.document import SitePlan
-from mapserver.plugins.acceptance.drives import Drive, DriveRequest, MapUnderTest, checked, examined, replayed
+from mapserver.plugins.acceptance.drives import Drive, DriveRequest, MapUnderTest, examined, replayed
 from mapserver.plugins.acceptance.figures import UNKNOWN_PLACE, AreaFigures, Count, Report, Similar, StartCounts
 from mapserver.plugins.acceptance.ladders import darkest_grey
 from mapserver.quality.directions import headings_of, opposite, tile_directions
@@ -40,19 +40,14 @@ def examine(
     areas = maps.areas(site)
     where = partial(area_name, areas, under_test.manifest.tile_size_m)
     with single_threaded_libraries(), ThreadPoolExecutor(os.cpu_count()) as pool:
-        begun = [
-            (request, pool.submit(replayed, request, under_test), pool.submit(checked, request)) for request in drives
-        ]
-        found = [
-            examined(request, under_test, replay.result(), findings.result()) for request, replay, findings in begun
-        ]
-        probes = [picture.probe for drive in found for picture in drive.pictures]
-        probes = [probes[n] for n in spread(np.arange(len(probes)), PROBES)]
+        replays = [pool.submit(replayed, request, under_test) for request in drives]
+        found = [examined(request, under_test, replay) for request, replay in zip(drives, replays, strict=True)]
+        pictures = [picture for drive in found for picture in drive.pictures]
+        probes = [pictures[n].probe for n in spread(np.arange(len(pictures)), PROBES)]
         alike = similar(under_test.view, where, probes)
     known = [] if under_test.built is None else under_test.built.calibrations
     judged = maps.evidence(site, version)
     built = [] if judged is None else judged.calibrations or []
-    pictures = [picture for drive in found for picture in drive.pictures]
     rungs = [rung for picture in pictures for rung in picture.rungs["darkness"].values()]
     levels = [*((picture.grey, picture.is_fixed) for picture in pictures), *rungs]
     counts = maps.fleet.counters(site, "version", key=str(version)).get((site, str(version)), Counters())

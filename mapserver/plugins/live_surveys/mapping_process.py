@@ -38,7 +38,6 @@ _MOST_MISSING = 64
 _NICENESS = 5  # lower priority than tracking
 
 
-NO_SKETCH = MapSketch(keyframes=0)
 _Item = tuple[RectifiedFrame, NewKeyframe]
 
 
@@ -53,7 +52,7 @@ class MappingProcess:
         self._theirs, self._rectifier = theirs, rectifier
         self._waiting: queue.Queue[_Item | None] = queue.Queue()
         self._sent = self.most_behind = 0
-        self.sketch = NO_SKETCH  # after the newest processed keyframe
+        self.sketch = MapSketch(keyframes=0)  # after the newest processed keyframe
         self.failed = ""  # why no more keyframes are accepted
         self._put_s: deque[float] = deque()  # of keyframes not yet in a sketch
         self.longest_lag_s = 0.0  # from a keyframe to its sketch

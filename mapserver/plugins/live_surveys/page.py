@@ -97,9 +97,7 @@ def install(host: Host) -> None:
 def heard(surveys: LiveSurveys, _: Services, context: PageContext) -> dict[str, object]:
     """Changes when the page does."""
     survey = surveys.of(context.site)
-    if survey is None:
-        return {"heard": None}
-    return {"heard": survey.sha256, "silent": survey.is_silent}
+    return {"heard": None} if survey is None else {"heard": survey.sha256, "silent": survey.is_silent}
 
 
 def page(surveys: LiveSurveys, _: Services, context: PageContext) -> dict[str, object]:
